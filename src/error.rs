@@ -1,0 +1,111 @@
+//! What can go wrong, sorted by what the user can do about it.
+
+use std::path::{Path, PathBuf};
+
+/// The result of everything in this crate that can fail.
+pub type Result<T, E = Error> = std::result::Result<T, E>;
+
+/// An error names the object, the fact and, where there is one, the remedy, in one line.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// A file or folder that was read is missing, cut short or not what it should be.
+    #[error("{}: {problem}", path.display())]
+    Input {
+        /// The file or folder.
+        path: PathBuf,
+        /// The fact and the remedy.
+        problem: String,
+    },
+    /// A file or folder could not be written.
+    #[error("{}: {problem}", path.display())]
+    Output {
+        /// The file or folder.
+        path: PathBuf,
+        /// The fact and the remedy.
+        problem: String,
+    },
+    /// An option or a combination of options that makes no sense; the exit code is 2.
+    #[error("{0}")]
+    Usage(String),
+    /// There is no Vulkan loader, or no device that the choice names.
+    #[error("{0}")]
+    NoDevice(String),
+    /// The device lacks something every kernel needs.
+    #[error(
+        "{device} lacks {feature}; `nightsplat doctor` lists every device and what it offers, --device picks another"
+    )]
+    MissingFeature {
+        /// The device's name.
+        device: String,
+        /// The feature, extension or limit, by its Vulkan name.
+        feature: String,
+    },
+    /// A buffer did not fit into device memory.
+    #[error("out of device memory: buffer `{buffer}` needs {bytes} bytes; lower --max-gaussians or raise --downscale")]
+    OutOfMemory {
+        /// The buffer's name.
+        buffer: String,
+        /// Its size in bytes.
+        bytes: u64,
+    },
+    /// A buffer exceeds what one binding may hold on this device.
+    #[error(
+        "buffer `{buffer}` needs {bytes} bytes, {device} binds {limit} at most; lower --max-gaussians or raise --downscale"
+    )]
+    BufferTooLarge {
+        /// The buffer's name.
+        buffer: String,
+        /// Its size in bytes.
+        bytes: u64,
+        /// The device's name.
+        device: String,
+        /// maxStorageBufferRange, in bytes.
+        limit: u64,
+    },
+    /// The device stopped answering.
+    #[error("{device} was lost while it ran `{pass}`; lower the load or update the driver")]
+    DeviceLost {
+        /// The device's name.
+        device: String,
+        /// The last pass recorded.
+        pass: String,
+    },
+    /// A Vulkan call failed for a reason not named above.
+    #[error("{call} failed on {device}: {result}")]
+    Vulkan {
+        /// The Vulkan call.
+        call: &'static str,
+        /// The device's name, or "the Vulkan loader".
+        device: String,
+        /// What it returned.
+        result: ash::vk::Result,
+    },
+    /// A loss term is NaN or infinite.
+    #[error("step {step}, view {view}: {what} is not finite; lower the learning rates or inspect the view's image")]
+    NotFinite {
+        /// The training step, from 1.
+        step: u64,
+        /// The view's name.
+        view: String,
+        /// The loss term or buffer that is not finite.
+        what: String,
+    },
+}
+
+impl Error {
+    /// An [`Error::Input`].
+    pub fn input(path: impl AsRef<Path>, problem: impl Into<String>) -> Self {
+        Self::Input { path: path.as_ref().to_owned(), problem: problem.into() }
+    }
+
+    /// An [`Error::Output`].
+    pub fn output(path: impl AsRef<Path>, problem: impl Into<String>) -> Self {
+        Self::Output { path: path.as_ref().to_owned(), problem: problem.into() }
+    }
+
+    /// The process's exit code: 2 for misuse, 1 for everything else.
+    pub fn exit_code(&self) -> u8 {
+        if matches!(self, Self::Usage(_)) { 2 } else { 1 }
+    }
+}

@@ -1,0 +1,15 @@
+//! `nightsplat` trains 3D Gaussian Splatting from dark photographs, on explicit Vulkan compute.
+//!
+//! Data flows one way; a module uses only modules above it in this list
+//! (`tests/architecture.rs` asserts it):
+//!
+//! ```text
+//! photographs on disk -> dataset -> pseudo-GT (tone curve) ┐
+//!                                                          ├-> loss -> backward -> optimizer -> densify -> next step
+//! points -> scene (Gaussians) -> project -> bin -> sort -> blend ┘
+//!                                                          └-> eval, export, render
+//! ```
+
+pub mod error;
+
+pub use error::{Error, Result};

@@ -1,0 +1,3 @@
+//! The `nightsplat` command.
+
+fn main() {}
