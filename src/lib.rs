@@ -10,10 +10,13 @@
 //!                                                          └-> eval, export, render
 //! ```
 
+pub mod camera;
+pub mod dataset;
 pub mod error;
 #[expect(unsafe_code, reason = "the only module that speaks Vulkan")]
 pub mod gpu;
 pub mod kernels;
 pub mod reference;
+pub mod image;
 
 pub use error::{Error, Result};
