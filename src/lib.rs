@@ -10,6 +10,9 @@
 //!                                                          └-> eval, export, render
 //! ```
 
+pub mod camera;
+pub mod dataset;
 pub mod error;
+pub mod image;
 
 pub use error::{Error, Result};
