@@ -11,8 +11,18 @@
 //! ```
 
 pub mod camera;
+#[cfg(feature = "cli")]
+pub mod cli;
 pub mod dataset;
 pub mod error;
+#[expect(unsafe_code, reason = "the only module that speaks Vulkan")]
+pub mod gpu;
 pub mod image;
+pub mod kernels;
+pub mod metrics;
+pub mod random;
+pub mod reference;
+pub mod report;
+pub mod scene;
 
 pub use error::{Error, Result};

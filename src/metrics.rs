@@ -31,7 +31,8 @@ impl Scores {
 
     /// The mean of each score; none of nothing.
     pub fn mean(scores: &[Self]) -> Option<Self> {
-        let mean = |score: fn(&Self) -> f64| scores.iter().map(score).sum::<f64>() / scores.len() as f64;
+        let mean =
+            |score: fn(&Self) -> f64| scores.iter().map(score).sum::<f64>() / scores.len() as f64;
         (!scores.is_empty()).then(|| Self {
             psnr: mean(|scores| scores.psnr),
             psnr_channel_mean: mean(|scores| scores.psnr_channel_mean),
@@ -110,7 +111,8 @@ fn ssim_of_channel(a: &[f32], b: &[f32], width: usize) -> f64 {
         blur(&a.iter().zip(b).map(|(&a, &b)| value(a.into(), b.into())).collect::<Vec<_>>(), width)
     };
     let (mean_a, mean_b) = (blurred(|a, _| a), blurred(|_, b| b));
-    let (square_a, square_b, product) = (blurred(|a, _| a * a), blurred(|_, b| b * b), blurred(|a, b| a * b));
+    let (square_a, square_b, product) =
+        (blurred(|a, _| a * a), blurred(|_, b| b * b), blurred(|a, b| a * b));
     let ssim = |i: usize| {
         let (mean_a, mean_b) = (mean_a[i], mean_b[i]);
         let (var_a, var_b) = (square_a[i] - mean_a * mean_a, square_b[i] - mean_b * mean_b);

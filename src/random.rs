@@ -50,7 +50,10 @@ mod tests {
             (mean, variance)
         };
         let (mean, variance) = moments(&|i| stream.uniform(i));
-        assert!((mean - 0.5).abs() < 0.01 && (variance - 1.0 / 12.0).abs() < 0.002, "{mean} {variance}");
+        assert!(
+            (mean - 0.5).abs() < 0.01 && (variance - 1.0 / 12.0).abs() < 0.002,
+            "{mean} {variance}"
+        );
         let (mean, variance) = moments(&|i| stream.normal(i));
         assert!(mean.abs() < 0.03 && (variance - 1.0).abs() < 0.04, "{mean} {variance}");
     }

@@ -21,7 +21,7 @@ use crate::{Error, Result};
 mod room;
 
 /// How much darker the dark photographs are, in linear light.
-pub const DARKENING: f64 = 22.0;
+pub const DARKENING: f64 = 25.0;
 
 /// Electrons that a pixel holds at the reference's white.
 const FULL_WELL: f64 = 9000.0;
@@ -59,11 +59,16 @@ impl SyntheticOptions {
     fn check(&self) -> Result<()> {
         const SIDES: std::ops::RangeInclusive<u32> = 16..=8192;
         if !(2..=999).contains(&self.views) {
-            return Err(Error::Usage(format!("{} views cannot be made; ask for 2 to 999", self.views)));
+            return Err(Error::Usage(format!(
+                "{} views cannot be made; ask for 2 to 999",
+                self.views
+            )));
         }
         if !SIDES.contains(&self.width) || !SIDES.contains(&self.height) {
             let (width, height) = (self.width, self.height);
-            return Err(Error::Usage(format!("views of {width}x{height} cannot be made; ask for sides of 16 to 8192")));
+            return Err(Error::Usage(format!(
+                "views of {width}x{height} cannot be made; ask for sides of 16 to 8192"
+            )));
         }
         Ok(())
     }
@@ -83,13 +88,15 @@ pub fn write(dir: impl AsRef<Path>, options: &SyntheticOptions) -> Result<()> {
     let dir = dir.as_ref();
     let (low, high, sparse) = (dir.join("low"), dir.join("high"), dir.join("colmap_sparse/0"));
     for folder in [&low, &high, &sparse] {
-        fs::create_dir_all(folder).map_err(|error| Error::output(folder, format!("cannot be made: {error}")))?;
+        fs::create_dir_all(folder)
+            .map_err(|error| Error::output(folder, format!("cannot be made: {error}")))?;
     }
     // The lists of frames are what makes the set look complete, so an earlier set's go first and ours come last.
     for split in ["train", "test", "val"] {
         let list = dir.join(format!("transforms_{split}.json"));
         if list.exists() {
-            fs::remove_file(&list).map_err(|error| Error::output(&list, format!("cannot be replaced: {error}")))?;
+            fs::remove_file(&list)
+                .map_err(|error| Error::output(&list, format!("cannot be replaced: {error}")))?;
         }
     }
 
@@ -104,8 +111,11 @@ pub fn write(dir: impl AsRef<Path>, options: &SyntheticOptions) -> Result<()> {
     for (name, text) in colmap_model(&room, &cameras, options.seed) {
         write_file(&sparse.join(name), &text)?;
     }
-    let (test, train): (Vec<usize>, Vec<usize>) = (0..options.views).partition(|view| view % TEST_EVERY == 0);
-    for (split, folder, views) in [("train", "low", &train[..]), ("test", "high", &test), ("val", "high", &test[..1])] {
+    let (test, train): (Vec<usize>, Vec<usize>) =
+        (0..options.views).partition(|view| view % TEST_EVERY == 0);
+    for (split, folder, views) in
+        [("train", "low", &train[..]), ("test", "high", &test), ("val", "high", &test[..1])]
+    {
         let list = transforms(&cameras, folder, views);
         write_file(&dir.join(format!("transforms_{split}.json")), &format!("{list:#}\n"))?;
     }
@@ -113,7 +123,8 @@ pub fn write(dir: impl AsRef<Path>, options: &SyntheticOptions) -> Result<()> {
 }
 
 fn write_file(path: &Path, text: &str) -> Result<()> {
-    fs::write(path, text).map_err(|error| Error::output(path, format!("cannot be written: {error}")))
+    fs::write(path, text)
+        .map_err(|error| Error::output(path, format!("cannot be written: {error}")))
 }
 
 /// The photograph's name, the same in `low/`, `high/` and the COLMAP model.
@@ -126,7 +137,7 @@ fn file_name(view: usize) -> String {
 fn camera(view: usize, options: &SyntheticOptions) -> Camera {
     const AZIMUTH: f64 = 0.75; // radians to either side
     const ELEVATION: (f64, f64) = (0.24, 0.62); // radians
-    const DISTANCE: (f64, f64) = (2.75, 3.15);
+    const DISTANCE: (f64, f64) = (2.95, 3.45);
     let fraction = |step: f64| (0.5 + step * view as f64).fract();
     let azimuth = AZIMUTH * (2.0 * fraction(0.754_877_666) - 1.0);
     let elevation = ELEVATION.0 + (ELEVATION.1 - ELEVATION.0) * fraction(0.569_840_291);
@@ -137,13 +148,14 @@ fn camera(view: usize, options: &SyntheticOptions) -> Camera {
     let right = DVec3::Z.cross(back).normalize();
     let world_from_view = DMat3::from_cols(right, -back.cross(right), -back);
     let size = DVec2::new(options.width.into(), options.height.into());
-    let focal = 1.02 * size.max_element();
+    let focal = 0.92 * size.max_element();
     Camera {
         width: options.width,
         height: options.height,
         focal: DVec2::new(focal, 1.01 * focal),
         principal_point: size * DVec2::new(0.525, 0.485),
-        view_from_world: DAffine3::from_mat3_translation(world_from_view, FOCUS + distance * back).inverse(),
+        view_from_world: DAffine3::from_mat3_translation(world_from_view, FOCUS + distance * back)
+            .inverse(),
     }
 }
 
@@ -155,12 +167,20 @@ fn ray(camera: &Camera, pixel: DVec2) -> DVec3 {
 
 /// Linear radiance, row by row, the mean of 2x2 rays per pixel.
 fn render(room: &Room, camera: &Camera) -> Vec<DVec3> {
-    const OFFSETS: [DVec2; 4] =
-        [DVec2::new(0.25, 0.25), DVec2::new(0.75, 0.25), DVec2::new(0.25, 0.75), DVec2::new(0.75, 0.75)];
+    const OFFSETS: [DVec2; 4] = [
+        DVec2::new(0.25, 0.25),
+        DVec2::new(0.75, 0.25),
+        DVec2::new(0.25, 0.75),
+        DVec2::new(0.75, 0.75),
+    ];
     let center = camera.center();
     let radiance = |index: u32| {
         let corner = DVec2::new((index % camera.width).into(), (index / camera.width).into());
-        OFFSETS.map(|offset| room.radiance(center, ray(camera, corner + offset))).iter().sum::<DVec3>() / 4.0
+        OFFSETS
+            .map(|offset| room.radiance(center, ray(camera, corner + offset)))
+            .iter()
+            .sum::<DVec3>()
+            / 4.0
     };
     (0..camera.width * camera.height).into_par_iter().map(radiance).collect()
 }
@@ -182,7 +202,9 @@ fn dark_photograph(radiance: &[DVec3], camera: &Camera, noise: Stream) -> Image 
 
 /// An image of linear values at (pixel, channel), encoded, clamped to [0, 1].
 fn photograph(camera: &Camera, linear: impl Fn(usize, usize) -> f64) -> Image {
-    let encoded = |pixel: usize, channel: usize| srgb_from_linear(linear(pixel, channel) as f32).clamp(0.0, 1.0);
+    let encoded = |pixel: usize, channel: usize| {
+        srgb_from_linear(linear(pixel, channel) as f32).clamp(0.0, 1.0)
+    };
     Image::from_fn(camera.width, camera.height, |x, y| {
         [0, 1, 2].map(|channel| encoded((y * camera.width + x) as usize, channel))
     })
@@ -193,8 +215,11 @@ fn transforms(cameras: &[Camera], folder: &str, views: &[usize]) -> Value {
     let Camera { width, height, focal, principal_point, .. } = cameras[0];
     let frame = |&view: &usize| {
         let pose = cameras[view].view_from_world.inverse();
-        let [right, down, forward] = [pose.matrix3.x_axis, pose.matrix3.y_axis, pose.matrix3.z_axis];
-        let mut rows = [0, 1, 2].map(|row| [right[row], -down[row], -forward[row], pose.translation[row]]).to_vec();
+        let [right, down, forward] =
+            [pose.matrix3.x_axis, pose.matrix3.y_axis, pose.matrix3.z_axis];
+        let mut rows = [0, 1, 2]
+            .map(|row| [right[row], -down[row], -forward[row], pose.translation[row]])
+            .to_vec();
         rows.push([0.0, 0.0, 0.0, 1.0]);
         json!({ "file_path": format!("{folder}/{}", file_name(view)), "transform_matrix": rows })
     };
@@ -224,12 +249,16 @@ fn sparse_points(room: &Room, cameras: &[Camera], seed: u64) -> Vec<SparsePoint>
     let sample = |index: u64| {
         let uniform = |draw: u64| stream.uniform(index * DRAWS_PER_POINT + draw);
         let camera = &cameras[(uniform(0) * cameras.len() as f64) as usize];
-        let pixel = DVec2::new(uniform(1) * f64::from(camera.width), uniform(2) * f64::from(camera.height));
+        let pixel =
+            DVec2::new(uniform(1) * f64::from(camera.width), uniform(2) * f64::from(camera.height));
         let position = room.first_point(camera.center(), ray(camera, pixel))?;
-        let seen = |(view, camera): (usize, &Camera)| Some((view, seen_at(room, camera, position)?));
+        let seen =
+            |(view, camera): (usize, &Camera)| Some((view, seen_at(room, camera, position)?));
         let track: Vec<_> = cameras.iter().enumerate().filter_map(seen).collect();
         // Each normal draw takes two counters.
-        let error = DVec3::from_array([2, 3, 4].map(|draw| stream.normal(index * DRAWS_PER_POINT / 2 + draw)));
+        let error = DVec3::from_array(
+            [2, 3, 4].map(|draw| stream.normal(index * DRAWS_PER_POINT / 2 + draw)),
+        );
         (track.len() >= 2).then(|| SparsePoint { position: position + PRECISION * error, track })
     };
     (0..DRAWS).into_par_iter().filter_map(sample).collect()
@@ -257,7 +286,8 @@ fn colmap_model(room: &Room, cameras: &[Camera], seed: u64) -> [(&'static str, S
 
     let mut observations = vec![String::new(); cameras.len()];
     let mut observation_counts = vec![0; cameras.len()];
-    let mut point_list = String::from("# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n");
+    let mut point_list =
+        String::from("# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n");
     // Writing to a string cannot fail, so the results below hold nothing.
     for (index, SparsePoint { position, track }) in points.iter().enumerate() {
         let id = index + 1;
@@ -270,13 +300,28 @@ fn colmap_model(room: &Room, cameras: &[Camera], seed: u64) -> [(&'static str, S
         point_list.push('\n');
     }
 
-    let mut image_list =
-        String::from("# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n");
+    let mut image_list = String::from(
+        "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n",
+    );
     for (view, camera) in cameras.iter().enumerate() {
         let (_, rotation, translation) = camera.view_from_world.to_scale_rotation_translation();
-        let pose = [rotation.w, rotation.x, rotation.y, rotation.z, translation.x, translation.y, translation.z];
+        let pose = [
+            rotation.w,
+            rotation.x,
+            rotation.y,
+            rotation.z,
+            translation.x,
+            translation.y,
+            translation.z,
+        ];
         let pose = pose.map(|number| number.to_string()).join(" ");
-        let _ = writeln!(image_list, "{} {pose} 1 {}\n{}", view + 1, file_name(view), observations[view].trim_end());
+        let _ = writeln!(
+            image_list,
+            "{} {pose} 1 {}\n{}",
+            view + 1,
+            file_name(view),
+            observations[view].trim_end()
+        );
     }
     [("cameras.txt", camera_list), ("images.txt", image_list), ("points3D.txt", point_list)]
 }

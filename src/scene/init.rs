@@ -34,11 +34,17 @@ const LONE_SCALE: f64 = 0.01;
 /// [`Error::Usage`] where a position or colour is not finite or their numbers differ.
 pub fn from_points(positions: &[DVec3], colors: &[Vec3], sh_degree: u32) -> Result<Gaussians> {
     if positions.len() != colors.len() {
-        return Err(Error::Usage(format!("{} points have {} colours", positions.len(), colors.len())));
+        return Err(Error::Usage(format!(
+            "{} points have {} colours",
+            positions.len(),
+            colors.len()
+        )));
     }
     let finite = |(position, color): (&DVec3, &Vec3)| position.is_finite() && color.is_finite();
     if let Some(point) = positions.iter().zip(colors).position(|pair| !finite(pair)) {
-        return Err(Error::Usage(format!("point {point} has a position or colour that is not finite")));
+        return Err(Error::Usage(format!(
+            "point {point} has a position or colour that is not finite"
+        )));
     }
 
     let mut gaussians = Gaussians::zeros(positions.len(), sh_degree);
@@ -64,7 +70,8 @@ fn scales(positions: &[DVec3]) -> Result<Vec<f64>> {
     let mut distinct: Vec<_> = positions.iter().map(key).collect();
     distinct.sort_unstable();
     distinct.dedup();
-    let distinct: Vec<[f64; 3]> = distinct.into_iter().map(|bits| bits.map(f64::from_bits)).collect();
+    let distinct: Vec<[f64; 3]> =
+        distinct.into_iter().map(|bits| bits.map(f64::from_bits)).collect();
     if distinct.len() <= 1 {
         return Ok(vec![LONE_SCALE; positions.len()]);
     }
@@ -74,9 +81,11 @@ fn scales(positions: &[DVec3]) -> Result<Vec<f64>> {
     // The nearest position is the point itself.
     let wanted = NonZero::<usize>::MIN.saturating_add(NEIGHBOURS);
     let scale = |position: &DVec3| {
-        let nearest = tree.query(&position.to_array()).nearest_n::<SquaredEuclidean<f64>>(wanted).execute();
+        let nearest =
+            tree.query(&position.to_array()).nearest_n::<SquaredEuclidean<f64>>(wanted).execute();
         let others = &nearest[1..];
-        let mean = others.iter().map(|neighbour| neighbour.distance).sum::<f64>() / others.len() as f64;
+        let mean =
+            others.iter().map(|neighbour| neighbour.distance).sum::<f64>() / others.len() as f64;
         mean.max(LEAST_SQUARED_DISTANCE).sqrt()
     };
     Ok(positions.par_iter().map(scale).collect())
@@ -84,7 +93,7 @@ fn scales(positions: &[DVec3]) -> Result<Vec<f64>> {
 
 /// `count` random positions inside what the cameras see, for captures without points; none without cameras.
 ///
-/// Each lies at a uniform place of a random camera's image, at a depth that is log-uniform between a fifth of the
+/// Each lies at a uniform place of a random camera's image, at a depth that is log-uniform between half the
 /// capture's radius and five times it (radius: the greatest distance of a camera from the cameras' mean; 1 where all
 /// cameras are in one place). A position that a second camera sees is preferred: its depth can be learned.
 pub fn random(cameras: &[Camera], count: usize, seed: u64) -> Vec<DVec3> {
@@ -94,19 +103,27 @@ pub fn random(cameras: &[Camera], count: usize, seed: u64) -> Vec<DVec3> {
         return Vec::new();
     }
     let radius = radius(cameras);
-    let (near, far) = (0.2 * radius, 5.0 * radius);
+    let (near, far) = (0.5 * radius, 5.0 * radius);
     let draw = |point: u64| {
         let stream = Stream::new(seed, point);
         let position = |attempt: u64| {
             let uniform = |draw: u64| stream.uniform(attempt * DRAWS_PER_TRY + draw);
             let camera = &cameras[(uniform(0) * cameras.len() as f64) as usize];
-            let pixel = DVec2::new(uniform(1) * f64::from(camera.width), uniform(2) * f64::from(camera.height));
+            let pixel = DVec2::new(
+                uniform(1) * f64::from(camera.width),
+                uniform(2) * f64::from(camera.height),
+            );
             let depth = near * (far / near).powf(uniform(3));
             let in_view = ((pixel - camera.principal_point) / camera.focal).extend(1.0) * depth;
             camera.view_from_world.inverse().transform_point3(in_view)
         };
-        let seen_twice =
-            |position: &DVec3| cameras.iter().filter(|camera| pixel_inside(camera, *position).is_some()).nth(1).is_some();
+        let seen_twice = |position: &DVec3| {
+            cameras
+                .iter()
+                .filter(|camera| pixel_inside(camera, *position).is_some())
+                .nth(1)
+                .is_some()
+        };
         (1..TRIES).map(position).find(seen_twice).unwrap_or_else(|| position(0))
     };
     (0..count as u64).into_par_iter().map(draw).collect()
@@ -125,7 +142,9 @@ fn radius(cameras: &[Camera]) -> f64 {
 /// Where a camera sees a position, pixels; none behind the camera or outside its image.
 fn pixel_inside(camera: &Camera, position: DVec3) -> Option<DVec2> {
     let size = DVec2::new(camera.width.into(), camera.height.into());
-    camera.project(position).filter(|pixel| pixel.cmpge(DVec2::ZERO).all() && pixel.cmplt(size).all())
+    camera
+        .project(position)
+        .filter(|pixel| pixel.cmpge(DVec2::ZERO).all() && pixel.cmplt(size).all())
 }
 
 /// The colour of each point: the mean of what the training views that see it show in their targets, RGB.

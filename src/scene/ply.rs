@@ -86,7 +86,9 @@ fn write(gaussians: &Gaussians, path: &Path) -> std::io::Result<()> {
     }
     writeln!(file, "end_header")?;
 
-    let value = |(begin, stride): (usize, usize), gaussian: usize| gaussians.parameters[begin + stride * gaussian];
+    let value = |(begin, stride): (usize, usize), gaussian: usize| {
+        gaussians.parameters[begin + stride * gaussian]
+    };
     let means: Vec<_> = means.iter().map(|property| property.address(gaussians)).collect();
     let others: Vec<_> = others.iter().map(|property| property.address(gaussians)).collect();
     let mut row = Vec::with_capacity(properties.len() + NORMALS.len());
@@ -109,7 +111,8 @@ fn write(gaussians: &Gaussians, path: &Path) -> std::io::Result<()> {
 /// needed property is missing or not finite.
 pub fn load(path: impl AsRef<Path>) -> Result<Gaussians> {
     let path = path.as_ref();
-    let bytes = fs::read(path).map_err(|error| Error::input(path, format!("cannot be read: {error}")))?;
+    let bytes =
+        fs::read(path).map_err(|error| Error::input(path, format!("cannot be read: {error}")))?;
     parse(&bytes).map_err(|problem| Error::input(path, problem))
 }
 
@@ -126,7 +129,11 @@ fn parse(bytes: &[u8]) -> Result<Gaussians, String> {
         ));
     }
     if body.len() > expected && !header.more_elements {
-        return Err(format!("holds {} bytes more than its {} vertices need", body.len() - expected, header.count));
+        return Err(format!(
+            "holds {} bytes more than its {} vertices need",
+            body.len() - expected,
+            header.count
+        ));
     }
 
     let mut gaussians = Gaussians::zeros(header.count, header.sh_degree()?);
@@ -137,7 +144,10 @@ fn parse(bytes: &[u8]) -> Result<Gaussians, String> {
             let [a, b, c, d] = [0, 1, 2, 3].map(|byte| vertex[offset + byte]);
             let value = f32::from_le_bytes([a, b, c, d]);
             if !value.is_finite() {
-                return Err(format!("vertex {gaussian}: `{}` is {value}, not a finite number", property.name));
+                return Err(format!(
+                    "vertex {gaussian}: `{}` is {value}, not a finite number",
+                    property.name
+                ));
             }
             gaussians.parameters[begin + stride * gaussian] = value;
         }
@@ -165,28 +175,46 @@ impl Header {
         if !bytes.starts_with(b"ply") {
             return Err("is not a PLY file".to_owned());
         }
-        let end = bytes.windows(END.len()).position(|window| window == END).ok_or("is cut short in the header")?;
-        let newline = bytes[end..].iter().position(|&byte| byte == b'\n').ok_or("is cut short in the header")?;
+        let end = bytes
+            .windows(END.len())
+            .position(|window| window == END)
+            .ok_or("is cut short in the header")?;
+        let newline = bytes[end..]
+            .iter()
+            .position(|&byte| byte == b'\n')
+            .ok_or("is cut short in the header")?;
         let text = std::str::from_utf8(&bytes[..end]).map_err(|_| "the header is not text")?;
 
-        let mut header =
-            Self { length: end + newline + 1, count: 0, stride: 0, properties: HashMap::new(), more_elements: false };
+        let mut header = Self {
+            length: end + newline + 1,
+            count: 0,
+            stride: 0,
+            properties: HashMap::new(),
+            more_elements: false,
+        };
         let (mut format_is_known, mut in_vertices) = (false, false);
         for line in text.lines() {
             match *line.split_whitespace().collect::<Vec<_>>() {
                 ["format", "binary_little_endian", _] => format_is_known = true,
                 ["format", format, _] => {
-                    return Err(format!("is a PLY of format {format}; save it as binary_little_endian"));
+                    return Err(format!(
+                        "is a PLY of format {format}; save it as binary_little_endian"
+                    ));
                 }
                 ["element", "vertex", count] if !in_vertices => {
                     in_vertices = true;
-                    header.count = count.parse().map_err(|_| format!("`{count}` is not a vertex count"))?;
+                    header.count =
+                        count.parse().map_err(|_| format!("`{count}` is not a vertex count"))?;
                 }
                 ["element", name, _] if !in_vertices => {
-                    return Err(format!("element `{name}` comes before the vertices; only vertices are expected"));
+                    return Err(format!(
+                        "element `{name}` comes before the vertices; only vertices are expected"
+                    ));
                 }
                 ["element", ..] => header.more_elements = true,
-                ["property", kind, name] if in_vertices && !header.more_elements => header.push(kind, name)?,
+                ["property", kind, name] if in_vertices && !header.more_elements => {
+                    header.push(kind, name)?
+                }
                 ["property", "list", ..] if !header.more_elements => {
                     return Err("a list property in the vertices is not supported".to_owned());
                 }
@@ -221,7 +249,9 @@ impl Header {
     fn sh_degree(&self) -> Result<u32, String> {
         let found = self.properties.keys().filter(|name| name.starts_with("f_rest_")).count();
         let degree = (0..=MAX_SH_DEGREE).find(|&degree| 3 * rest_coefficients(degree) == found);
-        degree.ok_or_else(|| format!("has {found} f_rest_* properties; 0, 9, 24 or 45 make an SH degree of 0 to 3"))
+        degree.ok_or_else(|| {
+            format!("has {found} f_rest_* properties; 0, 9, 24 or 45 make an SH degree of 0 to 3")
+        })
     }
 
     /// The byte offset of a float property in the vertex.
@@ -229,8 +259,9 @@ impl Header {
         match self.properties.get(name) {
             Some((offset, kind)) if kind == "float" || kind == "float32" => Ok(*offset),
             Some((_, kind)) => Err(format!("property `{name}` is of type {kind}, not float")),
-            None => Err(format!("has no property `{name}`; is it a point cloud without Gaussians?")),
+            None => {
+                Err(format!("has no property `{name}`; is it a point cloud without Gaussians?"))
+            }
         }
     }
 }
-

@@ -14,8 +14,8 @@ enum Shape {
     Plane { normal: DVec3, offset: f64 },
     /// A sphere.
     Sphere { center: DVec3, radius: f64 },
-    /// A box turned about the vertical axis by an angle in radians.
-    Block { center: DVec3, half: DVec3, yaw: f64 },
+    /// A box; `turn` takes directions from the world to the box's own axes.
+    Block { center: DVec3, half: DVec3, turn: DMat3 },
 }
 
 /// A shape with its look.
@@ -47,18 +47,28 @@ pub(super) const FOCUS: DVec3 = DVec3::new(0.0, 0.3, 0.5);
 /// The centre of the lamp, a square that faces the focus.
 const LAMP: DVec3 = DVec3::new(-1.5, -2.3, 3.4);
 const LAMP_HALF_WIDTH: f64 = 0.55;
-const LAMP_RADIANCE: DVec3 = DVec3::new(1.52, 1.42, 1.26);
+const LAMP_RADIANCE: DVec3 = DVec3::new(0.84, 0.77, 0.66);
 const LAMP_SAMPLES_PER_SIDE: usize = 4;
-const SKY_RADIANCE: DVec3 = DVec3::new(0.36, 0.40, 0.47);
-const GROUND_RADIANCE: DVec3 = DVec3::new(0.20, 0.16, 0.12);
+const SKY_RADIANCE: DVec3 = DVec3::new(0.12, 0.135, 0.165);
+const GROUND_RADIANCE: DVec3 = DVec3::new(0.07, 0.055, 0.04);
 
 impl Room {
     /// The room whose textures are drawn from `seed`.
     pub(super) fn new(seed: u64) -> Self {
-        let plane = |normal, offset, albedo| Surface { shape: Shape::Plane { normal, offset }, albedo, gloss: 0.0 };
-        let sphere = |center, radius, albedo| Surface { shape: Shape::Sphere { center, radius }, albedo, gloss: 0.25 };
-        let block =
-            |center, half, yaw, albedo| Surface { shape: Shape::Block { center, half, yaw }, albedo, gloss: 0.0 };
+        let plane = |normal, offset, albedo| Surface {
+            shape: Shape::Plane { normal, offset },
+            albedo,
+            gloss: 0.0,
+        };
+        let sphere = |center, radius, albedo| Surface {
+            shape: Shape::Sphere { center, radius },
+            albedo,
+            gloss: 0.25,
+        };
+        let block = |center, half, yaw: f64, albedo| {
+            let turn = DMat3::from_rotation_z(-yaw);
+            Surface { shape: Shape::Block { center, half, turn }, albedo, gloss: 0.0 }
+        };
         let surfaces = vec![
             plane(DVec3::Z, 0.0, Self::planks),
             plane(DVec3::NEG_Y, -2.0, Self::back_wall),
@@ -90,7 +100,10 @@ impl Room {
     }
 
     fn nearest(&self, origin: DVec3, direction: DVec3) -> Option<(&Surface, Hit)> {
-        let hits = self.surfaces.iter().filter_map(|surface| Some((surface, surface.shape.hit(origin, direction)?)));
+        let hits = self
+            .surfaces
+            .iter()
+            .filter_map(|surface| Some((surface, surface.shape.hit(origin, direction)?)));
         hits.min_by(|(_, a), (_, b)| a.distance.total_cmp(&b.distance))
     }
 
@@ -123,8 +136,11 @@ impl Room {
     }
 
     fn is_clear(&self, origin: DVec3, direction: DVec3, distance: f64) -> bool {
-        let solids = self.surfaces.iter().filter(|surface| !matches!(surface.shape, Shape::Plane { .. }));
-        solids.filter_map(|surface| surface.shape.hit(origin, direction)).all(|hit| hit.distance > distance)
+        let solids =
+            self.surfaces.iter().filter(|surface| !matches!(surface.shape, Shape::Plane { .. }));
+        solids
+            .filter_map(|surface| surface.shape.hit(origin, direction))
+            .all(|hit| hit.distance > distance)
     }
 
     /// The share of the sky that the shapes leave open above a position.
@@ -139,7 +155,9 @@ impl Room {
                 let away = 0.5 - 0.5 * normal.dot(facing);
                 1.0 - away * (-distance / REACH).exp() * 0.6
             }
-            Shape::Sphere { center, radius } => 1.0 - hidden_by_sphere(position, normal, center, radius),
+            Shape::Sphere { center, radius } => {
+                1.0 - hidden_by_sphere(position, normal, center, radius)
+            }
             Shape::Block { center, half, .. } => {
                 1.0 - 0.8 * hidden_by_sphere(position, normal, center, half.element_sum() / 3.0)
             }
@@ -164,7 +182,8 @@ impl Room {
 
     /// Three octaves of noise, in [0, 1].
     fn fractal_noise(&self, place: DVec3) -> f64 {
-        let octave = |k: i32| 0.5f64.powi(k) * self.noise(place * f64::from(1 << k) + 17.0 * f64::from(k));
+        let octave =
+            |k: i32| 0.5f64.powi(k) * self.noise(place * f64::from(1 << k) + 17.0 * f64::from(k));
         (octave(0) + octave(1) + octave(2)) / 1.75
     }
 
@@ -172,7 +191,8 @@ impl Room {
         const WIDTH: f64 = 0.42;
         let plank = (place.x / WIDTH).floor();
         let shade = self.noise(DVec3::new(plank * 7.3, 0.5, 0.5));
-        let grain = self.fractal_noise(DVec3::new(place.x * 16.0, place.y * 1.8 + plank * 5.0, 3.0));
+        let grain =
+            self.fractal_noise(DVec3::new(place.x * 16.0, place.y * 1.8 + plank * 5.0, 3.0));
         let across = (place.x / WIDTH - plank - 0.5).abs();
         let gap = 1.0 - 0.55 * smoothstep(0.46, 0.49, across);
         let light = DVec3::new(0.66, 0.44, 0.26);
@@ -181,7 +201,7 @@ impl Room {
     }
 
     fn back_wall(&self, place: DVec3) -> DVec3 {
-        const PICTURE_CENTER: DVec2 = DVec2::new(-0.55, 1.72);
+        const PICTURE_CENTER: DVec2 = DVec2::new(-0.55, 1.56);
         const PICTURE_HALF: DVec2 = DVec2::new(0.62, 0.42);
         const FRAME: f64 = 0.07;
         let in_picture = DVec2::new(place.x, place.z) - PICTURE_CENTER;
@@ -202,14 +222,17 @@ impl Room {
 
     /// The picture on the wall, at coordinates in [-1, 1], y up.
     fn sunset(&self, place: DVec2) -> DVec3 {
-        let ridge = -0.25 + 0.7 * (self.fractal_noise(DVec3::new(place.x * 2.2 + 9.0, 0.0, 7.0)) - 0.5);
+        let ridge =
+            -0.25 + 0.7 * (self.fractal_noise(DVec3::new(place.x * 2.2 + 9.0, 0.0, 7.0)) - 0.5);
         if place.y < ridge {
-            return DVec3::new(0.06, 0.10, 0.16).lerp(DVec3::new(0.16, 0.24, 0.22), (ridge - place.y).min(1.0));
+            return DVec3::new(0.06, 0.10, 0.16)
+                .lerp(DVec3::new(0.16, 0.24, 0.22), (ridge - place.y).min(1.0));
         }
         if (place - DVec2::new(0.3, 0.22)).length() < 0.26 {
             return DVec3::new(0.95, 0.80, 0.45);
         }
-        DVec3::new(0.90, 0.42, 0.20).lerp(DVec3::new(0.22, 0.26, 0.50), smoothstep(-0.4, 1.0, place.y))
+        DVec3::new(0.90, 0.42, 0.20)
+            .lerp(DVec3::new(0.22, 0.26, 0.50), smoothstep(-0.4, 1.0, place.y))
     }
 
     fn plaster(&self, place: DVec3) -> DVec3 {
@@ -217,8 +240,11 @@ impl Room {
     }
 
     fn beach_ball(&self, place: DVec3) -> DVec3 {
-        const WEDGES: [DVec3; 3] =
-            [DVec3::new(0.05, 0.36, 0.42), DVec3::new(0.82, 0.78, 0.66), DVec3::new(0.78, 0.30, 0.10)];
+        const WEDGES: [DVec3; 3] = [
+            DVec3::new(0.05, 0.36, 0.42),
+            DVec3::new(0.82, 0.78, 0.66),
+            DVec3::new(0.78, 0.30, 0.10),
+        ];
         let place = DMat3::from_rotation_x(0.6) * place;
         if place.z > 0.93 {
             return WEDGES[1];
@@ -242,8 +268,11 @@ impl Room {
         const CELL: f64 = 0.21;
         // A little off the faces, so that rounding there does not choose the cell.
         let cells = ((place + 1e-4) / CELL).floor().element_sum() as i64;
-        let tone =
-            if cells & 1 == 0 { DVec3::new(0.78, 0.56, 0.14) } else { DVec3::new(0.10, 0.14, 0.30) };
+        let tone = if cells & 1 == 0 {
+            DVec3::new(0.78, 0.56, 0.14)
+        } else {
+            DVec3::new(0.10, 0.14, 0.30)
+        };
         tone * (0.85 + 0.3 * self.fractal_noise(place * 9.0))
     }
 
@@ -279,8 +308,7 @@ impl Shape {
                 // A negative root makes the distance NaN, which is not greater than zero either.
                 (distance > 0.0).then_some(Hit { distance, normal, place: normal })
             }
-            Self::Block { center, half, yaw } => {
-                let turn = DMat3::from_rotation_z(-yaw);
+            Self::Block { center, half, turn } => {
                 let (origin, direction) = (turn * (origin - center), turn * direction);
                 let (a, b) = ((-half - origin) / direction, (half - origin) / direction);
                 let (enter, exit) = (a.min(b), a.max(b));
@@ -288,7 +316,11 @@ impl Shape {
                 let axis = [DVec3::X, DVec3::Y, DVec3::Z][enter.max_position()];
                 let normal = turn.transpose() * (-axis * direction.dot(axis).signum());
                 let place = origin + distance * direction;
-                (distance > 0.0 && distance < exit.min_element()).then_some(Hit { distance, normal, place })
+                (distance > 0.0 && distance < exit.min_element()).then_some(Hit {
+                    distance,
+                    normal,
+                    place,
+                })
             }
         }
     }
