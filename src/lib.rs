@@ -11,6 +11,8 @@
 //! ```
 
 pub mod camera;
+#[cfg(feature = "cli")]
+pub mod cli;
 pub mod dataset;
 pub mod error;
 #[expect(unsafe_code, reason = "the only module that speaks Vulkan")]
@@ -18,5 +20,9 @@ pub mod gpu;
 pub mod kernels;
 pub mod reference;
 pub mod image;
+pub mod metrics;
+pub mod random;
+pub mod report;
+pub mod scene;
 
 pub use error::{Error, Result};
