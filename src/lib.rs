@@ -11,5 +11,7 @@
 //! ```
 
 pub mod error;
+pub mod reference;
+pub mod tone;
 
 pub use error::{Error, Result};
