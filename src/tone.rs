@@ -139,7 +139,9 @@ impl ToneSettings {
         ];
         for (name, value, holds, rule) in rules {
             if !(holds && (value as f32).is_finite()) {
-                return Err(Error::Usage(format!("{name} is {value}; it must be finite and {rule}")));
+                return Err(Error::Usage(format!(
+                    "{name} is {value}; it must be finite and {rule}"
+                )));
             }
         }
         Ok(())
