@@ -11,6 +11,10 @@
 //! ```
 
 pub mod error;
+#[expect(unsafe_code, reason = "the only module that speaks Vulkan")]
+pub mod gpu;
+pub mod kernels;
+pub mod pseudo_gt;
 pub mod reference;
 pub mod tone;
 
