@@ -18,11 +18,13 @@ pub mod error;
 #[expect(unsafe_code, reason = "the only module that speaks Vulkan")]
 pub mod gpu;
 pub mod kernels;
+pub mod pseudo_gt;
 pub mod reference;
 pub mod image;
 pub mod metrics;
 pub mod random;
 pub mod report;
 pub mod scene;
+pub mod tone;
 
 pub use error::{Error, Result};
