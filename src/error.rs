@@ -42,7 +42,9 @@ pub enum Error {
         feature: String,
     },
     /// A buffer did not fit into device memory.
-    #[error("out of device memory: buffer `{buffer}` needs {bytes} bytes; lower --max-gaussians or raise --downscale")]
+    #[error(
+        "out of device memory: buffer `{buffer}` needs {bytes} bytes; lower --max-gaussians or raise --downscale"
+    )]
     OutOfMemory {
         /// The buffer's name.
         buffer: String,
@@ -82,7 +84,9 @@ pub enum Error {
         result: ash::vk::Result,
     },
     /// A loss term is NaN or infinite.
-    #[error("step {step}, view {view}: {what} is not finite; lower the learning rates or inspect the view's image")]
+    #[error(
+        "step {step}, view {view}: {what} is not finite; lower the learning rates or inspect the view's image"
+    )]
     NotFinite {
         /// The training step, from 1.
         step: u64,

@@ -11,5 +11,9 @@
 //! ```
 
 pub mod error;
+#[expect(unsafe_code, reason = "the only module that speaks Vulkan")]
+pub mod gpu;
+pub mod kernels;
+pub mod reference;
 
 pub use error::{Error, Result};
