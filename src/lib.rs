@@ -15,5 +15,6 @@ pub mod error;
 pub mod gpu;
 pub mod kernels;
 pub mod reference;
+pub mod sort;
 
 pub use error::{Error, Result};

@@ -9,4 +9,11 @@
     reason = "keeps each line comparable to the shader; a NaN must fail the test"
 )]
 
+mod dispatch_arguments;
+mod scan_downsweep;
+mod scan_spine;
+mod scan_upsweep;
+mod sort_downsweep;
+mod sort_spine;
+mod sort_upsweep;
 mod tile_ranges;
