@@ -8,7 +8,8 @@ use std::io::Cursor;
 use std::path::Path;
 
 use ::image::{
-    DynamicImage, ExtendedColorType, ImageEncoder, ImageFormat, ImageReader, codecs::png::PngEncoder,
+    DynamicImage, ExtendedColorType, ImageEncoder, ImageFormat, ImageReader,
+    codecs::png::PngEncoder,
 };
 use rayon::prelude::*;
 
