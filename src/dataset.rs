@@ -8,6 +8,7 @@ mod colmap;
 mod files;
 mod pixels;
 mod similarity;
+pub mod synthetic;
 mod transforms;
 mod undistort;
 

@@ -1,0 +1,209 @@
+//! A thin, typed layer over Vulkan compute: a device, its buffers, and a recorder of passes.
+//!
+//! The only module that speaks Vulkan, and the only one with `unsafe`. It rests on four rules:
+//!
+//! - one queue, one timeline semaphore, one `u64` per submission; nothing waits for the whole device;
+//! - a dropped buffer or pipeline is freed once the timeline has passed every submission that may use it;
+//! - barriers follow from what a kernel declares it reads and writes, never from the caller;
+//! - a borrowed device ([`Gpu::from_host`]) keeps everything that it had: we destroy what we created and nothing else.
+
+mod buffer;
+mod device;
+mod kernel;
+mod pipeline;
+mod recorder;
+mod requirements;
+mod submission;
+#[doc(hidden)]
+pub mod testing;
+mod validation;
+
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use ash::{ext, khr, vk};
+
+pub use buffer::{Buffer, Download};
+pub use device::{DeviceChoice, DeviceReport, HostDevice, devices};
+pub use kernel::{Binding, Kernel, Reference};
+pub use pipeline::Pipeline;
+pub use recorder::{Recorder, Threads};
+pub use requirements::{REQUIREMENTS, Requirement, required_device_features};
+pub use submission::{PassTime, Submission};
+
+use crate::{Error, Result};
+
+/// A Vulkan device with one compute queue. Cloning shares the device.
+#[derive(Clone, Debug)]
+pub struct Gpu {
+    shared: Arc<Shared>,
+}
+
+/// What a device is and what it can hold.
+#[derive(Clone, Debug)]
+pub struct Properties {
+    /// The device's name, as the driver gives it.
+    pub name: String,
+    /// The driver's name and version, as the driver gives them.
+    pub driver: String,
+    /// Lanes of a subgroup in our kernels.
+    pub subgroup_size: u32,
+    /// Kernels can ask for that subgroup size.
+    pub subgroup_size_is_selectable: bool,
+    /// Bytes that one storage buffer binding can span.
+    pub max_storage_buffer_range: u64,
+    /// Workgroups of a dispatch along one dimension.
+    pub max_workgroups: u32,
+    /// Nanoseconds of one timestamp tick.
+    pub timestamp_period: f32,
+    /// The device is a processor (lavapipe and the like).
+    pub is_cpu: bool,
+}
+
+/// Everything that buffers, pipelines and submissions need to outlive their [`Gpu`].
+struct Shared {
+    properties: Properties,
+    device: ash::Device,
+    push_descriptor: khr::push_descriptor::Device,
+    /// Labels; absent where the instance does not offer them.
+    debug: Option<ext::debug_utils::Device>,
+    allocator: Mutex<Option<gpu_allocator::vulkan::Allocator>>,
+    queue: Mutex<Queue>,
+    timeline: vk::Semaphore,
+    /// The timeline value after which a resource that is dropped now is unused.
+    last_use: AtomicU64,
+    retired: Mutex<Vec<(u64, Retired)>>,
+    pipeline_cache: vk::PipelineCache,
+    /// What we created around the device and destroy with it; nothing for a borrowed device.
+    owned: Option<device::Owned>,
+}
+
+/// The queue is held while a submission is recorded, so that timeline values are known in advance.
+struct Queue {
+    raw: vk::Queue,
+    family: u32,
+    submitted: u64,
+}
+
+/// A Vulkan object whose owner is gone.
+enum Retired {
+    Buffer(vk::Buffer, gpu_allocator::vulkan::Allocation),
+    Pipeline(vk::Pipeline, vk::PipelineLayout, vk::DescriptorSetLayout),
+    Commands(vk::CommandPool),
+    Queries(vk::QueryPool),
+}
+
+impl std::fmt::Debug for Shared {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Shared").field("properties", &self.properties).finish_non_exhaustive()
+    }
+}
+
+/// A lock is only poisoned by a panic elsewhere; our state stays consistent at every point where one could occur.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl Gpu {
+    /// What the device is.
+    pub fn properties(&self) -> &Properties {
+        &self.shared.properties
+    }
+
+    /// Validation messages seen so far (own devices with validation only).
+    pub fn validation_messages(&self) -> Vec<String> {
+        self.shared.owned.as_ref().map(device::Owned::messages).unwrap_or_default()
+    }
+
+    /// Waits until everything submitted so far is done.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub fn wait_idle(&self) -> Result<()> {
+        let submitted = lock(&self.shared.queue).submitted;
+        self.shared.wait(submitted)
+    }
+}
+
+impl Shared {
+    /// An error for a Vulkan call that failed.
+    fn error(&self, call: &'static str, result: vk::Result) -> Error {
+        let device = self.properties.name.clone();
+        match result {
+            vk::Result::ERROR_DEVICE_LOST => Error::DeviceLost { device, pass: call.to_owned() },
+            _ => Error::Vulkan { call, device, result },
+        }
+    }
+
+    /// Blocks until the timeline reaches `value`, then frees what nobody uses any more.
+    fn wait(&self, value: u64) -> Result<()> {
+        let (semaphores, values) = ([self.timeline], [value]);
+        let wait = vk::SemaphoreWaitInfo::default().semaphores(&semaphores).values(&values);
+        // SAFETY: the semaphore lives as long as `self`.
+        unsafe { self.device.wait_semaphores(&wait, u64::MAX) }
+            .map_err(|result| self.error("vkWaitSemaphores", result))?;
+        self.collect(value);
+        Ok(())
+    }
+
+    fn retire(&self, retired: Retired) {
+        lock(&self.retired).push((self.last_use.load(Ordering::Acquire), retired));
+    }
+
+    /// Frees every retired object whose last submission is `reached` or earlier.
+    fn collect(&self, reached: u64) {
+        let done: Vec<_> =
+            lock(&self.retired).extract_if(.., |(last_use, _)| *last_use <= reached).collect();
+        for (_, retired) in done {
+            // SAFETY: the timeline has passed the object's last use, and its owner is gone.
+            unsafe { self.destroy(retired) };
+        }
+    }
+
+    /// # Safety
+    /// No submission uses the object any more, and it is destroyed once.
+    unsafe fn destroy(&self, retired: Retired) {
+        // SAFETY: as the caller promises.
+        unsafe {
+            match retired {
+                Retired::Buffer(raw, allocation) => {
+                    self.device.destroy_buffer(raw, None);
+                    if let Some(allocator) = lock(&self.allocator).as_mut() {
+                        // Freeing can only fail for an allocation of another allocator.
+                        allocator.free(allocation).unwrap_or_default();
+                    }
+                }
+                Retired::Pipeline(raw, layout, set_layout) => {
+                    self.device.destroy_pipeline(raw, None);
+                    self.device.destroy_pipeline_layout(layout, None);
+                    self.device.destroy_descriptor_set_layout(set_layout, None);
+                }
+                Retired::Commands(pool) => self.device.destroy_command_pool(pool, None),
+                Retired::Queries(pool) => self.device.destroy_query_pool(pool, None),
+            }
+        }
+    }
+}
+
+impl Drop for Shared {
+    fn drop(&mut self) {
+        let submitted = lock(&self.queue).submitted;
+        // A lost device still has to be torn down.
+        let _ = self.wait(submitted);
+        self.collect(u64::MAX);
+        // The allocator returns its memory blocks to the device before the device goes.
+        drop(lock(&self.allocator).take());
+        if let Some(owned) = &self.owned {
+            owned.save_pipeline_cache(&self.device, self.pipeline_cache);
+        }
+        // SAFETY: every object below was created here and nothing uses it any more.
+        unsafe {
+            self.device.destroy_pipeline_cache(self.pipeline_cache, None);
+            self.device.destroy_semaphore(self.timeline, None);
+            if let Some(owned) = &self.owned {
+                self.device.destroy_device(None);
+                owned.destroy();
+            }
+        }
+    }
+}

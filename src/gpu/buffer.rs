@@ -1,0 +1,225 @@
+//! Typed device buffers and the ways in and out of them.
+
+use std::marker::PhantomData;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+
+use ash::vk;
+use gpu_allocator::MemoryLocation;
+use gpu_allocator::vulkan::{Allocation, AllocationCreateDesc, AllocationScheme};
+
+use super::{Gpu, Recorder, Retired, Shared, lock};
+use crate::{Error, Result};
+
+/// An array of `T` in device memory. Dropping it frees the memory once no submission uses it.
+#[derive(Debug)]
+pub struct Buffer<T> {
+    memory: Memory,
+    len: usize,
+    element: PhantomData<T>,
+}
+
+/// A Vulkan buffer and the memory behind it.
+#[derive(Debug)]
+struct Memory {
+    shared: Arc<Shared>,
+    raw: vk::Buffer,
+    /// Taken when the buffer retires.
+    allocation: Option<Allocation>,
+    name: String,
+}
+
+/// A copy of a buffer that a submission brings to the host.
+#[derive(Debug)]
+pub struct Download<T> {
+    host: Memory,
+    len: usize,
+    value: u64,
+    element: PhantomData<T>,
+}
+
+impl<T: bytemuck::Pod> Buffer<T> {
+    /// The number of elements.
+    pub fn len(&self) -> usize {
+        self.len
+    }
+
+    /// True for a buffer of no elements.
+    pub fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+
+    /// The name it was created with.
+    pub fn name(&self) -> &str {
+        &self.memory.name
+    }
+
+    /// The Vulkan buffer, for a host application that binds it itself.
+    pub fn handle(&self) -> vk::Buffer {
+        self.memory.raw
+    }
+
+    /// The size of the elements, in bytes.
+    pub(super) fn size(&self) -> u64 {
+        (self.len * size_of::<T>()) as u64
+    }
+}
+
+impl Gpu {
+    /// A buffer of `len` elements whose contents are undefined.
+    ///
+    /// # Errors
+    /// The buffer exceeds the binding limit or the memory of the device.
+    pub fn uninit<T: bytemuck::Pod>(&self, name: &str, len: usize) -> Result<Buffer<T>> {
+        let bytes = (len * size_of::<T>()) as u64;
+        let memory = Memory::new(&self.shared, name, bytes, MemoryLocation::GpuOnly)?;
+        Ok(Buffer { memory, len, element: PhantomData })
+    }
+
+    /// A buffer of `len` elements of zero bits.
+    ///
+    /// # Errors
+    /// As [`Gpu::uninit`], or the device was lost.
+    pub fn zeros<T: bytemuck::Pod>(&self, name: &str, len: usize) -> Result<Buffer<T>> {
+        let mut buffer = self.uninit(name, len)?;
+        self.run(name, |pass| {
+            pass.fill(&mut buffer, 0);
+            Ok(())
+        })?;
+        Ok(buffer)
+    }
+
+    /// A buffer that holds a copy of `data`.
+    ///
+    /// # Errors
+    /// As [`Gpu::zeros`].
+    pub fn buffer<T: bytemuck::Pod>(&self, name: &str, data: &[T]) -> Result<Buffer<T>> {
+        let mut buffer = self.uninit(name, data.len())?;
+        self.write(&mut buffer, data)?;
+        Ok(buffer)
+    }
+
+    /// Overwrites the first elements of `buffer` with `data` and waits until that is done.
+    ///
+    /// # Errors
+    /// `data` is longer than the buffer, or the device is out of memory or lost.
+    pub fn write<T: bytemuck::Pod>(&self, buffer: &mut Buffer<T>, data: &[T]) -> Result<()> {
+        if data.len() > buffer.len {
+            let (name, len) = (buffer.name(), buffer.len);
+            let n = data.len();
+            return Err(Error::Usage(format!("buffer `{name}` holds {len} elements, not {n}")));
+        }
+        if data.is_empty() {
+            return Ok(());
+        }
+        let bytes: &[u8] = bytemuck::cast_slice(data);
+        let mut staging =
+            Memory::new(&self.shared, "staging", bytes.len() as u64, MemoryLocation::CpuToGpu)?;
+        if let Some(mapped) = staging.allocation.as_mut().and_then(Allocation::mapped_slice_mut) {
+            mapped[..bytes.len()].copy_from_slice(bytes);
+        }
+        self.run("write", |pass| {
+            pass.copy_raw(staging.raw, buffer.handle(), bytes.len() as u64);
+            Ok(())
+        })?;
+        Ok(())
+    }
+
+    /// A copy of `buffer` on the host, after everything submitted before.
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub fn read<T: bytemuck::Pod>(&self, buffer: &Buffer<T>) -> Result<Vec<T>> {
+        let mut download = None;
+        self.run("read", |pass| {
+            download = Some(pass.download(buffer)?);
+            Ok(())
+        })?;
+        download.map_or_else(|| Ok(vec![]), Download::wait)
+    }
+}
+
+impl Recorder<'_> {
+    /// Copies `buffer` as it is at this point of the recording to the host.
+    ///
+    /// # Errors
+    /// The device is out of memory.
+    pub fn download<T: bytemuck::Pod>(&mut self, buffer: &Buffer<T>) -> Result<Download<T>> {
+        let bytes = buffer.size();
+        let host = Memory::new(self.shared(), buffer.name(), bytes, MemoryLocation::GpuToCpu)?;
+        if bytes > 0 {
+            self.copy_raw(buffer.handle(), host.raw, bytes);
+        }
+        Ok(Download { host, len: buffer.len, value: self.value(), element: PhantomData })
+    }
+}
+
+impl<T: bytemuck::Pod> Download<T> {
+    /// Waits for the submission that the copy is part of.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub fn wait(self) -> Result<Vec<T>> {
+        self.host.shared.wait(self.value)?;
+        let bytes = self.len * size_of::<T>();
+        let mut data = vec![T::zeroed(); self.len];
+        if let Some(mapped) = self.host.allocation.as_ref().and_then(Allocation::mapped_slice) {
+            bytemuck::cast_slice_mut(&mut data).copy_from_slice(&mapped[..bytes]);
+        }
+        Ok(data)
+    }
+}
+
+impl Memory {
+    fn new(shared: &Arc<Shared>, name: &str, bytes: u64, location: MemoryLocation) -> Result<Self> {
+        let limit = shared.properties.max_storage_buffer_range;
+        if bytes > limit && location == MemoryLocation::GpuOnly {
+            let device = shared.properties.name.clone();
+            return Err(Error::BufferTooLarge { buffer: name.to_owned(), bytes, device, limit });
+        }
+        let usage = vk::BufferUsageFlags::STORAGE_BUFFER
+            | vk::BufferUsageFlags::INDIRECT_BUFFER
+            | vk::BufferUsageFlags::TRANSFER_SRC
+            | vk::BufferUsageFlags::TRANSFER_DST;
+        // Vulkan has no empty buffers; an empty array still binds.
+        let info = vk::BufferCreateInfo::default().size(bytes.max(16)).usage(usage);
+        let out_of_memory = || Error::OutOfMemory { buffer: name.to_owned(), bytes };
+        // SAFETY: the device is live; the buffer is bound once to memory that satisfies its requirements.
+        unsafe {
+            let raw = shared.device.create_buffer(&info, None).map_err(|_| out_of_memory())?;
+            let requirements = shared.device.get_buffer_memory_requirements(raw);
+            let allocation = lock(&shared.allocator).as_mut().and_then(|allocator| {
+                let desc = AllocationCreateDesc {
+                    name,
+                    requirements,
+                    location,
+                    linear: true,
+                    allocation_scheme: AllocationScheme::GpuAllocatorManaged,
+                };
+                allocator.allocate(&desc).ok()
+            });
+            let Some(allocation) = allocation else {
+                shared.device.destroy_buffer(raw, None);
+                return Err(out_of_memory());
+            };
+            let bound =
+                shared.device.bind_buffer_memory(raw, allocation.memory(), allocation.offset());
+            let shared = Arc::clone(shared);
+            let memory = Self { shared, raw, allocation: Some(allocation), name: name.to_owned() };
+            bound.map_err(|_| out_of_memory())?;
+            Ok(memory)
+        }
+    }
+}
+
+impl Drop for Memory {
+    fn drop(&mut self) {
+        if let Some(allocation) = self.allocation.take() {
+            self.shared.retire(Retired::Buffer(self.raw, allocation));
+            // Without work in flight nothing else would come by to free it.
+            if self.shared.last_use.load(Ordering::Acquire) == 0 {
+                self.shared.collect(0);
+            }
+        }
+    }
+}

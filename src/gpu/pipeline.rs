@@ -1,0 +1,163 @@
+//! A kernel specialised for its constants and the device.
+
+use std::io::Cursor;
+use std::marker::PhantomData;
+use std::sync::Arc;
+
+use ash::vk;
+
+use super::{Gpu, Kernel, Retired, Shared};
+use crate::Result;
+
+/// A kernel ready to be dispatched.
+#[derive(Debug)]
+pub struct Pipeline<K> {
+    pub(super) raw: vk::Pipeline,
+    pub(super) layout: vk::PipelineLayout,
+    set_layout: vk::DescriptorSetLayout,
+    shared: Arc<Shared>,
+    kernel: PhantomData<K>,
+}
+
+impl Gpu {
+    /// Specialises kernel `K` with `constants`.
+    ///
+    /// # Errors
+    /// The driver refuses the kernel.
+    pub fn pipeline<K: Kernel>(&self, constants: &K::Constants) -> Result<Pipeline<K>> {
+        let mut values = K::constants(constants);
+        if let Some(id) = K::SUBGROUP_SIZE_ID {
+            values.push((id, self.properties().subgroup_size));
+        }
+        let shared = &self.shared;
+        let fail = |call| move |result| shared.error(call, result);
+        // SAFETY: every create info points at live locals, and what fails half-way is destroyed here.
+        unsafe {
+            let set_layout =
+                set_layout::<K>(&shared.device).map_err(fail("vkCreateDescriptorSetLayout"))?;
+            let layout = match pipeline_layout::<K>(&shared.device, set_layout) {
+                Ok(layout) => layout,
+                Err(result) => {
+                    shared.device.destroy_descriptor_set_layout(set_layout, None);
+                    return Err(shared.error("vkCreatePipelineLayout", result));
+                }
+            };
+            match raw_pipeline::<K>(shared, layout, &values) {
+                Ok(raw) => {
+                    shared.name(raw, K::NAME);
+                    let shared = Arc::clone(shared);
+                    Ok(Pipeline { raw, layout, set_layout, shared, kernel: PhantomData })
+                }
+                Err(result) => {
+                    shared.device.destroy_pipeline_layout(layout, None);
+                    shared.device.destroy_descriptor_set_layout(set_layout, None);
+                    tracing::error!("kernel {} was refused", K::NAME);
+                    Err(shared.error("vkCreateComputePipelines", result))
+                }
+            }
+        }
+    }
+}
+
+/// # Safety
+/// The device is live.
+unsafe fn set_layout<K: Kernel>(
+    device: &ash::Device,
+) -> Result<vk::DescriptorSetLayout, vk::Result> {
+    let bindings: Vec<_> = K::BINDINGS
+        .iter()
+        .map(|binding| {
+            vk::DescriptorSetLayoutBinding::default()
+                .binding(binding.index)
+                .descriptor_type(vk::DescriptorType::STORAGE_BUFFER)
+                .descriptor_count(1)
+                .stage_flags(vk::ShaderStageFlags::COMPUTE)
+        })
+        .collect();
+    let info = vk::DescriptorSetLayoutCreateInfo::default()
+        .flags(vk::DescriptorSetLayoutCreateFlags::PUSH_DESCRIPTOR_KHR)
+        .bindings(&bindings);
+    // SAFETY: `info` points at live locals.
+    unsafe { device.create_descriptor_set_layout(&info, None) }
+}
+
+/// # Safety
+/// The device and the set layout are live.
+unsafe fn pipeline_layout<K: Kernel>(
+    device: &ash::Device,
+    set_layout: vk::DescriptorSetLayout,
+) -> Result<vk::PipelineLayout, vk::Result> {
+    let set_layouts = [set_layout];
+    let ranges = [vk::PushConstantRange::default()
+        .stage_flags(vk::ShaderStageFlags::COMPUTE)
+        .size(size_of::<K::Params>() as u32)];
+    let ranges = if size_of::<K::Params>() == 0 { &[][..] } else { &ranges[..] };
+    let info = vk::PipelineLayoutCreateInfo::default()
+        .set_layouts(&set_layouts)
+        .push_constant_ranges(ranges);
+    // SAFETY: `info` points at live locals.
+    unsafe { device.create_pipeline_layout(&info, None) }
+}
+
+/// # Safety
+/// The device and the layout are live.
+unsafe fn raw_pipeline<K: Kernel>(
+    shared: &Shared,
+    layout: vk::PipelineLayout,
+    constants: &[(u32, u32)],
+) -> Result<vk::Pipeline, vk::Result> {
+    let code = ash::util::read_spv(&mut Cursor::new(K::SPIRV))
+        .map_err(|_| vk::Result::ERROR_INITIALIZATION_FAILED)?;
+    let entries: Vec<_> = (0u32..)
+        .zip(constants)
+        .map(|(i, &(constant_id, _))| vk::SpecializationMapEntry {
+            constant_id,
+            offset: 4 * i,
+            size: 4,
+        })
+        .collect();
+    let data: Vec<u32> = constants.iter().map(|&(_, bits)| bits).collect();
+    let specialization =
+        vk::SpecializationInfo::default().map_entries(&entries).data(bytemuck::cast_slice(&data));
+    let mut required = vk::PipelineShaderStageRequiredSubgroupSizeCreateInfo::default()
+        .required_subgroup_size(shared.properties.subgroup_size);
+    let mut stage = vk::PipelineShaderStageCreateInfo::default()
+        .stage(vk::ShaderStageFlags::COMPUTE)
+        .name(c"main")
+        .specialization_info(&specialization);
+    if K::SUBGROUP_SIZE_ID.is_some() {
+        stage = stage.flags(vk::PipelineShaderStageCreateFlags::REQUIRE_FULL_SUBGROUPS);
+        // Where a device cannot be told the size, its only size is the one it reports.
+        if shared.properties.subgroup_size_is_selectable {
+            stage = stage.push_next(&mut required);
+        }
+    }
+    let info = vk::ShaderModuleCreateInfo::default().code(&code);
+    // SAFETY: the create infos point at live locals; the module is not needed after the call.
+    unsafe {
+        let module = shared.device.create_shader_module(&info, None)?;
+        let info =
+            vk::ComputePipelineCreateInfo::default().stage(stage.module(module)).layout(layout);
+        let pipelines =
+            shared.device.create_compute_pipelines(shared.pipeline_cache, &[info], None);
+        shared.device.destroy_shader_module(module, None);
+        pipelines.map(|pipelines| pipelines[0]).map_err(|(_, result)| result)
+    }
+}
+
+impl Shared {
+    /// Names an object for captures and validation messages.
+    fn name<H: vk::Handle>(&self, object: H, name: &str) {
+        let (Some(debug), Ok(name)) = (&self.debug, std::ffi::CString::new(name)) else { return };
+        let info =
+            vk::DebugUtilsObjectNameInfoEXT::default().object_handle(object).object_name(&name);
+        // SAFETY: the object belongs to this device; a name that is refused is not missed.
+        let _ = unsafe { debug.set_debug_utils_object_name(&info) };
+    }
+}
+
+impl<K> Drop for Pipeline<K> {
+    fn drop(&mut self) {
+        self.shared.retire(Retired::Pipeline(self.raw, self.layout, self.set_layout));
+    }
+}

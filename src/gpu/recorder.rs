@@ -1,0 +1,273 @@
+//! Records passes: bindings, parameters, dispatch, and the barriers that their hazards demand.
+
+use std::collections::HashMap;
+use std::ffi::CString;
+use std::sync::Arc;
+
+use ash::vk;
+
+use super::{Buffer, Gpu, Kernel, Pipeline, Shared};
+use crate::{Error, Result};
+
+/// How many invocations a dispatch needs; the kernel knows its workgroup size.
+#[derive(Clone, Copy, Debug)]
+pub enum Threads<'a> {
+    /// At least so many threads; a one-dimensional extent is folded where the device takes fewer workgroups along x.
+    Exactly([u32; 3]),
+    /// So many workgroups, folded alike.
+    Workgroups([u32; 3]),
+    /// The workgroups that the first element says, written by an earlier kernel.
+    Indirect(&'a Buffer<[u32; 3]>),
+}
+
+/// A command buffer being filled. Passes run in order; each sees the results of those before it.
+#[derive(Debug)]
+pub struct Recorder<'g> {
+    shared: &'g Arc<Shared>,
+    commands: vk::CommandBuffer,
+    /// The timeline value that signals the end of this recording.
+    value: u64,
+    queries: Option<vk::QueryPool>,
+    pub(super) labels: Vec<&'static str>,
+    /// Buffers touched since the last barrier; true when written.
+    pending: HashMap<vk::Buffer, bool>,
+}
+
+/// Timestamps that fit one recording; passes beyond are not timed.
+pub(super) const MAX_TIMESTAMPS: u32 = 4096;
+
+impl<'g> Recorder<'g> {
+    /// Starts with a barrier behind everything submitted before.
+    pub(super) fn new(
+        shared: &'g Arc<Shared>,
+        commands: vk::CommandBuffer,
+        value: u64,
+        queries: Option<vk::QueryPool>,
+    ) -> Self {
+        let mut recorder =
+            Self { shared, commands, value, queries, labels: vec![], pending: HashMap::new() };
+        recorder.barrier();
+        recorder.timestamp();
+        recorder
+    }
+
+    pub(super) fn shared(&self) -> &'g Arc<Shared> {
+        self.shared
+    }
+
+    pub(super) fn value(&self) -> u64 {
+        self.value
+    }
+
+    /// Records one pass: label, barrier if a hazard demands it, bindings, params, dispatch, timestamp.
+    ///
+    /// # Errors
+    /// The extent exceeds what the device can launch.
+    pub fn dispatch<K: Kernel>(
+        &mut self,
+        pipeline: &Pipeline<K>,
+        params: &K::Params,
+        buffers: K::Buffers<'_>,
+        threads: Threads<'_>,
+    ) -> Result<()> {
+        let raw = K::handles(&buffers);
+        let bound = K::BINDINGS.iter().zip(&raw).map(|(b, &raw)| (raw, b.writable));
+        let indirect = match threads {
+            Threads::Indirect(arguments) => Some((arguments.handle(), false)),
+            _ => None,
+        };
+        self.synchronize(bound.chain(indirect));
+        let groups = match threads {
+            Threads::Exactly(n) => {
+                let mut size = K::WORKGROUP_SIZE;
+                if size[0] == 0 {
+                    size[0] = self.shared.properties.subgroup_size;
+                }
+                self.fold(K::NAME, std::array::from_fn(|i| n[i].div_ceil(size[i])))?
+            }
+            Threads::Workgroups(n) => self.fold(K::NAME, n)?,
+            Threads::Indirect(_) => [0; 3],
+        };
+        self.begin_label(K::NAME);
+        self.bind(pipeline, params, &raw);
+        let device = &self.shared.device;
+        // SAFETY: recording; a retired buffer outlives this submission.
+        unsafe {
+            match indirect {
+                Some((arguments, _)) => device.cmd_dispatch_indirect(self.commands, arguments, 0),
+                None if groups.contains(&0) => {}
+                None => device.cmd_dispatch(self.commands, groups[0], groups[1], groups[2]),
+            }
+        }
+        self.end_label(K::NAME);
+        Ok(())
+    }
+
+    /// Sets every 32-bit word of `buffer` to `word`.
+    pub fn fill<T: bytemuck::Pod>(&mut self, buffer: &mut Buffer<T>, word: u32) {
+        if buffer.is_empty() {
+            return;
+        }
+        self.synchronize([(buffer.handle(), true)].into_iter());
+        // SAFETY: recording; the buffer is live. Sizes of our element types are multiples of four.
+        unsafe {
+            let (raw, whole) = (buffer.handle(), vk::WHOLE_SIZE);
+            self.shared.device.cmd_fill_buffer(self.commands, raw, 0, whole, word);
+        }
+    }
+
+    /// Copies the first elements of `source` to `target`, as many as both hold.
+    pub fn copy<T: bytemuck::Pod>(&mut self, source: &Buffer<T>, target: &mut Buffer<T>) {
+        let bytes = source.size().min(target.size());
+        if bytes > 0 {
+            self.copy_raw(source.handle(), target.handle(), bytes);
+        }
+    }
+
+    pub(super) fn copy_raw(&mut self, source: vk::Buffer, target: vk::Buffer, size: u64) {
+        self.synchronize([(source, false), (target, true)].into_iter());
+        let region = [vk::BufferCopy { src_offset: 0, dst_offset: 0, size }];
+        // SAFETY: recording; both buffers hold `size` bytes.
+        unsafe { self.shared.device.cmd_copy_buffer(self.commands, source, target, &region) };
+    }
+
+    /// Makes everything recorded so far visible to the host and to whatever the host records next.
+    pub(super) fn finish(&mut self) {
+        let stages =
+            vk::PipelineStageFlags2::COMPUTE_SHADER | vk::PipelineStageFlags2::ALL_TRANSFER;
+        let barrier = [vk::MemoryBarrier2::default()
+            .src_stage_mask(stages)
+            .src_access_mask(vk::AccessFlags2::SHADER_WRITE | vk::AccessFlags2::TRANSFER_WRITE)
+            .dst_stage_mask(vk::PipelineStageFlags2::HOST | vk::PipelineStageFlags2::ALL_COMMANDS)
+            .dst_access_mask(vk::AccessFlags2::HOST_READ | vk::AccessFlags2::MEMORY_READ)];
+        let info = vk::DependencyInfo::default().memory_barriers(&barrier);
+        // SAFETY: recording.
+        unsafe { self.shared.device.cmd_pipeline_barrier2(self.commands, &info) };
+    }
+
+    /// One barrier behind everything, if a buffer in `uses` was written since the last, or is now and was read.
+    fn synchronize(&mut self, uses: impl Iterator<Item = (vk::Buffer, bool)> + Clone) {
+        let hazard = uses
+            .clone()
+            .any(|(raw, writes)| self.pending.get(&raw).is_some_and(|&written| written || writes));
+        if hazard {
+            self.barrier();
+        }
+        for (raw, writes) in uses {
+            *self.pending.entry(raw).or_default() |= writes;
+        }
+    }
+
+    fn barrier(&mut self) {
+        let stages =
+            vk::PipelineStageFlags2::COMPUTE_SHADER | vk::PipelineStageFlags2::ALL_TRANSFER;
+        let barrier = [vk::MemoryBarrier2::default()
+            .src_stage_mask(stages)
+            .src_access_mask(vk::AccessFlags2::SHADER_WRITE | vk::AccessFlags2::TRANSFER_WRITE)
+            .dst_stage_mask(stages | vk::PipelineStageFlags2::DRAW_INDIRECT)
+            .dst_access_mask(
+                vk::AccessFlags2::SHADER_READ
+                    | vk::AccessFlags2::SHADER_WRITE
+                    | vk::AccessFlags2::TRANSFER_READ
+                    | vk::AccessFlags2::TRANSFER_WRITE
+                    | vk::AccessFlags2::INDIRECT_COMMAND_READ,
+            )];
+        let info = vk::DependencyInfo::default().memory_barriers(&barrier);
+        // SAFETY: recording.
+        unsafe { self.shared.device.cmd_pipeline_barrier2(self.commands, &info) };
+        self.pending.clear();
+    }
+
+    fn bind<K: Kernel>(&self, pipeline: &Pipeline<K>, params: &K::Params, raw: &[vk::Buffer]) {
+        let infos: Vec<_> = raw
+            .iter()
+            .map(|&raw| [vk::DescriptorBufferInfo::default().buffer(raw).range(vk::WHOLE_SIZE)])
+            .collect();
+        let writes: Vec<_> = K::BINDINGS
+            .iter()
+            .zip(&infos)
+            .map(|(binding, info)| {
+                vk::WriteDescriptorSet::default()
+                    .dst_binding(binding.index)
+                    .descriptor_type(vk::DescriptorType::STORAGE_BUFFER)
+                    .buffer_info(info)
+            })
+            .collect();
+        let (commands, bind_point) = (self.commands, vk::PipelineBindPoint::COMPUTE);
+        // SAFETY: recording; pipeline and buffers are live and match the layout by construction.
+        unsafe {
+            self.shared.device.cmd_bind_pipeline(commands, bind_point, pipeline.raw);
+            self.shared.push_descriptor.cmd_push_descriptor_set(
+                commands,
+                bind_point,
+                pipeline.layout,
+                0,
+                &writes,
+            );
+            let bytes = bytemuck::bytes_of(params);
+            if !bytes.is_empty() {
+                let stage = vk::ShaderStageFlags::COMPUTE;
+                self.shared.device.cmd_push_constants(commands, pipeline.layout, stage, 0, bytes);
+            }
+        }
+    }
+
+    /// Spreads workgroups along x over y where the device takes fewer along one dimension.
+    fn fold(&self, pass: &'static str, [x, y, z]: [u32; 3]) -> Result<[u32; 3]> {
+        let max = self.shared.properties.max_workgroups;
+        let folded = if x > max && y == 1 { [max, x.div_ceil(max), z] } else { [x, y, z] };
+        if folded.iter().any(|&n| n > max) {
+            return Err(Error::Usage(format!("{pass}: {x} x {y} x {z} workgroups are too many")));
+        }
+        Ok(folded)
+    }
+
+    fn begin_label(&self, name: &'static str) {
+        if let (Some(debug), Ok(name)) = (&self.shared.debug, CString::new(name)) {
+            let label = vk::DebugUtilsLabelEXT::default().label_name(&name);
+            // SAFETY: recording.
+            unsafe { debug.cmd_begin_debug_utils_label(self.commands, &label) };
+        }
+    }
+
+    fn end_label(&mut self, name: &'static str) {
+        if let Some(debug) = &self.shared.debug {
+            // SAFETY: recording; every label that is ended was begun.
+            unsafe { debug.cmd_end_debug_utils_label(self.commands) };
+        }
+        self.labels.push(name);
+        self.timestamp();
+    }
+
+    fn timestamp(&self) {
+        let index = self.labels.len() as u32;
+        if let Some(queries) = self.queries.filter(|_| index < MAX_TIMESTAMPS) {
+            let stage = vk::PipelineStageFlags2::ALL_COMMANDS;
+            // SAFETY: the query was reset before recording began.
+            unsafe {
+                self.shared.device.cmd_write_timestamp2(self.commands, stage, queries, index);
+            }
+        }
+    }
+}
+
+impl Gpu {
+    /// Records into a command buffer of the host application, which submits it when it likes.
+    ///
+    /// # Errors
+    /// What `record` returns.
+    ///
+    /// # Safety
+    /// `commands` is recording on this device's queue family, outside a render pass, and every buffer and pipeline used
+    /// stays alive until the host's submission is done.
+    pub unsafe fn record_into(
+        &self,
+        commands: vk::CommandBuffer,
+        record: impl FnOnce(&mut Recorder<'_>) -> Result<()>,
+    ) -> Result<()> {
+        let mut recorder = Recorder::new(&self.shared, commands, 0, None);
+        record(&mut recorder)?;
+        recorder.finish();
+        Ok(())
+    }
+}

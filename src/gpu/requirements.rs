@@ -1,0 +1,206 @@
+//! What every device must offer: one table, read by device selection, `doctor` and the embedding check.
+
+use std::collections::BTreeSet;
+use std::ffi::CStr;
+
+use ash::{khr, vk};
+
+/// The subgroup operations that our kernels use.
+const SUBGROUP_OPERATIONS: vk::SubgroupFeatureFlags = vk::SubgroupFeatureFlags::from_raw(
+    vk::SubgroupFeatureFlags::BASIC.as_raw()
+        | vk::SubgroupFeatureFlags::VOTE.as_raw()
+        | vk::SubgroupFeatureFlags::ARITHMETIC.as_raw()
+        | vk::SubgroupFeatureFlags::BALLOT.as_raw()
+        | vk::SubgroupFeatureFlags::SHUFFLE.as_raw(),
+);
+
+/// The device extensions that a device is created with.
+pub(super) const EXTENSIONS: &[&CStr] = &[khr::push_descriptor::NAME];
+
+/// What a physical device offers, gathered once.
+pub(super) struct Offered {
+    pub(super) properties: vk::PhysicalDeviceProperties,
+    pub(super) subgroup_size: u32,
+    pub(super) subgroup_operations: vk::SubgroupFeatureFlags,
+    pub(super) subgroup_stages: vk::ShaderStageFlags,
+    pub(super) required_subgroup_size_stages: vk::ShaderStageFlags,
+    pub(super) max_push_descriptors: u32,
+    pub(super) extensions: BTreeSet<String>,
+    pub(super) vulkan12: vk::PhysicalDeviceVulkan12Features<'static>,
+    pub(super) vulkan13: vk::PhysicalDeviceVulkan13Features<'static>,
+    pub(super) compute_family: Option<u32>,
+}
+
+/// One thing that every device must offer.
+#[derive(Clone, Copy)]
+pub struct Requirement {
+    /// The Vulkan name of the feature, extension or limit.
+    pub name: &'static str,
+    /// What it is needed for.
+    pub why: &'static str,
+    offered: fn(&Offered) -> bool,
+}
+
+impl std::fmt::Debug for Requirement {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(self.name)
+    }
+}
+
+impl Requirement {
+    pub(super) fn met_by(&self, offered: &Offered) -> bool {
+        (self.offered)(offered)
+    }
+}
+
+/// Everything a device must offer, most fundamental first.
+pub const REQUIREMENTS: &[Requirement] = &[
+    Requirement {
+        name: "Vulkan 1.3",
+        why: "the baseline of every kernel",
+        offered: |o| o.properties.api_version >= vk::API_VERSION_1_3,
+    },
+    Requirement {
+        name: "compute queue",
+        why: "everything runs on one",
+        offered: |o| o.compute_family.is_some(),
+    },
+    Requirement {
+        name: "VK_KHR_push_descriptor",
+        why: "binds the buffers of a pass while it is recorded",
+        offered: |o| o.extensions.contains("VK_KHR_push_descriptor"),
+    },
+    Requirement {
+        name: "maxPushDescriptors >= 16",
+        why: "the most buffers that one pass binds",
+        offered: |o| o.max_push_descriptors >= 16,
+    },
+    Requirement {
+        name: "timelineSemaphore",
+        why: "one counter orders all submissions",
+        offered: |o| o.vulkan12.timeline_semaphore == vk::TRUE,
+    },
+    Requirement {
+        name: "scalarBlockLayout",
+        why: "the same bytes in GLSL and Rust",
+        offered: |o| o.vulkan12.scalar_block_layout == vk::TRUE,
+    },
+    Requirement {
+        name: "hostQueryReset",
+        why: "timestamps of every pass",
+        offered: |o| o.vulkan12.host_query_reset == vk::TRUE,
+    },
+    Requirement {
+        name: "synchronization2",
+        why: "barriers and submissions",
+        offered: |o| o.vulkan13.synchronization2 == vk::TRUE,
+    },
+    Requirement {
+        name: "subgroupSizeControl",
+        why: "one subgroup owns a tile: its size must be known",
+        offered: |o| o.vulkan13.subgroup_size_control == vk::TRUE,
+    },
+    Requirement {
+        name: "computeFullSubgroups",
+        why: "every lane of a subgroup takes part",
+        offered: |o| o.vulkan13.compute_full_subgroups == vk::TRUE,
+    },
+    Requirement {
+        name: "subgroup operations basic, vote, arithmetic, ballot, shuffle in compute",
+        why: "blending and sorting without barriers",
+        offered: |o| {
+            o.subgroup_operations.contains(SUBGROUP_OPERATIONS)
+                && o.subgroup_stages.contains(vk::ShaderStageFlags::COMPUTE)
+        },
+    },
+    Requirement {
+        name: "subgroup size 4 to 128",
+        why: "a ballot fits four words, a tile at most 32 rows of lanes",
+        offered: |o| (4..=128).contains(&o.subgroup_size),
+    },
+    Requirement {
+        name: "maxComputeWorkGroupInvocations >= 256",
+        why: "the widest workgroup",
+        offered: |o| o.properties.limits.max_compute_work_group_invocations >= 256,
+    },
+    Requirement {
+        name: "maxComputeSharedMemorySize >= 24576",
+        why: "the state of a tile",
+        offered: |o| o.properties.limits.max_compute_shared_memory_size >= 24_576,
+    },
+];
+
+/// The features a device must be created with, to chain into `VkDeviceCreateInfo`; the extension is
+/// `VK_KHR_push_descriptor`. For hosts that lend their device to [`Gpu::from_host`](super::Gpu::from_host).
+pub fn required_device_features()
+-> (vk::PhysicalDeviceVulkan12Features<'static>, vk::PhysicalDeviceVulkan13Features<'static>) {
+    let vulkan12 = vk::PhysicalDeviceVulkan12Features::default()
+        .timeline_semaphore(true)
+        .scalar_block_layout(true)
+        .host_query_reset(true);
+    let vulkan13 = vk::PhysicalDeviceVulkan13Features::default()
+        .synchronization2(true)
+        .subgroup_size_control(true)
+        .compute_full_subgroups(true);
+    (vulkan12, vulkan13)
+}
+
+impl Offered {
+    pub(super) fn gather(
+        instance: &ash::Instance,
+        physical: vk::PhysicalDevice,
+    ) -> Result<Self, vk::Result> {
+        let mut vulkan11 = vk::PhysicalDeviceVulkan11Properties::default();
+        let mut vulkan13_properties = vk::PhysicalDeviceVulkan13Properties::default();
+        let mut push = vk::PhysicalDevicePushDescriptorPropertiesKHR::default();
+        let mut properties = vk::PhysicalDeviceProperties2::default()
+            .push_next(&mut vulkan11)
+            .push_next(&mut vulkan13_properties)
+            .push_next(&mut push);
+        let mut vulkan12 = vk::PhysicalDeviceVulkan12Features::default();
+        let mut vulkan13 = vk::PhysicalDeviceVulkan13Features::default();
+        let mut features = vk::PhysicalDeviceFeatures2::default()
+            .push_next(&mut vulkan12)
+            .push_next(&mut vulkan13);
+        // SAFETY: the chains point at live locals of the types that the structures name.
+        let (extensions, families) = unsafe {
+            instance.get_physical_device_properties2(physical, &mut properties);
+            instance.get_physical_device_features2(physical, &mut features);
+            (
+                instance.enumerate_device_extension_properties(physical)?,
+                instance.get_physical_device_queue_family_properties(physical),
+            )
+        };
+        let properties = properties.properties;
+        let name = |e: &vk::ExtensionProperties| {
+            e.extension_name_as_c_str().ok().map(|name| name.to_string_lossy().into_owned())
+        };
+        Ok(Self {
+            properties,
+            subgroup_size: vulkan11.subgroup_size,
+            subgroup_operations: vulkan11.subgroup_supported_operations,
+            subgroup_stages: vulkan11.subgroup_supported_stages,
+            required_subgroup_size_stages: vulkan13_properties.required_subgroup_size_stages,
+            max_push_descriptors: push.max_push_descriptors,
+            extensions: extensions.iter().filter_map(name).collect(),
+            // The chain pointers die with this function.
+            vulkan12: vk::PhysicalDeviceVulkan12Features {
+                p_next: std::ptr::null_mut(),
+                ..vulkan12
+            },
+            vulkan13: vk::PhysicalDeviceVulkan13Features {
+                p_next: std::ptr::null_mut(),
+                ..vulkan13
+            },
+            compute_family: families
+                .iter()
+                .position(|family| family.queue_flags.contains(vk::QueueFlags::COMPUTE))
+                .and_then(|index| u32::try_from(index).ok()),
+        })
+    }
+
+    /// The first requirement that is not met.
+    pub(super) fn missing(&self) -> Option<&'static Requirement> {
+        REQUIREMENTS.iter().find(|requirement| !requirement.met_by(self))
+    }
+}

@@ -1,0 +1,184 @@
+//! Hands recorded work to the queue and waits for it.
+
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+
+use ash::vk;
+
+use super::recorder::MAX_TIMESTAMPS;
+use super::{Gpu, Recorder, Retired, Shared, lock};
+use crate::Result;
+
+/// Work in flight.
+#[derive(Debug)]
+pub struct Submission {
+    shared: Arc<Shared>,
+    value: u64,
+}
+
+/// How long one pass took on the device.
+#[derive(Clone, Copy, Debug)]
+pub struct PassTime {
+    /// The kernel.
+    pub name: &'static str,
+    /// Milliseconds on the device.
+    pub milliseconds: f64,
+}
+
+impl Submission {
+    /// Blocks until the work is done.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub fn wait(&self) -> Result<()> {
+        self.shared.wait(self.value)
+    }
+}
+
+impl Gpu {
+    /// Records passes and submits them; does not wait.
+    ///
+    /// # Errors
+    /// What `record` returns (nothing is submitted then), or the device was lost.
+    pub fn submit(
+        &self,
+        label: &str,
+        record: impl FnOnce(&mut Recorder<'_>) -> Result<()>,
+    ) -> Result<Submission> {
+        self.record_and_submit(label, None, record).map(|(submission, _)| submission)
+    }
+
+    /// Records passes, submits them and waits.
+    ///
+    /// # Errors
+    /// As [`Gpu::submit`].
+    pub fn run(
+        &self,
+        label: &str,
+        record: impl FnOnce(&mut Recorder<'_>) -> Result<()>,
+    ) -> Result<()> {
+        self.submit(label, record)?.wait()
+    }
+
+    /// As [`Gpu::run`], and measures how long each pass took.
+    ///
+    /// # Errors
+    /// As [`Gpu::submit`].
+    pub fn profile(
+        &self,
+        label: &str,
+        record: impl FnOnce(&mut Recorder<'_>) -> Result<()>,
+    ) -> Result<Vec<PassTime>> {
+        let shared = &self.shared;
+        let info = vk::QueryPoolCreateInfo::default()
+            .query_type(vk::QueryType::TIMESTAMP)
+            .query_count(MAX_TIMESTAMPS);
+        // SAFETY: the device is live; the pool is retired below whatever happens.
+        let queries = unsafe { shared.device.create_query_pool(&info, None) }
+            .map_err(|result| shared.error("vkCreateQueryPool", result))?;
+        // SAFETY: the pool was just created.
+        unsafe { shared.device.reset_query_pool(queries, 0, MAX_TIMESTAMPS) };
+        let times = self.record_and_submit(label, Some(queries), record).and_then(
+            |(submission, labels)| {
+                submission.wait()?;
+                self.pass_times(queries, &labels)
+            },
+        );
+        shared.retire(Retired::Queries(queries));
+        times
+    }
+
+    fn pass_times(&self, queries: vk::QueryPool, labels: &[&'static str]) -> Result<Vec<PassTime>> {
+        let mut ticks = vec![0u64; (labels.len() + 1).min(MAX_TIMESTAMPS as usize)];
+        let flags = vk::QueryResultFlags::TYPE_64 | vk::QueryResultFlags::WAIT;
+        // SAFETY: as many timestamps were written.
+        unsafe { self.shared.device.get_query_pool_results(queries, 0, &mut ticks, flags) }
+            .map_err(|result| self.shared.error("vkGetQueryPoolResults", result))?;
+        let period = f64::from(self.shared.properties.timestamp_period) * 1e-6;
+        let milliseconds = |pair: &[u64]| pair[1].saturating_sub(pair[0]) as f64 * period;
+        let times = labels.iter().zip(ticks.windows(2));
+        Ok(times.map(|(&name, pair)| PassTime { name, milliseconds: milliseconds(pair) }).collect())
+    }
+
+    fn record_and_submit(
+        &self,
+        label: &str,
+        queries: Option<vk::QueryPool>,
+        record: impl FnOnce(&mut Recorder<'_>) -> Result<()>,
+    ) -> Result<(Submission, Vec<&'static str>)> {
+        let shared = &self.shared;
+        let mut queue = lock(&shared.queue);
+        let fail = |call| move |result| shared.error(call, result);
+        let pool_info = vk::CommandPoolCreateInfo::default()
+            .flags(vk::CommandPoolCreateFlags::TRANSIENT)
+            .queue_family_index(queue.family);
+        // SAFETY: the device is live; the pool is retired when this function ends, after its last submission.
+        let pool = unsafe { shared.device.create_command_pool(&pool_info, None) }
+            .map_err(fail("vkCreateCommandPool"))?;
+        let value = queue.submitted + 1;
+        // From here on, whatever is dropped may be in this recording.
+        shared.last_use.store(value, Ordering::Release);
+        let recorded = self.record_commands(pool, value, queries, record);
+        let submitted = recorded.and_then(|(commands, labels)| {
+            let commands = [vk::CommandBufferSubmitInfo::default().command_buffer(commands)];
+            let signal = [vk::SemaphoreSubmitInfo::default()
+                .semaphore(shared.timeline)
+                .value(value)
+                .stage_mask(vk::PipelineStageFlags2::ALL_COMMANDS)];
+            let info = [vk::SubmitInfo2::default()
+                .command_buffer_infos(&commands)
+                .signal_semaphore_infos(&signal)];
+            // SAFETY: the queue is locked, the command buffer recorded and not touched again.
+            unsafe { shared.device.queue_submit2(queue.raw, &info, vk::Fence::null()) }
+                .map_err(fail("vkQueueSubmit2"))?;
+            tracing::trace!(label, value, "submitted");
+            Ok(labels)
+        });
+        shared.retire(Retired::Commands(pool));
+        match submitted {
+            Ok(labels) => {
+                queue.submitted = value;
+                Ok((Submission { shared: Arc::clone(shared), value }, labels))
+            }
+            Err(error) => {
+                // Nothing was submitted: what was dropped meanwhile waits for the next submission's value.
+                Err(error)
+            }
+        }
+    }
+
+    fn record_commands(
+        &self,
+        pool: vk::CommandPool,
+        value: u64,
+        queries: Option<vk::QueryPool>,
+        record: impl FnOnce(&mut Recorder<'_>) -> Result<()>,
+    ) -> Result<(vk::CommandBuffer, Vec<&'static str>)> {
+        let shared = &self.shared;
+        let fail = |call| move |result| shared.error(call, result);
+        let allocate =
+            vk::CommandBufferAllocateInfo::default().command_pool(pool).command_buffer_count(1);
+        let begin = vk::CommandBufferBeginInfo::default()
+            .flags(vk::CommandBufferUsageFlags::ONE_TIME_SUBMIT);
+        // SAFETY: pool and command buffer are live and used by this thread alone.
+        let commands = unsafe {
+            let commands = shared
+                .device
+                .allocate_command_buffers(&allocate)
+                .map_err(fail("vkAllocateCommandBuffers"))?[0];
+            shared
+                .device
+                .begin_command_buffer(commands, &begin)
+                .map_err(fail("vkBeginCommandBuffer"))?;
+            commands
+        };
+        let mut recorder = Recorder::new(shared, commands, value, queries);
+        record(&mut recorder)?;
+        recorder.finish();
+        let labels = recorder.labels;
+        // SAFETY: recording.
+        unsafe { shared.device.end_command_buffer(commands) }
+            .map_err(fail("vkEndCommandBuffer"))?;
+        Ok((commands, labels))
+    }
+}

@@ -1,0 +1,21 @@
+//! CPU references: one file per kernel, same name, same buffers, plain loops.
+//!
+//! They are written to be read beside the shader, line by line, and to be obviously right rather than fast; the tests
+//! hold each kernel to its reference.
+
+#![expect(
+    clippy::needless_range_loop,
+    clippy::neg_cmp_op_on_partial_ord,
+    reason = "keeps each line comparable to the shader; a NaN must fail the test"
+)]
+
+mod compensated_sum;
+pub(crate) mod luminance;
+mod luminance_histogram;
+mod percentile_select;
+mod tile_ranges;
+pub mod tone;
+mod tone_map;
+mod tone_statistics;
+
+use compensated_sum::CompensatedSum;
