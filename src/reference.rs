@@ -9,4 +9,9 @@
     reason = "keeps each line comparable to the shader; a NaN must fail the test"
 )]
 
+mod l1;
+mod loss_log;
+pub mod ssim_backward;
+pub mod ssim_forward;
 mod tile_ranges;
+pub mod tone;
