@@ -9,6 +9,7 @@
     reason = "keeps each line comparable to the shader; a NaN must fail the test"
 )]
 
+mod adam;
 mod compensated_sum;
 pub(crate) mod luminance;
 mod luminance_histogram;
