@@ -10,10 +10,10 @@
 )]
 
 mod compensated_sum;
-mod dispatch_arguments;
 pub(crate) mod luminance;
 mod luminance_histogram;
 mod percentile_select;
+mod dispatch_arguments;
 mod scan_downsweep;
 mod scan_spine;
 mod scan_upsweep;
@@ -26,3 +26,7 @@ mod tone_map;
 mod tone_statistics;
 
 use compensated_sum::CompensatedSum;
+mod l1;
+mod loss_log;
+pub mod ssim_backward;
+pub mod ssim_forward;
