@@ -69,7 +69,7 @@ fn luminance_matches_the_reference() {
             let mut luminances = vec![0.0; pixels];
             let mut sums = vec![Vec2::ZERO; thread_count as usize];
             let mut searches = vec![RankSearch::default(); 4];
-            let mut histograms = vec![9; 1024];
+            let mut histograms = vec![9; 4096];
             let mut buffers = (
                 gpu.zeros("luminances", pixels).unwrap(),
                 gpu.zeros("sums", sums.len()).unwrap(),
@@ -116,11 +116,12 @@ fn luminance_histogram_and_percentile_select_match_their_references() {
         let last = pixels as u32 - 1;
         let ranks = [last / 10, last.min(last / 10 + 1), last / 2, last];
         let mut searches = ranks.map(|rank| RankSearch { prefix: 0, rank, histogram: 0 });
-        let mut histograms = vec![0; 1024];
+        let mut histograms = vec![0; 4096];
         let on_device = gpu.buffer("luminances", &luminances).unwrap();
         let mut device_searches = gpu.buffer("searches", &searches).unwrap();
         let mut device_histograms = gpu.buffer("histograms", &histograms).unwrap();
-        for shift in [24, 16, 8, 0] {
+        // Below 2 the first digit has no more than ten bits, so one kernel counts all three.
+        for (shift, digit_bits) in [(20, 11), (10, 10), (0, 10)] {
             let params = luminance_histogram::Params {
                 pixel_count: pixels as u32,
                 thread_count: 1024,
@@ -150,7 +151,7 @@ fn luminance_histogram_and_percentile_select_match_their_references() {
             let slices =
                 percentile_select::Slices { searches: &mut searches, histograms: &mut histograms };
             percentile_select::Kernel::run(
-                &percentile_select::Params {},
+                &percentile_select::Params { digit_bits },
                 &percentile_select::Constants {},
                 slices,
             );
@@ -161,7 +162,7 @@ fn luminance_histogram_and_percentile_select_match_their_references() {
             gpu.run("percentile_select", |pass| {
                 pass.dispatch(
                     &select,
-                    &percentile_select::Params {},
+                    &percentile_select::Params { digit_bits },
                     bound,
                     Threads::Workgroups([1, 1, 1]),
                 )
@@ -172,7 +173,7 @@ fn luminance_histogram_and_percentile_select_match_their_references() {
                 searches,
                 "{pixels} pixels, shift {shift}"
             );
-            assert_eq!(gpu.read(&device_histograms).unwrap(), vec![0; 1024]);
+            assert_eq!(gpu.read(&device_histograms).unwrap(), vec![0; 4096]);
         }
         let mut sorted = luminances;
         sorted.sort_by(f32::total_cmp);
