@@ -186,7 +186,8 @@ mod tests {
             let pinhole = image_of(&lens, map.focal, Distortion::default());
             let worst =
                 ours.data.iter().zip(&pinhole.data).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-            assert!(worst < 2e-3, "{distortion:?}: {worst}");
+            // Half a pixel off would be 2e-2; what remains is the repeated edge.
+            assert!(worst < 4e-3, "{distortion:?}: {worst}");
         }
     }
 
