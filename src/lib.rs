@@ -22,6 +22,7 @@ pub mod reference;
 pub mod render;
 pub mod image;
 pub mod metrics;
+pub mod pseudo_gt;
 pub mod random;
 pub mod report;
 pub mod scene;

@@ -1,10 +1,17 @@
 //! The pseudo-GT kernels against their references, and the whole against the statistics on the host.
 
+#![expect(
+    clippy::unwrap_used,
+    clippy::print_stdout,
+    reason = "a test's helpers fail the test; what is skipped is said"
+)]
+
 use std::path::Path;
 
 use glam::Vec2;
 use nightsplat::gpu::testing::{assert_no_validation_messages, gpu};
 use nightsplat::gpu::{Gpu, Reference, Threads};
+use nightsplat::image::Image;
 use nightsplat::kernels::{
     RankSearch, ToneParameters, ToneStatistics, luminance, luminance_histogram, percentile_select,
     tone_map, tone_statistics,
@@ -416,9 +423,7 @@ fn a_real_photograph_maps_on_the_device_as_on_the_host() {
         println!("skipped: {} is absent", path.display());
         return;
     }
-    let rgb = image::open(path).unwrap().to_rgb8();
-    let plane = |c: usize| rgb.pixels().map(move |pixel| f32::from(pixel.0[c]) / 255.0);
-    let image: Vec<f32> = plane(0).chain(plane(1)).chain(plane(2)).collect();
+    let image = Image::load(path).unwrap().data;
     for curve in ToneCurve::ALL {
         let settings = ToneSettings::new(curve);
         let (_, _, target) = on_device(&gpu(), settings, &image).unwrap();
