@@ -1,6 +1,6 @@
 //! Cameras: the undistorted pinhole that everything renders with, and the calibrated lens that a dataset lists.
 //!
-//! Axes are OpenCV's (x right, y down, z forward); pixel units, the image's corner at (0, 0), pixel centres at +0.5.
+//! Axes are those of `OpenCV` (x right, y down, z forward); pixel units, the image's corner at (0, 0), pixel centres at +0.5.
 
 use glam::{DAffine3, DVec2, DVec3};
 
@@ -15,7 +15,7 @@ pub struct Camera {
     pub focal: DVec2,
     /// Where the optical axis meets the image, pixels; rarely the centre.
     pub principal_point: DVec2,
-    /// Rigid: world space to view space (OpenCV axes).
+    /// Rigid: world space to view space (`OpenCV` axes).
     pub view_from_world: DAffine3,
 }
 

@@ -351,28 +351,21 @@ mod tests {
         let (path, _folder) = file("a.png");
         let grey = |x: u32, y: u32| (40 * x + 7 * y) as u8;
         let expected = Image::from_fn(5, 3, |x, y| [f32::from(grey(x, y)) / 255.0; 3]);
-        let save: [&dyn Fn(); 6] = [
-            &|| ImageBuffer::from_fn(5, 3, |x, y| Luma([grey(x, y)])).save(&path).unwrap(),
-            &|| ImageBuffer::from_fn(5, 3, |x, y| LumaA([grey(x, y), 9])).save(&path).unwrap(),
-            &|| ImageBuffer::from_fn(5, 3, |x, y| Rgb([grey(x, y); 3])).save(&path).unwrap(),
+        let save: [&dyn Fn() -> ::image::ImageResult<()>; 6] = [
+            &|| ImageBuffer::from_fn(5, 3, |x, y| Luma([grey(x, y)])).save(&path),
+            &|| ImageBuffer::from_fn(5, 3, |x, y| LumaA([grey(x, y), 9])).save(&path),
+            &|| ImageBuffer::from_fn(5, 3, |x, y| Rgb([grey(x, y); 3])).save(&path),
             &|| {
                 ImageBuffer::from_fn(5, 3, |x, y| Rgba([grey(x, y), grey(x, y), grey(x, y), 0]))
                     .save(&path)
-                    .unwrap()
             },
+            &|| ImageBuffer::from_fn(5, 3, |x, y| Luma([u16::from(grey(x, y)) * 257])).save(&path),
             &|| {
-                ImageBuffer::from_fn(5, 3, |x, y| Luma([u16::from(grey(x, y)) * 257]))
-                    .save(&path)
-                    .unwrap()
-            },
-            &|| {
-                ImageBuffer::from_fn(5, 3, |x, y| Rgb([u16::from(grey(x, y)) * 257; 3]))
-                    .save(&path)
-                    .unwrap()
+                ImageBuffer::from_fn(5, 3, |x, y| Rgb([u16::from(grey(x, y)) * 257; 3])).save(&path)
             },
         ];
         for (layout, save) in save.iter().enumerate() {
-            save();
+            save().unwrap();
             assert!(worst(&Image::load(&path).unwrap(), &expected) < 1e-7, "layout {layout}");
             assert_eq!(Image::size_of(&path).unwrap(), (5, 3));
         }
@@ -404,6 +397,22 @@ mod tests {
         for (x, expected) in expected.into_iter().enumerate() {
             assert!((loaded.data[x] - expected).abs() < 1e-5, "{}: {}", values[x], loaded.data[x]);
         }
+    }
+
+    #[test]
+    fn a_grey_exr_is_grey_and_one_without_colour_is_refused() {
+        use exr::prelude::{SpecificChannels, Vec2, WritableImage};
+        let (path, _folder) = file("a.exr");
+        let save = |name: &str| {
+            let channels = SpecificChannels::build().with_channel(name);
+            let channels = channels.with_pixel_fn(|Vec2(x, _): Vec2<usize>| (0.25_f32 * x as f32,));
+            exr::image::Image::from_channels((3, 2), channels).write().to_file(&path).unwrap();
+        };
+        save("Y");
+        let [red, green, blue] = Image::load(&path).unwrap().pixel(2, 1);
+        assert!((red - 0.735_357).abs() < 1e-5 && red == green && green == blue);
+        save("Z");
+        assert!(Image::load(&path).unwrap_err().to_string().contains("neither R nor Y"));
     }
 
     #[test]

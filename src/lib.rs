@@ -18,6 +18,7 @@ pub mod error;
 #[expect(unsafe_code, reason = "the only module that speaks Vulkan")]
 pub mod gpu;
 pub mod kernels;
+pub mod loss;
 pub mod reference;
 pub mod render;
 pub mod image;

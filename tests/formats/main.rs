@@ -1,5 +1,11 @@
 //! Datasets: every layout is recognised and read the same, and bad input is told in one line.
 
+#![allow(
+    clippy::unwrap_used,
+    clippy::print_stdout,
+    reason = "a test may fail, and says what it skips"
+)]
+
 mod bad_input;
 mod real;
 mod synthetic;
@@ -146,6 +152,34 @@ fn an_angle_alone_makes_a_centred_camera_of_the_photographs_size() {
 }
 
 #[test]
+fn backslashes_and_frames_of_unknown_size_are_handled() {
+    let folder = tempfile::tempdir().unwrap();
+    photographs(folder.path(), "images", 0..3, 1.0);
+    let frames = (0..4)
+        .map(|index| frame(index, &format!(".\\images\\{}.png", name(index))))
+        .collect::<Vec<_>>();
+    let listing = json!({ "fl_x": 35.0, "frames": frames });
+    write_json(folder.path().join("transforms.json"), &listing);
+    let dataset = load(folder.path());
+    assert_eq!(dataset.views.len(), 3);
+    assert!(
+        dataset.skipped[0].contains("images/v03.png: neither w and h"),
+        "{:?}",
+        dataset.skipped
+    );
+}
+
+#[test]
+fn a_model_without_points_loads_without_points() {
+    let folder = tempfile::tempdir().unwrap();
+    photographs(folder.path(), "images", 0..9, 1.0);
+    model(9).write_binary(&folder.path().join("sparse/0"));
+    std::fs::remove_file(folder.path().join("sparse/0/points3D.bin")).unwrap();
+    let dataset = load(folder.path());
+    assert_eq!((dataset.views.len(), dataset.points.len()), (9, 0));
+}
+
+#[test]
 fn both_colmap_encodings_and_folders_give_the_same_dataset() {
     let load_written = |folder: &str, text: bool| {
         let root = tempfile::tempdir().unwrap();
@@ -153,9 +187,9 @@ fn both_colmap_encodings_and_folders_give_the_same_dataset() {
         let model = model(10);
         let folder = root.path().join(folder);
         if text {
-            model.write_text(&folder)
+            model.write_text(&folder);
         } else {
-            model.write_binary(&folder)
+            model.write_binary(&folder);
         }
         load(root.path())
     };

@@ -11,7 +11,7 @@ pub(crate) const SIZE: (u32, u32) = (40, 30);
 pub(crate) const FOCAL: DVec2 = DVec2::new(35.0, 36.0);
 pub(crate) const PRINCIPAL_POINT: DVec2 = DVec2::new(18.0, 16.0);
 
-/// View number `index`: world to view, OpenCV axes, looking at the origin from a ring.
+/// View number `index`: world to view, `OpenCV` axes, looking at the origin from a ring.
 pub(crate) fn pose(index: usize) -> DAffine3 {
     let angle = 0.4 * index as f64;
     let center = DVec3::new(3.0 * angle.cos(), 3.0 * angle.sin(), 0.5 + 0.1 * (index % 3) as f64);
