@@ -1,11 +1,5 @@
 //! The pseudo-GT kernels against their references, and the whole against the statistics on the host.
 
-#![expect(
-    clippy::unwrap_used,
-    clippy::print_stdout,
-    reason = "a test's helpers fail the test; what is skipped is said"
-)]
-
 use std::path::Path;
 
 use glam::Vec2;

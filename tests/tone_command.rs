@@ -1,12 +1,6 @@
 //! `nightsplat tone`, in process.
 #![cfg(feature = "cli")]
 
-#![expect(
-    clippy::unwrap_used,
-    clippy::print_stdout,
-    reason = "a test's helpers fail the test; what is skipped is said"
-)]
-
 use std::path::{Path, PathBuf};
 
 use nightsplat::Error;
