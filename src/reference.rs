@@ -9,4 +9,20 @@
     reason = "keeps each line comparable to the shader; a NaN must fail the test"
 )]
 
+mod compensated_sum;
+pub(crate) mod luminance;
+mod luminance_histogram;
+mod percentile_select;
+mod dispatch_arguments;
+mod scan_downsweep;
+mod scan_spine;
+mod scan_upsweep;
+mod sort_downsweep;
+mod sort_spine;
+mod sort_upsweep;
 mod tile_ranges;
+pub mod tone;
+mod tone_map;
+mod tone_statistics;
+
+use compensated_sum::CompensatedSum;

@@ -1,0 +1,42 @@
+// The window of SSIM, and how the SSIM kernels march over an image.
+//
+// Wang et al. 2004 with the window of 3DGS: 11 x 11 Gaussian, sigma 1.5, zero padding, per channel.
+//
+// A thread owns COLUMNS columns of one channel and marches down ROWS rows. Per input row it blurs along x
+// in registers and adds the result, weighted by the taps along y, to the outputs still in reach: each value
+// is loaded once per strip, nothing is shared between threads, and no barrier is needed.
+
+layout(constant_id = 0) const uint COLUMNS = 8;  // outputs per row and thread
+layout(constant_id = 1) const uint ROWS = 32;    // rows per thread, beside 2 RADIUS rows of warm-up
+
+const int RADIUS = 5;
+const uint PENDING = 2 * RADIUS;    // rows of outputs in reach beside the one that completes
+const uint REACH = COLUMNS + PENDING;  // inputs along x
+
+// exp(-d^2 / (2 sigma^2)) / sum for d = 0..RADIUS.
+const float TAPS[RADIUS + 1] =
+    float[](0.2660117248617943, 0.21300553771125366, 0.1093606895097, 0.03600077212843082, 0.007598758135239184, 0.0010283800844791099);
+
+// Column `x` of the blurred row: one window of a row in registers.
+float blur(float row[REACH], uint x) {
+    uint centre = x + RADIUS;
+    float sum = TAPS[0] * row[centre];
+    [[unroll]] for (int d = 1; d <= RADIUS; ++d) sum += TAPS[d] * (row[centre - d] + row[centre + d]);
+    return sum;
+}
+
+// The columns and rows that a thread owns.
+struct Strip {
+    int x;        // first column
+    int y;        // first row
+    int end;      // one past the last row
+    uint channel; // 0..3; 3 and more: nothing to do
+};
+
+Strip strip_of(uint thread, uint width, uint height) {
+    uint across = (width + COLUMNS - 1) / COLUMNS;
+    uint down = (height + ROWS - 1) / ROWS;
+    uint y = thread / across;
+    uint top = y % down * ROWS;
+    return Strip(int(thread % across * COLUMNS), int(top), int(min(top + ROWS, height)), y / down);
+}

@@ -1,0 +1,40 @@
+#version 460
+#extension GL_GOOGLE_include_directive : require
+#include "kernel.glsl"
+#include "tone.glsl"
+
+//! The gradient of mean|a - b| with respect to the render a, b the pseudo-GT, and partial sums of |a - b|.
+//!
+//! A thread takes COUNT values, one subgroup apart, so that a subgroup reads one run. At a = b the gradient
+//! is 0. Reference: `src/reference/l1.rs`.
+
+layout(local_size_x_id = 100) in;
+layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
+layout(constant_id = 0) const uint COUNT = 32;  // values per thread
+
+layout(push_constant) uniform Params {
+    uint  value_count;  // 3HW
+    float l1_scale;     // 1 / (3HW)
+};
+
+layout(binding = 0) readonly  buffer Render   { float render[]; };         // (3, H, W), not clamped
+layout(binding = 1) readonly  buffer Low      { float low[]; };            // (3, H, W), sRGB-encoded
+layout(binding = 2) readonly  buffer Tone     { ToneParameters tone[]; };  // (1,)
+layout(binding = 3) writeonly buffer DRender  { float d_render[]; };       // (3, H, W)
+layout(binding = 4) writeonly buffer Partials { float partials[]; };       // one per workgroup
+
+void main() {
+    uint first = WORKGROUP_INDEX * SUBGROUP_SIZE * COUNT + gl_LocalInvocationID.x;
+    ToneParameters curve = tone[0];
+    float sum = 0.0;
+    for (uint k = 0; k < COUNT; ++k) {
+        uint i = first + k * SUBGROUP_SIZE;
+        if (i < value_count) {
+            float difference = render[i] - tone_curve(low[i], curve);
+            d_render[i] = l1_scale * sign(difference);
+            sum += abs(difference);
+        }
+    }
+    sum = subgroupAdd(sum);
+    if (subgroupElect()) partials[WORKGROUP_INDEX] = sum;
+}

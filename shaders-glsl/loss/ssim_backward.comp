@@ -1,0 +1,77 @@
+#version 460
+#extension GL_GOOGLE_include_directive : require
+#include "kernel.glsl"
+#include "tone.glsl"
+#include "ssim.glsl"
+
+//! The gradient of (1 - w) mean|a - b| + w (1 - mean SSIM) with respect to the render a, and partial sums of |a - b|.
+//!
+//! dSSIM/da = E[dS/dE[a]] + 2 a E[dS/dE[aa]] + b E[dS/dE[ab]]: the window is symmetric and zero outside the
+//! image, so the transposed blur is the blur. The derivatives come from `ssim_forward`, which shares the
+//! thread mapping. At a = b the gradient of the L1 term is 0. Reference: `src/reference/ssim_backward.rs`.
+
+layout(local_size_x_id = 100) in;
+layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
+
+layout(push_constant) uniform Params {
+    uint  width;        // pixels
+    uint  height;       // pixels
+    float l1_scale;     // (1 - w) / (3HW)
+    float ssim_scale;   // w / (3HW)
+};
+
+layout(binding = 0) readonly  buffer Render   { float render[]; };          // (3, H, W), not clamped
+layout(binding = 1) readonly  buffer Low      { float low[]; };             // (3, H, W), sRGB-encoded
+layout(binding = 2) readonly  buffer Tone     { ToneParameters tone[]; };   // (1,)
+layout(binding = 3) readonly  buffer DMoments { vec3 d_moments[]; };        // (3, H, W, 3), dS/dE[a], dS/dE[aa], dS/dE[ab]
+layout(binding = 4) writeonly buffer DRender  { float d_render[]; };        // (3, H, W)
+layout(binding = 5) writeonly buffer Partials { float partials[]; };        // one per workgroup
+
+// The three derivatives, in the order of the arrays below.
+const uint MEAN = 0, SQUARE = 1, PRODUCT = 2, DERIVATIVES = 3;
+
+void main() {
+    Strip strip = strip_of(THREAD_INDEX, width, height);
+    uint plane = strip.channel * width * height;
+    float pending[DERIVATIVES][COLUMNS][PENDING];
+    [[unroll]] for (uint m = 0; m < DERIVATIVES; ++m)
+        [[unroll]] for (uint x = 0; x < COLUMNS; ++x)
+            [[unroll]] for (uint k = 0; k < PENDING; ++k) pending[m][x][k] = 0.0;
+
+    ToneParameters curve = tone[0];
+    float sum = 0.0;
+    // A workgroup's last threads can be beyond the image: no rows, yet they take part in the sum.
+    int end = strip.channel < 3 ? strip.end + RADIUS : strip.y - RADIUS;
+    for (int y = strip.y - RADIUS; y < end; ++y) {
+        float row[DERIVATIVES][REACH];
+        [[unroll]] for (int k = 0; k < REACH; ++k) {
+            int x = strip.x + k - RADIUS;
+            bool inside = x >= 0 && x < int(width) && y >= 0 && y < int(height);
+            uint i = inside ? plane + uint(y) * width + uint(x) : 0;
+            vec3 d = d_moments[i];
+            [[unroll]] for (uint m = 0; m < DERIVATIVES; ++m) row[m][k] = inside ? d[m] : 0.0;
+        }
+        int done = y - RADIUS;
+        [[unroll]] for (uint x = 0; x < COLUMNS; ++x) {
+            float blurred[DERIVATIVES];
+            [[unroll]] for (uint m = 0; m < DERIVATIVES; ++m) {
+                float value = blur(row[m], x);
+                blurred[m] = pending[m][x][0] + TAPS[RADIUS] * value;
+                [[unroll]] for (int k = 1; k < PENDING; ++k)
+                    pending[m][x][k - 1] = pending[m][x][k] + TAPS[abs(k - RADIUS)] * value;
+                pending[m][x][PENDING - 1] = TAPS[RADIUS] * value;
+            }
+            uint column = uint(strip.x) + x;
+            if (done >= strip.y && column < width) {
+                uint i = plane + uint(done) * width + column;
+                float a = render[i];
+                float b = tone_curve(low[i], curve);
+                float d_ssim = blurred[MEAN] + 2.0 * a * blurred[SQUARE] + b * blurred[PRODUCT];
+                d_render[i] = l1_scale * sign(a - b) - ssim_scale * d_ssim;
+                sum += abs(a - b);
+            }
+        }
+    }
+    sum = subgroupAdd(sum);
+    if (subgroupElect()) partials[WORKGROUP_INDEX] = sum;
+}
