@@ -26,3 +26,7 @@ mod tone_map;
 mod tone_statistics;
 
 use compensated_sum::CompensatedSum;
+mod l1;
+mod loss_log;
+pub mod ssim_backward;
+pub mod ssim_forward;
