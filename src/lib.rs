@@ -15,6 +15,7 @@ pub mod error;
 pub mod gpu;
 pub mod kernels;
 pub mod loss;
+pub mod optimizer;
 pub mod reference;
 
 pub use error::{Error, Result};

@@ -9,6 +9,7 @@
     reason = "keeps each line comparable to the shader; a NaN must fail the test"
 )]
 
+mod adam;
 mod l1;
 mod loss_log;
 pub mod ssim_backward;
