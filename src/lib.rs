@@ -10,6 +10,10 @@
 //!                                                          └-> eval, export, render
 //! ```
 
+pub mod camera;
+#[cfg(feature = "cli")]
+pub mod cli;
+pub mod dataset;
 pub mod error;
 #[expect(unsafe_code, reason = "the only module that speaks Vulkan")]
 pub mod gpu;
@@ -17,5 +21,13 @@ pub mod kernels;
 pub mod loss;
 pub mod optimizer;
 pub mod reference;
+pub mod render;
+pub mod image;
+pub mod metrics;
+pub mod random;
+pub mod report;
+pub mod scene;
+pub mod sort;
+pub mod tone;
 
 pub use error::{Error, Result};

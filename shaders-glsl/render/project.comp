@@ -1,0 +1,98 @@
+#version 460
+#extension GL_GOOGLE_include_directive : require
+#include "kernel.glsl"
+#include "gaussian.glsl"
+#include "camera.glsl"
+#include "sh.glsl"
+#include "splat.glsl"
+
+//! Project: one thread per Gaussian, world space to image plane.
+//!
+//! EWA: cov2d = U U^T + 0.3 I with U = J W R S, so it is positive definite by construction, and its determinant is
+//! |U0 x U1|^2 + 0.3 trace(U U^T) + 0.09, which cannot cancel. Colour is max(SH + 0.5, 0): what every viewer shows.
+//! A culled Gaussian gets the last depth key and covers no tile.
+
+layout(local_size_x = 64) in;
+
+layout(push_constant, scalar) uniform Params {
+    mat4x3 view_from_world;
+    vec2  focal;            // pixels
+    vec2  principal_point;  // pixels
+    uvec2 size;             // pixels
+    float near;             // world units
+    uint  gaussian_count;
+    uint  sh_degree;        // in use; at most SH_DEGREE
+};
+
+layout(constant_id = 0) const uint SH_DEGREE = 3;  // stored
+
+layout(binding = 0) readonly  buffer Parameters { float parameters[]; };    // (columns x gaussian_count)
+layout(binding = 1) writeonly buffer Splats     { ProjectedSplat splats[]; };
+layout(binding = 2) writeonly buffer Colors     { float colors[]; };        // (gaussian_count, CHANNELS)
+layout(binding = 3) writeonly buffer DepthKeys  { uint depth_keys[]; };
+layout(binding = 4) writeonly buffer Ids        { uint ids[]; };
+layout(binding = 5) writeonly buffer TileCounts { uint tile_counts[]; };
+
+const uint CULLED = 0xffffffffu;
+
+vec3 sh_color(uint i, vec3 direction) {
+    float basis[16];
+    sh_basis(sh_degree, direction, basis);
+    vec3 color = basis[0] * LOAD_VEC3(parameters, DC_COLUMN, gaussian_count, i);
+    uint rest = REST_COLUMN * gaussian_count + 3 * (sh_count(SH_DEGREE) - 1) * i;
+    for (uint k = 1; k < sh_count(sh_degree); k++, rest += 3) {
+        color += basis[k] * vec3(parameters[rest], parameters[rest + 1], parameters[rest + 2]);
+    }
+    return max(color + 0.5, vec3(0.0));
+}
+
+void main() {
+    uint i = THREAD_INDEX;
+    if (i >= gaussian_count) return;
+    ids[i] = i;
+    depth_keys[i] = CULLED;
+    tile_counts[i] = 0;
+
+    vec3 mean = LOAD_VEC3(parameters, MEANS_COLUMN, gaussian_count, i);
+    vec3 mean_in_view = view_from_world * vec4(mean, 1.0);
+    float opacity = sigmoid(parameters[RAW_OPACITIES_COLUMN * gaussian_count + i]);
+    // Positive phrasing: a NaN depth or opacity fails the test too.
+    if (!(mean_in_view.z > near && opacity > ALPHA_MIN)) return;
+
+    vec2 slope = clamped_slope(mean_in_view, focal, principal_point, size);
+    mat3 world_axes = rotation(unit_quat(LOAD_VEC4(parameters, QUATS_COLUMN, gaussian_count, i)));
+    vec3 scale = exp(LOAD_VEC3(parameters, LOG_SCALES_COLUMN, gaussian_count, i));
+    mat3 view_axes = mat3(view_from_world) * world_axes;
+    for (uint k = 0; k < 3; k++) view_axes[k] *= scale[k];
+    mat3 rows = transpose(view_axes);  // row k of W R S as rows[.][k]
+    vec3 u0 = focal.x / mean_in_view.z * (rows * vec3(1.0, 0.0, -slope.x));
+    vec3 u1 = focal.y / mean_in_view.z * (rows * vec3(0.0, 1.0, -slope.y));
+
+    float xx = dot(u0, u0), xy = dot(u0, u1), yy = dot(u1, u1);
+    vec3 normal = cross(u0, u1);
+    float det = dot(normal, normal) + DILATION * (xx + yy) + DILATION * DILATION;
+    vec3 cov2d = vec3(xx + DILATION, xy, yy + DILATION);
+    // Positive phrasing: an overflow or a NaN is culled.
+    if (!(det < 1e30)) return;
+
+    ProjectedSplat splat;
+    splat.mean2d = focal * mean_in_view.xy / mean_in_view.z + principal_point;
+    splat.conic = vec3(cov2d.z, -cov2d.y, cov2d.x) / det;
+    splat.opacity = opacity;
+    splat.half_extent = sqrt(splat_level(opacity) * cov2d.xz) + 0.01;
+    splats[i] = splat;
+
+    vec3 center = -transpose(mat3(view_from_world)) * view_from_world[3];
+    vec3 color = sh_color(i, normalize(mean - center));
+    for (uint c = 0; c < 3; c++) colors[CHANNELS * i + c] = color[c];
+
+    uint count = 0;
+    uvec2 tile_rows = splat_tile_rows(splat, size.y);
+    for (uint row = tile_rows.x; row < tile_rows.y; row++) {
+        uvec2 columns = splat_tiles(splat, row, size.x);
+        count += columns.y - columns.x;
+    }
+    tile_counts[i] = count;
+    // Depth is positive, so its bits sort like its value.
+    if (count > 0) depth_keys[i] = floatBitsToUint(mean_in_view.z);
+}

@@ -1,0 +1,164 @@
+#version 460
+#extension GL_GOOGLE_include_directive : require
+#include "kernel.glsl"
+#include "gaussian.glsl"
+#include "camera.glsl"
+#include "sh.glsl"
+#include "splat.glsl"
+
+//! Project backward: one thread per Gaussian, from the gradients of its splat to those of its attributes.
+//!
+//! The chain of `project` read backwards; what it needs of the forward pass it computes again. Also keeps the statistics
+//! of density control: the norm of the screen-space gradient in normalised device units, damped near the camera.
+
+layout(local_size_x = 64) in;
+
+layout(push_constant, scalar) uniform Params {
+    mat4x3 view_from_world;
+    vec2  focal;            // pixels
+    vec2  principal_point;  // pixels
+    uvec2 size;             // pixels
+    uint  gaussian_count;
+    uint  sh_degree;        // in use; at most SH_DEGREE
+    float damping_weight;   // 0 to 1: how much of the gradient statistic is damped near the camera
+    float damping_depth;    // world units: no damping beyond
+};
+
+layout(constant_id = 0) const uint SH_DEGREE = 3;  // stored
+
+layout(binding = 0) readonly  buffer Parameters { float parameters[]; };  // (columns x gaussian_count)
+layout(binding = 1) readonly  buffer Splats     { ProjectedSplat splats[]; };
+layout(binding = 2) readonly  buffer Colors     { float colors[]; };      // (gaussian_count, CHANNELS)
+layout(binding = 3) readonly  buffer TileCounts { uint tile_counts[]; };
+layout(binding = 4) readonly  buffer DSplats    { float d_splats[]; };    // (gaussian_count, 6 + CHANNELS)
+layout(binding = 5) readonly  buffer Status     { uint status[]; };
+layout(binding = 6) writeonly buffer Gradients  { float gradients[]; };   // (columns x gaussian_count)
+layout(binding = 7) buffer GradNormSums { float grad_norm_sums[]; };
+layout(binding = 8) buffer VisitCounts  { uint visit_counts[]; };
+
+const uint RECORD = 6 + CHANNELS;
+
+#define STORE_VEC3(column, i, v) { \
+    uint at = (column) * gaussian_count + 3 * (i); \
+    gradients[at] = (v).x; gradients[at + 1] = (v).y; gradients[at + 2] = (v).z; }
+#define STORE_VEC4(column, i, v) { \
+    uint at = (column) * gaussian_count + 4 * (i); \
+    gradients[at] = (v).x; gradients[at + 1] = (v).y; gradients[at + 2] = (v).z; gradients[at + 3] = (v).w; }
+
+// The gradient of a unit quaternion's rotation matrix.
+vec4 rotation_backward(vec4 q, mat3 d) {
+    float w = q.x, x = q.y, y = q.z, z = q.w;
+    return 2.0 * vec4(
+        x * (d[1][2] - d[2][1]) + y * (d[2][0] - d[0][2]) + z * (d[0][1] - d[1][0]),
+        w * (d[1][2] - d[2][1]) - 2.0 * x * (d[1][1] + d[2][2]) + y * (d[0][1] + d[1][0]) + z * (d[0][2] + d[2][0]),
+        w * (d[2][0] - d[0][2]) + x * (d[0][1] + d[1][0]) - 2.0 * y * (d[0][0] + d[2][2]) + z * (d[1][2] + d[2][1]),
+        w * (d[0][1] - d[1][0]) + x * (d[0][2] + d[2][0]) + y * (d[1][2] + d[2][1]) - 2.0 * z * (d[0][0] + d[1][1])
+    );
+}
+
+// Writes the gradients of the SH coefficients; returns that of the mean, through the viewing direction.
+vec3 sh_backward(uint i, vec3 offset, vec3 d_color) {
+    float distance = max(length(offset), 1e-12);
+    vec3 direction = offset / distance;
+    float basis[16];
+    vec3 basis_gradient[16];
+    sh_basis(sh_degree, direction, basis);
+    sh_basis_gradient(sh_degree, direction, basis_gradient);
+    STORE_VEC3(DC_COLUMN, i, basis[0] * d_color);
+    vec3 d_direction = vec3(0.0);
+    uint rest = REST_COLUMN * gaussian_count + 3 * (sh_count(SH_DEGREE) - 1) * i;
+    for (uint k = 1; k < sh_count(SH_DEGREE); k++, rest += 3) {
+        vec3 coefficient = vec3(parameters[rest], parameters[rest + 1], parameters[rest + 2]);
+        d_direction += dot(coefficient, d_color) * basis_gradient[k];
+        for (uint c = 0; c < 3; c++) gradients[rest + c] = basis[k] * d_color[c];
+    }
+    return (d_direction - direction * dot(direction, d_direction)) / distance;
+}
+
+void store_zero(uint i) {
+    STORE_VEC3(MEANS_COLUMN, i, vec3(0.0));
+    STORE_VEC4(QUATS_COLUMN, i, vec4(0.0));
+    STORE_VEC3(LOG_SCALES_COLUMN, i, vec3(0.0));
+    gradients[RAW_OPACITIES_COLUMN * gaussian_count + i] = 0.0;
+    STORE_VEC3(DC_COLUMN, i, vec3(0.0));
+    uint rest = REST_COLUMN * gaussian_count + 3 * (sh_count(SH_DEGREE) - 1) * i;
+    for (uint k = 0; k < 3 * (sh_count(SH_DEGREE) - 1); k++) gradients[rest + k] = 0.0;
+}
+
+void main() {
+    uint i = THREAD_INDEX;
+    if (i >= gaussian_count) return;
+    if (tile_counts[i] == 0) {
+        store_zero(i);
+        return;
+    }
+    ProjectedSplat splat = splats[i];
+    uint record = RECORD * i;
+    vec2 d_mean2d = vec2(d_splats[record], d_splats[record + 1]);
+    vec3 d_conic = vec3(d_splats[record + 2], d_splats[record + 3], d_splats[record + 4]);
+    float d_opacity = d_splats[record + 5];
+    vec3 d_color;
+    // A colour clamped at zero passes nothing on.
+    for (uint c = 0; c < 3; c++) d_color[c] = colors[CHANNELS * i + c] > 0.0 ? d_splats[record + 6 + c] : 0.0;
+
+    // The forward pass again.
+    mat3 view_rotation = mat3(view_from_world);
+    vec3 mean = LOAD_VEC3(parameters, MEANS_COLUMN, gaussian_count, i);
+    vec3 mean_in_view = view_from_world * vec4(mean, 1.0);
+    float z = mean_in_view.z;
+    vec2 free_slope = mean_in_view.xy / z;
+    vec2 slope = clamped_slope(mean_in_view, focal, principal_point, size);
+    vec4 quat = LOAD_VEC4(parameters, QUATS_COLUMN, gaussian_count, i);
+    vec4 unit = unit_quat(quat);
+    mat3 axes = rotation(unit);
+    vec3 scale = exp(LOAD_VEC3(parameters, LOG_SCALES_COLUMN, gaussian_count, i));
+    mat3 scaled_axes = axes;
+    for (uint k = 0; k < 3; k++) scaled_axes[k] *= scale[k];
+    mat3 world_from_view = transpose(view_rotation);
+    vec3 t0 = world_from_view * (focal.x / z * vec3(1.0, 0.0, -slope.x));  // rows of J W
+    vec3 t1 = world_from_view * (focal.y / z * vec3(0.0, 1.0, -slope.y));
+    vec3 u0 = t0 * scaled_axes, u1 = t1 * scaled_axes;
+
+    // conic = inverse(cov2d), cov2d = U U^T + 0.3 I
+    float a = splat.conic.x, b = splat.conic.y, c = splat.conic.z;
+    float d_xx = -(a * a * d_conic.x + a * b * d_conic.y + b * b * d_conic.z);
+    float d_xy = -(2.0 * a * b * d_conic.x + (a * c + b * b) * d_conic.y + 2.0 * b * c * d_conic.z);
+    float d_yy = -(b * b * d_conic.x + b * c * d_conic.y + c * c * d_conic.z);
+    vec3 d_u0 = 2.0 * d_xx * u0 + d_xy * u1;
+    vec3 d_u1 = 2.0 * d_yy * u1 + d_xy * u0;
+
+    // U = (J W) (R S)
+    mat3 d_scaled_axes = outerProduct(t0, d_u0) + outerProduct(t1, d_u1);
+    vec3 d_log_scale;
+    mat3 d_axes;
+    for (uint k = 0; k < 3; k++) {
+        d_log_scale[k] = dot(d_scaled_axes[k], scaled_axes[k]);
+        d_axes[k] = d_scaled_axes[k] * scale[k];
+    }
+    vec4 d_unit = rotation_backward(unit, d_axes);
+    float norm = length(quat);
+    vec4 d_quat = norm > 1e-12 ? (d_unit - unit * dot(unit, d_unit)) / norm : vec4(0.0);
+
+    // J = focal / z (1, 0, -slope)
+    vec3 d_j0 = view_rotation * (scaled_axes * d_u0);
+    vec3 d_j1 = view_rotation * (scaled_axes * d_u1);
+    vec2 d_slope = -focal / z * vec2(d_j0.z, d_j1.z);
+    bvec2 is_free = equal(free_slope, slope);
+    vec2 d_xy_view = focal * d_mean2d / z + mix(vec2(0.0), d_slope / z, is_free);
+    float d_z = -(focal.x * (d_j0.x - slope.x * d_j0.z) + focal.y * (d_j1.y - slope.y * d_j1.z)) / (z * z)
+        - dot(d_xy_view, free_slope);
+    vec3 center = -world_from_view * view_from_world[3];
+    vec3 d_mean = world_from_view * vec3(d_xy_view, d_z) + sh_backward(i, mean - center, d_color);
+
+    STORE_VEC3(MEANS_COLUMN, i, d_mean);
+    STORE_VEC4(QUATS_COLUMN, i, d_quat);
+    STORE_VEC3(LOG_SCALES_COLUMN, i, d_log_scale);
+    gradients[RAW_OPACITIES_COLUMN * gaussian_count + i] = d_opacity * splat.opacity * (1.0 - splat.opacity);
+
+    if (status[0] == 0) {
+        float nearness = min(1.0, z / damping_depth);
+        float damping = damping_weight * nearness * nearness + 1.0 - damping_weight;
+        grad_norm_sums[i] += damping * length(0.5 * vec2(size) * d_mean2d);
+        visit_counts[i] += 1;
+    }
+}

@@ -1,0 +1,36 @@
+#version 460
+#extension GL_GOOGLE_include_directive : require
+#include "kernel.glsl"
+#include "splat.glsl"
+
+//! Reduce records: one thread per depth rank sums its Gaussian's slots, in slot order.
+//!
+//! The same order every time gives the same bits every time.
+
+layout(local_size_x = 64) in;
+
+layout(push_constant) uniform Params { uint gaussian_count; };
+
+layout(binding = 0) readonly  buffer Counts  { uint counts[]; };  // [0]: intersections; 0 after an overflow
+layout(binding = 1) readonly  buffer Ids     { uint sorted_ids[]; };
+layout(binding = 2) readonly  buffer Ordered { uint ordered_counts[]; };
+layout(binding = 3) readonly  buffer Offsets { uint offsets[]; };
+layout(binding = 4) readonly  buffer Records { float records[]; };   // (slots, 6 + CHANNELS)
+layout(binding = 5) writeonly buffer DSplats { float d_splats[]; };  // (gaussian_count, 6 + CHANNELS)
+
+const uint RECORD = 6 + CHANNELS;
+
+void main() {
+    uint rank = THREAD_INDEX;
+    if (rank >= gaussian_count) return;
+    float sum[RECORD];
+    for (uint k = 0; k < RECORD; k++) sum[k] = 0.0;
+    if (counts[0] != 0) {
+        uint end = offsets[rank] + ordered_counts[rank];
+        for (uint slot = offsets[rank]; slot < end; slot++) {
+            for (uint k = 0; k < RECORD; k++) sum[k] += records[RECORD * slot + k];
+        }
+    }
+    uint id = sorted_ids[rank];
+    for (uint k = 0; k < RECORD; k++) d_splats[RECORD * id + k] = sum[k];
+}

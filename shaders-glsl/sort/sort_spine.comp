@@ -1,0 +1,36 @@
+#version 460
+#extension GL_GOOGLE_include_directive : require
+#include "kernel.glsl"
+#include "partition.glsl"
+
+//! Radix sort, second of three kernels a pass: where each partition begins among the keys of one digit.
+//!
+//! One subgroup per digit turns the digit's row of the table into exclusive prefix sums and leaves the
+//! row's total, which the downsweep adds up over the smaller digits.
+
+layout(local_size_x_id = 100) in;
+layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
+
+layout(push_constant) uniform Params {
+    uint count_index;  // where in `counts` the number of keys lives
+    uint capacity;     // keys
+};
+
+layout(binding = 0) readonly  buffer Counts { uint counts[]; };
+layout(binding = 1)           buffer Table  { uint table[]; };         // (digits, partitions)
+layout(binding = 2) writeonly buffer Totals { uint digit_totals[]; };  // (digits)
+
+void main() {
+    uint digit = WORKGROUP_INDEX;
+    uint partition_count = partitions_of(min(counts[count_index], capacity));
+    uint running = 0;
+    for (uint first = 0; first < partition_count; first += SUBGROUP_SIZE) {
+        uint part = first + gl_SubgroupInvocationID;
+        uint i = digit * partition_count + part;
+        uint keys = part < partition_count ? table[i] : 0;
+        uint inclusive = subgroupInclusiveAdd(keys);
+        if (part < partition_count) table[i] = running + inclusive - keys;
+        running += subgroupShuffle(inclusive, SUBGROUP_SIZE - 1);
+    }
+    if (subgroupElect()) digit_totals[digit] = running;
+}

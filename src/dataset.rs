@@ -1,0 +1,461 @@
+//! Datasets: photographs on disk become views with undistorted cameras, a split and points.
+//!
+//! The format is found by looking: NeRF-style `transforms*.json` first (the layouts of LOM and `RealX3D` included), then a
+//! COLMAP model. What the model trains on is the dark photograph (`View::image`); a normal-light photograph of the
+//! same name is a test view's reference image (`View::reference`), used for scores only and loaded for test views only.
+
+mod colmap;
+mod files;
+mod pixels;
+mod similarity;
+pub mod synthetic;
+mod transforms;
+mod undistort;
+
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::path::{Path, PathBuf};
+
+use glam::{DAffine3, DVec3};
+
+use crate::camera::{Camera, Lens};
+use crate::image::Image;
+use crate::{Error, Result};
+use files::Files;
+use pixels::Source;
+use similarity::Similarity;
+
+/// Photographs with cameras, and points of the scene they show.
+#[derive(Clone, Debug)]
+pub struct Dataset {
+    /// The folder it was loaded from.
+    pub root: PathBuf,
+    /// Sorted by name; at least one training view has an image.
+    pub views: Vec<View>,
+    /// In the cameras' world; empty where the dataset has none.
+    pub points: Vec<Point>,
+    /// What was left out, one line each: the photograph and why.
+    pub skipped: Vec<String>,
+}
+
+/// A photograph's place in the dataset.
+#[derive(Clone, Debug)]
+pub struct View {
+    /// The photograph's file name without extension; unique.
+    pub name: String,
+    /// Whether it is trained on or scored.
+    pub split: Split,
+    /// Undistorted, at the loaded resolution.
+    pub camera: Camera,
+    /// The photograph to train on; every training view has one.
+    pub image: Option<Image>,
+    /// The normal-light photograph to score against, of the camera's size; test views only.
+    pub reference: Option<Image>,
+}
+
+/// What a view is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Split {
+    /// Trained on.
+    Train,
+    /// Held out, for scores.
+    Test,
+}
+
+/// A triangulated point of the scene.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Point {
+    /// World space.
+    pub position: DVec3,
+    /// Indices into [`Dataset::views`] of those that see it, ascending; may be empty.
+    pub views: Vec<u32>,
+}
+
+/// How a dataset is loaded.
+#[derive(Clone, Debug)]
+pub struct LoadOptions {
+    /// Factor by which width and height shrink, at least 1; sizes are rounded to whole pixels.
+    pub downscale: f64,
+    /// A folder of reference images by name, in place of what is found beside the input.
+    pub reference: Option<PathBuf>,
+    /// Whether test views load their dark photograph too, where there is one.
+    pub load_low_test: bool,
+}
+
+impl Default for LoadOptions {
+    fn default() -> Self {
+        Self { downscale: 1.0, reference: None, load_low_test: true }
+    }
+}
+
+/// One view as a listing describes it, before any pixel is read.
+#[derive(Clone, Debug)]
+struct Frame {
+    name: String,
+    /// Path as listed, relative to the root.
+    listed: String,
+    /// `None`: the split rule decides.
+    split: Option<Split>,
+    /// The listed file, where it exists.
+    file: Option<PathBuf>,
+    lens: Lens,
+    /// Rigid; the world is the listing's.
+    view_from_world: DAffine3,
+}
+
+#[derive(Debug, Default)]
+struct Listing {
+    frames: Vec<Frame>,
+    skipped: Vec<String>,
+}
+
+/// Folders that hold the dark input where a normal-light twin lies beside them.
+const DARK_FOLDERS: [&str; 2] = ["low", "images_low"];
+/// Folders that may hold the normal-light twin.
+const NORMAL_FOLDERS: [&str; 4] = ["high", "val", "test", "images"];
+/// Every eighth of the name-sorted views is held out where nothing else says which.
+const TEST_EVERY: usize = 8;
+/// The largest camera-centre error, relative to the cameras' extent, at which two worlds count as the same.
+const MAX_WORLD_RESIDUAL: f64 = 0.01;
+
+impl Dataset {
+    /// Loads the dataset below `root`.
+    ///
+    /// Frames whose file is absent or does not decode are named in [`Dataset::skipped`]; test views stay as poses.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] for a downscale that makes no sense; [`Error::Input`] naming the folder or file where there is
+    /// no dataset, no training photograph left, a file cut short, two views of one name, an unsupported camera model,
+    /// or a photograph whose size contradicts its camera.
+    pub fn load(root: impl AsRef<Path>, options: &LoadOptions) -> Result<Self> {
+        let root = root.as_ref();
+        options.check()?;
+        if !root.is_dir() {
+            return Err(Error::input(root, "is not a folder; name the dataset's folder"));
+        }
+        let files = Files::default();
+        let Listing { mut frames, mut skipped } = list(root, &files)?;
+        refuse_two_of_one_name(root, &frames)?;
+        frames.sort_by(|a, b| a.name.cmp(&b.name));
+        split(root, &mut frames)?;
+
+        let sources = sources(root, &frames, options, &files, &mut skipped);
+        let views = pixels::load(sources, options.downscale, &mut skipped)?;
+        if !views.iter().any(|view| view.split == Split::Train) {
+            let first = skipped.first().map(|line| format!(" ({line})")).unwrap_or_default();
+            let problem = format!(
+                "no photograph is left to train on{first}; check the image folders and the split"
+            );
+            return Err(Error::input(root, problem));
+        }
+        let points = points(root, &views)?;
+        for line in &skipped {
+            tracing::warn!("skipped {line}");
+        }
+        tracing::info!(
+            "{}: {} views, {} points, {} skipped",
+            root.display(),
+            views.len(),
+            points.len(),
+            skipped.len()
+        );
+        Ok(Self { root: root.to_owned(), views, points, skipped })
+    }
+
+    /// The training views.
+    pub fn train_views(&self) -> impl Iterator<Item = &View> {
+        self.views.iter().filter(|view| view.split == Split::Train)
+    }
+
+    /// The held-out views.
+    pub fn test_views(&self) -> impl Iterator<Item = &View> {
+        self.views.iter().filter(|view| view.split == Split::Test)
+    }
+
+    /// The scene's size as 3DGS takes it: 1.1 times the largest distance of a training camera to their mean, world
+    /// units; 1 where all stand in one spot.
+    pub fn extent(&self) -> f64 {
+        let centers: Vec<DVec3> = self.train_views().map(|view| view.camera.center()).collect();
+        let mean = centers.iter().sum::<DVec3>() / centers.len() as f64;
+        let radius = centers.iter().map(|center| center.distance(mean)).fold(0.0, f64::max);
+        if radius > 0.0 { 1.1 * radius } else { 1.0 }
+    }
+}
+
+impl LoadOptions {
+    fn check(&self) -> Result<()> {
+        // Positive phrasing: a NaN fails the test too.
+        if !(self.downscale >= 1.0 && self.downscale.is_finite()) {
+            let problem =
+                format!("downscale {} makes no image; give a factor of 1 or more", self.downscale);
+            return Err(Error::Usage(problem));
+        }
+        match &self.reference {
+            Some(folder) if !folder.is_dir() => {
+                Err(Error::input(folder, "is not a folder of reference images"))
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+fn list(root: &Path, files: &Files) -> Result<Listing> {
+    let mut listing = Listing::default();
+    let listings = transforms::find(root);
+    for (path, split) in &listings {
+        transforms::read(root, path, *split, files, &mut listing)?;
+    }
+    if listings.is_empty() {
+        let folder = colmap::find(root, &["cameras", "images"]).ok_or_else(|| {
+            Error::input(
+                root,
+                "holds no dataset; expected transforms_train.json, transforms.json or a COLMAP model in sparse/0",
+            )
+        })?;
+        list_colmap(root, &folder, files, &mut listing)?;
+    }
+    if listing.frames.is_empty() {
+        let first = listing.skipped.first().map_or("its listing is empty", String::as_str);
+        return Err(Error::input(
+            root,
+            format!("has no usable view ({first}); export the cameras anew"),
+        ));
+    }
+    Ok(listing)
+}
+
+fn list_colmap(root: &Path, folder: &Path, files: &Files, listing: &mut Listing) -> Result<()> {
+    let lenses = colmap::read_cameras(folder)?;
+    for image in colmap::read_images(folder)? {
+        let name = image.name.replace('\\', "/");
+        let lens = lenses.get(&image.camera).copied().ok_or_else(|| {
+            Error::input(
+                folder,
+                format!("{name} has camera {}, which is not listed; export it anew", image.camera),
+            )
+        })?;
+        let Some(view_from_world) = image.view_from_world else {
+            listing.skipped.push(format!("{name}: its pose is not finite"));
+            continue;
+        };
+        let beside_root = files.find(root, &name);
+        let listed = if beside_root.is_some() { name.clone() } else { format!("images/{name}") };
+        let file = beside_root.or_else(|| files.find(&root.join("images"), &name));
+        let name = files::stem(&name).to_owned();
+        listing.frames.push(Frame { name, listed, split: None, file, lens, view_from_world });
+    }
+    Ok(())
+}
+
+fn refuse_two_of_one_name(root: &Path, frames: &[Frame]) -> Result<()> {
+    let mut listed = HashMap::new();
+    for frame in frames {
+        if let Some(other) = listed.insert(&frame.name, &frame.listed) {
+            let problem = format!(
+                "two views are named {} ({other} and {}); rename or remove one, file names must differ",
+                frame.name, frame.listed
+            );
+            return Err(Error::input(root, problem));
+        }
+    }
+    Ok(())
+}
+
+/// Frames that the listing did not assign: by `test.txt` (a name a line), else every eighth. Sorted by name already.
+fn split(root: &Path, frames: &mut [Frame]) -> Result<()> {
+    let path = root.join("test.txt");
+    let mut undecided: Vec<&mut Frame> =
+        frames.iter_mut().filter(|frame| frame.split.is_none()).collect();
+    if undecided.is_empty() || !path.is_file() {
+        for (index, frame) in undecided.into_iter().enumerate() {
+            frame.split = Some(if index % TEST_EVERY == 0 { Split::Test } else { Split::Train });
+        }
+        return Ok(());
+    }
+    let text = std::fs::read_to_string(&path)
+        .map_err(|error| Error::input(&path, format!("cannot be read: {error}")))?;
+    let mut held_out: BTreeSet<&str> =
+        text.lines().map(str::trim).filter(|line| !line.is_empty()).map(files::stem).collect();
+    for frame in &mut undecided {
+        frame.split =
+            Some(if held_out.remove(frame.name.as_str()) { Split::Test } else { Split::Train });
+    }
+    if let Some(name) = held_out.first() {
+        tracing::warn!(
+            "{}: {} names match no view, the first is {name}",
+            path.display(),
+            held_out.len()
+        );
+    }
+    Ok(())
+}
+
+/// Which files each view reads. A training view without its photograph is left out, a test view stays as a pose.
+fn sources(
+    root: &Path,
+    frames: &[Frame],
+    options: &LoadOptions,
+    files: &Files,
+    skipped: &mut Vec<String>,
+) -> Vec<Source> {
+    let training = frames.iter().filter(|frame| frame.split == Some(Split::Train));
+    let training_folders: BTreeSet<&str> = training.map(Frame::folder).collect();
+    let mut sources = Vec::new();
+    for frame in frames {
+        let split = frame.split.unwrap_or(Split::Train);
+        // A test listing names the normal-light photographs (LOM, RealX3D) unless training frames lie there too.
+        let lists_input = split == Split::Train || training_folders.contains(frame.folder());
+        let input = frame.input(root, lists_input, files);
+        let reference = match &options.reference {
+            _ if split == Split::Train => None,
+            Some(folder) => frame.find(folder, files),
+            None => frame.reference(root, input.as_ref(), files),
+        };
+        if input.is_none() && reference.is_none() {
+            let kept = if split == Split::Test { "; its pose is kept" } else { "" };
+            skipped.push(format!("{}: the file is absent{kept}", frame.listed));
+        }
+        if input.is_some() || split == Split::Test {
+            let input = input.filter(|_| split == Split::Train || options.load_low_test);
+            let Frame { name, lens, view_from_world, .. } = frame.clone();
+            sources.push(Source { name, split, lens, view_from_world, input, reference });
+        }
+    }
+    if let Some(folder) = &options.reference
+        && sources.iter().all(|source| source.reference.is_none())
+    {
+        tracing::warn!(
+            "{}: holds no photograph named like a test view; nothing will be scored",
+            folder.display()
+        );
+    }
+    sources
+}
+
+impl Frame {
+    /// The folder it is listed in.
+    fn folder(&self) -> &str {
+        self.listed.rsplit_once('/').map_or("", |(folder, _)| folder)
+    }
+
+    /// The photograph of the same name in another folder: at the same place below it, or directly in it.
+    fn find(&self, folder: &Path, files: &Files) -> Option<PathBuf> {
+        let below_first =
+            self.listed.split_once('/').map_or(self.listed.as_str(), |(_, below)| below);
+        files.find(folder, below_first).or_else(|| files.find(folder, &self.name))
+    }
+
+    /// The dark photograph; the listed file counts as that where nothing darker lies beside it.
+    fn input(&self, root: &Path, lists_input: bool, files: &Files) -> Option<PathBuf> {
+        if self.folder().split('/').any(|part| DARK_FOLDERS.contains(&part)) {
+            return self.file.clone();
+        }
+        let beside = DARK_FOLDERS.iter().find_map(|folder| self.find(&root.join(folder), files));
+        beside.or_else(|| self.file.clone().filter(|_| lists_input))
+    }
+
+    /// The normal-light photograph: the listed file where it is not the input, else one of that name beside it.
+    fn reference(&self, root: &Path, input: Option<&PathBuf>, files: &Files) -> Option<PathBuf> {
+        let beside =
+            NORMAL_FOLDERS.iter().filter_map(|folder| self.find(&root.join(folder), files));
+        self.file.clone().into_iter().chain(beside).find(|file| Some(file) != input)
+    }
+}
+
+/// The points of the dataset's COLMAP model, brought into the views' world.
+fn points(root: &Path, views: &[View]) -> Result<Vec<Point>> {
+    let Some(folder) = colmap::find(root, &["images", "points3D"]) else {
+        return Ok(Vec::new());
+    };
+    let images = colmap::read_images(&folder)?;
+    let points = colmap::read_points(&folder)?;
+    let by_name: BTreeMap<&str, u32> =
+        views.iter().zip(0..).map(|(view, index)| (view.name.as_str(), index)).collect();
+    let shared = images.iter().filter_map(|image| {
+        let view = *by_name.get(files::stem(&image.name))?;
+        Some((image.id, view, image.view_from_world?.inverse().translation))
+    });
+    let shared: Vec<(u32, u32, DVec3)> = shared.collect();
+    let pairs: Vec<_> = shared
+        .iter()
+        .map(|(_, view, center)| (*center, views[*view as usize].camera.center()))
+        .collect();
+    let Some(to_views) = same_world(&folder, &pairs) else {
+        return Ok(Vec::new());
+    };
+    let view_of: HashMap<u32, u32> =
+        shared.iter().map(|(image, view, _)| (*image, *view)).collect();
+    let point = |point: colmap::ModelPoint| {
+        let seen_by: BTreeSet<u32> =
+            point.images.iter().filter_map(|image| view_of.get(image).copied()).collect();
+        Point { position: to_views(point.position), views: seen_by.into_iter().collect() }
+    };
+    Ok(points.into_iter().map(point).collect())
+}
+
+/// The map from the model's world to the views'; a warning and `None` where the two do not belong together.
+fn same_world(folder: &Path, pairs: &[(DVec3, DVec3)]) -> Option<Box<dyn Fn(DVec3) -> DVec3>> {
+    if !pairs.is_empty() && pairs.iter().all(|(model, view)| model == view) {
+        return Some(Box::new(|point| point));
+    }
+    let folder = folder.display();
+    let Some(similarity) = Similarity::solve(pairs) else {
+        tracing::warn!(
+            "{folder}: {} shared cameras do not tell its place; its points are left out",
+            pairs.len()
+        );
+        return None;
+    };
+    let residual = similarity.residual;
+    if residual > MAX_WORLD_RESIDUAL {
+        tracing::warn!(
+            "{folder}: its cameras are off by {residual:.3} of their extent; its points are left out"
+        );
+        return None;
+    }
+    tracing::info!(
+        "{folder}: brought into the views' world, residual {residual:.1e} of the cameras' extent"
+    );
+    Some(Box::new(move |point| similarity.apply(point)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The model's cameras and the views they belong to, of a LOM scene, or `None` with a word on stdout.
+    fn lom_pairs(scene: &str) -> Option<Vec<(DVec3, DVec3)>> {
+        let root =
+            Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../shared/data/lom")).join(scene);
+        if !root.is_dir() {
+            println!("skipped: {} is absent", root.display());
+            return None;
+        }
+        let frames = list(&root, &Files::default()).unwrap().frames;
+        let images = colmap::read_images(&colmap::find(&root, &["images"]).unwrap()).unwrap();
+        let center = |pose: DAffine3| pose.inverse().translation;
+        let pairs = images.iter().map(|image| {
+            let frame = frames.iter().find(|frame| frame.name == files::stem(&image.name)).unwrap();
+            (center(image.view_from_world.unwrap()), center(frame.view_from_world))
+        });
+        Some(pairs.collect())
+    }
+
+    #[test]
+    fn loms_two_worlds_differ_by_an_exact_similarity() {
+        for (scene, count) in [("chair", 48), ("sofa", 33), ("shrub", 35)] {
+            if let Some(pairs) = lom_pairs(scene) {
+                let residual = Similarity::solve(&pairs).unwrap().residual;
+                assert!(residual < 1e-8, "{scene}: {residual}");
+                assert_eq!(pairs.len(), count);
+            }
+        }
+    }
+
+    #[test]
+    fn a_world_that_is_off_by_more_than_a_hundredth_gives_no_points() {
+        let center = |i: i32| DVec3::new(f64::from(i % 3), f64::from(i / 3), f64::from(i * i % 5));
+        let bent: Vec<_> =
+            (0..9).map(|i| (center(i), center(i) + DVec3::X * 0.3 * f64::from(i % 2))).collect();
+        assert!(same_world(Path::new("sparse/0"), &bent).is_none());
+    }
+}

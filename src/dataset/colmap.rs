@@ -1,0 +1,153 @@
+//! COLMAP models: cameras, images and points, from the binary or the text encoding.
+//!
+//! Formats: <https://colmap.github.io/format.html>. Poses are world to view, `OpenCV` axes, quaternions w first.
+
+mod binary;
+mod text;
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use glam::{DAffine3, DQuat, DVec2, DVec3};
+
+use crate::camera::{Distortion, Lens};
+use crate::{Error, Result};
+
+/// A registered photograph.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct ModelImage {
+    pub(super) id: u32,
+    pub(super) camera: u32,
+    /// Path relative to the image folder.
+    pub(super) name: String,
+    /// `None` where the model's numbers are no pose (NaN, or a rotation of length zero).
+    pub(super) view_from_world: Option<DAffine3>,
+}
+
+/// A triangulated point. Its colour is left in the file: it may come from normal-light photographs.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct ModelPoint {
+    pub(super) position: DVec3,
+    /// Ids of the images that see it.
+    pub(super) images: Vec<u32>,
+}
+
+/// The model folders that COLMAP and its users write, below a dataset's root, most likely first.
+const FOLDERS: [&str; 8] = [
+    "sparse/0",
+    "sparse",
+    "colmap_sparse/0",
+    "colmap_sparse",
+    "derived_colmap/sparse/0",
+    "colmap/sparse/0",
+    "colmap/sparse",
+    "colmap_text",
+];
+
+/// The first folder below `root` with a model's images (and with what else `needed` lists).
+pub(super) fn find(root: &Path, needed: &[&str]) -> Option<PathBuf> {
+    let complete = |folder: &PathBuf| needed.iter().all(|stem| file(folder, stem).is_some());
+    FOLDERS.iter().map(|folder| root.join(folder)).find(complete)
+}
+
+/// The lenses by camera id.
+pub(super) fn read_cameras(folder: &Path) -> Result<BTreeMap<u32, Lens>> {
+    match required(folder, "cameras")? {
+        Encoded::Binary(path) => binary::cameras(&path),
+        Encoded::Text(path) => text::cameras(&path),
+    }
+}
+
+/// The registered photographs, in the file's order.
+pub(super) fn read_images(folder: &Path) -> Result<Vec<ModelImage>> {
+    match required(folder, "images")? {
+        Encoded::Binary(path) => binary::images(&path),
+        Encoded::Text(path) => text::images(&path),
+    }
+}
+
+/// The points whose position is finite, by id; both encodings give the same order.
+pub(super) fn read_points(folder: &Path) -> Result<Vec<ModelPoint>> {
+    let points = match required(folder, "points3D")? {
+        Encoded::Binary(path) => binary::points(&path)?,
+        Encoded::Text(path) => text::points(&path)?,
+    };
+    Ok(points.into_values().filter(|point| point.position.is_finite()).collect())
+}
+
+enum Encoded {
+    Binary(PathBuf),
+    Text(PathBuf),
+}
+
+fn file(folder: &Path, stem: &str) -> Option<Encoded> {
+    let path =
+        |extension| Some(folder.join(stem).with_extension(extension)).filter(|path| path.is_file());
+    path("bin").map(Encoded::Binary).or_else(|| path("txt").map(Encoded::Text))
+}
+
+fn required(folder: &Path, stem: &str) -> Result<Encoded> {
+    file(folder, stem)
+        .ok_or_else(|| Error::input(folder, format!("has neither {stem}.bin nor {stem}.txt")))
+}
+
+/// Name and number of parameters by model id (colmap/src/colmap/sensor/models.h).
+const MODELS: [(&str, usize); 12] = [
+    ("SIMPLE_PINHOLE", 3),
+    ("PINHOLE", 4),
+    ("SIMPLE_RADIAL", 4),
+    ("RADIAL", 5),
+    ("OPENCV", 8),
+    ("OPENCV_FISHEYE", 8),
+    ("FULL_OPENCV", 12),
+    ("FOV", 5),
+    ("SIMPLE_RADIAL_FISHEYE", 4),
+    ("RADIAL_FISHEYE", 5),
+    ("THIN_PRISM_FISHEYE", 12),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+];
+
+/// A camera of a model by name; the error is what to tell the user.
+fn lens(model: &str, width: u64, height: u64, parameters: &[f64]) -> Result<Lens, String> {
+    let (focal, principal_point, distortion) = match (model, parameters) {
+        ("SIMPLE_PINHOLE", &[f, cx, cy]) => {
+            (DVec2::splat(f), DVec2::new(cx, cy), Distortion::default())
+        }
+        ("PINHOLE", &[fx, fy, cx, cy]) => {
+            (DVec2::new(fx, fy), DVec2::new(cx, cy), Distortion::default())
+        }
+        ("SIMPLE_RADIAL", &[f, cx, cy, k1]) => {
+            (DVec2::splat(f), DVec2::new(cx, cy), Distortion { k1, ..Distortion::default() })
+        }
+        ("RADIAL", &[f, cx, cy, k1, k2]) => {
+            (DVec2::splat(f), DVec2::new(cx, cy), Distortion { k1, k2, ..Distortion::default() })
+        }
+        ("OPENCV", &[fx, fy, cx, cy, k1, k2, p1, p2]) => {
+            (DVec2::new(fx, fy), DVec2::new(cx, cy), Distortion { k1, k2, p1, p2 })
+        }
+        ("SIMPLE_PINHOLE" | "PINHOLE" | "SIMPLE_RADIAL" | "RADIAL" | "OPENCV", _) => {
+            return Err(format!(
+                "has {} parameters, {model} takes another number",
+                parameters.len()
+            ));
+        }
+        _ => {
+            return Err(format!(
+                "has the unsupported model {model}; run COLMAP's image_undistorter and load its PINHOLE model"
+            ));
+        }
+    };
+    let side = |pixels: u64| u32::try_from(pixels).unwrap_or(u32::MAX);
+    let lens =
+        Lens { width: side(width), height: side(height), focal, principal_point, distortion };
+    lens.problem()
+        .map_or(Ok(lens), |problem| Err(format!("is unusable: {problem}; export the model anew")))
+}
+
+fn pose(quaternion: [f64; 4], translation: [f64; 3]) -> Option<DAffine3> {
+    let [w, x, y, z] = quaternion;
+    let rotation = DQuat::from_xyzw(x, y, z, w);
+    let translation = DVec3::from_array(translation);
+    let usable = rotation.is_finite() && rotation.length() > 1e-6 && translation.is_finite();
+    usable.then(|| DAffine3::from_rotation_translation(rotation.normalize(), translation))
+}

@@ -1,0 +1,168 @@
+//! From files to views: decode, check against the camera, undistort, shrink. Parallel over views.
+
+use std::path::{Path, PathBuf};
+
+use glam::DAffine3;
+use rayon::prelude::*;
+
+use super::undistort::Undistortion;
+use super::{Split, View};
+use crate::camera::{Camera, Lens};
+use crate::image::Image;
+use crate::{Error, Result};
+
+/// The shortest side that leaves something to train on, pixels.
+const MIN_SIDE: u32 = 16;
+
+/// What a view is made of.
+#[derive(Clone, Debug)]
+pub(super) struct Source {
+    pub(super) name: String,
+    pub(super) split: Split,
+    /// As listed; fitted to the photograph's size here.
+    pub(super) lens: Lens,
+    pub(super) view_from_world: DAffine3,
+    pub(super) input: Option<PathBuf>,
+    pub(super) reference: Option<PathBuf>,
+}
+
+/// The views in order of name. Files that do not decode are named in `skipped`.
+pub(super) fn load(
+    sources: Vec<Source>,
+    downscale: f64,
+    skipped: &mut Vec<String>,
+) -> Result<Vec<View>> {
+    let mut groups: Vec<(Lens, Vec<Source>)> = Vec::new();
+    for source in sources {
+        let source = Source { lens: fitted_lens(&source)?, ..source };
+        match groups.iter_mut().find(|(lens, _)| *lens == source.lens) {
+            Some((_, group)) => group.push(source),
+            None => groups.push((source.lens, vec![source])),
+        }
+    }
+    let loaded = groups.into_par_iter().map(|(lens, group)| load_group(&lens, group, downscale));
+    let loaded = loaded.collect::<Result<Vec<_>>>()?;
+    let mut loaded: Vec<Loaded> = loaded.into_iter().flatten().collect();
+    loaded.sort_by(|a, b| a.name.cmp(&b.name));
+    let mut views = Vec::with_capacity(loaded.len());
+    for Loaded { view, problems, .. } in loaded {
+        views.extend(view);
+        skipped.extend(problems);
+    }
+    Ok(views)
+}
+
+struct Loaded {
+    name: String,
+    /// `None`: a training view whose photograph does not decode.
+    view: Option<View>,
+    problems: Vec<String>,
+}
+
+/// The listed lens over the photograph as it is: the input's size, without one the reference image's.
+fn fitted_lens(source: &Source) -> Result<Lens> {
+    let lens = source.lens;
+    // What has no readable header is named when it is decoded.
+    let sized = [&source.input, &source.reference].into_iter().flatten();
+    let sized = sized.filter_map(|path| Some((path, Image::size_of(path).ok()?)));
+    let Some((path, (width, height))) = sized.clone().next() else {
+        return Ok(lens);
+    };
+    let fitted =
+        lens.fitted(width, height).ok_or_else(|| disagreement(path, (width, height), &lens))?;
+    if (width, height) != (lens.width, lens.height) {
+        tracing::info!(
+            "{}: is {width}x{height}, its camera {}x{}; intrinsics rescaled",
+            path.display(),
+            lens.width,
+            lens.height
+        );
+    }
+    Ok(fitted)
+}
+
+fn disagreement(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Error {
+    let (w, h) = (lens.width, lens.height);
+    let problem = format!(
+        "is {width}x{height} but its camera is {w}x{h}; use the photographs that the cameras were made with"
+    );
+    Error::input(path, problem)
+}
+
+/// Views of one lens share its undistortion map.
+fn load_group(lens: &Lens, group: Vec<Source>, downscale: f64) -> Result<Vec<Loaded>> {
+    let side = |pixels: u32| (f64::from(pixels) / downscale).round() as u32;
+    let size = (side(lens.width), side(lens.height));
+    let name = group.first().map_or("", |source| source.name.as_str());
+    if size.0.min(size.1) < MIN_SIDE {
+        return Err(Error::Usage(format!(
+            "downscale {downscale} leaves {}x{} pixels of view {name}, at least {MIN_SIDE} are needed; lower it",
+            size.0, size.1
+        )));
+    }
+    let undistortion = (!lens.is_pinhole()).then(|| {
+        Undistortion::new(lens).ok_or_else(|| {
+            let problem = "its distortion coefficients describe no lens; calibrate again or undistort with COLMAP";
+            Error::input(name, problem)
+        })
+    });
+    let undistortion = undistortion.transpose()?;
+    group
+        .into_par_iter()
+        .map(|source| load_view(source, lens, undistortion.as_ref(), size))
+        .collect()
+}
+
+fn load_view(
+    source: Source,
+    lens: &Lens,
+    undistortion: Option<&Undistortion>,
+    size: (u32, u32),
+) -> Result<Loaded> {
+    let Source { name, split, view_from_world, input, reference, .. } = source;
+    let mut problems = Vec::new();
+    let mut image = |path: Option<PathBuf>| -> Result<Option<Image>> {
+        let Some(path) = path else { return Ok(None) };
+        match Image::load(&path) {
+            Ok(image) => prepared(image, &path, lens, undistortion, size).map(Some),
+            Err(error) => {
+                problems.push(error.to_string());
+                Ok(None)
+            }
+        }
+    };
+    let (image, reference) = (image(input)?, image(reference)?);
+    let camera = Camera {
+        width: lens.width,
+        height: lens.height,
+        focal: undistortion.map_or(lens.focal, |undistortion| undistortion.focal),
+        principal_point: lens.principal_point,
+        view_from_world,
+    };
+    let camera = camera.resized(size.0, size.1);
+    let view = View { name: name.clone(), split, camera, image, reference };
+    let view = (split == Split::Test || view.image.is_some()).then_some(view);
+    Ok(Loaded { name, view, problems })
+}
+
+fn prepared(
+    image: Image,
+    path: &Path,
+    lens: &Lens,
+    undistortion: Option<&Undistortion>,
+    size: (u32, u32),
+) -> Result<Image> {
+    let (width, height) = (image.width, image.height);
+    if lens.fitted(width, height).is_none() {
+        return Err(disagreement(path, (width, height), lens));
+    }
+    // A reference image may be of another resolution than the input.
+    let image = if (width, height) == (lens.width, lens.height) {
+        image
+    } else {
+        image.resized(lens.width, lens.height)
+    };
+    let image =
+        undistortion.map_or_else(|| image.clone(), |undistortion| undistortion.apply(&image));
+    Ok(image.resized(size.0, size.1))
+}

@@ -1,0 +1,112 @@
+//! One self-contained HTML page of a run: tables, plots and pictures side by side, without external resources.
+
+use std::fmt::Write as _;
+
+use crate::image::Image;
+
+pub use self::plot::{Series, plot};
+pub use self::table::{Best, Column, Table};
+
+mod data_uri;
+mod plot;
+mod table;
+
+/// A page. Every text is escaped; `plots` are SVG as [`plot`] gives it.
+#[derive(Clone, Debug, Default)]
+pub struct Report {
+    /// The heading, also the window's title.
+    pub title: String,
+    /// The paragraphs under the heading.
+    pub intro: Vec<String>,
+    /// Tables of numbers, in order.
+    pub tables: Vec<Table>,
+    /// Plots, in order.
+    pub plots: Vec<String>,
+    /// Rows of pictures, in order.
+    pub comparisons: Vec<Comparison>,
+}
+
+/// Pictures of one view side by side.
+#[derive(Clone, Debug, Default)]
+pub struct Comparison {
+    /// The view's name.
+    pub title: String,
+    /// From left to right.
+    pub pictures: Vec<Picture>,
+}
+
+/// A picture with what is said beneath it.
+#[derive(Clone, Debug)]
+pub struct Picture {
+    /// What it shows.
+    pub caption: String,
+    /// Its scores in a few words; may be empty.
+    pub scores: String,
+    /// The picture itself, embedded as an 8-bit PNG.
+    pub image: Image,
+}
+
+impl Report {
+    /// The page as HTML.
+    pub fn html(&self) -> String {
+        let title = escape(&self.title);
+        let mut html = format!(
+            "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
+             <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
+             <title>{title}</title>\n<style>\n{}</style>\n</head>\n<body>\n<h1>{title}</h1>\n",
+            include_str!("report/style.css")
+        );
+        // Writing to a string cannot fail, so the results below hold nothing.
+        for paragraph in &self.intro {
+            let _ = writeln!(html, "<p>{}</p>", escape(paragraph));
+        }
+        for table in &self.tables {
+            html.push_str(&table.html());
+        }
+        for plot in &self.plots {
+            let _ = writeln!(html, "<figure class=\"plot\">{plot}</figure>");
+        }
+        for comparison in &self.comparisons {
+            html.push_str(&comparison.html());
+        }
+        html.push_str("</body>\n</html>\n");
+        html
+    }
+}
+
+impl Comparison {
+    fn html(&self) -> String {
+        let mut html =
+            format!("<section>\n<h2>{}</h2>\n<div class=\"pictures\">\n", escape(&self.title));
+        for Picture { caption, scores, image } in &self.pictures {
+            let caption = escape(caption);
+            let _ = writeln!(
+                html,
+                "<figure><img src=\"{}\" width=\"{}\" height=\"{}\" alt=\"{caption}\">\
+                 <figcaption><b>{caption}</b> <span>{}</span></figcaption></figure>",
+                data_uri::png(image),
+                image.width,
+                image.height,
+                escape(scores)
+            );
+        }
+        html.push_str("</div>\n</section>\n");
+        html
+    }
+}
+
+/// Text as HTML and SVG show it, also inside a quoted attribute.
+fn escape(text: &str) -> String {
+    let mut escaped = String::with_capacity(text.len());
+    for character in text.chars() {
+        match character {
+            '&' => escaped.push_str("&amp;"),
+            '<' => escaped.push_str("&lt;"),
+            '>' => escaped.push_str("&gt;"),
+            '"' => escaped.push_str("&quot;"),
+            '\'' => escaped.push_str("&#39;"),
+            other => escaped.push(other),
+        }
+    }
+    escaped
+}

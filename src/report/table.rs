@@ -1,0 +1,115 @@
+//! A table of numbers, as HTML and as Markdown.
+
+use std::fmt::Write as _;
+
+use super::escape;
+
+/// Which value of a column is marked.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Best {
+    /// None.
+    #[default]
+    Unmarked,
+    /// The least.
+    Least,
+    /// The greatest.
+    Greatest,
+}
+
+/// A column of numbers.
+#[derive(Clone, Debug, Default)]
+pub struct Column {
+    /// The heading.
+    pub name: String,
+    /// Digits after the decimal point.
+    pub digits: usize,
+    /// Which value is marked.
+    pub best: Best,
+}
+
+/// A table: a label and a number per column in each row.
+#[derive(Clone, Debug, Default)]
+pub struct Table {
+    /// The caption; may be empty.
+    pub title: String,
+    /// The heading of the labels.
+    pub label: String,
+    /// The columns after the labels.
+    pub columns: Vec<Column>,
+    /// Each row's label and numbers; a number that is missing (or not a number) shows as a dash.
+    pub rows: Vec<(String, Vec<Option<f64>>)>,
+}
+
+impl Table {
+    /// The table as a section of an HTML page, the best values marked.
+    pub fn html(&self) -> String {
+        let mut html = format!(
+            "<div class=\"table\"><table>\n<caption>{}</caption>\n<thead><tr><th scope=\"col\">{}</th>",
+            escape(&self.title),
+            escape(&self.label)
+        );
+        // Writing to a string cannot fail, so the results below hold nothing.
+        for column in &self.columns {
+            let _ = write!(html, "<th scope=\"col\">{}</th>", escape(&column.name));
+        }
+        html.push_str("</tr></thead>\n<tbody>\n");
+        for (row, (label, _)) in self.rows.iter().enumerate() {
+            let _ = write!(html, "<tr><td>{}</td>", escape(label));
+            for column in 0..self.columns.len() {
+                let class = if self.is_best(row, column) { " class=\"best\"" } else { "" };
+                let _ = write!(html, "<td{class}>{}</td>", self.cell(row, column));
+            }
+            html.push_str("</tr>\n");
+        }
+        html.push_str("</tbody>\n</table></div>\n");
+        html
+    }
+
+    /// The table as Markdown (GitHub's), the best values bold; the title is left to the page.
+    pub fn markdown(&self) -> String {
+        let plain = |text: &str| text.replace('|', "\\|").replace(['\n', '\r'], " ");
+        let mut markdown = format!("| {} |", plain(&self.label));
+        for column in &self.columns {
+            let _ = write!(markdown, " {} |", plain(&column.name));
+        }
+        let _ = writeln!(markdown, "\n| --- |{}", " ---: |".repeat(self.columns.len()));
+        for (row, (label, _)) in self.rows.iter().enumerate() {
+            let _ = write!(markdown, "| {} |", plain(label));
+            for column in 0..self.columns.len() {
+                let mark = if self.is_best(row, column) { "**" } else { "" };
+                let _ = write!(markdown, " {mark}{}{mark} |", self.cell(row, column));
+            }
+            markdown.push('\n');
+        }
+        markdown
+    }
+
+    fn value(&self, row: usize, column: usize) -> Option<f64> {
+        self.rows[row].1.get(column).copied().flatten().filter(|value| !value.is_nan())
+    }
+
+    fn cell(&self, row: usize, column: usize) -> String {
+        let digits = self.columns[column].digits;
+        match self.value(row, column) {
+            Some(value) if value == f64::INFINITY => "∞".to_owned(),
+            Some(value) => format!("{value:.digits$}"),
+            None => "–".to_owned(),
+        }
+    }
+
+    /// Values that print alike are equally good; a lone value is not marked.
+    fn is_best(&self, row: usize, column: usize) -> bool {
+        let values: Vec<f64> =
+            (0..self.rows.len()).filter_map(|row| self.value(row, column)).collect();
+        let best = match self.columns[column].best {
+            Best::Unmarked => return false,
+            Best::Least => values.iter().copied().min_by(f64::total_cmp),
+            Best::Greatest => values.iter().copied().max_by(f64::total_cmp),
+        };
+        let digits = self.columns[column].digits;
+        let is_equal =
+            |best: f64, value: f64| format!("{best:.digits$}") == format!("{value:.digits$}");
+        values.len() > 1
+            && best.zip(self.value(row, column)).is_some_and(|(best, value)| is_equal(best, value))
+    }
+}

@@ -1,0 +1,214 @@
+//! The scene: 3D Gaussians on the host, and the one table of their attributes.
+
+use std::ops::Range;
+
+use glam::Vec3;
+
+pub mod init;
+pub mod ply;
+
+/// The constant basis function of the spherical harmonics, 1 / (2 sqrt(pi)).
+pub const SH_C0: f32 = 0.282_094_79;
+
+/// The highest SH degree that the kernels know.
+pub const MAX_SH_DEGREE: u32 = 3;
+
+/// Something that every Gaussian has; the order is that of the planes in memory.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Attribute {
+    /// Position in the world.
+    Means,
+    /// Rotation, (w, x, y, z), not normalised.
+    Quats,
+    /// Natural logarithms of the standard deviations along the rotated axes.
+    LogScales,
+    /// Opacity before the sigmoid.
+    RawOpacities,
+    /// SH coefficients of degree 0, RGB; the colour is 0.5 + [`SH_C0`] times this.
+    Dc,
+    /// SH coefficients above degree 0, coefficient-major, RGB.
+    Rest,
+}
+
+/// All that is to know about one attribute.
+#[derive(Debug)]
+pub struct AttributeSpec {
+    /// Which attribute this row describes.
+    pub attribute: Attribute,
+    /// The name used in logs, buffers and timings.
+    pub name: &'static str,
+    /// Floats per Gaussian at an SH degree.
+    pub width: fn(sh_degree: u32) -> usize,
+    /// Adam's initial learning rate (3DGS's `OptimizationParams`).
+    pub learning_rate: f64,
+    /// Whether the learning rate is multiplied by the extent of the cameras.
+    pub scales_with_extent: bool,
+    /// The PLY property at a position among the attribute's properties (INRIA layout).
+    pub ply_property: fn(position: usize) -> String,
+}
+
+/// The one table of attributes; `shaders-glsl/include/gaussian.glsl` is its device side.
+pub const ATTRIBUTES: [AttributeSpec; 6] = [
+    AttributeSpec {
+        attribute: Attribute::Means,
+        name: "means",
+        width: |_| 3,
+        learning_rate: 1.6e-4,
+        scales_with_extent: true,
+        ply_property: |position| ["x", "y", "z"][position].to_owned(),
+    },
+    AttributeSpec {
+        attribute: Attribute::Quats,
+        name: "quats",
+        width: |_| 4,
+        learning_rate: 1e-3,
+        scales_with_extent: false,
+        ply_property: |position| format!("rot_{position}"),
+    },
+    AttributeSpec {
+        attribute: Attribute::LogScales,
+        name: "log_scales",
+        width: |_| 3,
+        learning_rate: 5e-3,
+        scales_with_extent: false,
+        ply_property: |position| format!("scale_{position}"),
+    },
+    AttributeSpec {
+        attribute: Attribute::RawOpacities,
+        name: "raw_opacities",
+        width: |_| 1,
+        learning_rate: 0.05,
+        scales_with_extent: false,
+        ply_property: |_| "opacity".to_owned(),
+    },
+    AttributeSpec {
+        attribute: Attribute::Dc,
+        name: "dc",
+        width: |_| 3,
+        learning_rate: 2.5e-3,
+        scales_with_extent: false,
+        ply_property: |position| format!("f_dc_{position}"),
+    },
+    AttributeSpec {
+        attribute: Attribute::Rest,
+        name: "rest",
+        width: |sh_degree| 3 * rest_coefficients(sh_degree),
+        learning_rate: 1.25e-4,
+        scales_with_extent: false,
+        ply_property: |position| format!("f_rest_{position}"),
+    },
+];
+
+/// SH coefficients above degree 0: (degree + 1)^2 - 1.
+pub const fn rest_coefficients(sh_degree: u32) -> usize {
+    ((sh_degree + 1) * (sh_degree + 1) - 1) as usize
+}
+
+/// Floats per Gaussian, all attributes together.
+pub fn width(sh_degree: u32) -> usize {
+    ATTRIBUTES.iter().map(|spec| (spec.width)(sh_degree)).sum()
+}
+
+impl Attribute {
+    /// The attribute's row of [`ATTRIBUTES`].
+    pub const fn spec(self) -> &'static AttributeSpec {
+        &ATTRIBUTES[self as usize]
+    }
+
+    /// The floats per Gaussian that come before this attribute, at any SH degree: its plane begins at this times
+    /// the number of Gaussians.
+    pub fn column(self) -> usize {
+        // Only the last attribute's width depends on the degree.
+        ATTRIBUTES[..self as usize].iter().map(|spec| (spec.width)(0)).sum()
+    }
+}
+
+/// 3D Gaussians, stored as planes: all means, then all quats, and so on in the order of [`ATTRIBUTES`].
+#[derive(Clone, Debug, PartialEq)]
+pub struct Gaussians {
+    /// The number of Gaussians.
+    pub count: usize,
+    /// The SH degree that there is room for, 0 to [`MAX_SH_DEGREE`].
+    pub sh_degree: u32,
+    /// `count * width(sh_degree)` floats.
+    pub parameters: Vec<f32>,
+}
+
+impl Gaussians {
+    /// `count` Gaussians with every parameter zero.
+    pub fn zeros(count: usize, sh_degree: u32) -> Self {
+        Self { count, sh_degree, parameters: vec![0.0; count * width(sh_degree)] }
+    }
+
+    /// Where an attribute lies in [`Gaussians::parameters`].
+    pub fn plane(&self, attribute: Attribute) -> Range<usize> {
+        let begin = attribute.column() * self.count;
+        begin..begin + (attribute.spec().width)(self.sh_degree) * self.count
+    }
+
+    /// Positions in the world, (count).
+    pub fn means(&self) -> &[Vec3] {
+        bytemuck::cast_slice(&self.parameters[self.plane(Attribute::Means)])
+    }
+
+    /// Positions in the world, (count), to change.
+    pub fn means_mut(&mut self) -> &mut [Vec3] {
+        let plane = self.plane(Attribute::Means);
+        bytemuck::cast_slice_mut(&mut self.parameters[plane])
+    }
+
+    /// Rotations (w, x, y, z), not normalised, (count).
+    pub fn quats(&self) -> &[[f32; 4]] {
+        bytemuck::cast_slice(&self.parameters[self.plane(Attribute::Quats)])
+    }
+
+    /// Rotations (w, x, y, z), (count), to change.
+    pub fn quats_mut(&mut self) -> &mut [[f32; 4]] {
+        let plane = self.plane(Attribute::Quats);
+        bytemuck::cast_slice_mut(&mut self.parameters[plane])
+    }
+
+    /// Natural logarithms of the standard deviations, (count).
+    pub fn log_scales(&self) -> &[Vec3] {
+        bytemuck::cast_slice(&self.parameters[self.plane(Attribute::LogScales)])
+    }
+
+    /// Natural logarithms of the standard deviations, (count), to change.
+    pub fn log_scales_mut(&mut self) -> &mut [Vec3] {
+        let plane = self.plane(Attribute::LogScales);
+        bytemuck::cast_slice_mut(&mut self.parameters[plane])
+    }
+
+    /// Opacities before the sigmoid, (count).
+    pub fn raw_opacities(&self) -> &[f32] {
+        &self.parameters[self.plane(Attribute::RawOpacities)]
+    }
+
+    /// Opacities before the sigmoid, (count), to change.
+    pub fn raw_opacities_mut(&mut self) -> &mut [f32] {
+        let plane = self.plane(Attribute::RawOpacities);
+        &mut self.parameters[plane]
+    }
+
+    /// SH coefficients of degree 0, RGB, (count).
+    pub fn dc(&self) -> &[Vec3] {
+        bytemuck::cast_slice(&self.parameters[self.plane(Attribute::Dc)])
+    }
+
+    /// SH coefficients of degree 0, RGB, (count), to change.
+    pub fn dc_mut(&mut self) -> &mut [Vec3] {
+        let plane = self.plane(Attribute::Dc);
+        bytemuck::cast_slice_mut(&mut self.parameters[plane])
+    }
+
+    /// SH coefficients above degree 0, RGB, (count, [`rest_coefficients`]).
+    pub fn rest(&self) -> &[Vec3] {
+        bytemuck::cast_slice(&self.parameters[self.plane(Attribute::Rest)])
+    }
+
+    /// SH coefficients above degree 0, RGB, (count, [`rest_coefficients`]), to change.
+    pub fn rest_mut(&mut self) -> &mut [Vec3] {
+        let plane = self.plane(Attribute::Rest);
+        bytemuck::cast_slice_mut(&mut self.parameters[plane])
+    }
+}

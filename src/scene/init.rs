@@ -1,0 +1,221 @@
+//! The Gaussians that training begins with.
+
+use std::borrow::Borrow;
+use std::num::NonZero;
+
+use glam::{DVec2, DVec3, Vec3};
+use kiddo::{ImmutableKdTree, SquaredEuclidean};
+use rayon::prelude::*;
+
+use super::{Gaussians, SH_C0};
+use crate::camera::Camera;
+use crate::dataset::{Point, Split, View};
+use crate::image::Image;
+use crate::random::Stream;
+use crate::{Error, Result};
+
+/// The opacity of every new Gaussian (3DGS).
+const OPACITY: f32 = 0.1;
+
+/// The least mean squared distance to the neighbours, world units squared (3DGS).
+const LEAST_SQUARED_DISTANCE: f64 = 1e-7;
+
+/// The standard deviation of a Gaussian that has no neighbour at all, world units.
+const LONE_SCALE: f64 = 0.01;
+
+/// One round Gaussian per point, in the points' order.
+///
+/// Opacity 0.1, no rotation, SH degree 0 such that the colour is `colors[i]` (sRGB-encoded, [0, 1]), nothing above
+/// it. The standard deviation is the root of the mean squared distance to the three nearest other positions (3DGS);
+/// coincident points count as one position, so duplicates do not shrink to nothing. With fewer than four positions
+/// the mean goes over those there are; a single position has the standard deviation 0.01.
+///
+/// # Errors
+/// [`Error::Usage`] where a position or colour is not finite or their numbers differ.
+pub fn from_points(positions: &[DVec3], colors: &[Vec3], sh_degree: u32) -> Result<Gaussians> {
+    if positions.len() != colors.len() {
+        return Err(Error::Usage(format!(
+            "{} points have {} colours",
+            positions.len(),
+            colors.len()
+        )));
+    }
+    let finite = |(position, color): (&DVec3, &Vec3)| position.is_finite() && color.is_finite();
+    if let Some(point) = positions.iter().zip(colors).position(|pair| !finite(pair)) {
+        return Err(Error::Usage(format!(
+            "point {point} has a position or colour that is not finite"
+        )));
+    }
+
+    let mut gaussians = Gaussians::zeros(positions.len(), sh_degree);
+    for (mean, position) in gaussians.means_mut().iter_mut().zip(positions) {
+        *mean = position.as_vec3();
+    }
+    gaussians.quats_mut().fill([1.0, 0.0, 0.0, 0.0]);
+    for (log_scale, scale) in gaussians.log_scales_mut().iter_mut().zip(scales(positions)?) {
+        *log_scale = Vec3::splat(scale.ln() as f32);
+    }
+    gaussians.raw_opacities_mut().fill((OPACITY / (1.0 - OPACITY)).ln());
+    for (dc, color) in gaussians.dc_mut().iter_mut().zip(colors) {
+        *dc = (color - 0.5) / SH_C0;
+    }
+    Ok(gaussians)
+}
+
+/// The standard deviation of each point's Gaussian, world units.
+fn scales(positions: &[DVec3]) -> Result<Vec<f64>> {
+    const NEIGHBOURS: usize = 3;
+    // Adding zero turns -0 into 0, so that equal coordinates have equal bits.
+    let key = |position: &DVec3| (*position + 0.0).to_array().map(f64::to_bits);
+    let mut distinct: Vec<_> = positions.iter().map(key).collect();
+    distinct.sort_unstable();
+    distinct.dedup();
+    let distinct: Vec<[f64; 3]> =
+        distinct.into_iter().map(|bits| bits.map(f64::from_bits)).collect();
+    if distinct.len() <= 1 {
+        return Ok(vec![LONE_SCALE; positions.len()]);
+    }
+
+    let tree: ImmutableKdTree<f64, 3> = ImmutableKdTree::new_from_slice(&distinct)
+        .map_err(|error| Error::Usage(format!("the points have no neighbours: {error}")))?;
+    // The nearest position is the point itself.
+    let wanted = NonZero::<usize>::MIN.saturating_add(NEIGHBOURS);
+    let scale = |position: &DVec3| {
+        let nearest =
+            tree.query(&position.to_array()).nearest_n::<SquaredEuclidean<f64>>(wanted).execute();
+        let others = &nearest[1..];
+        let mean =
+            others.iter().map(|neighbour| neighbour.distance).sum::<f64>() / others.len() as f64;
+        mean.max(LEAST_SQUARED_DISTANCE).sqrt()
+    };
+    Ok(positions.par_iter().map(scale).collect())
+}
+
+/// `count` random positions inside what the cameras see, for captures without points; none without cameras.
+///
+/// Each lies at a uniform place of a random camera's image, at a depth that is log-uniform between half the
+/// capture's radius and five times it (radius: the greatest distance of a camera from the cameras' mean; 1 where all
+/// cameras are in one place). A position that a second camera sees is preferred: its depth can be learned.
+pub fn random(cameras: &[Camera], count: usize, seed: u64) -> Vec<DVec3> {
+    const TRIES: u64 = 8;
+    const DRAWS_PER_TRY: u64 = 4;
+    if cameras.is_empty() {
+        return Vec::new();
+    }
+    let radius = radius(cameras);
+    let (near, far) = (0.5 * radius, 5.0 * radius);
+    let draw = |point: u64| {
+        let stream = Stream::new(seed, point);
+        let position = |attempt: u64| {
+            let uniform = |draw: u64| stream.uniform(attempt * DRAWS_PER_TRY + draw);
+            let camera = &cameras[(uniform(0) * cameras.len() as f64) as usize];
+            let pixel = DVec2::new(
+                uniform(1) * f64::from(camera.width),
+                uniform(2) * f64::from(camera.height),
+            );
+            let depth = near * (far / near).powf(uniform(3));
+            let in_view = ((pixel - camera.principal_point) / camera.focal).extend(1.0) * depth;
+            camera.view_from_world.inverse().transform_point3(in_view)
+        };
+        let seen_twice = |position: &DVec3| {
+            cameras
+                .iter()
+                .filter(|camera| pixel_inside(camera, *position).is_some())
+                .nth(1)
+                .is_some()
+        };
+        (1..TRIES).map(position).find(seen_twice).unwrap_or_else(|| position(0))
+    };
+    (0..count as u64).into_par_iter().map(draw).collect()
+}
+
+/// The greatest distance of a camera from the cameras' mean, world units; 1 where that is zero.
+fn radius(cameras: &[Camera]) -> f64 {
+    let centers: Vec<DVec3> = cameras.iter().map(Camera::center).collect();
+    let mean = centers.iter().sum::<DVec3>() / centers.len() as f64;
+    let radius = centers.iter().map(|center| center.distance(mean)).fold(0.0, f64::max);
+    // Below this the spread is the rounding of one place's coordinates.
+    let least = 1e-9 * mean.length().max(1.0);
+    if radius > least { radius } else { 1.0 }
+}
+
+/// Where a camera sees a position, pixels; none behind the camera or outside its image.
+fn pixel_inside(camera: &Camera, position: DVec3) -> Option<DVec2> {
+    let size = DVec2::new(camera.width.into(), camera.height.into());
+    camera
+        .project(position)
+        .filter(|pixel| pixel.cmpge(DVec2::ZERO).all() && pixel.cmplt(size).all())
+}
+
+/// The colour of each point: the mean of what the training views that see it show in their targets, RGB.
+///
+/// A point is seen by the training views of its track; without any, by every training view that it lies inside of. A
+/// point that no training view sees gets the mean grey of the targets. `target` gives the target of a view (an index
+/// into `views`), or nothing where there is none; it is asked once per training view, in order, so it may compute.
+///
+/// # Errors
+/// Those of `target`.
+pub fn colors_from_views<I: Borrow<Image>>(
+    points: &[Point],
+    views: &[View],
+    mut target: impl FnMut(usize) -> Result<Option<I>>,
+) -> Result<Vec<Vec3>> {
+    let mut seen = vec![[Mean::default(); 2]; points.len()];
+    let mut grey = Mean::default();
+    for (index, view) in views.iter().enumerate().filter(|(_, view)| view.split == Split::Train) {
+        let Some(target) = target(index)? else { continue };
+        let target = target.borrow();
+        grey.add(mean_grey(target));
+        seen.par_iter_mut().zip(points).for_each(|([tracked, inside], point)| {
+            let Some(pixel) = pixel_inside(&view.camera, point.position) else { return };
+            let color = bilinear(target, pixel);
+            inside.add(color);
+            if point.views.contains(&(index as u32)) {
+                tracked.add(color);
+            }
+        });
+    }
+    let grey = grey.value().unwrap_or(Vec3::splat(0.5));
+    let color = |[tracked, inside]: [Mean; 2]| tracked.value().or(inside.value()).unwrap_or(grey);
+    Ok(seen.into_iter().map(color).collect())
+}
+
+/// A running mean of colours.
+#[derive(Clone, Copy, Default)]
+struct Mean {
+    sum: Vec3,
+    count: u32,
+}
+
+impl Mean {
+    fn add(&mut self, color: Vec3) {
+        self.sum += color;
+        self.count += 1;
+    }
+
+    fn value(self) -> Option<Vec3> {
+        (self.count > 0).then(|| self.sum / self.count as f32)
+    }
+}
+
+fn mean_grey(image: &Image) -> Vec3 {
+    let sum: f64 = image.data.iter().copied().map(f64::from).sum();
+    Vec3::splat((sum / image.data.len().max(1) as f64) as f32)
+}
+
+/// The image's value at a place in pixels (pixel centres at +0.5), RGB; beyond the outermost centres the edge goes on.
+fn bilinear(image: &Image, pixel: DVec2) -> Vec3 {
+    let (width, height) = (image.width as usize, image.height as usize);
+    let axis = |place: f64, size: usize| {
+        let place = (place - 0.5).clamp(0.0, size.saturating_sub(1) as f64);
+        let low = place as usize;
+        (low, (low + 1).min(size.saturating_sub(1)), place.fract() as f32)
+    };
+    let ((x0, x1, tx), (y0, y1, ty)) = (axis(pixel.x, width), axis(pixel.y, height));
+    let channel = |channel: usize| {
+        let at = |x: usize, y: usize| image.data[(channel * height + y) * width + x];
+        let row = |y: usize| at(x0, y) + tx * (at(x1, y) - at(x0, y));
+        row(y0) + ty * (row(y1) - row(y0))
+    };
+    Vec3::new(channel(0), channel(1), channel(2))
+}

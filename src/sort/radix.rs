@@ -1,0 +1,164 @@
+//! The radix sort: least significant digit first, up to 8 bits a pass.
+
+use super::{Count, DispatchArguments, common_len};
+use crate::Result;
+use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
+use crate::kernels::{sort_downsweep, sort_spine, sort_upsweep};
+
+/// The most bits that one pass orders by: `MAX_DIGITS` of the shaders is 2^8.
+const MAX_DIGIT_BITS: u32 = 8;
+
+/// A stable sort of (key, value) pairs of `u32`, ascending by key.
+#[derive(Debug)]
+pub struct RadixSort {
+    gpu: Gpu,
+    upsweep: Pipeline<sort_upsweep::Kernel>,
+    spine: Pipeline<sort_spine::Kernel>,
+    downsweep: Pipeline<sort_downsweep::Kernel>,
+    partition_size: u32,
+    arguments: DispatchArguments,
+    scratch: Scratch,
+}
+
+/// What a sort needs beside the pairs themselves.
+#[derive(Debug)]
+struct Scratch {
+    /// Each pass writes the pairs here, then these and the caller's buffers change places.
+    keys: Buffer<u32>,
+    values: Buffer<u32>,
+    /// (digits, partitions)
+    table: Buffer<u32>,
+    /// (digits)
+    digit_totals: Buffer<u32>,
+}
+
+impl RadixSort {
+    /// A sort with scratch memory for buffers of `capacity` pairs; buffers of another length have it made anew.
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub fn new(gpu: &Gpu, capacity: u32) -> Result<Self> {
+        let partition_size = sort_upsweep::Constants::default().partition_size;
+        let rank_by_ballot = gpu.properties().subgroup_size > MAX_DIGIT_BITS;
+        Ok(Self {
+            gpu: gpu.clone(),
+            upsweep: gpu.pipeline(&sort_upsweep::Constants { partition_size })?,
+            spine: gpu.pipeline(&sort_spine::Constants { partition_size })?,
+            downsweep: gpu
+                .pipeline(&sort_downsweep::Constants { partition_size, rank_by_ballot })?,
+            partition_size,
+            arguments: DispatchArguments::new(gpu)?,
+            scratch: Scratch::new(gpu, capacity, partition_size)?,
+        })
+    }
+
+    /// Records the sort of the first `count` pairs by the lowest `bits` bits of their keys (32 at most); pairs of equal
+    /// bits keep their order. Afterwards `keys` and `values` hold the result, whatever the number of passes, because
+    /// they change places with the sort's own memory: what lay beyond the count is lost. A count beyond the buffers'
+    /// common length is clamped to it.
+    ///
+    /// # Errors
+    /// The buffers' lengths differ, the count's index is outside its buffer, or the device is out of memory.
+    pub fn record(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        count: Count<'_>,
+        keys: &mut Buffer<u32>,
+        values: &mut Buffer<u32>,
+        bits: u32,
+    ) -> Result<()> {
+        let capacity = common_len("sort", &[keys.len(), values.len()])?;
+        if self.scratch.keys.len() != keys.len() {
+            self.scratch = Scratch::new(&self.gpu, capacity, self.partition_size)?;
+        }
+        self.arguments.record(pass, count, self.partition_size, capacity)?;
+        for (shift, digit_bits) in digits(bits) {
+            self.record_pass(pass, count, keys, values, shift, digit_bits)?;
+            std::mem::swap(keys, &mut self.scratch.keys);
+            std::mem::swap(values, &mut self.scratch.values);
+        }
+        Ok(())
+    }
+
+    /// Orders the pairs by one digit, from `keys` and `values` into the scratch.
+    fn record_pass(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        Count { counts, index: count_index }: Count<'_>,
+        keys: &Buffer<u32>,
+        values: &Buffer<u32>,
+        shift: u32,
+        digit_bits: u32,
+    ) -> Result<()> {
+        let capacity = common_len("sort", &[keys.len(), values.len()])?;
+        let Scratch { keys: sorted_keys, values: sorted_values, table, digit_totals } =
+            &mut self.scratch;
+        pass.dispatch(
+            &self.upsweep,
+            &sort_upsweep::Params { count_index, capacity, shift, digit_bits },
+            sort_upsweep::Buffers { counts, keys, table },
+            self.arguments.threads(),
+        )?;
+        pass.dispatch(
+            &self.spine,
+            &sort_spine::Params { count_index, capacity },
+            sort_spine::Buffers { counts, table, digit_totals },
+            Threads::Workgroups([1 << digit_bits, 1, 1]),
+        )?;
+        pass.dispatch(
+            &self.downsweep,
+            &sort_downsweep::Params { count_index, capacity, shift, digit_bits },
+            sort_downsweep::Buffers {
+                counts,
+                table,
+                digit_totals,
+                keys,
+                values,
+                sorted_keys,
+                sorted_values,
+            },
+            self.arguments.threads(),
+        )
+    }
+}
+
+impl Scratch {
+    fn new(gpu: &Gpu, capacity: u32, partition_size: u32) -> Result<Self> {
+        let partitions = capacity.div_ceil(partition_size) as usize;
+        Ok(Self {
+            keys: gpu.uninit("sort_keys", capacity as usize)?,
+            values: gpu.uninit("sort_values", capacity as usize)?,
+            table: gpu.uninit("sort_table", partitions << MAX_DIGIT_BITS)?,
+            digit_totals: gpu.uninit("sort_digit_totals", 1 << MAX_DIGIT_BITS)?,
+        })
+    }
+}
+
+/// The lowest bit and the width of each pass's digit. As few passes as possible, and digits as equal as possible: two
+/// digits of 5 bits need an eighth of the counters that 8 and 2 bits do.
+fn digits(bits: u32) -> impl Iterator<Item = (u32, u32)> {
+    let bits = bits.min(u32::BITS);
+    let passes = bits.div_ceil(MAX_DIGIT_BITS);
+    let width = bits.div_ceil(passes.max(1)).max(1);
+    (0..bits).step_by(width as usize).map(move |shift| (shift, width.min(bits - shift)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::digits;
+
+    #[test]
+    fn digits_cover_every_bit_once_in_the_fewest_passes() {
+        for bits in 0..=32 {
+            let digits: Vec<_> = digits(bits).collect();
+            assert_eq!(digits.len() as u32, bits.div_ceil(8), "{bits} bits");
+            let mut next = 0;
+            for (shift, width) in digits {
+                assert_eq!(shift, next, "{bits} bits");
+                assert!((1..=8).contains(&width), "{bits} bits");
+                next += width;
+            }
+            assert_eq!(next, bits);
+        }
+    }
+}

@@ -1,0 +1,151 @@
+//! The page stands alone, escapes what it is given and marks what is best.
+
+use nightsplat::image::Image;
+use nightsplat::report::{Best, Column, Comparison, Picture, Report, Series, Table, plot};
+
+fn column(name: &str, digits: usize, best: Best) -> Column {
+    Column { name: name.into(), digits, best }
+}
+
+fn table() -> Table {
+    Table {
+        title: "Scores <test>".into(),
+        label: "curve".into(),
+        columns: vec![
+            column("PSNR", 2, Best::Greatest),
+            column("seconds", 0, Best::Least),
+            column("steps", 0, Best::Unmarked),
+        ],
+        rows: vec![
+            ("linear".into(), vec![Some(20.111), Some(31.0), Some(100.0)]),
+            ("a|b".into(), vec![Some(25.004), None, Some(200.0)]),
+            ("ap3".into(), vec![Some(25.001), Some(29.6), Some(f64::NAN)]),
+        ],
+    }
+}
+
+#[test]
+fn a_table_in_markdown_marks_the_best_of_each_column() {
+    let expected = "\
+| curve | PSNR | seconds | steps |
+| --- | ---: | ---: | ---: |
+| linear | 20.11 | 31 | 100 |
+| a\\|b | **25.00** | – | 200 |
+| ap3 | **25.00** | **30** | – |
+";
+    assert_eq!(table().markdown(), expected);
+}
+
+#[test]
+fn a_table_in_html_marks_the_same_values() {
+    let html = table().html();
+    assert_eq!(html.matches("class=\"best\"").count(), 3);
+    assert!(
+        html.contains(
+            "<td>ap3</td><td class=\"best\">25.00</td><td class=\"best\">30</td><td>–</td>"
+        ),
+        "{html}"
+    );
+    assert!(html.contains("Scores &lt;test&gt;"));
+}
+
+#[test]
+fn a_lone_value_and_a_short_row_are_not_marked() {
+    let mut table = table();
+    table.rows.truncate(1);
+    table.rows.push(("short".into(), vec![]));
+    assert!(!table.markdown().contains("**"));
+    assert!(table.markdown().contains("| short | – | – | – |"));
+}
+
+#[test]
+fn infinity_is_a_value() {
+    let mut table = table();
+    table.rows[0].1[0] = Some(f64::INFINITY);
+    assert!(table.markdown().contains("| linear | **∞** |"), "{}", table.markdown());
+}
+
+fn page(text: &str) -> String {
+    let picture = |scores: &str| Picture {
+        caption: text.into(),
+        scores: scores.into(),
+        image: Image::filled(4, 3, [0.5, 2.0, -1.0]),
+    };
+    let series = [Series { name: text.into(), points: vec![(0.0, 1.0), (10.0, 0.2)] }];
+    Report {
+        title: text.into(),
+        intro: vec![text.into()],
+        tables: vec![table()],
+        plots: vec![plot(text, text, &series)],
+        comparisons: vec![Comparison {
+            title: text.into(),
+            pictures: vec![picture("20 dB"), picture("")],
+        }],
+    }
+    .html()
+}
+
+#[test]
+fn the_page_refers_to_nothing_outside_itself() {
+    let html = page("chair");
+    for outside in ["http:", "https:", "<script", "<link", "@import", "url("] {
+        assert!(!html.contains(outside), "{outside}");
+    }
+    assert_eq!(html.matches("src=\"data:image/png;base64,iVBORw0KGgo").count(), 2);
+    assert_eq!(html.matches("<figcaption>").count(), 2);
+    assert!(html.contains("prefers-color-scheme: dark"));
+}
+
+#[test]
+fn every_text_is_escaped() {
+    let html = page("<b onload=\"x('&')\">");
+    assert!(!html.contains("<b onload"));
+    // Title, heading, paragraph, two captions with alternative texts, row title, plot label, axes and legend.
+    assert_eq!(html.matches("&lt;b onload=&quot;x(&#39;&amp;&#39;)&quot;&gt;").count(), 13);
+}
+
+#[test]
+fn a_plot_draws_each_series_within_its_frame() {
+    let series =
+        |name: &str, points: &[(f64, f64)]| Series { name: name.into(), points: points.to_vec() };
+    let svg = plot(
+        "step",
+        "loss",
+        &[
+            series("linear", &[(0.0, 0.31), (50.0, f64::NAN), (100.0, 0.1)]),
+            series("ap3", &[(0.0, 0.2), (100.0, 0.05)]),
+        ],
+    );
+    assert_eq!(svg.matches("<polyline").count(), 2);
+    let lines = svg.split(" points=\"").skip(1).map(|rest| rest.split('"').next().unwrap());
+    let points: Vec<Vec<(f64, f64)>> = lines
+        .map(|line| {
+            let point = |pair: &str| {
+                pair.split_once(',').map(|(x, y)| (x.parse().unwrap(), y.parse().unwrap()))
+            };
+            line.split_whitespace().map(|pair| point(pair).unwrap()).collect()
+        })
+        .collect();
+    assert_eq!(points.iter().map(Vec::len).collect::<Vec<_>>(), [2, 2], "a NaN is drawn");
+    assert!(
+        points
+            .iter()
+            .flatten()
+            .all(|(x, y)| (56.0..=704.0).contains(x) && (34.0..=266.0).contains(y))
+    );
+    // A greater value is higher up.
+    assert!(points[0][0].1 < points[0][1].1);
+    for label in [">0.30<", ">100<", ">step<", ">loss<", ">linear<"] {
+        assert!(svg.contains(label), "{label} is missing in {svg}");
+    }
+}
+
+#[test]
+fn plots_of_nothing_of_one_value_and_of_extremes_stay_well_formed() {
+    let extremes = [f64::MAX, f64::MIN, 0.0, 1e-300];
+    let plots = [vec![], vec![(1.0, 2.0)], extremes.iter().map(|&value| (value, value)).collect()];
+    for points in plots {
+        let svg = plot("step", "PSNR", &[Series { name: "a".into(), points }]);
+        assert!(!svg.contains("NaN") && !svg.contains("inf"), "{svg}");
+    }
+}
