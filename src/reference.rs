@@ -11,23 +11,23 @@
 
 mod adam;
 mod compensated_sum;
+mod dispatch_arguments;
+mod l1;
+mod loss_log;
 pub(crate) mod luminance;
 mod luminance_histogram;
 mod percentile_select;
-mod dispatch_arguments;
 mod scan_downsweep;
 mod scan_spine;
 mod scan_upsweep;
 mod sort_downsweep;
 mod sort_spine;
 mod sort_upsweep;
+pub mod ssim_backward;
+pub mod ssim_forward;
 mod tile_ranges;
 pub mod tone;
 mod tone_map;
 mod tone_statistics;
 
 use compensated_sum::CompensatedSum;
-mod l1;
-mod loss_log;
-pub mod ssim_backward;
-pub mod ssim_forward;
