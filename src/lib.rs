@@ -15,6 +15,8 @@ pub mod camera;
 pub mod cli;
 pub mod dataset;
 pub mod error;
+pub mod eval;
+pub mod export;
 #[expect(unsafe_code, reason = "the only module that speaks Vulkan")]
 pub mod gpu;
 pub mod image;
