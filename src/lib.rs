@@ -17,16 +17,11 @@ pub mod dataset;
 pub mod error;
 #[expect(unsafe_code, reason = "the only module that speaks Vulkan")]
 pub mod gpu;
-<<<<<<< HEAD
-=======
-pub mod kernels;
-pub mod loss;
-pub mod reference;
-pub mod render;
->>>>>>> main
 pub mod image;
 pub mod kernels;
+pub mod loss;
 pub mod metrics;
+pub mod pseudo_gt;
 pub mod random;
 pub mod reference;
 pub mod render;
