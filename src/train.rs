@@ -10,7 +10,7 @@ use glam::UVec2;
 
 use crate::camera::Camera;
 use crate::dataset::Dataset;
-use crate::gpu::{Buffer, Gpu, Recorder};
+use crate::gpu::{Buffer, Gpu, PassTime, Recorder};
 use crate::image::Image;
 use crate::loss::{Loss, LossInputs, LossLog, StepLoss};
 use crate::optimizer::{Adam, AdamBuffers};
@@ -164,6 +164,19 @@ impl Trainer {
             return Err(Error::NotFinite { step, view, what: what.to_owned() });
         }
         Ok(reports)
+    }
+
+    /// Trains one step and reports how long each of its passes took on the device.
+    ///
+    /// # Errors
+    /// As [`Trainer::advance`]; a step that overflows its memory is not counted, the next [`Trainer::advance`] redoes it.
+    pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
+        let step = self.step + 1;
+        let times = self.gpu.clone().profile("step", |pass| self.record_step(pass, step, 0))?;
+        if self.gpu.read(self.renderer.status())?.first() == Some(&0) {
+            self.step = step;
+        }
+        Ok(times)
     }
 
     /// The algorithm: render a view, compare it with its pseudo-GT, go back, update.
