@@ -14,17 +14,18 @@ pub mod camera;
 #[cfg(feature = "cli")]
 pub mod cli;
 pub mod dataset;
+pub mod densify;
 pub mod error;
 #[expect(unsafe_code, reason = "the only module that speaks Vulkan")]
 pub mod gpu;
+pub mod image;
 pub mod kernels;
 pub mod loss;
+pub mod metrics;
 pub mod optimizer;
+pub mod random;
 pub mod reference;
 pub mod render;
-pub mod image;
-pub mod metrics;
-pub mod random;
 pub mod report;
 pub mod scene;
 pub mod sort;

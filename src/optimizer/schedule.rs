@@ -1,7 +1,10 @@
 //! What changes with the step: learning rates, SH degree, gradient damping, density control.
 
+use crate::scene::Attribute;
+
 /// Adam's learning rate of each attribute.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct LearningRates {
     /// Positions, in world units.
     pub means: f64,
@@ -19,7 +22,8 @@ pub struct LearningRates {
 
 /// The schedules as functions of the step, counted from 1. The defaults are those of 3DGS (Kerbl et al. 2023) but for
 /// density control, which ends at step 5 000 and acts every 200 steps, as in LITA-GS.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(default, deny_unknown_fields)]
 pub struct Schedule {
     /// The rates at the start; that of the means for a scene of extent 1.
     pub initial_rates: LearningRates,
@@ -41,14 +45,15 @@ pub struct Schedule {
 
 impl Default for Schedule {
     fn default() -> Self {
+        let rate = |attribute: Attribute| attribute.spec().learning_rate;
         Self {
             initial_rates: LearningRates {
-                means: 1.6e-4,
-                quats: 0.001,
-                log_scales: 0.005,
-                raw_opacities: 0.05,
-                dc: 0.0025,
-                rest: 0.0025 / 20.0,
+                means: rate(Attribute::Means),
+                quats: rate(Attribute::Quats),
+                log_scales: rate(Attribute::LogScales),
+                raw_opacities: rate(Attribute::RawOpacities),
+                dc: rate(Attribute::Dc),
+                rest: rate(Attribute::Rest),
             },
             final_means_rate: 1.6e-6,
             means_rate_steps: 30_000,
