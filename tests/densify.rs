@@ -343,6 +343,20 @@ fn a_quaternion_of_zero_length_draws_along_the_axes() {
     assert_no_validation_messages();
 }
 
+/// At this step the first uniform draw of this clone has all its bits zero; its logarithm must stay finite.
+#[test]
+fn the_rarest_draw_is_finite() {
+    let gpu = gpu();
+    let mut before = Host::calm(1);
+    before.pull_at(0);
+    let (after, report) = before.densify(&gpu, SETTINGS, 14_117_035);
+    assert_eq!(report.cloned, 1);
+    // 5.8 standard deviations: sqrt(2 ln 2^24).
+    let distance = after.mean(1).distance(before.mean(0));
+    assert!(distance > 0.05 && distance < 0.08, "{distance}");
+    assert_no_validation_messages();
+}
+
 #[test]
 fn a_gradient_that_is_nan_or_was_never_seen_multiplies_nothing() {
     let gpu = gpu();
