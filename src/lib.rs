@@ -16,6 +16,8 @@ pub mod cli;
 pub mod dataset;
 pub mod densify;
 pub mod error;
+pub mod eval;
+pub mod export;
 #[expect(unsafe_code, reason = "the only module that speaks Vulkan")]
 pub mod gpu;
 pub mod image;
@@ -23,6 +25,7 @@ pub mod kernels;
 pub mod loss;
 pub mod metrics;
 pub mod optimizer;
+pub mod pseudo_gt;
 pub mod random;
 pub mod reference;
 pub mod render;
@@ -30,5 +33,6 @@ pub mod report;
 pub mod scene;
 pub mod sort;
 pub mod tone;
+pub mod train;
 
 pub use error::{Error, Result};

@@ -14,6 +14,7 @@ use glam::{DVec3, UVec2, Vec2};
 
 use crate::camera::Camera;
 use crate::gpu::{Buffer, Gpu, Kernel as _, Pipeline, Recorder, Threads};
+use crate::image::Image;
 use crate::kernels::{
     blend_backward, blend_forward, check_capacity, emit, order_counts, project, project_backward,
     reduce_records, tile_ranges,
@@ -201,9 +202,41 @@ impl Renderer {
         &self.frame.status
     }
 
-    /// The status words, for kernels that raise flags of their own.
-    pub fn status_mut(&mut self) -> &mut Buffer<u32> {
-        &mut self.frame.status
+    /// The last render and the status words, for a loss that reads the one and raises flags in the other.
+    pub fn render_and_status(&mut self) -> (&Buffer<f32>, &mut Buffer<u32>) {
+        (&self.frame.render, &mut self.frame.status)
+    }
+
+    /// Renders to the host; grows the memory as the view demands.
+    ///
+    /// # Errors
+    /// The image exceeds what was reserved, or the device is out of memory or lost.
+    pub fn render_image(
+        &mut self,
+        gaussians: &Buffer<f32>,
+        camera: &Camera,
+        options: &RenderOptions,
+    ) -> Result<Image> {
+        let gpu = self.gpu.clone();
+        loop {
+            let mut status = None;
+            gpu.run("render", |pass| {
+                self.forward(pass, gaussians, camera, options)?;
+                status = Some(pass.download(&self.frame.status)?);
+                self.clear_status(pass);
+                Ok(())
+            })?;
+            let words = status.map_or_else(|| Ok(vec![]), |status| status.wait())?;
+            let status = Status::from_words(&words);
+            if !status.overflowed {
+                break;
+            }
+            self.grow(status.intersections)?;
+        }
+        let Camera { width, height, .. } = *camera;
+        let mut data = gpu.read(&self.frame.render)?;
+        data.truncate(3 * width as usize * height as usize);
+        Ok(Image { width, height, data })
     }
 
     /// Lowers every flag of the status.

@@ -1,5 +1,7 @@
 //! Scan and radix sort: each kernel against its reference, the whole against the standard library.
 
+#![expect(clippy::unwrap_used, reason = "what fails here fails the test")]
+
 use nightsplat::gpu::testing::{assert_no_validation_messages, gpu};
 use nightsplat::gpu::{Buffer, Gpu, Reference, Threads};
 use nightsplat::kernels::{
@@ -267,18 +269,18 @@ fn no_items_per_workgroup_count_as_one() {
 #[test]
 fn more_workgroups_than_fit_along_x_are_folded() {
     let gpu = gpu();
-    // Two values a partition make 70 001 workgroups.
+    // Two values a partition make 70 001 workgroups, in two rows of 35 001: the last is idle.
     let constants = scan_upsweep::Constants { partition_size: 2 };
     let (values, capacity) = (noise(140_001), 140_001);
     let params = scan_upsweep::Params { count_index: 0, capacity };
-    let mut expected = vec![0; 70_001];
+    let mut expected = vec![9; 70_002];
     let slices = scan_upsweep::Slices { counts: &[capacity], values: &values, sums: &mut expected };
     scan_upsweep::Kernel::run(&params, &constants, slices);
     let pipeline = gpu.pipeline::<scan_upsweep::Kernel>(&constants).unwrap();
     let mut arguments = DispatchArguments::new(&gpu).unwrap();
     let counts = gpu.buffer("counts", &[capacity]).unwrap();
     let values = gpu.buffer("values", &values).unwrap();
-    let mut sums = gpu.zeros("sums", expected.len()).unwrap();
+    let mut sums = gpu.buffer("sums", &vec![9; expected.len()]).unwrap();
     gpu.run("folded", |pass| {
         arguments.record(pass, first(&counts), constants.partition_size, capacity)?;
         let buffers = scan_upsweep::Buffers { counts: &counts, values: &values, sums: &mut sums };
@@ -297,15 +299,18 @@ fn scan_kernels_match_their_references() {
     let downsweep = gpu.pipeline::<scan_downsweep::Kernel>(&Default::default()).unwrap();
     for size in SIZES {
         let partitions = size.div_ceil(PARTITION);
-        let groups = Threads::Workgroups([partitions, 1, 1]);
+        // One workgroup more than there are partitions: it must leave no trace.
+        let groups = Threads::Workgroups([partitions + 1, 1, 1]);
         let (capacity, count_index) = (size, 0);
-        let (counts, values) = ([size], noise(size));
-        let (mut sums, mut total) = (vec![0; partitions as usize], [0]);
+        // A count beyond the capacity is clamped to it.
+        let (counts, values) = ([size + 5], noise(size));
+        let (mut sums, mut total) = (vec![9; partitions as usize + 1], [0]);
         let gpu_counts = gpu.buffer("counts", &counts).unwrap();
         let gpu_values = gpu.buffer("values", &values).unwrap();
-        let mut gpu_sums = gpu.zeros("sums", sums.len()).unwrap();
+        let mut gpu_sums = gpu.buffer("sums", &sums).unwrap();
         let mut gpu_total = gpu.zeros("total", 1).unwrap();
-        let mut gpu_offsets = gpu.zeros("offsets", values.len()).unwrap();
+        let mut offsets = vec![7; values.len() + PARTITION as usize];
+        let mut gpu_offsets = gpu.buffer("offsets", &offsets).unwrap();
 
         let params = scan_upsweep::Params { count_index, capacity };
         let slices = scan_upsweep::Slices { counts: &counts, values: &values, sums: &mut sums };
@@ -327,7 +332,6 @@ fn scan_kernels_match_their_references() {
         assert_eq!(gpu.read(&gpu_total).unwrap(), total, "total of {size}");
 
         let params = scan_downsweep::Params { count_index, capacity };
-        let mut offsets = vec![0; values.len()];
         let slices = scan_downsweep::Slices {
             counts: &counts,
             values: &values,
@@ -367,8 +371,10 @@ fn compare_sort_kernels(rank_by_ballot: bool) {
     for (size, (shift, digit_bits)) in SIZES.into_iter().flat_map(|s| [(s, (31, 1)), (s, (5, 8))]) {
         let (capacity, count_index, digits) = (size, 0, 1_u32 << digit_bits);
         let partitions = size.div_ceil(PARTITION);
-        let groups = Threads::Workgroups([partitions, 1, 1]);
-        let (counts, keys) = ([size], noise(size));
+        // One workgroup more than there are partitions: it must leave no trace.
+        let groups = Threads::Workgroups([partitions + 1, 1, 1]);
+        // A count beyond the capacity is clamped to it.
+        let (counts, keys) = ([size + 5], noise(size));
         let values: Vec<u32> = (0..size).map(|i| 3 * i).collect();
         let mut table = vec![0; (digits * partitions) as usize];
         let mut digit_totals = vec![0; digits as usize];

@@ -21,6 +21,7 @@ layout(push_constant) uniform Params {
 struct StepLoss {
     float l1;    // mean |a - b|
     float ssim;  // mean SSIM
+    uint  status;  // status[0] at the end of the loss: the step counts only if it is 0
 };
 
 layout(binding = 0) readonly  buffer L1Partials   { float l1_partials[]; };
@@ -35,9 +36,11 @@ void main() {
     for (uint i = gl_LocalInvocationID.x; i < l1_partial_count; i += SUBGROUP_SIZE) l1 += l1_partials[i];
     float ssim = 0.0;
     for (uint i = gl_LocalInvocationID.x; i < ssim_partial_count; i += SUBGROUP_SIZE) ssim += ssim_partials[i];
-    StepLoss loss = StepLoss(subgroupAdd(l1) * mean_scale, subgroupAdd(ssim) * mean_scale);
+    StepLoss loss = StepLoss(subgroupAdd(l1) * mean_scale, subgroupAdd(ssim) * mean_scale, 0);
     if (subgroupElect()) {
+        loss.status = status[0];
+        if (!is_finite(loss.l1) || !is_finite(loss.ssim)) loss.status |= not_finite_flag;
+        status[0] = loss.status;
         log[slot] = loss;
-        if (!is_finite(loss.l1) || !is_finite(loss.ssim)) status[0] |= not_finite_flag;
     }
 }

@@ -12,13 +12,15 @@ impl Reference for Kernel {
             let sum: f64 = partials[..count as usize].iter().map(|&x| f64::from(x)).sum();
             (sum * f64::from(params.mean_scale)) as f32
         };
-        let loss = StepLoss {
+        let mut loss = StepLoss {
             l1: mean(l1_partials, params.l1_partial_count),
             ssim: mean(ssim_partials, params.ssim_partial_count),
+            status: status[0],
         };
-        log[params.slot as usize] = loss;
         if !loss.l1.is_finite() || !loss.ssim.is_finite() {
-            status[0] |= params.not_finite_flag;
+            loss.status |= params.not_finite_flag;
         }
+        status[0] = loss.status;
+        log[params.slot as usize] = loss;
     }
 }

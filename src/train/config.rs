@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use crate::dataset::LoadOptions;
+use crate::optimizer::Schedule;
 use crate::scene::MAX_SH_DEGREE;
 use crate::tone::ToneSettings;
 use crate::{Error, Result};
@@ -63,44 +64,22 @@ pub struct TrainConfig {
     pub random_points: usize,
     /// The curve that lifts each photograph.
     pub tone: ToneSettings,
-    /// Learning rates and schedules.
-    pub optimizer: OptimizerConfig,
+    /// Learning rates, and what else changes with the step.
+    pub schedule: Schedule,
     /// Density control.
     pub density: DensityConfig,
 }
 
-/// Adam's learning rates, and how they and the SH degree change with the step.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct OptimizerConfig {
-    /// Multiplies every learning rate of the attribute table.
-    pub learning_rate_scale: f64,
-    /// The means' learning rate falls to this fraction of its start, exponentially.
-    pub means_decay: f64,
-    /// At this step it would get there, however long the run is.
-    pub means_decay_steps: u64,
-    /// The SH degree in use rises by one every so many steps.
-    pub sh_degree_every: u64,
-}
-
-/// When and how Gaussians are added and removed.
+/// Which Gaussians multiply and which go; [`Schedule`] says when.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DensityConfig {
-    /// No change up to this step.
-    pub from_step: u64,
-    /// No change from this step.
-    pub until_step: u64,
-    /// Steps between changes.
-    pub every: u64,
     /// Mean norm of the screen-space gradient, in normalised device units, from which a Gaussian multiplies.
     pub gradient_threshold: f64,
     /// Larger than this fraction of the extent: split; smaller: cloned.
     pub split_scale: f64,
     /// Fainter Gaussians are removed.
     pub min_opacity: f64,
-    /// Steps up to which the statistics of Gaussians near the camera are damped fully; half up to 7/4 of it.
-    pub damping_until: u64,
 }
 
 impl Default for TrainConfig {
@@ -119,34 +98,15 @@ impl Default for TrainConfig {
             device: String::new(),
             random_points: 20_000,
             tone: ToneSettings::default(),
-            optimizer: OptimizerConfig::default(),
+            schedule: Schedule::default(),
             density: DensityConfig::default(),
-        }
-    }
-}
-
-impl Default for OptimizerConfig {
-    fn default() -> Self {
-        Self {
-            learning_rate_scale: 1.0,
-            means_decay: 0.01,
-            means_decay_steps: 30_000,
-            sh_degree_every: 1000,
         }
     }
 }
 
 impl Default for DensityConfig {
     fn default() -> Self {
-        Self {
-            from_step: 500,
-            until_step: 5000,
-            every: 200,
-            gradient_threshold: 2e-4,
-            split_scale: 0.01,
-            min_opacity: 0.005,
-            damping_until: 4000,
-        }
+        Self { gradient_threshold: 2e-4, split_scale: 0.01, min_opacity: 0.005 }
     }
 }
 
@@ -188,7 +148,7 @@ impl TrainConfig {
     /// [`Error::Usage`].
     pub fn check(&self) -> Result<()> {
         self.tone.check()?;
-        let (optimizer, density) = (&self.optimizer, &self.density);
+        let density = &self.density;
         let rules = [
             ("--steps", self.steps as f64, self.steps >= 1, "at least 1"),
             ("--sh-degree", f64::from(self.sh_degree), self.sh_degree <= MAX_SH_DEGREE, "0 to 3"),
@@ -200,19 +160,6 @@ impl TrainConfig {
                 "from 0 to 1",
             ),
             ("random_points", self.random_points as f64, self.random_points >= 1, "at least 1"),
-            (
-                "optimizer.learning_rate_scale",
-                optimizer.learning_rate_scale,
-                optimizer.learning_rate_scale >= 0.0,
-                "at least 0",
-            ),
-            (
-                "optimizer.means_decay",
-                optimizer.means_decay,
-                optimizer.means_decay > 0.0 && optimizer.means_decay <= 1.0,
-                "above 0 and at most 1",
-            ),
-            ("density.every", density.every as f64, density.every >= 1, "at least 1"),
             (
                 "density.gradient_threshold",
                 density.gradient_threshold,
