@@ -1,5 +1,7 @@
 //! The loss: its kernels against their references, its gradient against finite differences, its edge cases.
 
+#![expect(clippy::unwrap_used, reason = "what fails here fails the test")]
+
 use glam::{UVec2, Vec3};
 use nightsplat::gpu::testing::{assert_no_validation_messages, gpu};
 use nightsplat::gpu::{Buffer, Gpu, Reference, Threads};
@@ -243,8 +245,14 @@ fn loss_log_matches_its_reference() {
         })
         .unwrap();
         for (actual, expected) in gpu.read(&log).unwrap().iter().zip(expected) {
-            assert!((actual.l1 - expected.l1).abs() <= 1e-6 * expected.l1, "{actual:?} {expected:?}");
-            assert!((actual.ssim - expected.ssim).abs() <= 1e-6 * expected.ssim, "{actual:?} {expected:?}");
+            assert!(
+                (actual.l1 - expected.l1).abs() <= 1e-6 * expected.l1,
+                "{actual:?} {expected:?}"
+            );
+            assert!(
+                (actual.ssim - expected.ssim).abs() <= 1e-6 * expected.ssim,
+                "{actual:?} {expected:?}"
+            );
         }
         assert_eq!(gpu.read(&status).unwrap(), expected_status);
     }
