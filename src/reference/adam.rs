@@ -6,7 +6,8 @@ const BETA2: f32 = 0.999;
 const EPSILON: f32 = 1e-15;
 const GRADIENT_BOUND: f32 = 1e18;
 
-const LOG_SCALE_BOUNDS: [f32; 2] = [-30.0, 13.0];
+/// The bounds of the natural logarithm of a scale.
+pub(super) const LOG_SCALE_BOUNDS: [f32; 2] = [-30.0, 13.0];
 
 fn rate_of(params: &Params, column: usize) -> f32 {
     match column {
