@@ -11,6 +11,8 @@
 
 mod adam;
 mod compensated_sum;
+mod densify_count;
+mod densify_scatter;
 mod dispatch_arguments;
 mod l1;
 mod loss_log;
