@@ -10,6 +10,7 @@ use glam::UVec2;
 
 use crate::camera::Camera;
 use crate::dataset::Dataset;
+use crate::densify::{Densifier, DensifySettings};
 use crate::gpu::{Buffer, Gpu, PassTime, Recorder};
 use crate::image::Image;
 use crate::loss::{Loss, LossInputs, LossLog, StepLoss};
@@ -32,6 +33,7 @@ mod streams {
     pub(super) const POINTS: u64 = 1;
     pub(super) const BACKGROUND: u64 = 2;
     pub(super) const VIEWS: u64 = 3;
+    pub(super) const DENSITY: u64 = 4;
 }
 
 /// What one step did.
@@ -66,6 +68,7 @@ pub struct Trainer {
     renderer: Renderer,
     loss: Loss,
     adam: Adam,
+    densifier: Densifier,
     d_render: Buffer<f32>,
     log: Buffer<StepLoss>,
 }
@@ -92,6 +95,7 @@ impl Trainer {
             renderer: Renderer::new(gpu, settings)?,
             loss: Loss::new(gpu, config.tone.curve.constant(), config.ssim_weight, &sizes)?,
             adam: Adam::new(gpu)?,
+            densifier: Densifier::new(gpu, density(&config, dataset.extent()))?,
             d_render: gpu.uninit("d_render", 3 * pixels.unwrap_or_default())?,
             log: gpu.uninit("loss_log", STEPS_PER_SUBMISSION as usize)?,
             config,
@@ -107,7 +111,7 @@ impl Trainer {
 
     /// The number of Gaussians.
     pub fn gaussian_count(&self) -> usize {
-        self.model.count
+        self.model.count()
     }
 
     /// The Gaussians as they are now, on the host.
@@ -126,7 +130,8 @@ impl Trainer {
         let first = self.step + 1;
         let until = until.min(self.config.steps).min(self.step + STEPS_PER_SUBMISSION);
         // A submission ends where density control changes the number of Gaussians.
-        let last = (first..until).find(|&step| self.config.schedule.densifies_at(step)).unwrap_or(until);
+        let last =
+            (first..until).find(|&step| self.config.schedule.densifies_at(step)).unwrap_or(until);
         if last < first {
             return Ok(vec![]);
         }
@@ -143,13 +148,19 @@ impl Trainer {
         let Some((log, status)) = downloads else { return Ok(vec![]) };
         let (log, status) = (log.wait()?, Status::from_words(&status.wait()?));
         // The steps from the first failed one on have changed nothing.
-        let done = log.iter().take((last - first + 1) as usize).take_while(|l| l.status == 0).count();
+        let done =
+            log.iter().take((last - first + 1) as usize).take_while(|l| l.status == 0).count();
         let milliseconds = begin.elapsed().as_secs_f64() * 1e3 / done.max(1) as f64;
         let reports = (first..)
             .zip(&log[..done])
             .map(|(step, loss)| self.report(step, loss, milliseconds))
             .collect();
         self.step += done as u64;
+        if done > 0 && self.config.schedule.densifies_at(self.step) {
+            let changed = self.model.densify(&gpu, &mut self.densifier, self.step)?;
+            tracing::debug!("step {}: {changed:?}", self.step);
+            self.reserve()?;
+        }
         if status.overflowed {
             self.renderer.grow(status.intersections)?;
             let renderer = &mut self.renderer;
@@ -187,12 +198,11 @@ impl Trainer {
             sh_degree: schedule.sh_degree(step, self.config.sh_degree),
             background: background(&self.config, step),
         };
-        let damping =
-            Damping { weight: schedule.damping_weight(step), depth: self.extent as f32 };
+        let damping = Damping { weight: schedule.damping_weight(step), depth: self.extent as f32 };
         let size = UVec2::new(view.camera.width, view.camera.height);
         let model = &mut self.model;
 
-        self.renderer.forward(pass, &model.parameters, &view.camera, &options)?;
+        self.renderer.forward(pass, &model.gaussians.parameters, &view.camera, &options)?;
         let (render, status) = self.renderer.render_and_status();
         self.loss.record(
             pass,
@@ -202,7 +212,7 @@ impl Trainer {
         )?;
         self.renderer.backward(
             pass,
-            &model.parameters,
+            &model.gaussians.parameters,
             &view.camera,
             &options,
             damping,
@@ -217,11 +227,11 @@ impl Trainer {
             pass,
             step,
             &schedule.learning_rates(step, self.extent),
-            [model.count as u32, model.columns()],
+            [model.gaussians.count, model.gaussians.column_count],
             AdamBuffers {
-                parameters: &mut model.parameters,
+                parameters: &mut model.gaussians.parameters,
                 gradients: &model.gradients,
-                moments: &mut model.moments,
+                moments: &mut model.gaussians.moments,
                 status: self.renderer.status(),
             },
         )
@@ -236,25 +246,37 @@ impl Trainer {
             sh_degree: self.config.schedule.sh_degree(self.step, self.config.sh_degree),
             background: [0.0; 3],
         };
-        self.renderer.reserve(self.model.count, [camera])?;
-        self.renderer.render_image(&self.model.parameters, camera, &options)
+        self.renderer.reserve(self.model.count(), [camera])?;
+        self.renderer.render_image(&self.model.gaussians.parameters, camera, &options)
     }
 
     fn reserve(&mut self) -> Result<()> {
-        self.renderer.reserve(self.model.count, self.views.cameras())
+        self.renderer.reserve(self.model.count(), self.views.cameras())
     }
 
     fn report(&self, step: u64, loss: &StepLoss, milliseconds: f64) -> StepReport {
-        let (l1, ssim, weight) = (f64::from(loss.l1), f64::from(loss.ssim), self.config.ssim_weight);
+        let (l1, ssim, weight) =
+            (f64::from(loss.l1), f64::from(loss.ssim), self.config.ssim_weight);
         StepReport {
             step,
             view: self.views.of_step(self.config.seed, step).name.clone(),
             loss: (1.0 - weight) * l1 + weight * (1.0 - ssim),
             l1,
             ssim,
-            gaussians: self.model.count,
+            gaussians: self.model.count(),
             milliseconds,
         }
+    }
+}
+
+/// Density control in world units.
+fn density(config: &TrainConfig, extent: f64) -> DensifySettings {
+    DensifySettings {
+        gradient_threshold: config.density.gradient_threshold,
+        split_scale: config.density.split_scale * extent,
+        min_opacity: config.density.min_opacity,
+        max_gaussians: config.max_gaussians,
+        seed: Stream::new(config.seed, streams::DENSITY).bits(0),
     }
 }
 
