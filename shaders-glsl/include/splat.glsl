@@ -10,7 +10,8 @@ const float DILATION = 0.3;
 
 // The largest alpha: keeps 1 / (1 - alpha) finite in the backward pass.
 layout(constant_id = 1) const float ALPHA_MAX = 0.99;
-// Values per pixel: RGB first.
+// Values per pixel, at most MAX_CHANNELS: RGB first.
+const uint MAX_CHANNELS = 11;
 layout(constant_id = 2) const uint CHANNELS = 3;
 // The tile that one subgroup owns, in pixels; at most 32 rows of lanes.
 layout(constant_id = 3) const uint TILE_WIDTH = 16;

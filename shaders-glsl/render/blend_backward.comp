@@ -13,7 +13,7 @@ layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 
 layout(local_size_x_id = 100) in;
 
-layout(push_constant) uniform Params { uvec2 size; uint tile_columns; };
+layout(push_constant, scalar) uniform Params { uvec2 size; uint tile_columns; };
 
 layout(binding = 0) readonly  buffer Ranges  { uvec2 tile_ranges[]; };
 layout(binding = 1) readonly  buffer Slots   { uint sorted_slots[]; };
@@ -48,7 +48,7 @@ void main() {
     }
 
     uvec2 range = tile_ranges[tile];
-    uint alive = GROUPS == 32 ? 0xffffffffu : (1u << GROUPS) - 1;
+    uint alive = 0xffffffffu >> (32 - GROUPS);
     for (uint first = range.x; first < range.y; first += SUBGROUP_SIZE) {
         uint batch = min(SUBGROUP_SIZE, range.y - first);
         uint slot = sorted_slots[first + min(lane, batch - 1)];

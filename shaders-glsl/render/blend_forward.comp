@@ -13,16 +13,15 @@ layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 
 layout(local_size_x_id = 100) in;
 
-layout(push_constant) uniform Params { uvec2 size; uint tile_columns; };
+layout(push_constant, scalar) uniform Params { uvec2 size; uint tile_columns; float background[MAX_CHANNELS]; };
 
 layout(binding = 0) readonly  buffer Ranges     { uvec2 tile_ranges[]; };
 layout(binding = 1) readonly  buffer Slots      { uint sorted_slots[]; };
 layout(binding = 2) readonly  buffer Owners     { uint owners[]; };
 layout(binding = 3) readonly  buffer Splats     { ProjectedSplat splats[]; };
 layout(binding = 4) readonly  buffer Colors     { float colors[]; };
-layout(binding = 5) readonly  buffer Background { float background[]; };  // (CHANNELS)
-layout(binding = 6) writeonly buffer Render     { float render[]; };      // (CHANNELS, H, W)
-layout(binding = 7) writeonly buffer Transmittances { float transmittances[]; };  // (H, W)
+layout(binding = 5) writeonly buffer Render     { float render[]; };  // (CHANNELS, H, W)
+layout(binding = 6) writeonly buffer Transmittances { float transmittances[]; };  // (H, W)
 
 // Negative once the pixel is done; the magnitude is the transmittance.
 shared float transmittance[TILE_PIXELS];
@@ -41,7 +40,7 @@ void main() {
     }
 
     uvec2 range = tile_ranges[tile];
-    uint alive = GROUPS == 32 ? 0xffffffffu : (1u << GROUPS) - 1;
+    uint alive = 0xffffffffu >> (32 - GROUPS);
     for (uint first = range.x; first < range.y && alive != 0; first += SUBGROUP_SIZE) {
         uint batch = min(SUBGROUP_SIZE, range.y - first);
         // Lanes beyond the batch load its last splat and are never broadcast.
