@@ -1,7 +1,8 @@
 //! CPU references: one file per kernel, same name, same buffers, plain loops.
 //!
 //! They are written to be read beside the shader, line by line, and to be obviously right rather than fast; the tests
-//! hold each kernel to its reference.
+//! hold each kernel to its reference. What decides where a splat lies is f32, as in the shader; what makes light and
+//! gradients is f64.
 
 #![expect(
     clippy::needless_range_loop,
@@ -9,4 +10,16 @@
     reason = "keeps each line comparable to the shader; a NaN must fail the test"
 )]
 
+pub mod blend_backward;
+pub mod blend_forward;
+pub mod camera;
+mod check_capacity;
+mod emit;
+pub mod gaussian;
+mod order_counts;
+pub mod project;
+pub mod project_backward;
+mod reduce_records;
+pub mod sh;
+pub mod splat;
 mod tile_ranges;
