@@ -18,13 +18,14 @@ pub mod error;
 #[expect(unsafe_code, reason = "the only module that speaks Vulkan")]
 pub mod gpu;
 pub mod kernels;
-pub mod pseudo_gt;
 pub mod reference;
+pub mod render;
 pub mod image;
 pub mod metrics;
 pub mod random;
 pub mod report;
 pub mod scene;
+pub mod sort;
 pub mod tone;
 
 pub use error::{Error, Result};

@@ -20,8 +20,9 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-pub use self::statistics::{Statistics, luminance, percentile};
-pub use crate::reference::ToneParameters;
+pub(crate) use self::statistics::Rank;
+pub use self::statistics::{Statistics, percentile};
+pub use crate::kernels::ToneParameters;
 use crate::reference::tone;
 use crate::{Error, Result};
 

@@ -28,5 +28,6 @@ float tone_curve(float x, ToneParameters tone) {
     } else if (TONE_CURVE == CURVE_AP3) {
         y = tone.offset + tone.gain * (((0.0720 * t - 0.4376) * t + 0.9948) * t);
     }
-    return clamp(y, 0.0, 1.0);
+    // Positive phrasing: a NaN becomes black.
+    return y > 0.0 ? min(y, 1.0) : 0.0;
 }

@@ -10,7 +10,7 @@
 
 layout(local_size_x = 64) in;
 
-layout(push_constant) uniform Params { uvec2 size; uint gaussian_count; uint tile_columns; };
+layout(push_constant, scalar) uniform Params { uvec2 size; uint gaussian_count; uint tile_columns; };
 
 layout(binding = 0) readonly  buffer Counts  { uint counts[]; };       // [0]: intersections; 0 after an overflow
 layout(binding = 1) readonly  buffer Ids     { uint sorted_ids[]; };

@@ -14,7 +14,7 @@
 
 layout(local_size_x = 64) in;
 
-layout(push_constant) uniform Params {
+layout(push_constant, scalar) uniform Params {
     mat4x3 view_from_world;
     vec2  focal;            // pixels
     vec2  principal_point;  // pixels

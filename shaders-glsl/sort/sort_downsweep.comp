@@ -46,7 +46,8 @@ void find_first_places(uint part, uint partition_count) {
 
 // The lanes that hold a pair of this lane's digit.
 uvec4 lanes_of_digit(uint digit, bool holds_pair) {
-    if (SUBGROUP_SIZE <= 8) {
+    uint width = SUBGROUP_SIZE;
+    if (width <= 8) {
         // Against each lane in turn: the devices this narrow are processors, whose ballots are slow loops.
         uint compared = holds_pair ? digit : MAX_DIGITS;
         uint lanes = 0;

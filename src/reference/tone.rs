@@ -1,6 +1,6 @@
 //! The tone curves of `include/tone.glsl`, in the shader's order of operations.
 
-use super::ToneParameters;
+use crate::kernels::ToneParameters;
 
 /// `CURVE_NONE` of `include/tone.glsl`: the photograph as it is.
 pub const CURVE_NONE: u32 = 0;

@@ -1,17 +1,17 @@
 //! What a curve knows of a photograph: two percentiles and two means.
 
+use crate::kernels::ToneStatistics;
+use crate::reference::luminance::{luminance, measurable};
+
 /// Added to both percentiles, so that a black photograph divides by something.
 const EPSILON: f32 = 1e-6;
-
-/// Values beyond this are taken for it in the statistics: the largest half float.
-const LARGEST: f32 = 65504.0;
 
 /// The statistics of one photograph, over all its pixels, on sRGB-encoded values.
 ///
 /// They are finite for every input: NaN and negative values count as 0, and values above 65504 as 65504.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Statistics {
-    /// The 10th percentile of the luminance, plus 1e-6.
+    /// The 10th percentile of the BT.601 luminance, plus 1e-6.
     pub p10: f32,
     /// The 90th percentile of the luminance, plus 1e-6.
     pub p90: f32,
@@ -50,26 +50,37 @@ impl Statistics {
     }
 }
 
-/// BT.601 luminance of an RGB value, in the order of operations of the kernel.
-pub fn luminance([r, g, b]: [f32; 3]) -> f32 {
-    0.299 * r + 0.587 * g + 0.114 * b
+impl From<ToneStatistics> for Statistics {
+    fn from(ToneStatistics { p10, p90, mean_luminance, mean }: ToneStatistics) -> Self {
+        Self { p10, p90, mean_luminance, mean }
+    }
 }
 
-/// The `tenths` / 10 quantile of non-negative values, linear between the two neighbours of
-/// rank q (n - 1) as `torch.quantile` has it; reorders the values. 0 of no values.
-///
-/// The rank is split in integers: a rank in f32 is wrong beyond 2^24 values.
+/// Where a quantile lies among sorted values: `weight` of the way from one rank to the next.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Rank {
+    pub(crate) lower: usize,
+    pub(crate) upper: usize,
+    pub(crate) weight: f32,
+}
+
+impl Rank {
+    /// The rank q (n - 1), q = `tenths` / 10, split in integers: in f32 it is wrong beyond 2^24 values.
+    pub(crate) fn of(tenths: usize, count: usize) -> Self {
+        let last = count.saturating_sub(1);
+        let lower = tenths * last / 10;
+        Self { lower, upper: last.min(lower + 1), weight: (tenths * last % 10) as f32 / 10.0 }
+    }
+}
+
+/// The `tenths` / 10 quantile of non-negative values, linear between the two neighbours of its rank
+/// as `torch.quantile` has it; reorders the values. 0 of no values.
 pub fn percentile(values: &mut [f32], tenths: usize) -> f32 {
-    let Some(last) = values.len().checked_sub(1) else { return 0.0 };
-    let rank = tenths * last / 10;
-    let weight = (tenths * last % 10) as f32 / 10.0;
-    let (_, &mut lower, above) = values.select_nth_unstable_by(rank, f32::total_cmp);
+    if values.is_empty() {
+        return 0.0;
+    }
+    let rank = Rank::of(tenths, values.len());
+    let (_, &mut lower, above) = values.select_nth_unstable_by(rank.lower, f32::total_cmp);
     let upper = above.iter().copied().min_by(f32::total_cmp).unwrap_or(lower);
-    lower + weight * (upper - lower)
-}
-
-/// A value the statistics can take: finite, not negative.
-fn measurable(x: f32) -> f32 {
-    // Positive phrasing: a NaN fails it too.
-    if x > 0.0 { x.min(LARGEST) } else { 0.0 }
+    lower + rank.weight * (upper - lower)
 }

@@ -1,0 +1,49 @@
+#version 460
+#extension GL_GOOGLE_include_directive : require
+#include "kernel.glsl"
+#include "compensated_sum.glsl"
+#include "rank_search.glsl"
+
+//! Luminance: BT.601 on encoded values, per pixel, with the partial sums of its mean, and the start of the rank search.
+//!
+//! `thread_count` threads, at least 1024, each take every `thread_count`-th pixel, so that the order of every sum is
+//! fixed. NaN and negative values count as 0, values above 65504 as 65504.
+
+layout(local_size_x = 256) in;
+
+layout(push_constant) uniform Params {
+    uvec4 ranks;  // of the four searches
+    uint pixel_count;
+    uint thread_count;
+};
+
+layout(binding = 0) readonly buffer Image       { float image[]; };      // (3, H, W), sRGB
+layout(binding = 1) writeonly buffer Luminances { float luminances[]; }; // (H, W)
+layout(binding = 2) writeonly buffer Sums       { vec2 sums[]; };        // (threads) luminance; red + green + blue
+layout(binding = 3) writeonly buffer Searches   { RankSearch searches[]; };
+layout(binding = 4) writeonly buffer Histograms { uint histograms[]; };  // (SEARCHES, BINS)
+
+// Positive phrasing: a NaN fails it too.
+float measurable(float x) {
+    return x > 0.0 ? min(x, 65504.0) : 0.0;
+}
+
+void main() {
+    uint thread = THREAD_INDEX;
+    if (thread >= thread_count) return;
+    if (thread < SEARCHES) searches[thread] = RankSearch(0, ranks[thread], 0);
+    if (thread < SEARCHES * BINS) histograms[thread] = 0;
+
+    CompensatedSum total = CompensatedSum(vec2(0), vec2(0));
+    for (uint i = thread; i < pixel_count; i += thread_count) {
+        float r = measurable(image[i]);
+        float g = measurable(image[pixel_count + i]);
+        float b = measurable(image[2 * pixel_count + i]);
+        // `precise`: a fused multiply-add would move a percentile by an ulp between devices.
+        precise float luminance = 0.299 * r + 0.587 * g + 0.114 * b;
+        precise float sum = r + g + b;
+        luminances[i] = luminance;
+        total = add(total, vec2(luminance, sum));
+    }
+    sums[thread] = total.sum;
+}

@@ -1,0 +1,46 @@
+#version 460
+#extension GL_GOOGLE_include_directive : require
+#include "kernel.glsl"
+#include "rank_search.glsl"
+
+//! Luminance histogram: counts one digit of the luminances that begin with a search's prefix.
+//!
+//! `thread_count` threads each take every `thread_count`-th pixel; a workgroup counts in shared memory first. Counts are
+//! integers, so their order does not matter.
+
+layout(local_size_x = 256) in;
+
+layout(push_constant) uniform Params {
+    uint pixel_count;
+    uint thread_count;
+    uint shift;  // of the digit: 24, 16, 8, 0
+};
+
+layout(binding = 0) readonly buffer Luminances { float luminances[]; };
+layout(binding = 1) readonly buffer Searches   { RankSearch searches[]; };
+layout(binding = 2) buffer Histograms          { uint histograms[]; };  // (SEARCHES, BINS)
+
+shared uint counts[SEARCHES * BINS];
+
+void main() {
+    for (uint bin = gl_LocalInvocationID.x; bin < SEARCHES * BINS; bin += gl_WorkGroupSize.x) counts[bin] = 0;
+    RankSearch search[SEARCHES];
+    [[unroll]] for (uint s = 0; s < SEARCHES; ++s) search[s] = searches[s];
+    barrier();
+
+    for (uint i = THREAD_INDEX; i < pixel_count; i += thread_count) {
+        uint bits = floatBitsToUint(luminances[i]);
+        // In two steps: a shift by 32 is undefined.
+        uint prefix = bits >> shift >> 8;
+        uint histogram = SEARCHES;
+        [[unroll]] for (uint s = 0; s < SEARCHES; ++s) {
+            if (prefix == search[s].prefix) histogram = search[s].histogram;
+        }
+        if (histogram < SEARCHES) atomicAdd(counts[histogram * BINS + (bits >> shift & 255u)], 1);
+    }
+    barrier();
+
+    for (uint bin = gl_LocalInvocationID.x; bin < SEARCHES * BINS; bin += gl_WorkGroupSize.x) {
+        if (counts[bin] > 0) atomicAdd(histograms[bin], counts[bin]);
+    }
+}

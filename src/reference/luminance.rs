@@ -1,0 +1,38 @@
+use glam::Vec2;
+
+use super::CompensatedSum;
+use crate::gpu::Reference;
+use crate::kernels::RankSearch;
+use crate::kernels::luminance::{Constants, Kernel, Params, Slices};
+
+impl Reference for Kernel {
+    fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
+        let Slices { image, luminances, sums, searches, histograms } = slices;
+        for (search, rank) in searches.iter_mut().zip(params.ranks) {
+            *search = RankSearch { prefix: 0, rank, histogram: 0 };
+        }
+        histograms.fill(0);
+        let pixel_count = params.pixel_count as usize;
+        let thread_count = params.thread_count as usize;
+        for thread in 0..thread_count {
+            let mut total = CompensatedSum::default();
+            for i in (thread..pixel_count).step_by(thread_count) {
+                let [r, g, b] = [0, 1, 2].map(|plane| measurable(image[plane * pixel_count + i]));
+                luminances[i] = luminance([r, g, b]);
+                total.add(Vec2::new(luminances[i], r + g + b));
+            }
+            sums[thread] = total.sum;
+        }
+    }
+}
+
+/// BT.601 luminance of an RGB value, in the kernel's order of operations.
+pub(crate) fn luminance([r, g, b]: [f32; 3]) -> f32 {
+    0.299 * r + 0.587 * g + 0.114 * b
+}
+
+/// A value the statistics can take: finite, not negative.
+pub(crate) fn measurable(x: f32) -> f32 {
+    // Positive phrasing: a NaN fails it too.
+    if x > 0.0 { x.min(65504.0) } else { 0.0 }
+}

@@ -1,0 +1,23 @@
+use crate::gpu::Reference;
+use crate::kernels::RankSearch;
+use crate::kernels::percentile_select::{Constants, Kernel, Params, Slices};
+
+impl Reference for Kernel {
+    fn run(_: &Params, _: &Constants, Slices { searches, histograms }: Slices<'_>) {
+        for search in searches.iter_mut() {
+            let first = search.histogram * 256;
+            let mut digit = 0;
+            while digit < 255 && search.rank >= histograms[(first + digit) as usize] {
+                search.rank -= histograms[(first + digit) as usize];
+                digit += 1;
+            }
+            search.prefix = search.prefix << 8 | digit;
+        }
+        for thread in 0..searches.len() {
+            let RankSearch { prefix, .. } = searches[thread];
+            let first = searches.iter().position(|search| search.prefix == prefix);
+            searches[thread].histogram = first.unwrap_or(thread) as u32;
+        }
+        histograms.fill(0);
+    }
+}

@@ -1,0 +1,16 @@
+use super::tone::tone_curve;
+use crate::gpu::Reference;
+use crate::kernels::tone_map::{Constants, Kernel, Params, Slices};
+
+impl Reference for Kernel {
+    fn run(
+        params: &Params,
+        constants: &Constants,
+        Slices { image, parameters, target }: Slices<'_>,
+    ) {
+        for i in 0..params.value_count as usize {
+            target[i] =
+                tone_curve(constants.tone_curve, image[i], &parameters[params.view as usize]);
+        }
+    }
+}

@@ -1,0 +1,457 @@
+//! The differentiable rasteriser: Gaussians and a camera in, a render out; its gradient in, theirs out.
+//!
+//! ```text
+//! project -> sort by depth -> order_counts -> scan -> check_capacity -> emit -> sort by tile -> tile_ranges
+//!     -> blend_forward -> [loss] -> blend_backward -> reduce_records -> project_backward
+//! ```
+//!
+//! Counts stay on the device. Where the intersections of a view exceed the memory reserved for them, a status flag is
+//! raised, nothing is rendered or updated, and the host grows the buffers and redoes the step ([`Renderer::grow`]).
+
+mod frame;
+
+use glam::{DVec3, UVec2, Vec2};
+
+use crate::camera::Camera;
+use crate::gpu::{Buffer, Gpu, Kernel as _, Pipeline, Recorder, Threads};
+use crate::kernels::{
+    blend_backward, blend_forward, check_capacity, emit, order_counts, project, project_backward,
+    reduce_records, tile_ranges,
+};
+use crate::sort::{Count, DispatchArguments, RadixSort, Scan};
+use crate::{Error, Result};
+
+use frame::Frame;
+pub use frame::Status;
+
+/// Values per pixel that a background is given for.
+pub const MAX_CHANNELS: usize = 11;
+
+/// What a renderer is specialised for.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RenderSettings {
+    /// Gaussians nearer than this are not seen, in world units.
+    pub near: f32,
+    /// The largest alpha of a splat on a pixel; below 1.
+    pub max_alpha: f32,
+    /// Degree of the spherical harmonics stored.
+    pub sh_degree: u32,
+    /// The tile that one subgroup owns, in pixels.
+    pub tile: [u32; 2],
+}
+
+impl Default for RenderSettings {
+    fn default() -> Self {
+        Self { near: 0.2, max_alpha: 0.99, sh_degree: 3, tile: [16, 16] }
+    }
+}
+
+/// What changes from render to render.
+#[derive(Clone, Copy, Debug)]
+pub struct RenderOptions {
+    /// Degree of the spherical harmonics used, at most the one stored.
+    pub sh_degree: u32,
+    /// What is seen where no splat is, RGB.
+    pub background: [f32; 3],
+}
+
+/// How the screen-space gradient enters the statistics of density control.
+#[derive(Clone, Copy, Debug)]
+pub struct Damping {
+    /// 0 to 1: the fraction that is damped.
+    pub weight: f32,
+    /// Depth from which nothing is damped, in world units.
+    pub depth: f32,
+}
+
+/// Where the backward pass leaves its results, each for all Gaussians.
+#[derive(Debug)]
+pub struct Gradients<'a> {
+    /// (columns x Gaussians): gradient of every parameter.
+    pub parameters: &'a mut Buffer<f32>,
+    /// (Gaussians): sums of the norms of the screen-space gradients in normalised device units.
+    pub grad_norm_sums: &'a mut Buffer<f32>,
+    /// (Gaussians): in how many steps each was seen.
+    pub visit_counts: &'a mut Buffer<u32>,
+}
+
+/// Renders Gaussians, forward and backward. Holds the memory of one view.
+#[derive(Debug)]
+pub struct Renderer {
+    gpu: Gpu,
+    settings: RenderSettings,
+    project: Pipeline<project::Kernel>,
+    order_counts: Pipeline<order_counts::Kernel>,
+    check_capacity: Pipeline<check_capacity::Kernel>,
+    emit: Pipeline<emit::Kernel>,
+    tile_ranges: Pipeline<tile_ranges::Kernel>,
+    blend_forward: Pipeline<blend_forward::Kernel>,
+    blend_backward: Pipeline<blend_backward::Kernel>,
+    reduce_records: Pipeline<reduce_records::Kernel>,
+    project_backward: Pipeline<project_backward::Kernel>,
+    depth_sort: RadixSort,
+    tile_sort: RadixSort,
+    scan: Scan,
+    intersections: DispatchArguments,
+    frame: Frame,
+}
+
+impl Renderer {
+    /// Builds the kernels; memory comes with [`Renderer::reserve`].
+    ///
+    /// # Errors
+    /// The driver refuses a kernel, or the tile has more than 32 rows of lanes.
+    pub fn new(gpu: &Gpu, settings: RenderSettings) -> Result<Self> {
+        let [tile_width, tile_height] = settings.tile;
+        let lanes = gpu.properties().subgroup_size;
+        let pixels = tile_width * tile_height;
+        if pixels == 0 || pixels % lanes != 0 || pixels / lanes > 32 {
+            let what = format!("{tile_width}x{tile_height} tiles do not suit {lanes} lanes");
+            return Err(Error::Usage(format!("{what}; take a tile of 8 to 32 times as many pixels")));
+        }
+        let channels = 3;
+        let (alpha_max, sh_degree) = (settings.max_alpha, settings.sh_degree);
+        Ok(Self {
+            gpu: gpu.clone(),
+            settings,
+            project: gpu.pipeline(&project::Constants {
+                sh_degree,
+                alpha_max,
+                channels,
+                tile_width,
+                tile_height,
+            })?,
+            order_counts: gpu.pipeline(&order_counts::Constants::default())?,
+            check_capacity: gpu.pipeline(&check_capacity::Constants::default())?,
+            emit: gpu.pipeline(&emit::Constants { alpha_max, channels, tile_width, tile_height })?,
+            tile_ranges: gpu.pipeline(&tile_ranges::Constants::default())?,
+            blend_forward: gpu.pipeline(&blend_forward::Constants {
+                alpha_max,
+                channels,
+                tile_width,
+                tile_height,
+            })?,
+            blend_backward: gpu.pipeline(&blend_backward::Constants {
+                alpha_max,
+                channels,
+                tile_width,
+                tile_height,
+            })?,
+            reduce_records: gpu.pipeline(&reduce_records::Constants {
+                alpha_max,
+                channels,
+                tile_width,
+                tile_height,
+            })?,
+            project_backward: gpu.pipeline(&project_backward::Constants {
+                sh_degree,
+                alpha_max,
+                channels,
+                tile_width,
+                tile_height,
+            })?,
+            depth_sort: RadixSort::new(gpu, 0)?,
+            tile_sort: RadixSort::new(gpu, 0)?,
+            scan: Scan::new(gpu, 0)?,
+            intersections: DispatchArguments::new(gpu)?,
+            frame: Frame::new(gpu)?,
+        })
+    }
+
+    /// Makes room for `gaussian_count` Gaussians and the images of `cameras`.
+    ///
+    /// # Errors
+    /// The device is out of memory.
+    pub fn reserve<'a>(
+        &mut self,
+        gaussian_count: usize,
+        cameras: impl IntoIterator<Item = &'a Camera>,
+    ) -> Result<()> {
+        let (mut pixels, mut tiles) = (0, 0);
+        for camera in cameras {
+            let UVec2 { x, y } = self.tiles(camera);
+            pixels = pixels.max(camera.width as usize * camera.height as usize);
+            tiles = tiles.max(x as usize * y as usize);
+        }
+        self.frame.reserve(&self.gpu, gaussian_count, pixels, tiles)
+    }
+
+    /// Makes room for `intersections`, and half as many again.
+    ///
+    /// # Errors
+    /// The device is out of memory.
+    pub fn grow(&mut self, intersections: u32) -> Result<()> {
+        self.frame.reserve_intersections(&self.gpu, intersections)
+    }
+
+    /// The last render, planar (3, H, W).
+    pub fn render(&self) -> &Buffer<f32> {
+        &self.frame.render
+    }
+
+    /// The status words: see [`Status`]. Kernels that change parameters look at the first and do nothing unless it is 0.
+    pub fn status(&self) -> &Buffer<u32> {
+        &self.frame.status
+    }
+
+    /// The status words, for kernels that raise flags of their own.
+    pub fn status_mut(&mut self) -> &mut Buffer<u32> {
+        &mut self.frame.status
+    }
+
+    /// Lowers every flag of the status.
+    pub fn clear_status(&mut self, pass: &mut Recorder<'_>) {
+        pass.fill(&mut self.frame.status, 0);
+    }
+
+    /// Records the render of `gaussians` (planes of all attributes) as `camera` sees them.
+    ///
+    /// # Errors
+    /// The image exceeds what was reserved, or a pass exceeds what the device launches.
+    pub fn forward(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        gaussians: &Buffer<f32>,
+        camera: &Camera,
+        options: &RenderOptions,
+    ) -> Result<()> {
+        let view = self.view(camera)?;
+        self.record_project(pass, gaussians, &view, options.sh_degree)?;
+        self.record_bins(pass, &view)?;
+        let mut background = [0.0; MAX_CHANNELS];
+        background[..3].copy_from_slice(&options.background);
+        let frame = &mut self.frame;
+        pass.dispatch(
+            &self.blend_forward,
+            &blend_forward::Params { size: view.size, tile_columns: view.tiles.x, background },
+            blend_forward::Buffers {
+                tile_ranges: &frame.tile_ranges,
+                sorted_slots: &frame.slots,
+                owners: &frame.owners,
+                splats: &frame.splats,
+                colors: &frame.colors,
+                render: &mut frame.render,
+                transmittances: &mut frame.transmittances,
+            },
+            Threads::Workgroups([view.tile_count(), 1, 1]),
+        )
+    }
+
+    /// Records the gradients of the Gaussians, given `d_render`, that of the render recorded last (3, H, W).
+    ///
+    /// # Errors
+    /// A pass exceeds what the device launches.
+    pub fn backward(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        gaussians: &Buffer<f32>,
+        camera: &Camera,
+        options: &RenderOptions,
+        damping: Damping,
+        d_render: &Buffer<f32>,
+        gradients: Gradients<'_>,
+    ) -> Result<()> {
+        let view = self.view(camera)?;
+        let gaussian_count = self.frame.gaussian_count;
+        let frame = &mut self.frame;
+        pass.dispatch(
+            &self.blend_backward,
+            &blend_backward::Params { size: view.size, tile_columns: view.tiles.x },
+            blend_backward::Buffers {
+                tile_ranges: &frame.tile_ranges,
+                sorted_slots: &frame.slots,
+                owners: &frame.owners,
+                splats: &frame.splats,
+                colors: &frame.colors,
+                render: &frame.render,
+                d_render,
+                records: &mut frame.records,
+            },
+            Threads::Workgroups([view.tile_count(), 1, 1]),
+        )?;
+        pass.dispatch(
+            &self.reduce_records,
+            &reduce_records::Params { gaussian_count },
+            reduce_records::Buffers {
+                counts: &frame.counts,
+                sorted_ids: &frame.ids,
+                ordered_counts: &frame.ordered_counts,
+                offsets: &frame.offsets,
+                records: &frame.records,
+                d_splats: &mut frame.d_splats,
+            },
+            Threads::Exactly([gaussian_count, 1, 1]),
+        )?;
+        pass.dispatch(
+            &self.project_backward,
+            &project_backward::Params {
+                view_from_world: view.view_from_world,
+                focal: view.focal,
+                principal_point: view.principal_point,
+                size: view.size,
+                gaussian_count,
+                sh_degree: options.sh_degree,
+                damping_weight: damping.weight,
+                damping_depth: damping.depth,
+            },
+            project_backward::Buffers {
+                parameters: gaussians,
+                splats: &frame.splats,
+                colors: &frame.colors,
+                tile_counts: &frame.tile_counts,
+                d_splats: &frame.d_splats,
+                status: &frame.status,
+                gradients: gradients.parameters,
+                grad_norm_sums: gradients.grad_norm_sums,
+                visit_counts: gradients.visit_counts,
+            },
+            Threads::Exactly([gaussian_count, 1, 1]),
+        )
+    }
+
+    fn record_project(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        gaussians: &Buffer<f32>,
+        view: &View,
+        sh_degree: u32,
+    ) -> Result<()> {
+        let frame = &mut self.frame;
+        let gaussian_count = frame.gaussian_count;
+        pass.dispatch(
+            &self.project,
+            &project::Params {
+                view_from_world: view.view_from_world,
+                focal: view.focal,
+                principal_point: view.principal_point,
+                size: view.size,
+                near: self.settings.near,
+                gaussian_count,
+                sh_degree,
+            },
+            project::Buffers {
+                parameters: gaussians,
+                splats: &mut frame.splats,
+                colors: &mut frame.colors,
+                depth_keys: &mut frame.depth_keys,
+                ids: &mut frame.ids,
+                tile_counts: &mut frame.tile_counts,
+            },
+            Threads::Exactly([gaussian_count, 1, 1]),
+        )
+    }
+
+    /// From projected splats to each tile's list of them, front to back.
+    fn record_bins(&mut self, pass: &mut Recorder<'_>, view: &View) -> Result<()> {
+        let frame = &mut self.frame;
+        let gaussian_count = frame.gaussian_count;
+        let all = Count { counts: &frame.gaussian_counts, index: 0 };
+        self.depth_sort.record(pass, all, &mut frame.depth_keys, &mut frame.ids, u32::BITS)?;
+        pass.dispatch(
+            &self.order_counts,
+            &order_counts::Params { gaussian_count },
+            order_counts::Buffers {
+                sorted_ids: &frame.ids,
+                tile_counts: &frame.tile_counts,
+                ordered_counts: &mut frame.ordered_counts,
+            },
+            Threads::Exactly([gaussian_count, 1, 1]),
+        )?;
+        self.scan.record(
+            pass,
+            all,
+            &frame.ordered_counts,
+            &mut frame.offsets,
+            &mut frame.total,
+        )?;
+        let capacity = frame.intersection_capacity();
+        pass.dispatch(
+            &self.check_capacity,
+            &check_capacity::Params { gaussian_count, capacity },
+            check_capacity::Buffers {
+                total: &frame.total,
+                counts: &mut frame.counts,
+                status: &mut frame.status,
+            },
+            Threads::Exactly([1, 1, 1]),
+        )?;
+        pass.dispatch(
+            &self.emit,
+            &emit::Params { size: view.size, gaussian_count, tile_columns: view.tiles.x },
+            emit::Buffers {
+                counts: &frame.counts,
+                sorted_ids: &frame.ids,
+                ordered_counts: &frame.ordered_counts,
+                offsets: &frame.offsets,
+                splats: &frame.splats,
+                tiles: &mut frame.tiles,
+                slots: &mut frame.slots,
+                owners: &mut frame.owners,
+            },
+            Threads::Exactly([gaussian_count, 1, 1]),
+        )?;
+        let emitted = Count { counts: &frame.counts, index: 0 };
+        // One value more than there are tiles: padding sorts behind them all.
+        let bits = u32::BITS - view.tile_count().leading_zeros();
+        self.tile_sort.record(pass, emitted, &mut frame.tiles, &mut frame.slots, bits)?;
+        pass.fill(&mut frame.tile_ranges, 0);
+        let per_workgroup = tile_ranges::Kernel::WORKGROUP_SIZE[0];
+        self.intersections.record(pass, emitted, per_workgroup, capacity)?;
+        pass.dispatch(
+            &self.tile_ranges,
+            &tile_ranges::Params { tile_count: view.tile_count() },
+            tile_ranges::Buffers {
+                counts: &frame.counts,
+                sorted_tiles: &frame.tiles,
+                tile_ranges: &mut frame.tile_ranges,
+            },
+            self.intersections.threads(),
+        )
+    }
+
+    /// Columns and rows of tiles.
+    fn tiles(&self, camera: &Camera) -> UVec2 {
+        let [tile_width, tile_height] = self.settings.tile;
+        UVec2::new(camera.width.div_ceil(tile_width), camera.height.div_ceil(tile_height))
+    }
+
+    fn view(&self, camera: &Camera) -> Result<View> {
+        let pixels = camera.width as usize * camera.height as usize;
+        let tiles = self.tiles(camera);
+        if 3 * pixels > self.frame.render.len()
+            || (tiles.x * tiles.y) as usize > self.frame.tile_ranges.len()
+        {
+            let (width, height) = (camera.width, camera.height);
+            let what = format!("a {width}x{height} image exceeds what the renderer reserved");
+            return Err(Error::Usage(what));
+        }
+        let columns = [
+            camera.view_from_world.matrix3.x_axis,
+            camera.view_from_world.matrix3.y_axis,
+            camera.view_from_world.matrix3.z_axis,
+            camera.view_from_world.translation,
+        ];
+        Ok(View {
+            view_from_world: columns.map(|column: DVec3| column.as_vec3().to_array()),
+            focal: camera.focal.as_vec2(),
+            principal_point: camera.principal_point.as_vec2(),
+            size: UVec2::new(camera.width, camera.height),
+            tiles,
+        })
+    }
+}
+
+/// A camera as the kernels take it.
+struct View {
+    view_from_world: [[f32; 3]; 4],
+    focal: Vec2,
+    principal_point: Vec2,
+    size: UVec2,
+    tiles: UVec2,
+}
+
+impl View {
+    fn tile_count(&self) -> u32 {
+        self.tiles.x * self.tiles.y
+    }
+}

@@ -1,0 +1,147 @@
+//! The memory of one view: what the passes of a render hand each other.
+
+use glam::UVec2;
+
+use crate::Result;
+use crate::gpu::{Buffer, Gpu};
+use crate::kernels::ProjectedSplat;
+
+/// Values of a gradient record: mean2d 2, conic 3, opacity 1, colour 3.
+const RECORD: usize = 9;
+
+/// What the status words say.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Status {
+    /// More intersections than memory was reserved for.
+    pub overflowed: bool,
+    /// A loss term is NaN or infinite.
+    pub not_finite: bool,
+    /// The most intersections that a render had since the status was cleared.
+    pub intersections: u32,
+}
+
+impl Status {
+    /// The bit that `check_capacity` raises.
+    pub const OVERFLOWED: u32 = 1;
+    /// The bit that the loss raises.
+    pub const NOT_FINITE: u32 = 2;
+    /// The number of status words.
+    pub const WORDS: usize = 2;
+
+    /// Reads the words that [`super::Renderer::status`] holds.
+    pub fn from_words(words: &[u32]) -> Self {
+        let word = |i: usize| words.get(i).copied().unwrap_or_default();
+        Self {
+            overflowed: word(0) & Self::OVERFLOWED != 0,
+            not_finite: word(0) & Self::NOT_FINITE != 0,
+            intersections: word(1),
+        }
+    }
+}
+
+/// Buffers by what their length follows.
+#[derive(Debug)]
+pub(super) struct Frame {
+    // Gaussians
+    pub(super) gaussian_count: u32,
+    /// [0]: the count again, where a pass looks for it
+    pub(super) gaussian_counts: Buffer<u32>,
+    pub(super) splats: Buffer<ProjectedSplat>,
+    pub(super) colors: Buffer<f32>,
+    pub(super) depth_keys: Buffer<u32>,
+    pub(super) ids: Buffer<u32>,
+    pub(super) tile_counts: Buffer<u32>,
+    pub(super) ordered_counts: Buffer<u32>,
+    pub(super) offsets: Buffer<u32>,
+    pub(super) d_splats: Buffer<f32>,
+    // intersections
+    pub(super) tiles: Buffer<u32>,
+    pub(super) slots: Buffer<u32>,
+    pub(super) owners: Buffer<u32>,
+    pub(super) records: Buffer<f32>,
+    // pixels and tiles
+    pub(super) render: Buffer<f32>,
+    pub(super) transmittances: Buffer<f32>,
+    pub(super) tile_ranges: Buffer<UVec2>,
+    // single numbers
+    pub(super) total: Buffer<u32>,
+    pub(super) counts: Buffer<u32>,
+    pub(super) status: Buffer<u32>,
+}
+
+impl Frame {
+    /// Room for nothing but the single numbers.
+    pub(super) fn new(gpu: &Gpu) -> Result<Self> {
+        Ok(Self {
+            gaussian_count: 0,
+            gaussian_counts: gpu.zeros("gaussian_counts", 1)?,
+            splats: gpu.uninit("splats", 0)?,
+            colors: gpu.uninit("colors", 0)?,
+            depth_keys: gpu.uninit("depth_keys", 0)?,
+            ids: gpu.uninit("ids", 0)?,
+            tile_counts: gpu.uninit("tile_counts", 0)?,
+            ordered_counts: gpu.uninit("ordered_counts", 0)?,
+            offsets: gpu.uninit("offsets", 0)?,
+            d_splats: gpu.uninit("d_splats", 0)?,
+            tiles: gpu.uninit("tiles", 0)?,
+            slots: gpu.uninit("slots", 0)?,
+            owners: gpu.uninit("owners", 0)?,
+            records: gpu.uninit("records", 0)?,
+            render: gpu.uninit("render", 0)?,
+            transmittances: gpu.uninit("transmittances", 0)?,
+            tile_ranges: gpu.uninit("tile_ranges", 0)?,
+            total: gpu.zeros("total", 1)?,
+            counts: gpu.zeros("counts", 1)?,
+            status: gpu.zeros("status", Status::WORDS)?,
+        })
+    }
+
+    /// Lengths follow the number of Gaussians exactly; pixels and intersections only grow. A first guess gives every
+    /// Gaussian four tiles.
+    pub(super) fn reserve(
+        &mut self,
+        gpu: &Gpu,
+        count: usize,
+        pixels: usize,
+        tiles: usize,
+    ) -> Result<()> {
+        if self.gaussian_count as usize != count || self.splats.len() != count {
+            self.splats = gpu.uninit("splats", count)?;
+            self.colors = gpu.uninit("colors", 3 * count)?;
+            self.depth_keys = gpu.uninit("depth_keys", count)?;
+            self.ids = gpu.uninit("ids", count)?;
+            self.tile_counts = gpu.uninit("tile_counts", count)?;
+            self.ordered_counts = gpu.uninit("ordered_counts", count)?;
+            self.offsets = gpu.uninit("offsets", count)?;
+            self.d_splats = gpu.uninit("d_splats", RECORD * count)?;
+            self.gaussian_count = count as u32;
+            gpu.write(&mut self.gaussian_counts, &[count as u32])?;
+        }
+        if self.render.len() < 3 * pixels {
+            self.render = gpu.uninit("render", 3 * pixels)?;
+            self.transmittances = gpu.uninit("transmittances", pixels)?;
+        }
+        if self.tile_ranges.len() < tiles {
+            self.tile_ranges = gpu.uninit("tile_ranges", tiles)?;
+        }
+        if self.tiles.is_empty() {
+            self.reserve_intersections(gpu, 4 * count.max(1024) as u32)?;
+        }
+        Ok(())
+    }
+
+    pub(super) fn reserve_intersections(&mut self, gpu: &Gpu, intersections: u32) -> Result<()> {
+        let capacity = intersections as usize + intersections as usize / 2;
+        if capacity > self.tiles.len() {
+            self.tiles = gpu.uninit("tiles", capacity)?;
+            self.slots = gpu.uninit("slots", capacity)?;
+            self.owners = gpu.uninit("owners", capacity)?;
+            self.records = gpu.uninit("records", RECORD * capacity)?;
+        }
+        Ok(())
+    }
+
+    pub(super) fn intersection_capacity(&self) -> u32 {
+        self.tiles.len() as u32
+    }
+}

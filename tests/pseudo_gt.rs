@@ -1,0 +1,433 @@
+//! The pseudo-GT kernels against their references, and the whole against the statistics on the host.
+
+use std::path::Path;
+
+use glam::Vec2;
+use nightsplat::gpu::testing::{assert_no_validation_messages, gpu};
+use nightsplat::gpu::{Gpu, Reference, Threads};
+use nightsplat::kernels::{
+    RankSearch, ToneParameters, ToneStatistics, luminance, luminance_histogram, percentile_select,
+    tone_map, tone_statistics,
+};
+use nightsplat::pseudo_gt::PseudoGt;
+use nightsplat::tone::{Statistics, ToneCurve, ToneSettings};
+use nightsplat::{Error, Result};
+
+/// A reproducible value in [0, 1).
+fn noise(state: &mut u64) -> f32 {
+    *state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+    (*state >> 40) as f32 / (1u64 << 24) as f32
+}
+
+/// Planar noise that crowds near black, as dark photographs do.
+fn dark(pixels: usize, seed: u64) -> Vec<f32> {
+    let mut state = seed;
+    (0..3 * pixels).map(|_| noise(&mut state).powi(4) * 0.4).collect()
+}
+
+/// The same, as an 8-bit file stores it.
+fn dark_8_bit(pixels: usize, seed: u64) -> Vec<f32> {
+    dark(pixels, seed).into_iter().map(|x| (x * 255.0).round() / 255.0).collect()
+}
+
+/// Distance in representable values.
+fn ulps(a: f32, b: f32) -> u32 {
+    a.to_bits().abs_diff(b.to_bits())
+}
+
+/// The curve and the statistics that the device finds, and the mapped image.
+fn on_device(
+    gpu: &Gpu,
+    settings: ToneSettings,
+    image: &[f32],
+) -> Result<(ToneParameters, Statistics, Vec<f32>)> {
+    let mut pseudo_gt = PseudoGt::new(gpu, settings)?;
+    let image = gpu.buffer("image", image)?;
+    let mut parameters = gpu.zeros("tone parameters", 1)?;
+    let mut target = gpu.zeros("target", image.len())?;
+    gpu.run("pseudo-GT", |pass| {
+        pseudo_gt.statistics(pass, &image, [image.len() as u32 / 3, 1], &mut parameters, 0)?;
+        pseudo_gt.map(pass, &image, &parameters, 0, &mut target)
+    })?;
+    Ok((gpu.read(&parameters)?[0], pseudo_gt.measured()?, gpu.read(&target)?))
+}
+
+const SIZES: [usize; 6] = [1, 1023, 1024, 1025, 4097, 50_021];
+
+#[test]
+fn luminance_matches_the_reference() {
+    let gpu = gpu();
+    let pipeline = gpu.pipeline::<luminance::Kernel>(&luminance::Constants {}).unwrap();
+    for pixels in SIZES {
+        let mut image = dark(pixels, 3);
+        image[0] = f32::NAN;
+        image[pixels / 2] = -0.5;
+        image[2 * pixels] = f32::INFINITY;
+        for thread_count in [1024, 2048] {
+            let params =
+                luminance::Params { ranks: [0, 1, 2, 3], pixel_count: pixels as u32, thread_count };
+            let mut luminances = vec![0.0; pixels];
+            let mut sums = vec![Vec2::ZERO; thread_count as usize];
+            let mut searches = vec![RankSearch::default(); 4];
+            let mut histograms = vec![9; 1024];
+            let mut buffers = (
+                gpu.zeros("luminances", pixels).unwrap(),
+                gpu.zeros("sums", sums.len()).unwrap(),
+                gpu.zeros("searches", 4).unwrap(),
+                gpu.buffer("histograms", &histograms).unwrap(),
+            );
+            let slices = luminance::Slices {
+                image: &image,
+                luminances: &mut luminances,
+                sums: &mut sums,
+                searches: &mut searches,
+                histograms: &mut histograms,
+            };
+            luminance::Kernel::run(&params, &luminance::Constants {}, slices);
+            let bound = luminance::Buffers {
+                image: &gpu.buffer("image", &image).unwrap(),
+                luminances: &mut buffers.0,
+                sums: &mut buffers.1,
+                searches: &mut buffers.2,
+                histograms: &mut buffers.3,
+            };
+            gpu.run("luminance", |pass| {
+                pass.dispatch(&pipeline, &params, bound, Threads::Exactly([thread_count, 1, 1]))
+            })
+            .unwrap();
+            assert_eq!(gpu.read(&buffers.0).unwrap(), luminances, "{pixels} pixels");
+            assert_eq!(gpu.read(&buffers.1).unwrap(), sums, "{pixels} pixels");
+            assert_eq!(gpu.read(&buffers.2).unwrap(), searches);
+            assert_eq!(gpu.read(&buffers.3).unwrap(), histograms);
+        }
+    }
+    assert_no_validation_messages();
+}
+
+#[test]
+fn luminance_histogram_and_percentile_select_match_their_references() {
+    let gpu = gpu();
+    let histogram =
+        gpu.pipeline::<luminance_histogram::Kernel>(&luminance_histogram::Constants {}).unwrap();
+    let select =
+        gpu.pipeline::<percentile_select::Kernel>(&percentile_select::Constants {}).unwrap();
+    for pixels in SIZES {
+        let luminances = dark(pixels, 5)[..pixels].to_vec();
+        let last = pixels as u32 - 1;
+        let ranks = [last / 10, last.min(last / 10 + 1), last / 2, last];
+        let mut searches = ranks.map(|rank| RankSearch { prefix: 0, rank, histogram: 0 });
+        let mut histograms = vec![0; 1024];
+        let on_device = gpu.buffer("luminances", &luminances).unwrap();
+        let mut device_searches = gpu.buffer("searches", &searches).unwrap();
+        let mut device_histograms = gpu.buffer("histograms", &histograms).unwrap();
+        for shift in [24, 16, 8, 0] {
+            let params = luminance_histogram::Params {
+                pixel_count: pixels as u32,
+                thread_count: 1024,
+                shift,
+            };
+            let slices = luminance_histogram::Slices {
+                luminances: &luminances,
+                searches: &searches,
+                histograms: &mut histograms,
+            };
+            luminance_histogram::Kernel::run(&params, &luminance_histogram::Constants {}, slices);
+            let bound = luminance_histogram::Buffers {
+                luminances: &on_device,
+                searches: &device_searches,
+                histograms: &mut device_histograms,
+            };
+            gpu.run("luminance_histogram", |pass| {
+                pass.dispatch(&histogram, &params, bound, Threads::Exactly([1024, 1, 1]))
+            })
+            .unwrap();
+            assert_eq!(
+                gpu.read(&device_histograms).unwrap(),
+                histograms,
+                "{pixels} pixels, shift {shift}"
+            );
+
+            let slices =
+                percentile_select::Slices { searches: &mut searches, histograms: &mut histograms };
+            percentile_select::Kernel::run(
+                &percentile_select::Params {},
+                &percentile_select::Constants {},
+                slices,
+            );
+            let bound = percentile_select::Buffers {
+                searches: &mut device_searches,
+                histograms: &mut device_histograms,
+            };
+            gpu.run("percentile_select", |pass| {
+                pass.dispatch(
+                    &select,
+                    &percentile_select::Params {},
+                    bound,
+                    Threads::Workgroups([1, 1, 1]),
+                )
+            })
+            .unwrap();
+            assert_eq!(
+                gpu.read(&device_searches).unwrap(),
+                searches,
+                "{pixels} pixels, shift {shift}"
+            );
+            assert_eq!(gpu.read(&device_histograms).unwrap(), vec![0; 1024]);
+        }
+        let mut sorted = luminances;
+        sorted.sort_by(f32::total_cmp);
+        let found = searches.map(|search| f32::from_bits(search.prefix));
+        assert_eq!(found, ranks.map(|rank| sorted[rank as usize]), "{pixels} pixels");
+    }
+    assert_no_validation_messages();
+}
+
+#[test]
+fn tone_statistics_matches_the_reference() {
+    let gpu = gpu();
+    let mut state = 11;
+    let sums: Vec<Vec2> =
+        (0..2048).map(|_| Vec2::new(noise(&mut state), 3.0 * noise(&mut state))).collect();
+    let searches = [0.01, 0.012, 0.2, 0.22f32].map(|x| RankSearch {
+        prefix: x.to_bits(),
+        rank: 0,
+        histogram: 0,
+    });
+    for curve in ToneCurve::ALL {
+        let constants = tone_statistics::Constants { tone_curve: curve.constant() };
+        let pipeline = gpu.pipeline::<tone_statistics::Kernel>(&constants).unwrap();
+        for thread_count in [1, 255, 256, 257, 2048] {
+            let params = tone_statistics::Params {
+                weights: Vec2::new(0.3, 0.7),
+                view: 2,
+                pixel_count: 9999,
+                thread_count,
+                gain_c: 3.0,
+                theta: 0.49,
+                alpha: 0.12,
+                beta: 2.5,
+                base_gain: 1.0,
+            };
+            let mut statistics = vec![ToneStatistics::default()];
+            let mut parameters = vec![ToneParameters::default(); 4];
+            let slices = tone_statistics::Slices {
+                searches: &searches,
+                sums: &sums,
+                statistics: &mut statistics,
+                parameters: &mut parameters,
+            };
+            tone_statistics::Kernel::run(&params, &constants, slices);
+            let mut device_statistics = gpu.zeros("statistics", 1).unwrap();
+            let mut device_parameters = gpu.zeros("parameters", 4).unwrap();
+            let bound = tone_statistics::Buffers {
+                searches: &gpu.buffer("searches", &searches).unwrap(),
+                sums: &gpu.buffer("sums", &sums).unwrap(),
+                statistics: &mut device_statistics,
+                parameters: &mut device_parameters,
+            };
+            gpu.run("tone_statistics", |pass| {
+                pass.dispatch(&pipeline, &params, bound, Threads::Workgroups([1, 1, 1]))
+            })
+            .unwrap();
+            let found = gpu.read(&device_statistics).unwrap()[0];
+            assert_eq!([found.p10, found.p90], [statistics[0].p10, statistics[0].p90]);
+            // The sums are the same bits; a division may be off by 2.5 ulp.
+            assert!(ulps(found.mean_luminance, statistics[0].mean_luminance) <= 3, "{found:?}");
+            assert!(ulps(found.mean, statistics[0].mean) <= 6, "{found:?}");
+            let found = gpu.read(&device_parameters).unwrap();
+            assert!(
+                near(&found[2], &parameters[2]),
+                "{curve}: {:?}, not {:?}",
+                found[2],
+                parameters[2]
+            );
+            for untouched in [0, 1, 3] {
+                assert_eq!(found[untouched], ToneParameters::default());
+            }
+        }
+    }
+    assert_no_validation_messages();
+}
+
+/// Equal but for the division behind white and the power behind the offset, which Vulkan allows many ulps.
+fn near(a: &ToneParameters, b: &ToneParameters) -> bool {
+    let close = |a: f32, b: f32, bound: f32| (a - b).abs() <= bound * b.abs();
+    close(a.white, b.white, 1e-6) && close(a.offset, b.offset, 5e-6) && close(a.gain, b.gain, 1e-6)
+}
+
+#[test]
+fn tone_map_follows_the_reference_from_tiny_to_huge_values() {
+    let gpu = gpu();
+    let mut grid: Vec<f32> = (0..=20_000).map(|i| i as f32 / 5000.0).collect();
+    grid.extend([0.0, 1e-12, 1e-9, 1e-6, 0.009_999, 0.01, 0.010_001, 65.0, 1e6, f32::MAX]);
+    grid.extend([f32::NAN, f32::INFINITY, f32::NEG_INFINITY, -1.0, -1e-9]);
+    for curve in ToneCurve::ALL {
+        let constants = tone_map::Constants { tone_curve: curve.constant() };
+        let pipeline = gpu.pipeline::<tone_map::Kernel>(&constants).unwrap();
+        for (white, offset, gain) in [(1.0, 0.0, 1.0), (0.0816, 0.0754, 1.16), (1e-6, 0.12, 4.0)] {
+            let parameters = [ToneParameters::default(), ToneParameters { white, offset, gain }];
+            let params = tone_map::Params { value_count: grid.len() as u32, view: 1 };
+            let mut expected = vec![0.0; grid.len()];
+            let slices =
+                tone_map::Slices { image: &grid, parameters: &parameters, target: &mut expected };
+            tone_map::Kernel::run(&params, &constants, slices);
+            let mut target = gpu.zeros("target", grid.len()).unwrap();
+            let bound = tone_map::Buffers {
+                image: &gpu.buffer("image", &grid).unwrap(),
+                parameters: &gpu.buffer("parameters", &parameters).unwrap(),
+                target: &mut target,
+            };
+            gpu.run("tone_map", |pass| {
+                pass.dispatch(
+                    &pipeline,
+                    &params,
+                    bound,
+                    Threads::Exactly([params.value_count, 1, 1]),
+                )
+            })
+            .unwrap();
+            let mut worst = 0.0f32;
+            for ((&x, found), expected) in grid.iter().zip(gpu.read(&target).unwrap()).zip(expected)
+            {
+                worst = worst.max((found - expected).abs());
+                // exp may be off by 3 + 2 |x| ulp; tiny values keep their relative precision.
+                let bound = if offset == 0.0 && x / white < 1e-3 { 4e-7 * expected } else { 5e-7 };
+                assert!(
+                    (found - expected).abs() <= bound,
+                    "{curve}({x}) = {found}, not {expected}"
+                );
+            }
+            println!("{curve} {white}: {worst:e}");
+        }
+    }
+    assert_no_validation_messages();
+}
+
+#[test]
+fn device_statistics_equal_the_host_s() {
+    let gpu = gpu();
+    let mut state = 17;
+    let photographs = [
+        ("one black pixel", vec![0.0; 3]),
+        ("one white pixel", vec![1.0; 3]),
+        ("two pixels", vec![0.1, 0.7, 0.2, 0.3, 0.0, 0.9]),
+        ("black", vec![0.0; 30_000]),
+        ("white", vec![1.0; 30_000]),
+        ("constant", vec![0.03; 3 * 4001]),
+        (
+            "one dot in the dark",
+            (0..30_000).map(|i| f32::from(u8::from(i % 10_000 == 0))).collect(),
+        ),
+        ("not finite", vec![f32::NAN, f32::INFINITY, f32::NEG_INFINITY, -1.0, 0.5, 1e30]),
+        ("float noise", dark(70_001, 1)),
+        ("8-bit noise", dark_8_bit(187_500, 2)),
+        (
+            "every magnitude",
+            (0..30_000).map(|_| 10f32.powf(noise(&mut state) * 16.0 - 12.0)).collect(),
+        ),
+    ];
+    for (name, image) in &photographs {
+        let host = Statistics::of(image);
+        for curve in ToneCurve::ALL {
+            let settings = ToneSettings::new(curve);
+            let (found, device, target) = on_device(&gpu, settings, image).unwrap();
+            assert_eq!([device.p10, device.p90], [host.p10, host.p90], "{name}");
+            for (device, host) in
+                [(device.mean_luminance, host.mean_luminance), (device.mean, host.mean)]
+            {
+                assert!((device - host).abs() <= 1e-6 * host, "{name}: mean {device}, not {host}");
+            }
+            let expected = settings.parameters(&host);
+            assert!(near(&found, &expected), "{name}, {curve}: {found:?}, not {expected:?}");
+            assert!(target.iter().all(|y| (0.0..=1.0).contains(y)), "{name}, {curve}");
+        }
+    }
+    assert_no_validation_messages();
+}
+
+#[test]
+fn views_of_different_sizes_share_one_recording() {
+    let gpu = gpu();
+    let settings = ToneSettings::default();
+    let mut pseudo_gt = PseudoGt::new(&gpu, settings).unwrap();
+    let images = [(40, 30, 1), (200, 100, 2), (7, 3, 3)]
+        .map(|(w, h, seed)| ([w, h], dark((w * h) as usize, seed)));
+    let buffers =
+        images.each_ref().map(|(size, image)| (*size, gpu.buffer("image", image).unwrap()));
+    let mut parameters = gpu.zeros("tone parameters", 3).unwrap();
+    gpu.run("statistics", |pass| {
+        for (view, (size, image)) in buffers.iter().enumerate() {
+            pseudo_gt.statistics(pass, image, *size, &mut parameters, view as u32)?;
+        }
+        Ok(())
+    })
+    .unwrap();
+    for (found, (_, image)) in gpu.read(&parameters).unwrap().iter().zip(&images) {
+        let expected = settings.parameters(&Statistics::of(image));
+        assert!(near(found, &expected), "{found:?}, not {expected:?}");
+    }
+    assert_no_validation_messages();
+}
+
+#[test]
+fn the_same_photograph_gives_the_same_bits() {
+    let gpu = gpu();
+    let image = dark(50_000, 4);
+    let first = on_device(&gpu, ToneSettings::default(), &image).unwrap();
+    for _ in 0..24 {
+        assert_eq!(on_device(&gpu, ToneSettings::default(), &image).unwrap(), first);
+    }
+}
+
+#[test]
+fn what_cannot_be_measured_or_mapped_is_refused() {
+    let gpu = gpu();
+    let mut pseudo_gt = PseudoGt::new(&gpu, ToneSettings::default()).unwrap();
+    let image = gpu.zeros("image", 36).unwrap();
+    let empty = gpu.zeros("image", 0).unwrap();
+    let mut parameters = gpu.zeros("tone parameters", 1).unwrap();
+    let mut short = gpu.zeros("target", 35).unwrap();
+    let refused =
+        |what: &str, record: &mut dyn FnMut(&mut nightsplat::gpu::Recorder<'_>) -> Result<()>| {
+            let result = gpu.run("refused", |pass| record(pass));
+            assert!(matches!(result, Err(Error::Usage(_))), "{what}: {result:?}");
+        };
+    refused("another size", &mut |pass| {
+        pseudo_gt.statistics(pass, &image, [4, 4], &mut parameters, 0)
+    });
+    refused("no pixels", &mut |pass| {
+        pseudo_gt.statistics(pass, &empty, [0, 4], &mut parameters, 0)
+    });
+    refused("no such view", &mut |pass| {
+        pseudo_gt.statistics(pass, &image, [4, 3], &mut parameters, 1)
+    });
+    refused("no such view", &mut |pass| pseudo_gt.map(pass, &image, &parameters, 1, &mut short));
+    refused("short target", &mut |pass| pseudo_gt.map(pass, &image, &parameters, 0, &mut short));
+    let bad = ToneSettings { theta: 0.0, ..ToneSettings::default() };
+    assert!(matches!(PseudoGt::new(&gpu, bad), Err(Error::Usage(_))));
+}
+
+#[test]
+fn a_real_photograph_maps_on_the_device_as_on_the_host() {
+    let path =
+        Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../shared/data/lom/chair/low/1.JPG"));
+    if !path.is_file() {
+        println!("skipped: {} is absent", path.display());
+        return;
+    }
+    let rgb = image::open(path).unwrap().to_rgb8();
+    let plane = |c: usize| rgb.pixels().map(move |pixel| f32::from(pixel.0[c]) / 255.0);
+    let image: Vec<f32> = plane(0).chain(plane(1)).chain(plane(2)).collect();
+    for curve in ToneCurve::ALL {
+        let settings = ToneSettings::new(curve);
+        let (_, _, target) = on_device(&gpu(), settings, &image).unwrap();
+        let parameters = settings.parameters(&Statistics::of(&image));
+        let worst = image
+            .iter()
+            .zip(&target)
+            .map(|(&x, y)| (curve.apply(x, &parameters) - y).abs())
+            .fold(0.0, f32::max);
+        println!("{curve}: off by {worst:e} at most");
+        assert!(worst < 5e-6, "{curve}: off by {worst:e}");
+    }
+}
