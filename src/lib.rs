@@ -17,12 +17,12 @@ pub mod dataset;
 pub mod error;
 #[expect(unsafe_code, reason = "the only module that speaks Vulkan")]
 pub mod gpu;
-pub mod kernels;
-pub mod reference;
-pub mod render;
 pub mod image;
+pub mod kernels;
 pub mod metrics;
 pub mod random;
+pub mod reference;
+pub mod render;
 pub mod report;
 pub mod scene;
 pub mod sort;

@@ -90,5 +90,7 @@ impl DispatchArguments {
 fn common_len(what: &str, lens: &[usize]) -> Result<u32> {
     let same = lens.windows(2).all(|pair| pair[0] == pair[1]);
     let len = lens.first().and_then(|&len| u32::try_from(len).ok()).filter(|_| same);
-    len.ok_or_else(|| Error::Usage(format!("{what}: buffers of lengths {lens:?}; give them one length")))
+    len.ok_or_else(|| {
+        Error::Usage(format!("{what}: buffers of lengths {lens:?}; give them one length"))
+    })
 }

@@ -47,16 +47,8 @@ pub fn blend_pixel_backward(
 
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
-        let Slices {
-            tile_ranges,
-            sorted_slots,
-            owners,
-            splats,
-            colors,
-            render,
-            d_render,
-            records,
-        } = slices;
+        let Slices { tile_ranges, sorted_slots, owners, splats, colors, render, d_render, records } =
+            slices;
         let channels = constants.channels as usize;
         let record = 6 + channels;
         let [width, height] = params.size.as_usizevec2().to_array();
@@ -65,8 +57,10 @@ impl Reference for Kernel {
             let slots = &sorted_slots[range.x as usize..range.y as usize];
             let ids = || slots.iter().map(|&slot| owners[slot as usize] as usize);
             let list: Vec<Splat> = ids().map(|id| Splat::from(&splats[id])).collect();
-            let list_colors: Vec<f64> =
-                ids().flat_map(|id| &colors[channels * id..][..channels]).map(|&c| c.into()).collect();
+            let list_colors: Vec<f64> = ids()
+                .flat_map(|id| &colors[channels * id..][..channels])
+                .map(|&c| c.into())
+                .collect();
             let mut sums = vec![0.0; record * list.len()];
             for pixel in tile_pixels(index as u32, params.tile_columns, tile, params.size) {
                 let at = pixel.y as usize * width + pixel.x as usize;

@@ -28,15 +28,8 @@ pub fn blend_pixel(
 
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
-        let Slices {
-            tile_ranges,
-            sorted_slots,
-            owners,
-            splats,
-            colors,
-            render,
-            transmittances,
-        } = slices;
+        let Slices { tile_ranges, sorted_slots, owners, splats, colors, render, transmittances } =
+            slices;
         let channels = constants.channels as usize;
         let background: Vec<f64> =
             params.background[..channels].iter().copied().map(f64::from).collect();
@@ -46,8 +39,10 @@ impl Reference for Kernel {
             let slots = &sorted_slots[range.x as usize..range.y as usize];
             let ids = || slots.iter().map(|&slot| owners[slot as usize] as usize);
             let list: Vec<Splat> = ids().map(|id| Splat::from(&splats[id])).collect();
-            let list_colors: Vec<f64> =
-                ids().flat_map(|id| &colors[channels * id..][..channels]).map(|&c| c.into()).collect();
+            let list_colors: Vec<f64> = ids()
+                .flat_map(|id| &colors[channels * id..][..channels])
+                .map(|&c| c.into())
+                .collect();
             for pixel in tile_pixels(index as u32, params.tile_columns, tile, params.size) {
                 let center = pixel.as_dvec2() + 0.5;
                 let (values, transmittance) = blend_pixel(

@@ -8,16 +8,8 @@ const NO_TILE: u32 = u32::MAX;
 
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
-        let Slices {
-            counts,
-            sorted_ids,
-            ordered_counts,
-            offsets,
-            splats,
-            tiles,
-            slots,
-            owners,
-        } = slices;
+        let Slices { counts, sorted_ids, ordered_counts, offsets, splats, tiles, slots, owners } =
+            slices;
         let tile = UVec2::new(constants.tile_width, constants.tile_height);
         if counts[0] == 0 {
             return;

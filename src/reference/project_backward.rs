@@ -45,8 +45,7 @@ pub fn project_gaussian_backward(
     let [a, b, c] = splat.conic.to_array();
     let d_conic = d_splat.conic;
     let d_xx = -(a * a * d_conic.x + a * b * d_conic.y + b * b * d_conic.z);
-    let d_xy =
-        -(2.0 * a * b * d_conic.x + (a * c + b * b) * d_conic.y + 2.0 * b * c * d_conic.z);
+    let d_xy = -(2.0 * a * b * d_conic.x + (a * c + b * b) * d_conic.y + 2.0 * b * c * d_conic.z);
     let d_yy = -(b * b * d_conic.x + b * c * d_conic.y + c * c * d_conic.z);
     let d_u0 = 2.0 * d_xx * u0 + d_xy * u1;
     let d_u1 = 2.0 * d_yy * u1 + d_xy * u0;
@@ -56,8 +55,7 @@ pub fn project_gaussian_backward(
         DVec3::from_array([0, 1, 2].map(|k| d_scaled_axes.col(k).dot(scaled_axes.col(k))));
     let d_unit = rotation_backward(unit, d_scaled_axes * DMat3::from_diagonal(scale));
     let norm = gaussian.quat.length();
-    let d_quat =
-        if norm > 1e-12 { (d_unit - unit * unit.dot(d_unit)) / norm } else { DVec4::ZERO };
+    let d_quat = if norm > 1e-12 { (d_unit - unit * unit.dot(d_unit)) / norm } else { DVec4::ZERO };
 
     let d_j0 = camera.rotation * (scaled_axes * d_u0);
     let d_j1 = camera.rotation * (scaled_axes * d_u1);
@@ -68,8 +66,8 @@ pub fn project_gaussian_backward(
         }
     }
     let d_xy_view = (camera.focal * d_splat.mean2d + d_slope) / z;
-    let d_inverse_z = camera.focal.x * (d_j0.x - slope.x * d_j0.z)
-        + camera.focal.y * (d_j1.y - slope.y * d_j1.z);
+    let d_inverse_z =
+        camera.focal.x * (d_j0.x - slope.x * d_j0.z) + camera.focal.y * (d_j1.y - slope.y * d_j1.z);
     let d_z = -d_inverse_z / (z * z) - d_xy_view.dot(free_slope);
 
     let (d_mean_sh, d_sh) =
@@ -131,7 +129,8 @@ impl Reference for Kernel {
             if tile_counts[i] == 0 {
                 continue;
             }
-            let d: Vec<f64> = d_splats[(6 + channels) * i..][..9].iter().map(|&d| d.into()).collect();
+            let d: Vec<f64> =
+                d_splats[(6 + channels) * i..][..9].iter().map(|&d| d.into()).collect();
             let passes = |c: usize| if colors[channels * i + c] > 0.0 { d[6 + c] } else { 0.0 };
             let d_splat = DSplat {
                 mean2d: DVec2::from_slice(&d[0..2]),
