@@ -124,12 +124,12 @@ impl Setup {
         setup
     }
 
-    /// One that projects into the image or a little beside it, some pixels wide.
+    /// One that projects into the image or beside it, also where slopes are clamped, some pixels wide.
     fn random_gaussian(&self, random: &mut Random) -> Gaussian {
         let camera = self.camera();
         let depth = random.between(1.0, 5.0);
         let pixel =
-            camera.size * glam::DVec2::from_array([0; 2].map(|_| random.between(-0.1, 1.1)));
+            camera.size * glam::DVec2::from_array([0; 2].map(|_| random.between(-0.25, 1.25)));
         let in_view = ((pixel - camera.principal_point) / camera.focal * depth).extend(depth);
         let pixel_size = depth / camera.focal.x;
         let count = nightsplat::reference::sh::sh_count(self.sh_degree);
@@ -137,7 +137,7 @@ impl Setup {
             mean: camera.rotation.transpose() * (in_view - camera.translation),
             quat: random.normals().into(),
             log_scale: [0; 3].map(|_| (pixel_size * random.between(0.3, 8.0)).ln()).into(),
-            raw_opacity: random.between(-3.0, 4.0),
+            raw_opacity: random.between(-3.0, 6.0),
             sh: (0..count)
                 .map(|k| (random.normals().map(|c: f64| c / (1.0 + k as f64))).into())
                 .collect(),
