@@ -1,6 +1,6 @@
 //! Cameras: the undistorted pinhole that everything renders with, and the calibrated lens that a dataset lists.
 //!
-//! Axes are OpenCV's (x right, y down, z forward); pixel units, the image's corner at (0, 0), pixel centres at +0.5.
+//! Axes are those of `OpenCV` (x right, y down, z forward); pixel units, the image's corner at (0, 0), pixel centres at +0.5.
 
 use glam::{DAffine3, DVec2, DVec3};
 
@@ -15,7 +15,7 @@ pub struct Camera {
     pub focal: DVec2,
     /// Where the optical axis meets the image, pixels; rarely the centre.
     pub principal_point: DVec2,
-    /// Rigid: world space to view space (OpenCV axes).
+    /// Rigid: world space to view space (`OpenCV` axes).
     pub view_from_world: DAffine3,
 }
 
@@ -131,13 +131,107 @@ impl Lens {
         let listed = DVec2::new(f64::from(self.width), f64::from(self.height));
         let actual = DVec2::new(f64::from(width), f64::from(height));
         let scale = actual / listed;
+        let visible = width > 0 && height > 0;
         let off_by = (listed * scale.max_element() - actual).abs().max_element();
-        (off_by <= scale.max_element().max(1.0)).then_some(Self {
+        (visible && off_by <= scale.max_element().max(1.0)).then_some(Self {
             width,
             height,
             focal: self.focal * scale,
             principal_point: self.principal_point * scale,
             distortion: self.distortion,
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn camera() -> Camera {
+        let rotation = glam::DQuat::from_euler(glam::EulerRot::XYZ, 0.3, -0.7, 1.1);
+        Camera {
+            width: 100,
+            height: 60,
+            focal: DVec2::new(80.0, 90.0),
+            principal_point: DVec2::new(47.0, 33.0),
+            view_from_world: DAffine3::from_rotation_translation(
+                rotation,
+                DVec3::new(1.0, -2.0, 3.0),
+            ),
+        }
+    }
+
+    fn in_world(in_view: DVec3) -> DVec3 {
+        camera().view_from_world.inverse().transform_point3(in_view)
+    }
+
+    #[test]
+    fn a_point_on_the_axis_appears_at_the_principal_point_and_x_goes_right_y_down() {
+        let pixel = camera().project(in_world(DVec3::new(0.0, 0.0, 2.0))).unwrap();
+        assert!(pixel.distance(DVec2::new(47.0, 33.0)) < 1e-9);
+        let pixel = camera().project(in_world(DVec3::new(0.5, 0.25, 2.0))).unwrap();
+        assert!(pixel.distance(DVec2::new(67.0, 44.25)) < 1e-9);
+    }
+
+    #[test]
+    fn nothing_behind_the_camera_appears() {
+        assert_eq!(camera().project(in_world(DVec3::new(0.1, 0.1, -1.0))), None);
+        assert_eq!(camera().project(DVec3::NAN), None);
+        assert!(camera().view_from_world.transform_point3(camera().center()).length() < 1e-12);
+    }
+
+    #[test]
+    fn resizing_scales_what_is_projected_along_each_axis() {
+        let point = in_world(DVec3::new(0.3, -0.2, 1.5));
+        let (full, other) =
+            (camera().project(point).unwrap(), camera().resized(25, 30).project(point).unwrap());
+        assert!(other.distance(full * DVec2::new(0.25, 0.5)) < 1e-9);
+    }
+
+    #[test]
+    fn the_determinant_is_that_of_the_distortions_derivative() {
+        let distortion = Distortion { k1: -0.2, k2: 0.07, p1: 0.01, p2: -0.02 };
+        let (at, step) = (DVec2::new(0.4, -0.3), 1e-6);
+        let slope = |axis: DVec2| {
+            (distortion.distort(at + step * axis) - distortion.distort(at - step * axis))
+                / (2.0 * step)
+        };
+        let numeric = slope(DVec2::X).perp_dot(slope(DVec2::Y));
+        assert!((distortion.determinant(at) - numeric).abs() < 1e-8);
+    }
+
+    #[test]
+    fn a_lens_fits_a_photograph_of_its_shape_only() {
+        let distortion = Distortion { k1: 0.1, ..Distortion::default() };
+        let (focal, principal_point) = (DVec2::new(500.0, 510.0), DVec2::new(240.0, 190.0));
+        let lens = Lens { width: 500, height: 375, focal, principal_point, distortion };
+        assert_eq!(lens.fitted(500, 375), Some(lens));
+        assert_eq!(lens.fitted(250, 188).map(|half| half.width), Some(250));
+        assert_eq!(lens.fitted(1000, 750).map(|double| double.focal.x), Some(1000.0));
+        for (width, height) in [(375, 500), (400, 375), (500, 380), (0, 0)] {
+            assert_eq!(lens.fitted(width, height), None, "{width}x{height}");
+        }
+    }
+
+    #[test]
+    fn numbers_that_make_no_lens_are_told_apart() {
+        let (focal, principal_point) = (DVec2::splat(50.0), DVec2::splat(20.0));
+        let good = Lens {
+            width: 40,
+            height: 40,
+            focal,
+            principal_point,
+            distortion: Distortion::default(),
+        };
+        assert_eq!(good.problem(), None);
+        let bad = [
+            Lens { width: 0, ..good },
+            Lens { height: u32::MAX, ..good },
+            Lens { focal: DVec2::new(50.0, 0.0), ..good },
+            Lens { focal: DVec2::new(f64::NAN, 50.0), ..good },
+            Lens { principal_point: DVec2::new(f64::INFINITY, 0.0), ..good },
+            Lens { distortion: Distortion { p2: f64::NAN, ..Distortion::default() }, ..good },
+        ];
+        assert!(bad.iter().all(|lens| lens.problem().is_some()));
     }
 }

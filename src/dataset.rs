@@ -52,6 +52,13 @@ pub struct View {
     pub reference: Option<Image>,
 }
 
+impl View {
+    /// Whether the view is trained on.
+    pub fn is_train(&self) -> bool {
+        self.split == Split::Train
+    }
+}
+
 /// What a view is for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Split {

@@ -8,7 +8,8 @@ use std::io::Cursor;
 use std::path::Path;
 
 use ::image::{
-    DynamicImage, ExtendedColorType, ImageEncoder, ImageReader, codecs::png::PngEncoder,
+    DynamicImage, ExtendedColorType, ImageEncoder, ImageFormat, ImageReader,
+    codecs::png::PngEncoder,
 };
 use rayon::prelude::*;
 
@@ -98,7 +99,7 @@ impl Image {
         let reader = ImageReader::open(path).and_then(ImageReader::with_guessed_format);
         let reader =
             reader.map_err(|error| Error::input(path, format!("cannot be read: {error}")))?;
-        if reader.format().is_some() {
+        if reader.format() != Some(ImageFormat::OpenExr) {
             return reader.into_dimensions().map_err(|error| not_an_image(path, &error));
         }
         let meta = exr::meta::MetaData::read_from_file(path, false)
@@ -319,4 +320,191 @@ fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
             Error::output(path, format!("cannot be written: {error}"))
         },
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use ::image::{ImageBuffer, Luma, LumaA, Rgb, Rgba};
+
+    use super::*;
+
+    /// A path in a folder that goes when the second is dropped.
+    fn file(name: &str) -> (std::path::PathBuf, tempfile::TempDir) {
+        let folder = tempfile::tempdir().unwrap();
+        (folder.path().join(name), folder)
+    }
+
+    fn gradient(width: u32, height: u32) -> Image {
+        Image::from_fn(width, height, |x, y| {
+            let (x, y) = (x as f32 / width as f32, y as f32 / height as f32);
+            [x, y, (0.3 + x * y) % 1.0]
+        })
+    }
+
+    fn worst(a: &Image, b: &Image) -> f32 {
+        assert_eq!((a.width, a.height), (b.width, b.height));
+        a.data.iter().zip(&b.data).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
+    }
+
+    #[test]
+    fn every_png_layout_gives_the_same_colours_and_alpha_is_dropped() {
+        let (path, _folder) = file("a.png");
+        let grey = |x: u32, y: u32| (40 * x + 7 * y) as u8;
+        let expected = Image::from_fn(5, 3, |x, y| [f32::from(grey(x, y)) / 255.0; 3]);
+        let save: [&dyn Fn() -> ::image::ImageResult<()>; 6] = [
+            &|| ImageBuffer::from_fn(5, 3, |x, y| Luma([grey(x, y)])).save(&path),
+            &|| ImageBuffer::from_fn(5, 3, |x, y| LumaA([grey(x, y), 9])).save(&path),
+            &|| ImageBuffer::from_fn(5, 3, |x, y| Rgb([grey(x, y); 3])).save(&path),
+            &|| {
+                ImageBuffer::from_fn(5, 3, |x, y| Rgba([grey(x, y), grey(x, y), grey(x, y), 0]))
+                    .save(&path)
+            },
+            &|| ImageBuffer::from_fn(5, 3, |x, y| Luma([u16::from(grey(x, y)) * 257])).save(&path),
+            &|| {
+                ImageBuffer::from_fn(5, 3, |x, y| Rgb([u16::from(grey(x, y)) * 257; 3])).save(&path)
+            },
+        ];
+        for (layout, save) in save.iter().enumerate() {
+            save().unwrap();
+            assert!(worst(&Image::load(&path).unwrap(), &expected) < 1e-7, "layout {layout}");
+            assert_eq!(Image::size_of(&path).unwrap(), (5, 3));
+        }
+    }
+
+    #[test]
+    fn what_is_saved_is_loaded_to_the_formats_precision() {
+        let image = gradient(7, 5);
+        let (path, _folder) = file("a");
+        image.save_png8(&path).unwrap();
+        assert!(worst(&Image::load(&path).unwrap(), &image) <= 0.5 / 255.0 + 1e-6);
+        image.save_png16(&path).unwrap();
+        assert!(worst(&Image::load(&path).unwrap(), &image) <= 0.5 / 65_535.0 + 1e-6);
+        let bright = Image { data: image.data.iter().map(|value| 3.0 * value).collect(), ..image };
+        bright.save_exr(&path).unwrap();
+        assert!(worst(&Image::load(&path).unwrap(), &bright) < 1e-5);
+        assert_eq!(Image::size_of(&path).unwrap(), (7, 5));
+    }
+
+    #[test]
+    fn an_exr_is_linear_light_and_its_unusable_values_count_as_black() {
+        let (path, _folder) = file("a.exr");
+        let values = [0.5_f32, 0.001, f32::NAN, f32::INFINITY, -0.5, 4.0];
+        exr::prelude::write_rgb_file(&path, 6, 1, |x, _| (values[x], values[x], values[x]))
+            .unwrap();
+        let loaded = Image::load(&path).unwrap();
+        let expected =
+            [0.735_357, 0.012_92, 0.0, 0.0, 0.0, 1.055 * 4.0_f32.powf(1.0 / 2.4) - 0.055];
+        for (x, expected) in expected.into_iter().enumerate() {
+            assert!((loaded.data[x] - expected).abs() < 1e-5, "{}: {}", values[x], loaded.data[x]);
+        }
+    }
+
+    #[test]
+    fn a_grey_exr_is_grey_and_one_without_colour_is_refused() {
+        use exr::prelude::{SpecificChannels, Vec2, WritableImage};
+        let (path, _folder) = file("a.exr");
+        let save = |name: &str| {
+            let channels = SpecificChannels::build().with_channel(name);
+            let channels = channels.with_pixel_fn(|Vec2(x, _): Vec2<usize>| (0.25_f32 * x as f32,));
+            exr::image::Image::from_channels((3, 2), channels).write().to_file(&path).unwrap();
+        };
+        save("Y");
+        let [red, green, blue] = Image::load(&path).unwrap().pixel(2, 1);
+        assert!((red - 0.735_357).abs() < 1e-5 && red == green && green == blue);
+        save("Z");
+        assert!(Image::load(&path).unwrap_err().to_string().contains("neither R nor Y"));
+    }
+
+    #[test]
+    fn the_transfer_functions_invert_each_other_and_meet_at_the_toe() {
+        for step in 0..=4000 {
+            let srgb = step as f32 / 1000.0;
+            assert!(
+                (srgb_from_linear(linear_from_srgb(srgb)) - srgb).abs() < 2e-6 * srgb.max(1.0),
+                "{srgb}"
+            );
+        }
+        assert!((srgb_from_linear(0.003_130_8) - srgb_from_linear(0.003_130_9)).abs() < 1e-5);
+    }
+
+    #[test]
+    fn a_jpeg_is_loaded_whole_or_refused() {
+        let (path, _folder) = file("a.jpg");
+        ImageBuffer::from_fn(64, 48, |x, y| Rgb([(x * 3) as u8, (y * 4) as u8, 90]))
+            .save(&path)
+            .unwrap();
+        let pixel = Image::load(&path).unwrap().pixel(40, 20);
+        assert!(
+            (pixel[0] - 120.0 / 255.0).abs() < 0.06 && (pixel[1] - 80.0 / 255.0).abs() < 0.06,
+            "{pixel:?}"
+        );
+        let bytes = std::fs::read(&path).unwrap();
+        for length in 0..bytes.len() - 1 {
+            std::fs::write(&path, &bytes[..length]).unwrap();
+            let error = Image::load(&path).unwrap_err().to_string();
+            assert!(error.contains("a.jpg") && !error.contains('\n'), "{length}: {error}");
+        }
+    }
+
+    #[test]
+    fn a_file_that_is_no_image_is_named() {
+        let (path, _folder) = file("noise.png");
+        assert!(Image::load(&path).unwrap_err().to_string().contains("noise.png: cannot be read"));
+        let (exr, _exr_folder) = file("whole.exr");
+        gradient(9, 9).save_exr(&exr).unwrap();
+        let exr = std::fs::read(exr).unwrap();
+        for bytes in [
+            &b""[..],
+            b"not an image",
+            b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR",
+            &EXR_MAGIC,
+            &exr[..exr.len() / 2],
+        ] {
+            std::fs::write(&path, bytes).unwrap();
+            let error = Image::load(&path).unwrap_err().to_string();
+            assert!(error.contains("noise.png: is not a readable"), "{error}");
+        }
+    }
+
+    #[test]
+    fn shrinking_by_an_integer_takes_the_mean_of_whole_pixels() {
+        let image = gradient(12, 9);
+        let third = image.resized(4, 3);
+        for (x, y) in (0..3).flat_map(|y| (0..4).map(move |x| (x, y))) {
+            let block = (0..9).map(|index| image.pixel(3 * x + index % 3, 3 * y + index / 3));
+            let mean = block.fold([0.0_f64; 3], |sum, color| {
+                [0, 1, 2].map(|plane| sum[plane] + f64::from(color[plane]) / 9.0)
+            });
+            for (ours, mean) in third.pixel(x, y).into_iter().zip(mean) {
+                assert!((f64::from(ours) - mean).abs() < 1e-7);
+            }
+        }
+    }
+
+    #[test]
+    fn resizing_to_any_size_keeps_the_mean_and_constants() {
+        let image = gradient(13, 11);
+        let mean = |image: &Image| {
+            image.data.iter().copied().map(f64::from).sum::<f64>() / image.data.len() as f64
+        };
+        for (width, height) in [(5, 4), (13, 11), (12, 3), (1, 1), (20, 17), (0, 0)] {
+            let other = image.resized(width, height);
+            assert_eq!(other.data.len(), 3 * other.pixel_count());
+            assert!((mean(&other) - mean(&image)).abs() < 1e-6, "{width}x{height}");
+            let flat = Image::filled(13, 11, [0.1, 0.5, 0.9]).resized(width, height);
+            assert!(worst(&flat, &Image::filled(flat.width, flat.height, [0.1, 0.5, 0.9])) < 1e-7);
+        }
+    }
+
+    #[test]
+    fn a_failed_write_leaves_nothing_behind() {
+        let (path, folder) = file("taken");
+        std::fs::create_dir(&path).unwrap();
+        let error = gradient(4, 4).save_png8(&path).unwrap_err();
+        assert!(
+            matches!(&error, Error::Output { .. }) && error.to_string().contains("taken"),
+            "{error}"
+        );
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
 }

@@ -15,11 +15,16 @@ pub mod camera;
 pub mod cli;
 pub mod dataset;
 pub mod error;
+pub mod eval;
+pub mod export;
 #[expect(unsafe_code, reason = "the only module that speaks Vulkan")]
 pub mod gpu;
 pub mod image;
 pub mod kernels;
+pub mod loss;
 pub mod metrics;
+pub mod optimizer;
+pub mod pseudo_gt;
 pub mod random;
 pub mod reference;
 pub mod render;
@@ -27,5 +32,6 @@ pub mod report;
 pub mod scene;
 pub mod sort;
 pub mod tone;
+pub mod train;
 
 pub use error::{Error, Result};

@@ -1,11 +1,11 @@
 //! The pseudo-GT on the GPU: the statistics of a dark photograph, and the tone curve they give it.
 //!
 //! ```text
-//! luminance -> 4 x (luminance_histogram -> percentile_select) -> tone_statistics -> curve, in the loss or tone_map
+//! luminance -> select -> histogram -> select -> histogram -> select -> tone_statistics -> curve, in the loss or tone_map
 //! ```
 //!
 //! Percentiles are exact: luminance is not negative, so its bits sort as integers, and a radix select finds both
-//! neighbours of both ranks a byte at a time. Nothing is read back; the same photograph gives the same bits every time.
+//! neighbours of both ranks in three digits of 11, 10 and 10 bits. Nothing is read back; the same photograph gives the same bits every time.
 
 use glam::Vec2;
 
@@ -20,8 +20,8 @@ const THREADS: u32 = 128 * 256;
 /// Both neighbours of p10 and of p90.
 const SEARCHES: usize = 4;
 
-/// The values of one digit of the radix select.
-const BINS: usize = 256;
+/// The values of a ten-bit digit of the radix select.
+const BINS: usize = 1024;
 
 /// Takes the statistics of photographs and applies a tone curve, with scratch memory for the largest so far.
 #[derive(Debug)]
@@ -59,7 +59,7 @@ impl PseudoGt {
             luminances: gpu.uninit("luminances", 0)?,
             sums: gpu.uninit("luminance sums", THREADS as usize)?,
             searches: gpu.uninit("rank searches", SEARCHES)?,
-            histograms: gpu.uninit("luminance histograms", SEARCHES * BINS)?,
+            histograms: gpu.zeros("luminance histograms", SEARCHES * BINS)?,
             measured: gpu.uninit("tone statistics", 1)?,
         })
     }
@@ -121,7 +121,7 @@ impl PseudoGt {
         )
     }
 
-    /// Luminance with its partial sums, then the neighbours of both percentiles, a byte at a time.
+    /// Luminance with its partial sums, then the neighbours of both percentiles, digit by digit.
     fn search_ranks(
         &mut self,
         pass: &mut Recorder<'_>,
@@ -142,7 +142,8 @@ impl PseudoGt {
             },
             Threads::Exactly([THREADS, 1, 1]),
         )?;
-        for shift in [24, 16, 8, 0] {
+        self.select_digit(pass, 11)?;
+        for shift in [10, 0] {
             pass.dispatch(
                 &self.histogram,
                 &kernels::luminance_histogram::Params { pixel_count, thread_count: THREADS, shift },
@@ -153,17 +154,22 @@ impl PseudoGt {
                 },
                 Threads::Exactly([THREADS, 1, 1]),
             )?;
-            pass.dispatch(
-                &self.select,
-                &kernels::percentile_select::Params {},
-                kernels::percentile_select::Buffers {
-                    searches: &mut self.searches,
-                    histograms: &mut self.histograms,
-                },
-                Threads::Workgroups([1, 1, 1]),
-            )?;
+            self.select_digit(pass, 10)?;
         }
         Ok(())
+    }
+
+    /// Takes one digit of every search from the histograms and clears them.
+    fn select_digit(&mut self, pass: &mut Recorder<'_>, digit_bits: u32) -> Result<()> {
+        pass.dispatch(
+            &self.select,
+            &kernels::percentile_select::Params { digit_bits },
+            kernels::percentile_select::Buffers {
+                searches: &mut self.searches,
+                histograms: &mut self.histograms,
+            },
+            Threads::Workgroups([1, 1, 1]),
+        )
     }
 
     /// Records `target = curve(image)` with `parameters[view]`; `image` and `target` may be of any shape.

@@ -1,7 +1,7 @@
 //! Counter-based random numbers: each is a pure function of a seed, a stream and an index.
 //!
 //! Nothing is carried from draw to draw, so the order of evaluation and the number of threads change nothing.
-//! The mixer is SplitMix64's finaliser (Steele, Lea and Flood 2014).
+//! The mixer is `SplitMix64`'s finaliser (Steele, Lea and Flood 2014).
 
 /// One stream of random numbers; draw `index` of it is always the same.
 #[derive(Clone, Copy, Debug)]

@@ -10,13 +10,17 @@
     reason = "keeps each line comparable to the shader; a NaN must fail the test"
 )]
 
+mod adam;
 pub mod blend_backward;
 pub mod blend_forward;
 pub mod camera;
 mod check_capacity;
 mod compensated_sum;
+mod dispatch_arguments;
 mod emit;
 pub mod gaussian;
+mod l1;
+mod loss_log;
 pub(crate) mod luminance;
 mod luminance_histogram;
 mod order_counts;
@@ -24,8 +28,16 @@ mod percentile_select;
 pub mod project;
 pub mod project_backward;
 mod reduce_records;
+mod scan_downsweep;
+mod scan_spine;
+mod scan_upsweep;
 pub mod sh;
+mod sort_downsweep;
+mod sort_spine;
+mod sort_upsweep;
 pub mod splat;
+pub mod ssim_backward;
+pub mod ssim_forward;
 mod tile_ranges;
 pub mod tone;
 mod tone_map;

@@ -14,6 +14,7 @@ use glam::{DVec3, UVec2, Vec2};
 
 use crate::camera::Camera;
 use crate::gpu::{Buffer, Gpu, Kernel as _, Pipeline, Recorder, Threads};
+use crate::image::Image;
 use crate::kernels::{
     blend_backward, blend_forward, check_capacity, emit, order_counts, project, project_backward,
     reduce_records, tile_ranges,
@@ -107,9 +108,7 @@ impl Renderer {
         let pixels = tile_width * tile_height;
         if pixels == 0 || pixels % lanes != 0 || pixels / lanes > 32 {
             let what = format!("{tile_width}x{tile_height} tiles do not suit {lanes} lanes");
-            return Err(Error::Usage(format!(
-                "{what}; take a tile of 8 to 32 times as many pixels"
-            )));
+            return Err(Error::Usage(format!("{what}; take a tile of 8 to 32 times as many pixels")));
         }
         let channels = 3;
         let (alpha_max, sh_degree) = (settings.max_alpha, settings.sh_degree);
@@ -125,12 +124,7 @@ impl Renderer {
             })?,
             order_counts: gpu.pipeline(&order_counts::Constants::default())?,
             check_capacity: gpu.pipeline(&check_capacity::Constants::default())?,
-            emit: gpu.pipeline(&emit::Constants {
-                alpha_max,
-                channels,
-                tile_width,
-                tile_height,
-            })?,
+            emit: gpu.pipeline(&emit::Constants { alpha_max, channels, tile_width, tile_height })?,
             tile_ranges: gpu.pipeline(&tile_ranges::Constants::default())?,
             blend_forward: gpu.pipeline(&blend_forward::Constants {
                 alpha_max,
@@ -201,9 +195,41 @@ impl Renderer {
         &self.frame.status
     }
 
-    /// The status words, for kernels that raise flags of their own.
-    pub fn status_mut(&mut self) -> &mut Buffer<u32> {
-        &mut self.frame.status
+    /// The last render and the status words, for a loss that reads the one and raises flags in the other.
+    pub fn render_and_status(&mut self) -> (&Buffer<f32>, &mut Buffer<u32>) {
+        (&self.frame.render, &mut self.frame.status)
+    }
+
+    /// Renders to the host; grows the memory as the view demands.
+    ///
+    /// # Errors
+    /// The image exceeds what was reserved, or the device is out of memory or lost.
+    pub fn render_image(
+        &mut self,
+        gaussians: &Buffer<f32>,
+        camera: &Camera,
+        options: &RenderOptions,
+    ) -> Result<Image> {
+        let gpu = self.gpu.clone();
+        loop {
+            let mut status = None;
+            gpu.run("render", |pass| {
+                self.forward(pass, gaussians, camera, options)?;
+                status = Some(pass.download(&self.frame.status)?);
+                self.clear_status(pass);
+                Ok(())
+            })?;
+            let words = status.map_or_else(|| Ok(vec![]), |status| status.wait())?;
+            let status = Status::from_words(&words);
+            if !status.overflowed {
+                break;
+            }
+            self.grow(status.intersections)?;
+        }
+        let Camera { width, height, .. } = *camera;
+        let mut data = gpu.read(&self.frame.render)?;
+        data.truncate(3 * width as usize * height as usize);
+        Ok(Image { width, height, data })
     }
 
     /// Lowers every flag of the status.
@@ -364,7 +390,13 @@ impl Renderer {
             },
             Threads::Exactly([gaussian_count, 1, 1]),
         )?;
-        self.scan.record(pass, all, &frame.ordered_counts, &mut frame.offsets, &mut frame.total)?;
+        self.scan.record(
+            pass,
+            all,
+            &frame.ordered_counts,
+            &mut frame.offsets,
+            &mut frame.total,
+        )?;
         let capacity = frame.intersection_capacity();
         pass.dispatch(
             &self.check_capacity,

@@ -37,7 +37,7 @@ pub enum ToneCurve {
     None,
     /// One gain for all values: the mean becomes theta, bright values clip.
     Linear,
-    /// Adaptive SoftExp: bounded, concave.
+    /// Adaptive soft exponential: bounded, concave.
     Ase,
     /// Adaptive cubic: nearly proportional in the shadows, rolls off above p90.
     Ap3,

@@ -97,12 +97,3 @@ fn scores_agree_with_the_scoring_script() {
     );
     assert!((ours.ssim - theirs.ssim).abs() < 0.001, "{ours:?} {theirs:?}");
 }
-
-#[test]
-#[ignore = "timing, for --release"]
-fn a_pair_of_full_size_is_scored_quickly() {
-    let (render, reference) = pattern(500, 375);
-    let start = std::time::Instant::now();
-    let scores = Scores::of(&render, &reference).unwrap();
-    println!("{scores:?} in {:?}", start.elapsed());
-}

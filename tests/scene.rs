@@ -1,5 +1,7 @@
 //! Gaussians on the host: their table, their beginning, their file.
 
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
 use glam::{DAffine3, DVec2, DVec3, Vec3};
 use nightsplat::camera::Camera;
 use nightsplat::dataset::{Point, Split, View};

@@ -1,5 +1,7 @@
 //! The synthetic set has the layout it claims, loads as a dataset, and is what its options say, byte for byte.
 
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
 use std::collections::BTreeMap;
 use std::path::Path;
 

@@ -1,8 +1,15 @@
 //! Tone curves and the statistics behind them, against the paper and by their properties.
 
+#![expect(
+    clippy::unwrap_used,
+    clippy::print_stdout,
+    reason = "a test's helpers fail the test; what is skipped is said"
+)]
+
 use std::path::{Path, PathBuf};
 
 use nightsplat::Error;
+use nightsplat::image::Image;
 use nightsplat::tone::{Statistics, ToneCurve, ToneParameters, ToneSettings, percentile};
 
 /// Chair, sofa and shrub of LOM, or a note that they are absent.
@@ -25,9 +32,7 @@ fn names(scene: &Path, split: &str) -> Vec<String> {
 
 /// A photograph as planar (3, H, W), as stored.
 fn load(path: &Path) -> Vec<f32> {
-    let rgb = image::open(path).unwrap().to_rgb8();
-    let plane = |c: usize| rgb.pixels().map(move |pixel| f32::from(pixel.0[c]) / 255.0);
-    plane(0).chain(plane(1)).chain(plane(2)).collect()
+    Image::load(path).unwrap().data
 }
 
 fn psnr(a: &[f32], b: &[f32]) -> f64 {

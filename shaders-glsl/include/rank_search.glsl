@@ -1,5 +1,5 @@
 // Radix select: the values of given ranks among non-negative floats, whose bits sort as integers.
-// Four digits of eight bits, from the top; `luminance` begins the searches.
+// The sign is 0, so three digits from the top find the rest: 11, 10 and 10 bits.
 
 struct RankSearch {
     uint prefix;     // the digits found so far
@@ -7,5 +7,8 @@ struct RankSearch {
     uint histogram;  // the first search with the same prefix: its histogram serves both
 };
 
-const uint SEARCHES = 4;   // the lower and the upper neighbour of p10, then of p90
-const uint BINS     = 256; // of one digit
+const uint SEARCHES   = 4;                  // the lower and the upper neighbour of p10, then of p90
+const uint DIGIT_BITS = 10;                 // of the second and the third digit
+const uint BINS       = 1u << DIGIT_BITS;   // of one search's histogram
+const uint FIRST_BINS = 2 * BINS;           // of the first digit, which all searches share
+const uint FIRST_SHIFT = 2 * DIGIT_BITS;

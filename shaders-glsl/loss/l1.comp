@@ -5,12 +5,12 @@
 
 //! The gradient of mean|a - b| with respect to the render a, b the pseudo-GT, and partial sums of |a - b|.
 //!
-//! A thread takes COUNT values, one subgroup apart, so that a subgroup reads one run. At a = b the gradient
+//! A thread takes VALUES_PER_THREAD values, one subgroup apart, so that a subgroup reads one run. At a = b the gradient
 //! is 0. Reference: `src/reference/l1.rs`.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
-layout(constant_id = 0) const uint COUNT = 32;  // values per thread
+layout(constant_id = 0) const uint VALUES_PER_THREAD = 32;
 
 layout(push_constant) uniform Params {
     uint  value_count;  // 3HW
@@ -24,10 +24,10 @@ layout(binding = 3) writeonly buffer DRender  { float d_render[]; };       // (3
 layout(binding = 4) writeonly buffer Partials { float partials[]; };       // one per workgroup
 
 void main() {
-    uint first = WORKGROUP_INDEX * SUBGROUP_SIZE * COUNT + gl_LocalInvocationID.x;
+    uint first = WORKGROUP_INDEX * SUBGROUP_SIZE * VALUES_PER_THREAD + gl_LocalInvocationID.x;
     ToneParameters curve = tone[0];
     float sum = 0.0;
-    for (uint k = 0; k < COUNT; ++k) {
+    for (uint k = 0; k < VALUES_PER_THREAD; ++k) {
         uint i = first + k * SUBGROUP_SIZE;
         if (i < value_count) {
             float difference = render[i] - tone_curve(low[i], curve);

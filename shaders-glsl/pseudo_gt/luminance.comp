@@ -4,10 +4,11 @@
 #include "compensated_sum.glsl"
 #include "rank_search.glsl"
 
-//! Luminance: BT.601 on encoded values, per pixel, with the partial sums of its mean, and the start of the rank search.
+//! Luminance: BT.601 on encoded values, per pixel, with the partial sums of its mean and the first digit's histogram.
 //!
-//! `thread_count` threads, at least 1024, each take every `thread_count`-th pixel, so that the order of every sum is
-//! fixed. NaN and negative values count as 0, values above 65504 as 65504.
+//! `thread_count` threads each take every `thread_count`-th pixel, so that the order of every sum is fixed; counts are
+//! integers, so theirs does not matter. NaN and negative values count as 0, values above 65504 as 65504.
+//! `histograms` must be zero before.
 
 layout(local_size_x = 256) in;
 
@@ -21,7 +22,9 @@ layout(binding = 0) readonly buffer Image       { float image[]; };      // (3, 
 layout(binding = 1) writeonly buffer Luminances { float luminances[]; }; // (H, W)
 layout(binding = 2) writeonly buffer Sums       { vec2 sums[]; };        // (threads) luminance; red + green + blue
 layout(binding = 3) writeonly buffer Searches   { RankSearch searches[]; };
-layout(binding = 4) writeonly buffer Histograms { uint histograms[]; };  // (SEARCHES, BINS)
+layout(binding = 4) buffer Histograms           { uint histograms[]; };  // (FIRST_BINS)
+
+shared uint counts[FIRST_BINS];
 
 // Positive phrasing: a NaN fails it too.
 float measurable(float x) {
@@ -30,9 +33,9 @@ float measurable(float x) {
 
 void main() {
     uint thread = THREAD_INDEX;
-    if (thread >= thread_count) return;
     if (thread < SEARCHES) searches[thread] = RankSearch(0, ranks[thread], 0);
-    if (thread < SEARCHES * BINS) histograms[thread] = 0;
+    for (uint bin = gl_LocalInvocationID.x; bin < FIRST_BINS; bin += gl_WorkGroupSize.x) counts[bin] = 0;
+    barrier();
 
     CompensatedSum total = CompensatedSum(vec2(0), vec2(0));
     for (uint i = thread; i < pixel_count; i += thread_count) {
@@ -44,6 +47,12 @@ void main() {
         precise float sum = r + g + b;
         luminances[i] = luminance;
         total = add(total, vec2(luminance, sum));
+        atomicAdd(counts[floatBitsToUint(luminance) >> FIRST_SHIFT], 1);
     }
     sums[thread] = total.sum;
+    barrier();
+
+    for (uint bin = gl_LocalInvocationID.x; bin < FIRST_BINS; bin += gl_WorkGroupSize.x) {
+        if (counts[bin] > 0) atomicAdd(histograms[bin], counts[bin]);
+    }
 }

@@ -3,17 +3,17 @@
 #include "kernel.glsl"
 #include "rank_search.glsl"
 
-//! Luminance histogram: counts one digit of the luminances that begin with a search's prefix.
+//! Luminance histogram: counts the second or third digit of the luminances that begin with a search's prefix.
 //!
 //! `thread_count` threads each take every `thread_count`-th pixel; a workgroup counts in shared memory first. Counts are
-//! integers, so their order does not matter.
+//! integers, so their order does not matter. `histograms` must be zero before.
 
 layout(local_size_x = 256) in;
 
 layout(push_constant) uniform Params {
     uint pixel_count;
     uint thread_count;
-    uint shift;  // of the digit: 24, 16, 8, 0
+    uint shift;  // of the digit: 10, then 0
 };
 
 layout(binding = 0) readonly buffer Luminances { float luminances[]; };
@@ -29,14 +29,12 @@ void main() {
     barrier();
 
     for (uint i = THREAD_INDEX; i < pixel_count; i += thread_count) {
-        uint bits = floatBitsToUint(luminances[i]);
-        // In two steps: a shift by 32 is undefined.
-        uint prefix = bits >> shift >> 8;
+        uint digits = floatBitsToUint(luminances[i]) >> shift;
         uint histogram = SEARCHES;
         [[unroll]] for (uint s = 0; s < SEARCHES; ++s) {
-            if (prefix == search[s].prefix) histogram = search[s].histogram;
+            if (digits >> DIGIT_BITS == search[s].prefix) histogram = search[s].histogram;
         }
-        if (histogram < SEARCHES) atomicAdd(counts[histogram * BINS + (bits >> shift & 255u)], 1);
+        if (histogram < SEARCHES) atomicAdd(counts[histogram * BINS + digits % BINS], 1);
     }
     barrier();
 

@@ -5,28 +5,39 @@
 
 //! Percentile select: each search takes the digit whose bin holds its rank, and the histograms are cleared.
 //!
-//! One workgroup; one thread per search, then all threads clear.
+//! One workgroup: all threads move the counts to shared memory, then one thread per search walks them.
 
 layout(local_size_x = 256) in;
 
-layout(binding = 0) buffer Searches   { RankSearch searches[]; };
-layout(binding = 1) buffer Histograms { uint histograms[]; };  // (SEARCHES, BINS)
+layout(push_constant) uniform Params {
+    uint digit_bits;  // 11, then 10
+};
 
+layout(binding = 0) buffer Searches   { RankSearch searches[]; };
+layout(binding = 1) buffer Histograms { uint histograms[]; };  // (FIRST_BINS), then (SEARCHES, BINS)
+
+shared uint counts[SEARCHES * BINS];
 shared uint prefixes[SEARCHES];
 
 void main() {
     uint thread = gl_LocalInvocationID.x;
+    for (uint bin = thread; bin < SEARCHES * BINS; bin += gl_WorkGroupSize.x) {
+        counts[bin] = histograms[bin];
+        histograms[bin] = 0;
+    }
+    barrier();
+
     uint rank = 0;
     if (thread < SEARCHES) {
         RankSearch search = searches[thread];
         rank = search.rank;
         uint first = search.histogram * BINS;
         uint digit = 0;
-        while (digit < BINS - 1 && rank >= histograms[first + digit]) {
-            rank -= histograms[first + digit];
+        while (digit < (1u << digit_bits) - 1 && rank >= counts[first + digit]) {
+            rank -= counts[first + digit];
             ++digit;
         }
-        prefixes[thread] = search.prefix << 8 | digit;
+        prefixes[thread] = search.prefix << digit_bits | digit;
     }
     barrier();
 
@@ -35,5 +46,4 @@ void main() {
         while (prefixes[histogram] != prefixes[thread]) ++histogram;
         searches[thread] = RankSearch(prefixes[thread], rank, histogram);
     }
-    for (uint bin = thread; bin < SEARCHES * BINS; bin += gl_WorkGroupSize.x) histograms[bin] = 0;
 }

@@ -12,6 +12,9 @@
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
+// A ballot per bit of the digit, or (up to 32 lanes) a comparison per lane: the latter takes half the time on narrow
+// processors, whose ballots are loops.
+layout(constant_id = 1) const bool RANK_BY_BALLOT = true;
 
 layout(push_constant) uniform Params {
     uint count_index;  // where in `counts` the number of pairs lives
@@ -46,23 +49,21 @@ void find_first_places(uint part, uint partition_count) {
 
 // The lanes that hold a pair of this lane's digit.
 uvec4 lanes_of_digit(uint digit, bool holds_pair) {
-    uint width = SUBGROUP_SIZE;
-    if (width <= 8) {
-        // Against each lane in turn: the devices this narrow are processors, whose ballots are slow loops.
-        uint compared = holds_pair ? digit : MAX_DIGITS;
-        uint lanes = 0;
-        for (uint lane = 0; lane < SUBGROUP_SIZE; ++lane) {
-            lanes |= uint(subgroupShuffle(compared, lane) == compared) << lane;
+    if (RANK_BY_BALLOT) {
+        uvec4 lanes = subgroupBallot(holds_pair);
+        for (uint bit = 0; bit < digit_bits; ++bit) {
+            bool is_set = (digit >> bit & 1) == 1;
+            uvec4 set = subgroupBallot(is_set);
+            lanes &= is_set ? set : ~set;
         }
-        return uvec4(lanes, 0, 0, 0);
+        return lanes;
     }
-    uvec4 lanes = subgroupBallot(holds_pair);
-    for (uint bit = 0; bit < digit_bits; ++bit) {
-        bool is_set = (digit >> bit & 1) == 1;
-        uvec4 set = subgroupBallot(is_set);
-        lanes &= is_set ? set : ~set;
+    uint compared = holds_pair ? digit : MAX_DIGITS;
+    uint lanes = 0;
+    for (uint lane = 0; lane < SUBGROUP_SIZE; ++lane) {
+        lanes |= uint(subgroupShuffle(compared, lane) == compared) << lane;
     }
-    return lanes;
+    return uvec4(lanes, 0, 0, 0);
 }
 
 void main() {

@@ -97,11 +97,9 @@ fn leading_eigenvector(mut matrix: [[f64; 4]; 4]) -> [f64; 4] {
         for row in &mut matrix {
             (row[p], row[q]) = (cosine * row[p] - sine * row[q], sine * row[p] + cosine * row[q]);
         }
-        for column in 0..4 {
-            let (above, below) = (matrix[p][column], matrix[q][column]);
-            (matrix[p][column], matrix[q][column]) =
-                (cosine * above - sine * below, sine * above + cosine * below);
-        }
+        let (above, below) = (matrix[p], matrix[q]);
+        matrix[p] = std::array::from_fn(|column| cosine * above[column] - sine * below[column]);
+        matrix[q] = std::array::from_fn(|column| sine * above[column] + cosine * below[column]);
         for row in &mut vectors {
             (row[p], row[q]) = (cosine * row[p] - sine * row[q], sine * row[p] + cosine * row[q]);
         }
@@ -116,6 +114,8 @@ fn leading_eigenvector(mut matrix: [[f64; 4]; 4]) -> [f64; 4] {
 
 #[cfg(test)]
 mod tests {
+    use std::f64::consts::PI;
+
     use super::*;
 
     fn centers() -> Vec<DVec3> {
@@ -127,7 +127,7 @@ mod tests {
 
     #[test]
     fn a_known_similarity_is_recovered() {
-        for angle in [0.0, 0.3, 1.9, 3.14, 3.141_592_653_589_793, 5.0] {
+        for angle in [0.0, 0.3, 1.9, 0.999 * PI, PI, 5.0] {
             let rotation = DQuat::from_axis_angle(DVec3::new(0.3, -0.8, 0.5).normalize(), angle);
             let map = |point: DVec3| 3.7 * (rotation * point) + DVec3::new(-4.0, 11.0, 0.5);
             let pairs: Vec<_> = centers().iter().map(|center| (*center, map(*center))).collect();

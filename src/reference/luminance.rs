@@ -11,7 +11,6 @@ impl Reference for Kernel {
         for (search, rank) in searches.iter_mut().zip(params.ranks) {
             *search = RankSearch { prefix: 0, rank, histogram: 0 };
         }
-        histograms.fill(0);
         let pixel_count = params.pixel_count as usize;
         let thread_count = params.thread_count as usize;
         for thread in 0..thread_count {
@@ -19,6 +18,7 @@ impl Reference for Kernel {
             for i in (thread..pixel_count).step_by(thread_count) {
                 let [r, g, b] = [0, 1, 2].map(|plane| measurable(image[plane * pixel_count + i]));
                 luminances[i] = luminance([r, g, b]);
+                histograms[(luminances[i].to_bits() >> 20) as usize] += 1;
                 total.add(Vec2::new(luminances[i], r + g + b));
             }
             sums[thread] = total.sum;

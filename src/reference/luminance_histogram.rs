@@ -8,11 +8,10 @@ impl Reference for Kernel {
         Slices { luminances, searches, histograms }: Slices<'_>,
     ) {
         for luminance in &luminances[..params.pixel_count as usize] {
-            let bits = luminance.to_bits();
-            let prefix = bits >> params.shift >> 8;
-            let digit = bits >> params.shift & 255;
-            if let Some(search) = searches.iter().find(|search| search.prefix == prefix) {
-                histograms[(search.histogram * 256 + digit) as usize] += 1;
+            let digits = luminance.to_bits() >> params.shift;
+            let mut matching = searches.iter().filter(|search| search.prefix == digits >> 10);
+            if let Some(search) = matching.next() {
+                histograms[(search.histogram * 1024 + digits % 1024) as usize] += 1;
             }
         }
     }

@@ -3,15 +3,17 @@ use crate::kernels::RankSearch;
 use crate::kernels::percentile_select::{Constants, Kernel, Params, Slices};
 
 impl Reference for Kernel {
-    fn run(_: &Params, _: &Constants, Slices { searches, histograms }: Slices<'_>) {
+    fn run(params: &Params, _: &Constants, Slices { searches, histograms }: Slices<'_>) {
         for search in searches.iter_mut() {
-            let first = search.histogram * 256;
+            let first = search.histogram * 1024;
             let mut digit = 0;
-            while digit < 255 && search.rank >= histograms[(first + digit) as usize] {
+            while digit < (1 << params.digit_bits) - 1
+                && search.rank >= histograms[(first + digit) as usize]
+            {
                 search.rank -= histograms[(first + digit) as usize];
                 digit += 1;
             }
-            search.prefix = search.prefix << 8 | digit;
+            search.prefix = search.prefix << params.digit_bits | digit;
         }
         for thread in 0..searches.len() {
             let RankSearch { prefix, .. } = searches[thread];

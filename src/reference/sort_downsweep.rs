@@ -3,10 +3,12 @@ use crate::kernels::sort_downsweep::{Constants, Kernel, Params, Slices};
 
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
-        let Slices { counts, table, digit_totals, keys, values, sorted_keys, sorted_values } = slices;
+        let Slices { counts, table, digit_totals, keys, values, sorted_keys, sorted_values } =
+            slices;
         let count = counts[params.count_index as usize].min(params.capacity) as usize;
         let partition_size = constants.partition_size as usize;
-        let (digit_count, partition_count) = (1 << params.digit_bits, count.div_ceil(partition_size));
+        let (digit_count, partition_count) =
+            (1 << params.digit_bits, count.div_ceil(partition_size));
         for part in 0..partition_count {
             let mut next_place = vec![0; digit_count];
             let mut running = 0;

@@ -6,7 +6,7 @@ use crate::kernels::ToneParameters;
 pub const CURVE_NONE: u32 = 0;
 /// `CURVE_LINEAR`: x theta / mean.
 pub const CURVE_LINEAR: u32 = 1;
-/// `CURVE_ASE`: adaptive SoftExp.
+/// `CURVE_ASE`: adaptive soft exponential.
 pub const CURVE_ASE: u32 = 2;
 /// `CURVE_AP3`: adaptive cubic.
 pub const CURVE_AP3: u32 = 3;

@@ -97,7 +97,7 @@ fn scales(positions: &[DVec3]) -> Result<Vec<f64>> {
 /// capture's radius and five times it (radius: the greatest distance of a camera from the cameras' mean; 1 where all
 /// cameras are in one place). A position that a second camera sees is preferred: its depth can be learned.
 pub fn random(cameras: &[Camera], count: usize, seed: u64) -> Vec<DVec3> {
-    const TRIES: u64 = 8;
+    const TRIES: u64 = 16;
     const DRAWS_PER_TRY: u64 = 4;
     if cameras.is_empty() {
         return Vec::new();

@@ -213,7 +213,7 @@ impl Header {
                 }
                 ["element", ..] => header.more_elements = true,
                 ["property", kind, name] if in_vertices && !header.more_elements => {
-                    header.push(kind, name)?
+                    header.push(kind, name)?;
                 }
                 ["property", "list", ..] if !header.more_elements => {
                     return Err("a list property in the vertices is not supported".to_owned());

@@ -39,11 +39,13 @@ impl RadixSort {
     /// The device is out of memory or lost.
     pub fn new(gpu: &Gpu, capacity: u32) -> Result<Self> {
         let partition_size = sort_upsweep::Constants::default().partition_size;
+        let rank_by_ballot = gpu.properties().subgroup_size > MAX_DIGIT_BITS;
         Ok(Self {
             gpu: gpu.clone(),
             upsweep: gpu.pipeline(&sort_upsweep::Constants { partition_size })?,
             spine: gpu.pipeline(&sort_spine::Constants { partition_size })?,
-            downsweep: gpu.pipeline(&sort_downsweep::Constants { partition_size })?,
+            downsweep: gpu
+                .pipeline(&sort_downsweep::Constants { partition_size, rank_by_ballot })?,
             partition_size,
             arguments: DispatchArguments::new(gpu)?,
             scratch: Scratch::new(gpu, capacity, partition_size)?,

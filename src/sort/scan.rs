@@ -1,9 +1,9 @@
 //! The exclusive scan: where each item's output begins, from how much output it has.
 
 use super::{Count, DispatchArguments, common_len};
-use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::{scan_downsweep, scan_spine, scan_upsweep};
+use crate::{Error, Result};
 
 /// Exclusive prefix sums of `u32` values, modulo 2^32.
 #[derive(Debug)]
@@ -51,6 +51,11 @@ impl Scan {
         total: &mut Buffer<u32>,
     ) -> Result<()> {
         let capacity = common_len("scan", &[values.len(), offsets.len()])?;
+        if total.is_empty() {
+            let name = total.name();
+            let problem = format!("scan: buffer `{name}` is empty; give the total one element");
+            return Err(Error::Usage(problem));
+        }
         let partitions = capacity.div_ceil(self.partition_size) as usize;
         if self.sums.len() < partitions {
             self.sums = self.gpu.uninit("scan_sums", partitions)?;

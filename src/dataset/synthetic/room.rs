@@ -38,6 +38,8 @@ struct Hit {
 /// The scene.
 pub(super) struct Room {
     surfaces: Vec<Surface>,
+    /// Places on the lamp, the same for every position that it lights, so that all views agree on the shadows.
+    lamp: Vec<DVec3>,
     noise: Stream,
 }
 
@@ -80,7 +82,7 @@ impl Room {
             block(DVec3::new(0.95, 0.45, 0.42), DVec3::new(0.5, 0.4, 0.42), 0.45, Self::checker),
             block(DVec3::new(0.12, 1.1, 0.62), DVec3::new(0.32, 0.2, 0.62), -0.3, Self::bands),
         ];
-        Self { surfaces, noise: Stream::new(seed, 0) }
+        Self { surfaces, lamp: lamp_places(), noise: Stream::new(seed, 0) }
     }
 
     /// The radiance along a ray.
@@ -90,8 +92,8 @@ impl Room {
         let albedo = (surface.albedo)(self, hit.place);
         let up = 0.5 + 0.5 * hit.normal.z;
         let ambient = GROUND_RADIANCE.lerp(SKY_RADIANCE, up) * self.openness(position, hit.normal);
-        let (lit, highlight) = self.lamp(position, hit.normal, direction);
-        albedo * (ambient + LAMP_RADIANCE * lit) + LAMP_RADIANCE * (surface.gloss * highlight)
+        let (lit, highlight) = self.lamp(position, hit.normal, direction, surface.gloss);
+        albedo * (ambient + LAMP_RADIANCE * lit) + LAMP_RADIANCE * highlight
     }
 
     /// The first point along a ray.
@@ -108,31 +110,23 @@ impl Room {
     }
 
     /// The lamp's diffuse light (1 where it shines at a right angle and whole) and its highlight at a position.
-    ///
-    /// The places on the lamp are the same for every position, so that all views agree on the shadows.
-    fn lamp(&self, position: DVec3, normal: DVec3, direction: DVec3) -> (f64, f64) {
+    fn lamp(&self, position: DVec3, normal: DVec3, direction: DVec3, gloss: f64) -> (f64, f64) {
         const SHININESS: f64 = 60.0;
-        let (right, up) = (FOCUS - LAMP).normalize().any_orthonormal_pair();
         let start = position + 1e-6 * normal;
         let (mut lit, mut highlight) = (0.0, 0.0);
-        for sample in 0..LAMP_SAMPLES_PER_SIDE * LAMP_SAMPLES_PER_SIDE {
-            let cell = DVec2::new(
-                (sample % LAMP_SAMPLES_PER_SIDE) as f64,
-                (sample / LAMP_SAMPLES_PER_SIDE) as f64,
-            );
-            let place = LAMP_HALF_WIDTH * (2.0 * (cell + 0.5) / LAMP_SAMPLES_PER_SIDE as f64 - 1.0);
-            let to_lamp = LAMP + place.x * right + place.y * up - start;
-            let distance = to_lamp.length();
-            let to_lamp = to_lamp / distance;
+        for place in &self.lamp {
+            let distance = place.distance(start);
+            let to_lamp = (place - start) / distance;
             let cosine = normal.dot(to_lamp);
             if cosine > 0.0 && self.is_clear(start, to_lamp, distance) {
                 lit += cosine;
-                let half = (to_lamp - direction).normalize();
-                highlight += normal.dot(half).max(0.0).powf(SHININESS);
+                if gloss > 0.0 {
+                    let half = (to_lamp - direction).normalize();
+                    highlight += gloss * normal.dot(half).max(0.0).powf(SHININESS);
+                }
             }
         }
-        let samples = (LAMP_SAMPLES_PER_SIDE * LAMP_SAMPLES_PER_SIDE) as f64;
-        (lit / samples, highlight / samples)
+        (lit / self.lamp.len() as f64, highlight / self.lamp.len() as f64)
     }
 
     fn is_clear(&self, origin: DVec3, direction: DVec3, distance: f64) -> bool {
@@ -324,6 +318,18 @@ impl Shape {
             }
         }
     }
+}
+
+/// A regular grid on the square lamp.
+fn lamp_places() -> Vec<DVec3> {
+    let (right, up) = (FOCUS - LAMP).normalize().any_orthonormal_pair();
+    let offset = |cell: usize| {
+        LAMP_HALF_WIDTH * (2.0 * (cell as f64 + 0.5) / LAMP_SAMPLES_PER_SIDE as f64 - 1.0)
+    };
+    let row = |y: usize| {
+        (0..LAMP_SAMPLES_PER_SIDE).map(move |x| LAMP + offset(x) * right + offset(y) * up)
+    };
+    (0..LAMP_SAMPLES_PER_SIDE).flat_map(row).collect()
 }
 
 fn hidden_by_sphere(position: DVec3, normal: DVec3, center: DVec3, radius: f64) -> f64 {

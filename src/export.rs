@@ -1,0 +1,170 @@
+//! The run directory: what a training run leaves behind.
+//!
+//! ```text
+//! RUN/config.toml    everything the run used
+//!     model.ply      the Gaussians, as splat viewers open them
+//!     train.csv      one line per step
+//!     metrics.json   scores of the test views
+//! ```
+//!
+//! A file appears under its name only once it is complete, `metrics.json` last: a directory that has it is whole.
+
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::path::{Path, PathBuf};
+
+use crate::scene::{Gaussians, ply};
+use crate::train::{StepReport, TrainConfig};
+use crate::{Error, Result};
+
+/// A run directory and the log that grows in it.
+#[derive(Debug)]
+pub struct RunDirectory {
+    path: PathBuf,
+    log: BufWriter<File>,
+}
+
+/// The files of a run that a new run replaces; nothing else in the directory is touched.
+const FILES: [&str; 4] = ["metrics.json", "model.ply", "train.csv", "config.toml"];
+
+impl RunDirectory {
+    /// Makes the directory and writes the configuration.
+    ///
+    /// # Errors
+    /// It holds a run already and `overwrite` is false, or it cannot be written.
+    pub fn create(path: &Path, config: &TrainConfig, overwrite: bool) -> Result<Self> {
+        let used = FILES.iter().find(|file| path.join(file).exists());
+        if let Some(file) = used.filter(|_| !overwrite) {
+            let problem = format!("already holds a run ({file}); pass --overwrite to replace it");
+            return Err(Error::output(path, problem));
+        }
+        std::fs::create_dir_all(path).map_err(|error| unwritable(path, &error))?;
+        for file in FILES.map(|file| path.join(file)).iter().filter(|file| file.exists()) {
+            std::fs::remove_file(file).map_err(|error| unwritable(file, &error))?;
+        }
+        write_whole(&path.join("config.toml"), config.to_toml()?.as_bytes())?;
+        let log_path = path.join("train.csv");
+        let log = File::create(&log_path).map_err(|error| unwritable(&log_path, &error))?;
+        let mut run = Self { path: path.to_owned(), log: BufWriter::new(log) };
+        run.log_line("step,view,loss,l1,ssim,gaussians,milliseconds")?;
+        Ok(run)
+    }
+
+    /// Appends a step to `train.csv`.
+    ///
+    /// # Errors
+    /// The disk is full or gone.
+    pub fn log(&mut self, report: &StepReport) -> Result<()> {
+        let StepReport { step, view, loss, l1, ssim, gaussians, milliseconds } = report;
+        self.log_line(&format!(
+            "{step},{view},{loss:.6},{l1:.6},{ssim:.6},{gaussians},{milliseconds:.2}"
+        ))
+    }
+
+    /// Writes `model.ply`.
+    ///
+    /// # Errors
+    /// The disk is full or gone.
+    pub fn save_model(&mut self, gaussians: &Gaussians) -> Result<()> {
+        self.log.flush().map_err(|error| unwritable(&self.path, &error))?;
+        ply::save(gaussians, self.path.join("model.ply"))
+    }
+
+    /// Writes `metrics.json`, the sign that the run is whole.
+    ///
+    /// # Errors
+    /// The disk is full or gone.
+    pub fn save_metrics(&self, metrics: &serde_json::Value) -> Result<()> {
+        write_json(&self.path.join("metrics.json"), metrics)
+    }
+
+    fn log_line(&mut self, line: &str) -> Result<()> {
+        writeln!(self.log, "{line}").map_err(|error| unwritable(&self.path, &error))
+    }
+}
+
+/// The configuration of a finished or unfinished run.
+///
+/// # Errors
+/// The directory holds none.
+pub fn load_config(run: &Path) -> Result<TrainConfig> {
+    let path = run.join("config.toml");
+    if !path.is_file() {
+        let problem = "is no run directory: it has no config.toml; name the --out of `nightsplat train`";
+        return Err(Error::input(run, problem));
+    }
+    TrainConfig::load(&path)
+}
+
+/// The trained Gaussians of a run.
+///
+/// # Errors
+/// The run has not been trained to its end, or the file is cut short.
+pub fn load_model(run: &Path) -> Result<Gaussians> {
+    let path = run.join("model.ply");
+    if !path.is_file() {
+        return Err(Error::input(run, "has no model.ply: the run did not finish; train it again"));
+    }
+    ply::load(path)
+}
+
+/// Writes a JSON file, pretty-printed, whole or not at all.
+///
+/// # Errors
+/// The folder cannot be written.
+pub fn write_json(path: &Path, value: &serde_json::Value) -> Result<()> {
+    let mut text = serde_json::to_string_pretty(value).map_err(|error| Error::Usage(error.to_string()))?;
+    text.push('\n');
+    write_whole(path, text.as_bytes())
+}
+
+/// Writes a file under another name first, so that it is never seen half-written.
+///
+/// # Errors
+/// The folder cannot be written.
+pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
+    let mut partial = path.as_os_str().to_owned();
+    partial.push(".partial");
+    std::fs::write(&partial, bytes)
+        .and_then(|()| std::fs::rename(&partial, path))
+        .map_err(|error| unwritable(path, &error))
+}
+
+fn unwritable(path: &Path, error: &std::io::Error) -> Error {
+    Error::output(path, format!("cannot be written ({error}); check the folder and the disk"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_run_is_only_replaced_when_asked() {
+        let folder = tempfile::tempdir().unwrap();
+        let config = TrainConfig::default();
+        drop(RunDirectory::create(folder.path(), &config, false).unwrap());
+        std::fs::write(folder.path().join("notes.txt"), "mine").unwrap();
+        let error = RunDirectory::create(folder.path(), &config, false).unwrap_err();
+        assert!(error.to_string().contains("--overwrite"), "{error}");
+        drop(RunDirectory::create(folder.path(), &config, true).unwrap());
+        assert!(folder.path().join("notes.txt").exists());
+        assert_eq!(load_config(folder.path()).unwrap(), config);
+    }
+
+    #[test]
+    fn an_unfinished_run_has_no_model() {
+        let folder = tempfile::tempdir().unwrap();
+        assert!(load_config(folder.path()).unwrap_err().to_string().contains("config.toml"));
+        drop(RunDirectory::create(folder.path(), &TrainConfig::default(), false).unwrap());
+        assert!(load_model(folder.path()).unwrap_err().to_string().contains("did not finish"));
+    }
+
+    #[test]
+    fn a_directory_that_cannot_be_made_is_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("file");
+        std::fs::write(&file, "").unwrap();
+        let error = RunDirectory::create(&file.join("run"), &TrainConfig::default(), false).unwrap_err();
+        assert!(error.to_string().contains("file"), "{error}");
+    }
+}

@@ -1,0 +1,148 @@
+//! What changes with the step: learning rates, SH degree, gradient damping, density control.
+
+/// Adam's learning rate of each attribute.
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LearningRates {
+    /// Positions, in world units.
+    pub means: f64,
+    /// Quaternions.
+    pub quats: f64,
+    /// Logarithms of the scales.
+    pub log_scales: f64,
+    /// Opacities before the sigmoid.
+    pub raw_opacities: f64,
+    /// SH coefficients of degree 0.
+    pub dc: f64,
+    /// SH coefficients above degree 0.
+    pub rest: f64,
+}
+
+/// The schedules as functions of the step, counted from 1. The defaults are those of 3DGS (Kerbl et al. 2023) but for
+/// density control, which ends at step 5 000 and acts every 200 steps, as in LITA-GS.
+#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Schedule {
+    /// The rates at the start; that of the means for a scene of extent 1.
+    pub initial_rates: LearningRates,
+    /// The rate of the means at the end of its decay, for a scene of extent 1.
+    pub final_means_rate: f64,
+    /// The steps over which the rate of the means decays exponentially.
+    pub means_rate_steps: u64,
+    /// The SH degree in use grows by one every so many steps, from 0.
+    pub sh_degree_interval: u64,
+    /// Density control acts after this step,
+    pub densify_after: u64,
+    /// before this one,
+    pub densify_before: u64,
+    /// and every so many steps.
+    pub densify_interval: u64,
+    /// The weight of the near-camera damping is 1 before the first of these steps, 1/2 before the second, then 0.
+    pub damping_steps: [u64; 2],
+}
+
+impl Default for Schedule {
+    fn default() -> Self {
+        Self {
+            initial_rates: LearningRates {
+                means: 1.6e-4,
+                quats: 0.001,
+                log_scales: 0.005,
+                raw_opacities: 0.05,
+                dc: 0.0025,
+                rest: 0.0025 / 20.0,
+            },
+            final_means_rate: 1.6e-6,
+            means_rate_steps: 30_000,
+            sh_degree_interval: 1_000,
+            densify_after: 500,
+            densify_before: 5_000,
+            densify_interval: 200,
+            damping_steps: [4_000, 7_000],
+        }
+    }
+}
+
+impl Schedule {
+    /// The rates of `step` in a scene of `extent`: the means' decay log-linearly, the others stay.
+    pub fn learning_rates(&self, step: u64, extent: f64) -> LearningRates {
+        let done = (step as f64 / self.means_rate_steps.max(1) as f64).min(1.0);
+        let decay = (self.final_means_rate / self.initial_rates.means).powf(done);
+        LearningRates { means: self.initial_rates.means * decay * extent, ..self.initial_rates }
+    }
+
+    /// The SH degree that `step` trains, at most `max`.
+    pub fn sh_degree(&self, step: u64, max: u32) -> u32 {
+        let degree = step / self.sh_degree_interval.max(1);
+        degree.min(u64::from(max)) as u32
+    }
+
+    /// Whether density control acts at the end of `step`.
+    pub fn densifies_at(&self, step: u64) -> bool {
+        step > self.densify_after
+            && step < self.densify_before
+            && step.is_multiple_of(self.densify_interval.max(1))
+    }
+
+    /// The weight w of the near-camera damping of the screen gradients that density control reads: they are
+    /// multiplied by w min(1, (z / extent)^2) + 1 - w (Pixel-GS).
+    pub fn damping_weight(&self, step: u64) -> f32 {
+        match self.damping_steps {
+            [full, _] if step < full => 1.0,
+            [_, half] if step < half => 0.5,
+            _ => 0.0,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_means_rate_decays_a_hundredfold_and_stays() {
+        let schedule = Schedule::default();
+        let rate = |step| schedule.learning_rates(step, 2.0).means;
+        assert!((rate(0) - 3.2e-4).abs() < 1e-12);
+        assert!((rate(15_000) - 3.2e-5).abs() < 1e-12);
+        assert!((rate(30_000) - 3.2e-6).abs() < 1e-12);
+        assert!((rate(90_000) - 3.2e-6).abs() < 1e-12);
+        assert_eq!(schedule.learning_rates(7, 2.0).quats, 0.001);
+    }
+
+    #[test]
+    fn the_sh_degree_grows_every_thousand_steps() {
+        let schedule = Schedule::default();
+        let degrees =
+            [1, 999, 1_000, 2_999, 3_000, 100_000].map(|step| schedule.sh_degree(step, 3));
+        assert_eq!(degrees, [0, 0, 1, 2, 3, 3]);
+        assert_eq!(schedule.sh_degree(5_000, 1), 1);
+    }
+
+    #[test]
+    fn density_control_acts_strictly_inside_its_window() {
+        let schedule = Schedule::default();
+        let steps: Vec<u64> = (0..=6_000).filter(|&step| schedule.densifies_at(step)).collect();
+        assert_eq!((steps[0], steps[1], *steps.last().unwrap()), (600, 800, 4_800));
+    }
+
+    #[test]
+    fn damping_fades_in_two_steps() {
+        let schedule = Schedule::default();
+        let weights = [1, 3_999, 4_000, 6_999, 7_000].map(|step| schedule.damping_weight(step));
+        assert_eq!(weights, [1.0, 1.0, 0.5, 0.5, 0.0]);
+    }
+
+    #[test]
+    fn an_interval_of_zero_does_not_divide_by_zero() {
+        let schedule = Schedule {
+            means_rate_steps: 0,
+            sh_degree_interval: 0,
+            densify_interval: 0,
+            ..Default::default()
+        };
+        assert!(schedule.learning_rates(1, 1.0).means.is_finite());
+        assert_eq!(schedule.sh_degree(2, 3), 2);
+        assert!(schedule.densifies_at(501));
+    }
+}

@@ -1,0 +1,22 @@
+use super::tone::tone_curve;
+use crate::gpu::Reference;
+use crate::kernels::l1::{Constants, Kernel, Params, Slices};
+
+impl Reference for Kernel {
+    /// The whole sum goes into the first partial: how many there are is the device's choice.
+    fn run(
+        params: &Params,
+        constants: &Constants,
+        Slices { render, low, tone, d_render, partials }: Slices<'_>,
+    ) {
+        let mut sum = 0.0;
+        for i in 0..params.value_count as usize {
+            let difference = render[i] - tone_curve(constants.tone_curve, low[i], &tone[0]);
+            let sign = if difference == 0.0 { 0.0 } else { difference.signum() };
+            d_render[i] = params.l1_scale * sign;
+            sum += f64::from(difference.abs());
+        }
+        partials.fill(0.0);
+        partials[0] = sum as f32;
+    }
+}

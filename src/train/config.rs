@@ -1,0 +1,206 @@
+//! Everything that a training run depends on: the command line, a TOML file and the run directory say it alike.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+
+use crate::dataset::LoadOptions;
+use crate::optimizer::Schedule;
+use crate::scene::MAX_SH_DEGREE;
+use crate::tone::ToneSettings;
+use crate::{Error, Result};
+
+/// What is seen where no splat is.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Background {
+    /// Black, as in the paper.
+    #[default]
+    Black,
+    /// Another colour every step: dark surfaces cannot hide in the background.
+    Random,
+}
+
+impl std::str::FromStr for Background {
+    type Err = Error;
+
+    fn from_str(name: &str) -> Result<Self> {
+        match name {
+            "black" => Ok(Self::Black),
+            "random" => Ok(Self::Random),
+            _ => Err(Error::Usage(format!("unknown background `{name}`; black or random"))),
+        }
+    }
+}
+
+/// A training run. The defaults are the paper's protocol for LOM.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct TrainConfig {
+    /// The dataset's folder.
+    pub dataset: PathBuf,
+    /// A folder of reference images by name, in place of what lies beside the input.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub reference: Option<PathBuf>,
+    /// Steps; each renders one training view.
+    pub steps: u64,
+    /// Factor by which photographs shrink.
+    pub downscale: f64,
+    /// Everything random follows from it.
+    pub seed: u64,
+    /// Highest degree of the spherical harmonics.
+    pub sh_degree: u32,
+    /// Weight w of 1 - SSIM beside (1 - w) L1.
+    pub ssim_weight: f64,
+    /// Density control stops growing here.
+    pub max_gaussians: usize,
+    /// What is seen where no splat is, during training; scores and renders use black.
+    pub background: Background,
+    /// Scores the test views every so many steps; 0: at the end only.
+    pub eval_every: u64,
+    /// The device: a part of its name or its index; empty: the best.
+    pub device: String,
+    /// Random points to begin with where the dataset has none.
+    pub random_points: usize,
+    /// The curve that lifts each photograph.
+    pub tone: ToneSettings,
+    /// Learning rates, and what else changes with the step.
+    pub schedule: Schedule,
+    /// Density control.
+    pub density: DensityConfig,
+}
+
+/// Which Gaussians multiply and which go; [`Schedule`] says when.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct DensityConfig {
+    /// Mean norm of the screen-space gradient, in normalised device units, from which a Gaussian multiplies.
+    pub gradient_threshold: f64,
+    /// Larger than this fraction of the extent: split; smaller: cloned.
+    pub split_scale: f64,
+    /// Fainter Gaussians are removed.
+    pub min_opacity: f64,
+}
+
+impl Default for TrainConfig {
+    fn default() -> Self {
+        Self {
+            dataset: PathBuf::new(),
+            reference: None,
+            steps: 5000,
+            downscale: 1.0,
+            seed: 10,
+            sh_degree: MAX_SH_DEGREE,
+            ssim_weight: 0.2,
+            max_gaussians: 1_000_000,
+            background: Background::Black,
+            eval_every: 0,
+            device: String::new(),
+            random_points: 20_000,
+            tone: ToneSettings::default(),
+            schedule: Schedule::default(),
+            density: DensityConfig::default(),
+        }
+    }
+}
+
+impl Default for DensityConfig {
+    fn default() -> Self {
+        Self { gradient_threshold: 2e-4, split_scale: 0.01, min_opacity: 0.005 }
+    }
+}
+
+impl TrainConfig {
+    /// Reads a TOML file; what it leaves out keeps its default.
+    ///
+    /// # Errors
+    /// The file cannot be read, or says something that no run has.
+    pub fn load(path: &Path) -> Result<Self> {
+        let text = std::fs::read_to_string(path)
+            .map_err(|error| Error::input(path, format!("cannot be read: {error}")))?;
+        toml::from_str(&text).map_err(|error| {
+            let line = error.span().map(|span| text[..span.start].lines().count().max(1));
+            let place = line.map(|line| format!(" (line {line})")).unwrap_or_default();
+            Error::input(path, format!("is no configuration: {}{place}", error.message()))
+        })
+    }
+
+    /// The configuration as TOML.
+    ///
+    /// # Errors
+    /// None for values that [`TrainConfig::check`] accepts.
+    pub fn to_toml(&self) -> Result<String> {
+        toml::to_string(self).map_err(|error| Error::Usage(error.to_string()))
+    }
+
+    /// How the dataset is to be loaded.
+    pub fn load_options(&self) -> LoadOptions {
+        LoadOptions {
+            downscale: self.downscale,
+            reference: self.reference.clone(),
+            ..LoadOptions::default()
+        }
+    }
+
+    /// Refuses values that make no sense, naming the option.
+    ///
+    /// # Errors
+    /// [`Error::Usage`].
+    pub fn check(&self) -> Result<()> {
+        self.tone.check()?;
+        let density = &self.density;
+        let rules = [
+            ("--steps", self.steps as f64, self.steps >= 1, "at least 1"),
+            ("--sh-degree", f64::from(self.sh_degree), self.sh_degree <= MAX_SH_DEGREE, "0 to 3"),
+            ("--max-gaussians", self.max_gaussians as f64, self.max_gaussians >= 1, "at least 1"),
+            (
+                "--ssim-weight",
+                self.ssim_weight,
+                (0.0..=1.0).contains(&self.ssim_weight),
+                "from 0 to 1",
+            ),
+            ("random_points", self.random_points as f64, self.random_points >= 1, "at least 1"),
+            (
+                "density.gradient_threshold",
+                density.gradient_threshold,
+                density.gradient_threshold > 0.0,
+                "above 0",
+            ),
+        ];
+        for (name, value, holds, rule) in rules {
+            if !(holds && value.is_finite()) {
+                return Err(Error::Usage(format!("{name} is {value}; it must be {rule}")));
+            }
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_configuration_survives_its_toml() {
+        let config = TrainConfig { seed: 3, background: Background::Random, ..Default::default() };
+        let text = config.to_toml().unwrap();
+        assert_eq!(toml::from_str::<TrainConfig>(&text).unwrap(), config);
+    }
+
+    #[test]
+    fn an_unknown_key_names_its_line() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("config.toml");
+        std::fs::write(&path, "steps = 3\nstepz = 4\n").unwrap();
+        let message = TrainConfig::load(&path).unwrap_err().to_string();
+        assert!(message.contains("stepz") && message.contains("line"), "{message}");
+    }
+
+    #[test]
+    fn values_that_make_no_sense_are_refused_by_name() {
+        let refused = |config: TrainConfig| config.check().unwrap_err().to_string();
+        assert!(refused(TrainConfig { steps: 0, ..Default::default() }).contains("--steps"));
+        assert!(refused(TrainConfig { ssim_weight: f64::NAN, ..Default::default() }).contains("ssim"));
+        assert!(refused(TrainConfig { sh_degree: 4, ..Default::default() }).contains("--sh-degree"));
+    }
+}

@@ -1,0 +1,112 @@
+//! The training views on the device: dark photographs, their curves, and the order in which steps take them.
+
+use glam::{DVec3, UVec2};
+
+use super::{TrainConfig, streams};
+use crate::Result;
+use crate::camera::Camera;
+use crate::dataset::{Dataset, Point};
+use crate::gpu::{Buffer, Gpu};
+use crate::image::Image;
+use crate::kernels::ToneParameters;
+use crate::pseudo_gt::PseudoGt;
+use crate::random::Stream;
+use crate::scene::{Gaussians, init};
+
+/// One training view.
+#[derive(Debug)]
+pub(super) struct TrainView {
+    pub(super) name: String,
+    /// Index into the dataset's views.
+    index: usize,
+    pub(super) camera: Camera,
+    /// The dark photograph, planar (3, H, W), sRGB-encoded.
+    pub(super) image: Buffer<f32>,
+    /// The curve that its statistics give; one element.
+    pub(super) tone: Buffer<ToneParameters>,
+}
+
+/// All training views, in the dataset's order.
+#[derive(Debug)]
+pub(super) struct Views(Vec<TrainView>);
+
+impl Views {
+    /// Uploads every training photograph and takes its statistics once.
+    pub(super) fn upload(gpu: &Gpu, pseudo_gt: &mut PseudoGt, dataset: &Dataset) -> Result<Self> {
+        let mut views = vec![];
+        for (index, view) in dataset.views.iter().enumerate() {
+            let Some(image) = view.image.as_ref().filter(|_| view.is_train()) else { continue };
+            let pixels = gpu.buffer("low", &image.data)?;
+            let mut tone = gpu.uninit("tone", 1)?;
+            gpu.run("statistics", |pass| {
+                pseudo_gt.statistics(pass, &pixels, [image.width, image.height], &mut tone, 0)
+            })?;
+            let (name, camera) = (view.name.clone(), view.camera.clone());
+            views.push(TrainView { name, index, camera, image: pixels, tone });
+        }
+        Ok(Self(views))
+    }
+
+    /// The view that a step trains on: every epoch takes each view once, in an order of its own.
+    pub(super) fn of_step(&self, seed: u64, step: u64) -> &TrainView {
+        let count = self.0.len() as u64;
+        let (epoch, place) = ((step - 1) / count, (step - 1) % count);
+        let stream = Stream::new(seed, streams::VIEWS);
+        // Fisher-Yates from the end; the picks of an epoch only depend on its number.
+        let mut order: Vec<usize> = (0..self.0.len()).collect();
+        for left in (1..count).rev() {
+            let draw = stream.bits(epoch * count + left) % (left + 1);
+            order.swap(left as usize, draw as usize);
+        }
+        &self.0[order[place as usize]]
+    }
+
+    pub(super) fn cameras(&self) -> impl Iterator<Item = &Camera> {
+        self.0.iter().map(|view| &view.camera)
+    }
+
+    /// Width and height of every view.
+    pub(super) fn sizes(&self) -> Vec<UVec2> {
+        self.cameras().map(|camera| UVec2::new(camera.width, camera.height)).collect()
+    }
+
+    /// One Gaussian per point of the dataset, or per random point where there is none, coloured as the targets of the
+    /// training views show it.
+    pub(super) fn initial_gaussians(
+        &self,
+        gpu: &Gpu,
+        pseudo_gt: &PseudoGt,
+        dataset: &Dataset,
+        config: &TrainConfig,
+    ) -> Result<Gaussians> {
+        let random;
+        let points = if dataset.points.is_empty() {
+            let cameras: Vec<Camera> = self.cameras().cloned().collect();
+            let count = config.random_points.min(config.max_gaussians);
+            let seed = Stream::new(config.seed, streams::POINTS).bits(0);
+            tracing::info!("no points in the dataset: {count} random ones");
+            let point = |position| Point { position, views: vec![] };
+            random = init::random(&cameras, count, seed).into_iter().map(point).collect();
+            &random
+        } else {
+            &dataset.points
+        };
+        let kept = &points[..points.len().min(config.max_gaussians)];
+        let colors = init::colors_from_views(kept, &dataset.views, |index| {
+            let view = self.0.iter().find(|view| view.index == index);
+            view.map(|view| view.target(gpu, pseudo_gt)).transpose()
+        })?;
+        let positions: Vec<DVec3> = kept.iter().map(|point| point.position).collect();
+        init::from_points(&positions, &colors, config.sh_degree)
+    }
+}
+
+impl TrainView {
+    /// The pseudo-GT of the view.
+    fn target(&self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<Image> {
+        let mut target = gpu.uninit("target", self.image.len())?;
+        gpu.run("target", |pass| pseudo_gt.map(pass, &self.image, &self.tone, 0, &mut target))?;
+        let Camera { width, height, .. } = self.camera;
+        Ok(Image { width, height, data: gpu.read(&target)? })
+    }
+}
