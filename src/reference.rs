@@ -4,11 +4,7 @@
 //! hold each kernel to its reference. What decides where a splat lies is f32, as in the shader; what makes light and
 //! gradients is f64.
 
-#![expect(
-    clippy::needless_range_loop,
-    clippy::neg_cmp_op_on_partial_ord,
-    reason = "keeps each line comparable to the shader; a NaN must fail the test"
-)]
+#![expect(clippy::needless_range_loop, reason = "keeps each line comparable to the shader")]
 
 mod adam;
 pub mod blend_backward;

@@ -149,12 +149,9 @@ impl Chain {
                 );
             }
         }
-        for c in 0..3 {
+        for (c, &actual) in d_background.iter().enumerate() {
             let expected = difference(&background, c, &|b| self.loss(&parameters, b));
-            assert!(
-                (d_background[c] - expected).abs() < 1e-6 * expected.abs(),
-                "{name}: background"
-            );
+            assert!((actual - expected).abs() < 1e-6 * expected.abs(), "{name}: background");
         }
     }
 }
@@ -394,9 +391,7 @@ fn gradient_bounds(setup: &Setup, frame: &Frame, d_splats: &[f32]) -> Vec<f64> {
                 .zip(&exact)
                 .for_each(|((b, m), e)| *b += (m - e).abs());
         }
-        let mut values = bound.iter();
-        let as_gaussian = one.load(&bound, 0);
-        planes.store(&as_gaussian, i, |at, _| bounds[at] = *values.next().unwrap());
+        planes.store(&one.load(&bound, 0), i, |at, value| bounds[at] = value);
     }
     bounds
 }

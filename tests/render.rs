@@ -1,5 +1,7 @@
 //! The forward kernels of the rasteriser: against their references, at their limits, and against golden renders.
 
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
 use std::collections::HashSet;
 use std::path::Path;
 

@@ -52,8 +52,8 @@ pub(crate) fn assert_close(
 ) {
     assert_eq!(actual.len(), expected.len(), "{what}");
     // Positive phrasing: a NaN is a mismatch.
-    let bad = |i: &usize| !((actual[*i] - expected[*i]).abs() <= bound(*i, expected[*i]));
-    let bad: Vec<usize> = (0..actual.len()).filter(bad).collect();
+    let is_close = |i: usize| (actual[i] - expected[i]).abs() <= bound(i, expected[i]);
+    let bad: Vec<usize> = (0..actual.len()).filter(|&i| !is_close(i)).collect();
     let first = |&i: &usize| format!("[{i}] {} instead of {}", actual[i], expected[i]);
     let shown: Vec<String> = bad.iter().take(10).map(first).collect();
     assert!(bad.is_empty(), "{what}: {} of {} differ: {shown:#?}", bad.len(), actual.len());

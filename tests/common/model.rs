@@ -1,6 +1,6 @@
 //! The rounding model of the blending kernels.
 
-use glam::{DVec2, UVec2};
+use glam::UVec2;
 use nightsplat::reference::splat::{ALPHA_MIN, Fragment, Splat, TRANSMITTANCE_MIN, fragments};
 
 use super::{Frame, Setup};
@@ -10,8 +10,6 @@ pub(crate) const ROUNDING: f64 = f32::EPSILON as f64 / 2.0;
 
 /// One pixel as f64 sees it, and what f32 may make of it.
 pub(crate) struct PixelModel {
-    /// Its centre.
-    pub(crate) center: DVec2,
     /// Its place in a plane.
     pub(crate) at: usize,
     /// Front to back.
@@ -27,7 +25,7 @@ pub(crate) struct PixelModel {
 /// The rounding model of the blending kernels, for the pixels of a tile and the splats and colours of its list.
 ///
 /// sigma is a sum whose terms round a few times each; exp adds 3 + 2 sigma units (the Vulkan specification's bound);
-/// alpha_i moves the pixel by at most 2 max|c| T_i. Products and sums over the list add a rounding per splat.
+/// an alpha moves the pixel by at most 2 max|c| T. Products and sums over the list add a rounding per splat.
 pub(crate) fn model_tile(setup: &Setup, frame: &Frame, tile: usize) -> Vec<PixelModel> {
     let (splats, colors) = tile_list(setup, frame, tile);
     let colors =
@@ -72,7 +70,7 @@ fn model_pixel(setup: &Setup, splats: &[Splat], max_color: f64, pixel: UVec2) ->
             || near(last, TRANSMITTANCE_MIN, transmittance_error)
     });
     let at = (pixel.y * setup.params.size.x + pixel.x) as usize;
-    PixelModel { center, at, fragments, alpha_errors, error, is_fragile }
+    PixelModel { at, fragments, alpha_errors, error, is_fragile }
 }
 
 /// The splats of a tile's list, front to back, and their colours.
