@@ -72,11 +72,12 @@ void main() {
     vec3 normal = cross(u0, u1);
     float det = dot(normal, normal) + DILATION * (xx + yy) + DILATION * DILATION;
     vec3 cov2d = vec3(xx + DILATION, xy, yy + DILATION);
+    vec2 mean2d = focal * mean_in_view.xy / mean_in_view.z + principal_point;
     // Positive phrasing: an overflow or a NaN is culled.
-    if (!(det < 1e30)) return;
+    if (!(det < 1e30 && all(lessThan(abs(mean2d), vec2(1e30))))) return;
 
     ProjectedSplat splat;
-    splat.mean2d = focal * mean_in_view.xy / mean_in_view.z + principal_point;
+    splat.mean2d = mean2d;
     splat.conic = vec3(cov2d.z, -cov2d.y, cov2d.x) / det;
     splat.opacity = opacity;
     splat.half_extent = sqrt(splat_level(opacity) * cov2d.xz) + 0.01;

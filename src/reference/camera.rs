@@ -1,0 +1,81 @@
+//! The pinhole camera of `include/camera.glsl`, in f64.
+
+use glam::{DMat3, DVec2, DVec3, DVec4, UVec2, Vec2};
+
+/// How far outside the image, in widths and heights, the Jacobian of the projection is still taken.
+pub const JACOBIAN_MARGIN: f64 = 0.15;
+
+/// A view as the parameters of the projecting kernels describe it.
+#[derive(Clone, Debug)]
+pub struct Camera {
+    /// The rotation from world to view.
+    pub rotation: DMat3,
+    /// The translation from world to view.
+    pub translation: DVec3,
+    /// Pixels.
+    pub focal: DVec2,
+    /// Pixels.
+    pub principal_point: DVec2,
+    /// Pixels.
+    pub size: DVec2,
+}
+
+impl Camera {
+    /// From the parameters of `project` and `project_backward`.
+    pub fn new(
+        view_from_world: [[f32; 3]; 4],
+        focal: Vec2,
+        principal_point: Vec2,
+        size: UVec2,
+    ) -> Self {
+        let [x, y, z, translation] =
+            view_from_world.map(|column| DVec3::from(column.map(f64::from)));
+        Self {
+            rotation: DMat3::from_cols(x, y, z),
+            translation,
+            focal: focal.as_dvec2(),
+            principal_point: principal_point.as_dvec2(),
+            size: size.as_dvec2(),
+        }
+    }
+
+    /// A point of the world in view coordinates.
+    pub fn view(&self, point: DVec3) -> DVec3 {
+        self.rotation * point + self.translation
+    }
+
+    /// The camera's position in the world.
+    pub fn center(&self) -> DVec3 {
+        -(self.rotation.transpose() * self.translation)
+    }
+
+    /// x / z and y / z, clamped to the image and its margin.
+    pub fn clamped_slope(&self, mean_in_view: DVec3) -> DVec2 {
+        let margin = JACOBIAN_MARGIN * self.size;
+        let low = -(self.principal_point + margin) / self.focal;
+        let high = (self.size - self.principal_point + margin) / self.focal;
+        (mean_in_view.truncate() / mean_in_view.z).max(low).min(high)
+    }
+}
+
+/// The rotation of a unit quaternion (w, x, y, z).
+pub fn rotation(q: DVec4) -> DMat3 {
+    let [w, x, y, z] = q.to_array();
+    DMat3::from_cols_array(&[
+        1.0 - 2.0 * (y * y + z * z),
+        2.0 * (x * y + w * z),
+        2.0 * (x * z - w * y),
+        2.0 * (x * y - w * z),
+        1.0 - 2.0 * (x * x + z * z),
+        2.0 * (y * z + w * x),
+        2.0 * (x * z + w * y),
+        2.0 * (y * z - w * x),
+        1.0 - 2.0 * (x * x + y * y),
+    ])
+}
+
+/// A quaternion of unit length; the identity where the length is not a positive number.
+pub fn unit_quat(q: DVec4) -> DVec4 {
+    let norm = q.length();
+    if norm > 1e-12 { q / norm } else { DVec4::X }
+}

@@ -1,0 +1,79 @@
+//! One Gaussian's attributes in the planes of `include/gaussian.glsl`.
+
+use glam::{DVec3, DVec4};
+
+use super::sh::sh_count;
+
+/// A Gaussian, or the gradient of one, in f64.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Gaussian {
+    /// World units.
+    pub mean: DVec3,
+    /// (w, x, y, z), not normalised.
+    pub quat: DVec4,
+    /// ln of the standard deviations, in world units.
+    pub log_scale: DVec3,
+    /// Before the sigmoid.
+    pub raw_opacity: f64,
+    /// All stored SH coefficients, degree 0 first, RGB.
+    pub sh: Vec<DVec3>,
+}
+
+/// How an array of attributes is laid out.
+#[derive(Clone, Copy, Debug)]
+pub struct Planes {
+    /// Gaussians in the array.
+    pub count: usize,
+    /// The degree that is stored.
+    pub sh_degree: u32,
+}
+
+impl Planes {
+    /// Floats of the whole array.
+    pub fn len(self) -> usize {
+        self.count * (11 + 3 * sh_count(self.sh_degree))
+    }
+
+    /// True where there is no Gaussian.
+    pub fn is_empty(self) -> bool {
+        self.count == 0
+    }
+
+    /// Where Gaussian `i` has its floats, attribute by attribute.
+    fn places(self, i: usize) -> impl Iterator<Item = usize> {
+        let rest = 3 * (sh_count(self.sh_degree) - 1);
+        [(0, 3), (3, 4), (7, 3), (10, 1), (11, 3), (14, rest)].into_iter().flat_map(
+            move |(column, width)| {
+                let first = column * self.count + width * i;
+                first..first + width
+            },
+        )
+    }
+
+    /// Gaussian `i` of the array.
+    pub fn load<T: Copy + Into<f64>>(self, parameters: &[T], i: usize) -> Gaussian {
+        let v: Vec<f64> = self.places(i).map(|at| parameters[at].into()).collect();
+        Gaussian {
+            mean: DVec3::from_slice(&v[0..3]),
+            quat: DVec4::from_slice(&v[3..7]),
+            log_scale: DVec3::from_slice(&v[7..10]),
+            raw_opacity: v[10],
+            sh: v[11..].chunks_exact(3).map(DVec3::from_slice).collect(),
+        }
+    }
+
+    /// Writes Gaussian `i` through `set`, which takes the place in the array and the value.
+    pub fn store(self, gaussian: &Gaussian, i: usize, mut set: impl FnMut(usize, f64)) {
+        let values = (gaussian.mean.to_array().into_iter())
+            .chain(gaussian.quat.to_array())
+            .chain(gaussian.log_scale.to_array())
+            .chain([gaussian.raw_opacity])
+            .chain(gaussian.sh.iter().flat_map(|coefficient| coefficient.to_array()));
+        self.places(i).zip(values).for_each(|(at, value)| set(at, value));
+    }
+}
+
+/// The logistic function.
+pub fn sigmoid(x: f64) -> f64 {
+    1.0 / (1.0 + (-x).exp())
+}
