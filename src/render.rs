@@ -37,15 +37,19 @@ pub struct RenderSettings {
     pub max_alpha: f32,
     /// Degree of the spherical harmonics stored.
     pub sh_degree: u32,
-    /// The tile that one subgroup owns, in pixels.
-    pub tile: [u32; 2],
+    /// The tile that one subgroup owns, in pixels; none: what suits the device.
+    pub tile: Option<[u32; 2]>,
 }
 
 impl Default for RenderSettings {
     fn default() -> Self {
-        Self { near: 0.2, max_alpha: 0.99, sh_degree: 3, tile: [16, 16] }
+        Self { near: 0.2, max_alpha: 0.99, sh_degree: 3, tile: None }
     }
 }
+
+/// The tile of a GPU, as in 3DGS, and that of a processor, whose subgroups are narrow: measured on lavapipe.
+const GPU_TILE: [u32; 2] = [16, 16];
+const CPU_TILE: [u32; 2] = [16, 8];
 
 /// What changes from render to render.
 #[derive(Clone, Copy, Debug)]
@@ -81,6 +85,7 @@ pub struct Gradients<'a> {
 pub struct Renderer {
     gpu: Gpu,
     settings: RenderSettings,
+    tile: [u32; 2],
     project: Pipeline<project::Kernel>,
     order_counts: Pipeline<order_counts::Kernel>,
     check_capacity: Pipeline<check_capacity::Kernel>,
@@ -103,7 +108,8 @@ impl Renderer {
     /// # Errors
     /// The driver refuses a kernel, or the tile has more than 32 rows of lanes.
     pub fn new(gpu: &Gpu, settings: RenderSettings) -> Result<Self> {
-        let [tile_width, tile_height] = settings.tile;
+        let tile = if gpu.properties().is_cpu { CPU_TILE } else { GPU_TILE };
+        let [tile_width, tile_height] = settings.tile.unwrap_or(tile);
         let lanes = gpu.properties().subgroup_size;
         let pixels = tile_width * tile_height;
         if pixels == 0 || pixels % lanes != 0 || pixels / lanes > 32 {
@@ -113,10 +119,12 @@ impl Renderer {
             )));
         }
         let channels = 3;
+        let skips_groups = !gpu.properties().is_cpu;
         let (alpha_max, sh_degree) = (settings.max_alpha, settings.sh_degree);
         Ok(Self {
             gpu: gpu.clone(),
             settings,
+            tile: [tile_width, tile_height],
             project: gpu.pipeline(&project::Constants {
                 sh_degree,
                 alpha_max,
@@ -138,12 +146,14 @@ impl Renderer {
                 channels,
                 tile_width,
                 tile_height,
+                skips_groups,
             })?,
             blend_backward: gpu.pipeline(&blend_backward::Constants {
                 alpha_max,
                 channels,
                 tile_width,
                 tile_height,
+                skips_groups,
             })?,
             reduce_records: gpu.pipeline(&reduce_records::Constants {
                 alpha_max,
@@ -445,7 +455,7 @@ impl Renderer {
 
     /// Columns and rows of tiles.
     fn tiles(&self, camera: &Camera) -> UVec2 {
-        let [tile_width, tile_height] = self.settings.tile;
+        let [tile_width, tile_height] = self.tile;
         UVec2::new(camera.width.div_ceil(tile_width), camera.height.div_ceil(tile_height))
     }
 
