@@ -90,7 +90,8 @@ impl RunDirectory {
 pub fn load_config(run: &Path) -> Result<TrainConfig> {
     let path = run.join("config.toml");
     if !path.is_file() {
-        let problem = "is no run directory: it has no config.toml; name the --out of `nightsplat train`";
+        let problem =
+            "is no run directory: it has no config.toml; name the --out of `nightsplat train`";
         return Err(Error::input(run, problem));
     }
     TrainConfig::load(&path)
@@ -113,7 +114,8 @@ pub fn load_model(run: &Path) -> Result<Gaussians> {
 /// # Errors
 /// The folder cannot be written.
 pub fn write_json(path: &Path, value: &serde_json::Value) -> Result<()> {
-    let mut text = serde_json::to_string_pretty(value).map_err(|error| Error::Usage(error.to_string()))?;
+    let mut text =
+        serde_json::to_string_pretty(value).map_err(|error| Error::Usage(error.to_string()))?;
     text.push('\n');
     write_whole(path, text.as_bytes())
 }
@@ -164,7 +166,8 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("file");
         std::fs::write(&file, "").unwrap();
-        let error = RunDirectory::create(&file.join("run"), &TrainConfig::default(), false).unwrap_err();
+        let error =
+            RunDirectory::create(&file.join("run"), &TrainConfig::default(), false).unwrap_err();
         assert!(error.to_string().contains("file"), "{error}");
     }
 }

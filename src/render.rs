@@ -108,7 +108,9 @@ impl Renderer {
         let pixels = tile_width * tile_height;
         if pixels == 0 || pixels % lanes != 0 || pixels / lanes > 32 {
             let what = format!("{tile_width}x{tile_height} tiles do not suit {lanes} lanes");
-            return Err(Error::Usage(format!("{what}; take a tile of 8 to 32 times as many pixels")));
+            return Err(Error::Usage(format!(
+                "{what}; take a tile of 8 to 32 times as many pixels"
+            )));
         }
         let channels = 3;
         let (alpha_max, sh_degree) = (settings.max_alpha, settings.sh_degree);
@@ -124,7 +126,12 @@ impl Renderer {
             })?,
             order_counts: gpu.pipeline(&order_counts::Constants::default())?,
             check_capacity: gpu.pipeline(&check_capacity::Constants::default())?,
-            emit: gpu.pipeline(&emit::Constants { alpha_max, channels, tile_width, tile_height })?,
+            emit: gpu.pipeline(&emit::Constants {
+                alpha_max,
+                channels,
+                tile_width,
+                tile_height,
+            })?,
             tile_ranges: gpu.pipeline(&tile_ranges::Constants::default())?,
             blend_forward: gpu.pipeline(&blend_forward::Constants {
                 alpha_max,
@@ -390,13 +397,7 @@ impl Renderer {
             },
             Threads::Exactly([gaussian_count, 1, 1]),
         )?;
-        self.scan.record(
-            pass,
-            all,
-            &frame.ordered_counts,
-            &mut frame.offsets,
-            &mut frame.total,
-        )?;
+        self.scan.record(pass, all, &frame.ordered_counts, &mut frame.offsets, &mut frame.total)?;
         let capacity = frame.intersection_capacity();
         pass.dispatch(
             &self.check_capacity,

@@ -126,7 +126,8 @@ impl Trainer {
         let first = self.step + 1;
         let until = until.min(self.config.steps).min(self.step + STEPS_PER_SUBMISSION);
         // A submission ends where density control changes the number of Gaussians.
-        let last = (first..until).find(|&step| self.config.schedule.densifies_at(step)).unwrap_or(until);
+        let last =
+            (first..until).find(|&step| self.config.schedule.densifies_at(step)).unwrap_or(until);
         if last < first {
             return Ok(vec![]);
         }
@@ -143,7 +144,8 @@ impl Trainer {
         let Some((log, status)) = downloads else { return Ok(vec![]) };
         let (log, status) = (log.wait()?, Status::from_words(&status.wait()?));
         // The steps from the first failed one on have changed nothing.
-        let done = log.iter().take((last - first + 1) as usize).take_while(|l| l.status == 0).count();
+        let done =
+            log.iter().take((last - first + 1) as usize).take_while(|l| l.status == 0).count();
         let milliseconds = begin.elapsed().as_secs_f64() * 1e3 / done.max(1) as f64;
         let reports = (first..)
             .zip(&log[..done])
@@ -174,8 +176,7 @@ impl Trainer {
             sh_degree: schedule.sh_degree(step, self.config.sh_degree),
             background: background(&self.config, step),
         };
-        let damping =
-            Damping { weight: schedule.damping_weight(step), depth: self.extent as f32 };
+        let damping = Damping { weight: schedule.damping_weight(step), depth: self.extent as f32 };
         let size = UVec2::new(view.camera.width, view.camera.height);
         let model = &mut self.model;
 
@@ -232,7 +233,8 @@ impl Trainer {
     }
 
     fn report(&self, step: u64, loss: &StepLoss, milliseconds: f64) -> StepReport {
-        let (l1, ssim, weight) = (f64::from(loss.l1), f64::from(loss.ssim), self.config.ssim_weight);
+        let (l1, ssim, weight) =
+            (f64::from(loss.l1), f64::from(loss.ssim), self.config.ssim_weight);
         StepReport {
             step,
             view: self.views.of_step(self.config.seed, step).name.clone(),

@@ -83,11 +83,13 @@ pub(crate) struct TrainOptions {
 impl TrainOptions {
     /// The configuration: defaults, then the file, then the command line.
     pub(crate) fn config(&self, dataset: PathBuf) -> crate::Result<TrainConfig> {
-        let mut config = self.config.as_deref().map_or_else(|| Ok(TrainConfig::default()), TrainConfig::load)?;
+        let mut config =
+            self.config.as_deref().map_or_else(|| Ok(TrainConfig::default()), TrainConfig::load)?;
         config.dataset = dataset;
         if let Some(curve) = self.curve.filter(|&curve| curve != config.tone.curve) {
             // Another curve brings its own c; the other constants stay.
-            config.tone = ToneSettings { curve, gain_c: ToneSettings::new(curve).gain_c, ..config.tone };
+            config.tone =
+                ToneSettings { curve, gain_c: ToneSettings::new(curve).gain_c, ..config.tone };
         }
         fn set<T: Clone>(value: &mut T, option: &Option<T>) {
             if let Some(option) = option {
@@ -122,8 +124,8 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     let gpu = Gpu::new(&config.device.parse::<DeviceChoice>()?)?;
     let dataset = Dataset::load(&config.dataset, &config.load_options())?;
     let mut directory = RunDirectory::create(&args.out, &config, args.overwrite)?;
-    let (scored, seconds, gaussians) = train(&gpu, &config, &dataset, |report| directory.log(report))
-        .and_then(|trained| {
+    let (scored, seconds, gaussians) =
+        train(&gpu, &config, &dataset, |report| directory.log(report)).and_then(|trained| {
             directory.save_model(&trained.gaussians)?;
             Ok((trained.scored, trained.seconds, trained.gaussians.count))
         })?;

@@ -128,16 +128,16 @@ impl Owned {
 /// Every Vulkan device of this machine, the best first, whether it meets the requirements or not.
 ///
 /// # Errors
-/// There is no Vulkan loader.
+/// There is no Vulkan loader, or no device at all.
 pub fn devices() -> Result<Vec<DeviceReport>> {
     let owned = instance(false)?;
-    let reports = physical_devices(&owned.instance)?
-        .into_iter()
-        .map(|physical| report(&owned.instance, physical))
-        .collect();
+    let reports = physical_devices(&owned.instance).and_then(|all| {
+        all.into_iter().map(|physical| report(&owned.instance, physical)).collect()
+    });
     // SAFETY: no device was created from the instance.
     unsafe { owned.destroy() };
     reports
+        .and_then(|reports: Vec<_>| if reports.is_empty() { Err(no_device()) } else { Ok(reports) })
 }
 
 impl Gpu {
@@ -273,7 +273,15 @@ impl Gpu {
 // Instance
 
 fn loader_error(result: vk::Result) -> Error {
-    Error::NoDevice(format!("Vulkan did not start ({result}): {INSTALL}"))
+    match result {
+        // The loader's words for no driver at all.
+        vk::Result::ERROR_INCOMPATIBLE_DRIVER => no_device(),
+        _ => Error::NoDevice(format!("Vulkan did not start ({result}): {INSTALL}")),
+    }
+}
+
+fn no_device() -> Error {
+    Error::NoDevice(format!("there is no Vulkan device: {INSTALL}"))
 }
 
 fn entry() -> Result<ash::Entry> {
@@ -363,7 +371,7 @@ fn choose(
         .map(|physical| Ok((physical, Offered::gather(instance, physical).map_err(loader_error)?)))
         .collect::<Result<Vec<_>>>()?;
     if offers.is_empty() {
-        return Err(Error::NoDevice(format!("there is no Vulkan device: {INSTALL}")));
+        return Err(no_device());
     }
     let names: Vec<_> = offers.iter().map(|(_, o)| device_name(&o.properties)).collect();
     let index = match choice {

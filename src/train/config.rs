@@ -200,7 +200,11 @@ mod tests {
     fn values_that_make_no_sense_are_refused_by_name() {
         let refused = |config: TrainConfig| config.check().unwrap_err().to_string();
         assert!(refused(TrainConfig { steps: 0, ..Default::default() }).contains("--steps"));
-        assert!(refused(TrainConfig { ssim_weight: f64::NAN, ..Default::default() }).contains("ssim"));
-        assert!(refused(TrainConfig { sh_degree: 4, ..Default::default() }).contains("--sh-degree"));
+        assert!(
+            refused(TrainConfig { ssim_weight: f64::NAN, ..Default::default() }).contains("ssim")
+        );
+        assert!(
+            refused(TrainConfig { sh_degree: 4, ..Default::default() }).contains("--sh-degree")
+        );
     }
 }
