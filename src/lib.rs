@@ -14,6 +14,7 @@ pub mod camera;
 #[cfg(feature = "cli")]
 pub mod cli;
 pub mod dataset;
+pub mod densify;
 pub mod error;
 pub mod eval;
 pub mod export;

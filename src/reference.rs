@@ -12,6 +12,8 @@ pub mod blend_forward;
 pub mod camera;
 mod check_capacity;
 mod compensated_sum;
+mod densify_count;
+mod densify_scatter;
 mod dispatch_arguments;
 mod emit;
 pub mod gaussian;

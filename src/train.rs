@@ -10,7 +10,8 @@ use glam::UVec2;
 
 use crate::camera::Camera;
 use crate::dataset::Dataset;
-use crate::gpu::{Buffer, Gpu, Recorder};
+use crate::densify::{Densifier, DensifySettings};
+use crate::gpu::{Buffer, Gpu, PassTime, Recorder};
 use crate::image::Image;
 use crate::loss::{Loss, LossInputs, LossLog, StepLoss};
 use crate::optimizer::{Adam, AdamBuffers};
@@ -32,6 +33,7 @@ mod streams {
     pub(super) const POINTS: u64 = 1;
     pub(super) const BACKGROUND: u64 = 2;
     pub(super) const VIEWS: u64 = 3;
+    pub(super) const DENSITY: u64 = 4;
 }
 
 /// What one step did.
@@ -66,6 +68,7 @@ pub struct Trainer {
     renderer: Renderer,
     loss: Loss,
     adam: Adam,
+    densifier: Densifier,
     d_render: Buffer<f32>,
     log: Buffer<StepLoss>,
 }
@@ -92,6 +95,7 @@ impl Trainer {
             renderer: Renderer::new(gpu, settings)?,
             loss: Loss::new(gpu, config.tone.curve.constant(), config.ssim_weight, &sizes)?,
             adam: Adam::new(gpu)?,
+            densifier: Densifier::new(gpu, density(&config, dataset.extent()))?,
             d_render: gpu.uninit("d_render", 3 * pixels.unwrap_or_default())?,
             log: gpu.uninit("loss_log", STEPS_PER_SUBMISSION as usize)?,
             config,
@@ -107,7 +111,7 @@ impl Trainer {
 
     /// The number of Gaussians.
     pub fn gaussian_count(&self) -> usize {
-        self.model.count
+        self.model.count()
     }
 
     /// The Gaussians as they are now, on the host.
@@ -152,6 +156,11 @@ impl Trainer {
             .map(|(step, loss)| self.report(step, loss, milliseconds))
             .collect();
         self.step += done as u64;
+        if done > 0 && self.config.schedule.densifies_at(self.step) {
+            let changed = self.model.densify(&gpu, &mut self.densifier, self.step)?;
+            tracing::debug!("step {}: {changed:?}", self.step);
+            self.reserve()?;
+        }
         if status.overflowed {
             self.renderer.grow(status.intersections)?;
             let renderer = &mut self.renderer;
@@ -168,6 +177,19 @@ impl Trainer {
         Ok(reports)
     }
 
+    /// Trains one step and reports how long each of its passes took on the device.
+    ///
+    /// # Errors
+    /// As [`Trainer::advance`]; a step that overflows its memory is not counted, the next [`Trainer::advance`] redoes it.
+    pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
+        let step = self.step + 1;
+        let times = self.gpu.clone().profile("step", |pass| self.record_step(pass, step, 0))?;
+        if self.gpu.read(self.renderer.status())?.first() == Some(&0) {
+            self.step = step;
+        }
+        Ok(times)
+    }
+
     /// The algorithm: render a view, compare it with its pseudo-GT, go back, update.
     fn record_step(&mut self, pass: &mut Recorder<'_>, step: u64, slot: u32) -> Result<()> {
         let schedule = &self.config.schedule;
@@ -180,7 +202,7 @@ impl Trainer {
         let size = UVec2::new(view.camera.width, view.camera.height);
         let model = &mut self.model;
 
-        self.renderer.forward(pass, &model.parameters, &view.camera, &options)?;
+        self.renderer.forward(pass, &model.gaussians.parameters, &view.camera, &options)?;
         let (render, status) = self.renderer.render_and_status();
         self.loss.record(
             pass,
@@ -190,7 +212,7 @@ impl Trainer {
         )?;
         self.renderer.backward(
             pass,
-            &model.parameters,
+            &model.gaussians.parameters,
             &view.camera,
             &options,
             damping,
@@ -205,11 +227,11 @@ impl Trainer {
             pass,
             step,
             &schedule.learning_rates(step, self.extent),
-            [model.count as u32, model.columns()],
+            [model.gaussians.count, model.gaussians.column_count],
             AdamBuffers {
-                parameters: &mut model.parameters,
+                parameters: &mut model.gaussians.parameters,
                 gradients: &model.gradients,
-                moments: &mut model.moments,
+                moments: &mut model.gaussians.moments,
                 status: self.renderer.status(),
             },
         )
@@ -224,12 +246,12 @@ impl Trainer {
             sh_degree: self.config.schedule.sh_degree(self.step, self.config.sh_degree),
             background: [0.0; 3],
         };
-        self.renderer.reserve(self.model.count, [camera])?;
-        self.renderer.render_image(&self.model.parameters, camera, &options)
+        self.renderer.reserve(self.model.count(), [camera])?;
+        self.renderer.render_image(&self.model.gaussians.parameters, camera, &options)
     }
 
     fn reserve(&mut self) -> Result<()> {
-        self.renderer.reserve(self.model.count, self.views.cameras())
+        self.renderer.reserve(self.model.count(), self.views.cameras())
     }
 
     fn report(&self, step: u64, loss: &StepLoss, milliseconds: f64) -> StepReport {
@@ -241,9 +263,20 @@ impl Trainer {
             loss: (1.0 - weight) * l1 + weight * (1.0 - ssim),
             l1,
             ssim,
-            gaussians: self.model.count,
+            gaussians: self.model.count(),
             milliseconds,
         }
+    }
+}
+
+/// Density control in world units.
+fn density(config: &TrainConfig, extent: f64) -> DensifySettings {
+    DensifySettings {
+        gradient_threshold: config.density.gradient_threshold,
+        split_scale: config.density.split_scale * extent,
+        min_opacity: config.density.min_opacity,
+        max_gaussians: config.max_gaussians,
+        seed: Stream::new(config.seed, streams::DENSITY).bits(0),
     }
 }
 

@@ -1,9 +1,11 @@
 //! The loss: its kernels against their references, its gradient against finite differences, its edge cases.
 
+#![expect(clippy::unwrap_used, reason = "what fails here fails the test")]
+
 use glam::{UVec2, Vec3};
 use nightsplat::gpu::testing::{assert_no_validation_messages, gpu};
 use nightsplat::gpu::{Buffer, Gpu, Reference, Threads};
-use nightsplat::kernels::{ToneParameters, l1, ssim_backward, ssim_forward};
+use nightsplat::kernels::{ToneParameters, l1, loss_log, ssim_backward, ssim_forward};
 use nightsplat::loss::{Loss, LossInputs, LossLog, StepLoss};
 use nightsplat::reference::ssim_backward::gradient;
 use nightsplat::reference::ssim_forward::ssim;
@@ -203,6 +205,56 @@ fn l1_matches_its_reference() {
         assert_close("d_render", &outcome.d_render, &expected, 0.0);
         assert!((outcome.loss.l1 - sum[0] / count as f32).abs() < 1e-6);
         assert_eq!(outcome.loss.ssim, 0.0, "SSIM is not modelled at weight 0");
+    }
+    assert_no_validation_messages();
+}
+
+#[test]
+fn loss_log_matches_its_reference() {
+    let gpu = gpu();
+    let pipeline = gpu.pipeline::<loss_log::Kernel>(&loss_log::Constants::default()).unwrap();
+    let partials: Vec<f32> = (0..1000).map(|i| 300.0 + (i as f32 * 0.7).sin()).collect();
+    let l1_partials = gpu.buffer("l1_partials", &partials).unwrap();
+    let ssim_partials = gpu.buffer("ssim_partials", &partials).unwrap();
+    for (l1_partial_count, ssim_partial_count) in [(0, 0), (1, 0), (7, 8), (9, 33), (1000, 999)] {
+        let params = loss_log::Params {
+            slot: 2,
+            l1_partial_count,
+            ssim_partial_count,
+            mean_scale: 1.0 / 300.0,
+            not_finite_flag: NOT_FINITE,
+        };
+        let (mut expected, mut expected_status) = ([StepLoss::default(); 4], [1]);
+        let slices = loss_log::Slices {
+            l1_partials: &partials,
+            ssim_partials: &partials,
+            log: &mut expected,
+            status: &mut expected_status,
+        };
+        loss_log::Kernel::run(&params, &loss_log::Constants::default(), slices);
+        let mut log = gpu.zeros::<StepLoss>("log", 4).unwrap();
+        let mut status = gpu.buffer("status", &[1]).unwrap();
+        gpu.run("loss_log", |pass| {
+            let buffers = loss_log::Buffers {
+                l1_partials: &l1_partials,
+                ssim_partials: &ssim_partials,
+                log: &mut log,
+                status: &mut status,
+            };
+            pass.dispatch(&pipeline, &params, buffers, Threads::Workgroups([1, 1, 1]))
+        })
+        .unwrap();
+        for (actual, expected) in gpu.read(&log).unwrap().iter().zip(expected) {
+            assert!(
+                (actual.l1 - expected.l1).abs() <= 1e-6 * expected.l1,
+                "{actual:?} {expected:?}"
+            );
+            assert!(
+                (actual.ssim - expected.ssim).abs() <= 1e-6 * expected.ssim,
+                "{actual:?} {expected:?}"
+            );
+        }
+        assert_eq!(gpu.read(&status).unwrap(), expected_status);
     }
     assert_no_validation_messages();
 }

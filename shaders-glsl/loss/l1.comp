@@ -5,7 +5,7 @@
 
 //! The gradient of mean|a - b| with respect to the render a, b the pseudo-GT, and partial sums of |a - b|.
 //!
-//! A thread takes VALUES_PER_THREAD values, one subgroup apart, so that a subgroup reads one run. At a = b the gradient
+//! A thread takes `VALUES_PER_THREAD` values, one subgroup apart, so that a subgroup reads one run. At a = b the gradient
 //! is 0. Reference: `src/reference/l1.rs`.
 
 layout(local_size_x_id = 100) in;

@@ -6,7 +6,7 @@
 //! Adam over the planes of include/gaussian.glsl: beta 0.9 and 0.999, epsilon 1e-15.
 //!
 //! m = b1 m + (1 - b1) g, v = b2 v + (1 - b2) g^2, p -= rate / (1 - b1^t) m / (sqrt(v) / sqrt(1 - b2^t) + epsilon).
-//! A workgroup's row is the column, along it each thread takes FLOATS_PER_THREAD floats. A gradient that is not finite
+//! A workgroup's row is the column, along it each thread takes `FLOATS_PER_THREAD` floats. A gradient that is not finite
 //! counts as zero, so that it poisons neither moment; log scales stay within bounds whose exp is finite.
 //! Nothing changes while status[0] is set. Kingma and Ba 2015. Reference: `src/reference/adam.rs`.
 

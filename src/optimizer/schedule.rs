@@ -1,5 +1,7 @@
 //! What changes with the step: learning rates, SH degree, gradient damping, density control.
 
+use crate::scene::Attribute;
+
 /// Adam's learning rate of each attribute.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -43,14 +45,15 @@ pub struct Schedule {
 
 impl Default for Schedule {
     fn default() -> Self {
+        let rate = |attribute: Attribute| attribute.spec().learning_rate;
         Self {
             initial_rates: LearningRates {
-                means: 1.6e-4,
-                quats: 0.001,
-                log_scales: 0.005,
-                raw_opacities: 0.05,
-                dc: 0.0025,
-                rest: 0.0025 / 20.0,
+                means: rate(Attribute::Means),
+                quats: rate(Attribute::Quats),
+                log_scales: rate(Attribute::LogScales),
+                raw_opacities: rate(Attribute::RawOpacities),
+                dc: rate(Attribute::Dc),
+                rest: rate(Attribute::Rest),
             },
             final_means_rate: 1.6e-6,
             means_rate_steps: 30_000,

@@ -6,7 +6,7 @@ use super::ssim_forward::{blur, target, widen};
 use crate::gpu::Reference;
 use crate::kernels::ssim_backward::{Constants, Kernel, Params, Slices};
 
-/// The gradient of l1_scale sum|a - b| - ssim_scale sum SSIM with respect to one channel of the render `a`;
+/// The gradient of `l1_scale` sum|a - b| - `ssim_scale` sum SSIM with respect to one channel of the render `a`;
 /// `d_moments` are the derivatives that [`super::ssim_forward::ssim`] finds.
 pub fn gradient(
     [width, height]: [usize; 2],

@@ -1,0 +1,42 @@
+use crate::gpu::Reference;
+use crate::kernels::densify_count::{Constants, Kernel, Params, Slices};
+
+pub(super) const PRUNE: u32 = 0;
+pub(super) const KEEP: u32 = 1;
+pub(super) const CLONE: u32 = 2;
+pub(super) const SPLIT: u32 = 3;
+
+/// First column and width of every plane.
+pub(super) fn planes(column_count: usize) -> [(usize, usize); 6] {
+    [(0, 3), (3, 4), (7, 3), (10, 1), (11, 3), (14, column_count - 14)]
+}
+
+impl Reference for Kernel {
+    fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
+        let n = params.gaussian_count as usize;
+        for i in 0..n {
+            let is_finite = planes(params.column_count as usize).iter().all(|(column, width)| {
+                (0..*width).all(|k| slices.parameters[column * n + width * i + k].is_finite())
+            });
+            let is_visible = slices.parameters[10 * n + i] >= params.min_raw_opacity;
+            let largest =
+                (0..3).map(|k| slices.parameters[7 * n + 3 * i + k]).fold(f32::MIN, f32::max);
+            let mean_gradient = match slices.visit_counts[i] {
+                0 => 0.0,
+                visits => slices.grad_norm_sums[i] / visits as f32,
+            };
+            let fate = if !is_finite || !is_visible {
+                PRUNE
+            } else if !(mean_gradient > params.gradient_threshold) {
+                KEEP
+            } else if largest > params.split_log_scale {
+                SPLIT
+            } else {
+                CLONE
+            };
+            slices.mean_gradients[i] = mean_gradient;
+            slices.fates[i] = fate;
+            slices.offspring_counts[i] = [0, 1, 2, 2][fate as usize];
+        }
+    }
+}

@@ -1,0 +1,75 @@
+use std::f32::consts::TAU;
+
+use glam::{Quat, Vec3};
+
+use super::densify_count::{CLONE, KEEP, SPLIT, planes};
+use crate::gpu::Reference;
+use crate::kernels::densify_scatter::{Constants, Kernel, Params, Slices};
+
+fn random_bits(key: u32) -> u32 {
+    let state = key.wrapping_mul(747_796_405).wrapping_add(2_891_336_453);
+    let word = ((state >> ((state >> 28) + 4)) ^ state).wrapping_mul(277_803_737);
+    (word >> 22) ^ word
+}
+
+fn random_uniform(key: u32) -> f32 {
+    ((random_bits(key) >> 8) + 1) as f32 / 16_777_216.0
+}
+
+fn random_normal3(key: u32) -> Vec3 {
+    let uniform = |draw: u32| random_uniform(key.wrapping_add(draw));
+    let radius = [0, 1].map(|draw| (-2.0 * uniform(draw).ln()).sqrt());
+    let angle = [2, 3].map(|draw| TAU * uniform(draw));
+    Vec3::new(radius[0] * angle[0].cos(), radius[0] * angle[0].sin(), radius[1] * angle[1].cos())
+}
+
+/// A draw from the normal distribution that Gaussian `i` is.
+fn draw_mean(params: &Params, parameters: &[f32], i: usize, copy: u32) -> Vec3 {
+    let n = params.gaussian_count as usize;
+    let mean = Vec3::from_slice(&parameters[3 * i..]);
+    let quat = &parameters[3 * n + 4 * i..];
+    let quat = Quat::from_xyzw(quat[1], quat[2], quat[3], quat[0]);
+    let rotation = if quat.length() > 1e-12 { quat.normalize() } else { Quat::IDENTITY };
+    let scales = Vec3::from_slice(&parameters[7 * n + 3 * i..]).exp();
+    let step_key = random_bits(random_bits(params.seed).wrapping_add(params.step));
+    let key = random_bits(step_key.wrapping_add(2 * i as u32 + copy));
+    mean + rotation * (scales * random_normal3(key))
+}
+
+impl Reference for Kernel {
+    fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
+        let (n, new_n) = (params.gaussian_count as usize, params.new_gaussian_count as usize);
+        for i in 0..n {
+            let fate = slices.fates[i];
+            let copies = match fate {
+                CLONE | SPLIT => 2,
+                KEEP => 1,
+                _ => 0,
+            };
+            for copy in 0..copies {
+                let to = slices.offsets[i] as usize + copy as usize;
+                let is_new = fate == SPLIT || copy > 0;
+                for (column, width) in planes(params.column_count as usize) {
+                    for k in 0..width {
+                        let source = column * n + width * i + k;
+                        let target = column * new_n + width * to + k;
+                        let kept = |moments: &[f32]| if is_new { 0.0 } else { moments[source] };
+                        slices.new_parameters[target] = slices.parameters[source];
+                        slices.new_first_moments[target] = kept(slices.first_moments);
+                        slices.new_second_moments[target] = kept(slices.second_moments);
+                    }
+                }
+                if !is_new {
+                    continue;
+                }
+                let mean = draw_mean(params, slices.parameters, i, copy);
+                for k in 0..3 {
+                    slices.new_parameters[3 * to + k] = mean[k];
+                    if fate == SPLIT {
+                        slices.new_parameters[7 * new_n + 3 * to + k] -= 1.6f32.ln();
+                    }
+                }
+            }
+        }
+    }
+}

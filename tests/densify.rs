@@ -1,0 +1,458 @@
+//! Density control: the kernels against their references, what becomes of whom, the limit, the edges.
+
+#![expect(clippy::unwrap_used, reason = "what fails here fails the test")]
+
+use glam::{Quat, Vec3};
+use nightsplat::densify::{
+    Densifier, DensifyReport, DensifySettings, DeviceGaussians, GradientStatistics,
+};
+use nightsplat::gpu::testing::{assert_no_validation_messages, gpu};
+use nightsplat::gpu::{Gpu, Reference};
+use nightsplat::kernels::{densify_count, densify_scatter};
+use nightsplat::optimizer::Moments;
+
+const COLUMNS: usize = 23;
+const SETTINGS: DensifySettings = DensifySettings {
+    gradient_threshold: 2e-4,
+    split_scale: 0.05,
+    min_opacity: 0.005,
+    max_gaussians: usize::MAX,
+    seed: 10,
+};
+const STEP: u64 = 600;
+
+/// Gaussians, their moments and their statistics in host memory.
+#[derive(Clone, Debug, PartialEq)]
+struct Host {
+    count: usize,
+    parameters: Vec<f32>,
+    first: Vec<f32>,
+    second: Vec<f32>,
+    grad_norm_sums: Vec<f32>,
+    visit_counts: Vec<u32>,
+}
+
+impl Host {
+    /// Opaque Gaussians of scale 0.01 that nothing pulls at.
+    fn calm(count: usize) -> Self {
+        let wave = |phase: f32| -> Vec<f32> {
+            (0..count * COLUMNS).map(|i| (i as f32 * 0.7 + phase).sin()).collect()
+        };
+        let mut parameters = wave(0.0);
+        parameters[7 * count..10 * count].fill(0.01f32.ln());
+        parameters[10 * count..11 * count].fill(2.0);
+        let (first, second) = (wave(1.0), wave(2.0));
+        Self {
+            count,
+            parameters,
+            first,
+            second,
+            grad_norm_sums: vec![0.0; count],
+            visit_counts: vec![4; count],
+        }
+    }
+
+    /// Large and small, faint and opaque ones under gradients of all sizes, some never seen.
+    fn mixed(count: usize) -> Self {
+        let mut host = Self::calm(count);
+        for i in 0..count {
+            host.parameters[7 * count + 3 * i] =
+                if i % 3 == 0 { 0.2f32.ln() } else { 0.01f32.ln() };
+            host.parameters[10 * count + i] = if i % 7 == 0 { -6.0 } else { 1.0 };
+            host.visit_counts[i] = i as u32 % 5;
+            host.grad_norm_sums[i] = (i * 37 % 101) as f32 * 2e-5;
+        }
+        host
+    }
+
+    fn pull_at(&mut self, i: usize) {
+        self.grad_norm_sums[i] = 1.0;
+    }
+
+    fn quat_mut(&mut self, i: usize) -> &mut [f32] {
+        let first = 3 * self.count + 4 * i;
+        &mut self.parameters[first..first + 4]
+    }
+
+    fn log_scales_mut(&mut self, i: usize) -> &mut [f32] {
+        let first = 7 * self.count + 3 * i;
+        &mut self.parameters[first..first + 3]
+    }
+
+    fn mean(&self, i: usize) -> Vec3 {
+        Vec3::from_slice(&self.parameters[3 * i..])
+    }
+
+    /// All floats of one Gaussian, column by column.
+    fn row(&self, planes: &[f32], i: usize) -> Vec<f32> {
+        [(0, 3), (3, 4), (7, 3), (10, 1), (11, 3), (14, COLUMNS - 14)]
+            .into_iter()
+            .flat_map(|(column, width)| {
+                let first = column * self.count + width * i;
+                planes[first..first + width].to_vec()
+            })
+            .collect()
+    }
+
+    fn densify(&self, gpu: &Gpu, settings: DensifySettings, step: u64) -> (Self, DensifyReport) {
+        let upload = |name: &str, data: &[f32]| gpu.buffer(name, data).unwrap();
+        let gaussians = DeviceGaussians {
+            count: self.count as u32,
+            column_count: COLUMNS as u32,
+            parameters: upload("parameters", &self.parameters),
+            moments: Moments {
+                first: upload("first", &self.first),
+                second: upload("second", &self.second),
+            },
+        };
+        let grad_norm_sums = upload("grad_norm_sums", &self.grad_norm_sums);
+        let visit_counts = gpu.buffer("visit_counts", &self.visit_counts).unwrap();
+        let statistics =
+            GradientStatistics { grad_norm_sums: &grad_norm_sums, visit_counts: &visit_counts };
+        let mut densifier = Densifier::new(gpu, settings).unwrap();
+        let (after, report) = densifier.densify(&gaussians, statistics, step).unwrap();
+        assert_eq!(report.count, after.count as usize);
+        assert_eq!(after.parameters.len(), report.count * COLUMNS);
+        let host = Self {
+            count: report.count,
+            parameters: gpu.read(&after.parameters).unwrap(),
+            first: gpu.read(&after.moments.first).unwrap(),
+            second: gpu.read(&after.moments.second).unwrap(),
+            grad_norm_sums: vec![0.0; report.count],
+            visit_counts: vec![0; report.count],
+        };
+        (host, report)
+    }
+
+    /// The same by the references, with prefix sums on the host.
+    fn reference(&self, settings: DensifySettings, step: u64) -> Self {
+        let n = self.count;
+        let (mut mean_gradients, mut fates, mut offspring_counts) =
+            (vec![0.0; n], vec![0; n], vec![0; n]);
+        let params = densify_count::Params {
+            gaussian_count: n as u32,
+            column_count: COLUMNS as u32,
+            gradient_threshold: settings.gradient_threshold as f32,
+            split_log_scale: settings.split_scale.ln() as f32,
+            min_raw_opacity: (settings.min_opacity / (1.0 - settings.min_opacity)).ln() as f32,
+        };
+        let slices = densify_count::Slices {
+            parameters: &self.parameters,
+            grad_norm_sums: &self.grad_norm_sums,
+            visit_counts: &self.visit_counts,
+            mean_gradients: &mut mean_gradients,
+            fates: &mut fates,
+            offspring_counts: &mut offspring_counts,
+        };
+        densify_count::Kernel::run(&params, &densify_count::Constants::default(), slices);
+        let mut count = 0;
+        let offsets: Vec<u32> = offspring_counts
+            .iter()
+            .map(|offspring| {
+                count += offspring;
+                count - offspring
+            })
+            .collect();
+        let count = count as usize;
+        let mut after = Self {
+            count,
+            parameters: vec![0.0; count * COLUMNS],
+            first: vec![0.0; count * COLUMNS],
+            second: vec![0.0; count * COLUMNS],
+            grad_norm_sums: vec![0.0; count],
+            visit_counts: vec![0; count],
+        };
+        let params = densify_scatter::Params {
+            gaussian_count: n as u32,
+            new_gaussian_count: count as u32,
+            column_count: COLUMNS as u32,
+            seed: settings.seed as u32,
+            step: step as u32,
+        };
+        let slices = densify_scatter::Slices {
+            parameters: &self.parameters,
+            first_moments: &self.first,
+            second_moments: &self.second,
+            fates: &fates,
+            offsets: &offsets,
+            new_parameters: &mut after.parameters,
+            new_first_moments: &mut after.first,
+            new_second_moments: &mut after.second,
+        };
+        densify_scatter::Kernel::run(&params, &densify_scatter::Constants::default(), slices);
+        after
+    }
+}
+
+#[test]
+fn density_control_matches_its_references() {
+    let gpu = gpu();
+    for count in [0, 1, 2, 63, 64, 65, 1000] {
+        let before = Host::mixed(count);
+        let (actual, report) = before.densify(&gpu, SETTINGS, STEP);
+        let expected = before.reference(SETTINGS, STEP);
+        assert_eq!(actual.count, expected.count, "{report:?}");
+        assert_eq!((&actual.first, &actual.second), (&expected.first, &expected.second));
+        for (i, (a, b)) in actual.parameters.iter().zip(&expected.parameters).enumerate() {
+            // Only drawn means and split scales are computed; exp, log and cos are good to about 1e-5 here.
+            let tolerance = if i < 10 * actual.count { 2e-5 } else { 0.0 };
+            assert!((a - b).abs() <= tolerance, "{count} Gaussians, float {i}: {a} {b}");
+        }
+        if count == 1000 {
+            assert!(report.cloned > 100 && report.split > 50 && report.pruned > 100, "{report:?}");
+        }
+    }
+    assert_no_validation_messages();
+}
+
+#[test]
+fn a_small_gaussian_under_a_large_gradient_stays_and_gets_a_copy() {
+    let gpu = gpu();
+    let mut before = Host::calm(3);
+    before.pull_at(1);
+    let (after, report) = before.densify(&gpu, SETTINGS, STEP);
+    assert_eq!(report, DensifyReport { cloned: 1, split: 0, pruned: 0, count: 4 });
+    for (old, new) in [(0, 0), (1, 1), (2, 3)] {
+        for (planes, new_planes) in [
+            (&before.parameters, &after.parameters),
+            (&before.first, &after.first),
+            (&before.second, &after.second),
+        ] {
+            assert_eq!(before.row(planes, old), after.row(new_planes, new));
+        }
+    }
+    let (parent, copy) = (before.row(&before.parameters, 1), after.row(&after.parameters, 2));
+    assert_eq!(parent[3..], copy[3..]);
+    let distance = before.mean(1).distance(after.mean(2));
+    assert!(distance > 0.0 && distance < 0.06, "{distance}: not a draw at scale 0.01");
+    assert!(
+        after.row(&after.first, 2).iter().chain(&after.row(&after.second, 2)).all(|m| *m == 0.0)
+    );
+    assert_no_validation_messages();
+}
+
+#[test]
+fn a_large_gaussian_under_a_large_gradient_is_replaced_by_two_smaller_ones() {
+    let gpu = gpu();
+    let mut before = Host::calm(2);
+    before.pull_at(0);
+    before.log_scales_mut(0).copy_from_slice(&[0.2f32.ln(), 0.1f32.ln(), 0.01f32.ln()]);
+    let (after, report) = before.densify(&gpu, SETTINGS, STEP);
+    assert_eq!(report, DensifyReport { cloned: 0, split: 1, pruned: 0, count: 3 });
+    for i in 0..2 {
+        let row = after.row(&after.parameters, i);
+        let parent = before.row(&before.parameters, 0);
+        assert_eq!((&row[3..7], &row[10..]), (&parent[3..7], &parent[10..]));
+        for (log_scale, scale) in row[7..10].iter().zip([0.2f32, 0.1, 0.01]) {
+            assert!((log_scale.exp() - scale / 1.6).abs() < 1e-6);
+        }
+        assert!(after.row(&after.first, i).iter().all(|m| *m == 0.0));
+    }
+    assert_ne!(after.mean(0), after.mean(1));
+    assert_eq!(before.row(&before.first, 1), after.row(&after.first, 2));
+    assert_no_validation_messages();
+}
+
+#[test]
+fn drawn_positions_have_the_covariance_of_their_parent() {
+    let gpu = gpu();
+    let count = 4000;
+    let mut before = Host::calm(count);
+    let rotation = Quat::from_euler(glam::EulerRot::XYZ, 0.3, 0.7, -0.4);
+    let scales = Vec3::new(0.04, 0.02, 0.005);
+    for i in 0..count {
+        before.pull_at(i);
+        // Twice the length: what is stored is not normalised.
+        let [x, y, z, w] = (rotation * 2.0).to_array();
+        before.quat_mut(i).copy_from_slice(&[w, x, y, z]);
+        before.log_scales_mut(i).copy_from_slice(&scales.to_array().map(f32::ln));
+    }
+    let (after, report) = before.densify(&gpu, SETTINGS, STEP);
+    assert_eq!(report.cloned, count);
+    let draws: Vec<Vec3> = (0..count)
+        .map(|i| rotation.inverse() * (after.mean(2 * i + 1) - before.mean(i)) / scales)
+        .collect();
+    let mean = draws.iter().sum::<Vec3>() / count as f32;
+    assert!(mean.abs().max_element() < 0.05, "{mean}");
+    for j in 0..3 {
+        for k in 0..3 {
+            let moment = draws.iter().map(|draw| draw[j] * draw[k]).sum::<f32>() / count as f32;
+            let expected = f32::from(u8::from(j == k));
+            assert!((moment - expected).abs() < 0.08, "moment {j} {k}: {moment}");
+        }
+    }
+    assert_no_validation_messages();
+}
+
+#[test]
+fn a_faint_gaussian_goes_even_where_views_pull_at_it() {
+    let gpu = gpu();
+    let mut before = Host::calm(3);
+    before.parameters[10 * 3 + 1] = -5.4;
+    before.pull_at(1);
+    let (after, report) = before.densify(&gpu, SETTINGS, STEP);
+    assert_eq!(report, DensifyReport { cloned: 0, split: 0, pruned: 1, count: 2 });
+    assert_eq!(after.row(&after.first, 1), before.row(&before.first, 2));
+    assert_no_validation_messages();
+}
+
+#[test]
+fn all_can_go() {
+    let gpu = gpu();
+    let mut before = Host::calm(70);
+    before.parameters[10 * 70..11 * 70].fill(-9.0);
+    let (after, report) = before.densify(&gpu, SETTINGS, STEP);
+    assert_eq!(report, DensifyReport { pruned: 70, ..Default::default() });
+    assert_eq!(after.count, 0);
+    assert_no_validation_messages();
+}
+
+#[test]
+fn a_gaussian_that_is_not_finite_goes() {
+    let gpu = gpu();
+    for (column, value) in [
+        (0, f32::NAN),
+        (4, f32::INFINITY),
+        (8, f32::INFINITY),
+        (10, f32::NAN),
+        (12, f32::NEG_INFINITY),
+        (20, f32::NAN),
+    ] {
+        let mut before = Host::calm(5);
+        before.pull_at(2);
+        before.parameters[column * 5 + 2] = value;
+        let (after, report) = before.densify(&gpu, SETTINGS, STEP);
+        assert_eq!(
+            (report.pruned, report.count - report.cloned),
+            (1, 4),
+            "column {column}: {report:?}"
+        );
+        assert!(after.parameters.iter().all(|p| p.is_finite()));
+    }
+    assert_no_validation_messages();
+}
+
+#[test]
+fn a_quaternion_of_zero_length_draws_along_the_axes() {
+    let gpu = gpu();
+    let mut before = Host::calm(1);
+    before.pull_at(0);
+    before.quat_mut(0).fill(0.0);
+    before.log_scales_mut(0).copy_from_slice(&[0.04f32.ln(), -30.0, -30.0]);
+    let (after, _) = before.densify(&gpu, SETTINGS, STEP);
+    let offset = after.mean(1) - before.mean(0);
+    assert!(offset.x != 0.0 && offset.y == 0.0 && offset.z == 0.0, "{offset}");
+    assert_no_validation_messages();
+}
+
+/// At this step the first uniform draw of this clone has all its bits zero; its logarithm must stay finite.
+#[test]
+fn the_rarest_draw_is_finite() {
+    let gpu = gpu();
+    let mut before = Host::calm(1);
+    before.pull_at(0);
+    let (after, report) = before.densify(&gpu, SETTINGS, 14_117_035);
+    assert_eq!(report.cloned, 1);
+    // 5.8 standard deviations: sqrt(2 ln 2^24).
+    let distance = after.mean(1).distance(before.mean(0));
+    assert!(distance > 0.05 && distance < 0.08, "{distance}");
+    assert_no_validation_messages();
+}
+
+#[test]
+fn a_gradient_that_is_nan_or_was_never_seen_multiplies_nothing() {
+    let gpu = gpu();
+    let mut before = Host::calm(3);
+    before.grad_norm_sums = vec![f32::NAN, 1.0, 7e-4];
+    before.visit_counts = vec![1, 0, 4];
+    let (_, report) = before.densify(&gpu, SETTINGS, STEP);
+    assert_eq!(report, DensifyReport { count: 3, ..Default::default() });
+    assert_no_validation_messages();
+}
+
+#[test]
+fn growth_beyond_the_limit_goes_to_the_neediest() {
+    let gpu = gpu();
+    let mut before = Host::calm(10);
+    before.parameters[10 * 10] = -9.0;
+    for i in 0..10 {
+        before.grad_norm_sums[i] = 0.1 * (i * 3 % 10) as f32 + 0.1;
+    }
+    // Nine stay; their gradients but one's rank as 3, 7, 1, 4, 8, 2, 5, 9, 6 times 0.1 + 0.1.
+    let (after, report) =
+        before.densify(&gpu, DensifySettings { max_gaussians: 11, ..SETTINGS }, STEP);
+    assert_eq!(report, DensifyReport { cloned: 2, split: 0, pruned: 1, count: 11 });
+    // Gaussians 3 (rank 9) and 6 (rank 8) have their copies behind them.
+    let rows: Vec<_> = (0..11).map(|i| after.row(&after.parameters, i)[3..].to_vec()).collect();
+    let twins: Vec<usize> = (0..10).filter(|&i| rows[i] == rows[i + 1]).collect();
+    assert_eq!(twins, [2, 6]);
+    assert_no_validation_messages();
+}
+
+#[test]
+fn the_limit_holds_where_all_gradients_are_equal_and_where_it_is_passed_already() {
+    let gpu = gpu();
+    let mut before = Host::calm(100);
+    before.grad_norm_sums.fill(0.3);
+    for (limit, most) in [(150, 150), (100, 100), (60, 100), (0, 100), (200, 200)] {
+        let settings = DensifySettings { max_gaussians: limit, ..SETTINGS };
+        let (_, report) = before.densify(&gpu, settings, STEP);
+        assert!((100..=most).contains(&report.count), "limit {limit}: {report:?}");
+    }
+    assert_no_validation_messages();
+}
+
+#[test]
+fn the_same_pass_leaves_the_same_bits_and_another_step_or_seed_other_ones() {
+    let gpu = gpu();
+    let before = Host::mixed(500);
+    let bits = |seed: u64, step: u64| -> Vec<u32> {
+        let (after, _) = before.densify(&gpu, DensifySettings { seed, ..SETTINGS }, step);
+        after.parameters.iter().map(|p| p.to_bits()).collect()
+    };
+    let first = bits(10, 600);
+    assert!(first == bits(10, 600));
+    assert!(first != bits(10, 800));
+    assert!(first != bits(11, 600));
+    // Seeds that differ above 32 bits are other seeds.
+    assert!(first != bits(10 | 1 << 40, 600));
+    assert_no_validation_messages();
+}
+
+#[test]
+fn settings_that_make_no_sense_are_refused() {
+    let gpu = gpu();
+    for settings in [
+        DensifySettings { gradient_threshold: f64::NAN, ..SETTINGS },
+        DensifySettings { gradient_threshold: -1.0, ..SETTINGS },
+        DensifySettings { split_scale: f64::INFINITY, ..SETTINGS },
+        DensifySettings { min_opacity: 1.0, ..SETTINGS },
+    ] {
+        assert!(Densifier::new(&gpu, settings).is_err(), "{settings:?}");
+    }
+}
+
+/// A kernel that ran on would read beyond its buffers.
+#[test]
+fn a_buffer_that_is_too_short_is_refused() {
+    let gpu = gpu();
+    let mut densifier = Densifier::new(&gpu, SETTINGS).unwrap();
+    for (short, columns) in [(0, 14), (1, 14), (2, 14), (3, 14), (4, 14), (5, 13)] {
+        let len = |index: usize, len: usize| if index == short { len - 1 } else { len };
+        let gaussians = DeviceGaussians {
+            count: 2,
+            column_count: columns,
+            parameters: gpu.zeros("parameters", len(0, 28)).unwrap(),
+            moments: Moments {
+                first: gpu.zeros("first", len(1, 28)).unwrap(),
+                second: gpu.zeros("second", len(2, 28)).unwrap(),
+            },
+        };
+        let grad_norm_sums = gpu.zeros("grad_norm_sums", len(3, 2)).unwrap();
+        let visit_counts = gpu.zeros("visit_counts", len(4, 2)).unwrap();
+        let statistics =
+            GradientStatistics { grad_norm_sums: &grad_norm_sums, visit_counts: &visit_counts };
+        assert!(densifier.densify(&gaussians, statistics, 1).is_err(), "{short}");
+    }
+    assert_no_validation_messages();
+}
