@@ -1,5 +1,6 @@
 //! `nightsplat bench`: check every kernel against its CPU reference, then time it.
 
+mod check;
 mod kernels;
 mod scene;
 mod stages;
@@ -19,7 +20,7 @@ use scene::Scene;
 /// The scene is the same every time. Bounds are those of two processor cores at the default size.
 #[derive(Clone, Debug, clap::Args)]
 pub struct BenchArgs {
-    /// Print JSON instead of tables: device, driver, kernels, groups, step_ms
+    /// Print JSON instead of tables: device, driver, kernels, groups and the step
     #[arg(long)]
     pub json: bool,
     /// The device: a part of its name or its index in `nightsplat doctor` [default: the best]
