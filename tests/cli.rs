@@ -522,7 +522,7 @@ fn a_configuration_with_an_unknown_key_names_it() {
         Path::new(&fixture().set()),
         &arguments,
         1,
-        &["config.toml", "stepz", "line 2"],
+        &["config.toml", "stepz", "(line "],
     );
 }
 

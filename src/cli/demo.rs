@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Result;
 
 use super::{table, train};
+use crate::Error;
 use crate::dataset::synthetic::{self, SyntheticOptions};
 use crate::dataset::{Dataset, View};
 use crate::eval::{self, ViewScore};
@@ -17,7 +18,6 @@ use crate::optimizer::Schedule;
 use crate::report::{Best, Column, Comparison, Picture, Report, Series, Table, plot};
 use crate::tone::{ToneCurve, ToneSettings};
 use crate::train::TrainConfig;
-use crate::{Error, Result as NamedResult};
 
 /// Make a small dark multi-view set, train on it with three tone curves, and show the results side by side.
 ///
@@ -75,7 +75,7 @@ pub fn run(args: &DemoArgs) -> Result<()> {
 }
 
 /// Makes the folder, or takes one that an earlier demo made.
-fn claim(folder: &Path) -> NamedResult<()> {
+fn claim(folder: &Path) -> crate::Result<()> {
     let mark = folder.join(MARK);
     let is_empty = std::fs::read_dir(folder).map_or(true, |mut entries| entries.next().is_none());
     if !is_empty && !mark.exists() {
@@ -107,7 +107,7 @@ fn config(curve: ToneCurve, dataset: &Dataset, gpu: &Gpu) -> TrainConfig {
     }
 }
 
-fn train_with(curve: ToneCurve, gpu: &Gpu, dataset: &Dataset, out: &Path) -> NamedResult<Run> {
+fn train_with(curve: ToneCurve, gpu: &Gpu, dataset: &Dataset, out: &Path) -> crate::Result<Run> {
     let config = config(curve, dataset, gpu);
     let mut directory = RunDirectory::create(&out.join(curve.name()), &config, true)?;
     let mut losses = vec![];
@@ -122,7 +122,7 @@ fn train_with(curve: ToneCurve, gpu: &Gpu, dataset: &Dataset, out: &Path) -> Nam
 }
 
 /// What the dark photographs themselves score: the least that a model must beat.
-fn dark_scores(dataset: &Dataset) -> NamedResult<Vec<ViewScore>> {
+fn dark_scores(dataset: &Dataset) -> crate::Result<Vec<ViewScore>> {
     let nothing = || Error::input(&dataset.root, "has a test view without its dark photograph");
     eval::score(dataset, |view| view.image.clone().ok_or_else(nothing))
 }

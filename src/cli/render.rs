@@ -62,7 +62,7 @@ pub fn run(args: &RenderArgs) -> Result<()> {
         let problem = "has no view of that split; try --split all";
         return Err(Error::input(&dataset.root, problem).into());
     }
-    make_folder(out, &dataset)?;
+    make_folder(out, &dataset, run)?;
     let bar = progress_bar(views.len());
     for view in &views {
         bar.set_message(view.name.clone());
@@ -75,12 +75,16 @@ pub fn run(args: &RenderArgs) -> Result<()> {
     Ok(())
 }
 
-/// Makes the folder, unless it is one of the dataset's: renders have the names of the photographs.
-fn make_folder(out: &Path, dataset: &Dataset) -> crate::Result<()> {
+/// Makes the folder, unless it is one of the dataset's, where the photographs have the names of the renders. The run
+/// itself may lie there.
+fn make_folder(out: &Path, dataset: &Dataset, run: &Path) -> crate::Result<()> {
     std::fs::create_dir_all(out)
         .map_err(|error| Error::output(out, format!("cannot be made: {error}")))?;
-    let is_inside = |(out, root): (PathBuf, PathBuf)| out.starts_with(root);
-    if out.canonicalize().ok().zip(dataset.root.canonicalize().ok()).is_some_and(is_inside) {
+    let is_in = |folder: &Path| {
+        let paths = out.canonicalize().ok().zip(folder.canonicalize().ok());
+        paths.is_some_and(|(out, folder)| out.starts_with(folder))
+    };
+    if is_in(&dataset.root) && !is_in(run) {
         return Err(Error::output(out, "lies inside the dataset; choose another --out"));
     }
     Ok(())

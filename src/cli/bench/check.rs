@@ -116,3 +116,25 @@ pub(super) fn agree(
         expected.len()
     )
 }
+
+#[cfg(test)]
+mod tests {
+    use super::Rule::{Close, Exact, Sum};
+    use super::agree;
+
+    #[test]
+    fn one_value_in_a_thousand_may_be_off_but_not_two_nor_any_where_bits_count() {
+        let expected = vec![1.0; 1000];
+        let with = |wrong: &[f64]| {
+            let mut actual = expected.clone();
+            actual[..wrong.len()].copy_from_slice(wrong);
+            actual
+        };
+        let passes = |rule, wrong: &[f64]| agree("k", "b", rule, &with(wrong), &expected).is_ok();
+        assert!(passes(Close(1e-3), &[1.001, 0.999, 2.0]));
+        assert!(!passes(Close(1e-3), &[2.0, f64::NAN]));
+        assert!(passes(Exact, &[]) && !passes(Exact, &[1.0 + 1e-12]));
+        assert!(passes(Sum(1e-3), &[2.0, 0.0]) && !passes(Sum(1e-3), &[f64::NAN]));
+        assert!(agree("k", "b", Close(1.0), &expected[..999], &expected).is_err());
+    }
+}
