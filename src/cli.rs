@@ -1,15 +1,27 @@
 //! The command line: one file per subcommand.
 
+use std::path::Path;
+
 use anyhow::Result;
 use clap::{Parser, Subcommand};
+use indicatif::{ProgressBar, ProgressStyle};
 
+use crate::image::Image;
+
+pub mod bench;
+pub mod demo;
+pub mod doctor;
+pub mod eval;
+mod finished_run;
+pub mod render;
 pub mod synth;
+mod table;
 pub mod tone;
 pub mod train;
 
 /// 3D Gaussian Splatting from dark photographs, on any Vulkan device.
 #[derive(Debug, Parser)]
-#[command(name = "nightsplat", version, max_term_width = 100, after_help = EXAMPLES)]
+#[command(name = "nightsplat", version, max_term_width = 98, after_help = EXAMPLES)]
 pub struct Cli {
     #[command(subcommand)]
     command: Command,
@@ -22,13 +34,19 @@ const EXAMPLES: &str = "Start with:
   nightsplat demo                                   see it work, without any data
   nightsplat doctor                                 which devices there are
   nightsplat train photos --out run                 train from a folder of dark photographs
-  nightsplat eval run --save-images                 score it where there are references";
+  nightsplat eval run --save-images                 score it where there are references
+  nightsplat render run --split all --out pictures  see the model from every camera";
 
 #[derive(Debug, Subcommand)]
 enum Command {
     Train(Box<train::TrainArgs>),
+    Eval(eval::EvalArgs),
+    Render(render::RenderArgs),
     Tone(tone::ToneArgs),
     Synth(synth::SynthArgs),
+    Demo(demo::DemoArgs),
+    Doctor(doctor::DoctorArgs),
+    Bench(bench::BenchArgs),
 }
 
 impl Cli {
@@ -44,8 +62,46 @@ impl Cli {
     pub fn run(self) -> Result<()> {
         match self.command {
             Command::Train(args) => train::run(&args),
+            Command::Eval(args) => eval::run(&args),
+            Command::Render(args) => render::run(&args),
             Command::Tone(args) => Ok(tone::run(args)?),
             Command::Synth(args) => Ok(synth::run(args)?),
+            Command::Demo(args) => demo::run(&args),
+            Command::Doctor(args) => doctor::run(&args),
+            Command::Bench(args) => bench::run(&args),
         }
     }
+}
+
+/// The picture files that a command writes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum ImageFormat {
+    /// 8 bits a channel, sRGB-encoded, clamped.
+    #[default]
+    Png,
+    /// 32-bit float, linear light.
+    Exr,
+}
+
+impl ImageFormat {
+    /// The extension of its files.
+    pub fn extension(self) -> &'static str {
+        match self {
+            Self::Png => "png",
+            Self::Exr => "exr",
+        }
+    }
+
+    fn save(self, image: &Image, path: &Path) -> crate::Result<()> {
+        match self {
+            Self::Png => image.save_png8(path),
+            Self::Exr => image.save_exr(path),
+        }
+    }
+}
+
+/// A bar on standard error, shown only where that is a terminal.
+fn progress_bar(len: usize) -> ProgressBar {
+    let style = ProgressStyle::with_template("{bar:32} {pos}/{len}  {msg}  {eta} left");
+    ProgressBar::new(len as u64).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
 }

@@ -80,8 +80,13 @@ pub fn score(
     Ok(scored)
 }
 
-/// `metrics.json`: means and views, and what the run took.
-pub fn metrics(scored: &[ViewScore], seconds: f64, gaussians: usize, steps: u64) -> Value {
+/// `metrics.json`: means and views, and what the run took; null where that, or a mean, is not known.
+pub fn metrics(
+    scored: &[ViewScore],
+    seconds: impl Into<Option<f64>>,
+    gaussians: usize,
+    steps: u64,
+) -> Value {
     let all: Vec<Scores> = scored.iter().map(|view| view.scores).collect();
     let mean = Scores::mean(&all).map_or(Value::Null, |mean| entry(&mean));
     let views: Map<String, Value> =
@@ -89,7 +94,7 @@ pub fn metrics(scored: &[ViewScore], seconds: f64, gaussians: usize, steps: u64)
     json!({
         "mean": mean,
         "views": views,
-        "seconds": seconds,
+        "seconds": seconds.into(),
         "gaussians": gaussians,
         "steps": steps,
     })

@@ -19,6 +19,11 @@ pub use crate::kernels::StepLoss;
 const CPU_STRIP: [u32; 2] = [16, 64];
 const GPU_STRIP: [u32; 2] = [2, 32];
 
+/// The strip that suits the device.
+pub(crate) fn strip(gpu: &Gpu) -> [u32; 2] {
+    if gpu.properties().is_cpu { CPU_STRIP } else { GPU_STRIP }
+}
+
 /// What one step's loss reads.
 #[derive(Clone, Copy, Debug)]
 pub struct LossInputs<'a> {
@@ -91,7 +96,7 @@ impl Loss {
         let subgroup_size = gpu.properties().subgroup_size;
         let max_values = sizes.iter().map(|&size| value_count(size)).max().unwrap_or(0);
         let terms = if ssim_weight > 0.0 {
-            let [columns, rows] = if gpu.properties().is_cpu { CPU_STRIP } else { GPU_STRIP };
+            let [columns, rows] = strip(gpu);
             Terms::Ssim(Ssim {
                 weight: ssim_weight,
                 strip: [columns, rows],

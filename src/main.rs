@@ -9,7 +9,10 @@ use nightsplat::cli::Cli;
 use tracing_subscriber::filter::LevelFilter;
 
 fn main() -> ExitCode {
-    let cli = Cli::parse();
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(error) => return misuse(&error),
+    };
     let level = match cli.verbosity() {
         0 => LevelFilter::WARN,
         1 => LevelFilter::INFO,
@@ -29,6 +32,27 @@ fn main() -> ExitCode {
     // A closed stderr leaves nobody to tell.
     let _ = writeln!(std::io::stderr(), "error: {error:#}");
     ExitCode::from(error.downcast_ref::<Error>().map_or(1, Error::exit_code))
+}
+
+/// Help is printed as it is; what is wrong with a command line is said in one line, as every other error.
+fn misuse(error: &clap::Error) -> ExitCode {
+    use clap::error::ErrorKind;
+    let help = [
+        ErrorKind::DisplayHelp,
+        ErrorKind::DisplayVersion,
+        ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand,
+    ];
+    if help.contains(&error.kind()) {
+        error.exit();
+    }
+    let text = error.to_string();
+    let lines = text.lines().map(str::trim).filter(|line| !line.is_empty());
+    let told =
+        lines.take_while(|line| !line.starts_with("Usage:") && !line.starts_with("For more"));
+    let line = told.collect::<Vec<_>>().join(" ").replace(" tip: ", "; ");
+    // A closed stderr leaves nobody to tell.
+    let _ = writeln!(std::io::stderr(), "{line}; --help says more");
+    ExitCode::from(2)
 }
 
 /// Whoever reads our output has seen enough, as in `nightsplat doctor | head`.

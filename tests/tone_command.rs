@@ -4,7 +4,8 @@
 use std::path::{Path, PathBuf};
 
 use nightsplat::Error;
-use nightsplat::cli::tone::{ToneArgs, ToneFormat, apply};
+use nightsplat::cli::ImageFormat;
+use nightsplat::cli::tone::{ToneArgs, apply};
 use nightsplat::image::Image;
 use nightsplat::tone::{Statistics, ToneCurve, ToneSettings};
 
@@ -16,7 +17,7 @@ fn args(input: &Path, out: PathBuf) -> ToneArgs {
         gain: None,
         theta: 0.49,
         json: false,
-        format: ToneFormat::Png,
+        format: ImageFormat::Png,
         device: None,
     }
 }
@@ -69,7 +70,7 @@ fn exr_keeps_what_8_bits_round_and_clipping_is_counted() {
     let image = Image::load(&photograph).unwrap();
     let linear = ToneArgs {
         curve: ToneCurve::Linear,
-        format: ToneFormat::Exr,
+        format: ImageFormat::Exr,
         ..args(&photograph, dir.path().join("out"))
     };
     let views = apply(&linear).unwrap();

@@ -5,9 +5,9 @@ use std::ffi::OsStr;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
 
+use super::{ImageFormat, progress_bar};
 use crate::gpu::{Buffer, DeviceChoice, Gpu};
 use crate::image::Image;
 use crate::kernels::ToneParameters;
@@ -37,20 +37,10 @@ pub struct ToneArgs {
     pub json: bool,
     /// The files to write: 8-bit PNG, or float EXR in linear light.
     #[arg(long, value_enum, default_value_t)]
-    pub format: ToneFormat,
+    pub format: ImageFormat,
     /// The device, by a part of its name or by index [default: the best].
     #[arg(long, value_name = "NAME|INDEX")]
     pub device: Option<DeviceChoice>,
-}
-
-/// The files that `tone` writes.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
-pub enum ToneFormat {
-    /// 8 bits a channel, sRGB-encoded.
-    #[default]
-    Png,
-    /// 32-bit float, linear light.
-    Exr,
 }
 
 /// What `tone` tells of a photograph.
@@ -128,10 +118,7 @@ pub fn apply(args: &ToneArgs) -> Result<BTreeMap<String, ToneReport>> {
         progress.set_message(name.clone());
         match mapper.map(photograph) {
             Ok((report, image)) => {
-                match args.format {
-                    ToneFormat::Png => image.save_png8(target)?,
-                    ToneFormat::Exr => image.save_exr(target)?,
-                }
+                args.format.save(&image, &target)?;
                 views.insert(name, report);
             }
             Err(error @ Error::Input { .. }) if photographs.len() > 1 => {
@@ -175,12 +162,9 @@ fn photographs(input: &Path) -> Result<Vec<PathBuf>> {
 fn targets(
     photographs: &[PathBuf],
     out: &Path,
-    format: ToneFormat,
+    format: ImageFormat,
 ) -> Result<Vec<(String, PathBuf)>> {
-    let extension = match format {
-        ToneFormat::Png => "png",
-        ToneFormat::Exr => "exr",
-    };
+    let extension = format.extension();
     let sources: Vec<_> = photographs.iter().filter_map(|path| path.canonicalize().ok()).collect();
     let mut seen = BTreeMap::new();
     let mut target = |photograph: &PathBuf| {
@@ -197,13 +181,6 @@ fn targets(
         Ok((name, target))
     };
     photographs.iter().map(&mut target).collect()
-}
-
-/// Shown on standard error, and only where that is a terminal.
-fn progress_bar(photographs: usize) -> ProgressBar {
-    let style = ProgressStyle::with_template("{bar:40} {pos}/{len} {msg}");
-    ProgressBar::new(photographs as u64)
-        .with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
 }
 
 /// Maps photographs on the device, one at a time.

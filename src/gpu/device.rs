@@ -145,7 +145,7 @@ impl Owned {
 /// Every Vulkan device of this machine, the best first, whether it meets the requirements or not.
 ///
 /// # Errors
-/// There is no Vulkan loader, or no device.
+/// There is no Vulkan loader, or no device at all.
 pub fn devices() -> Result<Vec<DeviceReport>> {
     let owned = instance(false)?;
     let reports = physical_devices(&owned.instance).and_then(|all| {
@@ -292,7 +292,15 @@ impl Gpu {
 // Instance
 
 fn loader_error(result: vk::Result) -> Error {
-    Error::NoDevice(format!("Vulkan did not start ({result}): {INSTALL}"))
+    match result {
+        // The loader's words for no driver at all.
+        vk::Result::ERROR_INCOMPATIBLE_DRIVER => no_device(),
+        _ => Error::NoDevice(format!("Vulkan did not start ({result}): {INSTALL}")),
+    }
+}
+
+fn no_device() -> Error {
+    Error::NoDevice(format!("there is no Vulkan device: {INSTALL}"))
 }
 
 fn entry() -> Result<ash::Entry> {
@@ -354,7 +362,7 @@ fn physical_devices(instance: &ash::Instance) -> Result<Vec<vk::PhysicalDevice>>
     // SAFETY: the instance is live.
     let mut all = unsafe { instance.enumerate_physical_devices() }.map_err(loader_error)?;
     if all.is_empty() {
-        return Err(Error::NoDevice(format!("there is no Vulkan device: {INSTALL}")));
+        return Err(no_device());
     }
     all.sort_by_key(|&physical| {
         // SAFETY: the handle was just enumerated.

@@ -1,0 +1,136 @@
+//! Every kernel on the data of a training step.
+//!
+//! Each works on what the device made of the one before it, so an error shows where it arises. The strict bounds are
+//! those of the tests; here a kernel passes when it does the same work.
+
+mod bin;
+mod learn;
+
+use glam::Vec2;
+
+use super::check::Rule::{Close, Exact};
+use super::check::check;
+use super::scene::{self, Scene};
+use super::{Bench, Timing};
+use crate::gpu::Threads;
+use crate::kernels::*;
+use crate::tone::{ToneCurve, ToneSettings};
+
+/// The constants that the kernels of the rasteriser share.
+macro_rules! constants {
+    ($kernel:ident $(, $field:ident: $value:expr)*) => {{
+        let $crate::render::RenderSettings { max_alpha: alpha_max, tile: [tile_width, tile_height], .. } =
+            $crate::render::RenderSettings::default();
+        $kernel::Constants { alpha_max, channels: 3, tile_width, tile_height, $($field: $value,)* }
+    }};
+}
+
+use constants;
+
+/// Every kernel, in the order of a training step.
+///
+/// # Errors
+/// A kernel disagrees with its reference, or the device is out of memory or lost.
+pub(super) fn check_and_time(bench: &Bench, scene: &Scene) -> anyhow::Result<Vec<Timing>> {
+    let mut timings = vec![];
+    let tone = statistics(bench, &mut timings)?;
+    let frame = bin::project_and_bin(bench, &mut timings, scene)?;
+    learn::blend_and_back(bench, &mut timings, scene, &frame, tone)?;
+    Ok(timings)
+}
+
+/// The pseudo-GT of a Full-HD photograph; gives the curve.
+fn statistics(bench: &Bench, timings: &mut Vec<Timing>) -> anyhow::Result<ToneParameters> {
+    const THREADS: u32 = 128 * 256;
+    let photograph = scene::dark(1920, 1080);
+    let (pixel_count, image) = (photograph.pixel_count() as u32, photograph.data);
+    let settings = ToneSettings::default();
+    let last = pixel_count - 1;
+    let [p10, p90] = [1, 9].map(|tenths| last / 10 * tenths + last % 10 * tenths / 10);
+    let luminances = vec![0.0_f32; pixel_count as usize];
+    let sums = vec![Vec2::ZERO; THREADS as usize];
+    let (searches, histograms) = (vec![RankSearch::default(); 4], vec![0_u32; 4096]);
+    let (luminances, sums, searches, histograms) = check!(
+        bench,
+        timings,
+        luminance,
+        luminance::Constants::default(),
+        luminance::Params {
+            ranks: [p10, p10 + 1, p90, p90 + 1],
+            pixel_count,
+            thread_count: THREADS
+        },
+        Threads::Exactly([THREADS, 1, 1]),
+        [image],
+        [luminances: Close(1e-6), sums: Close(1e-5), searches: Exact, histograms: Close(0.0)]
+    );
+    let (mut searches, mut histograms) = check!(
+        bench,
+        timings,
+        percentile_select,
+        percentile_select::Constants::default(),
+        percentile_select::Params { digit_bits: 11 },
+        Threads::Workgroups([1, 1, 1]),
+        [],
+        [searches: Exact, histograms: Exact]
+    );
+    for shift in [10, 0] {
+        let (found,) = check!(
+            bench,
+            timings,
+            luminance_histogram,
+            luminance_histogram::Constants::default(),
+            luminance_histogram::Params { pixel_count, thread_count: THREADS, shift },
+            Threads::Exactly([THREADS, 1, 1]),
+            [luminances, searches],
+            [histograms: Exact]
+        );
+        histograms = found;
+        (searches, histograms) = check!(
+            bench,
+            timings,
+            percentile_select,
+            percentile_select::Constants::default(),
+            percentile_select::Params { digit_bits: 10 },
+            Threads::Workgroups([1, 1, 1]),
+            [],
+            [searches: Exact, histograms: Exact]
+        );
+    }
+    let weight = |tenths: u32| (last % 10 * tenths % 10) as f32 / 10.0;
+    let tone_curve = ToneCurve::Ap3.constant();
+    let (statistics, parameters) =
+        (vec![ToneStatistics::default()], vec![ToneParameters::default()]);
+    let (_, parameters) = check!(
+        bench,
+        timings,
+        tone_statistics,
+        tone_statistics::Constants { tone_curve },
+        tone_statistics::Params {
+            view: 0,
+            pixel_count,
+            thread_count: THREADS,
+            weights: Vec2::new(weight(1), weight(9)),
+            gain_c: settings.gain_c as f32,
+            theta: settings.theta as f32,
+            alpha: settings.alpha as f32,
+            beta: settings.beta as f32,
+            base_gain: settings.base_gain as f32,
+        },
+        Threads::Workgroups([1, 1, 1]),
+        [searches, sums],
+        [statistics: Close(1e-5), parameters: Close(1e-5)]
+    );
+    let target = vec![0.0_f32; image.len()];
+    check!(
+        bench,
+        timings,
+        tone_map,
+        tone_map::Constants { tone_curve },
+        tone_map::Params { value_count: image.len() as u32, view: 0 },
+        Threads::Exactly([image.len() as u32, 1, 1]),
+        [image, parameters],
+        [target: Close(1e-5)]
+    );
+    Ok(parameters[0])
+}

@@ -1,0 +1,80 @@
+//! The scene of the bench: deterministic, and as hard as a trained one.
+
+use glam::{DAffine3, DVec2, Vec3};
+
+use crate::camera::Camera;
+use crate::image::Image;
+use crate::random::Stream;
+use crate::scene::{Gaussians, SH_C0};
+
+/// Gaussians before a camera that looks along z from the origin.
+pub(super) struct Scene {
+    pub(super) camera: Camera,
+    pub(super) gaussians: Gaussians,
+    /// A dark photograph of the camera's size.
+    pub(super) low: Image,
+}
+
+/// The natural logarithm of a Gaussian's standard deviation in pixels: mean and deviation. With them 20 000 Gaussians
+/// have about 65 000 intersections at 512x384.
+const LOG_PIXELS: [f64; 2] = [0.545, 0.8];
+
+/// Random draws per Gaussian; each normal one takes two counters.
+const DRAWS: u64 = 32;
+
+impl Scene {
+    pub(super) fn new(width: u32, height: u32, count: usize) -> Self {
+        let camera = Camera {
+            width,
+            height,
+            focal: DVec2::splat(0.9 * f64::from(width)),
+            principal_point: DVec2::new(0.51 * f64::from(width), 0.49 * f64::from(height)),
+            view_from_world: DAffine3::IDENTITY,
+        };
+        let gaussians = gaussians(&camera, count);
+        Self { low: dark(width, height), gaussians, camera }
+    }
+}
+
+fn gaussians(camera: &Camera, count: usize) -> Gaussians {
+    let stream = Stream::new(65, 0);
+    let uniform = |gaussian: usize, draw: u64| stream.uniform(gaussian as u64 * DRAWS + draw);
+    let normal =
+        |gaussian: usize, draw: u64| stream.normal(gaussian as u64 * DRAWS / 2 + draw) as f32;
+    let size = DVec2::new(camera.width.into(), camera.height.into());
+    let mut gaussians = Gaussians::zeros(count, 3);
+    for i in 0..count {
+        let depth = 2.0 + 4.0 * uniform(i, 0);
+        let pixel = size * DVec2::new(uniform(i, 1), uniform(i, 2));
+        let in_view = (pixel - camera.principal_point) / camera.focal * depth;
+        let axis = |draw: u64| {
+            let log_pixels = LOG_PIXELS[0] + LOG_PIXELS[1] * f64::from(normal(i, draw));
+            (log_pixels.exp().clamp(0.6, 20.0) * depth / camera.focal.x).ln() as f32
+        };
+        let opacity = 0.03 + 0.9 * uniform(i, 3).powi(2);
+        gaussians.means_mut()[i] = in_view.extend(depth).as_vec3();
+        gaussians.log_scales_mut()[i] = Vec3::new(axis(4), axis(5), axis(6));
+        gaussians.quats_mut()[i] = [7, 8, 9, 10].map(|draw| normal(i, draw));
+        gaussians.raw_opacities_mut()[i] = (opacity / (1.0 - opacity)).ln() as f32;
+        gaussians.dc_mut()[i] =
+            Vec3::from_array([11, 12, 13].map(|draw| normal(i, draw))) / SH_C0 / 6.0;
+    }
+    // A trained model's view dependence is faint.
+    for (i, coefficient) in (0..).zip(gaussians.rest_mut()) {
+        let draw = |c: u64| 0.05 * Stream::new(65, 1).normal(3 * i + c) as f32;
+        *coefficient = Vec3::from_array([0, 1, 2].map(draw));
+    }
+    gaussians
+}
+
+/// Smooth and dark, with noise.
+pub(super) fn dark(width: u32, height: u32) -> Image {
+    let noise = Stream::new(65, 2);
+    Image::from_fn(width, height, |x, y| {
+        [0_u32, 1, 2].map(|channel| {
+            let wave = (0.02 * f64::from(x + 31 * channel)).sin() * (0.03 * f64::from(y)).cos();
+            let draw = u64::from(3 * (y * width + x) + channel);
+            (0.06 + 0.04 * wave + 0.01 * noise.normal(draw)).max(0.0) as f32
+        })
+    })
+}

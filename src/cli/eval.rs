@@ -1,0 +1,85 @@
+//! `nightsplat eval`: score a finished run on its test views.
+
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use anyhow::Result;
+
+use super::finished_run::FinishedRun;
+use super::{progress_bar, table};
+use crate::eval::{self, ViewScore};
+use crate::gpu::DeviceChoice;
+use crate::metrics::Scores;
+
+/// Score a finished run on the test views of its dataset.
+///
+/// Renders every test view that has a normal-light reference image and compares the two in 8 bits: PSNR over all
+/// channels, the mean of the three channels' PSNRs (what the paper's code computes), and SSIM.
+#[derive(Clone, Debug, clap::Args)]
+pub struct EvalArgs {
+    /// The run directory that `nightsplat train` wrote
+    pub run: PathBuf,
+    /// Print what metrics.json holds instead of a table
+    #[arg(long)]
+    pub json: bool,
+    /// Write what was scored to RUN/eval/renders and RUN/eval/references
+    #[arg(long)]
+    pub save_images: bool,
+    /// The device: a part of its name or its index in `nightsplat doctor` [default: that of the run]
+    #[arg(long, value_name = "NAME|INDEX")]
+    pub device: Option<DeviceChoice>,
+}
+
+/// Scores the run and prints the scores.
+///
+/// # Errors
+/// The folder holds no finished run, its dataset is gone, or a file cannot be written.
+pub fn run(args: &EvalArgs) -> Result<()> {
+    let FinishedRun { config, dataset, gaussian_count, mut player } =
+        FinishedRun::open(&args.run, args.device.as_ref())?;
+    let bar = progress_bar(dataset.test_views().filter(|view| view.reference.is_some()).count());
+    let scored = eval::score(&dataset, |view| {
+        bar.set_message(view.name.clone());
+        player.render(view).inspect(|_| bar.inc(1))
+    })?;
+    bar.finish_and_clear();
+    if scored.is_empty() {
+        let root = dataset.root.display();
+        tracing::warn!("{root}: no test view has a reference image, so there is nothing to score");
+    }
+    if args.save_images {
+        eval::save_images(&args.run.join("eval"), &scored)?;
+    }
+    let mut out = std::io::stdout().lock();
+    if args.json {
+        let seconds = trained_seconds(&args.run);
+        let metrics = eval::metrics(&scored, seconds, gaussian_count, config.steps);
+        writeln!(out, "{metrics:#}")?;
+    } else {
+        write!(out, "{}", score_table(&scored))?;
+    }
+    Ok(())
+}
+
+/// What training took, as the run's metrics.json has it.
+fn trained_seconds(run: &Path) -> Option<f64> {
+    let text = std::fs::read_to_string(run.join("metrics.json")).ok()?;
+    serde_json::from_str::<serde_json::Value>(&text).ok()?["seconds"].as_f64()
+}
+
+fn score_table(scored: &[ViewScore]) -> String {
+    let row = |name: &str, scores: &Scores| {
+        let Scores { psnr, psnr_channel_mean, ssim } = scores;
+        vec![
+            name.to_owned(),
+            format!("{psnr:.2}"),
+            format!("{psnr_channel_mean:.2}"),
+            format!("{ssim:.4}"),
+        ]
+    };
+    let all: Vec<Scores> = scored.iter().map(|view| view.scores).collect();
+    let mut rows = vec![["view", "PSNR", "channel mean", "SSIM"].map(str::to_owned).to_vec()];
+    rows.extend(scored.iter().map(|view| row(&view.name, &view.scores)));
+    rows.extend(Scores::mean(&all).map(|mean| row("mean", &mean)));
+    table::aligned(&rows)
+}

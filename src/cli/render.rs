@@ -1,0 +1,91 @@
+//! `nightsplat render`: pictures of a finished run from the cameras of its dataset.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::Result;
+
+use super::finished_run::FinishedRun;
+use super::{ImageFormat, progress_bar};
+use crate::Error;
+use crate::dataset::{Dataset, Split, View};
+use crate::gpu::DeviceChoice;
+
+/// Render a finished run from the cameras of its dataset, whether they took an image or not.
+#[derive(Clone, Debug, clap::Args)]
+pub struct RenderArgs {
+    /// The run directory that `nightsplat train` wrote
+    pub run: PathBuf,
+    /// Which cameras
+    #[arg(long, value_enum)]
+    pub split: SplitChoice,
+    /// The folder to write to, one picture per view; pictures of the same names are replaced
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// The files to write
+    #[arg(long, value_enum, default_value_t)]
+    pub format: ImageFormat,
+    /// The device: a part of its name or its index in `nightsplat doctor` [default: that of the run]
+    #[arg(long, value_name = "NAME|INDEX")]
+    pub device: Option<DeviceChoice>,
+}
+
+/// Views by what they are for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum SplitChoice {
+    /// Those trained on.
+    Train,
+    /// Those held out.
+    Test,
+    /// Both.
+    All,
+}
+
+impl SplitChoice {
+    fn includes(self, view: &View) -> bool {
+        match self {
+            Self::Train => view.split == Split::Train,
+            Self::Test => view.split == Split::Test,
+            Self::All => true,
+        }
+    }
+}
+
+/// Renders the views.
+///
+/// # Errors
+/// The folder holds no finished run, its dataset is gone or has no such view, or a file cannot be written.
+pub fn run(args: &RenderArgs) -> Result<()> {
+    let RenderArgs { run, split, out, format, device } = args;
+    let FinishedRun { dataset, mut player, .. } = FinishedRun::open(run, device.as_ref())?;
+    let views: Vec<&View> = dataset.views.iter().filter(|view| split.includes(view)).collect();
+    if views.is_empty() {
+        let problem = "has no view of that split; try --split all";
+        return Err(Error::input(&dataset.root, problem).into());
+    }
+    make_folder(out, &dataset, run)?;
+    let bar = progress_bar(views.len());
+    for view in &views {
+        bar.set_message(view.name.clone());
+        let path = out.join(format!("{}.{}", view.name, format.extension()));
+        format.save(&player.render(view)?, &path)?;
+        bar.inc(1);
+    }
+    bar.finish_and_clear();
+    tracing::info!("{} pictures are in {}", views.len(), out.display());
+    Ok(())
+}
+
+/// Makes the folder, unless it is one of the dataset's, where the photographs have the names of the renders. The run
+/// itself may lie there.
+fn make_folder(out: &Path, dataset: &Dataset, run: &Path) -> crate::Result<()> {
+    std::fs::create_dir_all(out)
+        .map_err(|error| Error::output(out, format!("cannot be made: {error}")))?;
+    let is_in = |folder: &Path| {
+        let paths = out.canonicalize().ok().zip(folder.canonicalize().ok());
+        paths.is_some_and(|(out, folder)| out.starts_with(folder))
+    };
+    if is_in(&dataset.root) && !is_in(run) {
+        return Err(Error::output(out, "lies inside the dataset; choose another --out"));
+    }
+    Ok(())
+}

@@ -1,0 +1,564 @@
+//! The built binary, as a shell runs it: what it writes, what it prints, and what it says of bad input.
+#![cfg(feature = "cli")]
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use std::sync::OnceLock;
+
+use nightsplat::image::Image;
+use nightsplat::metrics::Scores;
+use serde_json::Value;
+
+/// Runs `nightsplat` with arguments as a shell splits them; paths hold no spaces.
+fn nightsplat(arguments: &str) -> Output {
+    nightsplat_with(arguments, &[])
+}
+
+fn nightsplat_with(arguments: &str, environment: &[(&str, &str)]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_nightsplat"))
+        .args(arguments.split_whitespace())
+        .envs(environment.iter().copied())
+        .output()
+        .unwrap()
+}
+
+/// Standard output of a command that must succeed.
+fn succeed(arguments: &str) -> String {
+    let output = nightsplat(arguments);
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{arguments}: {stderr}");
+    String::from_utf8(output.stdout).unwrap()
+}
+
+/// The command must fail with this exit code and one line on standard error that has all of `parts`.
+fn refused(arguments: &str, code: i32, parts: &[&str]) {
+    assert_refused(arguments, &nightsplat(arguments), code, parts);
+}
+
+fn assert_refused(arguments: &str, output: &Output, code: i32, parts: &[&str]) {
+    let stderr = String::from_utf8(output.stderr.clone()).unwrap();
+    assert_eq!(output.status.code(), Some(code), "{arguments}: {stderr}");
+    let mut lines = stderr.lines();
+    let line = lines.next().unwrap_or_default();
+    assert!(line.starts_with("error: ") && lines.next().is_none(), "{arguments}: {stderr}");
+    for part in parts {
+        assert!(line.contains(part), "{arguments}: no `{part}` in: {line}");
+    }
+}
+
+/// Work that the tests share, done once: a small set and a short run on it.
+struct Fixture {
+    folder: tempfile::TempDir,
+}
+
+const TRAIN: &str = "--steps 40 --seed 3 --sh-degree 1 --curve ap3";
+
+fn fixture() -> &'static Fixture {
+    static FIXTURE: OnceLock<Fixture> = OnceLock::new();
+    FIXTURE.get_or_init(|| {
+        let fixture = Fixture { folder: tempfile::tempdir().unwrap() };
+        succeed(&format!("synth {} --views 9 --width 64 --height 48", fixture.set()));
+        succeed(&format!("train {} --out {} {TRAIN}", fixture.set(), fixture.run()));
+        fixture
+    })
+}
+
+impl Fixture {
+    fn set(&self) -> String {
+        self.path("set").display().to_string()
+    }
+
+    fn run(&self) -> String {
+        self.path("run").display().to_string()
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+}
+
+/// A copy of the fixture's set, to spoil.
+fn copied_set() -> tempfile::TempDir {
+    fn copy(from: &Path, to: &Path) {
+        fs::create_dir_all(to).unwrap();
+        for entry in fs::read_dir(from).unwrap() {
+            let (path, target) = entry.map(|e| (e.path(), to.join(e.file_name()))).unwrap();
+            if path.is_dir() {
+                copy(&path, &target);
+            } else {
+                fs::copy(path, target).unwrap();
+            }
+        }
+    }
+    let folder = tempfile::tempdir().unwrap();
+    copy(&fixture().path("set"), folder.path());
+    folder
+}
+
+fn json(path: impl AsRef<Path>) -> Value {
+    serde_json::from_slice(&fs::read(path).unwrap()).unwrap()
+}
+
+fn keys(value: &Value) -> Vec<&str> {
+    value.as_object().unwrap().keys().map(String::as_str).collect()
+}
+
+fn file_names(folder: impl AsRef<Path>) -> Vec<String> {
+    let entries = fs::read_dir(folder).unwrap();
+    let mut names: Vec<String> =
+        entries.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
+    names.sort();
+    names
+}
+
+// ---------------------------------------------------------------------------
+// What the commands write
+
+#[test]
+fn a_run_directory_has_its_four_files_and_metrics_their_shape() {
+    let run = fixture().path("run");
+    for name in ["config.toml", "metrics.json", "model.ply", "train.csv"] {
+        assert!(run.join(name).is_file(), "{name}");
+    }
+    assert!(file_names(&run).iter().all(|name| !name.ends_with(".partial")));
+    let metrics = json(run.join("metrics.json"));
+    assert_eq!(keys(&metrics), ["mean", "views", "seconds", "gaussians", "steps"]);
+    assert_eq!(keys(&metrics["mean"]), ["psnr", "psnr_channel_mean", "ssim"]);
+    assert_eq!(keys(&metrics["views"]), ["000", "008"]);
+    assert_eq!(keys(&metrics["views"]["008"]), ["psnr", "psnr_channel_mean", "ssim"]);
+    assert_eq!(metrics["steps"], 40);
+    assert!(
+        metrics["gaussians"].as_u64().unwrap() > 1000 && metrics["seconds"].as_f64().unwrap() > 0.0
+    );
+    let views = metrics["views"].as_object().unwrap();
+    let mean = views.values().map(|view| view["psnr"].as_f64().unwrap()).sum::<f64>() / 2.0;
+    assert!((metrics["mean"]["psnr"].as_f64().unwrap() - mean).abs() < 1e-9);
+
+    let log = fs::read_to_string(run.join("train.csv")).unwrap();
+    assert_eq!(log.lines().next(), Some("step,view,loss,l1,ssim,gaussians,milliseconds"));
+    assert_eq!(log.lines().count(), 41);
+    assert!(log.lines().nth(40).unwrap().starts_with("40,"));
+    let config = fs::read_to_string(run.join("config.toml")).unwrap();
+    assert!(config.contains("seed = 3") && config.contains("curve = \"ap3\""), "{config}");
+    assert!(
+        fs::read(run.join("model.ply")).unwrap().starts_with(b"ply\nformat binary_little_endian")
+    );
+}
+
+#[test]
+fn one_seed_gives_one_model_whatever_the_references_show() {
+    let set = copied_set();
+    // Every reference pixel changes, and the model's bits may not.
+    for name in file_names(set.path().join("high")) {
+        let path = set.path().join("high").join(name);
+        let mut image = Image::load(&path).unwrap();
+        image.data.iter_mut().for_each(|value| *value = 1.0 - *value);
+        image.save_png8(&path).unwrap();
+    }
+    let (root, run) = (set.path().display(), set.path().join("run"));
+    succeed(&format!("train {root} --out {} {TRAIN}", run.display()));
+    let first = fs::read(fixture().path("run/model.ply")).unwrap();
+    assert!(first == fs::read(run.join("model.ply")).unwrap(), "the references changed the model");
+    let means = [fixture().path("run"), run.clone()]
+        .map(|run| json(run.join("metrics.json"))["mean"].clone());
+    assert_ne!(means[0], means[1], "the scores ought to change with the references");
+    // A finished run becomes the configuration of the next, which replaces it.
+    let config = fixture().path("run/config.toml");
+    succeed(&format!(
+        "train {root} --out {} --config {} --overwrite",
+        run.display(),
+        config.display()
+    ));
+    assert!(
+        first == fs::read(run.join("model.ply")).unwrap(),
+        "the configuration changed the model"
+    );
+    succeed(
+        &format!("train {root} --out {} {TRAIN} --overwrite --seed 4", run.display())
+            .replace("--seed 3", ""),
+    );
+    assert!(
+        first != fs::read(run.join("model.ply")).unwrap(),
+        "another seed ought to change the model"
+    );
+}
+
+#[test]
+fn eval_agrees_with_train_and_saves_what_it_scored() {
+    let fixture = fixture();
+    let run = fixture.path("run");
+    let printed: Value =
+        serde_json::from_str(&succeed(&format!("eval {} --json --save-images", fixture.run())))
+            .unwrap();
+    let trained = json(run.join("metrics.json"));
+    assert_eq!(printed, trained);
+    let names = ["000.png", "008.png"];
+    assert_eq!(file_names(run.join("eval/renders")), names);
+    assert_eq!(file_names(run.join("eval/references")), names);
+    for name in ["000", "008"] {
+        let load =
+            |kind: &str| Image::load(run.join("eval").join(kind).join(name).with_extension("png"));
+        let scores = Scores::of(&load("renders").unwrap(), &load("references").unwrap()).unwrap();
+        let scored = &trained["views"][name];
+        assert!((scores.psnr - scored["psnr"].as_f64().unwrap()).abs() < 0.01, "{name}");
+        assert!((scores.ssim - scored["ssim"].as_f64().unwrap()).abs() < 0.001, "{name}");
+    }
+    let table = succeed(&format!("eval {}", fixture.run()));
+    let lines: Vec<&str> = table.lines().collect();
+    assert_eq!(lines.len(), 4, "{table}");
+    assert!(lines[0].starts_with("view") && lines[0].contains("channel mean"), "{table}");
+    let mean = format!("{:.2}", trained["mean"]["psnr"].as_f64().unwrap());
+    assert!(lines[3].starts_with("mean") && lines[3].contains(&mean), "{table}");
+    assert!(lines.iter().all(|line| line.len() == lines[0].len()), "not aligned:\n{table}");
+}
+
+#[test]
+fn a_set_without_references_trains_and_scores_nothing() {
+    let set = copied_set();
+    fs::remove_dir_all(set.path().join("high")).unwrap();
+    // The test poses' photographs lie in low/, so they are what is listed.
+    let (root, run) = (set.path().display(), set.path().join("run"));
+    succeed(&format!("train {root} --out {} --steps 2", run.display()));
+    assert_eq!(json(run.join("metrics.json"))["mean"], Value::Null);
+    let output = nightsplat(&format!("eval {} --json", run.display()));
+    assert!(output.status.success());
+    let printed: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!((&printed["mean"], keys(&printed["views"]).len()), (&Value::Null, 0));
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(said.contains("no test view has a reference image"), "{said}");
+    assert_eq!(succeed(&format!("eval {}", run.display())).lines().count(), 1);
+}
+
+#[test]
+fn every_pose_of_a_split_is_rendered_with_or_without_an_image() {
+    let set = copied_set();
+    // A test view of which nothing is left but its pose.
+    for folder in ["low", "high"] {
+        fs::remove_file(set.path().join(folder).join("008.png")).unwrap();
+    }
+    let run = set.path().join("run");
+    fs::create_dir(&run).unwrap();
+    fs::copy(fixture().path("run/model.ply"), run.join("model.ply")).unwrap();
+    let config = fs::read_to_string(fixture().path("run/config.toml")).unwrap();
+    fs::write(
+        run.join("config.toml"),
+        config.replace(&fixture().set(), &set.path().display().to_string()),
+    )
+    .unwrap();
+    let render = |split: &str, format: &str| {
+        let out = run.join(split);
+        succeed(&format!(
+            "render {} --split {split} --out {} --format {format}",
+            run.display(),
+            out.display()
+        ));
+        (file_names(&out), out)
+    };
+    let (names, exr) = render("all", "exr");
+    assert_eq!(names, (0..9).map(|view| format!("{view:03}.exr")).collect::<Vec<_>>());
+    let (names, png) = render("test", "png");
+    assert_eq!(names, ["000.png", "008.png"]);
+    let (names, _) = render("train", "png");
+    assert_eq!(names.len(), 7);
+    for name in ["000", "008"] {
+        let [float, byte] = [exr.join(format!("{name}.exr")), png.join(format!("{name}.png"))]
+            .map(|path| Image::load(path).unwrap());
+        assert_eq!((byte.width, byte.height), (64, 48));
+        for (float, byte) in float.data.iter().zip(&byte.data) {
+            assert!((float.clamp(0.0, 1.0) - byte).abs() < 0.51 / 255.0, "{float} {byte}");
+        }
+    }
+    let low = set.path().join("low");
+    refused(
+        &format!("render {} --split all --out {}", run.display(), low.display()),
+        1,
+        &["low", "inside the dataset", "--out"],
+    );
+    assert!(Image::load(low.join("001.png")).is_ok());
+}
+
+#[test]
+fn tone_maps_a_folder_and_prints_its_statistics() {
+    let fixture = fixture();
+    let out = fixture.path("toned");
+    let arguments =
+        format!("tone {}/low --curve ase --out {} --json", fixture.set(), out.display());
+    let printed: Value = serde_json::from_str(&succeed(&arguments)).unwrap();
+    assert_eq!(keys(&printed["views"]).len(), 9);
+    assert_eq!(file_names(&out).len(), 9);
+    let mean = |path: PathBuf| {
+        let image = Image::load(path).unwrap();
+        image.data.iter().sum::<f32>() / image.data.len() as f32
+    };
+    assert!(mean(out.join("000.png")) > 2.0 * mean(fixture.path("set/low/000.png")));
+}
+
+#[test]
+fn doctor_lists_the_devices_and_what_they_offer() {
+    let report = succeed("doctor");
+    assert!(report.contains("yes  timelineSemaphore") && report.contains("Vulkan 1."), "{report}");
+    assert!(report.contains("is used unless --device"), "{report}");
+}
+
+#[test]
+fn bench_checks_and_times_every_kernel_there_is() {
+    let small = "bench --json --repeats 1 --width 64 --height 48 --gaussians 300";
+    let printed: Value = serde_json::from_str(&succeed(small)).unwrap();
+    assert!(
+        !printed["device"].as_str().unwrap().is_empty()
+            && !printed["driver"].as_str().unwrap().is_empty()
+    );
+    assert!(printed["step_ms"].as_f64().unwrap() > 0.0);
+    assert!(printed["groups"]["blend_forward"].as_f64().unwrap() > 0.0);
+    let mut shaders = vec![];
+    let sources = Path::new(env!("CARGO_MANIFEST_DIR")).join("shaders-glsl");
+    for folder in fs::read_dir(sources).unwrap() {
+        let names = file_names(folder.unwrap().path());
+        shaders
+            .extend(names.iter().filter_map(|name| name.strip_suffix(".comp").map(str::to_owned)));
+    }
+    let mut timed = keys(&printed["kernels"]);
+    timed.sort_unstable();
+    shaders.sort();
+    assert_eq!(timed, shaders);
+}
+
+#[test]
+fn demo_touches_no_folder_of_somebody_else() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(folder.path().join("thesis.tex"), "mine").unwrap();
+    refused(&format!("demo --out {}", folder.path().display()), 1, &["not empty", "--out"]);
+    assert_eq!(file_names(folder.path()), ["thesis.tex"]);
+}
+
+#[test]
+fn help_teaches_every_command_in_lines_that_fit() {
+    let commands = ["", "train", "eval", "render", "tone", "synth", "demo", "doctor", "bench"];
+    for command in commands {
+        let help = succeed(&format!("{command} --help"));
+        assert!(help.lines().all(|line| line.chars().count() < 100), "{help}");
+    }
+    let help = succeed("--help");
+    assert!(commands.iter().all(|command| help.contains(command)), "{help}");
+    let train = succeed("train --help");
+    for option in "--curve --gain --theta --steps --downscale --seed --sh-degree --ssim-weight --max-gaussians \
+                   --background --reference --device --config --eval-every --out --overwrite"
+        .split_whitespace()
+    {
+        assert!(train.contains(option), "{option}");
+    }
+}
+
+// ---------------------------------------------------------------------------
+// Bad input
+
+/// Training on `root` must fail in one line and leave no run that looks complete.
+fn refuses_to_train(root: &Path, options: &str, code: i32, parts: &[&str]) {
+    let run = root.join("run");
+    refused(&format!("train {} --out {} {options}", root.display(), run.display()), code, parts);
+    for name in ["metrics.json", "model.ply"] {
+        assert!(!run.join(name).exists(), "{name} was left behind");
+    }
+}
+
+/// Training on `root` must succeed and say all of `parts` on standard error.
+fn trains_and_says(root: &Path, parts: &[&str]) {
+    let run = root.join("run");
+    let arguments = format!("train {} --out {} --steps 1", root.display(), run.display());
+    let output = nightsplat(&arguments);
+    let stderr = String::from_utf8(output.stderr).unwrap();
+    assert!(output.status.success() && run.join("metrics.json").exists(), "{stderr}");
+    for part in parts {
+        assert!(stderr.contains(part), "no `{part}` in: {stderr}");
+    }
+}
+
+fn edit(path: PathBuf, change: impl FnOnce(String) -> String) {
+    let text = fs::read_to_string(&path).unwrap();
+    fs::write(path, change(text)).unwrap();
+}
+
+#[test]
+fn a_set_that_is_not_there_or_has_no_photographs_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let nowhere = folder.path().join("nowhere");
+    let run = folder.path().join("run");
+    refused(
+        &format!("train {} --out {}", nowhere.display(), run.display()),
+        1,
+        &["nowhere", "not a folder"],
+    );
+    assert!(!run.exists());
+    refuses_to_train(folder.path(), "", 1, &["holds no dataset", "transforms"]);
+    let set = copied_set();
+    fs::remove_dir_all(set.path().join("low")).unwrap();
+    refuses_to_train(set.path(), "", 1, &["no photograph is left to train on"]);
+}
+
+#[test]
+fn a_listing_cut_short_is_named() {
+    let set = copied_set();
+    edit(set.path().join("transforms_train.json"), |text| text[..text.len() / 2].to_owned());
+    refuses_to_train(set.path(), "", 1, &["transforms_train.json", "cut short"]);
+}
+
+#[test]
+fn absent_and_broken_photographs_are_left_out_by_name() {
+    let set = copied_set();
+    fs::remove_file(set.path().join("low/003.png")).unwrap();
+    fs::write(set.path().join("low/004.png"), "no image").unwrap();
+    trains_and_says(set.path(), &["low/003.png", "absent", "low/004.png", "not a readable"]);
+}
+
+#[test]
+fn two_views_of_one_name_are_refused() {
+    let set = copied_set();
+    edit(set.path().join("transforms_train.json"), |text| {
+        text.replace("low/002.png", "low/001.png")
+    });
+    refuses_to_train(set.path(), "", 1, &["two views are named 001"]);
+}
+
+/// The fixture's set as COLMAP leaves one, after a change of its cameras and images.
+fn colmap_set(
+    cameras: impl FnOnce(String) -> String,
+    images: impl FnOnce(String) -> String,
+) -> tempfile::TempDir {
+    let set = copied_set();
+    let model = set.path().join("sparse/0");
+    fs::create_dir(set.path().join("sparse")).unwrap();
+    fs::rename(set.path().join("colmap_sparse/0"), &model).unwrap();
+    fs::rename(set.path().join("low"), set.path().join("images")).unwrap();
+    for split in ["train", "test", "val"] {
+        fs::remove_file(set.path().join(format!("transforms_{split}.json"))).unwrap();
+    }
+    edit(model.join("cameras.txt"), cameras);
+    edit(model.join("images.txt"), images);
+    set
+}
+
+#[test]
+fn a_colmap_model_trains_and_what_is_wrong_with_one_is_named() {
+    let same = |text: String| text;
+    trains_and_says(colmap_set(same, same).path(), &[]);
+
+    let set = colmap_set(|text| text.replace(" PINHOLE ", " FISHEYE "), same);
+    refuses_to_train(set.path(), "", 1, &["FISHEYE"]);
+
+    // Every pose: no view is left. One pose: the others go on.
+    let spoil = |count: usize| {
+        move |text: String| {
+            let mut left = count;
+            let line = |line: &str| {
+                let mut fields: Vec<&str> = line.split(' ').collect();
+                if line.ends_with(".png") && left > 0 {
+                    left -= 1;
+                    fields[5] = "NaN";
+                }
+                fields.join(" ") + "\n"
+            };
+            text.lines().map(line).collect()
+        }
+    };
+    refuses_to_train(colmap_set(same, spoil(9)).path(), "", 1, &["pose is not finite"]);
+    trains_and_says(colmap_set(same, spoil(1)).path(), &["000.png", "pose is not finite"]);
+
+    let set = colmap_set(|text| text.replace(" 64 48 ", " 64 64 "), same);
+    refuses_to_train(set.path(), "", 1, &["is 64x48 but its camera is 64x64"]);
+
+    let set = colmap_set(same, same);
+    // A count of ten thousand points, and then nothing.
+    let mut points = 10_000_u64.to_le_bytes().to_vec();
+    points.extend([0; 20]);
+    fs::remove_file(set.path().join("sparse/0/points3D.txt")).unwrap();
+    fs::write(set.path().join("sparse/0/points3D.bin"), points).unwrap();
+    refuses_to_train(set.path(), "", 1, &["points3D.bin", "cut short"]);
+}
+
+#[test]
+fn a_run_directory_is_neither_replaced_unasked_nor_made_where_it_cannot_be() {
+    let fixture = fixture();
+    let before = fs::read(fixture.path("run/metrics.json")).unwrap();
+    refused(
+        &format!("train {} --out {}", fixture.set(), fixture.run()),
+        1,
+        &["already holds a run", "--overwrite"],
+    );
+    assert_eq!(before, fs::read(fixture.path("run/metrics.json")).unwrap());
+    let file = fixture.path("set/low/000.png");
+    refused(
+        &format!("train {} --out {}/run", fixture.set(), file.display()),
+        1,
+        &["cannot be written"],
+    );
+}
+
+#[test]
+fn misuse_is_said_in_one_line_with_exit_code_2() {
+    let set = fixture().set();
+    let train =
+        |options: &str, parts: &[&str]| refuses_to_train(Path::new(&set), options, 2, parts);
+    train("--curve gamma", &["gamma", "linear, ase, ap3, none"]);
+    train("--steps 0", &["--steps"]);
+    train("--sh-degree 4", &["--sh-degree", "0 to 3"]);
+    train("--downscale 0.5", &["downscale"]);
+    train("--background blue", &["blue", "black or random"]);
+    train("--stepz 3", &["--stepz"]);
+    refused("train", 2, &["--out", "required"]);
+    refused("evaluate x", 2, &["evaluate"]);
+    refused("render x --split none --out y", 2, &["none", "train, test, all"]);
+    refused("bench --repeats 0", 2, &["--repeats"]);
+}
+
+#[test]
+fn a_configuration_with_an_unknown_key_names_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let config = folder.path().join("config.toml");
+    fs::write(&config, "steps = 3\nstepz = 4\n").unwrap();
+    let arguments = format!("--config {}", config.display());
+    refuses_to_train(
+        Path::new(&fixture().set()),
+        &arguments,
+        1,
+        &["config.toml", "stepz", "(line "],
+    );
+}
+
+#[test]
+fn no_device_and_an_unknown_one_are_said_with_the_remedy() {
+    let set = fixture().set();
+    refuses_to_train(Path::new(&set), "--device voodoo", 1, &["voodoo", "there are: "]);
+    refuses_to_train(Path::new(&set), "--device 99", 1, &["number 99", "there are: "]);
+    let nothing =
+        [("VK_DRIVER_FILES", "/nonexistent.json"), ("VK_ICD_FILENAMES", "/nonexistent.json")];
+    for arguments in ["doctor", "bench", "demo --out /nonexistent/demo"] {
+        let output = nightsplat_with(arguments, &nothing);
+        assert_refused(arguments, &output, 1, &["no Vulkan device", "install"]);
+    }
+}
+
+#[test]
+fn what_is_no_finished_run_is_refused_by_eval_and_render() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = folder.path().display();
+    for command in ["eval", "render --split all --out x"] {
+        let (command, options) = command.split_once(' ').unwrap_or((command, ""));
+        refused(&format!("{command} {run} {options}"), 1, &["no config.toml", "nightsplat train"]);
+    }
+    let config = fs::read_to_string(fixture().path("run/config.toml")).unwrap();
+    let moved = folder.path().join("moved");
+    fs::write(
+        folder.path().join("config.toml"),
+        config.replace(&fixture().set(), &moved.display().to_string()),
+    )
+    .unwrap();
+    refused(&format!("eval {run}"), 1, &["model.ply", "did not finish"]);
+    let model = fs::read(fixture().path("run/model.ply")).unwrap();
+    fs::write(folder.path().join("model.ply"), &model).unwrap();
+    refused(&format!("eval {run}"), 1, &["config.toml", "moved", "correct `dataset`"]);
+    fs::write(folder.path().join("config.toml"), config).unwrap();
+    fs::write(folder.path().join("model.ply"), &model[..model.len() / 2]).unwrap();
+    refused(&format!("eval {run}"), 1, &["model.ply"]);
+}
