@@ -194,12 +194,21 @@ impl Renderer {
         self.frame.reserve(&self.gpu, gaussian_count, pixels, tiles)
     }
 
-    /// Makes room for `intersections`, and half as many again.
+    /// Makes room for `intersections`, and half as many again; what room there is stays.
     ///
     /// # Errors
     /// The device is out of memory.
     pub fn grow(&mut self, intersections: u32) -> Result<()> {
-        self.frame.reserve_intersections(&self.gpu, intersections)
+        let capacity = intersections.saturating_add(intersections / 2);
+        self.set_intersection_capacity(capacity.max(self.frame.intersection_capacity()))
+    }
+
+    /// Makes room for exactly so many intersections.
+    ///
+    /// # Errors
+    /// The device is out of memory.
+    pub fn set_intersection_capacity(&mut self, intersections: u32) -> Result<()> {
+        self.frame.set_intersection_capacity(&self.gpu, intersections)
     }
 
     /// The last render, planar (3, H, W).
@@ -411,7 +420,7 @@ impl Renderer {
         let capacity = frame.intersection_capacity();
         pass.dispatch(
             &self.check_capacity,
-            &check_capacity::Params { gaussian_count, capacity },
+            &check_capacity::Params { capacity },
             check_capacity::Buffers {
                 total: &frame.total,
                 counts: &mut frame.counts,

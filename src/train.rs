@@ -122,6 +122,14 @@ impl Trainer {
         self.model.download(&self.gpu)
     }
 
+    /// Sets how many intersections a view may have before memory has to grow, where that is known better than guessed.
+    ///
+    /// # Errors
+    /// The device is out of memory.
+    pub fn set_intersection_capacity(&mut self, intersections: u32) -> Result<()> {
+        self.renderer.set_intersection_capacity(intersections)
+    }
+
     /// Trains up to `until`, one submission's worth at most, and reports every step done.
     ///
     /// # Errors

@@ -284,7 +284,7 @@ pub(crate) fn forward(setup: &Setup, capacity: Option<u32>) -> Frame {
     let (counts, status) = run_kernel!(
         check_capacity,
         check_capacity::Constants::default(),
-        check_capacity::Params { gaussian_count: n, capacity },
+        check_capacity::Params { capacity },
         Threads::Exactly([1, 1, 1]),
         [total],
         [counts, status]
