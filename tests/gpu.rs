@@ -78,9 +78,9 @@ fn a_buffer_of_no_elements_can_be_used_like_any_other() {
         Ok(())
     })
     .unwrap();
-    assert_eq!(gpu.read(&other).unwrap(), []);
-    assert_eq!(reverse(&[], Threads::Exactly([0, 1, 1])), []);
-    assert_eq!(reverse(&[], Threads::Exactly([1, 1, 1])), []);
+    assert!(gpu.read(&other).unwrap().is_empty());
+    assert!(reverse(&[], Threads::Exactly([0, 1, 1])).is_empty());
+    assert!(reverse(&[], Threads::Exactly([1, 1, 1])).is_empty());
     assert_no_validation_messages();
 }
 
