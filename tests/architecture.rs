@@ -59,7 +59,9 @@ fn crate_paths(text: &str) -> BTreeSet<String> {
     let code: Vec<&str> = text.lines().map(code).collect();
     let code = code.join("\n");
     let mut names = BTreeSet::new();
-    for (_, path) in code.match_indices("crate::").map(|(at, found)| (at, &code[at + found.len()..])) {
+    for (_, path) in
+        code.match_indices("crate::").map(|(at, found)| (at, &code[at + found.len()..]))
+    {
         if let Some(group) = path.strip_prefix('{') {
             // Of each entry of the group, at any depth, the first segment at depth one.
             let mut depth = 1;
@@ -89,7 +91,8 @@ fn first_segment(path: &str) -> String {
 
 #[test]
 fn paths_into_the_crate_are_found_however_they_are_written() {
-    let text = "use crate::a::B;\nuse crate::{c, d::{E, f}, G}; // crate::comment\nlet x = crate::h::i();";
+    let text =
+        "use crate::a::B;\nuse crate::{c, d::{E, f}, G}; // crate::comment\nlet x = crate::h::i();";
     let names: Vec<String> = crate_paths(text).into_iter().collect();
     assert_eq!(names, ["G", "a", "c", "d", "h"]);
 }

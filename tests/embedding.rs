@@ -174,9 +174,8 @@ impl Host {
             };
             let physical = all.into_iter().find(is_wanted).unwrap();
             let families = instance.get_physical_device_queue_family_properties(physical);
-            let has_compute = |f: &vk::QueueFamilyProperties| {
-                f.queue_flags.contains(vk::QueueFlags::COMPUTE)
-            };
+            let has_compute =
+                |f: &vk::QueueFamilyProperties| f.queue_flags.contains(vk::QueueFlags::COMPUTE);
             let family = families.iter().position(has_compute).unwrap() as u32;
             let device = device(&instance, physical, family);
             let pool_info = vk::CommandPoolCreateInfo::default().queue_family_index(family);
@@ -209,8 +208,7 @@ impl Host {
     fn memory(&self, len: usize) -> Memory {
         let usage = vk::BufferUsageFlags::TRANSFER_DST;
         let info = vk::BufferCreateInfo::default().size(4 * len as u64).usage(usage);
-        let flags =
-            vk::MemoryPropertyFlags::HOST_VISIBLE | vk::MemoryPropertyFlags::HOST_COHERENT;
+        let flags = vk::MemoryPropertyFlags::HOST_VISIBLE | vk::MemoryPropertyFlags::HOST_COHERENT;
         // SAFETY: the device is live; the buffer is bound once to memory of a type that suits it.
         unsafe {
             let buffer = self.device.create_buffer(&info, None).unwrap();
@@ -336,9 +334,7 @@ unsafe fn device(
     unsafe { instance.create_device(physical, &info, None) }.unwrap()
 }
 
-fn messenger_info(
-    messages: &Mutex<Vec<String>>,
-) -> vk::DebugUtilsMessengerCreateInfoEXT<'static> {
+fn messenger_info(messages: &Mutex<Vec<String>>) -> vk::DebugUtilsMessengerCreateInfoEXT<'static> {
     let severity = vk::DebugUtilsMessageSeverityFlagsEXT::ERROR
         | vk::DebugUtilsMessageSeverityFlagsEXT::WARNING;
     vk::DebugUtilsMessengerCreateInfoEXT::default()
