@@ -51,6 +51,19 @@ impl Default for RenderSettings {
 const GPU_TILE: [u32; 2] = [16, 16];
 const CPU_TILE: [u32; 2] = [16, 8];
 
+impl RenderSettings {
+    /// The tile on this device, in pixels.
+    pub fn tile_on(&self, gpu: &Gpu) -> [u32; 2] {
+        self.tile.unwrap_or(if gpu.properties().is_cpu { CPU_TILE } else { GPU_TILE })
+    }
+}
+
+/// Whether the blend kernels test which pixels of its tile a splat meets: a processor's driver runs both sides of every
+/// branch, so that there the test only costs.
+pub fn skips_groups(gpu: &Gpu) -> bool {
+    !gpu.properties().is_cpu
+}
+
 /// What changes from render to render.
 #[derive(Clone, Copy, Debug)]
 pub struct RenderOptions {
@@ -108,8 +121,7 @@ impl Renderer {
     /// # Errors
     /// The driver refuses a kernel, or the tile has more than 32 rows of lanes.
     pub fn new(gpu: &Gpu, settings: RenderSettings) -> Result<Self> {
-        let tile = if gpu.properties().is_cpu { CPU_TILE } else { GPU_TILE };
-        let [tile_width, tile_height] = settings.tile.unwrap_or(tile);
+        let [tile_width, tile_height] = settings.tile_on(gpu);
         let lanes = gpu.properties().subgroup_size;
         let pixels = tile_width * tile_height;
         if pixels == 0 || pixels % lanes != 0 || pixels / lanes > 32 {
@@ -119,7 +131,7 @@ impl Renderer {
             )));
         }
         let channels = 3;
-        let skips_groups = !gpu.properties().is_cpu;
+        let skips_groups = skips_groups(gpu);
         let (alpha_max, sh_degree) = (settings.max_alpha, settings.sh_degree);
         Ok(Self {
             gpu: gpu.clone(),

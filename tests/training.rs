@@ -12,7 +12,6 @@ use nightsplat::gpu::testing::{assert_no_validation_messages, gpu};
 use nightsplat::image::Image;
 use nightsplat::metrics::Scores;
 use nightsplat::scene::Gaussians;
-use nightsplat::tone::{ToneCurve, ToneSettings};
 use nightsplat::train::{Background, StepReport, TrainConfig, Trainer};
 
 /// Ten views of 64 x 48 pixels, loaded.
