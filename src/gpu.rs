@@ -24,7 +24,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use ash::{ext, khr, vk};
 
 pub use buffer::{Buffer, Download};
-pub use device::{DeviceChoice, DeviceReport, HostDevice, devices};
+pub use device::{DeviceChoice, DeviceReport, HostDevice, RequirementReport, devices};
 pub use kernel::{Binding, Kernel, Reference};
 pub use pipeline::Pipeline;
 pub use recorder::{Recorder, Threads};

@@ -37,14 +37,31 @@ pub struct RenderSettings {
     pub max_alpha: f32,
     /// Degree of the spherical harmonics stored.
     pub sh_degree: u32,
-    /// The tile that one subgroup owns, in pixels.
-    pub tile: [u32; 2],
+    /// The tile that one subgroup owns, in pixels; none: what suits the device.
+    pub tile: Option<[u32; 2]>,
 }
 
 impl Default for RenderSettings {
     fn default() -> Self {
-        Self { near: 0.2, max_alpha: 0.99, sh_degree: 3, tile: [16, 16] }
+        Self { near: 0.2, max_alpha: 0.99, sh_degree: 3, tile: None }
     }
+}
+
+/// The tile of a GPU, as in 3DGS, and that of a processor, whose subgroups are narrow: measured on lavapipe.
+const GPU_TILE: [u32; 2] = [16, 16];
+const CPU_TILE: [u32; 2] = [16, 8];
+
+impl RenderSettings {
+    /// The tile on this device, in pixels.
+    pub fn tile_on(&self, gpu: &Gpu) -> [u32; 2] {
+        self.tile.unwrap_or(if gpu.properties().is_cpu { CPU_TILE } else { GPU_TILE })
+    }
+}
+
+/// Whether the blend kernels test which pixels of its tile a splat meets: a processor's driver runs both sides of every
+/// branch, so that there the test only costs.
+pub fn skips_groups(gpu: &Gpu) -> bool {
+    !gpu.properties().is_cpu
 }
 
 /// What changes from render to render.
@@ -81,6 +98,7 @@ pub struct Gradients<'a> {
 pub struct Renderer {
     gpu: Gpu,
     settings: RenderSettings,
+    tile: [u32; 2],
     project: Pipeline<project::Kernel>,
     order_counts: Pipeline<order_counts::Kernel>,
     check_capacity: Pipeline<check_capacity::Kernel>,
@@ -103,7 +121,7 @@ impl Renderer {
     /// # Errors
     /// The driver refuses a kernel, or the tile has more than 32 rows of lanes.
     pub fn new(gpu: &Gpu, settings: RenderSettings) -> Result<Self> {
-        let [tile_width, tile_height] = settings.tile;
+        let [tile_width, tile_height] = settings.tile_on(gpu);
         let lanes = gpu.properties().subgroup_size;
         let pixels = tile_width * tile_height;
         if pixels == 0 || pixels % lanes != 0 || pixels / lanes > 32 {
@@ -113,10 +131,12 @@ impl Renderer {
             )));
         }
         let channels = 3;
+        let skips_groups = skips_groups(gpu);
         let (alpha_max, sh_degree) = (settings.max_alpha, settings.sh_degree);
         Ok(Self {
             gpu: gpu.clone(),
             settings,
+            tile: [tile_width, tile_height],
             project: gpu.pipeline(&project::Constants {
                 sh_degree,
                 alpha_max,
@@ -138,12 +158,14 @@ impl Renderer {
                 channels,
                 tile_width,
                 tile_height,
+                skips_groups,
             })?,
             blend_backward: gpu.pipeline(&blend_backward::Constants {
                 alpha_max,
                 channels,
                 tile_width,
                 tile_height,
+                skips_groups,
             })?,
             reduce_records: gpu.pipeline(&reduce_records::Constants {
                 alpha_max,
@@ -184,12 +206,21 @@ impl Renderer {
         self.frame.reserve(&self.gpu, gaussian_count, pixels, tiles)
     }
 
-    /// Makes room for `intersections`, and half as many again.
+    /// Makes room for `intersections`, and half as many again; what room there is stays.
     ///
     /// # Errors
     /// The device is out of memory.
     pub fn grow(&mut self, intersections: u32) -> Result<()> {
-        self.frame.reserve_intersections(&self.gpu, intersections)
+        let capacity = intersections.saturating_add(intersections / 2);
+        self.set_intersection_capacity(capacity.max(self.frame.intersection_capacity()))
+    }
+
+    /// Makes room for exactly so many intersections.
+    ///
+    /// # Errors
+    /// The device is out of memory.
+    pub fn set_intersection_capacity(&mut self, intersections: u32) -> Result<()> {
+        self.frame.set_intersection_capacity(&self.gpu, intersections)
     }
 
     /// The last render, planar (3, H, W).
@@ -401,7 +432,7 @@ impl Renderer {
         let capacity = frame.intersection_capacity();
         pass.dispatch(
             &self.check_capacity,
-            &check_capacity::Params { gaussian_count, capacity },
+            &check_capacity::Params { capacity },
             check_capacity::Buffers {
                 total: &frame.total,
                 counts: &mut frame.counts,
@@ -445,7 +476,7 @@ impl Renderer {
 
     /// Columns and rows of tiles.
     fn tiles(&self, camera: &Camera) -> UVec2 {
-        let [tile_width, tile_height] = self.settings.tile;
+        let [tile_width, tile_height] = self.tile;
         UVec2::new(camera.width.div_ceil(tile_width), camera.height.div_ceil(tile_height))
     }
 

@@ -18,7 +18,7 @@ use crate::optimizer::{Adam, AdamBuffers};
 use crate::pseudo_gt::PseudoGt;
 use crate::random::Stream;
 use crate::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer, Status};
-use crate::scene::Gaussians;
+use crate::scene::{Gaussians, width};
 use crate::{Error, Result};
 
 pub use config::{Background, DensityConfig, TrainConfig};
@@ -122,6 +122,14 @@ impl Trainer {
         self.model.download(&self.gpu)
     }
 
+    /// Sets how many intersections a view may have before memory has to grow, where that is known better than guessed.
+    ///
+    /// # Errors
+    /// The device is out of memory.
+    pub fn set_intersection_capacity(&mut self, intersections: u32) -> Result<()> {
+        self.renderer.set_intersection_capacity(intersections)
+    }
+
     /// Trains up to `until`, one submission's worth at most, and reports every step done.
     ///
     /// # Errors
@@ -156,7 +164,7 @@ impl Trainer {
             .map(|(step, loss)| self.report(step, loss, milliseconds))
             .collect();
         self.step += done as u64;
-        if done > 0 && self.config.schedule.densifies_at(self.step) {
+        if done > 0 && self.densifies_at(self.step) {
             let changed = self.model.densify(&gpu, &mut self.densifier, self.step)?;
             tracing::debug!("step {}: {changed:?}", self.step);
             self.reserve()?;
@@ -223,11 +231,14 @@ impl Trainer {
                 visit_counts: &mut model.visit_counts,
             },
         )?;
+        // Coefficients that are not in use yet have no gradient and no moments: nothing to update.
+        let columns =
+            if options.sh_degree == 0 { width(0) as u32 } else { model.gaussians.column_count };
         self.adam.record(
             pass,
             step,
             &schedule.learning_rates(step, self.extent),
-            [model.gaussians.count, model.gaussians.column_count],
+            [model.gaussians.count, columns],
             AdamBuffers {
                 parameters: &mut model.gaussians.parameters,
                 gradients: &model.gradients,
@@ -248,6 +259,12 @@ impl Trainer {
         };
         self.renderer.reserve(self.model.count(), [camera])?;
         self.renderer.render_image(&self.model.gaussians.parameters, camera, &options)
+    }
+
+    /// Density control acts after this step. Never so late that the run ends before what it added has settled.
+    fn densifies_at(&self, step: u64) -> bool {
+        let schedule = &self.config.schedule;
+        schedule.densifies_at(step) && step + schedule.densify_interval <= self.config.steps
     }
 
     fn reserve(&mut self) -> Result<()> {

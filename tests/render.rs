@@ -176,7 +176,7 @@ fn blend_forward_matches_the_reference() {
             (vec![f32::NAN; frame.render.len()], vec![f32::NAN; setup.pixels()]);
         let (mut render, mut transmittances) = run_reference!(
             blend_forward,
-            constants!(blend_forward, setup),
+            constants!(blend_forward, setup, skips_groups),
             common::blend_params(&setup),
             [tile_ranges, sorted_slots, owners, splats, colors],
             [render, transmittances]
@@ -220,7 +220,7 @@ fn an_overflow_renders_nothing_and_keeps_its_flag() {
         [(0, 0, [0, 0]), (5, 5, [1, 9]), (6, 5, [2, 1]), (u32::MAX, 5, [0, 0])]
     {
         let (total, counts, status) = (vec![total], vec![7], before.to_vec());
-        let params = check_capacity::Params { gaussian_count: 1, capacity };
+        let params = check_capacity::Params { capacity };
         let constants = check_capacity::Constants::default();
         let threads = Threads::Exactly([1, 1, 1]);
         let (actual, after) =
@@ -461,5 +461,26 @@ fn golden_renders_are_met() {
         let alpha: Vec<f32> = frame.transmittances.iter().map(|t| 1.0 - t).collect();
         assert_close(case, &alpha, &plane(3).collect::<Vec<_>>(), |_, _| 1e-4);
     }
+    assert_no_validation_messages();
+}
+
+#[test]
+fn a_count_that_wrapped_around_writes_no_slot_beyond_the_counted() {
+    let setup = Setup::new(3, UVec2::new(32, 32), 0, 1);
+    let splats = forward(&setup, None).splats;
+    // As if the offsets of later ranks had run past the total.
+    let (counts, sorted_ids, ordered_counts) = (vec![2], vec![0, 1, 2], vec![4, 4, 4]);
+    let offsets = vec![0, 4, u32::MAX - 1];
+    let [tiles, slots, owners] = [0; 3].map(|_| vec![7u32; 16]);
+    let (tiles, slots, owners) = run_kernel!(
+        emit,
+        constants!(emit, setup),
+        emit::Params { size: setup.params.size, gaussian_count: 3, tile_columns: setup.tiles().x },
+        Threads::Exactly([3, 1, 1]),
+        [counts, sorted_ids, ordered_counts, offsets, splats],
+        [tiles, slots, owners]
+    );
+    let untouched = |slots: &[u32]| slots[2..].iter().all(|&slot| slot == 7);
+    assert!(untouched(&tiles) && untouched(&slots) && untouched(&owners));
     assert_no_validation_messages();
 }

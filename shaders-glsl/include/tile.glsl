@@ -1,20 +1,39 @@
 // A tile owned by one subgroup: lane l of group g owns pixel g * SUBGROUP_SIZE + l, counted row by row.
+//
+// A tile's state lives in registers, one array element per group. Loops over groups are therefore unrolled: every
+// index is a constant.
 
-const uint TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT;
-const uint GROUPS = TILE_PIXELS / SUBGROUP_SIZE;
+// Skip the groups that a splat's ellipse does not meet. Pays on a GPU; a processor's driver runs both sides of every
+// branch, so there the test would only cost.
+layout(constant_id = 5) const bool SKIPS_GROUPS = true;
+
+const uint GROUPS = TILE_WIDTH * TILE_HEIGHT / SUBGROUP_SIZE;
+
+// The lane's pixel of group 0, relative to the tile.
+uvec2 lane_pixel() {
+    return uvec2(gl_SubgroupInvocationID % TILE_WIDTH, gl_SubgroupInvocationID / TILE_WIDTH);
+}
+
+// From the lane's pixel of group 0 to that of `group`.
+uvec2 group_offset(uint group) {
+    return uvec2(group * SUBGROUP_SIZE % TILE_WIDTH, group * SUBGROUP_SIZE / TILE_WIDTH);
+}
 
 // The groups of pixels, one bit each, that the splat's ellipse meets in the tile at `origin`.
 uint splat_groups(ProjectedSplat splat, uvec2 origin) {
-    uint groups = 0;
-    for (uint row = 0; row < TILE_HEIGHT; row++) {
-        float y = float(origin.y + row);
-        ivec2 columns = splat_columns(splat, y, y) - int(origin.x);
-        columns = ivec2(max(columns.x, 0), min(columns.y, int(TILE_WIDTH) - 1));
-        if (columns.x <= columns.y) {
-            uint first = (row * TILE_WIDTH + uint(columns.x)) / SUBGROUP_SIZE;
-            uint last = (row * TILE_WIDTH + uint(columns.y)) / SUBGROUP_SIZE;
-            // Bits first..last; the shift past bit 31 wraps to zero, as it should.
-            groups |= (2u << last) - (1u << first);
+    uint groups = 0xffffffffu;
+    if (SKIPS_GROUPS) {
+        groups = 0;
+        for (uint row = 0; row < TILE_HEIGHT; row++) {
+            float y = float(origin.y + row);
+            ivec2 columns = splat_columns(splat, y, y) - int(origin.x);
+            columns = ivec2(max(columns.x, 0), min(columns.y, int(TILE_WIDTH) - 1));
+            if (columns.x <= columns.y) {
+                uint first = (row * TILE_WIDTH + uint(columns.x)) / SUBGROUP_SIZE;
+                uint last = (row * TILE_WIDTH + uint(columns.y)) / SUBGROUP_SIZE;
+                // Bits first..last; the shift past bit 31 wraps to zero, as it should.
+                groups |= (2u << last) - (1u << first);
+            }
         }
     }
     return groups;

@@ -27,106 +27,117 @@ layout(binding = 7) writeonly buffer Records { float records[]; };
 
 const uint RECORD = 6 + CHANNELS;
 
-shared float transmittance[TILE_PIXELS];           // zero once the pixel is done
-shared float light[CHANNELS * TILE_PIXELS];        // still to come
-shared float d_pixel[CHANNELS * TILE_PIXELS];
-
 void main() {
     uint tile = WORKGROUP_INDEX;
     uint lane = gl_SubgroupInvocationID;
     uvec2 origin = uvec2(tile % tile_columns * TILE_WIDTH, tile / tile_columns * TILE_HEIGHT);
     if (origin.y >= size.y) return;
-    for (uint p = lane; p < TILE_PIXELS; p += SUBGROUP_SIZE) {
-        uvec2 pixel = origin + uvec2(p % TILE_WIDTH, p / TILE_WIDTH);
+    uvec2 first_pixel = origin + lane_pixel();
+
+    float transmittance[GROUPS];    // zero once the pixel is done
+    float light[GROUPS][CHANNELS];  // still to come
+    float d_pixel[GROUPS][CHANNELS];
+    [[unroll]] for (uint g = 0; g < GROUPS; g++) {
+        uvec2 pixel = first_pixel + group_offset(g);
         bool inside = all(lessThan(pixel, size));
         uint at = inside ? pixel.y * size.x + pixel.x : 0;
-        transmittance[p] = inside ? 1.0 : 0.0;
-        for (uint c = 0; c < CHANNELS; c++) {
-            light[c * TILE_PIXELS + p] = render[c * size.x * size.y + at];
-            d_pixel[c * TILE_PIXELS + p] = d_render[c * size.x * size.y + at];
+        transmittance[g] = inside ? 1.0 : 0.0;
+        [[unroll]] for (uint c = 0; c < CHANNELS; c++) {
+            light[g][c] = render[c * size.x * size.y + at];
+            d_pixel[g][c] = d_render[c * size.x * size.y + at];
         }
     }
 
     uvec2 range = tile_ranges[tile];
-    uint alive = 0xffffffffu >> (32 - GROUPS);
-    for (uint first = range.x; first < range.y; first += SUBGROUP_SIZE) {
+    uint first = range.x;
+    for (; first < range.y; first += SUBGROUP_SIZE) {
+        bool alive = false;
+        [[unroll]] for (uint g = 0; g < GROUPS; g++) alive = alive || transmittance[g] > 0.0;
+        if (!subgroupAny(alive)) break;
+
         uint batch = min(SUBGROUP_SIZE, range.y - first);
         uint slot = sorted_slots[first + min(lane, batch - 1)];
-        float my_d_splat[6] = float[](0.0, 0.0, 0.0, 0.0, 0.0, 0.0);
+        uint id = owners[slot];
+        ProjectedSplat mine = splats[id];
+        float my_color[CHANNELS];
+        [[unroll]] for (uint c = 0; c < CHANNELS; c++) my_color[c] = colors[CHANNELS * id + c];
+        uint my_groups = splat_groups(mine, origin);
+        vec2 my_d_mean2d = vec2(0.0);
+        vec3 my_d_conic = vec3(0.0);
+        float my_d_opacity = 0.0;
         float my_d_color[CHANNELS];
-        for (uint c = 0; c < CHANNELS; c++) my_d_color[c] = 0.0;
-        // Behind a tile that is done every gradient is zero.
-        if (alive != 0) {
-            uint id = owners[slot];
-            ProjectedSplat mine = splats[id];
-            float my_color[CHANNELS];
-            for (uint c = 0; c < CHANNELS; c++) my_color[c] = colors[CHANNELS * id + c];
-            uint my_groups = splat_groups(mine, origin);
+        [[unroll]] for (uint c = 0; c < CHANNELS; c++) my_d_color[c] = 0.0;
 
-            for (uint j = 0; j < batch; j++) {
-                uint groups = subgroupShuffle(my_groups, j) & alive;
-                if (groups == 0) continue;
-                vec2 mean2d = subgroupShuffle(mine.mean2d, j);
-                vec3 conic = subgroupShuffle(mine.conic, j);
-                float opacity = subgroupShuffle(mine.opacity, j);
-                float splat_color[CHANNELS];
-                for (uint c = 0; c < CHANNELS; c++) splat_color[c] = subgroupShuffle(my_color[c], j);
-                float d_splat[6] = float[](0.0, 0.0, 0.0, 0.0, 0.0, 0.0);
-                float d_color[CHANNELS];
-                for (uint c = 0; c < CHANNELS; c++) d_color[c] = 0.0;
-                for (; groups != 0; groups &= groups - 1) {
-                    uint p = findLSB(groups) * SUBGROUP_SIZE + lane;
-                    vec2 d = mean2d - (vec2(origin + uvec2(p % TILE_WIDTH, p / TILE_WIDTH)) + 0.5);
-                    float sigma = splat_sigma(conic, d);
-                    float falloff = exp(-sigma);
-                    float alpha = min(ALPHA_MAX, opacity * falloff);
-                    float before = transmittance[p];
-                    if (sigma >= 0.0 && alpha >= ALPHA_MIN && before > 0.0) {
-                        float after = before * (1.0 - alpha);
-                        if (after < TRANSMITTANCE_MIN) {
-                            transmittance[p] = 0.0;
-                        } else {
-                            transmittance[p] = after;
-                            float weight = alpha * before;
-                            float d_alpha = 0.0;
-                            for (uint c = 0; c < CHANNELS; c++) {
-                                float d_c = d_pixel[c * TILE_PIXELS + p];
-                                float to_come = light[c * TILE_PIXELS + p];
-                                d_color[c] += weight * d_c;
-                                d_alpha += (before * splat_color[c] - to_come) * d_c;
-                                light[c * TILE_PIXELS + p] = to_come - weight * splat_color[c];
-                            }
-                            d_alpha /= 1.0 - alpha;
-                            // At the cap alpha no longer depends on the splat.
-                            if (opacity * falloff <= ALPHA_MAX) {
-                                float d_sigma = -alpha * d_alpha;
-                                d_splat[0] += d_sigma * (conic.x * d.x + conic.y * d.y);
-                                d_splat[1] += d_sigma * (conic.y * d.x + conic.z * d.y);
-                                d_splat[2] += d_sigma * 0.5 * d.x * d.x;
-                                d_splat[3] += d_sigma * d.x * d.y;
-                                d_splat[4] += d_sigma * 0.5 * d.y * d.y;
-                                d_splat[5] += falloff * d_alpha;
-                            }
-                        }
+        for (uint j = 0; j < batch; j++) {
+            uint groups = subgroupBroadcast(my_groups, j);
+            vec2 offset = subgroupBroadcast(mine.mean2d, j) - (vec2(first_pixel) + 0.5);
+            vec3 conic = subgroupBroadcast(mine.conic, j);
+            float opacity = subgroupBroadcast(mine.opacity, j);
+            float splat_color[CHANNELS];
+            [[unroll]] for (uint c = 0; c < CHANNELS; c++) splat_color[c] = subgroupBroadcast(my_color[c], j);
+            // Moments of dL/dsigma over the pixels: what every gradient of the ellipse is made of.
+            float moment = 0.0;
+            vec2 moment_x_y = vec2(0.0);
+            vec3 moment_xx_xy_yy = vec3(0.0);
+            float d_color[CHANNELS];
+            [[unroll]] for (uint c = 0; c < CHANNELS; c++) d_color[c] = 0.0;
+
+            [[unroll]] for (uint g = 0; g < GROUPS; g++) {
+                if (SKIPS_GROUPS && (groups >> g & 1) == 0) continue;
+                vec2 d = offset - vec2(group_offset(g));
+                float sigma = splat_sigma(conic, d);
+                float falloff = exp(-sigma);
+                float alpha = min(ALPHA_MAX, opacity * falloff);
+                float before = transmittance[g];
+                if (sigma >= 0.0 && alpha >= ALPHA_MIN && before > 0.0) {
+                    float after = before * (1.0 - alpha);
+                    bool is_done = after < TRANSMITTANCE_MIN;
+                    transmittance[g] = is_done ? 0.0 : after;
+                    float weight = is_done ? 0.0 : alpha * before;
+                    float d_alpha = 0.0;
+                    [[unroll]] for (uint c = 0; c < CHANNELS; c++) {
+                        d_color[c] += weight * d_pixel[g][c];
+                        d_alpha += (before * splat_color[c] - light[g][c]) * d_pixel[g][c];
+                        light[g][c] -= weight * splat_color[c];
                     }
-                }
-                for (uint k = 0; k < 6; k++) {
-                    float sum = subgroupAdd(d_splat[k]);
-                    if (lane == j) my_d_splat[k] = sum;
-                }
-                for (uint c = 0; c < CHANNELS; c++) {
-                    float sum = subgroupAdd(d_color[c]);
-                    if (lane == j) my_d_color[c] = sum;
+                    // At the cap alpha no longer depends on the splat.
+                    bool is_free = !is_done && opacity * falloff <= ALPHA_MAX;
+                    d_alpha = is_free ? d_alpha / (1.0 - alpha) : 0.0;
+                    float d_sigma = -alpha * d_alpha;
+                    vec2 first_moment = d_sigma * d;
+                    moment += d_sigma;
+                    moment_x_y += first_moment;
+                    moment_xx_xy_yy += first_moment.xxy * d.xyy;
                 }
             }
-            for (uint groups = alive; groups != 0; groups &= groups - 1) {
-                uint group = findLSB(groups);
-                if (subgroupAll(transmittance[group * SUBGROUP_SIZE + lane] == 0.0)) alive &= ~(1u << group);
+            moment = subgroupAdd(moment);
+            moment_x_y = subgroupAdd(moment_x_y);
+            moment_xx_xy_yy = subgroupAdd(moment_xx_xy_yy);
+            if (lane == j) {
+                my_d_mean2d = vec2(dot(conic.xy, moment_x_y), dot(conic.yz, moment_x_y));
+                my_d_conic = vec3(0.5, 1.0, 0.5) * moment_xx_xy_yy;
+                // dL/dsigma = -opacity falloff dL/dalpha below the cap.
+                my_d_opacity = -moment / opacity;
+            }
+            [[unroll]] for (uint c = 0; c < CHANNELS; c++) {
+                float sum = subgroupAdd(d_color[c]);
+                if (lane == j) my_d_color[c] = sum;
             }
         }
         if (lane < batch) {
-            for (uint k = 0; k < 6; k++) records[RECORD * slot + k] = my_d_splat[k];
-            for (uint c = 0; c < CHANNELS; c++) records[RECORD * slot + 6 + c] = my_d_color[c];
+            uint at = RECORD * slot;
+            records[at] = my_d_mean2d.x;
+            records[at + 1] = my_d_mean2d.y;
+            records[at + 2] = my_d_conic.x;
+            records[at + 3] = my_d_conic.y;
+            records[at + 4] = my_d_conic.z;
+            records[at + 5] = my_d_opacity;
+            [[unroll]] for (uint c = 0; c < CHANNELS; c++) records[at + 6 + c] = my_d_color[c];
         }
+    }
+    // Behind a tile that is done every gradient is zero.
+    for (uint i = first + lane; i < range.y; i += SUBGROUP_SIZE) {
+        uint at = RECORD * sorted_slots[i];
+        [[unroll]] for (uint k = 0; k < RECORD; k++) records[at + k] = 0.0;
     }
 }

@@ -8,8 +8,8 @@ layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 //! Blend forward: one subgroup owns a tile and composites its splats front to back.
 //!
 //! C = sum_i c_i alpha_i T_i + T background, T_i = prod_{j < i} (1 - alpha_j). Each lane loads one splat of a batch and
-//! finds the groups of pixels that its ellipse meets; the batch is then broadcast splat by splat, and only those groups
-//! are touched. The tile's state lives in shared memory, but every lane only ever touches its own pixels: no barrier.
+//! finds the groups of pixels that its ellipse meets; the batch is then broadcast splat by splat. The tile's state stays
+//! in registers: no shared memory, no barrier.
 
 layout(local_size_x_id = 100) in;
 
@@ -23,74 +23,68 @@ layout(binding = 4) readonly  buffer Colors     { float colors[]; };
 layout(binding = 5) writeonly buffer Render     { float render[]; };  // (CHANNELS, H, W)
 layout(binding = 6) writeonly buffer Transmittances { float transmittances[]; };  // (H, W)
 
-// Negative once the pixel is done; the magnitude is the transmittance.
-shared float transmittance[TILE_PIXELS];
-shared float color[CHANNELS * TILE_PIXELS];
-
 void main() {
     uint tile = WORKGROUP_INDEX;
     uint lane = gl_SubgroupInvocationID;
     uvec2 origin = uvec2(tile % tile_columns * TILE_WIDTH, tile / tile_columns * TILE_HEIGHT);
     if (origin.y >= size.y) return;
-    for (uint p = lane; p < TILE_PIXELS; p += SUBGROUP_SIZE) {
-        uvec2 pixel = origin + uvec2(p % TILE_WIDTH, p / TILE_WIDTH);
+    uvec2 first_pixel = origin + lane_pixel();
+
+    // Negative once the pixel is done; the magnitude is the transmittance.
+    float transmittance[GROUPS];
+    float color[GROUPS][CHANNELS];
+    [[unroll]] for (uint g = 0; g < GROUPS; g++) {
         // A pixel outside the image is done from the start.
-        transmittance[p] = all(lessThan(pixel, size)) ? 1.0 : -1.0;
-        for (uint c = 0; c < CHANNELS; c++) color[c * TILE_PIXELS + p] = 0.0;
+        transmittance[g] = all(lessThan(first_pixel + group_offset(g), size)) ? 1.0 : -1.0;
+        [[unroll]] for (uint c = 0; c < CHANNELS; c++) color[g][c] = 0.0;
     }
 
     uvec2 range = tile_ranges[tile];
-    uint alive = 0xffffffffu >> (32 - GROUPS);
-    for (uint first = range.x; first < range.y && alive != 0; first += SUBGROUP_SIZE) {
+    for (uint first = range.x; first < range.y; first += SUBGROUP_SIZE) {
+        bool alive = false;
+        [[unroll]] for (uint g = 0; g < GROUPS; g++) alive = alive || transmittance[g] > 0.0;
+        if (!subgroupAny(alive)) break;
+
         uint batch = min(SUBGROUP_SIZE, range.y - first);
         // Lanes beyond the batch load its last splat and are never broadcast.
         uint id = owners[sorted_slots[first + min(lane, batch - 1)]];
         ProjectedSplat mine = splats[id];
         float my_color[CHANNELS];
-        for (uint c = 0; c < CHANNELS; c++) my_color[c] = colors[CHANNELS * id + c];
+        [[unroll]] for (uint c = 0; c < CHANNELS; c++) my_color[c] = colors[CHANNELS * id + c];
         uint my_groups = splat_groups(mine, origin);
 
         for (uint j = 0; j < batch; j++) {
-            uint groups = subgroupShuffle(my_groups, j) & alive;
-            if (groups == 0) continue;
-            vec2 mean2d = subgroupShuffle(mine.mean2d, j);
-            vec3 conic = subgroupShuffle(mine.conic, j);
-            float opacity = subgroupShuffle(mine.opacity, j);
+            uint groups = subgroupBroadcast(my_groups, j);
+            vec2 d = subgroupBroadcast(mine.mean2d, j) - (vec2(first_pixel) + 0.5);
+            vec3 conic = subgroupBroadcast(mine.conic, j);
+            float opacity = subgroupBroadcast(mine.opacity, j);
             float splat_color[CHANNELS];
-            for (uint c = 0; c < CHANNELS; c++) splat_color[c] = subgroupShuffle(my_color[c], j);
-            for (; groups != 0; groups &= groups - 1) {
-                uint p = findLSB(groups) * SUBGROUP_SIZE + lane;
-                vec2 d = mean2d - (vec2(origin + uvec2(p % TILE_WIDTH, p / TILE_WIDTH)) + 0.5);
-                float sigma = splat_sigma(conic, d);
+            [[unroll]] for (uint c = 0; c < CHANNELS; c++) splat_color[c] = subgroupBroadcast(my_color[c], j);
+
+            [[unroll]] for (uint g = 0; g < GROUPS; g++) {
+                if (SKIPS_GROUPS && (groups >> g & 1) == 0) continue;
+                float sigma = splat_sigma(conic, d - vec2(group_offset(g)));
                 float alpha = min(ALPHA_MAX, opacity * exp(-sigma));
-                float before = transmittance[p];
+                float before = transmittance[g];
                 if (sigma >= 0.0 && alpha >= ALPHA_MIN && before > 0.0) {
                     float after = before * (1.0 - alpha);
-                    if (after < TRANSMITTANCE_MIN) {
-                        transmittance[p] = -before;
-                    } else {
-                        transmittance[p] = after;
-                        for (uint c = 0; c < CHANNELS; c++) {
-                            color[c * TILE_PIXELS + p] += alpha * before * splat_color[c];
-                        }
-                    }
+                    bool is_done = after < TRANSMITTANCE_MIN;
+                    transmittance[g] = is_done ? -before : after;
+                    float weight = is_done ? 0.0 : alpha * before;
+                    [[unroll]] for (uint c = 0; c < CHANNELS; c++) color[g][c] += weight * splat_color[c];
                 }
             }
         }
-        for (uint groups = alive; groups != 0; groups &= groups - 1) {
-            uint group = findLSB(groups);
-            if (subgroupAll(transmittance[group * SUBGROUP_SIZE + lane] < 0.0)) alive &= ~(1u << group);
-        }
     }
 
-    for (uint p = lane; p < TILE_PIXELS; p += SUBGROUP_SIZE) {
-        uvec2 pixel = origin + uvec2(p % TILE_WIDTH, p / TILE_WIDTH);
+    [[unroll]] for (uint g = 0; g < GROUPS; g++) {
+        uvec2 pixel = first_pixel + group_offset(g);
         if (all(lessThan(pixel, size))) {
             uint at = pixel.y * size.x + pixel.x;
-            float last = abs(transmittance[p]);
+            float last = abs(transmittance[g]);
             transmittances[at] = last;
-            for (uint c = 0; c < CHANNELS; c++) {
-                render[c * size.x * size.y + at] = color[c * TILE_PIXELS + p] + last * background[c];
+            [[unroll]] for (uint c = 0; c < CHANNELS; c++) {
+                render[c * size.x * size.y + at] = color[g][c] + last * background[c];
             }
         }
     }

@@ -8,7 +8,7 @@
 
 layout(local_size_x = 1) in;
 
-layout(push_constant) uniform Params { uint gaussian_count; uint capacity; };
+layout(push_constant) uniform Params { uint capacity; };
 
 layout(binding = 0) readonly buffer Total  { uint total[]; };   // [0]: intersections of all Gaussians
 layout(binding = 1) writeonly buffer Counts { uint counts[]; }; // [0]: intersections to blend

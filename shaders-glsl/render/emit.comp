@@ -25,9 +25,10 @@ const uint NO_TILE = 0xffffffffu;
 
 void main() {
     uint rank = THREAD_INDEX;
-    if (rank >= gaussian_count || counts[0] == 0) return;
+    if (rank >= gaussian_count) return;
+    // No slot beyond those that were counted is ever written, not even where the sum of all counts wrapped around.
     uint end = offsets[rank] + ordered_counts[rank];
-    if (end == offsets[rank]) return;
+    if (end == offsets[rank] || end > counts[0]) return;
     uint id = sorted_ids[rank];
     ProjectedSplat splat = splats[id];
     uint slot = offsets[rank];

@@ -25,8 +25,8 @@ void main() {
     if (rank >= gaussian_count) return;
     float sum[RECORD];
     for (uint k = 0; k < RECORD; k++) sum[k] = 0.0;
-    if (counts[0] != 0) {
-        uint end = offsets[rank] + ordered_counts[rank];
+    uint end = offsets[rank] + ordered_counts[rank];
+    if (end <= counts[0]) {
         for (uint slot = offsets[rank]; slot < end; slot++) {
             for (uint k = 0; k < RECORD; k++) sum[k] += records[RECORD * slot + k];
         }

@@ -3,45 +3,111 @@
 use std::io::Write;
 
 use anyhow::Result;
+use serde::Serialize;
 
 use crate::Error;
 use crate::gpu::{DeviceReport, devices};
 
 /// List the Vulkan devices, what training requires, and whether each device offers it.
 #[derive(Clone, Copy, Debug, clap::Args)]
-pub struct DoctorArgs {}
+pub struct DoctorArgs {
+    /// Print the list as JSON.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// What `--json` prints.
+#[derive(Serialize)]
+struct Output<'a> {
+    devices: &'a [DeviceReport],
+    /// Index of the device that is used unless `--device` picks another.
+    chosen: Option<usize>,
+}
 
 /// Prints the report.
 ///
 /// # Errors
-/// There is no Vulkan, or no device that meets every requirement.
-pub fn run(_: &DoctorArgs) -> Result<()> {
-    let reports = devices()?;
-    let mut out = std::io::stdout().lock();
-    for (index, report) in reports.iter().enumerate() {
-        let DeviceReport { name, kind, api_version, subgroup_size, memory, requirements } = report;
-        let gib = *memory as f64 / f64::from(1 << 30);
-        writeln!(
-            out,
-            "{index}  {name}\n   {kind}, Vulkan {api_version}, subgroups of {subgroup_size}, {gib:.1} GiB"
-        )?;
-        let width = requirements.iter().map(|(name, ..)| name.len()).max().unwrap_or(0);
-        for (requirement, why, met) in requirements {
-            let met = if *met { "yes" } else { "no" };
-            writeln!(out, "   {met:3}  {requirement:width$}  {why}")?;
+/// There is no Vulkan, or no device that meets every requirement (which is printed nevertheless).
+pub fn run(args: &DoctorArgs) -> Result<()> {
+    let devices = devices()?;
+    let chosen = chosen(&devices);
+    let text = if args.json {
+        serde_json::to_string_pretty(&Output { devices: &devices, chosen })?
+    } else {
+        table(&devices, chosen)
+    };
+    writeln!(std::io::stdout().lock(), "{}", text.trim_end())?;
+    let lacking = devices.first().and_then(|device| Some((device.name.clone(), device.missing()?)));
+    match (chosen, lacking) {
+        (None, Some((device, feature))) => {
+            Err(Error::MissingFeature { device, feature: feature.to_owned() }.into())
         }
-        writeln!(out)?;
+        _ => Ok(()),
     }
-    if let Some(index) = reports.iter().position(|report| missing(report).is_none()) {
-        writeln!(out, "device {index} is used unless --device picks another")?;
-        return Ok(());
-    }
-    let first = reports.first().and_then(|report| Some((report.name.clone(), missing(report)?)));
-    let (device, feature) = first.unwrap_or_default();
-    Err(Error::MissingFeature { device, feature: feature.to_owned() }.into())
 }
 
-/// The first requirement that the device does not meet.
-fn missing(report: &DeviceReport) -> Option<&'static str> {
-    report.requirements.iter().find(|(.., met)| !met).map(|&(name, ..)| name)
+/// The first that lacks nothing, as [`DeviceChoice::Best`](crate::gpu::DeviceChoice::Best) has it.
+fn chosen(devices: &[DeviceReport]) -> Option<usize> {
+    devices.iter().position(|device| device.missing().is_none())
+}
+
+fn table(devices: &[DeviceReport], chosen: Option<usize>) -> String {
+    let mut text = String::new();
+    for (index, device) in devices.iter().enumerate() {
+        let DeviceReport { name, kind, api_version, subgroup_size, memory, requirements } = device;
+        let gib = *memory as f64 / f64::from(1 << 30);
+        text += &format!(
+            "{index}  {name}\n   {kind}, Vulkan {api_version}, subgroups of {subgroup_size}, {gib:.1} GiB\n"
+        );
+        let width = requirements.iter().map(|requirement| requirement.name.len()).max();
+        let width = width.unwrap_or(0);
+        for requirement in requirements {
+            let met = if requirement.met { "yes" } else { "no" };
+            text += &format!("   {met:3}  {:width$}  {}\n", requirement.name, requirement.why);
+        }
+        text += "\n";
+    }
+    match chosen {
+        Some(index) => text + &format!("device {index} is used unless --device picks another"),
+        None => text + "no device will do",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::RequirementReport;
+
+    fn device(name: &str, is_recent: bool) -> DeviceReport {
+        let requirement = |name, met| RequirementReport { name, why: "it is needed", met };
+        DeviceReport {
+            name: name.to_owned(),
+            kind: "discrete",
+            api_version: "1.3.0".to_owned(),
+            subgroup_size: 32,
+            memory: 3 << 29,
+            requirements: vec![requirement("Vulkan 1.3", true), requirement("shiny", is_recent)],
+        }
+    }
+
+    #[test]
+    fn the_first_device_that_lacks_nothing_is_chosen_and_what_others_lack_is_shown() {
+        let devices = [device("Abacus", false), device("Babbage", true), device("Curta", true)];
+        assert_eq!(chosen(&devices), Some(1));
+        let table = table(&devices, chosen(&devices));
+        assert!(
+            table.starts_with("0  Abacus\n   discrete, Vulkan 1.3.0, subgroups of 32, 1.5 GiB\n")
+        );
+        assert!(
+            table.contains("   yes  Vulkan 1.3  it is needed\n   no   shiny       it is needed\n")
+        );
+        assert!(table.ends_with("device 1 is used unless --device picks another"));
+    }
+
+    #[test]
+    fn where_no_device_will_do_none_is_chosen() {
+        let devices = [device("Abacus", false)];
+        assert_eq!(chosen(&devices), None);
+        assert!(table(&devices, None).ends_with("no device will do"));
+    }
 }

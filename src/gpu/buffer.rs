@@ -71,7 +71,7 @@ impl Gpu {
     /// # Errors
     /// The buffer exceeds the binding limit or the memory of the device.
     pub fn uninit<T: bytemuck::Pod>(&self, name: &str, len: usize) -> Result<Buffer<T>> {
-        let bytes = (len * size_of::<T>()) as u64;
+        let bytes = (len as u64).saturating_mul(size_of::<T>() as u64);
         let memory = Memory::new(&self.shared, name, bytes, MemoryLocation::GpuOnly)?;
         Ok(Buffer { memory, len, element: PhantomData })
     }

@@ -1,6 +1,6 @@
 //! Opens a device of our own, or takes one that a host application lends.
 
-use std::ffi::{CStr, c_char, c_void};
+use std::ffi::{CStr, c_void};
 use std::path::PathBuf;
 use std::str::FromStr;
 use std::sync::atomic::AtomicU64;
@@ -44,7 +44,7 @@ impl FromStr for DeviceChoice {
 }
 
 /// One device and how it meets the requirements, for `doctor`.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, serde::Serialize)]
 pub struct DeviceReport {
     /// The device's name.
     pub name: String,
@@ -56,8 +56,26 @@ pub struct DeviceReport {
     pub subgroup_size: u32,
     /// Bytes of device-local memory.
     pub memory: u64,
-    /// Each requirement's name, reason and whether the device meets it.
-    pub requirements: Vec<(&'static str, &'static str, bool)>,
+    /// Every requirement, in the order of [`REQUIREMENTS`].
+    pub requirements: Vec<RequirementReport>,
+}
+
+/// One requirement and whether a device meets it.
+#[derive(Clone, Copy, Debug, serde::Serialize)]
+pub struct RequirementReport {
+    /// The Vulkan name of the feature, extension or limit.
+    pub name: &'static str,
+    /// What it is needed for.
+    pub why: &'static str,
+    /// Whether the device meets it.
+    pub met: bool,
+}
+
+impl DeviceReport {
+    /// The first requirement that the device does not meet, by its name.
+    pub fn missing(&self) -> Option<&'static str> {
+        self.requirements.iter().find(|requirement| !requirement.met).map(|missing| missing.name)
+    }
 }
 
 /// A device that a host application lends, as raw handles, so that C++ hosts and other Vulkan bindings work.
@@ -66,9 +84,8 @@ pub struct DeviceReport {
 /// instance and queue alive for as long as the [`Gpu`] and everything made with it.
 #[derive(Clone, Copy, Debug)]
 pub struct HostDevice {
-    /// `vkGetInstanceProcAddr` of the host's loader.
-    pub get_instance_proc_addr:
-        unsafe extern "system" fn(u64, *const c_char) -> Option<unsafe extern "system" fn()>,
+    /// The address of `vkGetInstanceProcAddr` of the host's loader.
+    pub get_instance_proc_addr: *const c_void,
     /// `VkInstance`.
     pub instance: u64,
     /// `VkPhysicalDevice`.
@@ -137,7 +154,6 @@ pub fn devices() -> Result<Vec<DeviceReport>> {
     // SAFETY: no device was created from the instance.
     unsafe { owned.destroy() };
     reports
-        .and_then(|reports: Vec<_>| if reports.is_empty() { Err(no_device()) } else { Ok(reports) })
 }
 
 impl Gpu {
@@ -185,20 +201,23 @@ impl Gpu {
     /// Takes a device that the host application lends. Nothing of the host's is destroyed, changed or printed to.
     ///
     /// # Errors
-    /// The device lacks a requirement.
+    /// The device lacks a requirement, or `get_instance_proc_addr` is null.
     ///
     /// # Safety
     /// The handles are valid and stay so for as long as the `Gpu` and everything made with it; the required features
     /// and extensions are enabled; no other thread uses the queue while a `Gpu` method submits to it.
     pub unsafe fn from_host(host: HostDevice) -> Result<Self> {
-        // SAFETY: `VkInstance` is a pointer-sized handle; both function types name the same C function.
-        let static_fn = ash::StaticFn {
-            get_instance_proc_addr: unsafe {
-                std::mem::transmute::<*const c_void, vk::PFN_vkGetInstanceProcAddr>(
-                    host.get_instance_proc_addr as *const c_void,
-                )
-            },
+        // SAFETY: the caller says that the address is this function's; null becomes `None`.
+        let get_instance_proc_addr = unsafe {
+            std::mem::transmute::<*const c_void, Option<vk::PFN_vkGetInstanceProcAddr>>(
+                host.get_instance_proc_addr,
+            )
         };
+        let Some(get_instance_proc_addr) = get_instance_proc_addr else {
+            let problem = "HostDevice::get_instance_proc_addr is null: pass the host's";
+            return Err(Error::Usage(problem.to_owned()));
+        };
+        let static_fn = ash::StaticFn { get_instance_proc_addr };
         let physical = vk::PhysicalDevice::from_raw(host.physical_device);
         // SAFETY: the host's handles are valid.
         let (instance, device) = unsafe {
@@ -207,7 +226,7 @@ impl Gpu {
             (instance, device)
         };
         let offered = Offered::gather(&instance, physical).map_err(loader_error)?;
-        check(&offered)?;
+        offered.check()?;
         let queue =
             Queue { raw: vk::Queue::from_raw(host.queue), family: host.queue_family, submitted: 0 };
         Self::assemble(&instance, physical, &offered, device, queue, None)
@@ -342,6 +361,9 @@ fn instance(validate: bool) -> Result<Owned> {
 fn physical_devices(instance: &ash::Instance) -> Result<Vec<vk::PhysicalDevice>> {
     // SAFETY: the instance is live.
     let mut all = unsafe { instance.enumerate_physical_devices() }.map_err(loader_error)?;
+    if all.is_empty() {
+        return Err(no_device());
+    }
     all.sort_by_key(|&physical| {
         // SAFETY: the handle was just enumerated.
         let kind = unsafe { instance.get_physical_device_properties(physical) }.device_type;
@@ -356,12 +378,6 @@ fn physical_devices(instance: &ash::Instance) -> Result<Vec<vk::PhysicalDevice>>
     Ok(all)
 }
 
-fn device_name(properties: &vk::PhysicalDeviceProperties) -> String {
-    properties
-        .device_name_as_c_str()
-        .map_or_else(|_| "unnamed device".to_owned(), |name| name.to_string_lossy().into_owned())
-}
-
 fn choose(
     instance: &ash::Instance,
     choice: &DeviceChoice,
@@ -370,10 +386,7 @@ fn choose(
         .into_iter()
         .map(|physical| Ok((physical, Offered::gather(instance, physical).map_err(loader_error)?)))
         .collect::<Result<Vec<_>>>()?;
-    if offers.is_empty() {
-        return Err(no_device());
-    }
-    let names: Vec<_> = offers.iter().map(|(_, o)| device_name(&o.properties)).collect();
+    let names: Vec<_> = offers.iter().map(|(_, o)| o.device_name()).collect();
     let index = match choice {
         // Where none meets all requirements, the first is named with what it lacks.
         DeviceChoice::Best => {
@@ -397,15 +410,8 @@ fn choose(
             "there is no Vulkan device {wanted}; there are: {names}"
         )));
     };
-    check(&offered)?;
+    offered.check()?;
     Ok((physical, offered))
-}
-
-fn check(offered: &Offered) -> Result<()> {
-    offered.missing().map_or(Ok(()), |requirement| {
-        let device = device_name(&offered.properties);
-        Err(Error::MissingFeature { device, feature: requirement.name.to_owned() })
-    })
 }
 
 fn report(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Result<DeviceReport> {
@@ -419,7 +425,7 @@ fn report(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Result<Devi
         vk::api_version_patch(version),
     );
     Ok(DeviceReport {
-        name: device_name(&offered.properties),
+        name: offered.device_name(),
         kind: match offered.properties.device_type {
             vk::PhysicalDeviceType::DISCRETE_GPU => "discrete",
             vk::PhysicalDeviceType::INTEGRATED_GPU => "integrated",
@@ -435,7 +441,10 @@ fn report(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Result<Devi
             .filter(|heap| heap.flags.contains(vk::MemoryHeapFlags::DEVICE_LOCAL))
             .map(|heap| heap.size)
             .sum(),
-        requirements: REQUIREMENTS.iter().map(|r| (r.name, r.why, r.met_by(&offered))).collect(),
+        requirements: REQUIREMENTS
+            .iter()
+            .map(|r| RequirementReport { name: r.name, why: r.why, met: r.met_by(&offered) })
+            .collect(),
     })
 }
 
@@ -452,7 +461,7 @@ fn properties(
     let text =
         |text: Result<&CStr, _>| text.map(|t| t.to_string_lossy().into_owned()).unwrap_or_default();
     Properties {
-        name: device_name(&offered.properties),
+        name: offered.device_name(),
         driver: format!(
             "{} {}",
             text(driver.driver_name_as_c_str()),
@@ -487,7 +496,7 @@ fn create_device(
         .enabled_extension_names(&extensions)
         .push_next(&mut vulkan12)
         .push_next(&mut vulkan13);
-    let device = device_name(&offered.properties);
+    let device = offered.device_name();
     // SAFETY: `info` points at live locals; the requirements were checked.
     unsafe {
         let device = instance

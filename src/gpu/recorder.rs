@@ -5,6 +5,7 @@ use std::ffi::CString;
 use std::sync::Arc;
 
 use ash::vk;
+use ash::vk::Handle as _;
 
 use super::{Buffer, Gpu, Kernel, Pipeline, Shared};
 use crate::{Error, Result};
@@ -252,7 +253,7 @@ impl<'g> Recorder<'g> {
 }
 
 impl Gpu {
-    /// Records into a command buffer of the host application, which submits it when it likes.
+    /// Records into `commands`, a `VkCommandBuffer` of the host application, which submits it when it likes.
     ///
     /// # Errors
     /// What `record` returns.
@@ -262,9 +263,10 @@ impl Gpu {
     /// stays alive until the host's submission is done.
     pub unsafe fn record_into(
         &self,
-        commands: vk::CommandBuffer,
+        commands: u64,
         record: impl FnOnce(&mut Recorder<'_>) -> Result<()>,
     ) -> Result<()> {
+        let commands = vk::CommandBuffer::from_raw(commands);
         let mut recorder = Recorder::new(&self.shared, commands, 0, None);
         record(&mut recorder)?;
         recorder.finish();

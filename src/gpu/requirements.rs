@@ -5,6 +5,8 @@ use std::ffi::CStr;
 
 use ash::{khr, vk};
 
+use crate::{Error, Result};
+
 /// The subgroup operations that our kernels use.
 const SUBGROUP_OPERATIONS: vk::SubgroupFeatureFlags = vk::SubgroupFeatureFlags::from_raw(
     vk::SubgroupFeatureFlags::BASIC.as_raw()
@@ -199,8 +201,86 @@ impl Offered {
         })
     }
 
+    /// The device's name, as the driver gives it.
+    pub(super) fn device_name(&self) -> String {
+        let name = self.properties.device_name_as_c_str();
+        name.map_or_else(|_| "unnamed device".to_owned(), |name| name.to_string_lossy().into())
+    }
+
+    /// # Errors
+    /// The first requirement that is not met, by its name.
+    pub(super) fn check(&self) -> Result<()> {
+        self.missing().map_or(Ok(()), |requirement| {
+            let (device, feature) = (self.device_name(), requirement.name.to_owned());
+            Err(Error::MissingFeature { device, feature })
+        })
+    }
+
     /// The first requirement that is not met.
     pub(super) fn missing(&self) -> Option<&'static Requirement> {
         REQUIREMENTS.iter().find(|requirement| !requirement.met_by(self))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A device that meets every requirement, just so.
+    fn sufficient() -> Offered {
+        let mut properties = vk::PhysicalDeviceProperties::default();
+        properties.api_version = vk::API_VERSION_1_3;
+        properties.limits.max_compute_work_group_invocations = 256;
+        properties.limits.max_compute_shared_memory_size = 24_576;
+        for (to, from) in properties.device_name.iter_mut().zip(b"Abacus 3000") {
+            *to = *from as _;
+        }
+        let (vulkan12, vulkan13) = required_device_features();
+        Offered {
+            properties,
+            subgroup_size: 4,
+            subgroup_operations: SUBGROUP_OPERATIONS,
+            subgroup_stages: vk::ShaderStageFlags::COMPUTE,
+            required_subgroup_size_stages: vk::ShaderStageFlags::empty(),
+            max_push_descriptors: 16,
+            extensions: EXTENSIONS.iter().map(|name| name.to_str().unwrap().to_owned()).collect(),
+            vulkan12,
+            vulkan13,
+            compute_family: Some(0),
+        }
+    }
+
+    #[test]
+    fn each_missing_requirement_is_the_one_that_is_named() {
+        type Break = (&'static str, fn(&mut Offered));
+        let breaks: [Break; 14] = [
+            ("Vulkan 1.3", |o| o.properties.api_version = vk::API_VERSION_1_2),
+            ("compute queue", |o| o.compute_family = None),
+            ("VK_KHR_push_descriptor", |o| o.extensions.clear()),
+            ("maxPushDescriptors >= 16", |o| o.max_push_descriptors = 15),
+            ("timelineSemaphore", |o| o.vulkan12.timeline_semaphore = vk::FALSE),
+            ("scalarBlockLayout", |o| o.vulkan12.scalar_block_layout = vk::FALSE),
+            ("hostQueryReset", |o| o.vulkan12.host_query_reset = vk::FALSE),
+            ("synchronization2", |o| o.vulkan13.synchronization2 = vk::FALSE),
+            ("subgroupSizeControl", |o| o.vulkan13.subgroup_size_control = vk::FALSE),
+            ("computeFullSubgroups", |o| o.vulkan13.compute_full_subgroups = vk::FALSE),
+            ("subgroup operations", |o| o.subgroup_operations = vk::SubgroupFeatureFlags::BASIC),
+            ("subgroup size", |o| o.subgroup_size = 2),
+            ("maxComputeWorkGroupInvocations", |o| {
+                o.properties.limits.max_compute_work_group_invocations = 128;
+            }),
+            ("maxComputeSharedMemorySize", |o| {
+                o.properties.limits.max_compute_shared_memory_size = 16_384;
+            }),
+        ];
+        assert!(sufficient().check().is_ok());
+        assert_eq!(breaks.len(), REQUIREMENTS.len());
+        for (name, break_it) in breaks {
+            let mut offered = sufficient();
+            break_it(&mut offered);
+            let message = offered.check().unwrap_err().to_string();
+            assert!(message.starts_with(&format!("Abacus 3000 lacks {name}")), "{message}");
+            assert!(message.contains("nightsplat doctor") && !message.contains('\n'), "{message}");
+        }
     }
 }

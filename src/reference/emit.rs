@@ -11,13 +11,10 @@ impl Reference for Kernel {
         let Slices { counts, sorted_ids, ordered_counts, offsets, splats, tiles, slots, owners } =
             slices;
         let tile = UVec2::new(constants.tile_width, constants.tile_height);
-        if counts[0] == 0 {
-            return;
-        }
         for rank in 0..params.gaussian_count as usize {
             let first = offsets[rank] as usize;
             let reserved = ordered_counts[rank] as usize;
-            if reserved == 0 {
+            if reserved == 0 || first + reserved > counts[0] as usize {
                 continue;
             }
             let id = sorted_ids[rank];

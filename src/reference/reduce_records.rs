@@ -8,11 +8,12 @@ impl Reference for Kernel {
         for rank in 0..params.gaussian_count as usize {
             let d_splat = &mut d_splats[record * sorted_ids[rank] as usize..][..record];
             d_splat.fill(0.0);
-            if counts[0] == 0 {
+            let first = offsets[rank] as usize;
+            let end = first + ordered_counts[rank] as usize;
+            if end > counts[0] as usize {
                 continue;
             }
-            let first = offsets[rank] as usize;
-            for slot in first..first + ordered_counts[rank] as usize {
+            for slot in first..end {
                 for k in 0..record {
                     d_splat[k] += records[record * slot + k];
                 }

@@ -9,6 +9,9 @@ use crate::kernels::ProjectedSplat;
 /// Values of a gradient record: mean2d 2, conic 3, opacity 1, colour 3.
 const RECORD: usize = 9;
 
+/// The first guess of how many tiles a Gaussian meets; a view that needs more makes the memory grow.
+const TILES_PER_GAUSSIAN: u32 = 6;
+
 /// What the status words say.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Status {
@@ -96,8 +99,7 @@ impl Frame {
         })
     }
 
-    /// Lengths follow the number of Gaussians exactly; pixels and intersections only grow. A first guess gives every
-    /// Gaussian four tiles.
+    /// Lengths follow the number of Gaussians exactly; pixels only grow; intersections begin with a guess.
     pub(super) fn reserve(
         &mut self,
         gpu: &Gpu,
@@ -125,14 +127,14 @@ impl Frame {
             self.tile_ranges = gpu.uninit("tile_ranges", tiles)?;
         }
         if self.tiles.is_empty() {
-            self.reserve_intersections(gpu, 4 * count.max(1024) as u32)?;
+            self.set_intersection_capacity(gpu, TILES_PER_GAUSSIAN * count.max(1024) as u32)?;
         }
         Ok(())
     }
 
-    pub(super) fn reserve_intersections(&mut self, gpu: &Gpu, intersections: u32) -> Result<()> {
-        let capacity = intersections as usize + intersections as usize / 2;
-        if capacity > self.tiles.len() {
+    pub(super) fn set_intersection_capacity(&mut self, gpu: &Gpu, capacity: u32) -> Result<()> {
+        let capacity = capacity as usize;
+        if capacity != self.tiles.len() {
             self.tiles = gpu.uninit("tiles", capacity)?;
             self.slots = gpu.uninit("slots", capacity)?;
             self.owners = gpu.uninit("owners", capacity)?;

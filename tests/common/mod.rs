@@ -90,6 +90,7 @@ pub(crate) struct Setup {
     pub(crate) alpha_max: f32,
     pub(crate) channels: u32,
     pub(crate) tile: UVec2,
+    pub(crate) skips_groups: bool,
     pub(crate) background: [f32; 11],
 }
 
@@ -113,6 +114,7 @@ impl Setup {
             alpha_max: 0.99,
             channels: 3,
             tile: UVec2::new(16, 16),
+            skips_groups: true,
             background: std::array::from_fn(|c| 0.1 * c as f32),
         };
         setup.parameters = vec![0.0; setup.planes().len()];
@@ -183,20 +185,23 @@ impl Setup {
 pub(crate) fn variants() -> Vec<Setup> {
     type Row = (usize, [u32; 2], [u32; 2], u32, [u32; 2]);
     let rows: [Row; 7] = [
-        (0, [33, 17], [0, 0], 3, [16, 16]),
+        (0, [33, 17], [0, 0], 3, [16, 8]),
         (1, [16, 16], [0, 0], 3, [16, 16]),
         (63, [50, 37], [1, 1], 4, [16, 8]),
-        (64, [64, 48], [2, 1], 11, [16, 16]),
+        (64, [64, 48], [2, 1], 11, [16, 4]),
         (65, [65, 31], [3, 0], 3, [8, 8]),
         (65, [40, 41], [3, 2], 11, [8, 8]),
-        (1777, [131, 77], [3, 3], 3, [16, 16]),
+        (1777, [131, 77], [3, 3], 3, [16, 8]),
     ];
     let build = |(count, size, [stored, used], channels, tile): Row| {
         let mut setup = Setup::new(count, size.into(), stored, count as u64);
         setup.params.sh_degree = used;
         Setup { channels, tile: tile.into(), ..setup }
     };
-    rows.map(build).into()
+    // Once with the groups that a splat misses skipped, once with all of them taken.
+    let skipping = rows.map(build);
+    let not_skipping = skipping.clone().map(|setup| Setup { skips_groups: false, ..setup });
+    [skipping, not_skipping].concat()
 }
 
 /// The constants of a kernel that includes `splat.glsl`.
@@ -279,7 +284,7 @@ pub(crate) fn forward(setup: &Setup, capacity: Option<u32>) -> Frame {
     let (counts, status) = run_kernel!(
         check_capacity,
         check_capacity::Constants::default(),
-        check_capacity::Params { gaussian_count: n, capacity },
+        check_capacity::Params { capacity },
         Threads::Exactly([1, 1, 1]),
         [total],
         [counts, status]
@@ -312,7 +317,7 @@ pub(crate) fn forward(setup: &Setup, capacity: Option<u32>) -> Frame {
     let transmittances = vec![f32::NAN; setup.pixels()];
     let (render, transmittances) = run_kernel!(
         blend_forward,
-        constants!(blend_forward, setup),
+        constants!(blend_forward, setup, skips_groups),
         blend_params(setup),
         Threads::Workgroups([setup.tile_count(), 1, 1]),
         [tile_ranges, sorted_slots, owners, splats, colors],
@@ -394,7 +399,7 @@ pub(crate) fn backward(setup: &Setup, frame: &Frame, d_render: &[f32]) -> Gradie
     let records = vec![f32::NAN; setup.record() * owners.len()];
     let records = run_kernel!(
         blend_backward,
-        constants!(blend_backward, setup),
+        constants!(blend_backward, setup, skips_groups),
         blend_backward::Params { size: setup.params.size, tile_columns: setup.tiles().x },
         Threads::Workgroups([setup.tile_count(), 1, 1]),
         [tile_ranges, sorted_slots, owners, splats, colors, render, d_render],

@@ -18,9 +18,9 @@ use crate::tone::{ToneCurve, ToneSettings};
 
 /// The constants that the kernels of the rasteriser share.
 macro_rules! constants {
-    ($kernel:ident $(, $field:ident: $value:expr)*) => {{
-        let $crate::render::RenderSettings { max_alpha: alpha_max, tile: [tile_width, tile_height], .. } =
-            $crate::render::RenderSettings::default();
+    ($bench:expr, $kernel:ident $(, $field:ident: $value:expr)*) => {{
+        let settings = $crate::render::RenderSettings::default();
+        let ([tile_width, tile_height], alpha_max) = (settings.tile_on(&$bench.gpu), settings.max_alpha);
         $kernel::Constants { alpha_max, channels: 3, tile_width, tile_height, $($field: $value,)* }
     }};
 }

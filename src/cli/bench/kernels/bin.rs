@@ -35,7 +35,8 @@ pub(super) fn project_and_bin(
     timings: &mut Vec<Timing>,
     scene: &Scene,
 ) -> anyhow::Result<Frame> {
-    let RenderSettings { near, tile: [tile_width, tile_height], .. } = RenderSettings::default();
+    let settings = RenderSettings::default();
+    let (near, [tile_width, tile_height]) = (settings.near, settings.tile_on(&bench.gpu));
     let Scene { camera, gaussians, .. } = scene;
     let (size, n) = (UVec2::new(camera.width, camera.height), gaussians.count);
     let gaussian_count = n as u32;
@@ -58,7 +59,7 @@ pub(super) fn project_and_bin(
         bench,
         timings,
         project,
-        constants!(project, sh_degree: gaussians.sh_degree),
+        constants!(bench, project, sh_degree: gaussians.sh_degree),
         camera,
         per_gaussian,
         [parameters],
@@ -87,7 +88,7 @@ pub(super) fn project_and_bin(
         timings,
         check_capacity,
         check_capacity::Constants::default(),
-        check_capacity::Params { gaussian_count, capacity },
+        check_capacity::Params { capacity },
         Threads::Exactly([1, 1, 1]),
         [total],
         [counts: Exact, status: Exact]
@@ -97,7 +98,7 @@ pub(super) fn project_and_bin(
         bench,
         timings,
         emit,
-        constants!(emit),
+        constants!(bench, emit),
         emit::Params { size, gaussian_count, tile_columns },
         per_gaussian,
         [counts, sorted_ids, ordered_counts, offsets, splats],

@@ -13,6 +13,7 @@ use crate::kernels::*;
 use crate::loss::strip;
 use crate::optimizer::Schedule;
 use crate::random::Stream;
+use crate::render::skips_groups;
 use crate::tone::ToneCurve;
 
 /// # Errors
@@ -35,7 +36,7 @@ pub(super) fn blend_and_back(
         bench,
         timings,
         blend_forward,
-        constants!(blend_forward),
+        constants!(bench, blend_forward, skips_groups: skips_groups(&bench.gpu)),
         blend_forward::Params { size, tile_columns, background: [0.0; 11] },
         per_tile,
         [tile_ranges, sorted_slots, owners, splats, colors],
@@ -47,7 +48,7 @@ pub(super) fn blend_and_back(
         bench,
         timings,
         blend_backward,
-        constants!(blend_backward),
+        constants!(bench, blend_backward, skips_groups: skips_groups(&bench.gpu)),
         blend_backward::Params { size, tile_columns },
         per_tile,
         [tile_ranges, sorted_slots, owners, splats, colors, render, d_render],
@@ -60,7 +61,7 @@ pub(super) fn blend_and_back(
         bench,
         timings,
         reduce_records,
-        constants!(reduce_records),
+        constants!(bench, reduce_records),
         reduce_records::Params { gaussian_count },
         per_gaussian,
         [counts, sorted_ids, ordered_counts, offsets, records],
@@ -75,7 +76,7 @@ pub(super) fn blend_and_back(
         bench,
         timings,
         project_backward,
-        constants!(project_backward, sh_degree: scene.gaussians.sh_degree),
+        constants!(bench, project_backward, sh_degree: scene.gaussians.sh_degree),
         project_backward::Params {
             view_from_world: camera.view_from_world,
             focal: camera.focal,

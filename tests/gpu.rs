@@ -1,0 +1,268 @@
+//! The device layer: choosing a device, buffers at their limits, and every way to launch work.
+
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
+use glam::UVec2;
+use nightsplat::Error;
+use nightsplat::gpu::testing::{assert_no_validation_messages, gpu};
+use nightsplat::gpu::{Buffer, DeviceChoice, Gpu, Pipeline, Threads, devices};
+use nightsplat::kernels::{blend_forward, order_counts};
+
+/// Threads of a workgroup of `order_counts`.
+const WORKGROUP: usize = 256;
+
+fn order_counts_pipeline() -> Pipeline<order_counts::Kernel> {
+    gpu().pipeline(&order_counts::Constants::default()).unwrap()
+}
+
+/// Copies `tile_counts` to a buffer of zeros by way of `order_counts`, in reverse, with so many threads.
+fn reverse(tile_counts: &[u32], threads: Threads<'_>) -> Vec<u32> {
+    let (gpu, pipeline) = (gpu(), order_counts_pipeline());
+    let gaussian_count = tile_counts.len() as u32;
+    let sorted_ids: Vec<u32> = (0..gaussian_count).rev().collect();
+    let sorted_ids = gpu.buffer("sorted_ids", &sorted_ids).unwrap();
+    let tile_counts = gpu.buffer("tile_counts", tile_counts).unwrap();
+    let mut ordered_counts = gpu.zeros("ordered_counts", tile_counts.len()).unwrap();
+    gpu.run("reverse", |pass| {
+        let buffers = order_counts::Buffers {
+            sorted_ids: &sorted_ids,
+            tile_counts: &tile_counts,
+            ordered_counts: &mut ordered_counts,
+        };
+        pass.dispatch(&pipeline, &order_counts::Params { gaussian_count }, buffers, threads)
+    })
+    .unwrap();
+    gpu.read(&ordered_counts).unwrap()
+}
+
+// ---------------------------------------------------------------------------
+// Devices
+
+#[test]
+fn a_device_that_is_not_there_is_answered_with_those_that_are() {
+    let all = devices().unwrap();
+    let choices = ["no such device", "99"].map(|text| text.parse::<DeviceChoice>().unwrap());
+    assert_eq!(choices[1], DeviceChoice::Index(99));
+    for choice in choices {
+        let error = Gpu::new(&choice).unwrap_err();
+        let message = error.to_string();
+        let wanted =
+            if choice == DeviceChoice::Index(99) { "number 99" } else { "`no such device`" };
+        assert!(matches!(error, Error::NoDevice(_)) && message.contains(wanted), "{message}");
+        assert!(all.iter().all(|device| message.contains(&device.name)), "{message}");
+        assert!(!message.contains('\n'), "{message}");
+    }
+}
+
+#[test]
+fn a_device_is_found_by_a_part_of_its_name_in_any_case() {
+    let name = gpu().properties().name.clone();
+    let part = name[..name.len() / 2].to_uppercase();
+    let found = Gpu::new(&DeviceChoice::Name(part)).unwrap();
+    assert_eq!(found.properties().name, name);
+}
+
+// ---------------------------------------------------------------------------
+// Buffers
+
+#[test]
+fn a_buffer_of_no_elements_can_be_used_like_any_other() {
+    let gpu = gpu();
+    let mut empty: Buffer<u32> = gpu.zeros("empty", 0).unwrap();
+    let mut other: Buffer<u32> = gpu.buffer("other", &[]).unwrap();
+    assert!(empty.is_empty() && empty.len() == 0);
+    gpu.write(&mut empty, &[]).unwrap();
+    gpu.run("empty", |pass| {
+        pass.fill(&mut empty, 7);
+        pass.copy(&empty, &mut other);
+        Ok(())
+    })
+    .unwrap();
+    assert!(gpu.read(&other).unwrap().is_empty());
+    assert!(reverse(&[], Threads::Exactly([0, 1, 1])).is_empty());
+    assert!(reverse(&[], Threads::Exactly([1, 1, 1])).is_empty());
+    assert_no_validation_messages();
+}
+
+#[test]
+fn a_buffer_beyond_the_limit_is_named_with_the_limit() {
+    let gpu = gpu();
+    let limit = gpu.properties().max_storage_buffer_range;
+    for len in [limit as usize / 4 + 1, usize::MAX] {
+        let error = gpu.uninit::<u32>("monster", len).unwrap_err();
+        assert!(matches!(error, Error::BufferTooLarge { .. }), "{error}");
+        let message = error.to_string();
+        assert!(message.contains("`monster`") && message.contains(&limit.to_string()), "{message}");
+    }
+}
+
+#[test]
+fn a_write_longer_than_the_buffer_is_refused_and_changes_nothing() {
+    let gpu = gpu();
+    let mut buffer = gpu.buffer("short", &[1u32, 2, 3]).unwrap();
+    let message = gpu.write(&mut buffer, &[9; 4]).unwrap_err().to_string();
+    assert!(message.contains("`short`") && message.contains('3') && message.contains('4'));
+    assert_eq!(gpu.read(&buffer).unwrap(), [1, 2, 3]);
+    gpu.write(&mut buffer, &[9; 2]).unwrap();
+    assert_eq!(gpu.read(&buffer).unwrap(), [9, 9, 3]);
+    assert_no_validation_messages();
+}
+
+#[test]
+fn a_buffer_dropped_in_flight_lives_until_its_work_is_done() {
+    const LEN: usize = 1 << 20;
+    let gpu = gpu();
+    let mut result: Buffer<u32> = gpu.zeros("result", LEN).unwrap();
+    let mut doomed: Buffer<u32> = gpu.uninit("doomed", LEN).unwrap();
+    let submission = gpu
+        .submit("in flight", |pass| {
+            // Each waits for the one before: plenty of time to drop the buffer too early.
+            for word in 1..=50 {
+                pass.fill(&mut doomed, word);
+                pass.copy(&doomed, &mut result);
+            }
+            Ok(())
+        })
+        .unwrap();
+    drop(doomed);
+    // Memory freed too early would be handed out again here.
+    let newcomer = gpu.buffer("newcomer", &vec![77u32; LEN]).unwrap();
+    submission.wait().unwrap();
+    assert!(gpu.read(&result).unwrap().iter().all(|&word| word == 50));
+    assert!(gpu.read(&newcomer).unwrap().iter().all(|&word| word == 77));
+    assert_no_validation_messages();
+}
+
+#[test]
+fn what_a_failed_recording_drops_does_no_harm() {
+    let gpu = gpu();
+    let mut kept = gpu.buffer("kept", &[1u32, 2, 3]).unwrap();
+    let mut dropped: Buffer<u32> = gpu.zeros("dropped", 3).unwrap();
+    let failed = gpu.run("fails", |pass| {
+        pass.fill(&mut kept, 9);
+        pass.copy(&kept, &mut dropped);
+        drop(dropped);
+        Err(Error::Usage("enough".to_owned()))
+    });
+    assert_eq!(failed.unwrap_err().to_string(), "enough");
+    assert_eq!(gpu.read(&kept).unwrap(), [1, 2, 3]);
+    assert_no_validation_messages();
+}
+
+// ---------------------------------------------------------------------------
+// Launching
+
+#[test]
+fn order_counts_runs_on_as_many_threads_as_the_extent_asks_for() {
+    for count in [1, WORKGROUP - 1, WORKGROUP, WORKGROUP + 1, 10_007] {
+        let tile_counts: Vec<u32> = (1..=count as u32).collect();
+        let reversed: Vec<u32> = tile_counts.iter().copied().rev().collect();
+        assert_eq!(reverse(&tile_counts, Threads::Exactly([count as u32, 1, 1])), reversed);
+    }
+    assert_no_validation_messages();
+}
+
+#[test]
+fn an_indirect_dispatch_runs_the_workgroups_that_the_buffer_says() {
+    let gpu = gpu();
+    let tile_counts: Vec<u32> = (1..=1000).collect();
+    for (groups, threads) in [([2, 1, 1], 2 * WORKGROUP), ([1, 3, 1], 3 * WORKGROUP), ([0; 3], 0)] {
+        let arguments = gpu.buffer("arguments", &[groups, [1000; 3]]).unwrap();
+        let mut expected: Vec<u32> = tile_counts.iter().copied().rev().collect();
+        expected[threads..].fill(0);
+        assert_eq!(reverse(&tile_counts, Threads::Indirect(&arguments)), expected);
+    }
+    assert_no_validation_messages();
+}
+
+#[test]
+fn more_workgroups_than_fit_along_x_are_folded_and_none_is_lost() {
+    // Tiles of one subgroup without splats: what a workgroup costs is next to nothing.
+    const COLUMNS: u32 = 300;
+    let gpu = gpu();
+    let lanes = gpu.properties().subgroup_size;
+    let rows = gpu.properties().max_workgroups.min(65_535) / COLUMNS + 3;
+    assert!(rows * COLUMNS > 65_535);
+    let size = UVec2::new(lanes * COLUMNS, rows);
+    let constants = blend_forward::Constants {
+        channels: 3,
+        tile_width: lanes,
+        tile_height: 1,
+        ..blend_forward::Constants::default()
+    };
+    let pipeline = gpu.pipeline::<blend_forward::Kernel>(&constants).unwrap();
+    let mut background = [0.0; 11];
+    background[..3].copy_from_slice(&[0.25, 0.5, 0.75]);
+    let params = blend_forward::Params { size, tile_columns: COLUMNS, background };
+    let pixels = size.element_product() as usize;
+    let tile_ranges = gpu.zeros("tile_ranges", (rows * COLUMNS) as usize).unwrap();
+    let (sorted_slots, owners) =
+        (gpu.zeros("sorted_slots", 0).unwrap(), gpu.zeros("owners", 0).unwrap());
+    let (splats, colors) = (gpu.zeros("splats", 0).unwrap(), gpu.zeros("colors", 0).unwrap());
+    let mut render = gpu.zeros("render", 3 * pixels).unwrap();
+    let mut transmittances = gpu.zeros("transmittances", pixels).unwrap();
+    gpu.run("fold", |pass| {
+        let buffers = blend_forward::Buffers {
+            tile_ranges: &tile_ranges,
+            sorted_slots: &sorted_slots,
+            owners: &owners,
+            splats: &splats,
+            colors: &colors,
+            render: &mut render,
+            transmittances: &mut transmittances,
+        };
+        pass.dispatch(&pipeline, &params, buffers, Threads::Workgroups([rows * COLUMNS, 1, 1]))
+    })
+    .unwrap();
+    let render = gpu.read(&render).unwrap();
+    for (plane, value) in render.chunks(pixels).zip([0.25, 0.5, 0.75]) {
+        assert_eq!(plane.iter().position(|&pixel| pixel != value), None);
+    }
+    assert_no_validation_messages();
+}
+
+#[test]
+fn workgroups_that_cannot_be_folded_are_refused_by_the_name_of_the_pass() {
+    let gpu = gpu();
+    let too_many = gpu.properties().max_workgroups + 1;
+    let mut buffer = gpu.zeros("buffer", 1).unwrap();
+    let (ids, counts) = (gpu.zeros("ids", 1).unwrap(), gpu.zeros("counts", 1).unwrap());
+    let pipeline = order_counts_pipeline();
+    let refused = gpu.run("refused", |pass| {
+        let buffers = order_counts::Buffers {
+            sorted_ids: &ids,
+            tile_counts: &counts,
+            ordered_counts: &mut buffer,
+        };
+        let params = order_counts::Params { gaussian_count: 1 };
+        pass.dispatch(&pipeline, &params, buffers, Threads::Workgroups([too_many, 2, 1]))
+    });
+    let message = refused.unwrap_err().to_string();
+    assert!(message.contains("order_counts") && message.contains("workgroups"), "{message}");
+    assert_no_validation_messages();
+}
+
+#[test]
+fn a_profile_names_each_pass_and_its_time_in_order() {
+    let gpu = gpu();
+    let (mut a, mut b) = (gpu.zeros("a", 5000).unwrap(), gpu.zeros("b", 5000).unwrap());
+    let ids = gpu.zeros("ids", 5000).unwrap();
+    let pipeline = order_counts_pipeline();
+    let params = order_counts::Params { gaussian_count: 5000 };
+    let threads = Threads::Exactly([5000, 1, 1]);
+    let times = gpu
+        .profile("two passes", |pass| {
+            let buffers =
+                order_counts::Buffers { sorted_ids: &ids, tile_counts: &a, ordered_counts: &mut b };
+            pass.dispatch(&pipeline, &params, buffers, threads)?;
+            let buffers =
+                order_counts::Buffers { sorted_ids: &ids, tile_counts: &b, ordered_counts: &mut a };
+            pass.dispatch(&pipeline, &params, buffers, threads)
+        })
+        .unwrap();
+    let names: Vec<_> = times.iter().map(|time| time.name).collect();
+    assert_eq!(names, ["order_counts", "order_counts"]);
+    let total: f64 = times.iter().map(|time| time.milliseconds).sum();
+    assert!(times.iter().all(|time| time.milliseconds >= 0.0) && total > 0.0 && total < 10_000.0);
+    assert_no_validation_messages();
+}
