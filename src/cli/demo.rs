@@ -37,7 +37,7 @@ pub struct DemoArgs {
 const CURVES: [ToneCurve; 3] = [ToneCurve::Linear, ToneCurve::Ase, ToneCurve::Ap3];
 
 /// Enough for a clear picture, few enough for two processor cores.
-const STEPS: u64 = 500;
+const STEPS: u64 = 400;
 
 /// Marks a folder as ours to overwrite.
 const MARK: &str = ".nightsplat-demo";
@@ -59,7 +59,8 @@ struct Run {
 pub fn run(args: &DemoArgs) -> Result<()> {
     let gpu = Gpu::new(&args.device.clone().unwrap_or_default())?;
     claim(&args.out)?;
-    let folder = args.out.join("dataset");
+    // Absolute, so that the runs can be evaluated from anywhere.
+    let folder = std::path::absolute(args.out.join("dataset"))?;
     synthetic::write(&folder, &SyntheticOptions::default())?;
     let dataset = Dataset::load(&folder, &TrainConfig::default().load_options())?;
     let mut runs = vec![];
