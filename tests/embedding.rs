@@ -115,9 +115,13 @@ fn render_into(host: &Host, gpu: &Gpu, memory: &mut Memory) {
     // A renderer of its own, so that no earlier render can pass for this one.
     let mut renderer = renderer(gpu);
     host.submit(|commands| {
-        let record = |pass: &mut _| renderer.forward(pass, &parameters, &camera(), &OPTIONS);
         // SAFETY: the command buffer is recording; what it uses lives until the host has waited for it.
-        unsafe { gpu.record_into(commands.as_raw(), record) }.unwrap();
+        let recorded = unsafe {
+            gpu.record_into(commands.as_raw(), |pass| {
+                renderer.forward(pass, &parameters, &camera(), &OPTIONS)
+            })
+        };
+        recorded.unwrap();
         let region = [vk::BufferCopy { size: memory.size(), ..Default::default() }];
         let render = vk::Buffer::from_raw(renderer.render().handle().as_raw());
         // SAFETY: both buffers are live and hold `size` bytes.
