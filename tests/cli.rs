@@ -524,7 +524,7 @@ fn a_configuration_with_an_unknown_key_names_it() {
         Path::new(&fixture().set()),
         &arguments,
         1,
-        &["config.toml", "stepz", "(line "],
+        &["config.toml", "stepz", "(line 2)"],
     );
 }
 
