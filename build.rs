@@ -282,7 +282,7 @@ impl Kernel {
     }
 }
 
-/// SpecId to the bits of the default value, read off the module's words (the reflection does not tell).
+/// `SpecId` to the bits of the default value, read off the module's words (the reflection does not tell).
 fn spec_constant_defaults(spirv: &[u32]) -> BTreeMap<u32, u32> {
     const OP_SPEC_CONSTANT_TRUE: u32 = 48;
     const OP_SPEC_CONSTANT_FALSE: u32 = 49;
@@ -410,7 +410,8 @@ impl Constant {
         match self.ty.as_str() {
             "f32" => format!("f32::from_bits({:#x})", self.default),
             "bool" => format!("{}", self.default != 0),
-            ty => format!("{}u32 as {ty}", self.default),
+            "i32" => format!("{}", self.default as i32),
+            _ => format!("{}", self.default),
         }
     }
 

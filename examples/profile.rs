@@ -1,31 +1,51 @@
-use nightsplat::{dataset::*, gpu::*, train::*};
-fn main() {
-    let a: Vec<String> = std::env::args().collect();
-    let steps: u64 = a[3].parse().unwrap();
-    let config =
-        TrainConfig { downscale: a[2].parse().unwrap(), steps: steps + 100, ..Default::default() };
-    let gpu = Gpu::new(&DeviceChoice::Best).unwrap();
-    let d = Dataset::load(&a[1], &config.load_options()).unwrap();
-    let mut t = Trainer::new(&gpu, config, &d).unwrap();
-    while t.steps_done() < steps {
-        t.advance(steps).unwrap();
+//! Where the time of a training step goes: `cargo run --release --example profile -- DATASET DOWNSCALE STEPS`.
+//!
+//! Trains for so many steps, then prints each kernel's milliseconds, the median of nine steps.
+
+use std::io::Write;
+
+use nightsplat::dataset::Dataset;
+use nightsplat::gpu::{DeviceChoice, Gpu, PassTime};
+use nightsplat::train::{TrainConfig, Trainer};
+
+/// Steps that are measured.
+const REPEATS: u64 = 9;
+
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let [path, downscale, steps] = arguments.as_slice() else {
+        return Err("usage: profile DATASET DOWNSCALE STEPS".into());
+    };
+    let steps: u64 = steps.parse()?;
+    let config = TrainConfig {
+        downscale: downscale.parse()?,
+        steps: steps + REPEATS,
+        ..TrainConfig::default()
+    };
+    let gpu = Gpu::new(&DeviceChoice::Best)?;
+    let dataset = Dataset::load(path, &config.load_options())?;
+    let mut trainer = Trainer::new(&gpu, config, &dataset)?;
+    while trainer.steps_done() < steps {
+        trainer.advance(steps)?;
     }
-    let mut all: Vec<Vec<PassTime>> = (0..9).map(|_| t.profile_step().unwrap()).collect();
-    let n = all[0].len();
-    let mut total = 0.0;
-    let mut agg: Vec<(&str, f64)> = vec![];
-    for i in 0..n {
-        let mut v: Vec<f64> = all.iter().map(|x| x[i].milliseconds).collect();
-        v.sort_by(f64::total_cmp);
-        total += v[4];
-        match agg.iter_mut().find(|x| x.0 == all[0][i].name) {
-            Some(x) => x.1 += v[4],
-            None => agg.push((all[0][i].name, v[4])),
+    let repeats: Vec<Vec<PassTime>> =
+        (0..REPEATS).map(|_| trainer.profile_step()).collect::<Result<_, _>>()?;
+
+    let mut kernels: Vec<(&str, f64)> = vec![];
+    for (i, pass) in repeats[0].iter().enumerate() {
+        let mut times: Vec<f64> = repeats.iter().map(|passes| passes[i].milliseconds).collect();
+        times.sort_by(f64::total_cmp);
+        let median = times[times.len() / 2];
+        match kernels.iter_mut().find(|(name, _)| *name == pass.name) {
+            Some((_, sum)) => *sum += median,
+            None => kernels.push((pass.name, median)),
         }
     }
-    for (n, m) in agg {
-        println!("{n:24} {m:8.3}");
+    let mut out = std::io::stdout().lock();
+    for (name, milliseconds) in &kernels {
+        writeln!(out, "{name:24} {milliseconds:8.3}")?;
     }
-    println!("{} gaussians, total {total:.2}", t.gaussian_count());
-    all.clear();
+    let total: f64 = kernels.iter().map(|(_, milliseconds)| milliseconds).sum();
+    writeln!(out, "{total:.2} ms with {} Gaussians", trainer.gaussian_count())?;
+    Ok(())
 }

@@ -312,6 +312,7 @@ impl Renderer {
     ///
     /// # Errors
     /// A pass exceeds what the device launches.
+    #[expect(clippy::too_many_arguments, reason = "what the forward pass takes, and its gradient")]
     pub fn backward(
         &mut self,
         pass: &mut Recorder<'_>,

@@ -67,8 +67,10 @@ fn evaluate(
 
 /// The first mismatches, so that a failure shows its pattern.
 fn assert_close(what: &str, actual: &[f32], expected: &[f32], tolerance: f32) {
+    // Positive phrasing: a NaN is a mismatch.
+    let is_close = |i: usize| (actual[i] - expected[i]).abs() <= tolerance;
     let bad: Vec<_> = (0..expected.len())
-        .filter(|&i| !((actual[i] - expected[i]).abs() <= tolerance))
+        .filter(|&i| !is_close(i))
         .map(|i| (i, actual[i], expected[i]))
         .take(10)
         .collect();

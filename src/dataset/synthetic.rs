@@ -36,7 +36,7 @@ const TEST_EVERY: usize = 8;
 const NOISE_STREAM: u64 = 1;
 const POINT_STREAM: u64 = 2;
 
-/// What [`write`] makes.
+/// What [`write()`] makes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SyntheticOptions {
     /// Photographs, at least 2; every 8th is for testing.

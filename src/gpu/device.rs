@@ -310,8 +310,8 @@ fn entry() -> Result<ash::Entry> {
 }
 
 fn validation_is_installed() -> bool {
-    // SAFETY: no preconditions.
     let layers = entry().and_then(|entry| {
+        // SAFETY: no preconditions.
         unsafe { entry.enumerate_instance_layer_properties() }.map_err(loader_error)
     });
     layers.is_ok_and(|layers| {

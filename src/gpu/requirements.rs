@@ -228,8 +228,8 @@ mod tests {
 
     /// A device that meets every requirement, just so.
     fn sufficient() -> Offered {
-        let mut properties = vk::PhysicalDeviceProperties::default();
-        properties.api_version = vk::API_VERSION_1_3;
+        let mut properties =
+            vk::PhysicalDeviceProperties { api_version: vk::API_VERSION_1_3, ..Default::default() };
         properties.limits.max_compute_work_group_invocations = 256;
         properties.limits.max_compute_shared_memory_size = 24_576;
         for (to, from) in properties.device_name.iter_mut().zip(b"Abacus 3000") {

@@ -27,12 +27,10 @@ impl Reference for Kernel {
             };
             let fate = if !is_finite || !is_visible {
                 PRUNE
-            } else if !(mean_gradient > params.gradient_threshold) {
-                KEEP
-            } else if largest > params.split_log_scale {
-                SPLIT
+            } else if mean_gradient > params.gradient_threshold {
+                if largest > params.split_log_scale { SPLIT } else { CLONE }
             } else {
-                CLONE
+                KEEP
             };
             slices.mean_gradients[i] = mean_gradient;
             slices.fates[i] = fate;

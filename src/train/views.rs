@@ -41,7 +41,7 @@ impl Views {
             gpu.run("statistics", |pass| {
                 pseudo_gt.statistics(pass, &pixels, [image.width, image.height], &mut tone, 0)
             })?;
-            let (name, camera) = (view.name.clone(), view.camera.clone());
+            let (name, camera) = (view.name.clone(), view.camera);
             views.push(TrainView { name, index, camera, image: pixels, tone });
         }
         Ok(Self(views))
