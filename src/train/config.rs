@@ -119,7 +119,7 @@ impl TrainConfig {
         let text = std::fs::read_to_string(path)
             .map_err(|error| Error::input(path, format!("cannot be read: {error}")))?;
         toml::from_str(&text).map_err(|error| {
-            let line = error.span().map(|span| text[..span.start].lines().count().max(1));
+            let line = error.span().map(|span| text[..span.start].matches('\n').count() + 1);
             let place = line.map(|line| format!(" (line {line})")).unwrap_or_default();
             Error::input(path, format!("is no configuration: {}{place}", error.message()))
         })
@@ -193,7 +193,7 @@ mod tests {
         let path = folder.path().join("config.toml");
         std::fs::write(&path, "steps = 3\nstepz = 4\n").unwrap();
         let message = TrainConfig::load(&path).unwrap_err().to_string();
-        assert!(message.contains("stepz") && message.contains("line"), "{message}");
+        assert!(message.contains("stepz") && message.contains("line 2"), "{message}");
     }
 
     #[test]
