@@ -138,8 +138,7 @@ impl Trainer {
         let first = self.step + 1;
         let until = until.min(self.config.steps).min(self.step + STEPS_PER_SUBMISSION);
         // A submission ends where density control changes the number of Gaussians.
-        let last =
-            (first..until).find(|&step| self.config.schedule.densifies_at(step)).unwrap_or(until);
+        let last = (first..until).find(|&step| self.densifies_at(step)).unwrap_or(until);
         if last < first {
             return Ok(vec![]);
         }
