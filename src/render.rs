@@ -58,8 +58,8 @@ impl RenderSettings {
     }
 }
 
-/// Whether the blend kernels test which pixels of its tile a splat meets: a processor's driver runs both sides of every
-/// branch, so that there the test only costs.
+/// Whether the blend kernels skip the groups of pixels that a splat does not meet. The render is the same either way;
+/// off on processors, a default that is not settled: see `docs/benchmarks.md`.
 pub fn skips_groups(gpu: &Gpu) -> bool {
     !gpu.properties().is_cpu
 }
@@ -133,53 +133,25 @@ impl Renderer {
         let channels = 3;
         let skips_groups = skips_groups(gpu);
         let (alpha_max, sh_degree) = (settings.max_alpha, settings.sh_degree);
+        // What every kernel that includes `splat.glsl` is specialised with, and what some are beside it.
+        macro_rules! constants {
+            ($kernel:ident $(, $own:ident)*) => {
+                $kernel::Constants { alpha_max, channels, tile_width, tile_height, $($own,)* }
+            };
+        }
         Ok(Self {
             gpu: gpu.clone(),
             settings,
             tile: [tile_width, tile_height],
-            project: gpu.pipeline(&project::Constants {
-                sh_degree,
-                alpha_max,
-                channels,
-                tile_width,
-                tile_height,
-            })?,
+            project: gpu.pipeline(&constants!(project, sh_degree))?,
             order_counts: gpu.pipeline(&order_counts::Constants::default())?,
             check_capacity: gpu.pipeline(&check_capacity::Constants::default())?,
-            emit: gpu.pipeline(&emit::Constants {
-                alpha_max,
-                channels,
-                tile_width,
-                tile_height,
-            })?,
+            emit: gpu.pipeline(&constants!(emit))?,
             tile_ranges: gpu.pipeline(&tile_ranges::Constants::default())?,
-            blend_forward: gpu.pipeline(&blend_forward::Constants {
-                alpha_max,
-                channels,
-                tile_width,
-                tile_height,
-                skips_groups,
-            })?,
-            blend_backward: gpu.pipeline(&blend_backward::Constants {
-                alpha_max,
-                channels,
-                tile_width,
-                tile_height,
-                skips_groups,
-            })?,
-            reduce_records: gpu.pipeline(&reduce_records::Constants {
-                alpha_max,
-                channels,
-                tile_width,
-                tile_height,
-            })?,
-            project_backward: gpu.pipeline(&project_backward::Constants {
-                sh_degree,
-                alpha_max,
-                channels,
-                tile_width,
-                tile_height,
-            })?,
+            blend_forward: gpu.pipeline(&constants!(blend_forward, skips_groups))?,
+            blend_backward: gpu.pipeline(&constants!(blend_backward, skips_groups))?,
+            reduce_records: gpu.pipeline(&constants!(reduce_records))?,
+            project_backward: gpu.pipeline(&constants!(project_backward, sh_degree))?,
             depth_sort: RadixSort::new(gpu, 0)?,
             tile_sort: RadixSort::new(gpu, 0)?,
             scan: Scan::new(gpu, 0)?,
