@@ -58,12 +58,6 @@ impl RenderSettings {
     }
 }
 
-/// Whether the blend kernels skip the groups of pixels that a splat does not meet. The render is the same either way;
-/// off on processors, a default that is not settled: see `docs/benchmarks.md`.
-pub fn skips_groups(gpu: &Gpu) -> bool {
-    !gpu.properties().is_cpu
-}
-
 /// What changes from render to render.
 #[derive(Clone, Copy, Debug)]
 pub struct RenderOptions {
@@ -131,7 +125,6 @@ impl Renderer {
             )));
         }
         let channels = 3;
-        let skips_groups = skips_groups(gpu);
         let (alpha_max, sh_degree) = (settings.max_alpha, settings.sh_degree);
         // What every kernel that includes `splat.glsl` is specialised with, and what some are beside it.
         macro_rules! constants {
@@ -148,8 +141,8 @@ impl Renderer {
             check_capacity: gpu.pipeline(&check_capacity::Constants::default())?,
             emit: gpu.pipeline(&constants!(emit))?,
             tile_ranges: gpu.pipeline(&tile_ranges::Constants::default())?,
-            blend_forward: gpu.pipeline(&constants!(blend_forward, skips_groups))?,
-            blend_backward: gpu.pipeline(&constants!(blend_backward, skips_groups))?,
+            blend_forward: gpu.pipeline(&constants!(blend_forward))?,
+            blend_backward: gpu.pipeline(&constants!(blend_backward))?,
             reduce_records: gpu.pipeline(&constants!(reduce_records))?,
             project_backward: gpu.pipeline(&constants!(project_backward, sh_degree))?,
             depth_sort: RadixSort::new(gpu, 0)?,

@@ -259,7 +259,7 @@ fn blend_backward_and_its_reduction_match_the_references() {
         let records = vec![f32::NAN; actual.records.len()];
         let records = run_reference!(
             blend_backward,
-            constants!(blend_backward, setup, skips_groups),
+            constants!(blend_backward, setup),
             blend_backward::Params { size: setup.params.size, tile_columns: setup.tiles().x },
             [tile_ranges, sorted_slots, owners, splats, colors, render, d_render],
             [records]

@@ -176,7 +176,7 @@ fn blend_forward_matches_the_reference() {
             (vec![f32::NAN; frame.render.len()], vec![f32::NAN; setup.pixels()]);
         let (mut render, mut transmittances) = run_reference!(
             blend_forward,
-            constants!(blend_forward, setup, skips_groups),
+            constants!(blend_forward, setup),
             common::blend_params(&setup),
             [tile_ranges, sorted_slots, owners, splats, colors],
             [render, transmittances]

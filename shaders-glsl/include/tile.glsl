@@ -3,9 +3,6 @@
 // A tile's state lives in registers, one array element per group. Loops over groups are therefore unrolled: every
 // index is a constant.
 
-// Skip the groups that a splat's ellipse does not meet: they are below alpha 1/255, so only the time changes.
-layout(constant_id = 5) const bool SKIPS_GROUPS = true;
-
 const uint GROUPS = TILE_WIDTH * TILE_HEIGHT / SUBGROUP_SIZE;
 
 // The lane's pixel of group 0, relative to the tile.
@@ -18,21 +15,19 @@ uvec2 group_offset(uint group) {
     return uvec2(group * SUBGROUP_SIZE % TILE_WIDTH, group * SUBGROUP_SIZE / TILE_WIDTH);
 }
 
-// The groups of pixels, one bit each, that the splat's ellipse meets in the tile at `origin`.
+// The groups of pixels, one bit each, that the splat's ellipse meets in the tile at `origin`. In all others it is below
+// alpha 1/255: to skip them changes the time alone.
 uint splat_groups(ProjectedSplat splat, uvec2 origin) {
-    uint groups = 0xffffffffu;
-    if (SKIPS_GROUPS) {
-        groups = 0;
-        for (uint row = 0; row < TILE_HEIGHT; row++) {
-            float y = float(origin.y + row);
-            ivec2 columns = splat_columns(splat, y, y) - int(origin.x);
-            columns = ivec2(max(columns.x, 0), min(columns.y, int(TILE_WIDTH) - 1));
-            if (columns.x <= columns.y) {
-                uint first = (row * TILE_WIDTH + uint(columns.x)) / SUBGROUP_SIZE;
-                uint last = (row * TILE_WIDTH + uint(columns.y)) / SUBGROUP_SIZE;
-                // Bits first..last; the shift past bit 31 wraps to zero, as it should.
-                groups |= (2u << last) - (1u << first);
-            }
+    uint groups = 0;
+    for (uint row = 0; row < TILE_HEIGHT; row++) {
+        float y = float(origin.y + row);
+        ivec2 columns = splat_columns(splat, y, y) - int(origin.x);
+        columns = ivec2(max(columns.x, 0), min(columns.y, int(TILE_WIDTH) - 1));
+        if (columns.x <= columns.y) {
+            uint first = (row * TILE_WIDTH + uint(columns.x)) / SUBGROUP_SIZE;
+            uint last = (row * TILE_WIDTH + uint(columns.y)) / SUBGROUP_SIZE;
+            // Bits first..last; the shift past bit 31 wraps to zero, as it should.
+            groups |= (2u << last) - (1u << first);
         }
     }
     return groups;

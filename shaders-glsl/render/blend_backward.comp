@@ -83,7 +83,7 @@ void main() {
             [[unroll]] for (uint c = 0; c < CHANNELS; c++) d_color[c] = 0.0;
 
             [[unroll]] for (uint g = 0; g < GROUPS; g++) {
-                if (SKIPS_GROUPS && (groups >> g & 1) == 0) continue;
+                if ((groups >> g & 1) == 0) continue;
                 vec2 d = offset - vec2(group_offset(g));
                 float sigma = splat_sigma(conic, d);
                 float falloff = exp(-sigma);

@@ -62,7 +62,7 @@ void main() {
             [[unroll]] for (uint c = 0; c < CHANNELS; c++) splat_color[c] = subgroupBroadcast(my_color[c], j);
 
             [[unroll]] for (uint g = 0; g < GROUPS; g++) {
-                if (SKIPS_GROUPS && (groups >> g & 1) == 0) continue;
+                if ((groups >> g & 1) == 0) continue;
                 float sigma = splat_sigma(conic, d - vec2(group_offset(g)));
                 float alpha = min(ALPHA_MAX, opacity * exp(-sigma));
                 float before = transmittance[g];

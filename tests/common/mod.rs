@@ -90,7 +90,6 @@ pub(crate) struct Setup {
     pub(crate) alpha_max: f32,
     pub(crate) channels: u32,
     pub(crate) tile: UVec2,
-    pub(crate) skips_groups: bool,
     pub(crate) background: [f32; 11],
 }
 
@@ -114,7 +113,6 @@ impl Setup {
             alpha_max: 0.99,
             channels: 3,
             tile: UVec2::new(16, 16),
-            skips_groups: true,
             background: std::array::from_fn(|c| 0.1 * c as f32),
         };
         setup.parameters = vec![0.0; setup.planes().len()];
@@ -198,10 +196,7 @@ pub(crate) fn variants() -> Vec<Setup> {
         setup.params.sh_degree = used;
         Setup { channels, tile: tile.into(), ..setup }
     };
-    // Once with the groups that a splat misses skipped, once with all of them taken.
-    let skipping = rows.map(build);
-    let not_skipping = skipping.clone().map(|setup| Setup { skips_groups: false, ..setup });
-    [skipping, not_skipping].concat()
+    rows.map(build).to_vec()
 }
 
 /// The constants of a kernel that includes `splat.glsl`.
@@ -317,7 +312,7 @@ pub(crate) fn forward(setup: &Setup, capacity: Option<u32>) -> Frame {
     let transmittances = vec![f32::NAN; setup.pixels()];
     let (render, transmittances) = run_kernel!(
         blend_forward,
-        constants!(blend_forward, setup, skips_groups),
+        constants!(blend_forward, setup),
         blend_params(setup),
         Threads::Workgroups([setup.tile_count(), 1, 1]),
         [tile_ranges, sorted_slots, owners, splats, colors],
@@ -399,7 +394,7 @@ pub(crate) fn backward(setup: &Setup, frame: &Frame, d_render: &[f32]) -> Gradie
     let records = vec![f32::NAN; setup.record() * owners.len()];
     let records = run_kernel!(
         blend_backward,
-        constants!(blend_backward, setup, skips_groups),
+        constants!(blend_backward, setup),
         blend_backward::Params { size: setup.params.size, tile_columns: setup.tiles().x },
         Threads::Workgroups([setup.tile_count(), 1, 1]),
         [tile_ranges, sorted_slots, owners, splats, colors, render, d_render],

@@ -13,7 +13,6 @@ use crate::kernels::*;
 use crate::loss::strip;
 use crate::optimizer::Schedule;
 use crate::random::Stream;
-use crate::render::skips_groups;
 use crate::tone::ToneCurve;
 
 /// # Errors
@@ -36,7 +35,7 @@ pub(super) fn blend_and_back(
         bench,
         timings,
         blend_forward,
-        constants!(bench, blend_forward, skips_groups: skips_groups(&bench.gpu)),
+        constants!(bench, blend_forward),
         blend_forward::Params { size, tile_columns, background: [0.0; 11] },
         per_tile,
         [tile_ranges, sorted_slots, owners, splats, colors],
@@ -48,7 +47,7 @@ pub(super) fn blend_and_back(
         bench,
         timings,
         blend_backward,
-        constants!(bench, blend_backward, skips_groups: skips_groups(&bench.gpu)),
+        constants!(bench, blend_backward),
         blend_backward::Params { size, tile_columns },
         per_tile,
         [tile_ranges, sorted_slots, owners, splats, colors, render, d_render],
