@@ -34,8 +34,10 @@ pub struct DensifySettings {
 pub struct DeviceGaussians {
     /// The number of Gaussians.
     pub count: u32,
-    /// Floats per Gaussian: [`crate::scene::width`] of the SH degree.
+    /// Floats per Gaussian: [`crate::scene::width`].
     pub column_count: u32,
+    /// How many of these are features.
+    pub feature_count: u32,
     /// `count * column_count` floats.
     pub parameters: Buffer<f32>,
     /// As many each.
@@ -146,6 +148,7 @@ impl Densifier {
         let params = densify_count::Params {
             gaussian_count: gaussians.count,
             column_count: gaussians.column_count,
+            feature_count: gaussians.feature_count,
             gradient_threshold,
             split_log_scale: self.settings.split_scale.ln() as f32,
             min_raw_opacity: (min_opacity / (1.0 - min_opacity)).ln() as f32,
@@ -198,6 +201,7 @@ impl Densifier {
         let mut successors = DeviceGaussians {
             count: new_count as u32,
             column_count: gaussians.column_count,
+            feature_count: gaussians.feature_count,
             parameters: self.gpu.uninit("parameters", new_len)?,
             moments: Moments {
                 first: self.gpu.uninit("first_moments", new_len)?,
@@ -209,6 +213,7 @@ impl Densifier {
             gaussian_count: gaussians.count,
             new_gaussian_count: successors.count,
             column_count: gaussians.column_count,
+            feature_count: gaussians.feature_count,
             seed: (seed ^ (seed >> 32)) as u32,
             step: step as u32,
         };
@@ -240,7 +245,7 @@ fn report(fates: &[u32]) -> DensifyReport {
 
 /// A kernel that runs beyond a buffer reads its neighbours: refuse before anything is recorded.
 fn check(gaussians: &DeviceGaussians, statistics: GradientStatistics<'_>) -> Result<()> {
-    let DeviceGaussians { count, column_count, parameters, moments } = gaussians;
+    let DeviceGaussians { count, column_count, feature_count, parameters, moments } = gaussians;
     let (count, columns) = (*count as usize, *column_count as usize);
     let GradientStatistics { grad_norm_sums, visit_counts } = statistics;
     let planes =
@@ -249,7 +254,7 @@ fn check(gaussians: &DeviceGaussians, statistics: GradientStatistics<'_>) -> Res
         (grad_norm_sums.name(), grad_norm_sums.len(), count),
         (visit_counts.name(), visit_counts.len(), count),
     ];
-    if columns < crate::scene::width(0) {
+    if columns < crate::scene::width(0) + *feature_count as usize {
         return Err(Error::Usage(format!("density control: {columns} floats make no Gaussian")));
     }
     match planes.into_iter().chain(per_gaussian).find(|(_, len, needed)| len < needed) {

@@ -40,12 +40,12 @@ impl Player {
     /// # Errors
     /// The device is out of memory or lost.
     pub fn new(gpu: &Gpu, gaussians: &Gaussians) -> Result<Self> {
-        let sh_degree = gaussians.sh_degree;
-        let settings = RenderSettings { sh_degree, ..RenderSettings::default() };
+        let shape = gaussians.shape;
+        let settings = RenderSettings { shape, ..RenderSettings::default() };
         Ok(Self {
             parameters: gpu.buffer("parameters", &gaussians.parameters)?,
             count: gaussians.count,
-            sh_degree,
+            sh_degree: shape.sh_degree,
             renderer: Renderer::new(gpu, settings)?,
         })
     }

@@ -61,7 +61,8 @@ impl Adam {
         Ok(Self { pipeline: gpu.pipeline(&constants)?, floats_per_workgroup })
     }
 
-    /// Records step number `step`, from 1, over the first `column_count` columns of `gaussian_count` Gaussians.
+    /// Records step number `step`, from 1, over the first `column_count` columns of `gaussian_count` Gaussians, of which
+    /// `feature_count` are features.
     ///
     /// # Errors
     /// A buffer is shorter than that, or the step is 0.
@@ -70,7 +71,7 @@ impl Adam {
         pass: &mut Recorder<'_>,
         step: u64,
         rates: &LearningRates,
-        [gaussian_count, column_count]: [u32; 2],
+        [gaussian_count, column_count, feature_count]: [u32; 3],
         buffers: AdamBuffers<'_>,
     ) -> Result<()> {
         let AdamBuffers { parameters, gradients, moments, status } = buffers;
@@ -90,7 +91,7 @@ impl Adam {
         }
         pass.dispatch(
             &self.pipeline,
-            &params(step, rates, [gaussian_count, column_count]),
+            &params(step, rates, [gaussian_count, column_count, feature_count]),
             adam::Buffers {
                 parameters,
                 gradients,
@@ -111,19 +112,21 @@ impl Adam {
 fn params(
     step: u64,
     rates: &LearningRates,
-    [gaussian_count, column_count]: [u32; 2],
+    [gaussian_count, column_count, feature_count]: [u32; 3],
 ) -> adam::Params {
     let uncorrected = |beta: f64| 1.0 - beta.powf(step as f64);
     let rate = |rate: f64| (rate / uncorrected(0.9)) as f32;
     adam::Params {
         gaussian_count,
         column_count,
+        feature_count,
         second_correction: (1.0 / uncorrected(0.999).sqrt()) as f32,
         means_rate: rate(rates.means),
         quats_rate: rate(rates.quats),
         log_scales_rate: rate(rates.log_scales),
         raw_opacities_rate: rate(rates.raw_opacities),
         dc_rate: rate(rates.dc),
+        features_rate: rate(rates.features),
         rest_rate: rate(rates.rest),
     }
 }

@@ -19,6 +19,7 @@ use crate::kernels::{
     blend_backward, blend_forward, check_capacity, emit, order_counts, project, project_backward,
     reduce_records, tile_ranges,
 };
+use crate::scene::Shape;
 use crate::sort::{Count, DispatchArguments, RadixSort, Scan};
 use crate::{Error, Result};
 
@@ -35,26 +36,40 @@ pub struct RenderSettings {
     pub near: f32,
     /// The largest alpha of a splat on a pixel; below 1.
     pub max_alpha: f32,
-    /// Degree of the spherical harmonics stored.
-    pub sh_degree: u32,
+    /// What the Gaussians are made of.
+    pub shape: Shape,
+    /// Colours are the bare SH sum, which can be negative, as in LITA-GS, instead of max(SH + 0.5, 0).
+    pub raw_colors: bool,
     /// The tile that one subgroup owns, in pixels; none: what suits the device.
     pub tile: Option<[u32; 2]>,
 }
 
 impl Default for RenderSettings {
     fn default() -> Self {
-        Self { near: 0.2, max_alpha: 0.99, sh_degree: 3, tile: None }
+        Self { near: 0.2, max_alpha: 0.99, shape: 3.into(), raw_colors: false, tile: None }
     }
 }
 
 /// The tile of a GPU, as in 3DGS, and that of a processor, whose subgroups are narrow: measured on lavapipe.
 const GPU_TILE: [u32; 2] = [16, 16];
 const CPU_TILE: [u32; 2] = [16, 8];
+/// More channels than these take a smaller tile on a processor: its state no longer fits the registers of larger ones.
+const CPU_TILE_CHANNELS: usize = 5;
+const CPU_SMALL_TILE: [u32; 2] = [8, 8];
 
 impl RenderSettings {
     /// The tile on this device, in pixels.
     pub fn tile_on(&self, gpu: &Gpu) -> [u32; 2] {
-        self.tile.unwrap_or(if gpu.properties().is_cpu { CPU_TILE } else { GPU_TILE })
+        self.tile.unwrap_or(match self.channels() {
+            _ if !gpu.properties().is_cpu => GPU_TILE,
+            0..=CPU_TILE_CHANNELS => CPU_TILE,
+            _ => CPU_SMALL_TILE,
+        })
+    }
+
+    /// Values per pixel of a render: RGB and the features.
+    pub fn channels(&self) -> usize {
+        self.shape.features.channels()
     }
 }
 
@@ -63,7 +78,7 @@ impl RenderSettings {
 pub struct RenderOptions {
     /// Degree of the spherical harmonics used, at most the one stored.
     pub sh_degree: u32,
-    /// What is seen where no splat is, RGB.
+    /// What is seen where no splat is, RGB; features are zero there.
     pub background: [f32; 3],
 }
 
@@ -124,8 +139,9 @@ impl Renderer {
                 "{what}; take a tile of 8 to 32 times as many pixels"
             )));
         }
-        let channels = 3;
-        let (alpha_max, sh_degree) = (settings.max_alpha, settings.sh_degree);
+        let channels = settings.channels() as u32;
+        let (alpha_max, sh_degree) = (settings.max_alpha, settings.shape.sh_degree);
+        let raw_colors = settings.raw_colors;
         // What every kernel that includes `splat.glsl` is specialised with, and what some are beside it.
         macro_rules! constants {
             ($kernel:ident $(, $own:ident)*) => {
@@ -136,7 +152,7 @@ impl Renderer {
             gpu: gpu.clone(),
             settings,
             tile: [tile_width, tile_height],
-            project: gpu.pipeline(&constants!(project, sh_degree))?,
+            project: gpu.pipeline(&constants!(project, sh_degree, raw_colors))?,
             order_counts: gpu.pipeline(&order_counts::Constants::default())?,
             check_capacity: gpu.pipeline(&check_capacity::Constants::default())?,
             emit: gpu.pipeline(&constants!(emit))?,
@@ -144,12 +160,12 @@ impl Renderer {
             blend_forward: gpu.pipeline(&constants!(blend_forward))?,
             blend_backward: gpu.pipeline(&constants!(blend_backward))?,
             reduce_records: gpu.pipeline(&constants!(reduce_records))?,
-            project_backward: gpu.pipeline(&constants!(project_backward, sh_degree))?,
+            project_backward: gpu.pipeline(&constants!(project_backward, sh_degree, raw_colors))?,
             depth_sort: RadixSort::new(gpu, 0)?,
             tile_sort: RadixSort::new(gpu, 0)?,
             scan: Scan::new(gpu, 0)?,
             intersections: DispatchArguments::new(gpu)?,
-            frame: Frame::new(gpu)?,
+            frame: Frame::new(gpu, settings.channels())?,
         })
     }
 
@@ -188,7 +204,7 @@ impl Renderer {
         self.frame.set_intersection_capacity(&self.gpu, intersections)
     }
 
-    /// The last render, planar (3, H, W).
+    /// The last render, planar (channels, H, W): RGB, then the features.
     pub fn render(&self) -> &Buffer<f32> {
         &self.frame.render
     }
@@ -213,6 +229,22 @@ impl Renderer {
         camera: &Camera,
         options: &RenderOptions,
     ) -> Result<Image> {
+        let mut data = self.render_channels(gaussians, camera, options)?;
+        let Camera { width, height, .. } = *camera;
+        data.truncate(3 * width as usize * height as usize);
+        Ok(Image { width, height, data })
+    }
+
+    /// Renders every channel to the host, (channels, H, W); grows the memory as the view demands.
+    ///
+    /// # Errors
+    /// As [`Renderer::render_image`].
+    pub fn render_channels(
+        &mut self,
+        gaussians: &Buffer<f32>,
+        camera: &Camera,
+        options: &RenderOptions,
+    ) -> Result<Vec<f32>> {
         let gpu = self.gpu.clone();
         loop {
             let mut status = None;
@@ -229,10 +261,10 @@ impl Renderer {
             }
             self.grow(status.intersections)?;
         }
-        let Camera { width, height, .. } = *camera;
         let mut data = gpu.read(&self.frame.render)?;
-        data.truncate(3 * width as usize * height as usize);
-        Ok(Image { width, height, data })
+        let pixels = camera.width as usize * camera.height as usize;
+        data.truncate(self.settings.channels() * pixels);
+        Ok(data)
     }
 
     /// Lowers every flag of the status.
@@ -273,7 +305,7 @@ impl Renderer {
         )
     }
 
-    /// Records the gradients of the Gaussians, given `d_render`, that of the render recorded last (3, H, W).
+    /// Records the gradients of the Gaussians, given `d_render`, that of the render recorded last (channels, H, W).
     ///
     /// # Errors
     /// A pass exceeds what the device launches.
@@ -449,7 +481,7 @@ impl Renderer {
     fn view(&self, camera: &Camera) -> Result<View> {
         let pixels = camera.width as usize * camera.height as usize;
         let tiles = self.tiles(camera);
-        if 3 * pixels > self.frame.render.len()
+        if self.settings.channels() * pixels > self.frame.render.len()
             || (tiles.x * tiles.y) as usize > self.frame.tile_ranges.len()
         {
             let (width, height) = (camera.width, camera.height);

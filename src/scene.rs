@@ -4,8 +4,11 @@ use std::ops::Range;
 
 use glam::Vec3;
 
+mod features;
 pub mod init;
 pub mod ply;
+
+pub use features::{COLOR_CHANNELS, FEATURES, Feature, FeatureSpec, Features};
 
 /// The constant basis function of the spherical harmonics, 1 / (2 sqrt(pi)).
 pub const SH_C0: f32 = 0.282_094_79;
@@ -26,6 +29,8 @@ pub enum Attribute {
     RawOpacities,
     /// SH coefficients of degree 0, RGB; the colour is 0.5 + [`SH_C0`] times this.
     Dc,
+    /// What is blended beside colour, in the order of [`FEATURES`].
+    Features,
     /// SH coefficients above degree 0, coefficient-major, RGB.
     Rest,
 }
@@ -37,25 +42,41 @@ pub struct AttributeSpec {
     pub attribute: Attribute,
     /// The name used in logs, buffers and timings.
     pub name: &'static str,
-    /// Floats per Gaussian at an SH degree.
-    pub width: fn(sh_degree: u32) -> usize,
+    /// Floats per Gaussian.
+    pub width: fn(Shape) -> usize,
     /// Adam's initial learning rate (3DGS's `OptimizationParams`).
     pub learning_rate: f64,
     /// Whether the learning rate is multiplied by the extent of the cameras.
     pub scales_with_extent: bool,
     /// The PLY property at a position among the attribute's properties (INRIA layout).
-    pub ply_property: fn(position: usize) -> String,
+    pub ply_property: fn(Shape, position: usize) -> String,
+}
+
+/// What the Gaussians of a scene are made of, beside the ellipsoid and its opacity.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Shape {
+    /// The SH degree that there is room for, 0 to [`MAX_SH_DEGREE`].
+    pub sh_degree: u32,
+    /// What is blended beside colour.
+    pub features: Features,
+}
+
+/// Colour alone.
+impl From<u32> for Shape {
+    fn from(sh_degree: u32) -> Self {
+        Self { sh_degree, features: Features::NONE }
+    }
 }
 
 /// The one table of attributes; `shaders-glsl/include/gaussian.glsl` is its device side.
-pub const ATTRIBUTES: [AttributeSpec; 6] = [
+pub const ATTRIBUTES: [AttributeSpec; 7] = [
     AttributeSpec {
         attribute: Attribute::Means,
         name: "means",
         width: |_| 3,
         learning_rate: 1.6e-4,
         scales_with_extent: true,
-        ply_property: |position| ["x", "y", "z"][position].to_owned(),
+        ply_property: |_, position| ["x", "y", "z"][position].to_owned(),
     },
     AttributeSpec {
         attribute: Attribute::Quats,
@@ -63,7 +84,7 @@ pub const ATTRIBUTES: [AttributeSpec; 6] = [
         width: |_| 4,
         learning_rate: 1e-3,
         scales_with_extent: false,
-        ply_property: |position| format!("rot_{position}"),
+        ply_property: |_, position| format!("rot_{position}"),
     },
     AttributeSpec {
         attribute: Attribute::LogScales,
@@ -71,7 +92,7 @@ pub const ATTRIBUTES: [AttributeSpec; 6] = [
         width: |_| 3,
         learning_rate: 5e-3,
         scales_with_extent: false,
-        ply_property: |position| format!("scale_{position}"),
+        ply_property: |_, position| format!("scale_{position}"),
     },
     AttributeSpec {
         attribute: Attribute::RawOpacities,
@@ -79,7 +100,7 @@ pub const ATTRIBUTES: [AttributeSpec; 6] = [
         width: |_| 1,
         learning_rate: 0.05,
         scales_with_extent: false,
-        ply_property: |_| "opacity".to_owned(),
+        ply_property: |_, _| "opacity".to_owned(),
     },
     AttributeSpec {
         attribute: Attribute::Dc,
@@ -87,15 +108,23 @@ pub const ATTRIBUTES: [AttributeSpec; 6] = [
         width: |_| 3,
         learning_rate: 2.5e-3,
         scales_with_extent: false,
-        ply_property: |position| format!("f_dc_{position}"),
+        ply_property: |_, position| format!("f_dc_{position}"),
+    },
+    AttributeSpec {
+        attribute: Attribute::Features,
+        name: "features",
+        width: |shape| shape.features.width(),
+        learning_rate: 1.25e-4,
+        scales_with_extent: false,
+        ply_property: |shape, position| shape.features.ply_property(position),
     },
     AttributeSpec {
         attribute: Attribute::Rest,
         name: "rest",
-        width: |sh_degree| 3 * rest_coefficients(sh_degree),
+        width: |shape| 3 * rest_coefficients(shape.sh_degree),
         learning_rate: 1.25e-4,
         scales_with_extent: false,
-        ply_property: |position| format!("f_rest_{position}"),
+        ply_property: |_, position| format!("f_rest_{position}"),
     },
 ];
 
@@ -105,8 +134,9 @@ pub const fn rest_coefficients(sh_degree: u32) -> usize {
 }
 
 /// Floats per Gaussian, all attributes together.
-pub fn width(sh_degree: u32) -> usize {
-    ATTRIBUTES.iter().map(|spec| (spec.width)(sh_degree)).sum()
+pub fn width(shape: impl Into<Shape>) -> usize {
+    let shape = shape.into();
+    ATTRIBUTES.iter().map(|spec| (spec.width)(shape)).sum()
 }
 
 impl Attribute {
@@ -115,11 +145,11 @@ impl Attribute {
         &ATTRIBUTES[self as usize]
     }
 
-    /// The floats per Gaussian that come before this attribute, at any SH degree: its plane begins at this times
-    /// the number of Gaussians.
-    pub fn column(self) -> usize {
-        // Only the last attribute's width depends on the degree.
-        ATTRIBUTES[..self as usize].iter().map(|spec| (spec.width)(0)).sum()
+    /// The floats per Gaussian that come before this attribute: its plane begins at this times the number of
+    /// Gaussians.
+    pub fn column(self, shape: impl Into<Shape>) -> usize {
+        let shape = shape.into();
+        ATTRIBUTES[..self as usize].iter().map(|spec| (spec.width)(shape)).sum()
     }
 }
 
@@ -128,22 +158,23 @@ impl Attribute {
 pub struct Gaussians {
     /// The number of Gaussians.
     pub count: usize,
-    /// The SH degree that there is room for, 0 to [`MAX_SH_DEGREE`].
-    pub sh_degree: u32,
-    /// `count * width(sh_degree)` floats.
+    /// What they are made of.
+    pub shape: Shape,
+    /// `count * width(shape)` floats.
     pub parameters: Vec<f32>,
 }
 
 impl Gaussians {
     /// `count` Gaussians with every parameter zero.
-    pub fn zeros(count: usize, sh_degree: u32) -> Self {
-        Self { count, sh_degree, parameters: vec![0.0; count * width(sh_degree)] }
+    pub fn zeros(count: usize, shape: impl Into<Shape>) -> Self {
+        let shape = shape.into();
+        Self { count, shape, parameters: vec![0.0; count * width(shape)] }
     }
 
     /// Where an attribute lies in [`Gaussians::parameters`].
     pub fn plane(&self, attribute: Attribute) -> Range<usize> {
-        let begin = attribute.column() * self.count;
-        begin..begin + (attribute.spec().width)(self.sh_degree) * self.count
+        let begin = attribute.column(self.shape) * self.count;
+        begin..begin + (attribute.spec().width)(self.shape) * self.count
     }
 
     /// Positions in the world, (count).
@@ -199,6 +230,12 @@ impl Gaussians {
     pub fn dc_mut(&mut self) -> &mut [Vec3] {
         let plane = self.plane(Attribute::Dc);
         bytemuck::cast_slice_mut(&mut self.parameters[plane])
+    }
+
+    /// What is blended beside colour, (count, features), to change.
+    pub fn features_mut(&mut self) -> &mut [f32] {
+        let plane = self.plane(Attribute::Features);
+        &mut self.parameters[plane]
     }
 
     /// SH coefficients above degree 0, RGB, (count, [`rest_coefficients`]).

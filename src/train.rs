@@ -34,6 +34,7 @@ mod streams {
     pub(super) const BACKGROUND: u64 = 2;
     pub(super) const VIEWS: u64 = 3;
     pub(super) const DENSITY: u64 = 4;
+    pub(super) const FEATURES: u64 = 5;
 }
 
 /// What one step did.
@@ -83,7 +84,7 @@ impl Trainer {
         let mut pseudo_gt = PseudoGt::new(gpu, config.tone)?;
         let views = Views::upload(gpu, &mut pseudo_gt, dataset)?;
         let gaussians = views.initial_gaussians(gpu, &pseudo_gt, dataset, &config)?;
-        let settings = RenderSettings { sh_degree: config.sh_degree, ..RenderSettings::default() };
+        let settings = RenderSettings { shape: gaussians.shape, ..RenderSettings::default() };
         let sizes = views.sizes();
         let pixels = sizes.iter().map(|size| size.x as usize * size.y as usize).max();
         let mut trainer = Self {
@@ -231,13 +232,13 @@ impl Trainer {
             },
         )?;
         // Coefficients that are not in use yet have no gradient and no moments: nothing to update.
-        let columns =
-            if options.sh_degree == 0 { width(0) as u32 } else { model.gaussians.column_count };
+        let (columns, features) = (model.gaussians.column_count, model.gaussians.feature_count);
+        let columns = if options.sh_degree == 0 { width(0) as u32 + features } else { columns };
         self.adam.record(
             pass,
             step,
             &schedule.learning_rates(step, self.extent),
-            [model.gaussians.count, columns],
+            [model.gaussians.count, columns, features],
             AdamBuffers {
                 parameters: &mut model.gaussians.parameters,
                 gradients: &model.gradients,

@@ -11,7 +11,10 @@ use nightsplat::gpu::{Gpu, Reference};
 use nightsplat::kernels::{densify_count, densify_scatter};
 use nightsplat::optimizer::Moments;
 
-const COLUMNS: usize = 23;
+/// Four features and SH of degree 1.
+const COLUMNS: usize = 27;
+const FEATURES: usize = 4;
+const REST: usize = 14 + FEATURES;
 const SETTINGS: DensifySettings = DensifySettings {
     gradient_threshold: 2e-4,
     split_scale: 0.05,
@@ -85,7 +88,7 @@ impl Host {
 
     /// All floats of one Gaussian, column by column.
     fn row(&self, planes: &[f32], i: usize) -> Vec<f32> {
-        [(0, 3), (3, 4), (7, 3), (10, 1), (11, 3), (14, COLUMNS - 14)]
+        [(0, 3), (3, 4), (7, 3), (10, 1), (11, 3), (14, FEATURES), (REST, COLUMNS - REST)]
             .into_iter()
             .flat_map(|(column, width)| {
                 let first = column * self.count + width * i;
@@ -99,6 +102,7 @@ impl Host {
         let gaussians = DeviceGaussians {
             count: self.count as u32,
             column_count: COLUMNS as u32,
+            feature_count: FEATURES as u32,
             parameters: upload("parameters", &self.parameters),
             moments: Moments {
                 first: upload("first", &self.first),
@@ -132,6 +136,7 @@ impl Host {
         let params = densify_count::Params {
             gaussian_count: n as u32,
             column_count: COLUMNS as u32,
+            feature_count: FEATURES as u32,
             gradient_threshold: settings.gradient_threshold as f32,
             split_log_scale: settings.split_scale.ln() as f32,
             min_raw_opacity: (settings.min_opacity / (1.0 - settings.min_opacity)).ln() as f32,
@@ -166,6 +171,7 @@ impl Host {
             gaussian_count: n as u32,
             new_gaussian_count: count as u32,
             column_count: COLUMNS as u32,
+            feature_count: FEATURES as u32,
             seed: settings.seed as u32,
             step: step as u32,
         };
@@ -442,6 +448,7 @@ fn a_buffer_that_is_too_short_is_refused() {
         let gaussians = DeviceGaussians {
             count: 2,
             column_count: columns,
+            feature_count: 0,
             parameters: gpu.zeros("parameters", len(0, 28)).unwrap(),
             moments: Moments {
                 first: gpu.zeros("first", len(1, 28)).unwrap(),

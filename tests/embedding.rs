@@ -98,7 +98,7 @@ fn gaussians() -> Gaussians {
 }
 
 fn renderer(gpu: &Gpu) -> Renderer {
-    let settings = RenderSettings { sh_degree: 0, ..RenderSettings::default() };
+    let settings = RenderSettings { shape: 0.into(), ..RenderSettings::default() };
     let mut renderer = Renderer::new(gpu, settings).unwrap();
     renderer.reserve(gaussians().count, [&camera()]).unwrap();
     renderer

@@ -32,41 +32,53 @@ struct Projected {
 impl Chain {
     fn new(setup: Setup) -> Self {
         let mut random = Random::new(4);
-        let d_render = (0..3 * setup.pixels()).map(|_| random.between(-1.0, 1.0)).collect();
+        let d_render = (0..setup.channels as usize * setup.pixels())
+            .map(|_| random.between(-1.0, 1.0))
+            .collect();
         Self { setup, d_render }
     }
 
     fn project(&self, parameters: &[f64]) -> Projected {
         let (camera, params) = (self.setup.camera(), &self.setup.params);
-        let one = |i| -> Option<(usize, Projection)> {
+        let one = |i| -> Option<(usize, Projection, Vec<f64>)> {
             let gaussian = self.setup.planes().load(parameters, i);
-            Some((i, project_gaussian(&camera, params.near.into(), params.sh_degree, &gaussian)?))
+            let (near, raw_colors) = (params.near.into(), self.setup.raw_colors);
+            let projection =
+                project_gaussian(&camera, near, params.sh_degree, raw_colors, &gaussian)?;
+            Some((i, projection, gaussian.features))
         };
         let mut visible: Vec<_> = (0..self.setup.planes().count).filter_map(one).collect();
-        visible.sort_by(|(_, a), (_, b)| a.depth.total_cmp(&b.depth));
+        visible.sort_by(|(_, a, _), (_, b, _)| a.depth.total_cmp(&b.depth));
         Projected {
-            ids: visible.iter().map(|(i, _)| *i).collect(),
-            splats: visible.iter().map(|(_, p)| p.splat).collect(),
-            colors: visible.iter().flat_map(|(_, p)| p.color.to_array()).collect(),
+            ids: visible.iter().map(|(i, ..)| *i).collect(),
+            splats: visible.iter().map(|(_, p, _)| p.splat).collect(),
+            colors: visible
+                .iter()
+                .flat_map(|(_, p, features)| [&p.color.to_array()[..], features].concat())
+                .collect(),
         }
     }
 
     /// Centre and gradient of each pixel.
-    fn pixels(&self) -> impl Iterator<Item = (DVec2, [f64; 3])> {
+    fn pixels(&self) -> impl Iterator<Item = (DVec2, Vec<f64>)> {
         let (width, count) = (self.setup.params.size.x as usize, self.setup.pixels());
         (0..count).map(move |at| {
             let center = DVec2::new((at % width) as f64, (at / width) as f64) + 0.5;
-            (center, [0, 1, 2].map(|c| self.d_render[c * count + at]))
+            (center, (0..self.channels()).map(|c| self.d_render[c * count + at]).collect())
         })
     }
 
     fn loss(&self, parameters: &[f64], background: &[f64]) -> f64 {
         let Projected { splats, colors, .. } = self.project(parameters);
-        let pixel = |(center, d): (DVec2, [f64; 3])| {
+        let pixel = |(center, d): (DVec2, Vec<f64>)| {
             let (render, _) = blend_pixel(&splats, &colors, background, center, self.alpha_max());
             render.iter().zip(d).map(|(value, d)| value * d).sum::<f64>()
         };
         self.pixels().map(pixel).sum()
+    }
+
+    fn channels(&self) -> usize {
+        self.setup.channels as usize
     }
 
     fn alpha_max(&self) -> f64 {
@@ -76,7 +88,8 @@ impl Chain {
     /// The gradients of parameters and background that the references' own backward gives.
     fn gradient(&self, parameters: &[f64], background: &[f64]) -> (Vec<f64>, Vec<f64>) {
         let Projected { ids, splats, colors } = self.project(parameters);
-        let (mut records, mut d_background) = (vec![0.0; 9 * ids.len()], vec![0.0; 3]);
+        let (channels, record) = (self.channels(), self.setup.record());
+        let (mut records, mut d_background) = (vec![0.0; record * ids.len()], vec![0.0; channels]);
         for (center, d) in self.pixels() {
             let (render, transmittance) =
                 blend_pixel(&splats, &colors, background, center, self.alpha_max());
@@ -89,12 +102,13 @@ impl Chain {
                 self.alpha_max(),
                 &mut records,
             );
-            (0..3).for_each(|c| d_background[c] += transmittance * d[c]);
+            (0..channels).for_each(|c| d_background[c] += transmittance * d[c]);
         }
         let planes = self.setup.planes();
         let mut gradient = vec![0.0; planes.len()];
         for (j, &i) in ids.iter().enumerate() {
-            let d_splat = d_splat(&records[9 * j..][..9], &colors[3 * j..][..3]);
+            let d_splat =
+                d_splat(&self.setup, &records[record * j..][..record], &colors[channels * j..]);
             let gaussian = planes.load(parameters, i);
             let d = project_gaussian_backward(
                 &self.setup.camera(),
@@ -111,7 +125,8 @@ impl Chain {
     /// Compares central differences with the references' gradient, relative to the largest of each attribute.
     fn check(&self, name: &str) {
         let parameters: Vec<f64> = self.setup.parameters.iter().map(|&p| p.into()).collect();
-        let background: Vec<f64> = self.setup.background[..3].iter().map(|&b| b.into()).collect();
+        let background: Vec<f64> =
+            self.setup.background[..self.channels()].iter().map(|&b| b.into()).collect();
         let (gradient, d_background) = self.gradient(&parameters, &background);
         let difference = |values: &[f64], at: usize, loss: &dyn Fn(&[f64]) -> f64| {
             let step = 1e-5;
@@ -123,13 +138,15 @@ impl Chain {
             (moved(step) - moved(-step)) / (2.0 * step)
         };
         let count = self.setup.planes().count;
+        let rest = 14 + self.setup.planes().feature_count;
         for (attribute, first, end) in [
             ("means", 0, 3),
             ("quats", 3, 7),
             ("log_scales", 7, 10),
             ("raw_opacities", 10, 11),
             ("dc", 11, 14),
-            ("rest", 14, gradient.len() / count),
+            ("features", 14, rest),
+            ("rest", rest, gradient.len() / count),
         ] {
             let range = first * count..end * count;
             let largest = gradient[range.clone()].iter().fold(0.0f64, |a, g| a.max(g.abs()));
@@ -157,13 +174,15 @@ impl Chain {
 }
 
 /// What arrives at a splat, where clamped colours pass nothing on.
-fn d_splat(record: &[f64], color: &[f64]) -> DSplat {
-    let passes = |c: usize| if color[c] > 0.0 { record[6 + c] } else { 0.0 };
+fn d_splat(setup: &Setup, record: &[f64], color: &[f64]) -> DSplat {
+    let is_free = |c: usize| setup.raw_colors || color[c] > 0.0;
+    let passes = |c: usize| if is_free(c) { record[6 + c] } else { 0.0 };
     DSplat {
         mean2d: DVec2::from_slice(record),
         conic: DVec3::from_slice(&record[2..]),
         opacity: record[5],
         color: DVec3::from_array([0, 1, 2].map(passes)),
+        features: record[9..].to_vec(),
     }
 }
 
@@ -174,6 +193,14 @@ fn the_references_gradients_are_their_central_differences() {
         let mut setup = Setup::new(7, size, stored, 21 + u64::from(stored));
         setup.params.sh_degree = used;
         Chain::new(setup).check(&format!("SH degree {stored}"));
+    }
+}
+
+#[test]
+fn every_feature_and_every_raw_color_has_its_central_difference() {
+    for (channels, raw_colors) in [(5, false), (11, true)] {
+        let setup = Setup::with_channels(7, UVec2::new(26, 19), 1, channels, 61);
+        Chain::new(Setup { raw_colors, ..setup }).check(&format!("{channels} channels"));
     }
 }
 
@@ -334,7 +361,7 @@ fn project_backward_matches_the_reference() {
         let (grad_norm_sums, visit_counts) = (vec![0.5; n], vec![3; n]);
         let (gradients, grad_norm_sums, visit_counts) = run_reference!(
             project_backward,
-            constants!(project_backward, setup, sh_degree),
+            constants!(project_backward, setup, sh_degree, raw_colors),
             common::project_backward_params(&setup),
             [parameters, splats, colors, tile_counts, d_splats, status],
             [gradients, grad_norm_sums, visit_counts]
@@ -357,7 +384,7 @@ fn gradient_bounds(setup: &Setup, frame: &Frame, d_splats: &[f32]) -> Vec<f64> {
         let color: Vec<f64> =
             frame.colors[setup.channels as usize * i..][..3].iter().map(|&c| c.into()).collect();
         let record: Vec<f64> =
-            d_splats[setup.record() * i..][..9].iter().map(|&d| d.into()).collect();
+            d_splats[setup.record() * i..][..setup.record()].iter().map(|&d| d.into()).collect();
         let one = Planes { count: 1, ..planes };
         let mut inputs = vec![0.0; one.len()];
         one.store(&setup.get(i), 0, |at, value| inputs[at] = value);
@@ -370,7 +397,7 @@ fn gradient_bounds(setup: &Setup, frame: &Frame, d_splats: &[f32]) -> Vec<f64> {
                 conic: DVec3::from_slice(splat),
                 ..Splat::from(&ProjectedSplat::default())
             };
-            let d_splat = d_splat(&splat[3..], &color);
+            let d_splat = d_splat(setup, &splat[3..], &color);
             let gaussian = one.load(gaussian, 0);
             let degree = setup.params.sh_degree;
             let d =
@@ -408,7 +435,7 @@ fn an_overflow_leaves_no_gradient_and_no_statistics() {
 #[test]
 fn the_same_frame_gives_the_same_bits_every_time() {
     let tile = UVec2::new(16, 8);
-    let setup = Setup { channels: 4, tile, ..Setup::new(777, UVec2::new(131, 77), 2, 8) };
+    let setup = Setup { tile, ..Setup::with_channels(777, UVec2::new(131, 77), 2, 4, 8) };
     let frame = forward(&setup, None);
     let d_render: Vec<f32> =
         (0..frame.render.len()).map(|i| ((i % 17) as f32 - 8.0) / 8.0).collect();

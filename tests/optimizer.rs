@@ -7,13 +7,16 @@ use nightsplat::gpu::{Gpu, Reference};
 use nightsplat::kernels::adam;
 use nightsplat::optimizer::{Adam, AdamBuffers, LearningRates, Moments, Schedule};
 
-const COLUMNS: u32 = 23;
+/// Two features and SH of degree 1.
+const COLUMNS: u32 = 25;
+const FEATURES: u32 = 2;
 const RATES: LearningRates = LearningRates {
     means: 0.01,
     quats: 0.02,
     log_scales: 0.03,
     raw_opacities: 0.04,
     dc: 0.05,
+    features: 0.015,
     rest: 0.06,
 };
 
@@ -64,7 +67,7 @@ impl Planes {
                 moments: &mut moments,
                 status: &status,
             };
-            adam.record(pass, step, &RATES, [gaussian_count, column_count], buffers)
+            adam.record(pass, step, &RATES, [gaussian_count, column_count, FEATURES], buffers)
         })
         .unwrap();
         self.parameters = gpu.read(&parameters).unwrap();
@@ -79,12 +82,14 @@ impl Planes {
         let params = adam::Params {
             gaussian_count,
             column_count,
+            feature_count: FEATURES,
             second_correction: (1.0 / (1.0 - 0.999f64.powi(step)).sqrt()) as f32,
             means_rate: rate(RATES.means),
             quats_rate: rate(RATES.quats),
             log_scales_rate: rate(RATES.log_scales),
             raw_opacities_rate: rate(RATES.raw_opacities),
             dc_rate: rate(RATES.dc),
+            features_rate: rate(RATES.features),
             rest_rate: rate(RATES.rest),
         };
         let slices = adam::Slices {
@@ -152,7 +157,8 @@ fn the_first_step_moves_every_attribute_by_its_own_rate() {
     ]
     .into_iter()
     .chain([(9, RATES.log_scales), (10, RATES.raw_opacities), (11, RATES.dc), (13, RATES.dc)])
-    .chain([(14, RATES.rest), (COLUMNS - 1, RATES.rest)]);
+    .chain([(14, RATES.features), (13 + FEATURES, RATES.features)])
+    .chain([(14 + FEATURES, RATES.rest), (COLUMNS - 1, RATES.rest)]);
     for (column, rate) in rates {
         for i in (column * count) as usize..((column + 1) * count) as usize {
             let expected = before.parameters[i] - rate as f32 * before.gradients[i].signum();
@@ -267,7 +273,7 @@ fn a_buffer_that_is_too_short_is_refused() {
                 moments: &mut moments,
                 status: &status,
             };
-            adam.record(pass, step, &rates, [2, 14], buffers)
+            adam.record(pass, step, &rates, [2, 14, 0], buffers)
         });
         assert!(result.is_err(), "{lengths:?} {status_len} {step}");
     }

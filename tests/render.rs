@@ -32,7 +32,7 @@ fn project_matches_the_reference() {
         let Setup { parameters, params, .. } = &setup;
         let (splats, colors, depth_keys, ids, tile_counts) = run_reference!(
             project,
-            constants!(project, setup, sh_degree),
+            constants!(project, setup, sh_degree, raw_colors),
             params,
             [parameters],
             [splats, colors, depth_keys, ids, tile_counts]
@@ -450,6 +450,7 @@ fn golden_renders_are_met() {
                 quat: DVec4::from_slice(&wide(&quats[4 * i..])),
                 log_scale: DVec3::from_slice(&wide(&scales[3 * i..])),
                 raw_opacity: opacities[i].into(),
+                features: vec![],
                 sh: wide(&coefficients[48 * i..][..48]).chunks(3).map(DVec3::from_slice).collect(),
             };
             setup.set(i, &gaussian);

@@ -6,7 +6,9 @@ use glam::{DAffine3, DVec2, DVec3, Vec3};
 use nightsplat::camera::Camera;
 use nightsplat::dataset::{Point, Split, View};
 use nightsplat::image::Image;
-use nightsplat::scene::{ATTRIBUTES, Gaussians, SH_C0, init, ply, rest_coefficients, width};
+use nightsplat::scene::{
+    ATTRIBUTES, Features, Gaussians, SH_C0, Shape, init, ply, rest_coefficients, width,
+};
 
 /// A camera at `position` that looks along +z.
 fn camera(position: DVec3) -> Camera {
@@ -20,8 +22,8 @@ fn camera(position: DVec3) -> Camera {
 }
 
 /// Gaussians whose every parameter is another number.
-fn distinct(count: usize, sh_degree: u32) -> Gaussians {
-    let mut gaussians = Gaussians::zeros(count, sh_degree);
+fn distinct(count: usize, shape: impl Into<Shape>) -> Gaussians {
+    let mut gaussians = Gaussians::zeros(count, shape);
     for (index, parameter) in gaussians.parameters.iter_mut().enumerate() {
         *parameter = (index as f32 * 0.37).sin() * 1e3 + 1e-7 * index as f32;
     }
@@ -43,28 +45,40 @@ mod table {
         let shader = include_str!("../shaders-glsl/include/gaussian.glsl");
         for spec in &ATTRIBUTES {
             let name = format!("{}_COLUMN", spec.name.to_uppercase());
-            let line = shader.lines().find(|line| line.contains(&name)).expect(&name);
+            let Some(line) = shader.lines().find(|line| line.contains(&name)) else {
+                assert_eq!(spec.name, "rest", "its plane begins where the features end");
+                continue;
+            };
             let value = line.split('=').nth(1).unwrap().split(';').next().unwrap();
-            assert_eq!(spec.attribute.column(), value.trim().parse::<usize>().unwrap(), "{name}");
+            assert_eq!(spec.attribute.column(0), value.trim().parse::<usize>().unwrap(), "{name}");
         }
     }
 
     #[test]
     fn the_accessors_cover_every_parameter_once() {
-        for sh_degree in 0..=3 {
-            let mut gaussians = Gaussians::zeros(5, sh_degree);
+        let shapes = [
+            Features::NONE,
+            Features { structure: true, noise: true, ..Features::NONE },
+            Features::ALL,
+        ]
+        .into_iter()
+        .flat_map(|features| (0..=3).map(move |sh_degree| Shape { sh_degree, features }));
+        for shape in shapes {
+            let Shape { sh_degree, features } = shape;
+            let mut gaussians = Gaussians::zeros(5, shape);
             assert_eq!(
                 gaussians.parameters.len(),
-                5 * (14 + 3 * ((sh_degree as usize + 1).pow(2) - 1))
+                5 * (14 + features.width() + 3 * ((sh_degree as usize + 1).pow(2) - 1))
             );
             gaussians.means_mut().fill(Vec3::splat(1.0));
             gaussians.quats_mut().fill([2.0; 4]);
             gaussians.log_scales_mut().fill(Vec3::splat(3.0));
             gaussians.raw_opacities_mut().fill(4.0);
             gaussians.dc_mut().fill(Vec3::splat(5.0));
-            gaussians.rest_mut().fill(Vec3::splat(6.0));
-            let widths = ATTRIBUTES.map(|spec| 5 * (spec.width)(sh_degree));
-            let expected = (1..=6).zip(widths).flat_map(|(value, len)| vec![value as f32; len]);
+            gaussians.features_mut().fill(6.0);
+            gaussians.rest_mut().fill(Vec3::splat(7.0));
+            let widths = ATTRIBUTES.map(|spec| 5 * (spec.width)(shape));
+            let expected = (1..=7).zip(widths).flat_map(|(value, len)| vec![value as f32; len]);
             assert_eq!(gaussians.parameters, expected.collect::<Vec<_>>());
             assert_eq!(
                 (gaussians.means().len(), gaussians.quats().len(), gaussians.log_scales().len()),
@@ -87,7 +101,7 @@ mod from_points {
 
     fn scales(positions: &[DVec3]) -> Vec<f32> {
         let colors = vec![Vec3::ZERO; positions.len()];
-        let gaussians = init::from_points(positions, &colors, 0).unwrap();
+        let gaussians = init::from_points(positions, &colors, 0, 0).unwrap();
         gaussians.log_scales().iter().map(|log_scale| log_scale.x.exp()).collect()
     }
 
@@ -95,8 +109,8 @@ mod from_points {
     fn every_attribute_begins_as_in_3dgs() {
         let positions = [DVec3::ZERO, DVec3::X, DVec3::Y * 2.0, DVec3::Z * 3.0];
         let colors = [Vec3::new(0.1, 0.5, 0.9); 4];
-        let gaussians = init::from_points(&positions, &colors, 2).unwrap();
-        assert_eq!((gaussians.count, gaussians.sh_degree), (4, 2));
+        let gaussians = init::from_points(&positions, &colors, 2, 0).unwrap();
+        assert_eq!((gaussians.count, gaussians.shape), (4, 2.into()));
         assert_eq!(gaussians.means()[2], Vec3::new(0.0, 2.0, 0.0));
         assert_eq!(gaussians.quats(), [[1.0, 0.0, 0.0, 0.0]; 4]);
         let opacity = 1.0 / (1.0 + (-gaussians.raw_opacities()[3]).exp());
@@ -163,8 +177,9 @@ mod from_points {
 
     #[test]
     fn points_that_are_not_finite_or_lack_a_color_are_refused() {
-        let refused =
-            |positions: &[DVec3], colors: &[Vec3]| init::from_points(positions, colors, 0).is_err();
+        let refused = |positions: &[DVec3], colors: &[Vec3]| {
+            init::from_points(positions, colors, 0, 0).is_err()
+        };
         assert!(refused(&[DVec3::new(0.0, f64::NAN, 0.0)], &[Vec3::ZERO]));
         assert!(refused(&[DVec3::ZERO], &[Vec3::splat(f32::INFINITY)]));
         assert!(refused(&[DVec3::ZERO, DVec3::ONE], &[Vec3::ZERO]));
@@ -300,6 +315,22 @@ mod ply_file {
         let dir = tempfile::tempdir().unwrap();
         ply::save(gaussians, dir.path().join("model.ply")).unwrap();
         std::fs::read(dir.path().join("model.ply")).unwrap()
+    }
+
+    #[test]
+    fn features_come_back_and_stand_behind_the_harmonics() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("model.ply");
+        for features in [Features::ALL, Features { noise: true, ..Features::NONE }] {
+            let gaussians = distinct(5, Shape { sh_degree: 1, features });
+            ply::save(&gaussians, &path).unwrap();
+            assert_eq!(ply::load(&path).unwrap(), gaussians);
+        }
+        let header = bytes(&distinct(1, Shape { sh_degree: 0, features: Features::ALL }));
+        let header = String::from_utf8_lossy(&header).into_owned();
+        let names = "f_dc_2 f_depth_0 f_prior_0 f_noise_0 f_noise_1 f_noise_2 f_illu_0 f_illu_1 f_illu_2 opacity";
+        let lines = names.replace(' ', "\nproperty float ");
+        assert!(header.contains(&lines), "{header}");
     }
 
     /// The file with its header's text changed.

@@ -15,6 +15,7 @@ layout(local_size_x = 64) in;
 layout(push_constant) uniform Params {
     uint  gaussian_count;
     uint  column_count;
+    uint  feature_count;
     float gradient_threshold;  // mean norm in normalised device units; exceeded, not met
     float split_log_scale;     // ln of the largest standard deviation of a clone
     float min_raw_opacity;     // before the sigmoid
@@ -31,8 +32,8 @@ layout(binding = 5) writeonly buffer Offspring     { uint offspring_counts[]; };
 bool is_sound(uint i) {
     if (!(parameters[RAW_OPACITIES_COLUMN * gaussian_count + i] >= min_raw_opacity)) return false;
     for (uint plane = 0; plane < PLANE_COUNT; ++plane) {
-        uint column = plane_column(plane, column_count);
-        uint width = plane_column(plane + 1, column_count) - column;
+        uint column = plane_column(plane, feature_count, column_count);
+        uint width = plane_column(plane + 1, feature_count, column_count) - column;
         uint first = column * gaussian_count + width * i;
         for (uint k = 0; k < width; ++k) if (!(abs(parameters[first + k]) < 3e38)) return false;
     }

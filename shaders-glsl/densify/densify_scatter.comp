@@ -18,6 +18,7 @@ layout(push_constant) uniform Params {
     uint gaussian_count;
     uint new_gaussian_count;
     uint column_count;
+    uint feature_count;
     uint seed;
     uint step;
 };
@@ -35,8 +36,8 @@ const float LOG_SPLIT_FACTOR = 0.47000362924573558;  // ln 1.6
 
 void copy(uint from, uint to, bool is_new) {
     for (uint plane = 0; plane < PLANE_COUNT; ++plane) {
-        uint column = plane_column(plane, column_count);
-        uint width = plane_column(plane + 1, column_count) - column;
+        uint column = plane_column(plane, feature_count, column_count);
+        uint width = plane_column(plane + 1, feature_count, column_count) - column;
         uint source = column * gaussian_count + width * from;
         uint target = column * new_gaussian_count + width * to;
         for (uint k = 0; k < width; ++k) {

@@ -6,7 +6,8 @@ const uint QUATS_COLUMN         = 3;   // 4: w, x, y, z, not normalised
 const uint LOG_SCALES_COLUMN    = 7;   // 3: ln of the standard deviations
 const uint RAW_OPACITIES_COLUMN = 10;  // 1: before the sigmoid
 const uint DC_COLUMN            = 11;  // 3: SH degree 0, RGB
-const uint REST_COLUMN          = 14;  // 3 ((degree + 1)^2 - 1): SH above degree 0, coefficient-major, RGB
+const uint FEATURES_COLUMN      = 14;  // as many as the scene has, 0 to 8: what is blended beside colour
+// Behind the features: 3 ((degree + 1)^2 - 1): SH above degree 0, coefficient-major, RGB
 
 // Reads of one Gaussian i of n from the array `parameters`, which the kernel declares.
 #define LOAD_VEC3(array, column, n, i) \

@@ -17,12 +17,14 @@ layout(constant_id = 0) const uint FLOATS_PER_THREAD = 4;
 layout(push_constant) uniform Params {
     uint  gaussian_count;
     uint  column_count;         // columns that take part, from the first: rows of the dispatch
+    uint  feature_count;        // of these, from FEATURES_COLUMN on
     float second_correction;    // 1 / sqrt(1 - b2^t)
     float means_rate;           // learning rates / (1 - b1^t)
     float quats_rate;
     float log_scales_rate;
     float raw_opacities_rate;
     float dc_rate;
+    float features_rate;
     float rest_rate;
 };
 
@@ -46,7 +48,8 @@ float rate_of(uint column) {
     if (column < LOG_SCALES_COLUMN) return quats_rate;
     if (column < RAW_OPACITIES_COLUMN) return log_scales_rate;
     if (column < DC_COLUMN) return raw_opacities_rate;
-    if (column < REST_COLUMN) return dc_rate;
+    if (column < FEATURES_COLUMN) return dc_rate;
+    if (column < FEATURES_COLUMN + feature_count) return features_rate;
     return rest_rate;
 }
 

@@ -9,7 +9,8 @@
 //! Project: one thread per Gaussian, world space to image plane.
 //!
 //! EWA: cov2d = U U^T + 0.3 I with U = J W R S, so it is positive definite by construction, and its determinant is
-//! |U0 x U1|^2 + 0.3 trace(U U^T) + 0.09, which cannot cancel. Colour is max(SH + 0.5, 0): what every viewer shows.
+//! |U0 x U1|^2 + 0.3 trace(U U^T) + 0.09, which cannot cancel. Colour is max(SH + 0.5, 0), what every viewer shows, or
+//! the bare SH sum of LITA-GS; features are taken as they are.
 //! A culled Gaussian gets the last depth key and covers no tile.
 
 layout(local_size_x = 64) in;
@@ -25,6 +26,7 @@ layout(push_constant, scalar) uniform Params {
 };
 
 layout(constant_id = 0) const uint SH_DEGREE = 3;  // stored
+layout(constant_id = 5) const bool RAW_COLORS = false;
 
 layout(binding = 0) readonly  buffer Parameters { float parameters[]; };    // (columns x gaussian_count)
 layout(binding = 1) writeonly buffer Splats     { ProjectedSplat splats[]; };
@@ -34,15 +36,17 @@ layout(binding = 4) writeonly buffer Ids        { uint ids[]; };
 layout(binding = 5) writeonly buffer TileCounts { uint tile_counts[]; };
 
 const uint CULLED = 0xffffffffu;
+const uint FEATURE_COUNT = CHANNELS - 3;
 
 vec3 sh_color(uint i, vec3 direction) {
     float basis[16];
     sh_basis(sh_degree, direction, basis);
     vec3 color = basis[0] * LOAD_VEC3(parameters, DC_COLUMN, gaussian_count, i);
-    uint rest = REST_COLUMN * gaussian_count + 3 * (sh_count(SH_DEGREE) - 1) * i;
+    uint rest = (FEATURES_COLUMN + FEATURE_COUNT) * gaussian_count + 3 * (sh_count(SH_DEGREE) - 1) * i;
     for (uint k = 1; k < sh_count(sh_degree); k++, rest += 3) {
         color += basis[k] * vec3(parameters[rest], parameters[rest + 1], parameters[rest + 2]);
     }
+    if (RAW_COLORS) return color;
     return max(color + 0.5, vec3(0.0));
 }
 
@@ -86,6 +90,8 @@ void main() {
     vec3 center = -transpose(mat3(view_from_world)) * view_from_world[3];
     vec3 color = sh_color(i, normalize(mean - center));
     for (uint c = 0; c < 3; c++) colors[CHANNELS * i + c] = color[c];
+    uint features = FEATURES_COLUMN * gaussian_count + FEATURE_COUNT * i;
+    for (uint k = 0; k < FEATURE_COUNT; k++) colors[CHANNELS * i + 3 + k] = parameters[features + k];
 
     uint count = 0;
     uvec2 tile_rows = splat_tile_rows(splat, size.y);

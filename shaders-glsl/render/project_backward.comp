@@ -25,6 +25,7 @@ layout(push_constant, scalar) uniform Params {
 };
 
 layout(constant_id = 0) const uint SH_DEGREE = 3;  // stored
+layout(constant_id = 5) const bool RAW_COLORS = false;
 
 layout(binding = 0) readonly  buffer Parameters { float parameters[]; };  // (columns x gaussian_count)
 layout(binding = 1) readonly  buffer Splats     { ProjectedSplat splats[]; };
@@ -37,6 +38,7 @@ layout(binding = 7) buffer GradNormSums { float grad_norm_sums[]; };
 layout(binding = 8) buffer VisitCounts  { uint visit_counts[]; };
 
 const uint RECORD = 6 + CHANNELS;
+const uint FEATURE_COUNT = CHANNELS - 3;
 
 #define STORE_VEC3(column, i, v) { \
     uint at = (column) * gaussian_count + 3 * (i); \
@@ -66,7 +68,7 @@ vec3 sh_backward(uint i, vec3 offset, vec3 d_color) {
     sh_basis_gradient(sh_degree, direction, basis_gradient);
     STORE_VEC3(DC_COLUMN, i, basis[0] * d_color);
     vec3 d_direction = vec3(0.0);
-    uint rest = REST_COLUMN * gaussian_count + 3 * (sh_count(SH_DEGREE) - 1) * i;
+    uint rest = (FEATURES_COLUMN + FEATURE_COUNT) * gaussian_count + 3 * (sh_count(SH_DEGREE) - 1) * i;
     for (uint k = 1; k < sh_count(SH_DEGREE); k++, rest += 3) {
         vec3 coefficient = vec3(parameters[rest], parameters[rest + 1], parameters[rest + 2]);
         d_direction += dot(coefficient, d_color) * basis_gradient[k];
@@ -81,7 +83,9 @@ void store_zero(uint i) {
     STORE_VEC3(LOG_SCALES_COLUMN, i, vec3(0.0));
     gradients[RAW_OPACITIES_COLUMN * gaussian_count + i] = 0.0;
     STORE_VEC3(DC_COLUMN, i, vec3(0.0));
-    uint rest = REST_COLUMN * gaussian_count + 3 * (sh_count(SH_DEGREE) - 1) * i;
+    uint features = FEATURES_COLUMN * gaussian_count + FEATURE_COUNT * i;
+    for (uint k = 0; k < FEATURE_COUNT; k++) gradients[features + k] = 0.0;
+    uint rest = (FEATURES_COLUMN + FEATURE_COUNT) * gaussian_count + 3 * (sh_count(SH_DEGREE) - 1) * i;
     for (uint k = 0; k < 3 * (sh_count(SH_DEGREE) - 1); k++) gradients[rest + k] = 0.0;
 }
 
@@ -98,8 +102,14 @@ void main() {
     vec3 d_conic = vec3(d_splats[record + 2], d_splats[record + 3], d_splats[record + 4]);
     float d_opacity = d_splats[record + 5];
     vec3 d_color;
-    // A colour clamped at zero passes nothing on.
-    for (uint c = 0; c < 3; c++) d_color[c] = colors[CHANNELS * i + c] > 0.0 ? d_splats[record + 6 + c] : 0.0;
+    for (uint c = 0; c < 3; c++) {
+        // A colour clamped at zero passes nothing on.
+        bool passes = colors[CHANNELS * i + c] > 0.0;
+        if (RAW_COLORS) passes = true;
+        d_color[c] = passes ? d_splats[record + 6 + c] : 0.0;
+    }
+    uint features = FEATURES_COLUMN * gaussian_count + FEATURE_COUNT * i;
+    for (uint k = 0; k < FEATURE_COUNT; k++) gradients[features + k] = d_splats[record + 9 + k];
 
     // The forward pass again.
     mat3 view_rotation = mat3(view_from_world);

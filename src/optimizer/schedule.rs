@@ -4,7 +4,7 @@ use crate::scene::Attribute;
 
 /// Adam's learning rate of each attribute.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(default, deny_unknown_fields)]
 pub struct LearningRates {
     /// Positions, in world units.
     pub means: f64,
@@ -16,8 +16,26 @@ pub struct LearningRates {
     pub raw_opacities: f64,
     /// SH coefficients of degree 0.
     pub dc: f64,
+    /// What is blended beside colour.
+    pub features: f64,
     /// SH coefficients above degree 0.
     pub rest: f64,
+}
+
+/// Those of the attribute table.
+impl Default for LearningRates {
+    fn default() -> Self {
+        let rate = |attribute: Attribute| attribute.spec().learning_rate;
+        Self {
+            means: rate(Attribute::Means),
+            quats: rate(Attribute::Quats),
+            log_scales: rate(Attribute::LogScales),
+            raw_opacities: rate(Attribute::RawOpacities),
+            dc: rate(Attribute::Dc),
+            features: rate(Attribute::Features),
+            rest: rate(Attribute::Rest),
+        }
+    }
 }
 
 /// The schedules as functions of the step, counted from 1. The defaults are those of 3DGS (Kerbl et al. 2023) but for
@@ -45,16 +63,8 @@ pub struct Schedule {
 
 impl Default for Schedule {
     fn default() -> Self {
-        let rate = |attribute: Attribute| attribute.spec().learning_rate;
         Self {
-            initial_rates: LearningRates {
-                means: rate(Attribute::Means),
-                quats: rate(Attribute::Quats),
-                log_scales: rate(Attribute::LogScales),
-                raw_opacities: rate(Attribute::RawOpacities),
-                dc: rate(Attribute::Dc),
-                rest: rate(Attribute::Rest),
-            },
+            initial_rates: LearningRates::default(),
             final_means_rate: 1.6e-6,
             means_rate_steps: 30_000,
             sh_degree_interval: 1_000,

@@ -16,6 +16,7 @@ fn rate_of(params: &Params, column: usize) -> f32 {
         7..10 => params.log_scales_rate,
         10 => params.raw_opacities_rate,
         11..14 => params.dc_rate,
+        _ if column < 14 + params.feature_count as usize => params.features_rate,
         _ => params.rest_rate,
     }
 }

@@ -7,15 +7,18 @@ pub(super) const CLONE: u32 = 2;
 pub(super) const SPLIT: u32 = 3;
 
 /// First column and width of every plane.
-pub(super) fn planes(column_count: usize) -> [(usize, usize); 6] {
-    [(0, 3), (3, 4), (7, 3), (10, 1), (11, 3), (14, column_count - 14)]
+pub(super) fn planes(feature_count: usize, column_count: usize) -> [(usize, usize); 7] {
+    let rest = 14 + feature_count;
+    [(0, 3), (3, 4), (7, 3), (10, 1), (11, 3), (14, feature_count), (rest, column_count - rest)]
 }
 
 impl Reference for Kernel {
     fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
         let n = params.gaussian_count as usize;
         for i in 0..n {
-            let is_finite = planes(params.column_count as usize).iter().all(|(column, width)| {
+            let [features, columns] =
+                [params.feature_count, params.column_count].map(|n| n as usize);
+            let is_finite = planes(features, columns).iter().all(|(column, width)| {
                 (0..*width).all(|k| slices.parameters[column * n + width * i + k].is_finite())
             });
             let is_visible = slices.parameters[10 * n + i] >= params.min_raw_opacity;

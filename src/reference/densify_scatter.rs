@@ -39,6 +39,7 @@ fn draw_mean(params: &Params, parameters: &[f32], i: usize, copy: u32) -> Vec3 {
 impl Reference for Kernel {
     fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
         let (n, new_n) = (params.gaussian_count as usize, params.new_gaussian_count as usize);
+        let [features, columns] = [params.feature_count, params.column_count].map(|n| n as usize);
         for i in 0..n {
             let fate = slices.fates[i];
             let copies = match fate {
@@ -49,7 +50,7 @@ impl Reference for Kernel {
             for copy in 0..copies {
                 let to = slices.offsets[i] as usize + copy as usize;
                 let is_new = fate == SPLIT || copy > 0;
-                for (column, width) in planes(params.column_count as usize) {
+                for (column, width) in planes(features, columns) {
                     for k in 0..width {
                         let source = column * n + width * i + k;
                         let target = column * new_n + width * to + k;

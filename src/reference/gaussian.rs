@@ -15,6 +15,8 @@ pub struct Gaussian {
     pub log_scale: DVec3,
     /// Before the sigmoid.
     pub raw_opacity: f64,
+    /// What is blended beside colour.
+    pub features: Vec<f64>,
     /// All stored SH coefficients, degree 0 first, RGB.
     pub sh: Vec<DVec3>,
 }
@@ -24,6 +26,8 @@ pub struct Gaussian {
 pub struct Planes {
     /// Gaussians in the array.
     pub count: usize,
+    /// Features of each.
+    pub feature_count: usize,
     /// The degree that is stored.
     pub sh_degree: u32,
 }
@@ -31,7 +35,7 @@ pub struct Planes {
 impl Planes {
     /// Floats of the whole array.
     pub fn len(self) -> usize {
-        self.count * (11 + 3 * sh_count(self.sh_degree))
+        self.count * (11 + self.feature_count + 3 * sh_count(self.sh_degree))
     }
 
     /// True where there is no Gaussian.
@@ -39,15 +43,15 @@ impl Planes {
         self.count == 0
     }
 
-    /// Where Gaussian `i` has its floats, attribute by attribute.
+    /// Where Gaussian `i` has its floats, in the order of [`Gaussian`].
     fn places(self, i: usize) -> impl Iterator<Item = usize> {
-        let rest = 3 * (sh_count(self.sh_degree) - 1);
-        [(0, 3), (3, 4), (7, 3), (10, 1), (11, 3), (14, rest)].into_iter().flat_map(
-            move |(column, width)| {
-                let first = column * self.count + width * i;
-                first..first + width
-            },
-        )
+        let (features, rest) = (self.feature_count, 3 * (sh_count(self.sh_degree) - 1));
+        let planes =
+            [(0, 3), (3, 4), (7, 3), (10, 1), (14, features), (11, 3), (14 + features, rest)];
+        planes.into_iter().flat_map(move |(column, width)| {
+            let first = column * self.count + width * i;
+            first..first + width
+        })
     }
 
     /// Gaussian `i` of the array.
@@ -58,7 +62,8 @@ impl Planes {
             quat: DVec4::from_slice(&v[3..7]),
             log_scale: DVec3::from_slice(&v[7..10]),
             raw_opacity: v[10],
-            sh: v[11..].chunks_exact(3).map(DVec3::from_slice).collect(),
+            features: v[11..11 + self.feature_count].to_vec(),
+            sh: v[11 + self.feature_count..].chunks_exact(3).map(DVec3::from_slice).collect(),
         }
     }
 
@@ -68,6 +73,7 @@ impl Planes {
             .chain(gaussian.quat.to_array())
             .chain(gaussian.log_scale.to_array())
             .chain([gaussian.raw_opacity])
+            .chain(gaussian.features.iter().copied())
             .chain(gaussian.sh.iter().flat_map(|coefficient| coefficient.to_array()));
         self.places(i).zip(values).for_each(|(at, value)| set(at, value));
     }

@@ -19,17 +19,18 @@ pub struct Projection {
     pub splat: Splat,
     /// Pixels: the box around the ellipse alpha = 1/255.
     pub half_extent: DVec2,
-    /// RGB, not below zero.
+    /// RGB; not below zero, but for raw colours.
     pub color: DVec3,
     /// z in the view, world units.
     pub depth: f64,
 }
 
-/// Projects one Gaussian with SH up to `sh_degree`; `None` where it is culled.
+/// Projects one Gaussian with SH up to `sh_degree`; `None` where it is culled. Raw colours are the bare SH sum.
 pub fn project_gaussian(
     camera: &Camera,
     near: f64,
     sh_degree: u32,
+    raw_colors: bool,
     gaussian: &Gaussian,
 ) -> Option<Projection> {
     let mean_in_view = camera.view(gaussian.mean);
@@ -64,7 +65,7 @@ pub fn project_gaussian(
     Some(Projection {
         splat: Splat { mean2d, conic, opacity },
         half_extent,
-        color: (color + 0.5).max(DVec3::ZERO),
+        color: if raw_colors { color } else { (color + 0.5).max(DVec3::ZERO) },
         depth,
     })
 }
@@ -74,8 +75,10 @@ impl Reference for Kernel {
         let Slices { parameters, splats, colors, depth_keys, ids, tile_counts } = slices;
         let &Params { view_from_world, focal, principal_point, size, near, .. } = params;
         let camera = Camera::new(view_from_world, focal, principal_point, size);
-        let planes =
-            Planes { count: params.gaussian_count as usize, sh_degree: constants.sh_degree };
+        let (channels, sh_degree) = (constants.channels as usize, constants.sh_degree);
+        let feature_count = channels - 3;
+        let planes = Planes { count: params.gaussian_count as usize, feature_count, sh_degree };
+        let raw_colors = constants.raw_colors;
         let tile = UVec2::new(constants.tile_width, constants.tile_height);
         for i in 0..planes.count {
             ids[i] = i as u32;
@@ -83,7 +86,7 @@ impl Reference for Kernel {
             tile_counts[i] = 0;
             let gaussian = planes.load(parameters, i);
             let Some(projection) =
-                project_gaussian(&camera, near.into(), params.sh_degree, &gaussian)
+                project_gaussian(&camera, near.into(), params.sh_degree, raw_colors, &gaussian)
             else {
                 continue;
             };
@@ -93,8 +96,9 @@ impl Reference for Kernel {
                 opacity: projection.splat.opacity as f32,
                 half_extent: projection.half_extent.as_vec2(),
             };
-            for c in 0..3 {
-                colors[constants.channels as usize * i + c] = projection.color[c] as f32;
+            let values = projection.color.to_array().into_iter().chain(gaussian.features);
+            for (color, value) in colors[channels * i..].iter_mut().zip(values) {
+                *color = value as f32;
             }
             let [top, bottom] = splat_tile_rows(&splats[i], size.y, tile);
             for row in top..bottom {

@@ -20,6 +20,8 @@ pub struct DSplat {
     pub opacity: f64,
     /// RGB; zero where the colour was clamped.
     pub color: DVec3,
+    /// Of what is blended beside colour.
+    pub features: Vec<f64>,
 }
 
 /// The gradients of a Gaussian's attributes from those of the splat it became.
@@ -78,6 +80,7 @@ pub fn project_gaussian_backward(
         quat: d_quat,
         log_scale: d_log_scale,
         raw_opacity: d_splat.opacity * opacity * (1.0 - opacity),
+        features: d_splat.features.clone(),
         sh: d_sh,
     }
 }
@@ -121,22 +124,25 @@ impl Reference for Kernel {
         let Slices { gradients, grad_norm_sums, visit_counts, .. } = slices;
         let &Params { view_from_world, focal, principal_point, size, .. } = params;
         let camera = Camera::new(view_from_world, focal, principal_point, size);
-        let planes =
-            Planes { count: params.gaussian_count as usize, sh_degree: constants.sh_degree };
-        let channels = constants.channels as usize;
+        let (channels, sh_degree) = (constants.channels as usize, constants.sh_degree);
+        let feature_count = channels - 3;
+        let planes = Planes { count: params.gaussian_count as usize, feature_count, sh_degree };
+        let raw_colors = constants.raw_colors;
         gradients[..planes.len()].fill(0.0);
         for i in 0..planes.count {
             if tile_counts[i] == 0 {
                 continue;
             }
             let d: Vec<f64> =
-                d_splats[(6 + channels) * i..][..9].iter().map(|&d| d.into()).collect();
-            let passes = |c: usize| if colors[channels * i + c] > 0.0 { d[6 + c] } else { 0.0 };
+                d_splats[(6 + channels) * i..][..6 + channels].iter().map(|&d| d.into()).collect();
+            let is_free = |c: usize| raw_colors || colors[channels * i + c] > 0.0;
+            let passes = |c: usize| if is_free(c) { d[6 + c] } else { 0.0 };
             let d_splat = DSplat {
                 mean2d: DVec2::from_slice(&d[0..2]),
                 conic: DVec3::from_slice(&d[2..5]),
                 opacity: d[5],
                 color: DVec3::from_array([0, 1, 2].map(passes)),
+                features: d[9..].to_vec(),
             };
             let gaussian = planes.load(parameters, i);
             let splat = Splat::from(&splats[i]);

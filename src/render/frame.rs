@@ -6,8 +6,8 @@ use crate::Result;
 use crate::gpu::{Buffer, Gpu};
 use crate::kernels::ProjectedSplat;
 
-/// Values of a gradient record: mean2d 2, conic 3, opacity 1, colour 3.
-const RECORD: usize = 9;
+/// Values of a gradient record before its channels: mean2d 2, conic 3, opacity 1.
+const RECORD_HEAD: usize = 6;
 
 /// The first guess of how many tiles a Gaussian meets; a view that needs more makes the memory grow.
 const TILES_PER_GAUSSIAN: u32 = 6;
@@ -45,6 +45,8 @@ impl Status {
 /// Buffers by what their length follows.
 #[derive(Debug)]
 pub(super) struct Frame {
+    /// Values per pixel.
+    channels: usize,
     // Gaussians
     pub(super) gaussian_count: u32,
     /// [0]: the count again, where a pass looks for it
@@ -74,8 +76,9 @@ pub(super) struct Frame {
 
 impl Frame {
     /// Room for nothing but the single numbers.
-    pub(super) fn new(gpu: &Gpu) -> Result<Self> {
+    pub(super) fn new(gpu: &Gpu, channels: usize) -> Result<Self> {
         Ok(Self {
+            channels,
             gaussian_count: 0,
             gaussian_counts: gpu.zeros("gaussian_counts", 1)?,
             splats: gpu.uninit("splats", 0)?,
@@ -109,18 +112,18 @@ impl Frame {
     ) -> Result<()> {
         if self.gaussian_count as usize != count || self.splats.len() != count {
             self.splats = gpu.uninit("splats", count)?;
-            self.colors = gpu.uninit("colors", 3 * count)?;
+            self.colors = gpu.uninit("colors", self.channels * count)?;
             self.depth_keys = gpu.uninit("depth_keys", count)?;
             self.ids = gpu.uninit("ids", count)?;
             self.tile_counts = gpu.uninit("tile_counts", count)?;
             self.ordered_counts = gpu.uninit("ordered_counts", count)?;
             self.offsets = gpu.uninit("offsets", count)?;
-            self.d_splats = gpu.uninit("d_splats", RECORD * count)?;
+            self.d_splats = gpu.uninit("d_splats", (RECORD_HEAD + self.channels) * count)?;
             self.gaussian_count = count as u32;
             gpu.write(&mut self.gaussian_counts, &[count as u32])?;
         }
-        if self.render.len() < 3 * pixels {
-            self.render = gpu.uninit("render", 3 * pixels)?;
+        if self.render.len() < self.channels * pixels {
+            self.render = gpu.uninit("render", self.channels * pixels)?;
             self.transmittances = gpu.uninit("transmittances", pixels)?;
         }
         if self.tile_ranges.len() < tiles {
@@ -138,7 +141,7 @@ impl Frame {
             self.tiles = gpu.uninit("tiles", capacity)?;
             self.slots = gpu.uninit("slots", capacity)?;
             self.owners = gpu.uninit("owners", capacity)?;
-            self.records = gpu.uninit("records", RECORD * capacity)?;
+            self.records = gpu.uninit("records", (RECORD_HEAD + self.channels) * capacity)?;
         }
         Ok(())
     }

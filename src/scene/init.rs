@@ -7,7 +7,7 @@ use glam::{DVec2, DVec3, Vec3};
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rayon::prelude::*;
 
-use super::{Gaussians, SH_C0};
+use super::{Gaussians, SH_C0, Shape};
 use crate::camera::Camera;
 use crate::dataset::{Point, Split, View};
 use crate::image::Image;
@@ -28,11 +28,17 @@ const LONE_SCALE: f64 = 0.01;
 /// Opacity 0.1, no rotation, SH degree 0 such that the colour is `colors[i]` (sRGB-encoded, [0, 1]), nothing above
 /// it. The standard deviation is the root of the mean squared distance to the three nearest other positions (3DGS);
 /// coincident points count as one position, so duplicates do not shrink to nothing. With fewer than four positions
-/// the mean goes over those there are; a single position has the standard deviation 0.01.
+/// the mean goes over those there are; a single position has the standard deviation 0.01. Features are uniform in
+/// [0, 1), drawn from `seed` (LITA-GS).
 ///
 /// # Errors
 /// [`Error::Usage`] where a position or colour is not finite or their numbers differ.
-pub fn from_points(positions: &[DVec3], colors: &[Vec3], sh_degree: u32) -> Result<Gaussians> {
+pub fn from_points(
+    positions: &[DVec3],
+    colors: &[Vec3],
+    shape: impl Into<Shape>,
+    seed: u64,
+) -> Result<Gaussians> {
     if positions.len() != colors.len() {
         return Err(Error::Usage(format!(
             "{} points have {} colours",
@@ -47,7 +53,7 @@ pub fn from_points(positions: &[DVec3], colors: &[Vec3], sh_degree: u32) -> Resu
         )));
     }
 
-    let mut gaussians = Gaussians::zeros(positions.len(), sh_degree);
+    let mut gaussians = Gaussians::zeros(positions.len(), shape);
     for (mean, position) in gaussians.means_mut().iter_mut().zip(positions) {
         *mean = position.as_vec3();
     }
@@ -58,6 +64,10 @@ pub fn from_points(positions: &[DVec3], colors: &[Vec3], sh_degree: u32) -> Resu
     gaussians.raw_opacities_mut().fill((OPACITY / (1.0 - OPACITY)).ln());
     for (dc, color) in gaussians.dc_mut().iter_mut().zip(colors) {
         *dc = (color - 0.5) / SH_C0;
+    }
+    let draws = Stream::new(seed, 0);
+    for (i, feature) in gaussians.features_mut().iter_mut().enumerate() {
+        *feature = draws.uniform(i as u64) as f32;
     }
     Ok(gaussians)
 }

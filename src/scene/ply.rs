@@ -1,7 +1,8 @@
 //! Gaussians as a PLY file in the INRIA layout that every splat viewer opens.
 //!
 //! Binary little-endian, one vertex per Gaussian: `x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3`.
-//! Normals are zero; `f_rest_*` is channel-major (all of red, then green, then blue); opacity is before the sigmoid,
+//! Features, where the scene has any, stand between `f_rest_*` and `opacity`: `f_depth_0 f_prior_0 f_noise_0..2 f_illu_0..2`,
+//! which viewers skip. Normals are zero; `f_rest_*` is channel-major (all of red, then green, then blue); opacity is before the sigmoid,
 //! scales are logarithms, `rot_0` is w. Source: `save_ply` of the 3DGS code.
 
 use std::collections::HashMap;
@@ -9,14 +10,17 @@ use std::fs;
 use std::io::{BufWriter, Write as _};
 use std::path::Path;
 
-use super::{Attribute, Gaussians, MAX_SH_DEGREE, rest_coefficients};
+use super::{
+    Attribute, FEATURES, Feature, Features, Gaussians, MAX_SH_DEGREE, Shape, rest_coefficients,
+};
 use crate::{Error, Result};
 
 /// The attributes in the order of their properties; the unused normals follow the means.
-const FILE_ORDER: [Attribute; 6] = [
+const FILE_ORDER: [Attribute; 7] = [
     Attribute::Means,
     Attribute::Dc,
     Attribute::Rest,
+    Attribute::Features,
     Attribute::RawOpacities,
     Attribute::LogScales,
     Attribute::Quats,
@@ -32,25 +36,25 @@ struct Property {
 impl Property {
     /// The property's value is at `begin + stride * gaussian` in [`Gaussians::parameters`].
     fn address(&self, gaussians: &Gaussians) -> (usize, usize) {
-        let stride = (self.attribute.spec().width)(gaussians.sh_degree);
+        let stride = (self.attribute.spec().width)(gaussians.shape);
         (gaussians.plane(self.attribute).start + self.component, stride)
     }
 }
 
 /// Every property but the normals, in the order of the file.
-fn properties(sh_degree: u32) -> Vec<Property> {
+fn properties(shape: Shape) -> Vec<Property> {
     let of_attribute = |attribute: Attribute| {
         let spec = attribute.spec();
-        (0..(spec.width)(sh_degree)).map(move |position| {
+        (0..(spec.width)(shape)).map(move |position| {
             // The file is channel-major where the scene is coefficient-major.
             let component = match attribute {
                 Attribute::Rest => {
-                    let coefficients = rest_coefficients(sh_degree);
+                    let coefficients = rest_coefficients(shape.sh_degree);
                     3 * (position % coefficients) + position / coefficients
                 }
                 _ => position,
             };
-            Property { name: (spec.ply_property)(position), attribute, component }
+            Property { name: (spec.ply_property)(shape, position), attribute, component }
         })
     };
     FILE_ORDER.into_iter().flat_map(of_attribute).collect()
@@ -75,7 +79,7 @@ pub fn save(gaussians: &Gaussians, path: impl AsRef<Path>) -> Result<()> {
 
 fn write(gaussians: &Gaussians, path: &Path) -> std::io::Result<()> {
     const NORMALS: [&str; 3] = ["nx", "ny", "nz"];
-    let properties = properties(gaussians.sh_degree);
+    let properties = properties(gaussians.shape);
     let (means, others) = properties.split_at(3);
     let mut file = BufWriter::new(fs::File::create(path)?);
     writeln!(file, "ply\nformat binary_little_endian 1.0\nelement vertex {}", gaussians.count)?;
@@ -136,8 +140,8 @@ fn parse(bytes: &[u8]) -> Result<Gaussians, String> {
         ));
     }
 
-    let mut gaussians = Gaussians::zeros(header.count, header.sh_degree()?);
-    for property in properties(gaussians.sh_degree) {
+    let mut gaussians = Gaussians::zeros(header.count, header.shape()?);
+    for property in properties(gaussians.shape) {
         let offset = header.offset(&property.name)?;
         let (begin, stride) = property.address(&gaussians);
         for (gaussian, vertex) in body[..expected].chunks_exact(header.stride).enumerate() {
@@ -243,6 +247,24 @@ impl Header {
         }
         self.stride += size;
         Ok(())
+    }
+
+    fn shape(&self) -> Result<Shape, String> {
+        Ok(Shape { sh_degree: self.sh_degree()?, features: self.features() })
+    }
+
+    /// The features whose first property is there.
+    fn features(&self) -> Features {
+        let has = |feature: Feature| {
+            let name = FEATURES[feature as usize].ply_name;
+            self.properties.contains_key(&format!("f_{name}_0"))
+        };
+        Features {
+            depth: has(Feature::Depth),
+            structure: has(Feature::Structure),
+            noise: has(Feature::Noise),
+            illumination: has(Feature::Illumination),
+        }
     }
 
     /// The degree whose `f_rest_*` properties are all there.

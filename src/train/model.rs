@@ -4,13 +4,13 @@ use crate::Result;
 use crate::densify::{Densifier, DensifyReport, DeviceGaussians, GradientStatistics};
 use crate::gpu::{Buffer, Gpu};
 use crate::optimizer::Moments;
-use crate::scene::{Gaussians, width};
+use crate::scene::{Gaussians, Shape, width};
 
 /// Planes of every attribute with their moments and gradients, and the statistics of density control.
 #[derive(Debug)]
 pub(super) struct Model {
     pub(super) gaussians: DeviceGaussians,
-    sh_degree: u32,
+    shape: Shape,
     /// As many as parameters.
     pub(super) gradients: Buffer<f32>,
     /// One per Gaussian each.
@@ -24,17 +24,18 @@ impl Model {
     pub(super) fn upload(gpu: &Gpu, gaussians: &Gaussians) -> Result<Self> {
         let on_device = DeviceGaussians {
             count: gaussians.count as u32,
-            column_count: width(gaussians.sh_degree) as u32,
+            column_count: width(gaussians.shape) as u32,
+            feature_count: gaussians.shape.features.width() as u32,
             parameters: gpu.buffer("parameters", &gaussians.parameters)?,
             moments: Moments::zeros(gpu, gaussians.parameters.len())?,
         };
-        Self::new(gpu, on_device, gaussians.sh_degree)
+        Self::new(gpu, on_device, gaussians.shape)
     }
 
-    fn new(gpu: &Gpu, gaussians: DeviceGaussians, sh_degree: u32) -> Result<Self> {
+    fn new(gpu: &Gpu, gaussians: DeviceGaussians, shape: Shape) -> Result<Self> {
         let count = gaussians.count as usize;
         Ok(Self {
-            sh_degree,
+            shape,
             gradients: gpu.zeros("gradients", gaussians.parameters.len())?,
             grad_norm_sums: gpu.zeros("grad_norm_sums", count)?,
             visit_counts: gpu.zeros("visit_counts", count)?,
@@ -61,7 +62,7 @@ impl Model {
             visit_counts: &self.visit_counts,
         };
         let (gaussians, report) = densifier.densify(&self.gaussians, statistics, step)?;
-        *self = Self::new(gpu, gaussians, self.sh_degree)?;
+        *self = Self::new(gpu, gaussians, self.shape)?;
         Ok(report)
     }
 
@@ -69,6 +70,6 @@ impl Model {
     /// The device was lost.
     pub(super) fn download(&self, gpu: &Gpu) -> Result<Gaussians> {
         let parameters = gpu.read(&self.gaussians.parameters)?;
-        Ok(Gaussians { count: self.count(), sh_degree: self.sh_degree, parameters })
+        Ok(Gaussians { count: self.count(), shape: self.shape, parameters })
     }
 }

@@ -97,7 +97,8 @@ impl Views {
             view.map(|view| view.target(gpu, pseudo_gt)).transpose()
         })?;
         let positions: Vec<DVec3> = kept.iter().map(|point| point.position).collect();
-        init::from_points(&positions, &colors, config.sh_degree)
+        let seed = Stream::new(config.seed, streams::FEATURES).bits(0);
+        init::from_points(&positions, &colors, config.sh_degree, seed)
     }
 }
 

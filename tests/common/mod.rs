@@ -87,6 +87,7 @@ pub(crate) struct Setup {
     pub(crate) params: project::Params,
     pub(crate) parameters: Vec<f32>,
     pub(crate) sh_degree: u32,
+    pub(crate) raw_colors: bool,
     pub(crate) alpha_max: f32,
     pub(crate) channels: u32,
     pub(crate) tile: UVec2,
@@ -96,6 +97,17 @@ pub(crate) struct Setup {
 impl Setup {
     /// `count` Gaussians inside the view of a turned camera with an off-centre principal point.
     pub(crate) fn new(count: usize, size: UVec2, sh_degree: u32, seed: u64) -> Self {
+        Self::with_channels(count, size, sh_degree, 3, seed)
+    }
+
+    /// The same with features beside colour.
+    pub(crate) fn with_channels(
+        count: usize,
+        size: UVec2,
+        sh_degree: u32,
+        channels: u32,
+        seed: u64,
+    ) -> Self {
         let (sin, cos) = 0.3f32.sin_cos();
         let params = project::Params {
             view_from_world: [[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos], [0.2, -0.1, 0.4]],
@@ -110,8 +122,9 @@ impl Setup {
             params,
             parameters: vec![],
             sh_degree,
+            raw_colors: false,
             alpha_max: 0.99,
-            channels: 3,
+            channels,
             tile: UVec2::new(16, 16),
             background: std::array::from_fn(|c| 0.1 * c as f32),
         };
@@ -138,6 +151,7 @@ impl Setup {
             quat: random.normals().into(),
             log_scale: [0; 3].map(|_| (pixel_size * random.between(0.3, 8.0)).ln()).into(),
             raw_opacity: random.between(-3.0, 6.0),
+            features: (3..self.channels).map(|_| random.between(-1.0, 2.0)).collect(),
             sh: (0..count)
                 .map(|k| (random.normals().map(|c: f64| c / (1.0 + k as f64))).into())
                 .collect(),
@@ -145,7 +159,9 @@ impl Setup {
     }
 
     pub(crate) fn planes(&self) -> Planes {
-        Planes { count: self.params.gaussian_count as usize, sh_degree: self.sh_degree }
+        let feature_count = self.channels as usize - 3;
+        let count = self.params.gaussian_count as usize;
+        Planes { count, feature_count, sh_degree: self.sh_degree }
     }
 
     pub(crate) fn camera(&self) -> Camera {
@@ -179,7 +195,8 @@ impl Setup {
     }
 }
 
-/// Every size, channel count, tile and SH degree (stored, in use) that a kernel may trip over.
+/// Every size, channel count, tile and SH degree (stored, in use) that a kernel may trip over; colours are raw in those
+/// with many channels.
 pub(crate) fn variants() -> Vec<Setup> {
     type Row = (usize, [u32; 2], [u32; 2], u32, [u32; 2]);
     let rows: [Row; 7] = [
@@ -192,9 +209,9 @@ pub(crate) fn variants() -> Vec<Setup> {
         (1777, [131, 77], [3, 3], 3, [16, 8]),
     ];
     let build = |(count, size, [stored, used], channels, tile): Row| {
-        let mut setup = Setup::new(count, size.into(), stored, count as u64);
+        let mut setup = Setup::with_channels(count, size.into(), stored, channels, count as u64);
         setup.params.sh_degree = used;
-        Setup { channels, tile: tile.into(), ..setup }
+        Setup { raw_colors: channels > 4, tile: tile.into(), ..setup }
     };
     rows.map(build).to_vec()
 }
@@ -235,7 +252,7 @@ pub(crate) struct Frame {
     pub(crate) transmittances: Vec<f32>,
 }
 
-/// Colours before `project` fills in RGB: the channels above are somebody else's.
+/// Colours before `project` fills them in: those of culled Gaussians stay.
 pub(crate) fn initial_colors(setup: &Setup) -> Vec<f32> {
     let mut random = Random::new(9);
     let count = setup.params.gaussian_count * setup.channels;
@@ -254,7 +271,7 @@ pub(crate) fn forward(setup: &Setup, capacity: Option<u32>) -> Frame {
     let [depth_keys, ids, tile_counts] = [0; 3].map(|_| vec![0u32; n as usize]);
     let (splats, colors, depth_keys, ids, tile_counts) = run_kernel!(
         project,
-        constants!(project, setup, sh_degree),
+        constants!(project, setup, sh_degree, raw_colors),
         params,
         exactly,
         [parameters],
@@ -413,7 +430,7 @@ pub(crate) fn backward(setup: &Setup, frame: &Frame, d_render: &[f32]) -> Gradie
     let (grad_norm_sums, visit_counts) = (vec![0.5; n as usize], vec![3u32; n as usize]);
     let (gradients, grad_norm_sums, visit_counts) = run_kernel!(
         project_backward,
-        constants!(project_backward, setup, sh_degree),
+        constants!(project_backward, setup, sh_degree, raw_colors),
         project_backward_params(setup),
         Threads::Exactly([n, 1, 1]),
         [parameters, splats, colors, tile_counts, d_splats, status],

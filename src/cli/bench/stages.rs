@@ -183,13 +183,14 @@ impl<'s> Step<'s> {
             log_scales: 0.0,
             raw_opacities: 0.0,
             dc: 0.0,
+            features: 0.0,
             rest: 0.0,
         };
         self.adam.record(
             pass,
             1,
             &still,
-            [gaussians.count as u32, width(gaussians.sh_degree) as u32],
+            [gaussians.count as u32, width(gaussians.shape) as u32, 0],
             AdamBuffers {
                 parameters: &mut self.parameters,
                 gradients: &self.gradients,

@@ -53,13 +53,13 @@ pub(super) fn project_and_bin(
         size,
         near,
         gaussian_count,
-        sh_degree: gaussians.sh_degree,
+        sh_degree: gaussians.shape.sh_degree,
     };
     let (splats, colors, depth_keys, _, tile_counts) = check!(
         bench,
         timings,
         project,
-        constants!(bench, project, sh_degree: gaussians.sh_degree),
+        constants!(bench, project, sh_degree: gaussians.shape.sh_degree, raw_colors: false),
         camera,
         per_gaussian,
         [parameters],

@@ -75,7 +75,7 @@ pub(super) fn blend_and_back(
         bench,
         timings,
         project_backward,
-        constants!(bench, project_backward, sh_degree: scene.gaussians.sh_degree),
+        constants!(bench, project_backward, sh_degree: scene.gaussians.shape.sh_degree, raw_colors: false),
         project_backward::Params {
             view_from_world: camera.view_from_world,
             focal: camera.focal,
@@ -206,6 +206,8 @@ fn adam_step(
             log_scales_rate: rates.log_scales as f32,
             raw_opacities_rate: rates.raw_opacities as f32,
             dc_rate: rates.dc as f32,
+            feature_count: 0,
+            features_rate: rates.features as f32,
             rest_rate: rates.rest as f32,
         },
         Threads::Workgroups([gaussian_count.div_ceil(per_workgroup), column_count, 1]),
@@ -237,6 +239,7 @@ fn densify(
         densify_count::Params {
             gaussian_count,
             column_count,
+            feature_count: 0,
             gradient_threshold: grad_norm_sums.iter().sum::<f32>() / n as f32,
             split_log_scale: -4.5,
             min_raw_opacity: -3.0,
@@ -263,6 +266,7 @@ fn densify(
             gaussian_count,
             new_gaussian_count,
             column_count,
+            feature_count: 0,
             seed: 65,
             step: 1
         },
