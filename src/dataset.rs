@@ -50,6 +50,9 @@ pub struct View {
     pub image: Option<Image>,
     /// The normal-light photograph to score against, of the camera's size; test views only.
     pub reference: Option<Image>,
+    /// Depth from elsewhere, (H, W) of the camera's size, in units and with an offset of its own; larger is farther.
+    /// Training views only, and none where it says nothing, being the same everywhere.
+    pub depth: Option<Vec<f32>>,
 }
 
 impl View {
@@ -86,11 +89,29 @@ pub struct LoadOptions {
     pub reference: Option<PathBuf>,
     /// Whether test views load their dark photograph too, where there is one.
     pub load_low_test: bool,
+    /// What is looked for as the training views' depth.
+    pub depth: DepthOptions,
+}
+
+/// Where depth maps come from: `STEM.*` or `depth_STEM.*` in a folder.
+#[derive(Clone, Debug, Default)]
+pub struct DepthOptions {
+    /// Whether depth is loaded at all.
+    pub load: bool,
+    /// The folder; none: `depth/` or `depth_maps/` of the dataset.
+    pub folder: Option<PathBuf>,
+    /// The maps hold disparity, larger is nearer: they are negated.
+    pub is_disparity: bool,
 }
 
 impl Default for LoadOptions {
     fn default() -> Self {
-        Self { downscale: 1.0, reference: None, load_low_test: true }
+        Self {
+            downscale: 1.0,
+            reference: None,
+            load_low_test: true,
+            depth: DepthOptions::default(),
+        }
     }
 }
 
@@ -119,6 +140,8 @@ struct Listing {
 const DARK_FOLDERS: [&str; 2] = ["low", "images_low"];
 /// Folders that may hold the normal-light twin.
 const NORMAL_FOLDERS: [&str; 4] = ["high", "val", "test", "images"];
+/// Folders that may hold depth maps.
+const DEPTH_FOLDERS: [&str; 2] = ["depth", "depth_maps"];
 /// Every eighth of the name-sorted views is held out where nothing else says which.
 const TEST_EVERY: usize = 8;
 /// The largest camera-centre error, relative to the cameras' extent, at which two worlds count as the same.
@@ -146,7 +169,7 @@ impl Dataset {
         split(root, &mut frames)?;
 
         let sources = sources(root, &frames, options, &files, &mut skipped);
-        let views = pixels::load(sources, options.downscale, &mut skipped)?;
+        let views = pixels::load(sources, options, &mut skipped)?;
         if !views.iter().any(|view| view.split == Split::Train) {
             let first = skipped.first().map(|line| format!(" ({line})")).unwrap_or_default();
             let problem = format!(
@@ -199,6 +222,12 @@ impl LoadOptions {
         match &self.reference {
             Some(folder) if !folder.is_dir() => {
                 Err(Error::input(folder, "is not a folder of reference images"))
+            }
+            _ => Ok(()),
+        }?;
+        match &self.depth.folder {
+            Some(folder) if !folder.is_dir() => {
+                Err(Error::input(folder, "is not a folder of depth maps"))
             }
             _ => Ok(()),
         }
@@ -323,8 +352,11 @@ fn sources(
         }
         if input.is_some() || split == Split::Test {
             let input = input.filter(|_| split == Split::Train || options.load_low_test);
+            let depth = (options.depth.load && split == Split::Train)
+                .then(|| frame.depth(root, options.depth.folder.as_deref(), files))
+                .flatten();
             let Frame { name, lens, view_from_world, .. } = frame.clone();
-            sources.push(Source { name, split, lens, view_from_world, input, reference });
+            sources.push(Source { name, split, lens, view_from_world, input, reference, depth });
         }
     }
     if let Some(folder) = &options.reference
@@ -358,6 +390,18 @@ impl Frame {
         }
         let beside = DARK_FOLDERS.iter().find_map(|folder| self.find(&root.join(folder), files));
         beside.or_else(|| self.file.clone().filter(|_| lists_input))
+    }
+
+    /// The depth map: named like the photograph, or that behind `depth_`.
+    fn depth(&self, root: &Path, folder: Option<&Path>, files: &Files) -> Option<PathBuf> {
+        let folders = match folder {
+            Some(folder) => vec![folder.to_owned()],
+            None => DEPTH_FOLDERS.map(|name| root.join(name)).to_vec(),
+        };
+        folders.iter().find_map(|folder| {
+            self.find(folder, files)
+                .or_else(|| files.find(folder, &format!("depth_{}", self.name)))
+        })
     }
 
     /// The normal-light photograph: the listed file where it is not the input, else one of that name beside it.

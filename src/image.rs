@@ -79,8 +79,23 @@ impl Image {
         let path = path.as_ref();
         let bytes = std::fs::read(path)
             .map_err(|error| Error::input(path, format!("cannot be read: {error}")))?;
+        Self::decode(path, bytes, srgb_from_linear)
+    }
+
+    /// The same for numbers that are no colour, such as depth: EXR values are taken as they are.
+    ///
+    /// # Errors
+    /// As [`Image::load`].
+    pub fn load_as_stored(path: impl AsRef<Path>) -> Result<Self> {
+        let path = path.as_ref();
+        let bytes = std::fs::read(path)
+            .map_err(|error| Error::input(path, format!("cannot be read: {error}")))?;
+        Self::decode(path, bytes, |value| value)
+    }
+
+    fn decode(path: &Path, bytes: Vec<u8>, from_linear: fn(f32) -> f32) -> Result<Self> {
         if bytes.starts_with(&EXR_MAGIC) {
-            return from_exr(path, bytes);
+            return from_exr(path, bytes, from_linear);
         }
         if bytes.starts_with(&[0xFF, 0xD8]) && !jpeg_is_whole(&bytes) {
             return Err(Error::input(path, "this JPEG is cut short; copy it again"));
@@ -247,7 +262,7 @@ fn from_decoded(decoded: DynamicImage) -> Image {
     Image { width, height, data }
 }
 
-fn from_exr(path: &Path, bytes: Vec<u8>) -> Result<Image> {
+fn from_exr(path: &Path, bytes: Vec<u8>, from_linear: fn(f32) -> f32) -> Result<Image> {
     use exr::prelude::{ReadChannels, ReadLayers};
     let image = exr::prelude::read()
         .no_deep_data()
@@ -276,7 +291,7 @@ fn from_exr(path: &Path, bytes: Vec<u8>) -> Result<Image> {
             // Positive phrasing: a NaN fails the test too.
             let usable = linear >= 0.0 && linear.is_finite();
             replaced += usize::from(!usable);
-            if usable { srgb_from_linear(linear) } else { 0.0 }
+            if usable { from_linear(linear) } else { 0.0 }
         }));
     }
     if replaced > 0 {

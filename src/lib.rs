@@ -22,6 +22,7 @@
 //! - [`scene`]: Gaussians on the host, the one table of their attributes, PLY
 //! - [`pseudo_gt`]: dark photograph and curve to target, on the device
 //! - [`render`]: the differentiable rasteriser
+//! - [`window`]: the rectangle of a view that networks run on
 //! - [`loss`]: L1 and SSIM with their gradients
 //! - [`optimizer`]: Adam and the schedules of its learning rates
 //! - [`densify`]: clone, split, prune
@@ -56,5 +57,6 @@ pub mod scene;
 pub mod sort;
 pub mod tone;
 pub mod train;
+pub mod window;
 
 pub use error::{Error, Result};

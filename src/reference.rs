@@ -40,5 +40,7 @@ mod tile_ranges;
 pub mod tone;
 mod tone_map;
 mod tone_statistics;
+mod window_gather;
+mod window_scatter;
 
 use compensated_sum::CompensatedSum;

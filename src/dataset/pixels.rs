@@ -6,7 +6,7 @@ use glam::DAffine3;
 use rayon::prelude::*;
 
 use super::undistort::Undistortion;
-use super::{Split, View};
+use super::{LoadOptions, Split, View};
 use crate::camera::{Camera, Lens};
 use crate::image::Image;
 use crate::{Error, Result};
@@ -24,12 +24,13 @@ pub(super) struct Source {
     pub(super) view_from_world: DAffine3,
     pub(super) input: Option<PathBuf>,
     pub(super) reference: Option<PathBuf>,
+    pub(super) depth: Option<PathBuf>,
 }
 
 /// The views in order of name. Files that do not decode are named in `skipped`.
 pub(super) fn load(
     sources: Vec<Source>,
-    downscale: f64,
+    options: &LoadOptions,
     skipped: &mut Vec<String>,
 ) -> Result<Vec<View>> {
     let mut groups: Vec<(Lens, Vec<Source>)> = Vec::new();
@@ -40,7 +41,7 @@ pub(super) fn load(
             None => groups.push((source.lens, vec![source])),
         }
     }
-    let loaded = groups.into_par_iter().map(|(lens, group)| load_group(&lens, group, downscale));
+    let loaded = groups.into_par_iter().map(|(lens, group)| load_group(&lens, group, options));
     let loaded = loaded.collect::<Result<Vec<_>>>()?;
     let mut loaded: Vec<Loaded> = loaded.into_iter().flatten().collect();
     loaded.sort_by(|a, b| a.name.cmp(&b.name));
@@ -90,7 +91,8 @@ fn disagreement(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Error 
 }
 
 /// Views of one lens share its undistortion map.
-fn load_group(lens: &Lens, group: Vec<Source>, downscale: f64) -> Result<Vec<Loaded>> {
+fn load_group(lens: &Lens, group: Vec<Source>, options: &LoadOptions) -> Result<Vec<Loaded>> {
+    let downscale = options.downscale;
     let side = |pixels: u32| (f64::from(pixels) / downscale).round() as u32;
     let size = (side(lens.width), side(lens.height));
     let name = group.first().map_or("", |source| source.name.as_str());
@@ -109,7 +111,7 @@ fn load_group(lens: &Lens, group: Vec<Source>, downscale: f64) -> Result<Vec<Loa
     let undistortion = undistortion.transpose()?;
     group
         .into_par_iter()
-        .map(|source| load_view(source, lens, undistortion.as_ref(), size))
+        .map(|source| load_view(source, lens, undistortion.as_ref(), size, options))
         .collect()
 }
 
@@ -118,8 +120,9 @@ fn load_view(
     lens: &Lens,
     undistortion: Option<&Undistortion>,
     size: (u32, u32),
+    options: &LoadOptions,
 ) -> Result<Loaded> {
-    let Source { name, split, view_from_world, input, reference, .. } = source;
+    let Source { name, split, view_from_world, input, reference, depth, .. } = source;
     let mut problems = Vec::new();
     let mut image = |path: Option<PathBuf>| -> Result<Option<Image>> {
         let Some(path) = path else { return Ok(None) };
@@ -132,6 +135,11 @@ fn load_view(
         }
     };
     let (image, reference) = (image(input)?, image(reference)?);
+    let depth = depth.and_then(|path| {
+        depth_map(&path, lens, undistortion, size, options.depth.is_disparity)
+            .map_err(|problem| tracing::warn!("the depth of view {name} is not used: {problem}"))
+            .ok()
+    });
     let camera = Camera {
         width: lens.width,
         height: lens.height,
@@ -140,9 +148,36 @@ fn load_view(
         view_from_world,
     };
     let camera = camera.resized(size.0, size.1);
-    let view = View { name: name.clone(), split, camera, image, reference };
+    let view = View { name: name.clone(), split, camera, image, reference, depth };
     let view = (split == Split::Test || view.image.is_some()).then_some(view);
     Ok(Loaded { name, view, problems })
+}
+
+/// The depth map as the view's camera sees it, larger is farther.
+fn depth_map(
+    path: &Path,
+    lens: &Lens,
+    undistortion: Option<&Undistortion>,
+    size: (u32, u32),
+    is_disparity: bool,
+) -> Result<Vec<f32>> {
+    let mut map = Image::load_as_stored(path)?;
+    if (map.width, map.height) != (lens.width, lens.height) {
+        let (w, h) = (lens.width, lens.height);
+        let (width, height) = (map.width, map.height);
+        tracing::info!("{}: is {width}x{height}; resized to {w}x{h}", path.display());
+        map = map.resized(w, h);
+    }
+    let map = undistortion.map_or_else(|| map.clone(), |undistortion| undistortion.apply(&map));
+    let mut depth = map.resized(size.0, size.1).data;
+    depth.truncate(size.0 as usize * size.1 as usize);
+    if depth.iter().all(|&value| value == depth[0]) {
+        return Err(Error::input(path, "is the same everywhere"));
+    }
+    if is_disparity {
+        depth.iter_mut().for_each(|value| *value = -*value);
+    }
+    Ok(depth)
 }
 
 fn prepared(
