@@ -22,6 +22,7 @@
 //! - [`scene`]: Gaussians on the host, the one table of their attributes, PLY
 //! - [`pseudo_gt`]: dark photograph and curve to target, on the device
 //! - [`render`]: the differentiable rasteriser
+//! - [`nn`]: denoiser and tonemapper, forward and backward
 //! - [`loss`]: L1 and SSIM with their gradients
 //! - [`optimizer`]: Adam and the schedules of its learning rates
 //! - [`densify`]: clone, split, prune
@@ -46,6 +47,7 @@ pub mod image;
 pub mod kernels;
 pub mod loss;
 pub mod metrics;
+pub mod nn;
 pub mod optimizer;
 pub mod pseudo_gt;
 pub mod random;
