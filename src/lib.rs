@@ -23,6 +23,7 @@
 //! - [`pseudo_gt`]: dark photograph and curve to target, on the device
 //! - [`render`]: the differentiable rasteriser
 //! - [`window`]: the rectangle of a view that networks run on
+//! - [`nn`]: denoiser and tonemapper, forward and backward
 //! - [`loss`]: L1 and SSIM with their gradients
 //! - [`optimizer`]: Adam and the schedules of its learning rates
 //! - [`densify`]: clone, split, prune
@@ -47,6 +48,7 @@ pub mod image;
 pub mod kernels;
 pub mod loss;
 pub mod metrics;
+pub mod nn;
 pub mod optimizer;
 pub mod pseudo_gt;
 pub mod random;

@@ -1,0 +1,23 @@
+#version 460
+#extension GL_GOOGLE_include_directive : require
+#include "kernel.glsl"
+
+//! The end of a denoiser stage: N = I + u, R = clamp(R_0 - N, 0, 1), one thread per value.
+//!
+//! Reference: `src/reference/residual.rs`.
+
+layout(local_size_x = 256) in;
+
+layout(push_constant) uniform Params {
+    uint value_count;  // 3HW
+};
+
+layout(binding = 0) readonly  buffer Render     { float render[]; };       // R_0, (3, H, W)
+layout(binding = 1) readonly  buffer StageInput { float stage_input[]; };  // I, (3, H, W)
+layout(binding = 2) readonly  buffer Update     { float update[]; };       // u, (3, H, W)
+layout(binding = 3) writeonly buffer Denoised   { float denoised[]; };     // R, (3, H, W)
+
+void main() {
+    uint i = THREAD_INDEX;
+    if (i < value_count) denoised[i] = clamp(render[i] - (stage_input[i] + update[i]), 0.0, 1.0);
+}

@@ -1,0 +1,80 @@
+//! The networks: the denoiser that takes the noise from a render, and the tonemapper that darkens it again.
+//!
+//! Images are planes, (C, H, W), row by row. A network owns its parameters, with their gradients beside them, and the
+//! memory of one view: [`Denoiser::reserve`] takes it, `forward` fills it, `backward` uses it up. Sums over pixels are
+//! partial sums in a fixed order, so the same step gives the same bits.
+//!
+//! Norms use the statistics of the image itself, in training and afterwards: there are no running averages.
+
+mod conv;
+mod denoiser;
+mod file;
+mod norm;
+mod parameters;
+mod tonemapper;
+
+use glam::UVec2;
+
+use crate::gpu::{Buffer, Gpu};
+use crate::{Error, Result};
+
+pub use conv::shape;
+pub use denoiser::{Denoiser, DenoiserSettings};
+pub use file::{load, save};
+pub use parameters::{Parameters, Tensor};
+pub use tonemapper::Tonemapper;
+
+/// Red, green, blue.
+const RGB: u32 = 3;
+
+/// Pixels of a view.
+///
+/// # Errors
+/// The view is empty.
+fn pixel_count(size: UVec2) -> Result<usize> {
+    let UVec2 { x: width, y: height } = size;
+    match width as usize * height as usize {
+        0 => Err(Error::Usage(format!(
+            "a network has nothing to do for a view of {width} x {height}"
+        ))),
+        pixels => Ok(pixels),
+    }
+}
+
+/// A kernel that runs beyond a buffer corrupts its neighbours: refuse before anything is recorded.
+fn check_images<const N: usize>(pixels: usize, images: [&Buffer<f32>; N]) -> Result<()> {
+    let needed = RGB as usize * pixels;
+    match images.into_iter().find(|image| image.len() < needed) {
+        None => Ok(()),
+        Some(short) => {
+            let (name, len) = (short.name(), short.len());
+            let problem = format!("buffer `{name}` holds {len} values, the view has {needed}");
+            Err(Error::Usage(problem))
+        }
+    }
+}
+
+/// # Errors
+/// One binding cannot span `len` floats of `what`.
+fn check_binding(gpu: &Gpu, what: &str, size: UVec2, len: usize) -> Result<()> {
+    let properties = gpu.properties();
+    let (bytes, limit) = (float_bytes(len), properties.max_storage_buffer_range);
+    if bytes <= limit {
+        return Ok(());
+    }
+    let (UVec2 { x: width, y: height }, device) = (size, &properties.name);
+    Err(Error::Usage(format!(
+        "{what} at {width} x {height} take {bytes} bytes, {device} binds {limit} at most; use a smaller crop or fewer \
+         channels"
+    )))
+}
+
+/// The forward or backward pass does not match what came before it.
+fn out_of_turn(network: &str, size: UVec2, remedy: &str) -> Error {
+    let UVec2 { x: width, y: height } = size;
+    Error::Usage(format!("the {network} is not ready for a view of {width} x {height}; {remedy}"))
+}
+
+fn float_bytes(len: usize) -> u64 {
+    (len as u64).saturating_mul(size_of::<f32>() as u64)
+}

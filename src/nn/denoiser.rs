@@ -1,0 +1,466 @@
+//! The denoiser: stages that each estimate the noise that is left and take it from the render.
+//!
+//! ```text
+//! I_0 = noise map, I_k = R_k for k >= 1; R_0 = render
+//! f = relu(conv_in(I_k)); `repeats` times: f = f + relu(norm(conv(f)))     one conv and one norm for all repeats
+//! R_{k+1} = clamp(R_0 - (I_k + sigmoid(conv_out(f))), 0, 1)
+//! ```
+//!
+//! Activations are kept for one stage at a time: the backward pass computes those of the earlier stages again, from
+//! their inputs R_k.
+
+use glam::UVec2;
+use serde::{Deserialize, Serialize};
+
+use super::conv::{Activation, Conv, Seen, partial_count};
+use super::norm::{Backward, Forward, Norm, NormMemory, Use};
+use super::parameters::{Layout, Parameters};
+use super::{RGB, check_binding, check_images, float_bytes, out_of_turn, pixel_count};
+use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
+use crate::kernels::{relu_backward, residual, residual_backward};
+use crate::random::Stream;
+use crate::{Error, Result};
+
+/// The stream of random numbers that the weights are drawn from.
+const STREAM: u64 = 5;
+
+/// How large a denoiser is. The defaults are the paper's.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct DenoiserSettings {
+    /// Estimates of the noise, each with its own weights.
+    pub stages: u32,
+    /// How often a stage applies its inner convolution and norm.
+    pub repeats: u32,
+    /// Feature maps.
+    pub channels: u32,
+}
+
+impl Default for DenoiserSettings {
+    fn default() -> Self {
+        Self { stages: 3, repeats: 6, channels: 64 }
+    }
+}
+
+impl DenoiserSettings {
+    /// # Errors
+    /// A number is out of its range.
+    pub fn check(&self) -> Result<()> {
+        let ranges = [
+            ("stages", self.stages, 16),
+            ("repeats", self.repeats, 64),
+            ("channels", self.channels, 512),
+        ];
+        match ranges.into_iter().find(|(_, value, max)| !(1..=*max).contains(value)) {
+            None => Ok(()),
+            Some((name, value, max)) => Err(Error::Usage(format!(
+                "the denoiser's {name} are {value}; they must be within 1 and {max}"
+            ))),
+        }
+    }
+
+    fn channels(self) -> usize {
+        self.channels as usize
+    }
+}
+
+/// The denoiser, its parameters and the memory of one view.
+#[derive(Debug)]
+pub struct Denoiser {
+    gpu: Gpu,
+    settings: DenoiserSettings,
+    parameters: Parameters,
+    stages: Vec<Stage>,
+    kernels: Kernels,
+    reserved: Extent,
+    memory: Memory,
+    /// The size of the forward pass whose last stage the memory holds.
+    recorded: Option<UVec2>,
+}
+
+/// Where the layers of a stage lie in the parameters.
+#[derive(Clone, Copy, Debug)]
+struct Stage {
+    conv_in: u32,
+    conv: u32,
+    norm: u32,
+    conv_out: u32,
+}
+
+#[derive(Debug)]
+struct Kernels {
+    channels: u32,
+    conv_in: Conv,
+    conv: Conv,
+    conv_out: Conv,
+    norm: Norm,
+    relu_backward: Pipeline<relu_backward::Kernel>,
+    residual: Pipeline<residual::Kernel>,
+    residual_backward: Pipeline<residual_backward::Kernel>,
+}
+
+/// What decides how long the buffers are.
+#[derive(Clone, Copy, Debug, Default)]
+struct Extent {
+    pixels: usize,
+    /// Partial sums of the gradient of the inner convolution.
+    partials: usize,
+}
+
+#[derive(Debug)]
+struct Memory {
+    /// f of every repeat, (repeats + 1) x (C, H, W).
+    features: Vec<Buffer<f32>>,
+    /// conv(f) of every repeat, repeats x (C, H, W).
+    convolved: Vec<Buffer<f32>>,
+    norm: NormMemory,
+    /// u, (3, H, W).
+    update: Buffer<f32>,
+    /// R_1 to R_K, each (3, H, W).
+    denoised: Vec<Buffer<f32>>,
+    d_features: Buffer<f32>,
+    d_convolved: Buffer<f32>,
+    d_update: Buffer<f32>,
+    /// dL/dR_k, by turns, each (3, H, W).
+    d_denoised: [Buffer<f32>; 2],
+    partials: Buffer<f32>,
+}
+
+impl Denoiser {
+    /// Draws the weights; memory for a view comes with [`Denoiser::reserve`].
+    ///
+    /// # Errors
+    /// A setting is out of range, the driver refuses a kernel, or the device is out of memory.
+    pub fn new(gpu: &Gpu, settings: DenoiserSettings, seed: u64) -> Result<Self> {
+        settings.check()?;
+        let mut layout = Layout::new(Stream::new(seed, STREAM));
+        let channels = settings.channels;
+        let stage = |k| Stage {
+            conv_in: layout.conv(&format!("{k}.conv_in"), RGB, channels),
+            conv: layout.conv(&format!("{k}.conv"), channels, channels),
+            norm: layout.norm(&format!("{k}.norm"), channels),
+            conv_out: layout.conv(&format!("{k}.conv_out"), channels, RGB),
+        };
+        let stages = (0..settings.stages).map(stage).collect();
+        let reserved = Extent::default();
+        Ok(Self {
+            gpu: gpu.clone(),
+            settings,
+            parameters: layout.upload(gpu, serde_json::json!(settings).to_string())?,
+            stages,
+            kernels: Kernels::new(gpu, channels)?,
+            reserved,
+            memory: Memory::new(gpu, settings, reserved)?,
+            recorded: None,
+        })
+    }
+
+    /// What it was made with.
+    pub fn settings(&self) -> DenoiserSettings {
+        self.settings
+    }
+
+    /// The parameters of all stages and their gradients.
+    pub fn parameters(&self) -> &Parameters {
+        &self.parameters
+    }
+
+    /// As [`Denoiser::parameters`], to be changed.
+    pub fn parameters_mut(&mut self) -> &mut Parameters {
+        &mut self.parameters
+    }
+
+    /// How far a pixel's result looks, in pixels, beside the norms, which look at the whole view.
+    pub fn margin(&self) -> u32 {
+        self.settings.stages * (self.settings.repeats + 2)
+    }
+
+    /// The memory that [`Denoiser::reserve`] takes for a view.
+    pub fn bytes(settings: DenoiserSettings, size: UVec2) -> u64 {
+        let Extent { pixels, partials } = Extent::of(settings, size);
+        let maps = 2 * settings.repeats as usize + 3;
+        let images = settings.stages as usize + 4;
+        let norm = NormMemory::floats(pixels, settings.channels(), settings.repeats as usize);
+        let per_pixel = maps * settings.channels() + images * RGB as usize;
+        float_bytes(pixels * per_pixel + partials + norm)
+    }
+
+    /// Takes the memory for views up to `size`, unless it is there already.
+    ///
+    /// # Errors
+    /// A map exceeds what the device can bind, or the device is out of memory.
+    pub fn reserve(&mut self, size: UVec2) -> Result<()> {
+        let needed = Extent::of(self.settings, size);
+        if needed.fits(self.reserved) {
+            return Ok(());
+        }
+        let (gpu, channels) = (&self.gpu, self.settings.channels);
+        let map = self.settings.channels().max(RGB as usize) * needed.pixels;
+        check_binding(gpu, &format!("the denoiser's {channels} feature maps"), size, map)?;
+        let sums = format!("the sums of the gradients of the denoiser's {channels} channels");
+        check_binding(gpu, &sums, size, needed.partials)?;
+        // The old memory goes first: both together may not fit.
+        self.recorded = None;
+        let extent = needed.max(std::mem::take(&mut self.reserved));
+        self.memory = Memory::new(gpu, self.settings, Extent::default())?;
+        self.memory = Memory::new(gpu, self.settings, extent)?;
+        self.reserved = extent;
+        Ok(())
+    }
+
+    /// R_K of the last forward pass, (3, H, W); empty before memory is reserved.
+    pub fn denoised(&self) -> &Buffer<f32> {
+        &self.memory.denoised[self.memory.denoised.len() - 1]
+    }
+
+    /// Records the passes from the noise map and the render, each (3, H, W), to [`Denoiser::denoised`].
+    ///
+    /// # Errors
+    /// The view is empty or no memory is reserved for it, or an image is shorter than the view.
+    pub fn forward(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        size: UVec2,
+        noise: &Buffer<f32>,
+        render: &Buffer<f32>,
+    ) -> Result<()> {
+        let pixels = pixel_count(size)?;
+        if !Extent::of(self.settings, size).fits(self.reserved) {
+            return Err(out_of_turn("denoiser", size, "reserve memory for that size first"));
+        }
+        check_images(pixels, [noise, render])?;
+        let (kernels, memory) = (&self.kernels, &mut self.memory);
+        for (k, stage) in self.stages.iter().enumerate() {
+            kernels.stage_forward(pass, size, stage, &self.parameters.values, k, noise, memory)?;
+            let (before, from_here) = memory.denoised.split_at_mut(k);
+            let value_count = RGB * pixels as u32;
+            pass.dispatch(
+                &kernels.residual,
+                &residual::Params { value_count },
+                residual::Buffers {
+                    render,
+                    stage_input: before.last().unwrap_or(noise),
+                    update: &memory.update,
+                    denoised: &mut from_here[0],
+                },
+                Threads::Exactly([value_count, 1, 1]),
+            )?;
+        }
+        self.recorded = Some(size);
+        Ok(())
+    }
+
+    /// Records the passes from dL/dR_K back: overwrites the gradients of the parameters, writes `d_noise` and adds to
+    /// `d_render`, each (3, H, W). Inputs and parameters are those of the forward pass before it.
+    ///
+    /// # Errors
+    /// There is no forward pass of that size before it, or an image is shorter than the view.
+    #[expect(clippy::too_many_arguments, reason = "three images in, two gradients out")]
+    pub fn backward(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        size: UVec2,
+        noise: &Buffer<f32>,
+        render: &Buffer<f32>,
+        d_denoised: &Buffer<f32>,
+        d_noise: &mut Buffer<f32>,
+        d_render: &mut Buffer<f32>,
+    ) -> Result<()> {
+        let pixels = pixel_count(size)?;
+        check_images(pixels, [noise, render, d_denoised, d_noise, d_render])?;
+        if self.recorded.take() != Some(size) {
+            let remedy = "each backward pass needs a forward pass of its own before it";
+            return Err(out_of_turn("denoiser", size, remedy));
+        }
+        let Self { kernels, memory, parameters, stages, .. } = self;
+        pass.fill(&mut parameters.gradients, 0);
+        let last = stages.len() - 1;
+        for (k, stage) in stages.iter().enumerate().rev() {
+            if k < last {
+                kernels.stage_forward(pass, size, stage, &parameters.values, k, noise, memory)?;
+            }
+            // The two images take turns, so that what a stage reads is never what it writes.
+            let [even, odd] = &mut memory.d_denoised;
+            let (own, other) = if k % 2 == 0 { (even, odd) } else { (odd, even) };
+            let d_output = if k == last { d_denoised } else { &*other };
+            let d_input = if k == 0 { &mut *d_noise } else { own };
+            let stage_input = if k == 0 { noise } else { &memory.denoised[k - 1] };
+            let value_count = RGB * pixels as u32;
+            pass.dispatch(
+                &kernels.residual_backward,
+                &residual_backward::Params { value_count },
+                residual_backward::Buffers {
+                    render,
+                    stage_input,
+                    update: &memory.update,
+                    d_denoised: d_output,
+                    d_update: &mut memory.d_update,
+                    d_stage_input: &mut *d_input,
+                    d_render: &mut *d_render,
+                },
+                Threads::Exactly([value_count, 1, 1]),
+            )?;
+            let maps = Maps {
+                features: &memory.features,
+                convolved: &memory.convolved,
+                norm: &mut memory.norm,
+                d_features: &mut memory.d_features,
+                d_convolved: &mut memory.d_convolved,
+                partials: &mut memory.partials,
+            };
+            let ends = Ends { stage_input, d_update: &memory.d_update, d_stage_input: d_input };
+            kernels.stage_backward(pass, size, stage, parameters, maps, ends)?;
+        }
+        Ok(())
+    }
+}
+
+/// What the backward pass of a stage reads and overwrites.
+struct Maps<'a> {
+    features: &'a [Buffer<f32>],
+    convolved: &'a [Buffer<f32>],
+    norm: &'a mut NormMemory,
+    d_features: &'a mut Buffer<f32>,
+    d_convolved: &'a mut Buffer<f32>,
+    partials: &'a mut Buffer<f32>,
+}
+
+/// The images at both ends of a stage's network.
+struct Ends<'a> {
+    stage_input: &'a Buffer<f32>,
+    d_update: &'a Buffer<f32>,
+    /// Added to.
+    d_stage_input: &'a mut Buffer<f32>,
+}
+
+impl Kernels {
+    fn new(gpu: &Gpu, channels: u32) -> Result<Self> {
+        Ok(Self {
+            channels,
+            conv_in: Conv::new(gpu, [RGB, channels], Activation::Relu, true)?,
+            conv: Conv::new(gpu, [channels, channels], Activation::None, true)?,
+            conv_out: Conv::new(gpu, [channels, RGB], Activation::Sigmoid, false)?,
+            norm: Norm::new(gpu, channels)?,
+            relu_backward: gpu.pipeline(&relu_backward::Constants::default())?,
+            residual: gpu.pipeline(&residual::Constants::default())?,
+            residual_backward: gpu.pipeline(&residual_backward::Constants::default())?,
+        })
+    }
+
+    /// The features and the update u of stage `k`.
+    #[expect(clippy::too_many_arguments, reason = "a stage, its place and its input")]
+    fn stage_forward(
+        &self,
+        pass: &mut Recorder<'_>,
+        size: UVec2,
+        stage: &Stage,
+        values: &Buffer<f32>,
+        k: usize,
+        noise: &Buffer<f32>,
+        memory: &mut Memory,
+    ) -> Result<()> {
+        let Memory { features, convolved, norm, update, denoised, .. } = memory;
+        let input = if k == 0 { noise } else { &denoised[k - 1] };
+        self.conv_in.forward(pass, size, stage.conv_in, values, input, &mut features[0])?;
+        for (repeat, convolved) in convolved.iter_mut().enumerate() {
+            let (before, after) = features.split_at_mut(repeat + 1);
+            let (shortcut, target) = (&before[repeat], &mut after[0]);
+            self.conv.forward(pass, size, stage.conv, values, shortcut, convolved)?;
+            let images = Forward { source: convolved, shortcut, target };
+            self.norm.forward(pass, stage.norm_use(size, repeat), values, norm, images)?;
+        }
+        let last = &features[features.len() - 1];
+        self.conv_out.forward(pass, size, stage.conv_out, values, last, update)
+    }
+
+    /// From the gradient of the sigmoid's input to that of the stage's input; adds those of the stage's parameters.
+    fn stage_backward(
+        &self,
+        pass: &mut Recorder<'_>,
+        size: UVec2,
+        stage: &Stage,
+        parameters: &mut Parameters,
+        maps: Maps<'_>,
+        ends: Ends<'_>,
+    ) -> Result<()> {
+        let Parameters { values, gradients, .. } = parameters;
+        let Maps { features, convolved, norm, d_features, d_convolved, partials } = maps;
+        let last = &features[features.len() - 1];
+        let seen = Seen { source: last, d_target: ends.d_update };
+        self.conv_out.weight_gradient(pass, size, stage.conv_out, seen, partials, gradients)?;
+        self.conv_out.data_gradient(
+            pass,
+            size,
+            stage.conv_out,
+            values,
+            ends.d_update,
+            d_features,
+        )?;
+        for (repeat, source) in convolved.iter().enumerate().rev() {
+            let of = stage.norm_use(size, repeat);
+            let images = Backward { source, d_target: &*d_features, d_source: &mut *d_convolved };
+            self.norm.backward(pass, of, values, gradients, norm, images)?;
+            let seen = Seen { source: &features[repeat], d_target: &*d_convolved };
+            self.conv.weight_gradient(pass, size, stage.conv, seen, partials, gradients)?;
+            // Along the shortcut the gradient stays as it is: the convolution's is added to it.
+            self.conv.data_gradient(pass, size, stage.conv, values, d_convolved, d_features)?;
+        }
+        let value_count = self.channels * size.element_product();
+        pass.dispatch(
+            &self.relu_backward,
+            &relu_backward::Params { value_count },
+            relu_backward::Buffers { activations: &features[0], gradient: &mut *d_features },
+            Threads::Exactly([value_count, 1, 1]),
+        )?;
+        let seen = Seen { source: ends.stage_input, d_target: &*d_features };
+        self.conv_in.weight_gradient(pass, size, stage.conv_in, seen, partials, gradients)?;
+        let d_input = ends.d_stage_input;
+        self.conv_in.data_gradient(pass, size, stage.conv_in, values, d_features, d_input)
+    }
+}
+
+impl Stage {
+    fn norm_use(&self, size: UVec2, repeat: usize) -> Use {
+        Use { pixel_count: size.element_product(), offset: self.norm, repeat: repeat as u32 }
+    }
+}
+
+impl Extent {
+    fn of(settings: DenoiserSettings, size: UVec2) -> Self {
+        let channels = settings.channels;
+        let layers = [[RGB, channels], [channels, channels], [channels, RGB]];
+        Self {
+            pixels: size.x as usize * size.y as usize,
+            partials: layers.map(|layer| partial_count(size, layer)).into_iter().max().unwrap_or(0),
+        }
+    }
+
+    fn fits(self, reserved: Self) -> bool {
+        self.pixels <= reserved.pixels && self.partials <= reserved.partials
+    }
+
+    fn max(self, other: Self) -> Self {
+        Self { pixels: self.pixels.max(other.pixels), partials: self.partials.max(other.partials) }
+    }
+}
+
+impl Memory {
+    fn new(gpu: &Gpu, settings: DenoiserSettings, extent: Extent) -> Result<Self> {
+        let Extent { pixels, partials } = extent;
+        let repeats = settings.repeats as usize;
+        let map = |name| gpu.uninit(name, settings.channels() * pixels);
+        let image = |name| gpu.uninit(name, RGB as usize * pixels);
+        Ok(Self {
+            features: (0..=repeats).map(|_| map("features")).collect::<Result<_>>()?,
+            convolved: (0..repeats).map(|_| map("convolved")).collect::<Result<_>>()?,
+            norm: NormMemory::new(gpu, pixels, settings.channels(), repeats)?,
+            update: image("update")?,
+            denoised: (0..settings.stages).map(|_| image("denoised")).collect::<Result<_>>()?,
+            d_features: map("d_features")?,
+            d_convolved: map("d_convolved")?,
+            d_update: image("d_update")?,
+            d_denoised: [image("d_denoised")?, image("d_denoised")?],
+            partials: gpu.uninit("partials", partials)?,
+        })
+    }
+}

@@ -1,0 +1,91 @@
+//! The 3x3 convolution in double precision; the kernel's reference rounds what it returns.
+
+use super::ssim_forward::widen;
+use crate::gpu::Reference;
+use crate::kernels::conv3x3::{Constants, Kernel, Params, Slices};
+
+/// Calls `visit(pixel, tap, neighbour)` for each of the nine neighbours of each pixel that lie in the image.
+pub(super) fn for_each_tap(
+    [width, height]: [usize; 2],
+    mut visit: impl FnMut(usize, usize, usize),
+) {
+    for y in 0..height {
+        for x in 0..width {
+            for tap in 0..9 {
+                // One row and one column of padding: what wraps around lies outside too.
+                let (from_x, from_y) =
+                    ((x + tap % 3).wrapping_sub(1), (y + tap / 3).wrapping_sub(1));
+                if from_x < width && from_y < height {
+                    visit(y * width + x, tap, from_y * width + from_x);
+                }
+            }
+        }
+    }
+}
+
+/// output[o](p) = bias[o] + sum over i and t of weight[o, i, t] input[i](p + t) for images (C, H, W); zero padding.
+pub fn conv3x3(
+    size: [usize; 2],
+    [inputs, outputs]: [usize; 2],
+    weights: &[f64],
+    biases: &[f64],
+    input: &[f64],
+) -> Vec<f64> {
+    let pixels = size[0] * size[1];
+    let mut output: Vec<f64> =
+        (0..outputs * pixels).map(|i| biases.get(i / pixels).copied().unwrap_or(0.0)).collect();
+    for o in 0..outputs {
+        for i in 0..inputs {
+            let weights = &weights[9 * (o * inputs + i)..][..9];
+            let (input, output) = (&input[i * pixels..], &mut output[o * pixels..]);
+            for_each_tap(size, |pixel, tap, from| output[pixel] += weights[tap] * input[from]);
+        }
+    }
+    output
+}
+
+/// The gradient of the input of [`conv3x3`], given that of its output.
+pub fn data_gradient(
+    size: [usize; 2],
+    [inputs, outputs]: [usize; 2],
+    weights: &[f64],
+    d_output: &[f64],
+) -> Vec<f64> {
+    let pixels = size[0] * size[1];
+    let mut d_input = vec![0.0; inputs * pixels];
+    for o in 0..outputs {
+        for i in 0..inputs {
+            let weights = &weights[9 * (o * inputs + i)..][..9];
+            let (d_input, d_output) = (&mut d_input[i * pixels..], &d_output[o * pixels..]);
+            for_each_tap(size, |pixel, tap, from| d_input[from] += weights[tap] * d_output[pixel]);
+        }
+    }
+    d_input
+}
+
+/// What the kernel's constant `ACTIVATION` stands for.
+pub fn activate(activation: u32, x: f64) -> f64 {
+    match activation {
+        1 => x.max(0.0),
+        2 => 1.0 / (1.0 + (-x).exp()),
+        _ => x,
+    }
+}
+
+impl Reference for Kernel {
+    fn run(params: &Params, constants: &Constants, Slices { values, source, target }: Slices<'_>) {
+        let size = params.size.to_array().map(|n| n as usize);
+        let [from, to] = [params.in_channels, params.out_channels].map(|n| n as usize);
+        let (layer, source) = (widen(&values[params.offset as usize..]), widen(source));
+        let output = if constants.transposed {
+            data_gradient(size, [to, from], &layer, &source)
+        } else {
+            let (weights, biases) = layer.split_at(9 * from * to);
+            conv3x3(size, [from, to], weights, biases, &source)
+        };
+        for (target, output) in target.iter_mut().zip(output) {
+            let kept = if constants.accumulate { f64::from(*target) } else { 0.0 };
+            *target = (kept + activate(constants.activation, output)) as f32;
+        }
+    }
+}

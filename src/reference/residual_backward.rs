@@ -1,0 +1,27 @@
+//! The gradient of the end of a denoiser stage in double precision.
+
+use crate::gpu::Reference;
+use crate::kernels::residual_backward::{Constants, Kernel, Params, Slices};
+
+/// What the gradient `d` of the result of [`super::residual::residual`] becomes behind the clamp, which lets it pass
+/// within 0 and 1, bounds included: the gradient of R_0, and the negative of those of I and u.
+pub fn behind_clamp(difference: f64, d: f64) -> f64 {
+    if (0.0..=1.0).contains(&difference) { d } else { 0.0 }
+}
+
+impl Reference for Kernel {
+    fn run(
+        params: &Params,
+        _: &Constants,
+        Slices { render, stage_input, update, d_denoised, d_update, d_stage_input, d_render }: Slices<'_>,
+    ) {
+        for i in 0..params.value_count as usize {
+            let difference = render[i] - (stage_input[i] + update[i]);
+            let d = behind_clamp(difference.into(), d_denoised[i].into());
+            let u = f64::from(update[i]);
+            d_update[i] = (-d * u * (1.0 - u)) as f32;
+            d_stage_input[i] = -d as f32;
+            d_render[i] = (f64::from(d_render[i]) + d) as f32;
+        }
+    }
+}
