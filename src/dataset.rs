@@ -399,8 +399,7 @@ impl Frame {
             None => DEPTH_FOLDERS.map(|name| root.join(name)).to_vec(),
         };
         folders.iter().find_map(|folder| {
-            self.find(folder, files)
-                .or_else(|| files.find(folder, &format!("depth_{}", self.name)))
+            self.find(folder, files).or_else(|| files.find(folder, &format!("depth_{}", self.name)))
         })
     }
 

@@ -2,6 +2,8 @@
 
 mod config;
 mod model;
+mod parts;
+mod preset;
 mod views;
 
 use std::time::Instant;
@@ -23,6 +25,8 @@ use crate::{Error, Result};
 
 pub use config::{Background, DensityConfig, TrainConfig};
 use model::Model;
+pub use parts::{ModelConfig, ModelName, NetworkRates, Part, Weights};
+pub use preset::Preset;
 use views::Views;
 
 /// Steps that one submission holds at most: recording and reading back cost once for all of them.

@@ -235,7 +235,14 @@ mod colors {
     use super::*;
 
     fn view(split: Split, position: DVec3) -> View {
-        View { name: String::new(), split, camera: camera(position), image: None, reference: None, depth: None }
+        View {
+            name: String::new(),
+            split,
+            camera: camera(position),
+            image: None,
+            reference: None,
+            depth: None,
+        }
     }
 
     fn point(position: DVec3, views: &[u32]) -> Point {

@@ -1,8 +1,8 @@
 //! Windows of a view: where they lie, and what is copied.
 
 use glam::UVec2;
-use nightsplat::gpu::testing::{assert_no_validation_messages, gpu};
 use nightsplat::gpu::Reference;
+use nightsplat::gpu::testing::{assert_no_validation_messages, gpu};
 use nightsplat::kernels::{window_gather, window_scatter};
 use nightsplat::random::Stream;
 use nightsplat::window::{Window, Windows};
@@ -69,7 +69,14 @@ fn gathering_and_scattering_match_their_references() {
         let mut device_content = gpu.zeros("content", content.len()).unwrap();
         gpu.run("windows", |pass| {
             let planes = planes.clone();
-            windows.gather(pass, &device_image, size, planes.clone(), &window, &mut device_content)?;
+            windows.gather(
+                pass,
+                &device_image,
+                size,
+                planes.clone(),
+                &window,
+                &mut device_content,
+            )?;
             windows.scatter(pass, &device_content, &window, planes, size, &mut device_sum)
         })
         .unwrap();
@@ -87,8 +94,9 @@ fn a_window_beyond_the_view_or_its_buffers_is_refused() {
     let image = gpu.zeros("image", 3 * 64).unwrap();
     let mut content = gpu.zeros("content", 3 * 64).unwrap();
     let mut problem = |window: Window, planes| {
-        let gathered =
-            gpu.run("window", |pass| windows.gather(pass, &image, view, planes, &window, &mut content));
+        let gathered = gpu.run("window", |pass| {
+            windows.gather(pass, &image, view, planes, &window, &mut content)
+        });
         gathered.unwrap_err().to_string()
     };
     let beyond = Window { origin: UVec2::ONE, ..Window::whole(view) };

@@ -13,7 +13,7 @@ use crate::export::RunDirectory;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::metrics::Scores;
 use crate::tone::{ToneCurve, ToneSettings};
-use crate::train::{Background, TrainConfig, Trainer};
+use crate::train::{Background, ModelName, Part, Preset, TrainConfig, Trainer};
 
 /// Train a 3D Gaussian Splatting model from dark photographs.
 ///
@@ -69,6 +69,8 @@ pub(crate) struct TrainOptions {
     /// A folder of reference images by name, for scores only
     #[arg(long, value_name = "DIR")]
     reference: Option<PathBuf>,
+    #[command(flatten)]
+    model: ModelOptions,
     /// The device: a part of its name or its index in `nightsplat doctor` [default: the best]
     #[arg(long, value_name = "NAME|INDEX")]
     device: Option<String>,
@@ -80,8 +82,80 @@ pub(crate) struct TrainOptions {
     eval_every: Option<u64>,
 }
 
+/// The options that say what the model has beside colour.
+#[derive(Clone, Debug, Default, clap::Args)]
+#[command(next_help_heading = "Model")]
+pub(crate) struct ModelOptions {
+    /// plain: colour alone, as 3DGS; lita: every part of LITA-GS and L1 alone on R_0, the paper's model [default: plain]
+    #[arg(long)]
+    model: Option<ModelName>,
+    /// Exactly these parts, parted by commas: denoiser, tonemapper, structure, depth
+    #[arg(long, value_name = "LIST", value_delimiter = ',')]
+    parts: Option<Vec<Part>>,
+    /// The constants that the paper and its code state for a benchmark: lom, realx3d or mip360-varying; other options win
+    #[arg(long, value_name = "NAME")]
+    preset: Option<Preset>,
+    /// Train the networks on a random crop of N x N pixels a step; 0: on the whole view [default: 0]
+    #[arg(long, value_name = "N")]
+    denoiser_crop: Option<u32>,
+    /// Feature maps of the denoiser [default: 64]
+    #[arg(long, value_name = "N")]
+    denoiser_channels: Option<u32>,
+    /// Stages of the denoiser [default: 3]
+    #[arg(long, value_name = "N")]
+    denoiser_stages: Option<u32>,
+    /// Repeats of the inner convolution in a stage [default: 6]
+    #[arg(long, value_name = "N")]
+    denoiser_repeats: Option<u32>,
+    /// A folder of depth maps, NAME.* or depth_NAME.*, larger is farther [default: depth/ or depth_maps/ of the dataset]
+    #[arg(long, value_name = "DIR")]
+    depth: Option<PathBuf>,
+    /// The depth maps hold disparity: larger is nearer
+    #[arg(long)]
+    depth_is_disparity: bool,
+    /// Colours are the bare SH sum of LITA-GS instead of max(SH + 0.5, 0) [default: false]
+    #[arg(long, value_name = "BOOL")]
+    raw_colors: Option<bool>,
+}
+
+impl ModelOptions {
+    fn apply(&self, config: &mut TrainConfig) {
+        match self.model {
+            Some(ModelName::Plain) => config.model.set_parts(&[]),
+            Some(ModelName::Lita) => {
+                config.model.set_parts(&Part::ALL);
+                config.ssim_weight = 0.0;
+            }
+            None => {}
+        }
+        if let Some(preset) = self.preset {
+            preset.apply(config);
+        }
+        if let Some(parts) = &self.parts {
+            config.model.set_parts(parts);
+        }
+        let model = &mut config.model;
+        set(&mut model.denoiser_crop, &self.denoiser_crop);
+        set(&mut model.network.channels, &self.denoiser_channels);
+        set(&mut model.network.stages, &self.denoiser_stages);
+        set(&mut model.network.repeats, &self.denoiser_repeats);
+        set(&mut model.raw_colors, &self.raw_colors);
+        if self.depth.is_some() {
+            model.depth_folder.clone_from(&self.depth);
+        }
+        model.depth_is_disparity |= self.depth_is_disparity;
+    }
+}
+
+/// Takes over what the command line says.
+fn set<T: Clone>(value: &mut T, option: &Option<T>) {
+    if let Some(option) = option {
+        value.clone_from(option);
+    }
+}
+
 impl TrainOptions {
-    /// The configuration: defaults, then the file, then the command line.
+    /// The configuration: defaults, then the file, then preset and model, then the other options.
     pub(crate) fn config(&self, dataset: PathBuf) -> crate::Result<TrainConfig> {
         let mut config =
             self.config.as_deref().map_or_else(|| Ok(TrainConfig::default()), TrainConfig::load)?;
@@ -91,11 +165,7 @@ impl TrainOptions {
             config.tone =
                 ToneSettings { curve, gain_c: ToneSettings::new(curve).gain_c, ..config.tone };
         }
-        fn set<T: Clone>(value: &mut T, option: &Option<T>) {
-            if let Some(option) = option {
-                value.clone_from(option);
-            }
-        }
+        self.model.apply(&mut config);
         set(&mut config.tone.gain_c, &self.gain);
         set(&mut config.tone.theta, &self.theta);
         set(&mut config.steps, &self.steps);

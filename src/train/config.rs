@@ -4,7 +4,8 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use crate::dataset::LoadOptions;
+use super::parts::ModelConfig;
+use crate::dataset::{DepthOptions, LoadOptions};
 use crate::optimizer::Schedule;
 use crate::scene::MAX_SH_DEGREE;
 use crate::tone::ToneSettings;
@@ -68,6 +69,8 @@ pub struct TrainConfig {
     pub schedule: Schedule,
     /// Density control.
     pub density: DensityConfig,
+    /// What the model has beside colour.
+    pub model: ModelConfig,
 }
 
 /// Which Gaussians multiply and which go; [`Schedule`] says when.
@@ -100,6 +103,7 @@ impl Default for TrainConfig {
             tone: ToneSettings::default(),
             schedule: Schedule::default(),
             density: DensityConfig::default(),
+            model: ModelConfig::default(),
         }
     }
 }
@@ -138,6 +142,11 @@ impl TrainConfig {
         LoadOptions {
             downscale: self.downscale,
             reference: self.reference.clone(),
+            depth: DepthOptions {
+                load: self.model.depth,
+                folder: self.model.depth_folder.clone(),
+                is_disparity: self.model.depth_is_disparity,
+            },
             ..LoadOptions::default()
         }
     }
@@ -148,6 +157,7 @@ impl TrainConfig {
     /// [`Error::Usage`].
     pub fn check(&self) -> Result<()> {
         self.tone.check()?;
+        self.model.check()?;
         let density = &self.density;
         let rules = [
             ("--steps", self.steps as f64, self.steps >= 1, "at least 1"),

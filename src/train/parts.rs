@@ -1,0 +1,258 @@
+//! What a model has beside colour: each part of LITA-GS with its own switch.
+
+use std::path::PathBuf;
+use std::str::FromStr;
+
+use serde::{Deserialize, Serialize};
+
+use crate::nn::DenoiserSettings;
+use crate::scene::Features;
+use crate::{Error, Result};
+
+/// The models that have a name.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ModelName {
+    /// Colour alone: 3DGS.
+    Plain,
+    /// Every part: LITA-GS, the paper's backbone.
+    Lita,
+}
+
+impl FromStr for ModelName {
+    type Err = Error;
+
+    fn from_str(name: &str) -> Result<Self> {
+        match name {
+            "plain" => Ok(Self::Plain),
+            "lita" => Ok(Self::Lita),
+            _ => Err(Error::Usage(format!("unknown model `{name}`; plain or lita"))),
+        }
+    }
+}
+
+/// A part of the model that can be on or off.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Part {
+    /// Stages of a network that take the noise from the render: R_0 to R_K.
+    Denoiser,
+    /// A network that darkens illumination times R_K to the dark photograph.
+    Tonemapper,
+    /// A feature that is held to the colour-invariant edges of the target.
+    Structure,
+    /// A feature that is held to a depth map from elsewhere.
+    Depth,
+}
+
+impl Part {
+    /// Every part, in the order of the paper.
+    pub const ALL: [Self; 4] = [Self::Denoiser, Self::Tonemapper, Self::Structure, Self::Depth];
+
+    /// The name on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Denoiser => "denoiser",
+            Self::Tonemapper => "tonemapper",
+            Self::Structure => "structure",
+            Self::Depth => "depth",
+        }
+    }
+}
+
+impl FromStr for Part {
+    type Err = Error;
+
+    fn from_str(name: &str) -> Result<Self> {
+        Self::ALL.into_iter().find(|part| part.name() == name).ok_or_else(|| {
+            let names = Self::ALL.map(Self::name).join(", ");
+            Error::Usage(format!("unknown part `{name}`; the parts are {names}"))
+        })
+    }
+}
+
+/// Which parts a model has beside colour, and their constants. The default is colour alone.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ModelConfig {
+    /// [`Part::Denoiser`].
+    pub denoiser: bool,
+    /// [`Part::Tonemapper`].
+    pub tonemapper: bool,
+    /// [`Part::Structure`].
+    pub structure: bool,
+    /// [`Part::Depth`]; off for views without a depth map.
+    pub depth: bool,
+    /// Colours are the bare SH sum of LITA-GS instead of max(SH + 0.5, 0), what viewers show.
+    pub raw_colors: bool,
+    /// Side in pixels of the random crop that the networks train on; 0: the whole view.
+    pub denoiser_crop: u32,
+    /// Side in pixels of the boxes of the local depth term.
+    pub depth_box: u32,
+    /// A folder of depth maps, in place of `depth/` or `depth_maps/` of the dataset.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub depth_folder: Option<PathBuf>,
+    /// The depth maps hold disparity: larger is nearer.
+    pub depth_is_disparity: bool,
+    /// The size of the denoiser.
+    pub network: DenoiserSettings,
+    /// What each term weighs beside (1 - w) L1 + w (1 - SSIM).
+    pub weights: Weights,
+    /// Adam's learning rates of the networks.
+    pub rates: NetworkRates,
+}
+
+/// The weights of the terms of LITA-GS; 0 leaves a term out.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Weights {
+    /// Of mean (R_K - R_0)^2.
+    pub denoising: f64,
+    /// Of the total variation of R_K.
+    pub total_variation: f64,
+    /// Of the reconstruction of the dark photograph, (1 - w) L1 + w (1 - SSIM).
+    pub low: f64,
+    /// That w.
+    pub low_ssim: f64,
+    /// Of mean |structure - edges of the target|.
+    pub structure: f64,
+    /// Of 1 minus the correlation with the depth map, over the view and over boxes.
+    pub depth: f64,
+}
+
+/// Adam's learning rates, constant.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct NetworkRates {
+    /// Of the denoiser.
+    pub denoiser: f64,
+    /// Of the tonemapper.
+    pub tonemapper: f64,
+}
+
+impl Default for ModelConfig {
+    fn default() -> Self {
+        Self {
+            denoiser: false,
+            tonemapper: false,
+            structure: false,
+            depth: false,
+            raw_colors: false,
+            denoiser_crop: 0,
+            depth_box: 128,
+            depth_folder: None,
+            depth_is_disparity: false,
+            network: DenoiserSettings::default(),
+            weights: Weights::default(),
+            rates: NetworkRates::default(),
+        }
+    }
+}
+
+/// Those of the paper's code.
+impl Default for Weights {
+    fn default() -> Self {
+        Self {
+            denoising: 1.0,
+            total_variation: 1.0,
+            low: 1.0,
+            low_ssim: 0.2,
+            structure: 0.01,
+            depth: 0.1,
+        }
+    }
+}
+
+/// Those of the paper's code.
+impl Default for NetworkRates {
+    fn default() -> Self {
+        Self { denoiser: 5e-5, tonemapper: 1e-4 }
+    }
+}
+
+impl ModelConfig {
+    /// Whether a part is on.
+    pub fn has(&self, part: Part) -> bool {
+        match part {
+            Part::Denoiser => self.denoiser,
+            Part::Tonemapper => self.tonemapper,
+            Part::Structure => self.structure,
+            Part::Depth => self.depth,
+        }
+    }
+
+    /// Switches exactly these parts on.
+    pub fn set_parts(&mut self, parts: &[Part]) {
+        self.denoiser = parts.contains(&Part::Denoiser);
+        self.tonemapper = parts.contains(&Part::Tonemapper);
+        self.structure = parts.contains(&Part::Structure);
+        self.depth = parts.contains(&Part::Depth);
+    }
+
+    /// What the Gaussians carry for the parts that are on.
+    pub fn features(&self) -> Features {
+        Features {
+            depth: self.depth,
+            structure: self.structure,
+            noise: self.denoiser,
+            illumination: self.tonemapper,
+        }
+    }
+
+    /// # Errors
+    /// [`Error::Usage`] names a value that makes no sense.
+    pub(super) fn check(&self) -> Result<()> {
+        self.network.check()?;
+        let Weights { denoising, total_variation, low, low_ssim, structure, depth } = self.weights;
+        let rules = [
+            ("model.weights.denoising", denoising, f64::MAX),
+            ("model.weights.total_variation", total_variation, f64::MAX),
+            ("model.weights.low", low, f64::MAX),
+            ("model.weights.low_ssim", low_ssim, 1.0),
+            ("model.weights.structure", structure, f64::MAX),
+            ("model.weights.depth", depth, f64::MAX),
+            ("model.rates.denoiser", self.rates.denoiser, f64::MAX),
+            ("model.rates.tonemapper", self.rates.tonemapper, f64::MAX),
+        ];
+        for (name, value, most) in rules {
+            if !(0.0..=most).contains(&value) {
+                return Err(Error::Usage(format!("{name} is {value}; it must be 0 or more")));
+            }
+        }
+        if self.depth_box < 2 {
+            let problem = format!("model.depth_box is {}; it must be at least 2", self.depth_box);
+            return Err(Error::Usage(problem));
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_part_brings_its_channels() {
+        let mut model = ModelConfig::default();
+        assert_eq!(model.features().channels(), 3);
+        for (parts, channels) in [
+            (&[Part::Depth][..], 4),
+            (&[Part::Depth, Part::Structure], 5),
+            (&[Part::Denoiser], 6),
+            (&[Part::Structure, Part::Tonemapper], 7),
+            (&Part::ALL, 11),
+        ] {
+            model.set_parts(parts);
+            assert_eq!(model.features().channels(), channels);
+            assert!(Part::ALL.iter().all(|&part| model.has(part) == parts.contains(&part)));
+        }
+    }
+
+    #[test]
+    fn a_weight_that_makes_no_sense_is_refused_by_name() {
+        let mut model = ModelConfig::default();
+        model.weights.low_ssim = 1.5;
+        assert!(model.check().unwrap_err().to_string().contains("low_ssim"));
+        model = ModelConfig::default();
+        model.rates.denoiser = f64::NAN;
+        assert!(model.check().unwrap_err().to_string().contains("rates.denoiser"));
+    }
+}
