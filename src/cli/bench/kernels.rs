@@ -5,6 +5,7 @@
 
 mod bin;
 mod learn;
+mod losses;
 
 use glam::Vec2;
 
