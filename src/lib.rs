@@ -21,10 +21,12 @@
 //! - [`dataset`]: photographs with their cameras and points, from disk
 //! - [`scene`]: Gaussians on the host, the one table of their attributes, PLY
 //! - [`pseudo_gt`]: dark photograph and curve to target, on the device
+//! - [`structure`]: the edges of a pseudo-GT that do not depend on its illumination
 //! - [`render`]: the differentiable rasteriser
 //! - [`window`]: the rectangle of a view that networks run on
 //! - [`nn`]: denoiser and tonemapper, forward and backward
 //! - [`loss`]: L1 and SSIM with their gradients
+//! - [`loss`]: the loss terms with their gradients, and their log
 //! - [`optimizer`]: Adam and the schedules of its learning rates
 //! - [`densify`]: clone, split, prune
 //! - [`train`]: one step after another
@@ -57,6 +59,7 @@ pub mod render;
 pub mod report;
 pub mod scene;
 pub mod sort;
+pub mod structure;
 pub mod tone;
 pub mod train;
 pub mod window;

@@ -1,16 +1,26 @@
-//! The loss of a render against the pseudo-GT, its gradient, and its log.
+//! The loss terms, their gradients, and their log.
 //!
-//! L = (1 - w) mean|a - b| + w (1 - mean SSIM), means over all 3HW values; `a` is the render, not clamped, and `b` the
-//! tone curve of the dark photograph, evaluated inside the kernels. SSIM is that of 3DGS: 11 x 11 Gaussian window with
-//! sigma 1.5, per channel, zero padding. Nothing is read back: each step leaves its terms in a slot of a log.
+//! [`Loss`] compares a render with its pseudo-GT: L = (1 - w) mean|a - b| + w (1 - mean SSIM), means over all values of
+//! the interior; `a` is the render, not clamped, and `b` the tone curve of the dark photograph, evaluated inside the
+//! kernels. SSIM is that of 3DGS: 11 x 11 Gaussian window with sigma 1.5, per channel, zero padding. The other terms are
+//! one file each. Nothing is read back: each step leaves its terms in a slot of a log.
+
+mod denoising;
+mod depth;
+mod log;
+mod structure;
 
 use glam::{UVec2, Vec3};
 
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
-use crate::kernels::{ToneParameters, l1, loss_log, ssim_backward, ssim_forward};
+use crate::kernels::{ToneParameters, l1, ssim_backward, ssim_forward};
 use crate::{Error, Result};
 
-pub use crate::kernels::StepLoss;
+pub use denoising::{DenoisingGradients, DenoisingInputs, DenoisingLoss, DenoisingWeights};
+pub use depth::{DepthBoxes, DepthInputs, DepthLoss, DepthSettings};
+use log::PartialSums;
+pub use log::{LogSlot, LossLog, LossLogDownload, StepLosses, Term};
+pub use structure::{StructureInputs, StructureLoss};
 
 /// The columns and rows of a view that one thread of the SSIM kernels takes.
 ///
@@ -24,11 +34,65 @@ pub(crate) fn strip(gpu: &Gpu) -> [u32; 2] {
     if gpu.properties().is_cpu { CPU_STRIP } else { GPU_STRIP }
 }
 
+/// The rectangle of a view whose pixels a loss counts; the others are context.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Interior {
+    /// The first column and row.
+    pub origin: UVec2,
+    /// Width and height in pixels.
+    pub size: UVec2,
+}
+
+impl Interior {
+    /// All of a view.
+    pub const fn whole(size: UVec2) -> Self {
+        Self { origin: UVec2::ZERO, size }
+    }
+
+    /// One past the last column and row.
+    fn end(self) -> UVec2 {
+        self.origin + self.size
+    }
+
+    /// The values of its three channels.
+    fn value_count(self) -> u32 {
+        value_count(self.size)
+    }
+
+    /// Refuses an interior that is empty or reaches out of a view of `size`.
+    fn check(self, size: UVec2) -> Result<()> {
+        let Self { origin, size: own } = self;
+        let fits = own.min_element() > 0
+            && own.cmple(size).all()
+            && origin.cmple(size.saturating_sub(own)).all();
+        if !fits {
+            return Err(Error::Usage(format!(
+                "an interior of {} x {} at {}, {} does not lie in a view of {} x {}",
+                own.x, own.y, origin.x, origin.y, size.x, size.y
+            )));
+        }
+        Ok(())
+    }
+}
+
+/// What a loss compares and how.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct LossSettings {
+    /// A `CURVE_*` of include/tone.glsl.
+    pub tone_curve: u32,
+    /// w, in [0, 1].
+    pub ssim_weight: f64,
+    /// The columns of the log for mean|a - b| and for mean SSIM.
+    pub terms: [Term; 2],
+}
+
 /// What one step's loss reads.
 #[derive(Clone, Copy, Debug)]
 pub struct LossInputs<'a> {
     /// Width and height in pixels.
     pub size: UVec2,
+    /// The pixels that count.
+    pub interior: Interior,
     /// (3, H, W), not clamped.
     pub render: &'a Buffer<f32>,
     /// (3, H, W), sRGB-encoded.
@@ -37,34 +101,23 @@ pub struct LossInputs<'a> {
     pub tone: &'a Buffer<ToneParameters>,
 }
 
-/// What one step's loss writes beside the gradient.
-#[derive(Debug)]
-pub struct LossLog<'a> {
-    /// One element per slot.
-    pub log: &'a mut Buffer<StepLoss>,
-    /// The element that this step fills.
-    pub slot: u32,
-    /// The sticky status word; `not_finite_flag` is set in its first element if a term is NaN or infinite.
-    pub status: &'a mut Buffer<u32>,
-    /// The bits to set.
-    pub not_finite_flag: u32,
-}
-
-/// The loss kernels and their scratch memory, sized for a set of views.
+/// The kernels of L1 and SSIM and their scratch memory.
 #[derive(Debug)]
 pub struct Loss {
-    terms: Terms,
-    log: Pipeline<loss_log::Kernel>,
+    gpu: Gpu,
+    terms: [Term; 2],
+    kernels: Kernels,
     max_values: u32,
     l1_partials: Buffer<f32>,
     ssim_partials: Buffer<f32>,
 }
 
 #[derive(Debug)]
-enum Terms {
+enum Kernels {
     /// The SSIM weight is zero: no SSIM is evaluated.
     L1 {
-        pipeline: Pipeline<l1::Kernel>,
+        whole: Pipeline<l1::Kernel>,
+        interior: Pipeline<l1::Kernel>,
         values_per_workgroup: u32,
     },
     Ssim(Ssim),
@@ -82,92 +135,114 @@ struct Ssim {
 }
 
 impl Loss {
-    /// The kernels for `tone_curve` (a `CURVE_*` of include/tone.glsl) and an SSIM weight in [0, 1], and scratch memory
-    /// that holds the largest of the views' `sizes`.
+    /// The kernels, without scratch memory: see [`Loss::reserve`].
     ///
     /// # Errors
     /// The weight is outside [0, 1], or the device is out of memory.
-    pub fn new(gpu: &Gpu, tone_curve: u32, ssim_weight: f64, sizes: &[UVec2]) -> Result<Self> {
+    pub fn new(gpu: &Gpu, settings: LossSettings) -> Result<Self> {
+        let LossSettings { tone_curve, ssim_weight, terms } = settings;
         if !(0.0..=1.0).contains(&ssim_weight) {
             return Err(Error::Usage(format!(
                 "the SSIM weight is {ssim_weight}; it must be within 0 and 1"
             )));
         }
         let subgroup_size = gpu.properties().subgroup_size;
-        let max_values = sizes.iter().map(|&size| value_count(size)).max().unwrap_or(0);
-        let terms = if ssim_weight > 0.0 {
+        let kernels = if ssim_weight > 0.0 {
             let [columns, rows] = strip(gpu);
-            Terms::Ssim(Ssim {
+            Kernels::Ssim(Ssim {
                 weight: ssim_weight,
                 strip: [columns, rows],
                 subgroup_size,
                 forward: gpu.pipeline(&ssim_forward::Constants { columns, rows, tone_curve })?,
                 backward: gpu.pipeline(&ssim_backward::Constants { columns, rows, tone_curve })?,
-                d_moments: gpu.uninit("d_moments", max_values as usize)?,
+                d_moments: gpu.uninit("d_moments", 0)?,
             })
         } else {
             let constants = l1::Constants { tone_curve, ..Default::default() };
-            let values_per_workgroup = subgroup_size * constants.values_per_thread;
-            Terms::L1 { pipeline: gpu.pipeline(&constants)?, values_per_workgroup }
+            Kernels::L1 {
+                whole: gpu.pipeline(&constants)?,
+                interior: gpu.pipeline(&l1::Constants { with_interior: true, ..constants })?,
+                values_per_workgroup: subgroup_size * constants.values_per_thread,
+            }
         };
-        let partials = sizes.iter().map(|&size| terms.workgroups(size)).max().unwrap_or(0) as usize;
         Ok(Self {
+            gpu: gpu.clone(),
             terms,
-            log: gpu.pipeline(&loss_log::Constants::default())?,
-            max_values,
-            l1_partials: gpu.uninit("l1_partials", partials)?,
-            ssim_partials: gpu.uninit("ssim_partials", partials)?,
+            kernels,
+            max_values: 0,
+            l1_partials: gpu.uninit("l1_partials", 0)?,
+            ssim_partials: gpu.uninit("ssim_partials", 0)?,
         })
     }
 
-    /// Writes dL/d render, (3, H, W), to `d_render` and the means of |a - b| and of SSIM to the log. Where the SSIM
-    /// weight is 0, SSIM is not evaluated and logged as 0.
+    /// Scratch memory for views of `size`, and for those reserved for before.
     ///
     /// # Errors
-    /// The view is empty or larger than those that the scratch memory is for, or a buffer is shorter than the view or the log's slot.
+    /// The device is out of memory.
+    pub fn reserve(&mut self, size: UVec2) -> Result<()> {
+        let (values, workgroups) = (value_count(size), self.kernels.workgroups(size) as usize);
+        if values > self.max_values {
+            if let Kernels::Ssim(ssim) = &mut self.kernels {
+                ssim.d_moments = self.gpu.uninit("d_moments", values as usize)?;
+            }
+            self.max_values = values;
+        }
+        if workgroups > self.l1_partials.len() {
+            self.l1_partials = self.gpu.uninit("l1_partials", workgroups)?;
+            self.ssim_partials = self.gpu.uninit("ssim_partials", workgroups)?;
+        }
+        Ok(())
+    }
+
+    /// Writes dL/d render, (3, H, W), to `d_render`, also outside the interior, and the means of |a - b| and of SSIM to
+    /// the log. Where the SSIM weight is 0, SSIM is neither evaluated nor logged.
+    ///
+    /// # Errors
+    /// The view is empty or larger than those that scratch memory is reserved for, the interior is empty or not inside
+    /// it, a buffer is shorter than the view, or the log has no such slot.
     pub fn record(
         &mut self,
         pass: &mut Recorder<'_>,
         inputs: LossInputs<'_>,
         d_render: &mut Buffer<f32>,
-        log: LossLog<'_>,
+        log: &mut LogSlot<'_>,
     ) -> Result<()> {
-        self.check(&inputs, d_render, &log)?;
-        let values = value_count(inputs.size);
-        let workgroups = self.terms.workgroups(inputs.size);
+        self.check(&inputs, d_render, log)?;
+        let workgroups = self.kernels.workgroups(inputs.size);
         let threads = Threads::Workgroups([workgroups, 1, 1]);
         let [l1_partials, ssim_partials] = [&mut self.l1_partials, &mut self.ssim_partials];
-        match &mut self.terms {
-            Terms::L1 { pipeline, .. } => {
-                let LossInputs { render, low, tone, .. } = inputs;
+        let mut ssim_count = 0;
+        match &mut self.kernels {
+            Kernels::L1 { whole, interior, .. } => {
+                let LossInputs { size, render, low, tone, .. } = inputs;
+                let is_whole = inputs.interior == Interior::whole(size);
                 pass.dispatch(
-                    pipeline,
-                    &l1::Params { value_count: values, l1_scale: 1.0 / values as f32 },
+                    if is_whole { whole } else { interior },
+                    &l1::Params {
+                        value_count: value_count(size),
+                        l1_scale: 1.0 / inputs.interior.value_count() as f32,
+                        width: size.x,
+                        height: size.y,
+                        interior_begin: inputs.interior.origin,
+                        interior_end: inputs.interior.end(),
+                    },
                     l1::Buffers { render, low, tone, d_render, partials: l1_partials },
                     threads,
                 )?;
             }
-            Terms::Ssim(ssim) => {
+            Kernels::Ssim(ssim) => {
+                ssim_count = workgroups;
                 ssim.record(pass, threads, inputs, d_render, [l1_partials, ssim_partials])?;
             }
         }
-        let with_ssim = matches!(self.terms, Terms::Ssim(_));
-        pass.dispatch(
-            &self.log,
-            &loss_log::Params {
-                slot: log.slot,
-                l1_partial_count: workgroups,
-                ssim_partial_count: if with_ssim { workgroups } else { 0 },
-                mean_scale: 1.0 / values as f32,
-                not_finite_flag: log.not_finite_flag,
-            },
-            loss_log::Buffers {
-                l1_partials: &self.l1_partials,
-                ssim_partials: &self.ssim_partials,
-                log: log.log,
-                status: log.status,
-            },
-            Threads::Workgroups([1, 1, 1]),
+        let scale = 1.0 / inputs.interior.value_count() as f32;
+        let [l1, ssim] = self.terms;
+        log.record(
+            pass,
+            [
+                PartialSums { term: l1, partials: &self.l1_partials, count: workgroups, scale },
+                PartialSums { term: ssim, partials: &self.ssim_partials, count: ssim_count, scale },
+            ],
         )
     }
 
@@ -176,36 +251,26 @@ impl Loss {
         &self,
         inputs: &LossInputs<'_>,
         d_render: &Buffer<f32>,
-        log: &LossLog<'_>,
+        log: &LogSlot<'_>,
     ) -> Result<()> {
-        let UVec2 { x: width, y: height } = inputs.size;
         let values = value_count(inputs.size);
         let fits = (1..=self.max_values).contains(&values)
-            && self.terms.workgroups(inputs.size) as usize <= self.l1_partials.len();
+            && self.kernels.workgroups(inputs.size) as usize <= self.l1_partials.len();
         if !fits {
-            return Err(Error::Usage(format!(
-                "the loss has no scratch memory for a view of {width} x {height}"
-            )));
+            return Err(no_scratch("loss", inputs.size));
         }
+        inputs.interior.check(inputs.size)?;
         for buffer in [inputs.render, inputs.low, d_render] {
-            if buffer.len() < values as usize {
-                let (name, len) = (buffer.name(), buffer.len());
-                return Err(Error::Usage(format!(
-                    "buffer `{name}` holds {len} values, the view has {values}"
-                )));
-            }
+            holds(buffer, values as usize)?;
         }
-        if log.slot as usize >= log.log.len() || inputs.tone.is_empty() || log.status.is_empty() {
-            let (slot, len) = (log.slot, log.log.len());
-            return Err(Error::Usage(format!(
-                "the loss log has no slot {slot} of {len}, or there are no tone parameters or status word"
-            )));
+        if inputs.tone.is_empty() {
+            return Err(Error::Usage("there are no tone parameters".to_owned()));
         }
-        Ok(())
+        log.check()
     }
 }
 
-impl Terms {
+impl Kernels {
     /// One subgroup each; as many as there are partial sums.
     fn workgroups(&self, size: UVec2) -> u32 {
         match self {
@@ -225,24 +290,27 @@ impl Ssim {
         &mut self,
         pass: &mut Recorder<'_>,
         threads: Threads<'_>,
-        LossInputs { size, render, low, tone }: LossInputs<'_>,
+        LossInputs { size, interior, render, low, tone }: LossInputs<'_>,
         d_render: &mut Buffer<f32>,
         [l1_partials, ssim_partials]: [&mut Buffer<f32>; 2],
     ) -> Result<()> {
         let UVec2 { x: width, y: height } = size;
+        let (interior_begin, interior_end) = (interior.origin, interior.end());
         let d_moments = &mut self.d_moments;
         pass.dispatch(
             &self.forward,
-            &ssim_forward::Params { width, height },
+            &ssim_forward::Params { width, height, interior_begin, interior_end },
             ssim_forward::Buffers { render, low, tone, d_moments, partials: ssim_partials },
             threads,
         )?;
-        let mean_scale = 1.0 / f64::from(value_count(size));
+        let mean_scale = 1.0 / f64::from(interior.value_count());
         pass.dispatch(
             &self.backward,
             &ssim_backward::Params {
                 width,
                 height,
+                interior_begin,
+                interior_end,
                 l1_scale: ((1.0 - self.weight) * mean_scale) as f32,
                 ssim_scale: (self.weight * mean_scale) as f32,
             },
@@ -259,6 +327,33 @@ impl Ssim {
     }
 }
 
+/// The values of the three channels of a view.
 fn value_count(size: UVec2) -> u32 {
-    size.x.saturating_mul(size.y).saturating_mul(3)
+    pixel_count(size).saturating_mul(3)
+}
+
+fn pixel_count(size: UVec2) -> u32 {
+    size.x.saturating_mul(size.y)
+}
+
+/// Refuses a buffer that is too short.
+fn holds(buffer: &Buffer<f32>, values: usize) -> Result<()> {
+    if buffer.len() >= values {
+        return Ok(());
+    }
+    let (name, len) = (buffer.name(), buffer.len());
+    Err(Error::Usage(format!("buffer `{name}` holds {len} values, the view has {values}")))
+}
+
+fn no_scratch(term: &str, size: UVec2) -> Error {
+    let UVec2 { x, y } = size;
+    Error::Usage(format!("the {term} has no scratch memory for a view of {x} x {y}"))
+}
+
+/// Refuses a weight that is negative or not finite.
+fn check_weight(of: &str, weight: f64) -> Result<()> {
+    if weight.is_finite() && weight >= 0.0 {
+        return Ok(());
+    }
+    Err(Error::Usage(format!("the weight of {of} is {weight}; it must be 0 or more")))
 }

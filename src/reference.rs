@@ -11,11 +11,20 @@ pub mod blend_backward;
 pub mod blend_forward;
 pub mod camera;
 mod check_capacity;
+mod ciconv_columns;
+mod ciconv_moments;
+mod ciconv_normalize;
+mod ciconv_rows;
 mod compensated_sum;
 pub mod conv3x3;
 pub mod conv3x3_weight_gradient;
+mod denoising;
 mod densify_count;
 mod densify_scatter;
+mod depth_boxes;
+pub mod depth_correlation;
+mod depth_gradient;
+mod depth_moments;
 mod dispatch_arguments;
 mod emit;
 pub mod gaussian;
@@ -36,6 +45,7 @@ mod product;
 mod product_backward;
 pub mod project;
 pub mod project_backward;
+mod random;
 mod reduce_records;
 mod reduce_strips;
 mod relu_backward;
@@ -51,6 +61,7 @@ mod sort_upsweep;
 pub mod splat;
 pub mod ssim_backward;
 pub mod ssim_forward;
+mod structure_l1;
 mod tile_ranges;
 pub mod tone;
 mod tone_map;
@@ -59,3 +70,11 @@ mod window_gather;
 mod window_scatter;
 
 use compensated_sum::CompensatedSum;
+use glam::UVec2;
+
+/// Value `i` of planes of `width` x `height` lies in the columns and rows from `begin` to before `end`.
+fn inside(i: usize, [width, height]: [u32; 2], [begin, end]: [UVec2; 2]) -> bool {
+    let row = i as u32 / width;
+    let pixel = UVec2::new(i as u32 % width, row % height);
+    pixel.cmpge(begin).all() && pixel.cmplt(end).all()
+}

@@ -15,7 +15,7 @@ use crate::dataset::Dataset;
 use crate::densify::{Densifier, DensifySettings};
 use crate::gpu::{Buffer, Gpu, PassTime, Recorder};
 use crate::image::Image;
-use crate::loss::{Loss, LossInputs, LossLog, StepLoss};
+use crate::loss::{Interior, LogSlot, Loss, LossInputs, LossLog, LossSettings, StepLosses, Term};
 use crate::optimizer::{Adam, AdamBuffers};
 use crate::pseudo_gt::PseudoGt;
 use crate::random::Stream;
@@ -75,7 +75,7 @@ pub struct Trainer {
     adam: Adam,
     densifier: Densifier,
     d_render: Buffer<f32>,
-    log: Buffer<StepLoss>,
+    log: LossLog,
 }
 
 impl Trainer {
@@ -98,13 +98,16 @@ impl Trainer {
             views,
             model: Model::upload(gpu, &gaussians)?,
             renderer: Renderer::new(gpu, settings)?,
-            loss: Loss::new(gpu, config.tone.curve.constant(), config.ssim_weight, &sizes)?,
+            loss: Loss::new(gpu, loss_settings(&config))?,
             adam: Adam::new(gpu)?,
             densifier: Densifier::new(gpu, density(&config, dataset.extent()))?,
             d_render: gpu.uninit("d_render", 3 * pixels.unwrap_or_default())?,
-            log: gpu.uninit("loss_log", STEPS_PER_SUBMISSION as usize)?,
+            log: LossLog::new(gpu, STEPS_PER_SUBMISSION as usize)?,
             config,
         };
+        for &size in &sizes {
+            trainer.loss.reserve(size)?;
+        }
         trainer.reserve()?;
         Ok(trainer)
     }
@@ -154,7 +157,7 @@ impl Trainer {
             for step in first..=last {
                 self.record_step(pass, step, (step - first) as u32)?;
             }
-            downloads = Some((pass.download(&self.log)?, pass.download(self.renderer.status())?));
+            downloads = Some((self.log.download(pass)?, pass.download(self.renderer.status())?));
             Ok(())
         })?;
         let Some((log, status)) = downloads else { return Ok(vec![]) };
@@ -182,9 +185,9 @@ impl Trainer {
             })?;
         } else if status.not_finite {
             let step = self.step + 1;
-            let what = if log[done].l1.is_finite() { "SSIM" } else { "L1" };
+            let what = log[done].first_not_finite().map_or("the loss", Term::name).to_owned();
             let view = self.views.of_step(self.config.seed, step).name.clone();
-            return Err(Error::NotFinite { step, view, what: what.to_owned() });
+            return Err(Error::NotFinite { step, view, what });
         }
         Ok(reports)
     }
@@ -218,9 +221,15 @@ impl Trainer {
         let (render, status) = self.renderer.render_and_status();
         self.loss.record(
             pass,
-            LossInputs { size, render, low: &view.image, tone: &view.tone },
+            LossInputs {
+                size,
+                interior: Interior::whole(size),
+                render,
+                low: &view.image,
+                tone: &view.tone,
+            },
             &mut self.d_render,
-            LossLog { log: &mut self.log, slot, status, not_finite_flag: Status::NOT_FINITE },
+            &mut LogSlot { log: &mut self.log, slot, status, not_finite_flag: Status::NOT_FINITE },
         )?;
         self.renderer.backward(
             pass,
@@ -275,9 +284,12 @@ impl Trainer {
         self.renderer.reserve(self.model.count(), self.views.cameras())
     }
 
-    fn report(&self, step: u64, loss: &StepLoss, milliseconds: f64) -> StepReport {
-        let (l1, ssim, weight) =
-            (f64::from(loss.l1), f64::from(loss.ssim), self.config.ssim_weight);
+    fn report(&self, step: u64, losses: &StepLosses, milliseconds: f64) -> StepReport {
+        let (l1, ssim, weight) = (
+            f64::from(losses.get(Term::L1)),
+            f64::from(losses.get(Term::Ssim)),
+            self.config.ssim_weight,
+        );
         StepReport {
             step,
             view: self.views.of_step(self.config.seed, step).name.clone(),
@@ -287,6 +299,15 @@ impl Trainer {
             gaussians: self.model.count(),
             milliseconds,
         }
+    }
+}
+
+/// L1 and SSIM of the render against the pseudo-GT.
+fn loss_settings(config: &TrainConfig) -> LossSettings {
+    LossSettings {
+        tone_curve: config.tone.curve.constant(),
+        ssim_weight: config.ssim_weight,
+        terms: [Term::L1, Term::Ssim],
     }
 }
 

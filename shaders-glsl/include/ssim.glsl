@@ -25,6 +25,11 @@ float blur(float row[REACH], uint x) {
     return sum;
 }
 
+// The rectangle whose pixels count: all of them, or the interior of a view with a margin.
+bool is_inside(uint x, uint y, uvec2 begin, uvec2 end) {
+    return x >= begin.x && x < end.x && y >= begin.y && y < end.y;
+}
+
 // The columns and rows that a thread owns.
 struct Strip {
     int x;        // first column

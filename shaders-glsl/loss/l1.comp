@@ -6,15 +6,21 @@
 //! The gradient of mean|a - b| with respect to the render a, b the pseudo-GT, and partial sums of |a - b|.
 //!
 //! A thread takes `VALUES_PER_THREAD` values, one subgroup apart, so that a subgroup reads one run. At a = b the gradient
-//! is 0. Reference: `src/reference/l1.rs`.
+//! is 0. With `WITH_INTERIOR` the mean is over a rectangle of the view, and outside it the gradient is 0. Reference:
+//! `src/reference/l1.rs`.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 layout(constant_id = 0) const uint VALUES_PER_THREAD = 32;
+layout(constant_id = 1) const bool WITH_INTERIOR = false;
 
 layout(push_constant) uniform Params {
-    uint  value_count;  // 3HW
-    float l1_scale;     // 1 / (3HW)
+    uint  value_count;     // 3HW
+    float l1_scale;        // 1 / (3hw), h x w the interior
+    uint  width;           // pixels; this and what follows only with an interior
+    uint  height;          // pixels
+    uvec2 interior_begin;  // the first pixel
+    uvec2 interior_end;    // one past the last
 };
 
 layout(binding = 0) readonly  buffer Render   { float render[]; };         // (3, H, W), not clamped
@@ -23,14 +29,25 @@ layout(binding = 2) readonly  buffer Tone     { ToneParameters tone[]; };  // (1
 layout(binding = 3) writeonly buffer DRender  { float d_render[]; };       // (3, H, W)
 layout(binding = 4) writeonly buffer Partials { float partials[]; };       // one per workgroup
 
+bool counts(uint i) {
+    if (WITH_INTERIOR) {
+        uint row = i / width;
+        uvec2 pixel = uvec2(i - row * width, row % height);
+        return all(greaterThanEqual(pixel, interior_begin)) && all(lessThan(pixel, interior_end));
+    }
+    return true;
+}
+
 void main() {
-    uint first = WORKGROUP_INDEX * SUBGROUP_SIZE * VALUES_PER_THREAD + gl_LocalInvocationID.x;
+    uint first = WORKGROUP_INDEX * SUBGROUP_SIZE * VALUES_PER_THREAD;
+    if (first >= value_count) return;
+    first += gl_LocalInvocationID.x;
     ToneParameters curve = tone[0];
     float sum = 0.0;
     for (uint k = 0; k < VALUES_PER_THREAD; ++k) {
         uint i = first + k * SUBGROUP_SIZE;
         if (i < value_count) {
-            float difference = render[i] - tone_curve(low[i], curve);
+            float difference = counts(i) ? render[i] - tone_curve(low[i], curve) : 0.0;
             d_render[i] = l1_scale * sign(difference);
             sum += abs(difference);
         }

@@ -2,7 +2,7 @@
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
 
-//! The means of the loss terms from the partial sums of a step, into the step's slot of the log.
+//! The means of two loss terms from their partial sums, into the step's slot of the log.
 //!
 //! One subgroup, in a fixed order. A term that is NaN or infinite raises `not_finite_flag` in the sticky status word,
 //! so that the steps recorded behind this one change nothing. Reference: `src/reference/loss_log.rs`.
@@ -11,36 +11,35 @@ layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 
 layout(push_constant) uniform Params {
-    uint  slot;                // element of `log`
-    uint  l1_partial_count;    // 0: the term is not modelled and its mean is 0
-    uint  ssim_partial_count;
-    float mean_scale;          // 1 / (3HW)
-    uint  not_finite_flag;     // bits to set in status[0]
+    uint  slot;            // row of `log`
+    uint  term_count;      // columns of `log`
+    uvec2 terms;           // a column each
+    uvec2 partial_counts;  // 0: the term is not modelled and its column left as it is
+    vec2  mean_scales;     // 1 / (number of values in the mean)
+    uint  not_finite_flag; // bits to set in status[0]
 };
 
-struct StepLoss {
-    float l1;    // mean |a - b|
-    float ssim;  // mean SSIM
-    uint  status;  // status[0] at the end of the loss: the step counts only if it is 0
-};
-
-layout(binding = 0) readonly  buffer L1Partials   { float l1_partials[]; };
-layout(binding = 1) readonly  buffer SsimPartials { float ssim_partials[]; };
-layout(binding = 2) writeonly buffer Log          { StepLoss log[]; };
-layout(binding = 3)           buffer Status       { uint status[]; };
+layout(binding = 0) readonly  buffer FirstPartials  { float first_partials[]; };
+layout(binding = 1) readonly  buffer SecondPartials { float second_partials[]; };
+layout(binding = 2) writeonly buffer Log            { float log[]; };       // (slots, term_count)
+layout(binding = 3) writeonly buffer Statuses       { uint statuses[]; };   // (slots,), status[0] behind the step's last term
+layout(binding = 4)           buffer Status         { uint status[]; };
 
 bool is_finite(float x) { return (floatBitsToUint(x) & 0x7f800000u) != 0x7f800000u; }
 
 void main() {
-    float l1 = 0.0;
-    for (uint i = gl_LocalInvocationID.x; i < l1_partial_count; i += SUBGROUP_SIZE) l1 += l1_partials[i];
-    float ssim = 0.0;
-    for (uint i = gl_LocalInvocationID.x; i < ssim_partial_count; i += SUBGROUP_SIZE) ssim += ssim_partials[i];
-    StepLoss loss = StepLoss(subgroupAdd(l1) * mean_scale, subgroupAdd(ssim) * mean_scale, 0);
+    float first = 0.0;
+    for (uint i = gl_LocalInvocationID.x; i < partial_counts.x; i += SUBGROUP_SIZE) first += first_partials[i];
+    float second = 0.0;
+    for (uint i = gl_LocalInvocationID.x; i < partial_counts.y; i += SUBGROUP_SIZE) second += second_partials[i];
+    first = subgroupAdd(first) * mean_scales.x;
+    second = subgroupAdd(second) * mean_scales.y;
     if (subgroupElect()) {
-        loss.status = status[0];
-        if (!is_finite(loss.l1) || !is_finite(loss.ssim)) loss.status |= not_finite_flag;
-        status[0] = loss.status;
-        log[slot] = loss;
+        if (partial_counts.x > 0) log[slot * term_count + terms.x] = first;
+        if (partial_counts.y > 0) log[slot * term_count + terms.y] = second;
+        uint word = status[0];
+        if (!is_finite(first) || !is_finite(second)) word |= not_finite_flag;
+        status[0] = word;
+        statuses[slot] = word;
     }
 }

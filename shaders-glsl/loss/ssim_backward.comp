@@ -8,16 +8,19 @@
 //!
 //! dSSIM/da = E[dS/dE[a]] + 2 a E[dS/dE[aa]] + b E[dS/dE[ab]]: the window is symmetric and zero outside the
 //! image, so the transposed blur is the blur. The derivatives come from `ssim_forward`, which shares the
-//! thread mapping. At a = b the gradient of the L1 term is 0. Reference: `src/reference/ssim_backward.rs`.
+//! thread mapping. At a = b the gradient of the L1 term is 0. Means are over the interior; the L1 term stays
+//! inside it, the SSIM term reaches a window's radius beyond. Reference: `src/reference/ssim_backward.rs`.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 
 layout(push_constant) uniform Params {
-    uint  width;        // pixels
-    uint  height;       // pixels
-    float l1_scale;     // (1 - w) / (3HW)
-    float ssim_scale;   // w / (3HW)
+    uint  width;           // pixels
+    uint  height;          // pixels
+    uvec2 interior_begin;  // the first pixel
+    uvec2 interior_end;    // one past the last
+    float l1_scale;        // (1 - w) / (3hw), h x w the interior
+    float ssim_scale;      // w / (3hw)
 };
 
 layout(binding = 0) readonly  buffer Render   { float render[]; };          // (3, H, W), not clamped
@@ -67,8 +70,9 @@ void main() {
                 float a = render[i];
                 float b = tone_curve(low[i], curve);
                 float d_ssim = blurred[MEAN] + 2.0 * a * blurred[SQUARE] + b * blurred[PRODUCT];
-                d_render[i] = l1_scale * sign(a - b) - ssim_scale * d_ssim;
-                sum += abs(a - b);
+                float difference = is_inside(column, uint(done), interior_begin, interior_end) ? a - b : 0.0;
+                d_render[i] = l1_scale * sign(difference) - ssim_scale * d_ssim;
+                sum += abs(difference);
             }
         }
     }

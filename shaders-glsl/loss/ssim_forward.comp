@@ -9,15 +9,18 @@
 //! With a the render, b the target, and E[.] the windowed mean, per pixel and channel:
 //! S = (2 E[a] E[b] + C1) (2 (E[ab] - E[a] E[b]) + C2)
 //!   / ((E[a]^2 + E[b]^2 + C1) (E[aa] - E[a]^2 + E[bb] - E[b]^2 + C2)).
-//! Writes dS/dE[a], dS/dE[aa], dS/dE[ab] for `ssim_backward`, and one partial sum of S per workgroup.
+//! Writes dS/dE[a], dS/dE[aa], dS/dE[ab] for `ssim_backward`, and one partial sum of S per workgroup. Pixels outside the
+//! interior are seen by the windows, but their S counts neither in the sum nor in the derivatives, which are 0 there.
 //! The thread mapping is that of include/ssim.glsl. Reference: `src/reference/ssim_forward.rs`.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 
 layout(push_constant) uniform Params {
-    uint width;   // pixels
-    uint height;  // pixels
+    uint  width;           // pixels
+    uint  height;          // pixels
+    uvec2 interior_begin;  // the first pixel
+    uvec2 interior_end;    // one past the last
 };
 
 layout(binding = 0) readonly  buffer Render   { float render[]; };          // (3, H, W), not clamped
@@ -32,8 +35,8 @@ const float C2 = 0.0009;  // (0.03 L)^2
 // The five blurred moments, in the order of the arrays below.
 const uint A = 0, B = 1, AA = 2, BB = 3, AB = 4, MOMENTS = 5;
 
-// S at one pixel; leaves its three derivatives at `i`.
-float ssim(float moments[MOMENTS], uint i) {
+// S at one pixel, 0 where it does not count; leaves its three derivatives at `i`.
+float ssim(float moments[MOMENTS], uint i, bool counts) {
     float a = moments[A], b = moments[B];
     float a1 = 2.0 * a * b + C1;
     float a2 = 2.0 * (moments[AB] - a * b) + C2;
@@ -42,8 +45,9 @@ float ssim(float moments[MOMENTS], uint i) {
     float b2 = max(moments[AA] - a * a + moments[BB] - b * b, 0.0) + C2;
     float scale = 1.0 / (b1 * b2);
     float s = a1 * a2 * scale;
-    d_moments[i] = vec3(2.0 * (b * (a2 - a1) * scale - a * s * (1.0 / b1 - 1.0 / b2)), -s / b2, 2.0 * a1 * scale);
-    return s;
+    vec3 d = vec3(2.0 * (b * (a2 - a1) * scale - a * s * (1.0 / b1 - 1.0 / b2)), -s / b2, 2.0 * a1 * scale);
+    d_moments[i] = counts ? d : vec3(0);
+    return counts ? s : 0.0;
 }
 
 void main() {
@@ -85,7 +89,10 @@ void main() {
                 pending[m][x][PENDING - 1] = TAPS[RADIUS] * value;
             }
             uint column = uint(strip.x) + x;
-            if (done >= strip.y && column < width) sum += ssim(moments, plane + uint(done) * width + column);
+            if (done >= strip.y && column < width) {
+                bool counts = is_inside(column, uint(done), interior_begin, interior_end);
+                sum += ssim(moments, plane + uint(done) * width + column, counts);
+            }
         }
     }
     sum = subgroupAdd(sum);

@@ -3,14 +3,9 @@ use std::f32::consts::TAU;
 use glam::{Quat, Vec3};
 
 use super::densify_count::{CLONE, KEEP, SPLIT, planes};
+use super::random::random_bits;
 use crate::gpu::Reference;
 use crate::kernels::densify_scatter::{Constants, Kernel, Params, Slices};
-
-fn random_bits(key: u32) -> u32 {
-    let state = key.wrapping_mul(747_796_405).wrapping_add(2_891_336_453);
-    let word = ((state >> ((state >> 28) + 4)) ^ state).wrapping_mul(277_803_737);
-    (word >> 22) ^ word
-}
 
 fn random_uniform(key: u32) -> f32 {
     ((random_bits(key) >> 8) + 1) as f32 / 16_777_216.0

@@ -1,3 +1,4 @@
+use super::inside;
 use super::tone::tone_curve;
 use crate::gpu::Reference;
 use crate::kernels::l1::{Constants, Kernel, Params, Slices};
@@ -11,7 +12,13 @@ impl Reference for Kernel {
     ) {
         let mut sum = 0.0;
         for i in 0..params.value_count as usize {
-            let difference = render[i] - tone_curve(constants.tone_curve, low[i], &tone[0]);
+            let mut difference = render[i] - tone_curve(constants.tone_curve, low[i], &tone[0]);
+            let size = [params.width, params.height];
+            if constants.with_interior
+                && !inside(i, size, [params.interior_begin, params.interior_end])
+            {
+                difference = 0.0;
+            }
             let sign = if difference == 0.0 { 0.0 } else { difference.signum() };
             d_render[i] = params.l1_scale * sign;
             sum += f64::from(difference.abs());

@@ -2,6 +2,7 @@
 
 use glam::Vec3;
 
+use super::inside;
 use super::tone::tone_curve;
 use crate::gpu::Reference;
 use crate::kernels::ToneParameters;
@@ -85,8 +86,14 @@ impl Reference for Kernel {
             let plane = channel * width * height..(channel + 1) * width * height;
             let map = ssim(width, height, &a[plane.clone()], &b[plane.clone()]);
             for (i, ssim) in plane.zip(map) {
-                d_moments[i] = Vec3::from_array(ssim.d_moments.map(|d| d as f32));
-                sum += ssim.value;
+                let counts = inside(
+                    i,
+                    [params.width, params.height],
+                    [params.interior_begin, params.interior_end],
+                );
+                let d = if counts { ssim.d_moments } else { [0.0; 3] };
+                d_moments[i] = Vec3::from_array(d.map(|d| d as f32));
+                sum += if counts { ssim.value } else { 0.0 };
             }
         }
         partials.fill(0.0);

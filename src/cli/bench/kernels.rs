@@ -5,6 +5,7 @@
 
 mod bin;
 mod learn;
+mod losses;
 mod window;
 
 use glam::Vec2;

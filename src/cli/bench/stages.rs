@@ -8,7 +8,7 @@ use super::scene::{self, Scene};
 use super::{Bench, Timing, total};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, PassTime, Recorder};
-use crate::loss::{Loss, LossInputs, LossLog, StepLoss};
+use crate::loss::{Interior, LogSlot, Loss, LossInputs, LossLog, LossSettings, Term};
 use crate::optimizer::{Adam, AdamBuffers, LearningRates, Moments};
 use crate::pseudo_gt::PseudoGt;
 use crate::random::Stream;
@@ -117,7 +117,7 @@ struct Step<'s> {
     low: Buffer<f32>,
     tone: Buffer<ToneParameters>,
     d_render: Buffer<f32>,
-    log: Buffer<StepLoss>,
+    log: LossLog,
 }
 
 const OPTIONS: RenderOptions = RenderOptions { sh_degree: 3, background: [0.0; 3] };
@@ -136,10 +136,14 @@ impl<'s> Step<'s> {
         let mut tone = gpu.zeros("tone", 1)?;
         let size = [low.width, low.height];
         gpu.run("statistics", |pass| pseudo_gt.statistics(pass, &image, size, &mut tone, 0))?;
+        let terms = [Term::L1, Term::Ssim];
+        let settings = LossSettings { tone_curve: curve.constant(), ssim_weight: 0.2, terms };
+        let mut loss = Loss::new(gpu, settings)?;
+        loss.reserve(UVec2::from_array(size))?;
         Ok(Self {
             scene,
             renderer,
-            loss: Loss::new(gpu, curve.constant(), 0.2, &[UVec2::from_array(size)])?,
+            loss,
             adam: Adam::new(gpu)?,
             parameters,
             gradients: gpu.zeros("gradients", len)?,
@@ -149,7 +153,7 @@ impl<'s> Step<'s> {
             low: image,
             tone,
             d_render: gpu.zeros("d_render", low.data.len())?,
-            log: gpu.zeros("loss_log", 1)?,
+            log: LossLog::new(gpu, 1)?,
         })
     }
 
@@ -160,9 +164,20 @@ impl<'s> Step<'s> {
         let size = UVec2::new(camera.width, camera.height);
         self.loss.record(
             pass,
-            LossInputs { size, render, low: &self.low, tone: &self.tone },
+            LossInputs {
+                size,
+                interior: Interior::whole(size),
+                render,
+                low: &self.low,
+                tone: &self.tone,
+            },
             &mut self.d_render,
-            LossLog { log: &mut self.log, slot: 0, status, not_finite_flag: Status::NOT_FINITE },
+            &mut LogSlot {
+                log: &mut self.log,
+                slot: 0,
+                status,
+                not_finite_flag: Status::NOT_FINITE,
+            },
         )?;
         self.renderer.backward(
             pass,

@@ -1,19 +1,15 @@
 //! The render, its loss, the way back to the parameters, and their update.
 
-use glam::Vec3;
-
 use super::bin::Frame;
-use super::constants;
-use crate::cli::bench::check::Rule::{Close, Exact, Sum};
+use super::{constants, losses};
+use crate::cli::bench::check::Rule::{Close, Exact};
 use crate::cli::bench::check::check;
 use crate::cli::bench::scene::Scene;
 use crate::cli::bench::{Bench, Timing};
 use crate::gpu::{Kernel as _, Threads};
 use crate::kernels::*;
-use crate::loss::strip;
 use crate::optimizer::Schedule;
 use crate::random::Stream;
-use crate::tone::ToneCurve;
 
 /// # Errors
 /// A kernel disagrees with its reference, or the device is out of memory or lost.
@@ -41,7 +37,8 @@ pub(super) fn blend_and_back(
         [tile_ranges, sorted_slots, owners, splats, colors],
         [render: Close(1e-3), transmittances: Close(1e-3)]
     );
-    let d_render = loss(bench, timings, scene, &render, tone)?;
+    let d_render = losses::image(bench, timings, scene, &render, tone)?;
+    losses::others(bench, timings, scene, &render)?;
     let records = vec![0.0_f32; 9 * owners.len()];
     let (records,) = check!(
         bench,
@@ -92,86 +89,6 @@ pub(super) fn blend_and_back(
     );
     let moments = adam_step(bench, timings, scene, &gradients)?;
     densify(bench, timings, scene, &moments, &grad_norm_sums, &visit_counts)
-}
-
-/// Both terms, as one kernel pair and as L1 alone; gives the gradient of the render.
-fn loss(
-    bench: &Bench,
-    timings: &mut Vec<Timing>,
-    scene: &Scene,
-    render: &[f32],
-    tone: ToneParameters,
-) -> anyhow::Result<Vec<f32>> {
-    let (low, tone) = (&scene.low.data, vec![tone]);
-    let (width, height) = (scene.low.width, scene.low.height);
-    let tone_curve = ToneCurve::Ap3.constant();
-    let lanes = bench.gpu.properties().subgroup_size;
-    let mean_scale = 1.0 / render.len() as f32;
-    let [columns, rows] = strip(&bench.gpu);
-    let strips = 3 * width.div_ceil(columns) * height.div_ceil(rows);
-    let workgroups = strips.div_ceil(lanes);
-    let threads = Threads::Workgroups([workgroups, 1, 1]);
-    let d_moments = vec![Vec3::ZERO; render.len()];
-    let partials = vec![0.0_f32; workgroups as usize];
-    let (d_moments, ssim_partials) = check!(
-        bench,
-        timings,
-        ssim_forward,
-        ssim_forward::Constants { columns, rows, tone_curve },
-        ssim_forward::Params { width, height },
-        threads,
-        [render, low, tone],
-        [d_moments: Close(1e-2), partials: Sum(1e-3)]
-    );
-    let d_render = vec![0.0_f32; render.len()];
-    let (d_render, l1_partials) = check!(
-        bench,
-        timings,
-        ssim_backward,
-        ssim_backward::Constants { columns, rows, tone_curve },
-        ssim_backward::Params {
-            width,
-            height,
-            l1_scale: 0.8 * mean_scale,
-            ssim_scale: 0.2 * mean_scale
-        },
-        threads,
-        [render, low, tone, d_moments],
-        [d_render: Close(1e-2), partials: Sum(1e-4)]
-    );
-    let (log, status) = (vec![StepLoss::default()], vec![0_u32]);
-    check!(
-        bench,
-        timings,
-        loss_log,
-        loss_log::Constants::default(),
-        loss_log::Params {
-            slot: 0,
-            l1_partial_count: workgroups,
-            ssim_partial_count: workgroups,
-            mean_scale,
-            not_finite_flag: 2,
-        },
-        Threads::Workgroups([1, 1, 1]),
-        [l1_partials, ssim_partials],
-        [log: Close(1e-5), status: Exact]
-    );
-    let constants = l1::Constants { tone_curve, ..Default::default() };
-    let value_count = render.len() as u32;
-    let workgroups = value_count.div_ceil(lanes * constants.values_per_thread);
-    let partials = vec![0.0_f32; workgroups as usize];
-    let ssim_gradient = d_render.clone();
-    check!(
-        bench,
-        timings,
-        l1,
-        constants,
-        l1::Params { value_count, l1_scale: mean_scale },
-        Threads::Workgroups([workgroups, 1, 1]),
-        [render, low, tone],
-        [d_render: Close(1e-5), partials: Sum(1e-4)]
-    );
-    Ok(ssim_gradient)
 }
 
 /// Updates the parameters; gives the moments.

@@ -1,0 +1,149 @@
+//! The denoising terms: the denoised image stays near the render, and smooth.
+
+use glam::UVec2;
+
+use super::log::{LogSlot, PartialSums, Term};
+use super::{Interior, check_weight, holds, no_scratch, value_count};
+use crate::Result;
+use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
+use crate::kernels::denoising;
+
+/// The weights of the terms.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct DenoisingWeights {
+    /// Of the mean squared difference of denoised and rendered image.
+    pub mse: f64,
+    /// Of the total variation of the denoised image.
+    pub total_variation: f64,
+}
+
+/// What one step's denoising terms read.
+#[derive(Clone, Copy, Debug)]
+pub struct DenoisingInputs<'a> {
+    /// Width and height in pixels.
+    pub size: UVec2,
+    /// The pixels that count.
+    pub interior: Interior,
+    /// (3, H, W)
+    pub denoised: &'a Buffer<f32>,
+    /// (3, H, W)
+    pub render: &'a Buffer<f32>,
+}
+
+/// Where the gradients go, (3, H, W) each; both are written, not added to.
+#[derive(Debug)]
+pub struct DenoisingGradients<'a> {
+    /// With respect to the denoised image.
+    pub d_denoised: &'a mut Buffer<f32>,
+    /// With respect to the render.
+    pub d_render: &'a mut Buffer<f32>,
+}
+
+/// mse * mean (denoised - render)^2 + `total_variation` * TV(denoised).
+#[derive(Debug)]
+pub struct DenoisingLoss {
+    gpu: Gpu,
+    weights: DenoisingWeights,
+    pipeline: Pipeline<denoising::Kernel>,
+    subgroup_size: u32,
+    rows: u32,
+    mse_partials: Buffer<f32>,
+    tv_partials: Buffer<f32>,
+}
+
+impl DenoisingLoss {
+    /// The kernel, without scratch memory: see [`DenoisingLoss::reserve`].
+    ///
+    /// # Errors
+    /// A weight is negative or not finite, or the device is out of memory.
+    pub fn new(gpu: &Gpu, weights: DenoisingWeights) -> Result<Self> {
+        check_weight("the denoising", weights.mse)?;
+        check_weight("the total variation", weights.total_variation)?;
+        let constants = denoising::Constants::default();
+        Ok(Self {
+            gpu: gpu.clone(),
+            weights,
+            pipeline: gpu.pipeline(&constants)?,
+            subgroup_size: gpu.properties().subgroup_size,
+            rows: constants.rows,
+            mse_partials: gpu.uninit("mse_partials", 0)?,
+            tv_partials: gpu.uninit("tv_partials", 0)?,
+        })
+    }
+
+    /// Scratch memory for views of `size`, and for those reserved for before.
+    ///
+    /// # Errors
+    /// The device is out of memory.
+    pub fn reserve(&mut self, size: UVec2) -> Result<()> {
+        let workgroups = self.workgroups(size) as usize;
+        if workgroups > self.mse_partials.len() {
+            self.mse_partials = self.gpu.uninit("mse_partials", workgroups)?;
+            self.tv_partials = self.gpu.uninit("tv_partials", workgroups)?;
+        }
+        Ok(())
+    }
+
+    /// Writes both gradients for the whole view, 0 outside the interior, and both terms to the log.
+    ///
+    /// # Errors
+    /// The view is empty or larger than those reserved for, the interior is empty or not inside it, a buffer is shorter
+    /// than it, or the log has no such slot.
+    pub fn record(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        DenoisingInputs { size, interior, denoised, render }: DenoisingInputs<'_>,
+        DenoisingGradients { d_denoised, d_render }: DenoisingGradients<'_>,
+        log: &mut LogSlot<'_>,
+    ) -> Result<()> {
+        let workgroups = self.workgroups(size);
+        if size.min_element() == 0 || workgroups as usize > self.mse_partials.len() {
+            return Err(no_scratch("denoising term", size));
+        }
+        interior.check(size)?;
+        for buffer in [denoised, render, &*d_denoised, &*d_render] {
+            holds(buffer, value_count(size) as usize)?;
+        }
+        log.check()?;
+        let UVec2 { x: columns, y: rows } = interior.size;
+        // One column or row has no pair of neighbours across.
+        let pair_scale = |pairs: u32| if pairs == 0 { 0.0 } else { 2.0 / (3.0 * pairs as f32) };
+        let mean_scale = 1.0 / value_count(interior.size) as f32;
+        pass.dispatch(
+            &self.pipeline,
+            &denoising::Params {
+                width: size.x,
+                height: size.y,
+                interior_begin: interior.origin,
+                interior_end: interior.end(),
+                mse_weight: self.weights.mse as f32,
+                tv_weight: self.weights.total_variation as f32,
+                mean_scale,
+                x_scale: pair_scale((columns - 1) * rows),
+                y_scale: pair_scale(columns * (rows - 1)),
+            },
+            denoising::Buffers {
+                denoised,
+                render,
+                d_denoised,
+                d_render,
+                mse_partials: &mut self.mse_partials,
+                tv_partials: &mut self.tv_partials,
+            },
+            Threads::Workgroups([workgroups, 1, 1]),
+        )?;
+        let sums = |term, partials, scale| PartialSums { term, partials, count: workgroups, scale };
+        log.record(
+            pass,
+            [
+                sums(Term::Denoising, &self.mse_partials, mean_scale),
+                sums(Term::TotalVariation, &self.tv_partials, 1.0),
+            ],
+        )
+    }
+
+    /// One subgroup each; as many as there are partial sums.
+    fn workgroups(&self, size: UVec2) -> u32 {
+        value_count(UVec2::new(size.x, size.y.div_ceil(self.rows))).div_ceil(self.subgroup_size)
+    }
+}

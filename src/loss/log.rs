@@ -1,0 +1,193 @@
+//! The log of the loss terms: one row per step, one column per term, filled on the device.
+
+use crate::gpu::{Buffer, Download, Gpu, Pipeline, Recorder, Threads};
+use crate::kernels::loss_log;
+use crate::{Error, Result};
+
+/// A loss term that the log has a column for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Term {
+    /// Mean |render - target|.
+    L1,
+    /// Mean SSIM of render and target.
+    Ssim,
+    /// Mean |render - photograph| of the dark reconstruction.
+    LowL1,
+    /// Mean SSIM of the dark reconstruction and the photograph.
+    LowSsim,
+    /// Mean |structure - that of the target|.
+    Structure,
+    /// 1 - correlation of depths over the view.
+    Depth,
+    /// Mean 1 - correlation of depths over boxes.
+    DepthLocal,
+    /// Mean squared difference of denoised and rendered image.
+    Denoising,
+    /// Total variation of the denoised image.
+    TotalVariation,
+}
+
+impl Term {
+    /// Every term, in the order of the columns.
+    pub const ALL: [Self; 9] = [
+        Self::L1,
+        Self::Ssim,
+        Self::LowL1,
+        Self::LowSsim,
+        Self::Structure,
+        Self::Depth,
+        Self::DepthLocal,
+        Self::Denoising,
+        Self::TotalVariation,
+    ];
+
+    /// What the term is called in messages and tables.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::L1 => "L1",
+            Self::Ssim => "SSIM",
+            Self::LowL1 => "L1 of the dark reconstruction",
+            Self::LowSsim => "SSIM of the dark reconstruction",
+            Self::Structure => "structure",
+            Self::Depth => "depth",
+            Self::DepthLocal => "local depth",
+            Self::Denoising => "denoising",
+            Self::TotalVariation => "total variation",
+        }
+    }
+}
+
+/// The terms of one step.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct StepLosses {
+    /// The status word behind the last term: the step counts only if it is 0.
+    pub status: u32,
+    values: [f32; Term::ALL.len()],
+}
+
+impl StepLosses {
+    /// The mean that `term` had; 0 if it was never recorded.
+    pub fn get(&self, term: Term) -> f32 {
+        self.values[term as usize]
+    }
+
+    /// The first term that is NaN or infinite.
+    pub fn first_not_finite(&self) -> Option<Term> {
+        Term::ALL.into_iter().find(|&term| !self.get(term).is_finite())
+    }
+}
+
+/// The terms of as many steps as it has slots, on the device. A term that no step records stays 0.
+#[derive(Debug)]
+pub struct LossLog {
+    pipeline: Pipeline<loss_log::Kernel>,
+    /// (slots, terms)
+    values: Buffer<f32>,
+    /// (slots,)
+    statuses: Buffer<u32>,
+}
+
+/// A log on its way to the host.
+#[derive(Debug)]
+pub struct LossLogDownload {
+    values: Download<f32>,
+    statuses: Download<u32>,
+}
+
+/// Where the terms of one step go.
+#[derive(Debug)]
+pub struct LogSlot<'a> {
+    /// The log.
+    pub log: &'a mut LossLog,
+    /// The row that this step fills.
+    pub slot: u32,
+    /// The sticky status word; `not_finite_flag` is set in its first element if a term is NaN or infinite.
+    pub status: &'a mut Buffer<u32>,
+    /// The bits to set.
+    pub not_finite_flag: u32,
+}
+
+/// A term and the partial sums that it is the scaled sum of; with none of them its column is left as it is.
+pub(super) struct PartialSums<'a> {
+    pub(super) term: Term,
+    pub(super) partials: &'a Buffer<f32>,
+    pub(super) count: u32,
+    pub(super) scale: f32,
+}
+
+impl LossLog {
+    /// A log of zeros.
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub fn new(gpu: &Gpu, slots: usize) -> Result<Self> {
+        Ok(Self {
+            pipeline: gpu.pipeline(&loss_log::Constants::default())?,
+            values: gpu.zeros("loss_log", slots * Term::ALL.len())?,
+            statuses: gpu.zeros("step_statuses", slots)?,
+        })
+    }
+
+    /// Copies the log as it is at this point of the recording to the host.
+    ///
+    /// # Errors
+    /// The device is out of memory.
+    pub fn download(&self, pass: &mut Recorder<'_>) -> Result<LossLogDownload> {
+        Ok(LossLogDownload {
+            values: pass.download(&self.values)?,
+            statuses: pass.download(&self.statuses)?,
+        })
+    }
+}
+
+impl LossLogDownload {
+    /// Waits for the submission that the copy is part of; gives one element per slot.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub fn wait(self) -> Result<Vec<StepLosses>> {
+        let (values, statuses) = (self.values.wait()?, self.statuses.wait()?);
+        let rows = values.as_chunks().0.iter().zip(statuses);
+        Ok(rows.map(|(&values, status)| StepLosses { status, values }).collect())
+    }
+}
+
+impl LogSlot<'_> {
+    /// Refuses a slot that the log does not have, before anything is recorded.
+    pub(super) fn check(&self) -> Result<()> {
+        let (slot, slots) = (self.slot, self.log.statuses.len());
+        if slot as usize >= slots || self.status.is_empty() {
+            return Err(Error::Usage(format!(
+                "the loss log has no slot {slot} of {slots}, or there is no status word"
+            )));
+        }
+        Ok(())
+    }
+
+    /// The means of two terms.
+    pub(super) fn record(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        [first, second]: [PartialSums<'_>; 2],
+    ) -> Result<()> {
+        pass.dispatch(
+            &self.log.pipeline,
+            &loss_log::Params {
+                slot: self.slot,
+                term_count: Term::ALL.len() as u32,
+                terms: [first.term as u32, second.term as u32].into(),
+                partial_counts: [first.count, second.count].into(),
+                mean_scales: [first.scale, second.scale].into(),
+                not_finite_flag: self.not_finite_flag,
+            },
+            loss_log::Buffers {
+                first_partials: first.partials,
+                second_partials: second.partials,
+                log: &mut self.log.values,
+                statuses: &mut self.log.statuses,
+                status: self.status,
+            },
+            Threads::Workgroups([1, 1, 1]),
+        )
+    }
+}

@@ -1,0 +1,102 @@
+//! The structure term: a plane of the render against the structure of the pseudo-GT.
+
+use glam::UVec2;
+
+use super::log::{LogSlot, PartialSums, Term};
+use super::{check_weight, holds, no_scratch, pixel_count};
+use crate::Result;
+use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
+use crate::kernels::structure_l1;
+
+/// What one step's structure term reads.
+#[derive(Clone, Copy, Debug)]
+pub struct StructureInputs<'a> {
+    /// Width and height in pixels.
+    pub size: UVec2,
+    /// (channels, H, W), not clamped.
+    pub render: &'a Buffer<f32>,
+    /// The channel that holds the structure.
+    pub plane: u32,
+    /// (H, W), from [`crate::structure::StructureTarget`].
+    pub structure: &'a Buffer<f32>,
+}
+
+/// weight * mean |clamp(p, 0, 1) - structure|.
+#[derive(Debug)]
+pub struct StructureLoss {
+    gpu: Gpu,
+    weight: f64,
+    pipeline: Pipeline<structure_l1::Kernel>,
+    values_per_workgroup: u32,
+    partials: Buffer<f32>,
+}
+
+impl StructureLoss {
+    /// The kernel, without scratch memory: see [`StructureLoss::reserve`].
+    ///
+    /// # Errors
+    /// The weight is negative or not finite, or the device is out of memory.
+    pub fn new(gpu: &Gpu, weight: f64) -> Result<Self> {
+        check_weight("the structure", weight)?;
+        let constants = structure_l1::Constants::default();
+        Ok(Self {
+            gpu: gpu.clone(),
+            weight,
+            pipeline: gpu.pipeline(&constants)?,
+            values_per_workgroup: gpu.properties().subgroup_size * constants.values_per_thread,
+            partials: gpu.uninit("structure_partials", 0)?,
+        })
+    }
+
+    /// Scratch memory for views of `size`, and for those reserved for before.
+    ///
+    /// # Errors
+    /// The device is out of memory.
+    pub fn reserve(&mut self, size: UVec2) -> Result<()> {
+        let workgroups = pixel_count(size).div_ceil(self.values_per_workgroup) as usize;
+        if workgroups > self.partials.len() {
+            self.partials = self.gpu.uninit("structure_partials", workgroups)?;
+        }
+        Ok(())
+    }
+
+    /// Writes the plane of `d_render`, (channels, H, W), and the mean to the log.
+    ///
+    /// # Errors
+    /// The view is empty or larger than those reserved for, a buffer is shorter than it, or the log has no such slot.
+    pub fn record(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        StructureInputs { size, render, plane, structure }: StructureInputs<'_>,
+        d_render: &mut Buffer<f32>,
+        log: &mut LogSlot<'_>,
+    ) -> Result<()> {
+        let pixels = pixel_count(size);
+        let workgroups = pixels.div_ceil(self.values_per_workgroup);
+        if pixels == 0 || workgroups as usize > self.partials.len() {
+            return Err(no_scratch("structure term", size));
+        }
+        holds(structure, pixels as usize)?;
+        for buffer in [render, &*d_render] {
+            holds(buffer, (plane as usize + 1) * pixels as usize)?;
+        }
+        log.check()?;
+        pass.dispatch(
+            &self.pipeline,
+            &structure_l1::Params {
+                pixel_count: pixels,
+                first: plane * pixels,
+                scale: (self.weight / f64::from(pixels)) as f32,
+            },
+            structure_l1::Buffers { render, structure, d_render, partials: &mut self.partials },
+            Threads::Workgroups([workgroups, 1, 1]),
+        )?;
+        let sums = |count| PartialSums {
+            term: Term::Structure,
+            partials: &self.partials,
+            count,
+            scale: 1.0 / pixels as f32,
+        };
+        log.record(pass, [sums(workgroups), sums(0)])
+    }
+}
