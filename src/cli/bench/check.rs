@@ -4,7 +4,9 @@ use bytemuck::Pod;
 use glam::{UVec2, Vec2, Vec3};
 
 use super::Timing;
-use crate::kernels::{ProjectedSplat, RankSearch, StepLoss, ToneParameters, ToneStatistics};
+use crate::kernels::{
+    ChannelStatistics, ProjectedSplat, RankSearch, StepLoss, ToneParameters, ToneStatistics,
+};
 
 /// How an output must agree with the reference's.
 #[derive(Clone, Copy, Debug)]
@@ -34,7 +36,7 @@ macro_rules! elements {
     )+};
 }
 elements!(u32: u32, UVec2, [u32; 3], RankSearch);
-elements!(f32: f32, Vec2, Vec3, ProjectedSplat, StepLoss, ToneStatistics, ToneParameters);
+elements!(f32: f32, Vec2, Vec3, ChannelStatistics, ProjectedSplat, StepLoss, ToneStatistics, ToneParameters);
 
 /// Runs a kernel and its reference on copies of the same host data, compares the outputs, times the kernel, and
 /// gives the device's outputs as a tuple. Inputs and outputs are variables named as the kernel's buffers.

@@ -5,6 +5,7 @@
 
 mod bin;
 mod learn;
+mod nn;
 
 use glam::Vec2;
 
@@ -36,6 +37,7 @@ pub(super) fn check_and_time(bench: &Bench, scene: &Scene) -> anyhow::Result<Vec
     let tone = statistics(bench, &mut timings)?;
     let frame = bin::project_and_bin(bench, &mut timings, scene)?;
     learn::blend_and_back(bench, &mut timings, scene, &frame, tone)?;
+    nn::repeat_and_ends(bench, &mut timings)?;
     Ok(timings)
 }
 
