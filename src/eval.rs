@@ -1,7 +1,9 @@
 //! Scores a model on the test views of its dataset.
 
 use std::path::Path;
+use std::str::FromStr;
 
+use glam::UVec2;
 use serde_json::{Map, Value, json};
 
 use crate::dataset::{Dataset, View};
@@ -9,7 +11,8 @@ use crate::gpu::{Buffer, Gpu};
 use crate::image::Image;
 use crate::metrics::Scores;
 use crate::render::{RenderOptions, RenderSettings, Renderer};
-use crate::scene::Gaussians;
+use crate::scene::{Feature, Features, Gaussians};
+use crate::train::{Networks, Rendered};
 use crate::{Error, Result};
 
 /// What a test view scores, and the pictures behind it.
@@ -17,8 +20,10 @@ use crate::{Error, Result};
 pub struct ViewScore {
     /// The view's name.
     pub name: String,
-    /// The scores.
+    /// The scores of what the model shows: R_K, or R_0 where it has no denoiser.
     pub scores: Scores,
+    /// Those of R_0, where the model has a denoiser.
+    pub r0: Option<Scores>,
     /// What was scored, in 8 bits as it is saved.
     pub render: Image,
     /// What it was scored against, in 8 bits as it is saved.
@@ -31,22 +36,31 @@ pub struct Player {
     parameters: Buffer<f32>,
     count: usize,
     sh_degree: u32,
+    features: Features,
     renderer: Renderer,
+    networks: Option<Networks>,
 }
 
 impl Player {
-    /// Uploads `gaussians`.
+    /// Uploads `gaussians`, whose colours are `raw_colors` or as viewers show them; `networks` belong to them.
     ///
     /// # Errors
     /// The device is out of memory or lost.
-    pub fn new(gpu: &Gpu, gaussians: &Gaussians) -> Result<Self> {
+    pub fn new(
+        gpu: &Gpu,
+        gaussians: &Gaussians,
+        raw_colors: bool,
+        networks: Option<Networks>,
+    ) -> Result<Self> {
         let shape = gaussians.shape;
-        let settings = RenderSettings { shape, ..RenderSettings::default() };
+        let settings = RenderSettings { shape, raw_colors, ..RenderSettings::default() };
         Ok(Self {
             parameters: gpu.buffer("parameters", &gaussians.parameters)?,
             count: gaussians.count,
             sh_degree: shape.sh_degree,
+            features: shape.features,
             renderer: Renderer::new(gpu, settings)?,
+            networks,
         })
     }
 
@@ -54,10 +68,112 @@ impl Player {
     ///
     /// # Errors
     /// The device is out of memory or lost.
-    pub fn render(&mut self, view: &View) -> Result<Image> {
+    pub fn render(&mut self, view: &View) -> Result<Rendered> {
+        let (width, height) = (view.camera.width, view.camera.height);
+        let mut data = self.channels(view)?;
+        data.truncate(3 * width as usize * height as usize);
+        let denoised = match &mut self.networks {
+            Some(networks) => {
+                networks.denoised_image(self.renderer.render(), UVec2::new(width, height))?
+            }
+            None => None,
+        };
+        Ok(Rendered { colors: Image { width, height, data }, denoised })
+    }
+
+    /// One layer of what the view's camera sees; a feature of one channel is repeated.
+    ///
+    /// # Errors
+    /// The model has no such layer, or the device is out of memory or lost.
+    pub fn layer(&mut self, view: &View, layer: Layer) -> Result<Image> {
+        let lacks =
+            || Error::Usage(format!("the model has no {}; {}", layer.name(), self.layers()));
+        let feature = match layer {
+            Layer::Rgb => return Ok(self.render(view)?.colors),
+            Layer::Denoised => {
+                let lacks = lacks();
+                return self.render(view)?.denoised.ok_or(lacks);
+            }
+            Layer::Depth => Feature::Depth,
+            Layer::Structure => Feature::Structure,
+            Layer::Illumination => Feature::Illumination,
+            Layer::Noise => Feature::Noise,
+        };
+        let planes = self.features.channels_of(feature).ok_or_else(lacks)?;
+        let (width, height) = (view.camera.width, view.camera.height);
+        let pixels = width as usize * height as usize;
+        let channels = self.channels(view)?;
+        let plane = |c: usize| {
+            let plane = planes.start + c.min(planes.len() - 1);
+            channels[plane * pixels..][..pixels].iter().copied()
+        };
+        Ok(Image { width, height, data: (0..3).flat_map(plane).collect() })
+    }
+
+    /// What the model does have, for a message.
+    fn layers(&self) -> String {
+        let denoised = self.networks.as_ref().is_some_and(Networks::has_denoiser);
+        let features = self.features.specs().map(|spec| spec.name);
+        let names: Vec<&str> =
+            ["rgb"].into_iter().chain(denoised.then_some("denoised")).chain(features).collect();
+        format!("it has {}", names.join(", "))
+    }
+
+    fn channels(&mut self, view: &View) -> Result<Vec<f32>> {
         let options = RenderOptions { sh_degree: self.sh_degree, background: [0.0; 3] };
         self.renderer.reserve(self.count, [&view.camera])?;
-        self.renderer.render_image(&self.parameters, &view.camera, &options)
+        self.renderer.render_channels(&self.parameters, &view.camera, &options)
+    }
+}
+
+/// What can be seen of a model.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Layer {
+    /// R_0, the Gaussians' colours.
+    Rgb,
+    /// R_K, behind the denoiser.
+    Denoised,
+    /// The depth feature, in units of its own.
+    Depth,
+    /// The structure feature.
+    Structure,
+    /// The illumination feature.
+    Illumination,
+    /// The noise feature.
+    Noise,
+}
+
+impl Layer {
+    /// Every layer.
+    pub const ALL: [Self; 6] =
+        [Self::Rgb, Self::Denoised, Self::Depth, Self::Structure, Self::Illumination, Self::Noise];
+
+    /// The name on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Rgb => "rgb",
+            Self::Denoised => "denoised",
+            Self::Depth => "depth",
+            Self::Structure => "structure",
+            Self::Illumination => "illumination",
+            Self::Noise => "noise",
+        }
+    }
+
+    /// Whether its values are colour, sRGB-encoded, rather than numbers.
+    pub fn is_color(self) -> bool {
+        matches!(self, Self::Rgb | Self::Denoised)
+    }
+}
+
+impl FromStr for Layer {
+    type Err = Error;
+
+    fn from_str(name: &str) -> Result<Self> {
+        Self::ALL.into_iter().find(|layer| layer.name() == name).ok_or_else(|| {
+            let names = Self::ALL.map(Self::name).join(", ");
+            Error::Usage(format!("unknown layer `{name}`; the layers are {names}"))
+        })
     }
 }
 
@@ -68,14 +184,17 @@ impl Player {
 /// Those of `render`.
 pub fn score(
     dataset: &Dataset,
-    mut render: impl FnMut(&View) -> Result<Image>,
+    mut render: impl FnMut(&View) -> Result<Rendered>,
 ) -> Result<Vec<ViewScore>> {
     let mut scored = vec![];
     for view in dataset.test_views() {
         let Some(reference) = &view.reference else { continue };
-        let (render, reference) = (quantized(&render(view)?), quantized(reference));
+        let (rendered, reference) = (render(view)?, quantized(reference));
+        let render = quantized(rendered.output());
         let scores = Scores::of(&render, &reference)?;
-        scored.push(ViewScore { name: view.name.clone(), scores, render, reference });
+        let r0 = rendered.denoised.is_some();
+        let r0 = r0.then(|| Scores::of(&quantized(&rendered.colors), &reference)).transpose()?;
+        scored.push(ViewScore { name: view.name.clone(), scores, r0, render, reference });
     }
     Ok(scored)
 }
@@ -87,10 +206,12 @@ pub fn metrics(
     gaussians: usize,
     steps: u64,
 ) -> Value {
-    let all: Vec<Scores> = scored.iter().map(|view| view.scores).collect();
-    let mean = Scores::mean(&all).map_or(Value::Null, |mean| entry(&mean));
-    let views: Map<String, Value> =
-        scored.iter().map(|view| (view.name.clone(), entry(&view.scores))).collect();
+    let (all, r0) = means(scored);
+    let mean = all.map_or(Value::Null, |mean| entry(&mean, r0.as_ref()));
+    let views: Map<String, Value> = scored
+        .iter()
+        .map(|view| (view.name.clone(), entry(&view.scores, view.r0.as_ref())))
+        .collect();
     json!({
         "mean": mean,
         "views": views,
@@ -98,6 +219,13 @@ pub fn metrics(
         "gaussians": gaussians,
         "steps": steps,
     })
+}
+
+/// The mean scores, and those of R_0 where the model has a denoiser.
+pub fn means(scored: &[ViewScore]) -> (Option<Scores>, Option<Scores>) {
+    let all: Vec<Scores> = scored.iter().map(|view| view.scores).collect();
+    let r0: Vec<Scores> = scored.iter().filter_map(|view| view.r0).collect();
+    (Scores::mean(&all), Scores::mean(&r0))
 }
 
 /// Writes `renders/NAME.png` and `references/NAME.png` below `folder`.
@@ -119,13 +247,17 @@ pub fn save_images(folder: &Path, scored: &[ViewScore]) -> Result<()> {
     Ok(())
 }
 
-/// A score as JSON; infinite PSNR, of equal images, has no JSON number and is null.
-fn entry(scores: &Scores) -> Value {
-    json!({
+/// A score as JSON, that of R_0 in it; infinite PSNR, of equal images, has no JSON number and is null.
+fn entry(scores: &Scores, r0: Option<&Scores>) -> Value {
+    let mut entry = json!({
         "psnr": scores.psnr,
         "psnr_channel_mean": scores.psnr_channel_mean,
         "ssim": scores.ssim,
-    })
+    });
+    if let Some(r0) = r0 {
+        entry["r0"] = self::entry(r0, None);
+    }
+    entry
 }
 
 /// Clamped to [0, 1] and rounded to multiples of 1/255. A NaN becomes 0.

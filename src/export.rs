@@ -3,6 +3,7 @@
 //! ```text
 //! RUN/config.toml    everything the run used
 //!     model.ply      the Gaussians, as splat viewers open them
+//!     networks.safetensors    the weights of the networks, where the model has any
 //!     train.csv      one line per step
 //!     metrics.json   scores of the test views
 //! ```
@@ -13,8 +14,9 @@ use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
+use crate::gpu::Gpu;
 use crate::scene::{Gaussians, ply};
-use crate::train::{StepReport, TrainConfig};
+use crate::train::{ModelConfig, Networks, StepReport, TrainConfig};
 use crate::{Error, Result};
 
 /// A run directory and the log that grows in it.
@@ -25,7 +27,10 @@ pub struct RunDirectory {
 }
 
 /// The files of a run that a new run replaces; nothing else in the directory is touched.
-const FILES: [&str; 4] = ["metrics.json", "model.ply", "train.csv", "config.toml"];
+const FILES: [&str; 5] = ["metrics.json", "model.ply", NETWORKS, "train.csv", "config.toml"];
+
+/// The weights of the networks.
+const NETWORKS: &str = "networks.safetensors";
 
 impl RunDirectory {
     /// Makes the directory and writes the configuration.
@@ -46,7 +51,8 @@ impl RunDirectory {
         let log_path = path.join("train.csv");
         let log = File::create(&log_path).map_err(|error| unwritable(&log_path, &error))?;
         let mut run = Self { path: path.to_owned(), log: BufWriter::new(log) };
-        run.log_line("step,view,loss,l1,ssim,gaussians,milliseconds")?;
+        let terms: Vec<&str> = config.terms().iter().map(|(term, _)| term.column()).collect();
+        run.log_line(&format!("step,view,loss,{},gaussians,milliseconds", terms.join(",")))?;
         Ok(run)
     }
 
@@ -55,19 +61,32 @@ impl RunDirectory {
     /// # Errors
     /// The disk is full or gone.
     pub fn log(&mut self, report: &StepReport) -> Result<()> {
-        let StepReport { step, view, loss, l1, ssim, gaussians, milliseconds } = report;
-        self.log_line(&format!(
-            "{step},{view},{loss:.6},{l1:.6},{ssim:.6},{gaussians},{milliseconds:.2}"
-        ))
+        let StepReport { step, view, loss, terms, gaussians, milliseconds } = report;
+        let terms: String = terms.iter().map(|term| format!("{term:.6},")).collect();
+        self.log_line(&format!("{step},{view},{loss:.6},{terms}{gaussians},{milliseconds:.2}"))
     }
 
-    /// Writes `model.ply`.
+    /// Writes `model.ply`, in the colours that viewers show.
     ///
     /// # Errors
     /// The disk is full or gone.
-    pub fn save_model(&mut self, gaussians: &Gaussians) -> Result<()> {
+    pub fn save_model(&mut self, gaussians: &Gaussians, raw_colors: bool) -> Result<()> {
         self.log.flush().map_err(|error| unwritable(&self.path, &error))?;
-        ply::save(gaussians, self.path.join("model.ply"))
+        let path = self.path.join("model.ply");
+        if !raw_colors {
+            return ply::save(gaussians, path);
+        }
+        let mut gaussians = gaussians.clone();
+        gaussians.shift_colors(-0.5);
+        ply::save(&gaussians, path)
+    }
+
+    /// Writes the weights of the networks.
+    ///
+    /// # Errors
+    /// The disk is full or gone, or the device was lost.
+    pub fn save_networks(&self, networks: &Networks) -> Result<()> {
+        networks.save(&self.path.join(NETWORKS))
     }
 
     /// Writes `metrics.json`, the sign that the run is whole.
@@ -101,12 +120,29 @@ pub fn load_config(run: &Path) -> Result<TrainConfig> {
 ///
 /// # Errors
 /// The run has not been trained to its end, or the file is cut short.
-pub fn load_model(run: &Path) -> Result<Gaussians> {
+pub fn load_model(run: &Path, raw_colors: bool) -> Result<Gaussians> {
     let path = run.join("model.ply");
     if !path.is_file() {
         return Err(Error::input(run, "has no model.ply: the run did not finish; train it again"));
     }
-    ply::load(path)
+    let mut gaussians = ply::load(path)?;
+    if raw_colors {
+        gaussians.shift_colors(0.5);
+    }
+    Ok(gaussians)
+}
+
+/// The trained networks of a run; none where its model has none.
+///
+/// # Errors
+/// Their file is missing or damaged, or holds networks of another configuration.
+pub fn load_networks(gpu: &Gpu, run: &Path, model: &ModelConfig) -> Result<Option<Networks>> {
+    if !model.denoiser && !model.tonemapper {
+        return Ok(None);
+    }
+    let mut networks = Networks::new(gpu, model, 0)?;
+    networks.load(&run.join(NETWORKS))?;
+    Ok(Some(networks))
 }
 
 /// Writes a JSON file, pretty-printed, whole or not at all.
@@ -158,7 +194,9 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         assert!(load_config(folder.path()).unwrap_err().to_string().contains("config.toml"));
         drop(RunDirectory::create(folder.path(), &TrainConfig::default(), false).unwrap());
-        assert!(load_model(folder.path()).unwrap_err().to_string().contains("did not finish"));
+        assert!(
+            load_model(folder.path(), false).unwrap_err().to_string().contains("did not finish")
+        );
     }
 
     #[test]

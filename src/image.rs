@@ -79,10 +79,11 @@ impl Image {
         let path = path.as_ref();
         let bytes = std::fs::read(path)
             .map_err(|error| Error::input(path, format!("cannot be read: {error}")))?;
-        Self::decode(path, bytes, srgb_from_linear)
+        let encode = |linear: f32| (linear >= 0.0).then(|| srgb_from_linear(linear));
+        Self::decode(path, bytes, encode)
     }
 
-    /// The same for numbers that are no colour, such as depth: EXR values are taken as they are.
+    /// The same for numbers that are no colour, such as depth: EXR values are taken as they are, also negative ones.
     ///
     /// # Errors
     /// As [`Image::load`].
@@ -90,12 +91,12 @@ impl Image {
         let path = path.as_ref();
         let bytes = std::fs::read(path)
             .map_err(|error| Error::input(path, format!("cannot be read: {error}")))?;
-        Self::decode(path, bytes, |value| value)
+        Self::decode(path, bytes, Some)
     }
 
-    fn decode(path: &Path, bytes: Vec<u8>, from_linear: fn(f32) -> f32) -> Result<Self> {
+    fn decode(path: &Path, bytes: Vec<u8>, from_exr_value: FromExrValue) -> Result<Self> {
         if bytes.starts_with(&EXR_MAGIC) {
-            return from_exr(path, bytes, from_linear);
+            return from_exr(path, bytes, from_exr_value);
         }
         if bytes.starts_with(&[0xFF, 0xD8]) && !jpeg_is_whole(&bytes) {
             return Err(Error::input(path, "this JPEG is cut short; copy it again"));
@@ -150,9 +151,21 @@ impl Image {
     /// # Errors
     /// [`Error::Output`] names the file; nothing half-written is left under its name.
     pub fn save_exr(&self, path: impl AsRef<Path>) -> Result<()> {
+        self.encode_exr(path.as_ref(), linear_from_srgb)
+    }
+
+    /// The same for numbers that are no colour: they are written as they are.
+    ///
+    /// # Errors
+    /// As [`Image::save_exr`].
+    pub fn save_exr_as_stored(&self, path: impl AsRef<Path>) -> Result<()> {
+        self.encode_exr(path.as_ref(), |value| value)
+    }
+
+    fn encode_exr(&self, path: &Path, to_linear: fn(f32) -> f32) -> Result<()> {
         use exr::prelude::{SpecificChannels, Vec2, WritableImage};
         let channels = SpecificChannels::rgb(|Vec2(x, y): Vec2<usize>| {
-            let [red, green, blue] = self.pixel(x as u32, y as u32).map(linear_from_srgb);
+            let [red, green, blue] = self.pixel(x as u32, y as u32).map(to_linear);
             (red, green, blue)
         });
         let size = (self.width as usize, self.height as usize);
@@ -160,8 +173,8 @@ impl Image {
         exr::image::Image::from_channels(size, channels)
             .write()
             .to_buffered(&mut file)
-            .map_err(|error| Error::output(path.as_ref(), format!("cannot be encoded: {error}")))?;
-        write_whole(path.as_ref(), file.get_ref())
+            .map_err(|error| Error::output(path, format!("cannot be encoded: {error}")))?;
+        write_whole(path, file.get_ref())
     }
 
     /// The image at another size: every output pixel is the mean of the area it covers (a box filter, in float).
@@ -262,7 +275,10 @@ fn from_decoded(decoded: DynamicImage) -> Image {
     Image { width, height, data }
 }
 
-fn from_exr(path: &Path, bytes: Vec<u8>, from_linear: fn(f32) -> f32) -> Result<Image> {
+/// What a finite value of an EXR file means; none where it makes no sense.
+type FromExrValue = fn(f32) -> Option<f32>;
+
+fn from_exr(path: &Path, bytes: Vec<u8>, from_exr_value: FromExrValue) -> Result<Image> {
     use exr::prelude::{ReadChannels, ReadLayers};
     let image = exr::prelude::read()
         .no_deep_data()
@@ -287,16 +303,15 @@ fn from_exr(path: &Path, bytes: Vec<u8>, from_linear: fn(f32) -> f32) -> Result<
                 "this EXR file has subsampled channels; save it as plain RGB",
             ));
         }
-        data.extend(channel.sample_data.values_as_f32().map(|linear| {
-            // Positive phrasing: a NaN fails the test too.
-            let usable = linear >= 0.0 && linear.is_finite();
-            replaced += usize::from(!usable);
-            if usable { from_linear(linear) } else { 0.0 }
+        data.extend(channel.sample_data.values_as_f32().map(|value| {
+            let usable = Some(value).filter(|value| value.is_finite()).and_then(from_exr_value);
+            replaced += usize::from(usable.is_none());
+            usable.unwrap_or(0.0)
         }));
     }
     if replaced > 0 {
         tracing::warn!(
-            "{}: {replaced} values are negative or not finite; they count as 0",
+            "{}: {replaced} values are negative colours or not finite; they count as 0",
             path.display()
         );
     }

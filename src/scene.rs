@@ -232,6 +232,13 @@ impl Gaussians {
         bytemuck::cast_slice_mut(&mut self.parameters[plane])
     }
 
+    /// Adds a constant to the colour from every direction.
+    pub fn shift_colors(&mut self, by: f32) {
+        for dc in self.dc_mut() {
+            *dc += by / SH_C0;
+        }
+    }
+
     /// What is blended beside colour, (count, features), to change.
     pub fn features_mut(&mut self) -> &mut [f32] {
         let plane = self.plane(Attribute::Features);

@@ -2,8 +2,10 @@
 
 mod config;
 mod model;
+mod networks;
 mod parts;
 mod preset;
+mod terms;
 mod views;
 
 use std::time::Instant;
@@ -15,18 +17,22 @@ use crate::dataset::Dataset;
 use crate::densify::{Densifier, DensifySettings};
 use crate::gpu::{Buffer, Gpu, PassTime, Recorder};
 use crate::image::Image;
-use crate::loss::{Interior, LogSlot, Loss, LossInputs, LossLog, LossSettings, StepLosses, Term};
+use crate::loss::{
+    DepthBoxes, Interior, LogSlot, Loss, LossInputs, LossLog, LossSettings, StepLosses, Term,
+};
 use crate::optimizer::{Adam, AdamBuffers};
 use crate::pseudo_gt::PseudoGt;
 use crate::random::Stream;
 use crate::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer, Status};
-use crate::scene::{Gaussians, width};
+use crate::scene::{Features, Gaussians, width};
 use crate::{Error, Result};
 
 pub use config::{Background, DensityConfig, TrainConfig};
 use model::Model;
+pub use networks::Networks;
 pub use parts::{ModelConfig, ModelName, NetworkRates, Part, Weights};
 pub use preset::Preset;
+use terms::PartTerms;
 use views::Views;
 
 /// Steps that one submission holds at most: recording and reading back cost once for all of them.
@@ -39,6 +45,32 @@ mod streams {
     pub(super) const VIEWS: u64 = 3;
     pub(super) const DENSITY: u64 = 4;
     pub(super) const FEATURES: u64 = 5;
+    pub(super) const NETWORKS: u64 = 6;
+    pub(super) const CROPS: u64 = 7;
+    pub(super) const BOXES: u64 = 8;
+}
+
+/// What a model shows of a view.
+#[derive(Clone, Debug)]
+pub struct Rendered {
+    /// R_0: the Gaussians' colours.
+    pub colors: Image,
+    /// R_K, where the model has a denoiser.
+    pub denoised: Option<Image>,
+}
+
+impl Rendered {
+    /// What the model is scored on: R_K, or R_0 where there is no denoiser.
+    pub fn output(&self) -> &Image {
+        self.denoised.as_ref().unwrap_or(&self.colors)
+    }
+}
+
+/// A picture that no denoiser has seen.
+impl From<Image> for Rendered {
+    fn from(colors: Image) -> Self {
+        Self { colors, denoised: None }
+    }
 }
 
 /// What one step did.
@@ -48,12 +80,10 @@ pub struct StepReport {
     pub step: u64,
     /// The view it trained on.
     pub view: String,
-    /// (1 - w) L1 + w (1 - SSIM).
+    /// The weighted sum of the terms.
     pub loss: f64,
-    /// Mean |render - target|.
-    pub l1: f64,
-    /// Mean SSIM of render and target; 0 where its weight is 0.
-    pub ssim: f64,
+    /// Every term that the model has, unweighted: [`TrainConfig::terms`].
+    pub terms: Vec<f64>,
     /// The number of Gaussians it rendered.
     pub gaussians: usize,
     /// Its share of the time its submission took, in milliseconds.
@@ -72,6 +102,7 @@ pub struct Trainer {
     model: Model,
     renderer: Renderer,
     loss: Loss,
+    parts: PartTerms,
     adam: Adam,
     densifier: Densifier,
     d_render: Buffer<f32>,
@@ -83,14 +114,21 @@ impl Trainer {
     ///
     /// # Errors
     /// The configuration makes no sense, or the device is out of memory or lost.
-    pub fn new(gpu: &Gpu, config: TrainConfig, dataset: &Dataset) -> Result<Self> {
+    pub fn new(gpu: &Gpu, mut config: TrainConfig, dataset: &Dataset) -> Result<Self> {
         config.check()?;
+        config.leave_out_what_is_missing(dataset);
         let mut pseudo_gt = PseudoGt::new(gpu, config.tone)?;
-        let views = Views::upload(gpu, &mut pseudo_gt, dataset)?;
-        let gaussians = views.initial_gaussians(gpu, &pseudo_gt, dataset, &config)?;
-        let settings = RenderSettings { shape: gaussians.shape, ..RenderSettings::default() };
+        let views = Views::upload(gpu, &mut pseudo_gt, dataset, config.model.features())?;
         let sizes = views.sizes();
+        say_what_parts_see(&config.model, &sizes);
+        let gaussians = views.initial_gaussians(gpu, &pseudo_gt, dataset, &config)?;
+        let settings = RenderSettings {
+            shape: gaussians.shape,
+            raw_colors: config.model.raw_colors,
+            ..RenderSettings::default()
+        };
         let pixels = sizes.iter().map(|size| size.x as usize * size.y as usize).max();
+        let values = settings.channels() * pixels.unwrap_or_default();
         let mut trainer = Self {
             gpu: gpu.clone(),
             extent: dataset.extent(),
@@ -99,9 +137,10 @@ impl Trainer {
             model: Model::upload(gpu, &gaussians)?,
             renderer: Renderer::new(gpu, settings)?,
             loss: Loss::new(gpu, loss_settings(&config))?,
+            parts: PartTerms::new(gpu, &config, &sizes)?,
             adam: Adam::new(gpu)?,
             densifier: Densifier::new(gpu, density(&config, dataset.extent()))?,
-            d_render: gpu.uninit("d_render", 3 * pixels.unwrap_or_default())?,
+            d_render: gpu.uninit("d_render", values)?,
             log: LossLog::new(gpu, STEPS_PER_SUBMISSION as usize)?,
             config,
         };
@@ -154,6 +193,7 @@ impl Trainer {
         let gpu = self.gpu.clone();
         let mut downloads = None;
         gpu.run("steps", |pass| {
+            self.log.clear(pass);
             for step in first..=last {
                 self.record_step(pass, step, (step - first) as u32)?;
             }
@@ -219,18 +259,22 @@ impl Trainer {
 
         self.renderer.forward(pass, &model.gaussians.parameters, &view.camera, &options)?;
         let (render, status) = self.renderer.render_and_status();
-        self.loss.record(
-            pass,
-            LossInputs {
-                size,
-                interior: Interior::whole(size),
-                render,
-                low: &view.image,
-                tone: &view.tone,
-            },
-            &mut self.d_render,
-            &mut LogSlot { log: &mut self.log, slot, status, not_finite_flag: Status::NOT_FINITE },
-        )?;
+        let d_render = &mut self.d_render;
+        let log =
+            &mut LogSlot { log: &mut self.log, slot, status, not_finite_flag: Status::NOT_FINITE };
+        let inputs = LossInputs {
+            size,
+            interior: Interior::whole(size),
+            render,
+            low: &view.image,
+            tone: &view.tone,
+        };
+        if model.shape().features != Features::NONE {
+            // Not every term reaches every pixel of its planes.
+            pass.fill(d_render, 0);
+        }
+        self.loss.record(pass, inputs, d_render, log)?;
+        self.parts.record(pass, step, view, render, d_render, log)?;
         self.renderer.backward(
             pass,
             &model.gaussians.parameters,
@@ -258,20 +302,33 @@ impl Trainer {
                 moments: &mut model.gaussians.moments,
                 status: self.renderer.status(),
             },
-        )
+        )?;
+        self.parts.update(pass, step, &self.adam, self.renderer.status())
+    }
+
+    /// The networks; none where the model has none.
+    pub fn networks(&mut self) -> Option<&mut Networks> {
+        self.parts.networks()
     }
 
     /// Renders what `camera` sees, with every SH degree trained so far, before a black background.
     ///
     /// # Errors
     /// The device is out of memory or lost.
-    pub fn render(&mut self, camera: &Camera) -> Result<Image> {
+    pub fn render(&mut self, camera: &Camera) -> Result<Rendered> {
         let options = RenderOptions {
             sh_degree: self.config.schedule.sh_degree(self.step, self.config.sh_degree),
             background: [0.0; 3],
         };
         self.renderer.reserve(self.model.count(), [camera])?;
-        self.renderer.render_image(&self.model.gaussians.parameters, camera, &options)
+        let colors =
+            self.renderer.render_image(&self.model.gaussians.parameters, camera, &options)?;
+        let size = UVec2::new(camera.width, camera.height);
+        let denoised = match self.parts.networks() {
+            Some(networks) => networks.denoised_image(self.renderer.render(), size)?,
+            None => None,
+        };
+        Ok(Rendered { colors, denoised })
     }
 
     /// Density control acts after this step. Never so late that the run ends before what it added has settled.
@@ -285,20 +342,38 @@ impl Trainer {
     }
 
     fn report(&self, step: u64, losses: &StepLosses, milliseconds: f64) -> StepReport {
-        let (l1, ssim, weight) = (
-            f64::from(losses.get(Term::L1)),
-            f64::from(losses.get(Term::Ssim)),
-            self.config.ssim_weight,
-        );
+        let terms = self.config.terms();
         StepReport {
             step,
             view: self.views.of_step(self.config.seed, step).name.clone(),
-            loss: (1.0 - weight) * l1 + weight * (1.0 - ssim),
-            l1,
-            ssim,
+            loss: terms.iter().map(|&(term, weight)| weight * distance(term, losses)).sum(),
+            terms: terms.iter().map(|&(term, _)| f64::from(losses.get(term))).collect(),
             gaussians: self.model.count(),
             milliseconds,
         }
+    }
+}
+
+/// What a term adds to the loss, before its weight: SSIM is a likeness, the others are distances.
+fn distance(term: Term, losses: &StepLosses) -> f64 {
+    let value = f64::from(losses.get(term));
+    if matches!(term, Term::Ssim | Term::LowSsim) { 1.0 - value } else { value }
+}
+
+/// Says where the parts of a model see less than they are set to.
+fn say_what_parts_see(model: &ModelConfig, sizes: &[UVec2]) {
+    let shortest = sizes.iter().map(|size| size.min_element()).min().unwrap_or_default();
+    let boxes = DepthBoxes::new(UVec2::splat(shortest), model.depth_box);
+    if model.depth && boxes.side < model.depth_box {
+        let (wanted, side) = (model.depth_box, boxes.side);
+        tracing::warn!(
+            "depth boxes of {wanted} pixels exceed the views: {side} pixels in the smallest"
+        );
+    }
+    let longest = sizes.iter().map(|size| size.max_element()).max().unwrap_or_default();
+    if (model.denoiser || model.tonemapper) && model.denoiser_crop > longest {
+        let crop = model.denoiser_crop;
+        tracing::warn!("a crop of {crop} pixels exceeds every view: the networks see whole views");
     }
 }
 

@@ -45,7 +45,7 @@ fn train(config: &TrainConfig, dataset: &Dataset) -> (Vec<StepReport>, Gaussians
 }
 
 fn mean_psnr(dataset: &Dataset, gaussians: &Gaussians) -> f64 {
-    let mut player = Player::new(&gpu(), gaussians).unwrap();
+    let mut player = Player::new(&gpu(), gaussians, false, None).unwrap();
     let scored = eval::score(dataset, |view| player.render(view)).unwrap();
     let scores: Vec<Scores> = scored.iter().map(|view| view.scores).collect();
     Scores::mean(&scores).unwrap().psnr
@@ -172,7 +172,7 @@ fn a_render_shows_what_its_model_was_trained_to() {
     }
     let view = &dataset.views[0];
     let in_training = trainer.render(&view.camera).unwrap();
-    let mut player = Player::new(&gpu(), &trainer.gaussians().unwrap()).unwrap();
-    assert_eq!(in_training.data, player.render(view).unwrap().data);
+    let mut player = Player::new(&gpu(), &trainer.gaussians().unwrap(), false, None).unwrap();
+    assert_eq!(in_training.colors.data, player.render(view).unwrap().colors.data);
     assert_no_validation_messages();
 }

@@ -5,7 +5,8 @@
 
 //! Mean and sum of squared deviations of every chunk of every channel.
 //!
-//! Two passes over the chunk: deviations are taken from its own mean, so that no large squares cancel.
+//! Two passes over the chunk: deviations are taken from its own mean, so that no large squares cancel, and what they add
+//! up to corrects the rounding of that mean (Chan, Golub and LeVeque 1983).
 //! `norm_merge` merges the chunks. Reference: `src/reference/norm_statistics.rs`.
 
 layout(binding = 0) readonly  buffer Source   { float source[]; };   // (C, H, W)
@@ -16,12 +17,17 @@ void main() {
     uint end = chunk_end();
     float sum = 0.0;
     for (uint i = chunk_begin(); i < end; i += SUBGROUP_SIZE) sum += source[plane + i];
-    float mean = subgroupAdd(sum) / float(end - gl_WorkGroupID.x * CHUNK);
-    float squares = 0.0;
+    float count = float(end - gl_WorkGroupID.x * CHUNK);
+    float mean = subgroupAdd(sum) / count;
+    vec2 deviations = vec2(0.0);  // sum, sum of squares
     for (uint i = chunk_begin(); i < end; i += SUBGROUP_SIZE) {
         float deviation = source[plane + i] - mean;
-        squares += deviation * deviation;
+        deviations += deviation * vec2(1.0, deviation);
     }
-    squares = subgroupAdd(squares);
-    if (subgroupElect()) partials[CHANNEL * CHUNK_COUNT + gl_WorkGroupID.x] = vec2(mean, squares);
+    deviations = subgroupAdd(deviations);
+    float correction = deviations.x / count;
+    if (subgroupElect()) {
+        partials[CHANNEL * CHUNK_COUNT + gl_WorkGroupID.x] =
+            vec2(mean + correction, deviations.y - correction * deviations.x);
+    }
 }

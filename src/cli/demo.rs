@@ -116,8 +116,8 @@ fn train_with(curve: ToneCurve, gpu: &Gpu, dataset: &Dataset, out: &Path) -> cra
         losses.push(step.loss);
         directory.log(step)
     })?;
-    let (gaussians, seconds) = (trained.gaussians.count, trained.seconds);
-    directory.save_model(&trained.gaussians)?;
+    let (gaussians, seconds) = (trained.trainer.gaussian_count(), trained.seconds);
+    directory.save_model(&trained.trainer.gaussians()?, config.model.raw_colors)?;
     directory.save_metrics(&eval::metrics(&trained.scored, seconds, gaussians, config.steps))?;
     Ok(Run { curve, scored: trained.scored, seconds, gaussians, losses })
 }
@@ -125,7 +125,7 @@ fn train_with(curve: ToneCurve, gpu: &Gpu, dataset: &Dataset, out: &Path) -> cra
 /// What the dark photographs themselves score: the least that a model must beat.
 fn dark_scores(dataset: &Dataset) -> crate::Result<Vec<ViewScore>> {
     let nothing = || Error::input(&dataset.root, "has a test view without its dark photograph");
-    eval::score(dataset, |view| view.image.clone().ok_or_else(nothing))
+    eval::score(dataset, |view| Ok(view.image.clone().ok_or_else(nothing)?.into()))
 }
 
 fn mean(scored: &[ViewScore]) -> Option<Scores> {

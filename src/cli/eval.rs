@@ -68,18 +68,25 @@ fn trained_seconds(run: &Path) -> Option<f64> {
 }
 
 fn score_table(scored: &[ViewScore]) -> String {
-    let row = |name: &str, scores: &Scores| {
+    let row = |name: &str, scores: &Scores, r0: Option<&Scores>| {
         let Scores { psnr, psnr_channel_mean, ssim } = scores;
-        vec![
+        let mut row = vec![
             name.to_owned(),
             format!("{psnr:.2}"),
             format!("{psnr_channel_mean:.2}"),
             format!("{ssim:.4}"),
-        ]
+        ];
+        row.extend(
+            r0.into_iter().flat_map(|r0| [format!("{:.2}", r0.psnr), format!("{:.4}", r0.ssim)]),
+        );
+        row
     };
-    let all: Vec<Scores> = scored.iter().map(|view| view.scores).collect();
-    let mut rows = vec![["view", "PSNR", "channel mean", "SSIM"].map(str::to_owned).to_vec()];
-    rows.extend(scored.iter().map(|view| row(&view.name, &view.scores)));
-    rows.extend(Scores::mean(&all).map(|mean| row("mean", &mean)));
+    let (mean, mean_r0) = eval::means(scored);
+    let mut header = vec!["view", "PSNR", "channel mean", "SSIM"];
+    // Before the denoiser.
+    header.extend(mean_r0.iter().flat_map(|_| ["PSNR of R_0", "SSIM of R_0"]));
+    let mut rows = vec![header.into_iter().map(str::to_owned).collect()];
+    rows.extend(scored.iter().map(|view| row(&view.name, &view.scores, view.r0.as_ref())));
+    rows.extend(mean.map(|mean| row("mean", &mean, mean_r0.as_ref())));
     table::aligned(&rows)
 }

@@ -24,7 +24,8 @@ impl FinishedRun {
     /// The folder holds no finished run, its dataset is gone, or there is no such device.
     pub(super) fn open(run: &Path, device: Option<&DeviceChoice>) -> Result<Self> {
         let config = export::load_config(run)?;
-        let gaussians = export::load_model(run)?;
+        let raw_colors = config.model.raw_colors;
+        let gaussians = export::load_model(run, raw_colors)?;
         if !config.dataset.is_dir() {
             let problem = format!(
                 "names the dataset {}, which is not there; correct `dataset` in this file",
@@ -37,7 +38,12 @@ impl FinishedRun {
         Ok(Self {
             dataset: Dataset::load(&config.dataset, &config.load_options())?,
             gaussian_count: gaussians.count,
-            player: Player::new(&gpu, &gaussians)?,
+            player: Player::new(
+                &gpu,
+                &gaussians,
+                raw_colors,
+                export::load_networks(&gpu, run, &config.model)?,
+            )?,
             config,
         })
     }

@@ -8,7 +8,9 @@ use super::finished_run::FinishedRun;
 use super::{ImageFormat, progress_bar};
 use crate::Error;
 use crate::dataset::{Dataset, Split, View};
+use crate::eval::Layer;
 use crate::gpu::DeviceChoice;
+use crate::image::Image;
 
 /// Render a finished run from the cameras of its dataset, whether they took an image or not.
 #[derive(Clone, Debug, clap::Args)]
@@ -21,6 +23,10 @@ pub struct RenderArgs {
     /// The folder to write to, one picture per view; pictures of the same names are replaced
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
+    /// What to show: rgb, denoised, depth, structure, illumination or noise [default: denoised where the model has a
+    /// denoiser, else rgb]. A PNG of depth stretches from the least to the largest value of the view
+    #[arg(long)]
+    pub layer: Option<Layer>,
     /// The files to write
     #[arg(long, value_enum, default_value_t)]
     pub format: ImageFormat,
@@ -55,7 +61,7 @@ impl SplitChoice {
 /// # Errors
 /// The folder holds no finished run, its dataset is gone or has no such view, or a file cannot be written.
 pub fn run(args: &RenderArgs) -> Result<()> {
-    let RenderArgs { run, split, out, format, device } = args;
+    let RenderArgs { run, split, out, layer, format, device } = args;
     let FinishedRun { dataset, mut player, .. } = FinishedRun::open(run, device.as_ref())?;
     let views: Vec<&View> = dataset.views.iter().filter(|view| split.includes(view)).collect();
     if views.is_empty() {
@@ -67,12 +73,35 @@ pub fn run(args: &RenderArgs) -> Result<()> {
     for view in &views {
         bar.set_message(view.name.clone());
         let path = out.join(format!("{}.{}", view.name, format.extension()));
-        format.save(&player.render(view)?, &path)?;
+        match layer {
+            None => format.save(player.render(view)?.output(), &path)?,
+            Some(layer) if layer.is_color() => format.save(&player.layer(view, *layer)?, &path)?,
+            Some(layer) => save_numbers(player.layer(view, *layer)?, *layer, *format, &path)?,
+        }
         bar.inc(1);
     }
     bar.finish_and_clear();
     tracing::info!("{} pictures are in {}", views.len(), out.display());
     Ok(())
+}
+
+/// Numbers that are no colour: an EXR file holds them as they are.
+fn save_numbers(
+    mut image: Image,
+    layer: Layer,
+    format: ImageFormat,
+    path: &Path,
+) -> crate::Result<()> {
+    if format == ImageFormat::Exr {
+        return image.save_exr_as_stored(path);
+    }
+    if layer == Layer::Depth {
+        let least = image.data.iter().copied().fold(f32::INFINITY, f32::min);
+        let largest = image.data.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+        let scale = 1.0 / (largest - least).max(f32::MIN_POSITIVE);
+        image.data.iter_mut().for_each(|value| *value = (*value - least) * scale);
+    }
+    image.save_png8(path)
 }
 
 /// Makes the folder, unless it is one of the dataset's, where the photographs have the names of the renders. The run

@@ -11,7 +11,6 @@ use crate::dataset::Dataset;
 use crate::eval::{self, ViewScore};
 use crate::export::RunDirectory;
 use crate::gpu::{DeviceChoice, Gpu};
-use crate::metrics::Scores;
 use crate::tone::{ToneCurve, ToneSettings};
 use crate::train::{Background, ModelName, Part, Preset, TrainConfig, Trainer};
 
@@ -190,15 +189,18 @@ impl TrainOptions {
 /// # Errors
 /// Whatever keeps the run from its end, in one line.
 pub fn run(args: &TrainArgs) -> Result<()> {
-    let config = args.options.config(args.dataset.clone())?;
+    let mut config = args.options.config(args.dataset.clone())?;
     let gpu = Gpu::new(&config.device.parse::<DeviceChoice>()?)?;
     let dataset = Dataset::load(&config.dataset, &config.load_options())?;
+    config.leave_out_what_is_missing(&dataset);
     let mut directory = RunDirectory::create(&args.out, &config, args.overwrite)?;
-    let (scored, seconds, gaussians) =
-        train(&gpu, &config, &dataset, |report| directory.log(report)).and_then(|trained| {
-            directory.save_model(&trained.gaussians)?;
-            Ok((trained.scored, trained.seconds, trained.gaussians.count))
-        })?;
+    let Trained { mut trainer, scored, seconds } =
+        train(&gpu, &config, &dataset, |report| directory.log(report))?;
+    let gaussians = trainer.gaussian_count();
+    directory.save_model(&trainer.gaussians()?, config.model.raw_colors)?;
+    if let Some(networks) = trainer.networks() {
+        directory.save_networks(networks)?;
+    }
     directory.save_metrics(&eval::metrics(&scored, seconds, gaussians, config.steps))?;
     let mut out = std::io::stdout().lock();
     if let Some(line) = summary(&scored) {
@@ -215,7 +217,7 @@ pub fn run(args: &TrainArgs) -> Result<()> {
 
 /// What a training run made.
 pub(crate) struct Trained {
-    pub(crate) gaussians: crate::scene::Gaussians,
+    pub(crate) trainer: Trainer,
     pub(crate) scored: Vec<ViewScore>,
     /// Of the steps alone, without loading and scoring.
     pub(crate) seconds: f64,
@@ -254,19 +256,21 @@ pub(crate) fn train(
     }
     bar.finish_and_clear();
     let scored = eval::score(dataset, |view| trainer.render(&view.camera))?;
-    Ok(Trained { gaussians: trainer.gaussians()?, scored, seconds: seconds.as_secs_f64() })
+    Ok(Trained { trainer, scored, seconds: seconds.as_secs_f64() })
 }
 
 /// The mean scores in a line; none where nothing was scored.
 pub(crate) fn summary(scored: &[ViewScore]) -> Option<String> {
-    let all: Vec<Scores> = scored.iter().map(|view| view.scores).collect();
-    let mean = Scores::mean(&all)?;
+    let (mean, r0) = eval::means(scored);
+    let mean = mean?;
+    let before = r0.map(|r0| format!("; before the denoiser {:.2} dB, {:.3}", r0.psnr, r0.ssim));
     Some(format!(
-        "{} test views: PSNR {:.2} dB (channel mean {:.2}), SSIM {:.3}",
-        all.len(),
+        "{} test views: PSNR {:.2} dB (channel mean {:.2}), SSIM {:.3}{}",
+        scored.len(),
         mean.psnr,
         mean.psnr_channel_mean,
-        mean.ssim
+        mean.ssim,
+        before.unwrap_or_default()
     ))
 }
 

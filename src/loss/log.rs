@@ -41,6 +41,21 @@ impl Term {
         Self::TotalVariation,
     ];
 
+    /// The term's column in train.csv.
+    pub const fn column(self) -> &'static str {
+        match self {
+            Self::L1 => "l1",
+            Self::Ssim => "ssim",
+            Self::LowL1 => "low_l1",
+            Self::LowSsim => "low_ssim",
+            Self::Structure => "structure",
+            Self::Depth => "depth",
+            Self::DepthLocal => "depth_local",
+            Self::Denoising => "denoising",
+            Self::TotalVariation => "total_variation",
+        }
+    }
+
     /// What the term is called in messages and tables.
     pub const fn name(self) -> &'static str {
         match self {
@@ -77,7 +92,7 @@ impl StepLosses {
     }
 }
 
-/// The terms of as many steps as it has slots, on the device. A term that no step records stays 0.
+/// The terms of as many steps as it has slots, on the device.
 #[derive(Debug)]
 pub struct LossLog {
     pipeline: Pipeline<loss_log::Kernel>,
@@ -126,6 +141,11 @@ impl LossLog {
             values: gpu.zeros("loss_log", slots * Term::ALL.len())?,
             statuses: gpu.zeros("step_statuses", slots)?,
         })
+    }
+
+    /// Records zeros: a term that a step leaves out is 0.
+    pub fn clear(&mut self, pass: &mut Recorder<'_>) {
+        pass.fill(&mut self.values, 0);
     }
 
     /// Copies the log as it is at this point of the recording to the host.

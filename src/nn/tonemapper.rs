@@ -56,9 +56,9 @@ impl Tonemapper {
     pub fn new(gpu: &Gpu, seed: u64) -> Result<Self> {
         let mut layout = Layout::new(Stream::new(seed, STREAM));
         let offsets = [
-            layout.conv("conv_in", RGB, CHANNELS),
-            layout.conv("conv", CHANNELS, CHANNELS),
-            layout.conv("conv_out", CHANNELS, RGB),
+            layout.conv("conv1", RGB, CHANNELS),
+            layout.conv("conv2", CHANNELS, CHANNELS),
+            layout.conv("conv3", CHANNELS, RGB),
         ];
         Ok(Self {
             gpu: gpu.clone(),

@@ -5,7 +5,8 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::parts::ModelConfig;
-use crate::dataset::{DepthOptions, LoadOptions};
+use crate::dataset::{Dataset, DepthOptions, LoadOptions};
+use crate::loss::Term;
 use crate::optimizer::Schedule;
 use crate::scene::MAX_SH_DEGREE;
 use crate::tone::ToneSettings;
@@ -149,6 +150,44 @@ impl TrainConfig {
             },
             ..LoadOptions::default()
         }
+    }
+
+    /// Switches off the depth part where no training view has a depth map, and says so.
+    pub fn leave_out_what_is_missing(&mut self, dataset: &Dataset) {
+        if !self.model.depth {
+            return;
+        }
+        let count = dataset.train_views().filter(|view| view.depth.is_some()).count();
+        if count == 0 {
+            tracing::warn!("no view has a depth map (depth/NAME.png or --depth): no depth term");
+            self.model.depth = false;
+        } else {
+            tracing::info!(
+                "{count} of {} training views have a depth map",
+                dataset.train_views().count()
+            );
+        }
+    }
+
+    /// The loss terms of the model with their weights; SSIM terms enter the loss as 1 - SSIM.
+    pub fn terms(&self) -> Vec<(Term, f64)> {
+        let (model, weights) = (&self.model, &self.model.weights);
+        let mut terms = vec![(Term::L1, 1.0 - self.ssim_weight), (Term::Ssim, self.ssim_weight)];
+        if model.tonemapper {
+            terms.push((Term::LowL1, 1.0 - weights.low_ssim));
+            terms.push((Term::LowSsim, weights.low_ssim));
+        }
+        if model.structure {
+            terms.push((Term::Structure, weights.structure));
+        }
+        if model.depth {
+            terms.extend([Term::Depth, Term::DepthLocal].map(|term| (term, weights.depth)));
+        }
+        if model.denoiser {
+            terms.push((Term::Denoising, weights.denoising));
+            terms.push((Term::TotalVariation, weights.total_variation));
+        }
+        terms
     }
 
     /// Refuses values that make no sense, naming the option.

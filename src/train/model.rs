@@ -43,6 +43,10 @@ impl Model {
         })
     }
 
+    pub(super) fn shape(&self) -> Shape {
+        self.shape
+    }
+
     pub(super) fn count(&self) -> usize {
         self.gaussians.count as usize
     }

@@ -100,7 +100,7 @@ pub struct ModelConfig {
     pub rates: NetworkRates,
 }
 
-/// The weights of the terms of LITA-GS; 0 leaves a term out.
+/// The weights of the terms of LITA-GS.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Weights {
@@ -108,9 +108,7 @@ pub struct Weights {
     pub denoising: f64,
     /// Of the total variation of R_K.
     pub total_variation: f64,
-    /// Of the reconstruction of the dark photograph, (1 - w) L1 + w (1 - SSIM).
-    pub low: f64,
-    /// That w.
+    /// The reconstruction of the dark photograph weighs 1: (1 - w) L1 + w (1 - SSIM); this is its w.
     pub low_ssim: f64,
     /// Of mean |structure - edges of the target|.
     pub structure: f64,
@@ -150,14 +148,7 @@ impl Default for ModelConfig {
 /// Those of the paper's code.
 impl Default for Weights {
     fn default() -> Self {
-        Self {
-            denoising: 1.0,
-            total_variation: 1.0,
-            low: 1.0,
-            low_ssim: 0.2,
-            structure: 0.01,
-            depth: 0.1,
-        }
+        Self { denoising: 1.0, total_variation: 1.0, low_ssim: 0.2, structure: 0.01, depth: 0.1 }
     }
 }
 
@@ -201,11 +192,10 @@ impl ModelConfig {
     /// [`Error::Usage`] names a value that makes no sense.
     pub(super) fn check(&self) -> Result<()> {
         self.network.check()?;
-        let Weights { denoising, total_variation, low, low_ssim, structure, depth } = self.weights;
+        let Weights { denoising, total_variation, low_ssim, structure, depth } = self.weights;
         let rules = [
             ("model.weights.denoising", denoising, f64::MAX),
             ("model.weights.total_variation", total_variation, f64::MAX),
-            ("model.weights.low", low, f64::MAX),
             ("model.weights.low_ssim", low_ssim, 1.0),
             ("model.weights.structure", structure, f64::MAX),
             ("model.weights.depth", depth, f64::MAX),

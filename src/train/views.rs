@@ -11,7 +11,8 @@ use crate::image::Image;
 use crate::kernels::ToneParameters;
 use crate::pseudo_gt::PseudoGt;
 use crate::random::Stream;
-use crate::scene::{Gaussians, init};
+use crate::scene::{Features, Gaussians, Shape, init};
+use crate::structure::StructureTarget;
 
 /// One training view.
 #[derive(Debug)]
@@ -24,6 +25,10 @@ pub(super) struct TrainView {
     pub(super) image: Buffer<f32>,
     /// The curve that its statistics give; one element.
     pub(super) tone: Buffer<ToneParameters>,
+    /// The edges of the pseudo-GT, (H, W), where the model has structure.
+    pub(super) structure: Option<Buffer<f32>>,
+    /// Depth from elsewhere, (H, W), larger is farther, where the view has any.
+    pub(super) depth: Option<Buffer<f32>>,
 }
 
 /// All training views, in the dataset's order.
@@ -31,8 +36,14 @@ pub(super) struct TrainView {
 pub(super) struct Views(Vec<TrainView>);
 
 impl Views {
-    /// Uploads every training photograph and takes its statistics once.
-    pub(super) fn upload(gpu: &Gpu, pseudo_gt: &mut PseudoGt, dataset: &Dataset) -> Result<Self> {
+    /// Uploads every training photograph and takes its statistics once, with what the features are held to.
+    pub(super) fn upload(
+        gpu: &Gpu,
+        pseudo_gt: &mut PseudoGt,
+        dataset: &Dataset,
+        features: Features,
+    ) -> Result<Self> {
+        let mut structures = features.structure.then(|| StructureTarget::new(gpu)).transpose()?;
         let mut views = vec![];
         for (index, view) in dataset.views.iter().enumerate() {
             let Some(image) = view.image.as_ref().filter(|_| view.is_train()) else { continue };
@@ -41,8 +52,20 @@ impl Views {
             gpu.run("statistics", |pass| {
                 pseudo_gt.statistics(pass, &pixels, [image.width, image.height], &mut tone, 0)
             })?;
-            let (name, camera) = (view.name.clone(), view.camera);
-            views.push(TrainView { name, index, camera, image: pixels, tone });
+            let depth = view.depth.as_ref().filter(|_| features.depth);
+            let mut view = TrainView {
+                name: view.name.clone(),
+                index,
+                camera: view.camera,
+                image: pixels,
+                tone,
+                structure: None,
+                depth: depth.map(|depth| gpu.buffer("depth", depth)).transpose()?,
+            };
+            if let Some(structures) = &mut structures {
+                view.structure = Some(view.edges(gpu, pseudo_gt, structures)?);
+            }
+            views.push(view);
         }
         Ok(Self(views))
     }
@@ -67,7 +90,7 @@ impl Views {
 
     /// Width and height of every view.
     pub(super) fn sizes(&self) -> Vec<UVec2> {
-        self.cameras().map(|camera| UVec2::new(camera.width, camera.height)).collect()
+        self.0.iter().map(TrainView::size).collect()
     }
 
     /// One Gaussian per point of the dataset, or per random point where there is none, coloured as the targets of the
@@ -98,11 +121,33 @@ impl Views {
         })?;
         let positions: Vec<DVec3> = kept.iter().map(|point| point.position).collect();
         let seed = Stream::new(config.seed, streams::FEATURES).bits(0);
-        init::from_points(&positions, &colors, config.sh_degree, seed)
+        let shape = Shape { sh_degree: config.sh_degree, features: config.model.features() };
+        init::from_points(&positions, &colors, shape, seed)
     }
 }
 
 impl TrainView {
+    /// Width and height in pixels.
+    pub(super) fn size(&self) -> UVec2 {
+        UVec2::new(self.camera.width, self.camera.height)
+    }
+
+    /// The structure of the pseudo-GT.
+    fn edges(
+        &self,
+        gpu: &Gpu,
+        pseudo_gt: &PseudoGt,
+        structures: &mut StructureTarget,
+    ) -> Result<Buffer<f32>> {
+        let mut target = gpu.uninit("target", self.image.len())?;
+        let mut structure = gpu.uninit("structure", self.image.len() / 3)?;
+        gpu.run("structure", |pass| {
+            pseudo_gt.map(pass, &self.image, &self.tone, 0, &mut target)?;
+            structures.record(pass, &target, self.size(), &mut structure)
+        })?;
+        Ok(structure)
+    }
+
     /// The pseudo-GT of the view.
     fn target(&self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<Image> {
         let mut target = gpu.uninit("target", self.image.len())?;

@@ -5,7 +5,8 @@ use glam::{UVec2, Vec2, Vec3};
 
 use super::Timing;
 use crate::kernels::{
-    DepthGradient, DepthMoments, ProjectedSplat, RankSearch, ToneParameters, ToneStatistics,
+    ChannelStatistics, DepthGradient, DepthMoments, ProjectedSplat, RankSearch, ToneParameters,
+    ToneStatistics,
 };
 
 /// How an output must agree with the reference's.
@@ -37,7 +38,7 @@ macro_rules! elements {
 }
 elements!(u32: u32, UVec2, [u32; 3], [u32; 4], RankSearch);
 elements!(f32: f32, Vec2, Vec3, ProjectedSplat, ToneStatistics, ToneParameters);
-elements!(f32: DepthGradient, DepthMoments);
+elements!(f32: ChannelStatistics, DepthGradient, DepthMoments);
 
 /// Runs a kernel and its reference on copies of the same host data, compares the outputs, times the kernel, and
 /// gives the device's outputs as a tuple. Inputs and outputs are variables named as the kernel's buffers.

@@ -6,6 +6,7 @@
 mod bin;
 mod learn;
 mod losses;
+mod nn;
 mod window;
 
 use glam::Vec2;
@@ -39,6 +40,7 @@ pub(super) fn check_and_time(bench: &Bench, scene: &Scene) -> anyhow::Result<Vec
     let frame = bin::project_and_bin(bench, &mut timings, scene)?;
     learn::blend_and_back(bench, &mut timings, scene, &frame, tone)?;
     window::copy(bench, &mut timings)?;
+    nn::repeat_and_ends(bench, &mut timings)?;
     Ok(timings)
 }
 

@@ -1,0 +1,137 @@
+//! The networks of a model: what they make of a render.
+
+use std::path::Path;
+
+use glam::UVec2;
+
+use super::ModelConfig;
+use crate::Result;
+use crate::gpu::{Buffer, Gpu, Recorder};
+use crate::image::Image;
+use crate::nn::{self, Denoiser, Parameters, Tonemapper};
+use crate::scene::{COLOR_CHANNELS, Feature, Features};
+use crate::window::{Window, Windows};
+
+/// The networks that a model has, with the windows of the render that they take.
+#[derive(Debug)]
+pub struct Networks {
+    gpu: Gpu,
+    features: Features,
+    pub(super) denoiser: Option<Denoiser>,
+    pub(super) tonemapper: Option<Tonemapper>,
+    pub(super) windows: Windows,
+    /// R_0 of the window, (3, h, w).
+    pub(super) colors: Buffer<f32>,
+    /// The noise map of the window, (3, h, w).
+    pub(super) noise: Buffer<f32>,
+}
+
+impl Networks {
+    /// The networks of the parts that are on, with fresh weights.
+    ///
+    /// # Errors
+    /// The device is out of memory.
+    pub fn new(gpu: &Gpu, model: &ModelConfig, seed: u64) -> Result<Self> {
+        let denoiser = model.denoiser.then(|| Denoiser::new(gpu, model.network, seed));
+        let tonemapper = model.tonemapper.then(|| Tonemapper::new(gpu, seed));
+        Ok(Self {
+            gpu: gpu.clone(),
+            features: model.features(),
+            denoiser: denoiser.transpose()?,
+            tonemapper: tonemapper.transpose()?,
+            windows: Windows::new(gpu)?,
+            colors: gpu.uninit("window_colors", 0)?,
+            noise: gpu.uninit("window_noise", 0)?,
+        })
+    }
+
+    /// Whether there is a denoiser.
+    pub fn has_denoiser(&self) -> bool {
+        self.denoiser.is_some()
+    }
+
+    /// Takes memory for windows up to `size`.
+    ///
+    /// # Errors
+    /// The device is out of memory, or a map exceeds what it binds.
+    pub(super) fn reserve(&mut self, size: UVec2) -> Result<()> {
+        let values = COLOR_CHANNELS * size.x as usize * size.y as usize;
+        if self.colors.len() < values {
+            self.colors = self.gpu.uninit("window_colors", values)?;
+        }
+        if let Some(denoiser) = &mut self.denoiser {
+            denoiser.reserve(size)?;
+            if self.noise.len() < values {
+                self.noise = self.gpu.uninit("window_noise", values)?;
+            }
+        }
+        match &mut self.tonemapper {
+            Some(tonemapper) => tonemapper.reserve(size),
+            None => Ok(()),
+        }
+    }
+
+    /// Records R_0 to R_K of a window of `render`, (channels, H, W) of a view of `size`.
+    pub(super) fn denoise(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        render: &Buffer<f32>,
+        size: UVec2,
+        window: &Window,
+    ) -> Result<()> {
+        let planes = 0..COLOR_CHANNELS;
+        self.windows.gather(pass, render, size, planes, window, &mut self.colors)?;
+        let Some((denoiser, planes)) =
+            self.denoiser.as_mut().zip(self.features.channels_of(Feature::Noise))
+        else {
+            return Ok(());
+        };
+        self.windows.gather(pass, render, size, planes, window, &mut self.noise)?;
+        denoiser.forward(pass, window.size, &self.noise, &self.colors)
+    }
+
+    /// R_K of the window denoised last; R_0 without a denoiser.
+    pub(super) fn denoised(&self) -> &Buffer<f32> {
+        self.denoiser.as_ref().map_or(&self.colors, Denoiser::denoised)
+    }
+
+    /// R_K of a whole render, (channels, H, W); none without a denoiser.
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub fn denoised_image(&mut self, render: &Buffer<f32>, size: UVec2) -> Result<Option<Image>> {
+        if self.denoiser.is_none() {
+            return Ok(None);
+        }
+        self.reserve(size)?;
+        let gpu = self.gpu.clone();
+        gpu.run("denoise", |pass| self.denoise(pass, render, size, &Window::whole(size)))?;
+        let mut data = gpu.read(self.denoised())?;
+        data.truncate(COLOR_CHANNELS * size.x as usize * size.y as usize);
+        Ok(Some(Image { width: size.x, height: size.y, data }))
+    }
+
+    /// Writes the weights of every network.
+    ///
+    /// # Errors
+    /// The file cannot be written, or the device was lost.
+    pub fn save(&self, path: &Path) -> Result<()> {
+        let denoiser = self.denoiser.as_ref().map(|n| ("denoiser", n.parameters()));
+        let tonemapper = self.tonemapper.as_ref().map(|n| ("tonemapper", n.parameters()));
+        let networks: Vec<(&str, &Parameters)> = denoiser.into_iter().chain(tonemapper).collect();
+        nn::save(path, &networks, &self.gpu)
+    }
+
+    /// Reads the weights of every network.
+    ///
+    /// # Errors
+    /// The file is missing or damaged, or holds networks of another configuration.
+    pub fn load(&mut self, path: &Path) -> Result<()> {
+        let gpu = self.gpu.clone();
+        let denoiser = self.denoiser.as_mut().map(|n| ("denoiser", n.parameters_mut()));
+        let tonemapper = self.tonemapper.as_mut().map(|n| ("tonemapper", n.parameters_mut()));
+        let mut networks: Vec<(&str, &mut Parameters)> =
+            denoiser.into_iter().chain(tonemapper).collect();
+        nn::load(path, &mut networks, &gpu)
+    }
+}
