@@ -8,7 +8,9 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::image::Image;
 
+pub mod ablate;
 pub mod bench;
+mod comparison;
 pub mod demo;
 pub mod doctor;
 pub mod eval;
@@ -44,6 +46,7 @@ enum Command {
     Render(render::RenderArgs),
     Tone(tone::ToneArgs),
     Synth(synth::SynthArgs),
+    Ablate(Box<ablate::AblateArgs>),
     Demo(demo::DemoArgs),
     Doctor(doctor::DoctorArgs),
     Bench(bench::BenchArgs),
@@ -66,6 +69,7 @@ impl Cli {
             Command::Render(args) => render::run(&args),
             Command::Tone(args) => Ok(tone::run(args)?),
             Command::Synth(args) => Ok(synth::run(args)?),
+            Command::Ablate(args) => ablate::run(&args),
             Command::Demo(args) => demo::run(&args),
             Command::Doctor(args) => doctor::run(&args),
             Command::Bench(args) => bench::run(&args),

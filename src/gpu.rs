@@ -72,6 +72,7 @@ struct Shared {
     timeline: vk::Semaphore,
     /// The timeline value after which a resource that is dropped now is unused.
     last_use: AtomicU64,
+    usage: buffer::MemoryUsage,
     retired: Mutex<Vec<(u64, Retired)>>,
     pipeline_cache: vk::PipelineCache,
     /// What we created around the device and destroy with it; nothing for a borrowed device.

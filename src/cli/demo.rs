@@ -5,17 +5,16 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Result;
 
-use super::{table, train};
+use super::comparison::{self, Run};
+use super::train;
 use crate::Error;
+use crate::dataset::Dataset;
 use crate::dataset::synthetic::{self, SyntheticOptions};
-use crate::dataset::{Dataset, View};
 use crate::eval::{self, ViewScore};
-use crate::export::{self, RunDirectory};
+use crate::export;
 use crate::gpu::{DeviceChoice, Gpu};
-use crate::image::Image;
-use crate::metrics::Scores;
 use crate::optimizer::Schedule;
-use crate::report::{Best, Column, Comparison, Picture, Report, Series, Table, plot};
+use crate::report::{Report, plot};
 use crate::tone::{ToneCurve, ToneSettings};
 use crate::train::TrainConfig;
 
@@ -42,16 +41,6 @@ const STEPS: u64 = 400;
 /// Marks a folder as ours to overwrite.
 const MARK: &str = ".nightsplat-demo";
 
-/// One curve's run and what it made of the test views.
-struct Run {
-    curve: ToneCurve,
-    scored: Vec<ViewScore>,
-    seconds: f64,
-    gaussians: usize,
-    /// Of every step.
-    losses: Vec<f64>,
-}
-
 /// Runs the demo.
 ///
 /// # Errors
@@ -71,7 +60,7 @@ pub fn run(args: &DemoArgs) -> Result<()> {
     let page = args.out.join("index.html");
     export::write_whole(&page, report(&gpu, &dataset, &dark, &runs).html().as_bytes())?;
     let mut out = std::io::stdout().lock();
-    write!(out, "{}\n{}\n", terminal_table(&dark, &runs), page.display())?;
+    write!(out, "{}\n{}\n", comparison::terminal_table("target", &dark, &runs), page.display())?;
     Ok(())
 }
 
@@ -110,26 +99,15 @@ fn config(curve: ToneCurve, dataset: &Dataset, gpu: &Gpu) -> TrainConfig {
 
 fn train_with(curve: ToneCurve, gpu: &Gpu, dataset: &Dataset, out: &Path) -> crate::Result<Run> {
     let config = config(curve, dataset, gpu);
-    let mut directory = RunDirectory::create(&out.join(curve.name()), &config, true)?;
-    let mut losses = vec![];
-    let trained = train::train(gpu, &config, dataset, |step| {
-        losses.push(step.loss);
-        directory.log(step)
-    })?;
-    let (gaussians, seconds) = (trained.trainer.gaussian_count(), trained.seconds);
-    directory.save_model(&trained.trainer.gaussians()?, config.model.raw_colors)?;
-    directory.save_metrics(&eval::metrics(&trained.scored, seconds, gaussians, config.steps))?;
-    Ok(Run { curve, scored: trained.scored, seconds, gaussians, losses })
+    let (trained, losses) =
+        train::train_into(&out.join(curve.name()), gpu, &config, dataset, true)?;
+    Ok(Run::new(title(curve), trained, losses))
 }
 
 /// What the dark photographs themselves score: the least that a model must beat.
 fn dark_scores(dataset: &Dataset) -> crate::Result<Vec<ViewScore>> {
     let nothing = || Error::input(&dataset.root, "has a test view without its dark photograph");
     eval::score(dataset, |view| Ok(view.image.clone().ok_or_else(nothing)?.into()))
-}
-
-fn mean(scored: &[ViewScore]) -> Option<Scores> {
-    Scores::mean(&scored.iter().map(|view| view.scores).collect::<Vec<_>>())
 }
 
 /// The name of a run on the page.
@@ -163,85 +141,8 @@ fn report(gpu: &Gpu, dataset: &Dataset, dark: &[ViewScore], runs: &[Run]) -> Rep
             ),
             format!("{STEPS} steps each, on {}.", gpu.properties().name),
         ],
-        tables: vec![score_table(dark, runs)],
-        plots: vec![plot("step", "loss", &loss_series(runs, train_views))],
-        comparisons: test_views.map(|view| comparison(view, dark, runs)).collect(),
+        tables: vec![comparison::score_table("target", dark, runs)],
+        plots: vec![plot("step", "loss", &comparison::loss_series(runs, train_views))],
+        comparisons: test_views.map(|view| comparison::of_view(view, dark, runs)).collect(),
     }
-}
-
-fn score_table(dark: &[ViewScore], runs: &[Run]) -> Table {
-    let column = |name: &str, digits, best| Column { name: name.to_owned(), digits, best };
-    let scores = |scored: &[ViewScore]| {
-        let mean = mean(scored);
-        vec![
-            mean.map(|mean| mean.psnr),
-            mean.map(|mean| mean.psnr_channel_mean),
-            mean.map(|mean| mean.ssim),
-        ]
-    };
-    let mut rows = vec![("dark photograph".to_owned(), scores(dark))];
-    rows.extend(runs.iter().map(|run| {
-        let mut values = scores(&run.scored);
-        values.extend([Some(run.seconds), Some(run.gaussians as f64)]);
-        (title(run.curve), values)
-    }));
-    Table {
-        title: "Means over the test views".to_owned(),
-        label: "target".to_owned(),
-        columns: vec![
-            column("PSNR, dB", 2, Best::Greatest),
-            column("channel-mean PSNR, dB", 2, Best::Greatest),
-            column("SSIM", 3, Best::Greatest),
-            column("training, s", 0, Best::Unmarked),
-            column("Gaussians", 0, Best::Unmarked),
-        ],
-        rows,
-    }
-}
-
-/// The mean loss of every epoch: single views differ too much for a line.
-fn loss_series(runs: &[Run], epoch: usize) -> Vec<Series> {
-    let of_run = |run: &Run| {
-        let epochs = run.losses.chunks_exact(epoch.max(1)).enumerate();
-        let point = |(index, losses): (usize, &[f64])| {
-            let mean = losses.iter().sum::<f64>() / losses.len() as f64;
-            (((index + 1) * epoch) as f64, mean)
-        };
-        Series { name: title(run.curve), points: epochs.map(point).collect() }
-    };
-    runs.iter().map(of_run).collect()
-}
-
-/// One test view: what came in, what each curve made of it, and what it should be.
-fn comparison(view: &View, dark: &[ViewScore], runs: &[Run]) -> Comparison {
-    let picture = |caption: String, scored: &[ViewScore]| {
-        let scored = scored.iter().find(|scored| scored.name == view.name)?;
-        let Scores { psnr, ssim, .. } = scored.scores;
-        let scores = format!("{psnr:.2} dB, SSIM {ssim:.3}");
-        Some(Picture { caption, scores, image: scored.render.clone() })
-    };
-    let reference = |image: &Image| Picture {
-        caption: "normal-light reference".to_owned(),
-        scores: String::new(),
-        image: image.clone(),
-    };
-    let mut pictures: Vec<Picture> =
-        picture("dark photograph".to_owned(), dark).into_iter().collect();
-    pictures.extend(runs.iter().filter_map(|run| picture(title(run.curve), &run.scored)));
-    pictures.extend(view.reference.as_ref().map(reference));
-    Comparison { title: format!("Test view {}", view.name), pictures }
-}
-
-fn terminal_table(dark: &[ViewScore], runs: &[Run]) -> String {
-    let Table { label, columns, rows, .. } = score_table(dark, runs);
-    let mut lines = vec![vec![label]];
-    lines[0].extend(columns.iter().map(|column| column.name.clone()));
-    for (name, values) in rows {
-        let cells = columns.iter().zip(values);
-        let cell = |(column, value): (&Column, Option<f64>)| {
-            value.map_or_else(|| "-".to_owned(), |value| format!("{value:.*}", column.digits))
-        };
-        lines.push(std::iter::once(name).chain(cells.map(cell)).collect());
-    }
-    table::aligned(&lines)
 }

@@ -1,7 +1,7 @@
 //! `nightsplat train`: dark photographs in, a run directory out.
 
 use std::io::{IsTerminal, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
@@ -193,15 +193,9 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     let gpu = Gpu::new(&config.device.parse::<DeviceChoice>()?)?;
     let dataset = Dataset::load(&config.dataset, &config.load_options())?;
     config.leave_out_what_is_missing(&dataset);
-    let mut directory = RunDirectory::create(&args.out, &config, args.overwrite)?;
-    let Trained { mut trainer, scored, seconds } =
-        train(&gpu, &config, &dataset, |report| directory.log(report))?;
+    let (trained, _) = train_into(&args.out, &gpu, &config, &dataset, args.overwrite)?;
+    let Trained { trainer, scored, seconds, .. } = trained;
     let gaussians = trainer.gaussian_count();
-    directory.save_model(&trainer.gaussians()?, config.model.raw_colors)?;
-    if let Some(networks) = trainer.networks() {
-        directory.save_networks(networks)?;
-    }
-    directory.save_metrics(&eval::metrics(&scored, seconds, gaussians, config.steps))?;
     let mut out = std::io::stdout().lock();
     if let Some(line) = summary(&scored) {
         writeln!(out, "{line}")?;
@@ -221,15 +215,43 @@ pub(crate) struct Trained {
     pub(crate) scored: Vec<ViewScore>,
     /// Of the steps alone, without loading and scoring.
     pub(crate) seconds: f64,
+    /// The most that buffers took on the device.
+    pub(crate) peak_bytes: u64,
+}
+
+/// Trains into a run directory; gives the loss of every step as well.
+pub(crate) fn train_into(
+    out: &Path,
+    gpu: &Gpu,
+    config: &TrainConfig,
+    dataset: &Dataset,
+    overwrite: bool,
+) -> crate::Result<(Trained, Vec<f64>)> {
+    let mut directory = RunDirectory::create(out, config, overwrite)?;
+    let mut losses = vec![];
+    let mut trained = train(gpu, config, dataset, |step| {
+        losses.push(step.loss);
+        directory.log(step)
+    })?;
+    let trainer = &mut trained.trainer;
+    directory.save_model(&trainer.gaussians()?, config.model.raw_colors)?;
+    if let Some(networks) = trainer.networks() {
+        directory.save_networks(networks)?;
+    }
+    let gaussians = trainer.gaussian_count();
+    let metrics = eval::metrics(&trained.scored, trained.seconds, gaussians, config.steps);
+    directory.save_metrics(&metrics)?;
+    Ok((trained, losses))
 }
 
 /// Trains to the end, with a progress bar; `log` sees every step.
-pub(crate) fn train(
+fn train(
     gpu: &Gpu,
     config: &TrainConfig,
     dataset: &Dataset,
     mut log: impl FnMut(&crate::train::StepReport) -> crate::Result<()>,
 ) -> crate::Result<Trained> {
+    gpu.reset_peak_memory();
     let mut trainer = Trainer::new(gpu, config.clone(), dataset)?;
     let bar = progress_bar(config.steps);
     let mut seconds = Duration::ZERO;
@@ -255,8 +277,9 @@ pub(crate) fn train(
         }
     }
     bar.finish_and_clear();
+    let peak_bytes = gpu.peak_memory();
     let scored = eval::score(dataset, |view| trainer.render(&view.camera))?;
-    Ok(Trained { trainer, scored, seconds: seconds.as_secs_f64() })
+    Ok(Trained { trainer, scored, seconds: seconds.as_secs_f64(), peak_bytes })
 }
 
 /// The mean scores in a line; none where nothing was scored.

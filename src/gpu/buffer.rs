@@ -2,7 +2,7 @@
 
 use std::marker::PhantomData;
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use ash::vk;
 use gpu_allocator::MemoryLocation;
@@ -66,6 +66,16 @@ impl<T: bytemuck::Pod> Buffer<T> {
 }
 
 impl Gpu {
+    /// The most bytes that live buffers, staging included, have taken together since [`Gpu::reset_peak_memory`].
+    pub fn peak_memory(&self) -> u64 {
+        self.shared.usage.peak()
+    }
+
+    /// Counts the peak anew, from what is allocated now.
+    pub fn reset_peak_memory(&self) {
+        self.shared.usage.reset_peak();
+    }
+
     /// A buffer of `len` elements whose contents are undefined.
     ///
     /// # Errors
@@ -170,6 +180,32 @@ impl<T: bytemuck::Pod> Download<T> {
     }
 }
 
+/// Bytes of all live buffers, staging included.
+#[derive(Debug, Default)]
+pub(super) struct MemoryUsage {
+    now: AtomicU64,
+    peak: AtomicU64,
+}
+
+impl MemoryUsage {
+    fn add(&self, bytes: u64) {
+        let now = self.now.fetch_add(bytes, Ordering::AcqRel) + bytes;
+        self.peak.fetch_max(now, Ordering::AcqRel);
+    }
+
+    fn subtract(&self, bytes: u64) {
+        self.now.fetch_sub(bytes, Ordering::AcqRel);
+    }
+
+    pub(super) fn peak(&self) -> u64 {
+        self.peak.load(Ordering::Acquire)
+    }
+
+    pub(super) fn reset_peak(&self) {
+        self.peak.store(self.now.load(Ordering::Acquire), Ordering::Release);
+    }
+}
+
 impl Memory {
     fn new(shared: &Arc<Shared>, name: &str, bytes: u64, location: MemoryLocation) -> Result<Self> {
         let limit = shared.properties.max_storage_buffer_range;
@@ -204,6 +240,7 @@ impl Memory {
             };
             let bound =
                 shared.device.bind_buffer_memory(raw, allocation.memory(), allocation.offset());
+            shared.usage.add(allocation.size());
             let shared = Arc::clone(shared);
             let memory = Self { shared, raw, allocation: Some(allocation), name: name.to_owned() };
             bound.map_err(|_| out_of_memory())?;
@@ -215,6 +252,7 @@ impl Memory {
 impl Drop for Memory {
     fn drop(&mut self) {
         if let Some(allocation) = self.allocation.take() {
+            self.shared.usage.subtract(allocation.size());
             self.shared.retire(Retired::Buffer(self.raw, allocation));
             // Without work in flight nothing else would come by to free it.
             if self.shared.last_use.load(Ordering::Acquire) == 0 {

@@ -280,6 +280,7 @@ impl Gpu {
                 queue: Mutex::new(queue),
                 timeline,
                 last_use: AtomicU64::new(0),
+                usage: super::buffer::MemoryUsage::default(),
                 retired: Mutex::new(vec![]),
                 pipeline_cache,
                 owned,

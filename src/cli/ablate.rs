@@ -1,0 +1,116 @@
+//! `nightsplat ablate`: what each part of the model buys on a scene, and what it costs.
+
+use std::io::Write;
+use std::path::PathBuf;
+
+use anyhow::Result;
+
+use super::comparison::{self, Run};
+use super::train::{TrainOptions, train_into};
+use crate::Error;
+use crate::dataset::Dataset;
+use crate::eval;
+use crate::export;
+use crate::gpu::{DeviceChoice, Gpu};
+use crate::image::Image;
+use crate::report::{Report, plot};
+use crate::train::{Part, TrainConfig};
+
+/// Train colour alone, each part of LITA-GS alone beside it, and all of them: same seed, same steps.
+///
+/// Leaves DIR/index.html, a page with the scores, the seconds, the peak memory and the renders side by side, the same table
+/// as DIR/table.md, and a run directory for each model. A part that the dataset has nothing for, such as depth without
+/// depth maps, is left out.
+#[derive(Clone, Debug, clap::Args)]
+pub struct AblateArgs {
+    /// The dataset: a folder with transforms*.json (LOM, RealX3D, NeRF) or a COLMAP model in sparse/
+    pub dataset: PathBuf,
+    /// The folder to write to
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Replace the runs that DIR already holds
+    #[arg(long)]
+    pub overwrite: bool,
+    #[command(flatten)]
+    pub(crate) options: TrainOptions,
+}
+
+/// A model of the comparison: its folder, its name on the page, and its parts.
+struct Model {
+    folder: String,
+    title: String,
+    config: TrainConfig,
+}
+
+/// Trains every model and writes the page.
+///
+/// # Errors
+/// The dataset or a setting is not usable, a run is there already, or a file cannot be written.
+pub fn run(args: &AblateArgs) -> Result<()> {
+    let mut config = args.options.config(args.dataset.clone())?;
+    // Whether there are depth maps is for the dataset to say.
+    config.model.depth = true;
+    let gpu = Gpu::new(&config.device.parse::<DeviceChoice>()?)?;
+    let dataset = Dataset::load(&config.dataset, &config.load_options())?;
+    config.leave_out_what_is_missing(&dataset);
+    let models = models(&config);
+    for Model { folder, .. } in &models {
+        let taken = args.out.join(folder);
+        if taken.join("config.toml").exists() && !args.overwrite {
+            let problem = "already holds a run; pass --overwrite to replace it";
+            return Err(Error::output(taken, problem).into());
+        }
+    }
+    let mut runs = vec![];
+    for (i, Model { folder, title, config }) in models.iter().enumerate() {
+        tracing::info!("{} of {}: {title}", i + 1, models.len());
+        let out = args.out.join(folder);
+        let (trained, losses) = train_into(&out, &gpu, config, &dataset, args.overwrite)?;
+        runs.push(Run::new(title.clone(), trained, losses));
+    }
+    let dark = eval::score(&dataset, |view| {
+        // A test view without its dark photograph shows nothing.
+        let black = || Image::filled(view.camera.width, view.camera.height, [0.0; 3]);
+        Ok(view.image.clone().unwrap_or_else(black).into())
+    })?;
+    let table = comparison::score_table("model", &dark, &runs);
+    let test_views = dataset.test_views().filter(|view| view.reference.is_some());
+    let epoch = dataset.train_views().count();
+    let page = Report {
+        title: format!("What each part buys: {}", dataset.root.display()),
+        intro: vec![format!(
+            "{} steps each with seed {}, on {}. R_0 is the render of the Gaussians' colours; a model with a denoiser is \
+             scored behind it.",
+            config.steps,
+            config.seed,
+            gpu.properties().name
+        )],
+        plots: vec![plot("step", "loss", &comparison::loss_series(&runs, epoch))],
+        comparisons: test_views.map(|view| comparison::of_view(view, &dark, &runs)).collect(),
+        tables: vec![table.clone()],
+    };
+    let index = args.out.join("index.html");
+    export::write_whole(&index, page.html().as_bytes())?;
+    export::write_whole(&args.out.join("table.md"), table.markdown().as_bytes())?;
+    let mut out = std::io::stdout().lock();
+    let text = comparison::terminal_table("model", &dark, &runs);
+    write!(out, "{text}\n{}\n", index.display())?;
+    Ok(())
+}
+
+/// Colour alone, each part alone, all of them.
+fn models(config: &TrainConfig) -> Vec<Model> {
+    let usable: Vec<Part> =
+        Part::ALL.into_iter().filter(|&part| part != Part::Depth || config.model.depth).collect();
+    let model = |folder: &str, title: String, parts: &[Part]| {
+        let mut config = config.clone();
+        config.model.set_parts(parts);
+        Model { folder: folder.to_owned(), title, config }
+    };
+    let mut models = vec![model("plain", "plain".to_owned(), &[])];
+    models.extend(
+        usable.iter().map(|part| model(part.name(), format!("+ {}", part.name()), &[*part])),
+    );
+    models.push(model("lita", "all parts".to_owned(), &usable));
+    models
+}

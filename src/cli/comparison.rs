@@ -1,0 +1,118 @@
+//! Runs of one dataset side by side: the tables, curves and pictures of `demo` and `ablate`.
+
+use super::table;
+use super::train::Trained;
+use crate::dataset::View;
+use crate::eval::{self, ViewScore};
+use crate::image::Image;
+use crate::metrics::Scores;
+use crate::report::{Best, Column, Comparison, Picture, Series, Table};
+
+/// A run and what it made of the test views.
+pub(super) struct Run {
+    title: String,
+    scored: Vec<ViewScore>,
+    seconds: f64,
+    gaussians: usize,
+    /// The most that its buffers took on the device.
+    peak_bytes: u64,
+    /// Of every step.
+    losses: Vec<f64>,
+}
+
+impl Run {
+    pub(super) fn new(title: String, trained: Trained, losses: Vec<f64>) -> Self {
+        let Trained { trainer, scored, seconds, peak_bytes } = trained;
+        Self { title, scored, seconds, gaussians: trainer.gaussian_count(), peak_bytes, losses }
+    }
+}
+
+/// Means over the test views, first of the dark photographs.
+pub(super) fn score_table(label: &str, dark: &[ViewScore], runs: &[Run]) -> Table {
+    let column = |name: &str, digits, best| Column { name: name.to_owned(), digits, best };
+    let has_r0 = runs.iter().any(|run| eval::means(&run.scored).1.is_some());
+    let scores = |scored: &[ViewScore]| {
+        let (mean, r0) = eval::means(scored);
+        let mut values = vec![
+            mean.map(|mean| mean.psnr),
+            mean.map(|mean| mean.psnr_channel_mean),
+            mean.map(|mean| mean.ssim),
+        ];
+        if has_r0 {
+            // Without a denoiser what is scored is R_0.
+            let r0 = r0.or(mean);
+            values.extend([r0.map(|r0| r0.psnr), r0.map(|r0| r0.ssim)]);
+        }
+        values
+    };
+    let mut rows = vec![("dark photograph".to_owned(), scores(dark))];
+    rows.extend(runs.iter().map(|run| {
+        let mut values = scores(&run.scored);
+        let mebibytes = run.peak_bytes as f64 / f64::from(1 << 20);
+        values.extend([Some(run.seconds), Some(mebibytes), Some(run.gaussians as f64)]);
+        (run.title.clone(), values)
+    }));
+    let mut columns = vec![
+        column("PSNR, dB", 2, Best::Greatest),
+        column("channel-mean PSNR, dB", 2, Best::Greatest),
+        column("SSIM", 3, Best::Greatest),
+    ];
+    if has_r0 {
+        columns.push(column("PSNR of R_0, dB", 2, Best::Greatest));
+        columns.push(column("SSIM of R_0", 3, Best::Greatest));
+    }
+    columns.extend([
+        column("training, s", 0, Best::Unmarked),
+        column("peak, MiB", 0, Best::Unmarked),
+        column("Gaussians", 0, Best::Unmarked),
+    ]);
+    let title = "Means over the test views".to_owned();
+    Table { title, label: label.to_owned(), columns, rows }
+}
+
+/// The mean loss of every epoch: single views differ too much for a line.
+pub(super) fn loss_series(runs: &[Run], epoch: usize) -> Vec<Series> {
+    let of_run = |run: &Run| {
+        let epochs = run.losses.chunks_exact(epoch.max(1)).enumerate();
+        let point = |(index, losses): (usize, &[f64])| {
+            let mean = losses.iter().sum::<f64>() / losses.len() as f64;
+            (((index + 1) * epoch) as f64, mean)
+        };
+        Series { name: run.title.clone(), points: epochs.map(point).collect() }
+    };
+    runs.iter().map(of_run).collect()
+}
+
+/// One test view: what came in, what each run made of it, and what it should be.
+pub(super) fn of_view(view: &View, dark: &[ViewScore], runs: &[Run]) -> Comparison {
+    let picture = |caption: &str, scored: &[ViewScore]| {
+        let scored = scored.iter().find(|scored| scored.name == view.name)?;
+        let Scores { psnr, ssim, .. } = scored.scores;
+        let scores = format!("{psnr:.2} dB, SSIM {ssim:.3}");
+        Some(Picture { caption: caption.to_owned(), scores, image: scored.render.clone() })
+    };
+    let reference = |image: &Image| Picture {
+        caption: "normal-light reference".to_owned(),
+        scores: String::new(),
+        image: image.clone(),
+    };
+    let mut pictures: Vec<Picture> = picture("dark photograph", dark).into_iter().collect();
+    pictures.extend(runs.iter().filter_map(|run| picture(&run.title, &run.scored)));
+    pictures.extend(view.reference.as_ref().map(reference));
+    Comparison { title: format!("Test view {}", view.name), pictures }
+}
+
+/// The score table as text.
+pub(super) fn terminal_table(label: &str, dark: &[ViewScore], runs: &[Run]) -> String {
+    let Table { label, columns, rows, .. } = score_table(label, dark, runs);
+    let mut lines = vec![vec![label]];
+    lines[0].extend(columns.iter().map(|column| column.name.clone()));
+    for (name, values) in rows {
+        let cells = columns.iter().zip(values);
+        let cell = |(column, value): (&Column, Option<f64>)| {
+            value.map_or_else(|| "-".to_owned(), |value| format!("{value:.*}", column.digits))
+        };
+        lines.push(std::iter::once(name).chain(cells.map(cell)).collect());
+    }
+    table::aligned(&lines)
+}
