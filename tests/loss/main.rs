@@ -1,4 +1,4 @@
-//! The loss terms: kernels against their references, gradients against finite differences and PyTorch, edge cases.
+//! The loss terms: kernels against their references, gradients against finite differences and `PyTorch`, edge cases.
 
 #![expect(clippy::unwrap_used, reason = "what fails here fails the test")]
 
