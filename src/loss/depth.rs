@@ -1,7 +1,7 @@
 //! The depth term: a plane of the render correlates with an estimated depth, over the view and over random boxes.
 //!
-//! P(a, b) = 1 - mean(a^ b^), a^ = (a - mean a) / (s_a + 1e-6), s_a^2 the unbiased variance: the estimate's scale and
-//! offset do not matter.
+//! P(a, b) = 1 - mean(a^ b^), a^ = (a - mean a) / (s + 1e-6), s^2 the unbiased variance of a: the estimate's scale
+//! and offset do not matter.
 
 use glam::UVec2;
 

@@ -1,4 +1,4 @@
-//! CIConv in double precision: the columns pass and the invariant.
+//! `CIConv` in double precision: the columns pass and the invariant.
 
 use glam::{Vec2, Vec3};
 

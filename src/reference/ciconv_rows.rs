@@ -1,4 +1,4 @@
-//! CIConv in double precision: what the rows pass leaves, and its taps.
+//! `CIConv` in double precision: what the rows pass leaves, and its taps.
 
 use crate::gpu::Reference;
 use crate::kernels::ciconv_rows::{Constants, Kernel, Params, Slices};

@@ -21,10 +21,9 @@ impl Reference for Kernel {
             d_render[i] = -d[i] as f32;
         }
         for i in (0..values).filter(|&i| counts(i)) {
-            let row = i / width;
+            let (row, height) = (i / width, params.height as usize);
             let right = (i % width + 1 < width).then_some((i + 1, params.x_scale));
-            let below =
-                ((row + 1) as u32 % params.height > 0).then_some((i + width, params.y_scale));
+            let below = (row % height + 1 < height).then_some((i + width, params.y_scale));
             for (j, scale) in [right, below].into_iter().flatten().filter(|&(j, _)| counts(j)) {
                 let (scale, step) =
                     (f64::from(scale), f64::from(denoised[j]) - f64::from(denoised[i]));

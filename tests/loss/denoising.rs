@@ -1,0 +1,235 @@
+//! The denoising terms.
+
+use glam::UVec2;
+use nightsplat::gpu::Gpu;
+use nightsplat::gpu::testing::{assert_no_validation_messages, gpu};
+use nightsplat::kernels::denoising;
+use nightsplat::loss::{
+    DenoisingGradients, DenoisingInputs, DenoisingLoss, DenoisingWeights, Interior, Term,
+};
+
+use super::{
+    Logged, NOT_FINITE, Torch, assert_close, assert_gradient, bits, central_differences, largest,
+    log_step, noise, widen,
+};
+
+const WEIGHTS: DenoisingWeights = DenoisingWeights { mse: 0.7, total_variation: 1.3 };
+
+/// Views and the interiors that count in them.
+fn cases() -> Vec<(UVec2, Interior)> {
+    let whole = |size: [u32; 2]| (size.into(), Interior::whole(size.into()));
+    let inside = |size: [u32; 2], origin: [u32; 2], own: [u32; 2]| {
+        (size.into(), Interior { origin: origin.into(), size: own.into() })
+    };
+    vec![
+        whole([1, 1]),
+        whole([3, 1]),
+        whole([1, 3]),
+        whole([5, 7]),
+        whole([33, 17]),
+        whole([70, 66]),
+        inside([5, 7], [1, 2], [3, 4]),
+        inside([33, 17], [20, 3], [13, 14]),
+        inside([33, 17], [16, 8], [1, 1]),
+        inside([33, 40], [4, 15], [1, 20]),
+    ]
+}
+
+/// Both terms by their definition, in double precision, means over the interior.
+fn loss_of(size: UVec2, Interior { origin, size: own }: Interior, a: &[f64], b: &[f64]) -> f64 {
+    let (mut squares, mut vertical, mut horizontal) = (0.0, 0.0, 0.0);
+    let at = |channel: u32, x: u32, y: u32| {
+        ((channel * size.y + origin.y + y) * size.x + origin.x + x) as usize
+    };
+    for channel in 0..3 {
+        for y in 0..own.y {
+            for x in 0..own.x {
+                let i = at(channel, x, y);
+                squares += (a[i] - b[i]).powi(2);
+                if y > 0 {
+                    vertical += (a[i] - a[at(channel, x, y - 1)]).powi(2);
+                }
+                if x > 0 {
+                    horizontal += (a[i] - a[at(channel, x - 1, y)]).powi(2);
+                }
+            }
+        }
+    }
+    let mean = |sum: f64, count: u32| if count == 0 { 0.0 } else { sum / f64::from(3 * count) };
+    let tv = 2.0 * (mean(vertical, own.x * (own.y - 1)) + mean(horizontal, (own.x - 1) * own.y));
+    WEIGHTS.mse * mean(squares, own.x * own.y) + WEIGHTS.total_variation * tv
+}
+
+struct Outcome {
+    logged: Logged,
+    d_denoised: Vec<f32>,
+    d_render: Vec<f32>,
+}
+
+fn evaluate(
+    gpu: &Gpu,
+    weights: DenoisingWeights,
+    (size, interior): (UVec2, Interior),
+    [denoised, render]: [&[f32]; 2],
+) -> Outcome {
+    let [mut d_denoised, mut d_render] =
+        ["d_denoised", "d_render"].map(|d| gpu.buffer(d, &vec![f32::NAN; render.len()]).unwrap());
+    let [denoised, render] =
+        [("denoised", denoised), ("render", render)].map(|(n, x)| gpu.buffer(n, x).unwrap());
+    let mut loss = DenoisingLoss::new(gpu, weights).unwrap();
+    loss.reserve(size).unwrap();
+    let logged = log_step(gpu, |pass, log| {
+        let inputs = DenoisingInputs { size, interior, denoised: &denoised, render: &render };
+        let gradients = DenoisingGradients { d_denoised: &mut d_denoised, d_render: &mut d_render };
+        loss.record(pass, inputs, gradients, log)
+    })
+    .unwrap();
+    let [d_denoised, d_render] = [d_denoised, d_render].map(|d| gpu.read(&d).unwrap());
+    Outcome { logged, d_denoised, d_render }
+}
+
+#[test]
+fn the_terms_match_their_reference_and_finite_differences() {
+    let gpu = gpu();
+    for (size, interior) in cases() {
+        let values = 3 * size.element_product() as usize;
+        let (denoised, render) = (noise(1, values, 0.0, 1.0), noise(2, values, -0.2, 1.2));
+        let own = interior.size;
+        let pair_scale = |pairs: u32| if pairs == 0 { 0.0 } else { 2.0 / (3 * pairs) as f32 };
+        let params = denoising::Params {
+            width: size.x,
+            height: size.y,
+            interior_begin: interior.origin,
+            interior_end: interior.origin + own,
+            mse_weight: WEIGHTS.mse as f32,
+            tv_weight: WEIGHTS.total_variation as f32,
+            mean_scale: 1.0 / (3 * own.element_product()) as f32,
+            x_scale: pair_scale((own.x - 1) * own.y),
+            y_scale: pair_scale(own.x * (own.y - 1)),
+        };
+        let constants = denoising::Constants::default();
+        let [d_denoised, d_render] = [0; 2].map(|_| vec![f32::NAN; values]);
+        let [mse_partials, tv_partials] = [0; 2].map(|_| vec![0.0f32]);
+        let (d_denoised, d_render, mse_partials, tv_partials) = run_reference!(
+            denoising,
+            constants,
+            params,
+            [denoised, render],
+            [d_denoised, d_render, mse_partials, tv_partials]
+        );
+        if values < 3000 {
+            let (a, b) = (widen(&denoised), widen(&render));
+            let numeric = central_differences(&a, |a| loss_of(size, interior, a, &b));
+            assert_gradient("d_denoised", &d_denoised, &numeric);
+            let numeric = central_differences(&b, |b| loss_of(size, interior, &a, b));
+            assert_gradient("d_render", &d_render, &numeric);
+        }
+        let actual = evaluate(&gpu, WEIGHTS, (size, interior), [&denoised, &render]);
+        let close = |what: &str, actual: &[f32], expected: &[f32]| {
+            assert_close(what, actual, expected, 1e-5 * largest(expected));
+        };
+        close("d_denoised", &actual.d_denoised, &d_denoised);
+        close("d_render", &actual.d_render, &d_render);
+        let losses = actual.logged.losses;
+        close("MSE", &[losses.get(Term::Denoising)], &[mse_partials[0] * params.mean_scale]);
+        close("TV", &[losses.get(Term::TotalVariation)], &tv_partials);
+        assert_eq!(actual.logged.status, 0);
+    }
+    assert_no_validation_messages();
+}
+
+#[test]
+fn the_terms_are_those_of_pytorch() {
+    let (gpu, torch) = (gpu(), Torch::read());
+    let size = UVec2::new(17, 13);
+    let images = [torch.get("denoising.denoised"), torch.get("denoising.rendered")];
+    let evaluate = |mse: f64, total_variation: f64| {
+        let weights = DenoisingWeights { mse, total_variation };
+        evaluate(&gpu, weights, (size, Interior::whole(size)), images)
+    };
+    let (mse, tv) = (evaluate(1.0, 0.0), evaluate(0.0, 1.0));
+    torch.assert_agrees("denoising.mse.value", &[mse.logged.losses.get(Term::Denoising)]);
+    torch.assert_agrees("denoising.mse.d_denoised", &mse.d_denoised);
+    torch.assert_agrees("denoising.mse.d_rendered", &mse.d_render);
+    torch.assert_agrees("denoising.tv.value", &[tv.logged.losses.get(Term::TotalVariation)]);
+    torch.assert_agrees("denoising.tv.d_denoised", &tv.d_denoised);
+    assert!(tv.d_render.iter().all(|&d| d == 0.0), "the total variation has no business here");
+    assert_no_validation_messages();
+}
+
+#[test]
+fn a_constant_image_that_is_the_render_costs_nothing() {
+    let size = UVec2::new(20, 21);
+    let image = vec![0.3; 3 * 420];
+    let outcome = evaluate(&gpu(), WEIGHTS, (size, Interior::whole(size)), [&image, &image]);
+    assert_eq!(outcome.logged.losses.get(Term::Denoising), 0.0);
+    assert_eq!(outcome.logged.losses.get(Term::TotalVariation), 0.0);
+    assert!([outcome.d_denoised, outcome.d_render].concat().iter().all(|&d| d == 0.0));
+    assert_no_validation_messages();
+}
+
+#[test]
+fn a_value_that_is_not_finite_reaches_the_log_if_it_counts() {
+    let gpu = gpu();
+    let size = UVec2::splat(20);
+    let interior = Interior { origin: UVec2::splat(5), size: UVec2::splat(10) };
+    let image = noise(3, 1200, 0.0, 1.0);
+    let with_nan = |x: usize| {
+        let mut image = image.clone();
+        image[20 * x + x] = f32::NAN;
+        image
+    };
+    let broken = |images: [&[f32]; 2]| {
+        let Logged { losses, status } = evaluate(&gpu, WEIGHTS, (size, interior), images).logged;
+        assert_eq!(status, if losses.first_not_finite().is_some() { NOT_FINITE } else { 0 });
+        [Term::Denoising, Term::TotalVariation].map(|term| !losses.get(term).is_finite())
+    };
+    assert_eq!(broken([&image, &with_nan(7)]), [true, false]);
+    assert_eq!(broken([&with_nan(7), &image]), [true, true]);
+    assert_eq!(broken([&with_nan(4), &image]), [false, false]);
+    assert_eq!(broken([&image, &with_nan(15)]), [false, false]);
+    assert_no_validation_messages();
+}
+
+#[test]
+fn the_same_step_leaves_the_same_bits() {
+    let gpu = gpu();
+    let size = UVec2::new(131, 97);
+    let values = 3 * size.element_product() as usize;
+    let (denoised, render) = (noise(1, values, 0.0, 1.0), noise(2, values, 0.0, 1.0));
+    let step = || {
+        let outcome = evaluate(&gpu, WEIGHTS, (size, Interior::whole(size)), [&denoised, &render]);
+        let terms = [Term::Denoising, Term::TotalVariation];
+        let values = terms.map(|term| outcome.logged.losses.get(term));
+        (bits(&values), bits(&outcome.d_denoised), bits(&outcome.d_render))
+    };
+    let first = step();
+    assert!((0..5).all(|_| step() == first));
+    assert_no_validation_messages();
+}
+
+#[test]
+fn what_does_not_fit_is_refused() {
+    let gpu = gpu();
+    for (mse, total_variation) in [(-1.0, 0.0), (0.0, f64::INFINITY)] {
+        assert!(DenoisingLoss::new(&gpu, DenoisingWeights { mse, total_variation }).is_err());
+    }
+    let mut loss = DenoisingLoss::new(&gpu, WEIGHTS).unwrap();
+    loss.reserve(UVec2::splat(8)).unwrap();
+    let image = gpu.zeros("image", 192).unwrap();
+    let whole = |size: [u32; 2]| (size.into(), Interior::whole(size.into()));
+    let outside = Interior { origin: UVec2::splat(1), size: UVec2::splat(8) };
+    for (size, interior) in
+        [whole([0, 8]), whole([9, 8]), whole([100, 100]), (UVec2::splat(8), outside)]
+    {
+        let [mut d_denoised, mut d_render] = [0; 2].map(|_| gpu.zeros("d", 192).unwrap());
+        let logged = log_step(&gpu, |pass, log| {
+            let inputs = DenoisingInputs { size, interior, denoised: &image, render: &image };
+            let gradients =
+                DenoisingGradients { d_denoised: &mut d_denoised, d_render: &mut d_render };
+            loss.record(pass, inputs, gradients, log)
+        });
+        assert!(logged.is_err(), "{size} {interior:?}");
+    }
+    assert_no_validation_messages();
+}

@@ -1,0 +1,536 @@
+//! L1 and SSIM of an image.
+
+use glam::{UVec2, Vec3};
+use nightsplat::gpu::testing::{assert_no_validation_messages, gpu};
+use nightsplat::gpu::{Buffer, Gpu, Reference, Threads};
+use nightsplat::kernels::{ToneParameters, l1, ssim_backward, ssim_forward};
+use nightsplat::loss::{Interior, Loss, LossInputs, LossSettings, Term};
+use nightsplat::reference::ssim_backward::gradient;
+use nightsplat::reference::ssim_forward::ssim;
+use nightsplat::reference::tone::{CURVE_AP3, CURVE_ASE, CURVE_NONE};
+
+use super::{NOT_FINITE, Torch, assert_close, bits, central_differences, largest, log_step};
+
+const SIZES: [[u32; 2]; 8] =
+    [[1, 1], [3, 1], [1, 40], [5, 7], [17, 33], [16, 64], [33, 65], [131, 97]];
+const TONE: ToneParameters = ToneParameters { white: 0.12, offset: 0.05, gain: 1.07 };
+
+/// A dark photograph and a render that is off by a texture and by noise.
+fn images([width, height]: [u32; 2]) -> [Vec<f32>; 2] {
+    let mut state = 1u32;
+    let mut noise = move || {
+        state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        (state >> 8) as f32 / (1 << 24) as f32
+    };
+    let count = 3 * width * height;
+    let low: Vec<f32> =
+        (0..count).map(|i| 0.05 + 0.04 * (i as f32 * 0.37).sin() + 0.01 * noise()).collect();
+    let render = (0..count).map(|i| 0.4 + 0.3 * (i as f32 * 0.31).cos() + 0.2 * noise()).collect();
+    [render, low]
+}
+
+/// What one step of the loss leaves behind.
+struct Outcome {
+    l1: f32,
+    ssim: f32,
+    d_render: Vec<f32>,
+    status: u32,
+}
+
+fn settings(tone_curve: u32, ssim_weight: f64) -> LossSettings {
+    LossSettings { tone_curve, ssim_weight, terms: [Term::L1, Term::Ssim] }
+}
+
+fn evaluate(gpu: &Gpu, curve: u32, weight: f64, size: [u32; 2], images: &[Vec<f32>; 2]) -> Outcome {
+    evaluate_interior(gpu, curve, weight, size, Interior::whole(size.into()), TONE, images)
+}
+
+fn evaluate_interior(
+    gpu: &Gpu,
+    curve: u32,
+    weight: f64,
+    size: [u32; 2],
+    interior: Interior,
+    tone: ToneParameters,
+    [render, low]: &[Vec<f32>; 2],
+) -> Outcome {
+    let size = UVec2::from_array(size);
+    let mut loss = Loss::new(gpu, settings(curve, weight)).unwrap();
+    loss.reserve(size).unwrap();
+    let [render, low] =
+        [("render", render), ("low", low)].map(|(name, data)| gpu.buffer(name, data).unwrap());
+    let tone = gpu.buffer("tone", &[tone]).unwrap();
+    let mut d_render = gpu.buffer("d_render", &vec![f32::NAN; render.len()]).unwrap();
+    let logged = log_step(gpu, |pass, log| {
+        let inputs = LossInputs { size, interior, render: &render, low: &low, tone: &tone };
+        loss.record(pass, inputs, &mut d_render, log)
+    })
+    .unwrap();
+    let [l1, ssim] = [Term::L1, Term::Ssim].map(|term| logged.losses.get(term));
+    Outcome { l1, ssim, d_render: gpu.read(&d_render).unwrap(), status: logged.status }
+}
+
+/// Runs both SSIM kernels with their references beside them, with strips of `shape` columns and rows.
+fn check_ssim_kernels(
+    gpu: &Gpu,
+    curve: u32,
+    [columns, rows]: [u32; 2],
+    size: [u32; 2],
+    interior: Interior,
+) {
+    let [width, height] = size;
+    let (interior_begin, interior_end) = (interior.origin, interior.origin + interior.size);
+    let [render, low] = images(size);
+    let count = render.len();
+    let threads = 3 * width.div_ceil(columns) * height.div_ceil(rows);
+    let forward_constants = ssim_forward::Constants { columns, rows, tone_curve: curve };
+    let backward_constants = ssim_backward::Constants { columns, rows, tone_curve: curve };
+    let forward_params = ssim_forward::Params { width, height, interior_begin, interior_end };
+    let scale = 1.0 / count as f32;
+    let backward_params = ssim_backward::Params {
+        width,
+        height,
+        interior_begin,
+        interior_end,
+        l1_scale: 0.8 * scale,
+        ssim_scale: 0.2 * scale,
+    };
+
+    let (mut d_moments, mut d_render) = (vec![Vec3::ZERO; count], vec![0.0; count]);
+    let (mut ssim_sum, mut l1_sum) = (vec![0.0], vec![0.0]);
+    let tone = [TONE];
+    let slices = ssim_forward::Slices {
+        render: &render,
+        low: &low,
+        tone: &tone,
+        d_moments: &mut d_moments,
+        partials: &mut ssim_sum,
+    };
+    ssim_forward::Kernel::run(&forward_params, &forward_constants, slices);
+    let slices = ssim_backward::Slices {
+        render: &render,
+        low: &low,
+        tone: &tone,
+        d_moments: &d_moments,
+        d_render: &mut d_render,
+        partials: &mut l1_sum,
+    };
+    ssim_backward::Kernel::run(&backward_params, &backward_constants, slices);
+
+    let [render, low] =
+        [("render", &render), ("low", &low)].map(|(name, data)| gpu.buffer(name, data).unwrap());
+    let tone = gpu.buffer("tone", &tone).unwrap();
+    let mut gpu_d_moments = gpu.zeros("d_moments", count).unwrap();
+    let mut gpu_d_render = gpu.zeros("d_render", count).unwrap();
+    let mut ssim_partials = gpu.zeros("ssim_partials", threads as usize).unwrap();
+    let mut l1_partials = gpu.zeros("l1_partials", threads as usize).unwrap();
+    let forward = gpu.pipeline::<ssim_forward::Kernel>(&forward_constants).unwrap();
+    let backward = gpu.pipeline::<ssim_backward::Kernel>(&backward_constants).unwrap();
+    gpu.run("ssim", |pass| {
+        let buffers = ssim_forward::Buffers {
+            render: &render,
+            low: &low,
+            tone: &tone,
+            d_moments: &mut gpu_d_moments,
+            partials: &mut ssim_partials,
+        };
+        pass.dispatch(&forward, &forward_params, buffers, Threads::Exactly([threads, 1, 1]))?;
+        let buffers = ssim_backward::Buffers {
+            render: &render,
+            low: &low,
+            tone: &tone,
+            d_moments: &gpu_d_moments,
+            d_render: &mut gpu_d_render,
+            partials: &mut l1_partials,
+        };
+        pass.dispatch(&backward, &backward_params, buffers, Threads::Exactly([threads, 1, 1]))
+    })
+    .unwrap();
+
+    let sum = |partials: &Buffer<f32>| gpu.read(partials).unwrap().iter().sum::<f32>();
+    let near = |actual: f32, expected: f32| (actual - expected).abs() <= 1e-5 * count as f32;
+    let context = format!("{width} x {height} in strips of {columns} x {rows}");
+    assert!(
+        near(sum(&ssim_partials), ssim_sum[0]),
+        "{context}: SSIM {} {}",
+        sum(&ssim_partials),
+        ssim_sum[0]
+    );
+    assert!(
+        near(sum(&l1_partials), l1_sum[0]),
+        "{context}: L1 {} {}",
+        sum(&l1_partials),
+        l1_sum[0]
+    );
+    // The variances lose about 1e-7 of a squared mean near 1 to cancellation, against a floor of C2 = 9e-4.
+    let actual: Vec<f32> =
+        gpu.read(&gpu_d_moments).unwrap().iter().flat_map(|d| d.to_array()).collect();
+    let expected: Vec<f32> = d_moments.iter().flat_map(|d| d.to_array()).collect();
+    assert_close(&context, &actual, &expected, 1e-3 * largest(&expected));
+    assert_close(&context, &gpu.read(&gpu_d_render).unwrap(), &d_render, 1e-3 * largest(&d_render));
+}
+
+#[test]
+fn the_ssim_kernels_match_their_references_at_every_size() {
+    let gpu = gpu();
+    for size in SIZES {
+        check_ssim_kernels(&gpu, CURVE_AP3, [16, 64], size, Interior::whole(size.into()));
+    }
+    assert_no_validation_messages();
+}
+
+#[test]
+fn the_shape_of_the_strips_does_not_matter() {
+    let gpu = gpu();
+    for (shape, curve) in [([2, 32], CURVE_ASE), ([1, 1], CURVE_NONE), ([5, 7], CURVE_AP3)] {
+        check_ssim_kernels(&gpu, curve, shape, [37, 41], Interior::whole([37, 41].into()));
+    }
+    assert_no_validation_messages();
+}
+
+#[test]
+fn l1_matches_its_reference() {
+    let gpu = gpu();
+    for size in SIZES {
+        let [render, low] = images(size);
+        let count = render.len() as u32;
+        let params = l1::Params {
+            value_count: count,
+            l1_scale: 1.0 / count as f32,
+            width: size[0],
+            height: size[1],
+            interior_begin: UVec2::ZERO,
+            interior_end: size.into(),
+        };
+        let constants = l1::Constants { tone_curve: CURVE_ASE, ..Default::default() };
+        let (mut expected, mut sum) = (vec![0.0; count as usize], [0.0]);
+        let slices = l1::Slices {
+            render: &render,
+            low: &low,
+            tone: &[TONE],
+            d_render: &mut expected,
+            partials: &mut sum,
+        };
+        l1::Kernel::run(&params, &constants, slices);
+        let outcome = evaluate(&gpu, CURVE_ASE, 0.0, size, &[render, low]);
+        assert_close("d_render", &outcome.d_render, &expected, 0.0);
+        assert!((outcome.l1 - sum[0] / count as f32).abs() < 1e-6);
+        assert_eq!(outcome.ssim, 0.0, "SSIM is not modelled at weight 0");
+    }
+    assert_no_validation_messages();
+}
+
+/// (1 - w) mean|a - b| + w (1 - mean SSIM) of one channel, means over the interior.
+fn loss_of(
+    [width, height]: [usize; 2],
+    interior: Interior,
+    weight: f64,
+    a: &[f64],
+    b: &[f64],
+) -> f64 {
+    let ssim = ssim(width, height, a, b);
+    let (mut l1_sum, mut ssim_sum, mut count) = (0.0, 0.0, 0.0);
+    for i in 0..a.len() {
+        if contains(interior, i % width, i / width) {
+            l1_sum += (a[i] - b[i]).abs();
+            ssim_sum += ssim[i].value;
+            count += 1.0;
+        }
+    }
+    (1.0 - weight) * l1_sum / count + weight * (1.0 - ssim_sum / count)
+}
+
+fn contains(Interior { origin, size }: Interior, x: usize, y: usize) -> bool {
+    let pixel = UVec2::new(x as u32, y as u32);
+    pixel.cmpge(origin).all() && pixel.cmplt(origin + size).all()
+}
+
+/// Views with interiors: all of it, the middle, a corner, one pixel.
+fn interiors() -> Vec<([u32; 2], Interior)> {
+    let inside = |size, origin: [u32; 2], own: [u32; 2]| {
+        (size, Interior { origin: origin.into(), size: own.into() })
+    };
+    vec![
+        inside([1, 1], [0, 0], [1, 1]),
+        inside([3, 1], [1, 0], [2, 1]),
+        inside([5, 7], [1, 2], [3, 4]),
+        inside([17, 33], [0, 0], [17, 20]),
+        inside([33, 17], [20, 3], [13, 14]),
+        inside([33, 17], [16, 8], [1, 1]),
+        inside([70, 66], [6, 7], [50, 48]),
+    ]
+}
+
+#[test]
+fn the_reference_gradient_is_that_of_finite_differences() {
+    let whole = |size: [u32; 2]| (size, Interior::whole(size.into()));
+    let mut cases = vec![whole([1, 1]), whole([3, 1]), whole([5, 7]), whole([13, 17])];
+    cases.extend(interiors().into_iter().filter(|(size, _)| size[0] < 40));
+    for (size, interior) in cases {
+        let size = size.map(|extent| extent as usize);
+        let count = size[0] * size[1];
+        let weight = 0.2;
+        let b: Vec<f64> = (0..count).map(|i| 0.5 + 0.4 * (i as f64 * 0.7).sin()).collect();
+        // Away from a = b, where |a - b| has no derivative.
+        let a: Vec<f64> = (0..count).map(|i| b[i] + if i % 3 == 0 { 0.2 } else { -0.3 }).collect();
+        let map = ssim(size[0], size[1], &a, &b);
+        let counts = |i: usize| contains(interior, i % size[0], i / size[0]);
+        let d_moments: Vec<_> =
+            (0..count).map(|i| if counts(i) { map[i].d_moments } else { [0.0; 3] }).collect();
+        let mean_scale = 1.0 / f64::from(interior.size.element_product());
+        let scales = [(1.0 - weight) * mean_scale, weight * mean_scale];
+        let rectangle = [interior.origin, interior.origin + interior.size];
+        let analytic = gradient(size, rectangle, scales, &a, &b, &d_moments);
+        let numeric = central_differences(&a, |a| loss_of(size, interior, weight, a, &b));
+        for i in 0..count {
+            assert!(
+                (numeric[i] - analytic[i]).abs() < 1e-8,
+                "{size:?} {interior:?} at {i}: {} {}",
+                numeric[i],
+                analytic[i]
+            );
+        }
+    }
+}
+
+#[test]
+fn the_kernels_match_their_references_with_an_interior() {
+    let gpu = gpu();
+    for (size, interior) in interiors() {
+        check_ssim_kernels(&gpu, CURVE_AP3, [16, 64], size, interior);
+        check_ssim_kernels(&gpu, CURVE_ASE, [2, 32], size, interior);
+        let [render, low] = images(size);
+        let constants =
+            l1::Constants { tone_curve: CURVE_AP3, with_interior: true, ..Default::default() };
+        let params = l1::Params {
+            value_count: render.len() as u32,
+            l1_scale: 1.0 / (3 * interior.size.element_product()) as f32,
+            width: size[0],
+            height: size[1],
+            interior_begin: interior.origin,
+            interior_end: interior.origin + interior.size,
+        };
+        let (tone, d_render, partials) = (vec![TONE], vec![0.0f32; render.len()], vec![0.0f32]);
+        let (expected, sum) =
+            run_reference!(l1, constants, params, [render, low, tone], [d_render, partials]);
+        let outcome = evaluate_interior(&gpu, CURVE_AP3, 0.0, size, interior, TONE, &[render, low]);
+        assert_close("d_render", &outcome.d_render, &expected, 0.0);
+        assert!((outcome.l1 - sum[0] * params.l1_scale).abs() < 1e-6);
+    }
+    assert_no_validation_messages();
+}
+
+/// The interior's pixels see those around them, so their gradient is not that of the interior alone.
+#[test]
+fn outside_the_interior_the_value_ignores_the_render_but_ssim_does_not() {
+    let gpu = gpu();
+    let (size, interior) =
+        ([40, 40], Interior { origin: UVec2::splat(15), size: UVec2::splat(10) });
+    let [render, low] = images(size);
+    let evaluate = |weight: f64, render: &[f32]| {
+        let images = [render.to_vec(), low.clone()];
+        evaluate_interior(&gpu, CURVE_AP3, weight, size, interior, TONE, &images)
+    };
+    let distance = |i: usize| {
+        let axis = |at: usize| 15usize.saturating_sub(at).max(at.saturating_sub(24));
+        axis(i % 40).max(axis(i / 40 % 40))
+    };
+    let mut changed = render.clone();
+    (0..changed.len()).filter(|&i| distance(i) > 0).for_each(|i| changed[i] += 0.3);
+    let [l1, with_ssim] = [0.0, 0.3].map(|weight| evaluate(weight, &render));
+    let l1_changed = evaluate(0.0, &changed);
+    assert_eq!(l1.l1, l1_changed.l1);
+    assert_eq!(bits(&l1.d_render), bits(&l1_changed.d_render));
+    let changed = evaluate(0.3, &changed);
+    assert_eq!(with_ssim.l1, changed.l1);
+    assert_ne!(with_ssim.ssim, changed.ssim);
+    for i in 0..render.len() {
+        assert_eq!(l1.d_render[i] != 0.0, distance(i) == 0, "{i}");
+        assert_eq!(with_ssim.d_render[i] != 0.0, distance(i) <= 5, "{i}");
+    }
+    assert_no_validation_messages();
+}
+
+/// A value that counts for nothing must not spoil the mean, unless a window sees it.
+#[test]
+fn a_nan_beyond_every_window_of_the_interior_changes_nothing() {
+    let gpu = gpu();
+    let (size, interior) = ([40, 40], Interior { origin: UVec2::splat(8), size: UVec2::splat(10) });
+    let [mut render, low] = images(size);
+    render[39 * 40 + 39] = f32::NAN;
+    for weight in [0.0, 0.2] {
+        let images = [render.clone(), low.clone()];
+        let outcome = evaluate_interior(&gpu, CURVE_AP3, weight, size, interior, TONE, &images);
+        assert!(outcome.l1.is_finite() && outcome.ssim.is_finite() && outcome.status == 0);
+    }
+    assert_no_validation_messages();
+}
+
+#[test]
+fn an_interior_that_is_not_inside_is_refused() {
+    let gpu = gpu();
+    let size = UVec2::splat(8);
+    let mut loss = Loss::new(&gpu, settings(CURVE_AP3, 0.2)).unwrap();
+    loss.reserve(size).unwrap();
+    let tone = gpu.buffer("tone", &[TONE]).unwrap();
+    let image = gpu.zeros("image", 3 * 64).unwrap();
+    for (origin, own) in [([0, 0], [0, 8]), ([1, 0], [8, 8]), ([9, 0], [1, 1]), ([0, 0], [8, 9])] {
+        let interior = Interior { origin: origin.into(), size: own.into() };
+        let inputs = LossInputs { size, interior, render: &image, low: &image, tone: &tone };
+        let mut d_render = gpu.zeros("d_render", 3 * 64).unwrap();
+        let logged = log_step(&gpu, |pass, log| loss.record(pass, inputs, &mut d_render, log));
+        assert!(logged.is_err(), "{interior:?}");
+    }
+    assert_no_validation_messages();
+}
+
+#[test]
+fn l1_and_ssim_are_those_of_pytorch() {
+    let (gpu, torch) = (gpu(), Torch::read());
+    let images = [torch.get("image.render").to_vec(), torch.get("image.target").to_vec()];
+    let identity = ToneParameters { white: 1.0, offset: 0.0, gain: 1.0 };
+    let whole = Interior::whole([23, 19].into());
+    let evaluate = |weight: f64| {
+        evaluate_interior(&gpu, CURVE_NONE, weight, [23, 19], whole, identity, &images)
+    };
+    let [l1, ssim] = [0.0, 1.0].map(evaluate);
+    torch.assert_agrees("image.l1.value", &[l1.l1]);
+    torch.assert_agrees("image.l1.d_render", &l1.d_render);
+    torch.assert_agrees("image.ssim.value", &[1.0 - ssim.ssim]);
+    torch.assert_agrees("image.ssim.d_render", &ssim.d_render);
+    assert_no_validation_messages();
+}
+
+#[test]
+fn an_image_compared_with_itself_costs_nothing() {
+    let gpu = gpu();
+    let [_, low] = images([40, 30]);
+    let outcome = evaluate(
+        &gpu,
+        CURVE_NONE,
+        0.2,
+        [40, 30],
+        &[low.iter().map(|x| x / TONE.white).collect(), low],
+    );
+    assert!(outcome.l1 < 1e-7, "{}", outcome.l1);
+    assert!((outcome.ssim - 1.0).abs() < 1e-6, "{}", outcome.ssim);
+    assert!(largest(&outcome.d_render) < 1e-6, "{}", largest(&outcome.d_render));
+    assert_eq!(outcome.status, 0);
+    assert_no_validation_messages();
+}
+
+#[test]
+fn constant_images_have_the_ssim_of_their_means_inside() {
+    let gpu = gpu();
+    let size = [64, 48];
+    let (a, b) = (0.5f32, 0.25f32);
+    let count = (3 * size[0] * size[1]) as usize;
+    let outcome =
+        evaluate(&gpu, CURVE_NONE, 0.2, size, &[vec![a; count], vec![b * TONE.white; count]]);
+    assert!((outcome.l1 - 0.25).abs() < 1e-6);
+    // Zero padding changes the border; inside, variances vanish and (2ab + C1) / (a^2 + b^2 + C1) remains.
+    let inside = f64::from((2.0 * a * b + 1e-4) / (a * a + b * b + 1e-4));
+    let plane = [vec![f64::from(a); count / 3], vec![f64::from(b); count / 3]];
+    let map = ssim(size[0] as usize, size[1] as usize, &plane[0], &plane[1]);
+    assert!((map[24 * 64 + 32].value - inside).abs() < 1e-6);
+    let mean = map.iter().map(|ssim| ssim.value).sum::<f64>() / map.len() as f64;
+    assert!((f64::from(outcome.ssim) - mean).abs() < 1e-5, "{} {mean}", outcome.ssim);
+    assert_no_validation_messages();
+}
+
+#[test]
+fn black_images_have_a_finite_gradient() {
+    let gpu = gpu();
+    let count = 3 * 20 * 20;
+    let outcome = evaluate(&gpu, CURVE_NONE, 0.5, [20, 20], &[vec![0.0; count], vec![0.0; count]]);
+    assert!((outcome.ssim - 1.0).abs() < 1e-6);
+    assert!(outcome.d_render.iter().all(|d| d.abs() < 1e-6));
+    assert_no_validation_messages();
+}
+
+/// Squares near 4e4 round by more than C2: without the floor under the variances the denominator turns negative.
+#[test]
+fn a_render_that_is_far_too_bright_keeps_its_ssim_positive() {
+    let gpu = gpu();
+    let count = 3 * 48 * 48;
+    for brightness in [150.1f32, 170.3, 190.7, 210.9, 230.3, 250.7] {
+        let outcome = evaluate(
+            &gpu,
+            CURVE_NONE,
+            1.0,
+            [48, 48],
+            &[vec![brightness; count], vec![0.06; count]],
+        );
+        assert!(outcome.ssim > 0.0, "{brightness}: {}", outcome.ssim);
+        assert_eq!(outcome.status, 0);
+    }
+    assert_no_validation_messages();
+}
+
+#[test]
+fn a_value_that_is_not_finite_reaches_the_log_and_the_status() {
+    let gpu = gpu();
+    for (value, weight) in
+        [(f32::NAN, 0.2), (f32::NAN, 0.0), (f32::INFINITY, 0.2), (f32::NEG_INFINITY, 0.0)]
+    {
+        let [mut render, low] = images([50, 70]);
+        render[1234] = value;
+        let outcome = evaluate(&gpu, CURVE_AP3, weight, [50, 70], &[render, low]);
+        assert!(!outcome.l1.is_finite(), "{value} at weight {weight}: {}", outcome.l1);
+        assert_eq!(outcome.status, NOT_FINITE);
+    }
+    assert_no_validation_messages();
+}
+
+#[test]
+fn the_same_step_leaves_the_same_bits() {
+    let gpu = gpu();
+    let inputs = images([131, 97]);
+    let step = || {
+        let outcome = evaluate(&gpu, CURVE_AP3, 0.2, [131, 97], &inputs);
+        (outcome.l1.to_bits(), outcome.ssim.to_bits(), bits(&outcome.d_render))
+    };
+    let first = step();
+    for _ in 0..5 {
+        assert!(step() == first);
+    }
+    assert_no_validation_messages();
+}
+
+#[test]
+fn a_weight_outside_its_range_is_refused() {
+    let gpu = gpu();
+    for weight in [-0.1, 1.1, f64::NAN] {
+        assert!(Loss::new(&gpu, settings(CURVE_AP3, weight)).is_err());
+    }
+}
+
+/// A kernel that ran on would write beyond its buffers.
+#[test]
+fn a_view_that_does_not_fit_is_refused() {
+    let gpu = gpu();
+    let tone = gpu.buffer("tone", &[TONE]).unwrap();
+    let image = gpu.zeros("image", 3 * 64).unwrap();
+    for (weight, size, slot) in [
+        (0.2, [9, 8], 0),
+        (0.0, [9, 8], 0),
+        (0.2, [0, 8], 0),
+        // As many values, but more strips than there are partial sums.
+        (0.2, [64, 1], 0),
+        (0.2, [8, 8], 3),
+        (0.2, [u32::MAX, u32::MAX], 0),
+    ] {
+        let mut loss = Loss::new(&gpu, settings(CURVE_AP3, weight)).unwrap();
+        loss.reserve(UVec2::splat(8)).unwrap();
+        let mut d_render = gpu.zeros("d_render", 3 * 64).unwrap();
+        let result = log_step(&gpu, |pass, log| {
+            let size = UVec2::from_array(size);
+            let interior = Interior::whole(size);
+            let inputs = LossInputs { size, interior, render: &image, low: &image, tone: &tone };
+            log.slot = slot;
+            loss.record(pass, inputs, &mut d_render, log)
+        });
+        assert!(result.is_err(), "{weight} {size:?} {slot}");
+    }
+    assert_no_validation_messages();
+}

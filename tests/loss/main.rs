@@ -1,0 +1,119 @@
+//! The loss terms: kernels against their references, gradients against finite differences and `PyTorch`, edge cases.
+
+#![expect(clippy::unwrap_used, reason = "what fails here fails the test")]
+
+#[macro_use]
+#[path = "../common/mod.rs"]
+mod common;
+#[path = "../common/safetensors.rs"]
+mod safetensors;
+
+mod denoising;
+mod depth;
+mod image;
+mod log;
+mod structure;
+
+use std::collections::BTreeMap;
+
+use nightsplat::Result;
+use nightsplat::gpu::{Gpu, Recorder};
+use nightsplat::loss::{LogSlot, LossLog, StepLosses, Term};
+
+const NOT_FINITE: u32 = 2;
+
+/// What the terms of one step leave in the log.
+struct Logged {
+    losses: StepLosses,
+    status: u32,
+}
+
+/// Records terms into the middle one of three slots; the others stay as they are.
+fn log_step(
+    gpu: &Gpu,
+    record: impl FnOnce(&mut Recorder<'_>, &mut LogSlot<'_>) -> Result<()>,
+) -> Result<Logged> {
+    let mut log = LossLog::new(gpu, 3)?;
+    let mut status = gpu.zeros("status", 1)?;
+    let mut download = None;
+    gpu.run("losses", |pass| {
+        let mut slot =
+            LogSlot { log: &mut log, slot: 1, status: &mut status, not_finite_flag: NOT_FINITE };
+        record(pass, &mut slot)?;
+        download = Some(log.download(pass)?);
+        Ok(())
+    })?;
+    let steps = download.unwrap().wait()?;
+    assert_eq!(steps.len(), 3);
+    for other in [&steps[0], &steps[2]] {
+        assert!(Term::ALL.iter().all(|&term| other.get(term) == 0.0) && other.status == 0);
+    }
+    let status = gpu.read(&status)?[0];
+    assert_eq!(steps[1].status, status);
+    Ok(Logged { losses: steps[1], status })
+}
+
+/// The first mismatches, so that a failure shows its pattern.
+fn assert_close(what: &str, actual: &[f32], expected: &[f32], tolerance: f32) {
+    common::assert_close(what, actual, expected, |_, _| tolerance);
+}
+
+fn largest(values: &[f32]) -> f32 {
+    values.iter().fold(0.0, |largest, value| value.abs().max(largest))
+}
+
+fn bits(values: &[f32]) -> Vec<u32> {
+    values.iter().map(|value| value.to_bits()).collect()
+}
+
+/// Reproducible values between `low` and `high`.
+fn noise(seed: u64, count: usize, low: f64, high: f64) -> Vec<f32> {
+    let mut random = common::Random::new(seed);
+    (0..count).map(|_| random.between(low, high) as f32).collect()
+}
+
+/// The derivative of `loss` with respect to every element of `at`, by central differences.
+fn central_differences(at: &[f64], loss: impl Fn(&[f64]) -> f64) -> Vec<f64> {
+    let h = 1e-6;
+    let mut shifted = at.to_vec();
+    (0..at.len())
+        .map(|i| {
+            let mut at_offset = |offset: f64| {
+                shifted[i] = at[i] + offset;
+                loss(&shifted)
+            };
+            let difference = at_offset(h) - at_offset(-h);
+            shifted[i] = at[i];
+            difference / (2.0 * h)
+        })
+        .collect()
+}
+
+fn widen(values: &[f32]) -> Vec<f64> {
+    values.iter().map(|&value| f64::from(value)).collect()
+}
+
+/// The gradient that a reference finds against that of finite differences.
+fn assert_gradient(what: &str, analytic: &[f32], numeric: &[f64]) {
+    let numeric: Vec<f32> = numeric.iter().map(|&d| d as f32).collect();
+    assert_close(what, analytic, &numeric, 1e-5 * largest(&numeric) + 1e-9);
+}
+
+/// What `PyTorch` makes of the losses.
+struct Torch(BTreeMap<String, Vec<f32>>);
+
+impl Torch {
+    fn read() -> Self {
+        Self(safetensors::read("tests/fixtures/torch/losses.safetensors"))
+    }
+
+    fn get(&self, name: &str) -> &[f32] {
+        &self.0[name]
+    }
+
+    /// A value to 1e-4 of itself, a gradient to 1e-4 of its largest element.
+    fn assert_agrees(&self, name: &str, actual: &[f32]) {
+        let expected = self.get(name);
+        assert_close(name, actual, expected, 1e-4 * largest(expected));
+    }
+}

@@ -1,0 +1,274 @@
+//! The structure of a pseudo-GT, and the term that compares a plane of the render with it.
+
+use glam::{UVec2, Vec2, Vec3};
+use nightsplat::gpu::testing::{assert_no_validation_messages, gpu};
+use nightsplat::gpu::{Gpu, Threads};
+use nightsplat::kernels::{
+    ciconv_columns, ciconv_moments, ciconv_normalize, ciconv_rows, structure_l1,
+};
+use nightsplat::loss::{StructureInputs, StructureLoss, Term};
+use nightsplat::structure::StructureTarget;
+
+use super::{
+    Logged, NOT_FINITE, Torch, assert_close, assert_gradient, bits, central_differences, largest,
+    log_step, noise, widen,
+};
+
+const SIZES: [[u32; 2]; 7] = [[1, 1], [3, 1], [1, 40], [5, 7], [33, 17], [16, 64], [131, 97]];
+
+/// (3, H, W), soft shapes with some noise.
+fn photograph([width, height]: [u32; 2]) -> Vec<f32> {
+    let pixels = (width * height) as usize;
+    let soft = |i: usize| {
+        let (x, y) = ((i % width as usize) as f32, (i % pixels / width as usize) as f32);
+        0.5 + 0.3 * (0.2 * x + 0.3 * y + (i / pixels) as f32).sin()
+    };
+    let noise = noise(3, 3 * pixels, 0.0, 0.1);
+    (0..3 * pixels).map(|i| soft(i) + noise[i]).collect()
+}
+
+fn structure_of(gpu: &Gpu, image: &[f32], size: [u32; 2]) -> Vec<f32> {
+    let image = gpu.buffer("image", image).unwrap();
+    let mut structure = gpu.zeros("structure", image.len() / 3).unwrap();
+    let mut target = StructureTarget::new(gpu).unwrap();
+    gpu.run("structure", |pass| target.record(pass, &image, size.into(), &mut structure)).unwrap();
+    gpu.read(&structure).unwrap()
+}
+
+#[test]
+fn the_kernels_match_their_references() {
+    let pixels_per_moment = gpu().properties().subgroup_size;
+    for size in SIZES {
+        let [width, height] = size;
+        let (pixel_count, image) = (width * height, photograph(size));
+        let per_pixel = Threads::Exactly([pixel_count, 1, 1]);
+        let [smooth_rows, slope_rows] = [0; 2].map(|_| vec![Vec3::NAN; pixel_count as usize]);
+        let (constants, params) =
+            (ciconv_rows::Constants {}, ciconv_rows::Params { width, height });
+        let expected =
+            run_reference!(ciconv_rows, constants, params, [image], [smooth_rows, slope_rows]);
+        let (smooth_rows, slope_rows) = run_kernel!(
+            ciconv_rows,
+            constants,
+            params,
+            per_pixel,
+            [image],
+            [smooth_rows, slope_rows]
+        );
+        let flat = |rows: &[Vec3]| rows.iter().flat_map(Vec3::to_array).collect::<Vec<f32>>();
+        // Thirteen products of values below 1.
+        assert_close("smooth_rows", &flat(&smooth_rows), &flat(&expected.0), 2e-6);
+        assert_close("slope_rows", &flat(&slope_rows), &flat(&expected.1), 2e-6);
+
+        let (constants, params) = (
+            ciconv_columns::Constants::default(),
+            ciconv_columns::Params { width, height, pixels_per_moment },
+        );
+        let logs = vec![f32::NAN; pixel_count as usize];
+        let moments = vec![Vec2::NAN; pixel_count.div_ceil(pixels_per_moment) as usize];
+        let expected = run_reference!(
+            ciconv_columns,
+            constants,
+            params,
+            [smooth_rows, slope_rows],
+            [logs, moments]
+        );
+        let (logs, moments) = run_kernel!(
+            ciconv_columns,
+            constants,
+            params,
+            per_pixel,
+            [smooth_rows, slope_rows],
+            [logs, moments]
+        );
+        // A derivative that almost vanishes has lost its digits to cancellation; W is floored at 1e-5.
+        assert_close("logs", &logs, &expected.0, 1e-3);
+        let flat = |moments: &[Vec2]| moments.iter().flat_map(Vec2::to_array).collect::<Vec<_>>();
+        assert_close("moments", &flat(&moments), &flat(&expected.1), 5e-3);
+
+        let (constants, params) = (
+            ciconv_moments::Constants {},
+            ciconv_moments::Params { pixel_count, pixels_per_moment },
+        );
+        let norm = vec![Vec2::NAN];
+        let expected = run_reference!(ciconv_moments, constants, params, [moments], [norm]);
+        let one = Threads::Workgroups([1, 1, 1]);
+        let norm = run_kernel!(ciconv_moments, constants, params, one, [moments], [norm]);
+        assert!((norm[0].x - expected[0].x).abs() <= 1e-5 * expected[0].x.abs() + 1e-6);
+        assert!((norm[0].y - expected[0].y).abs() <= 1e-4 * expected[0].y, "{norm:?} {expected:?}");
+
+        let (constants, params) =
+            (ciconv_normalize::Constants {}, ciconv_normalize::Params { pixel_count });
+        let structure = vec![f32::NAN; pixel_count as usize];
+        let expected =
+            run_reference!(ciconv_normalize, constants, params, [logs, norm], [structure]);
+        let structure =
+            run_kernel!(ciconv_normalize, constants, params, per_pixel, [logs, norm], [structure]);
+        assert_close("structure", &structure, &expected, 1e-5);
+    }
+    assert_no_validation_messages();
+}
+
+#[test]
+fn the_structure_is_that_of_pytorch() {
+    let torch = Torch::read();
+    let structure = structure_of(&gpu(), torch.get("structure.image"), [31, 24]);
+    torch.assert_agrees("structure.target", &structure);
+    assert_no_validation_messages();
+}
+
+#[test]
+fn a_flat_image_without_a_border_has_no_structure() {
+    let gpu = gpu();
+    // Zero padding is an edge: only black has none.
+    let size = [40, 30];
+    assert!(structure_of(&gpu, &vec![0.0; 3 * 40 * 30], size).iter().all(|&s| s == 0.0));
+    let gray = structure_of(&gpu, &vec![0.5; 3 * 40 * 30], size);
+    for (i, s) in gray.into_iter().enumerate() {
+        let (x, y) = (i % 40, i / 40);
+        if (6..34).contains(&x) && (6..24).contains(&y) {
+            assert_eq!(s, 0.0, "{x} {y}");
+        }
+    }
+    assert_eq!(structure_of(&gpu, &[0.7, 0.1, 0.3], [1, 1]), [0.0]);
+    assert_no_validation_messages();
+}
+
+#[test]
+fn a_brighter_image_has_the_same_structure() {
+    let gpu = gpu();
+    let image = photograph([33, 17]);
+    let half: Vec<f32> = image.iter().map(|x| 0.5 * x).collect();
+    let [full, half] = [image, half].map(|image| structure_of(&gpu, &image, [33, 17]));
+    assert_close("structure", &half, &full, 2e-3);
+    assert_no_validation_messages();
+}
+
+#[test]
+fn the_same_image_has_the_same_structure_in_every_bit() {
+    let gpu = gpu();
+    let image = photograph([131, 97]);
+    let structure = || bits(&structure_of(&gpu, &image, [131, 97]));
+    let first = structure();
+    assert!((0..5).all(|_| structure() == first));
+    assert_no_validation_messages();
+}
+
+#[test]
+fn a_view_without_pixels_or_with_a_short_buffer_is_refused() {
+    let gpu = gpu();
+    let mut target = StructureTarget::new(&gpu).unwrap();
+    let image = gpu.zeros("image", 3 * 12).unwrap();
+    for (size, len) in [([0, 3], 12), ([5, 3], 15), ([4, 3], 11)] {
+        let mut structure = gpu.zeros("structure", len).unwrap();
+        let result = gpu.run("s", |pass| target.record(pass, &image, size.into(), &mut structure));
+        assert!(result.is_err(), "{size:?} {len}");
+    }
+    assert_no_validation_messages();
+}
+
+/// The term on plane 1 of a render of two planes; gives that plane of the gradient.
+fn evaluate(
+    gpu: &Gpu,
+    weight: f64,
+    size: UVec2,
+    plane: &[f32],
+    structure: &[f32],
+) -> (Logged, Vec<f32>) {
+    let pixels = plane.len();
+    let render = gpu.buffer("render", &[vec![9.0; pixels], plane.to_vec()].concat()).unwrap();
+    let structure = gpu.buffer("structure", structure).unwrap();
+    let mut d_render = gpu.buffer("d_render", &vec![5.0f32; 2 * pixels]).unwrap();
+    let mut loss = StructureLoss::new(gpu, weight).unwrap();
+    loss.reserve(size).unwrap();
+    let logged = log_step(gpu, |pass, log| {
+        let inputs = StructureInputs { size, render: &render, plane: 1, structure: &structure };
+        loss.record(pass, inputs, &mut d_render, log)
+    })
+    .unwrap();
+    let d_render = gpu.read(&d_render).unwrap();
+    assert!(d_render[..pixels].iter().all(|&d| d == 5.0), "another plane was written");
+    (logged, d_render[pixels..].to_vec())
+}
+
+#[test]
+fn the_term_matches_its_reference_and_finite_differences() {
+    let gpu = gpu();
+    for size in SIZES {
+        let pixels = (size[0] * size[1]) as usize;
+        let (render, structure) = (noise(5, pixels, -0.3, 1.3), noise(6, pixels, 0.0, 1.0));
+        let weight = 0.01;
+        let params = structure_l1::Params {
+            pixel_count: pixels as u32,
+            first: 0,
+            scale: weight as f32 / pixels as f32,
+        };
+        let constants = structure_l1::Constants::default();
+        let (d_render, partials) = (vec![f32::NAN; pixels], vec![0.0f32]);
+        let (expected, sum) = run_reference!(
+            structure_l1,
+            constants,
+            params,
+            [render, structure],
+            [d_render, partials]
+        );
+        let loss = |p: &[f64]| {
+            let differences =
+                p.iter().zip(&structure).map(|(p, &s)| (p.clamp(0.0, 1.0) - f64::from(s)).abs());
+            weight * differences.sum::<f64>() / pixels as f64
+        };
+        assert_gradient("structure_l1", &expected, &central_differences(&widen(&render), loss));
+        let (logged, actual) = evaluate(&gpu, weight, size.into(), &render, &structure);
+        assert_close("d_render", &actual, &expected, 1e-6 * largest(&expected));
+        let mean = sum[0] / pixels as f32;
+        assert!((logged.losses.get(Term::Structure) - mean).abs() <= 1e-6 + 1e-6 * mean);
+        assert_eq!(logged.status, 0);
+    }
+    assert_no_validation_messages();
+}
+
+#[test]
+fn the_term_is_that_of_pytorch() {
+    let torch = Torch::read();
+    let (prior, target) = (torch.get("structure.prior"), torch.get("structure.target"));
+    let (logged, d_prior) = evaluate(&gpu(), 1.0, [31, 24].into(), prior, target);
+    torch.assert_agrees("structure.value", &[logged.losses.get(Term::Structure)]);
+    torch.assert_agrees("structure.d_prior", &d_prior);
+    assert_no_validation_messages();
+}
+
+#[test]
+fn the_clamp_passes_its_bounds_and_nothing_beyond() {
+    let (render, structure) = ([-0.1, 0.0, 0.5, 1.0, 1.1], [0.5, 0.5, 0.5, 0.5, 0.5]);
+    let (_, d) = evaluate(&gpu(), 1.0, [5, 1].into(), &render, &structure);
+    assert_eq!(d, [0.0, -0.2, 0.0, 0.2, 0.0]);
+    assert_no_validation_messages();
+}
+
+#[test]
+fn a_value_that_is_not_finite_reaches_the_log() {
+    let mut render = noise(7, 100, 0.0, 1.0);
+    render[57] = f32::NAN;
+    let (logged, _) = evaluate(&gpu(), 1.0, [10, 10].into(), &render, &noise(8, 100, 0.0, 1.0));
+    assert_eq!(logged.losses.first_not_finite(), Some(Term::Structure));
+    assert_eq!(logged.status, NOT_FINITE);
+    assert_no_validation_messages();
+}
+
+#[test]
+fn what_does_not_fit_is_refused() {
+    let gpu = gpu();
+    assert!(StructureLoss::new(&gpu, -1.0).is_err() && StructureLoss::new(&gpu, f64::NAN).is_err());
+    let mut loss = StructureLoss::new(&gpu, 1.0).unwrap();
+    loss.reserve(UVec2::splat(8)).unwrap();
+    let render = gpu.zeros("render", 128).unwrap();
+    let structure = gpu.zeros("structure", 64).unwrap();
+    for (size, plane) in [([0, 8], 0), ([8, 8], 2), ([9, 8], 0), ([64, 64], 0)] {
+        let mut d_render = gpu.zeros("d_render", 128).unwrap();
+        let inputs =
+            StructureInputs { size: size.into(), render: &render, plane, structure: &structure };
+        let logged = log_step(&gpu, |pass, log| loss.record(pass, inputs, &mut d_render, log));
+        assert!(logged.is_err(), "{size:?} {plane}");
+    }
+    assert_no_validation_messages();
+}
