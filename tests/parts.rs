@@ -1,0 +1,342 @@
+//! The parts of LITA-GS: each alone and all together, trained, saved, and shown.
+
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
+use std::path::Path;
+use std::process::{Command, Output};
+
+use nightsplat::dataset::Dataset;
+use nightsplat::dataset::synthetic::{self, SyntheticOptions};
+use nightsplat::gpu::testing::{assert_no_validation_messages, gpu};
+use nightsplat::image::Image;
+use nightsplat::loss::Term;
+use nightsplat::scene::Gaussians;
+use nightsplat::train::{Part, StepReport, TrainConfig, Trainer};
+
+/// Six views of 40 x 30 pixels, with depth maps where asked.
+fn make_set(folder: &Path, with_depth: bool) {
+    let options = SyntheticOptions { views: 6, width: 40, height: 30, seed: 1 };
+    synthetic::write(folder, &options).unwrap();
+    if with_depth {
+        let depth = folder.join("depth");
+        std::fs::create_dir(&depth).unwrap();
+        // Of half the size, as estimators give it; a plane that recedes upwards.
+        let map = Image::from_fn(20, 15, |x, y| [1.0 - (y as f32 + 0.1 * x as f32) / 20.0; 3]);
+        for file in std::fs::read_dir(folder.join("low")).unwrap() {
+            let name = file.unwrap().path().file_stem().unwrap().to_str().unwrap().to_owned();
+            map.save_png16(depth.join(format!("depth_{name}.png"))).unwrap();
+        }
+    }
+}
+
+fn config(parts: &[Part]) -> TrainConfig {
+    let mut config = TrainConfig { steps: 40, sh_degree: 0, ..Default::default() };
+    config.schedule.densify_after = 10;
+    config.schedule.densify_interval = 15;
+    config.model.set_parts(parts);
+    config.model.network.channels = 4;
+    config.model.network.stages = 2;
+    config.model.network.repeats = 2;
+    config.model.rates.denoiser = 1e-2;
+    config.model.rates.tonemapper = 1e-2;
+    config.schedule.initial_rates.features = 5e-2;
+    config
+}
+
+fn load(folder: &Path, config: &TrainConfig) -> Dataset {
+    Dataset::load(folder, &config.load_options()).unwrap()
+}
+
+fn train(config: &TrainConfig, dataset: &Dataset) -> (Vec<StepReport>, Gaussians) {
+    let mut trainer = Trainer::new(&gpu(), config.clone(), dataset).unwrap();
+    let mut reports = vec![];
+    while trainer.steps_done() < config.steps {
+        reports.extend(trainer.advance(config.steps).unwrap());
+    }
+    (reports, trainer.gaussians().unwrap())
+}
+
+/// The mean of a term over the first and over the last epoch.
+fn fall(config: &TrainConfig, reports: &[StepReport], term: Term) -> [f64; 2] {
+    let column = config.terms().iter().position(|&(t, _)| t == term).unwrap();
+    let mean = |reports: &[StepReport]| {
+        reports.iter().map(|report| report.terms[column]).sum::<f64>() / reports.len() as f64
+    };
+    [mean(&reports[..5]), mean(&reports[reports.len() - 5..])]
+}
+
+#[test]
+fn each_part_alone_has_its_channels_and_its_terms_fall() {
+    let folder = tempfile::tempdir().unwrap();
+    make_set(folder.path(), true);
+    for (part, channels, terms) in [
+        (Part::Structure, 4, &[Term::Structure][..]),
+        (Part::Depth, 4, &[Term::Depth, Term::DepthLocal]),
+        (Part::Tonemapper, 6, &[Term::LowL1]),
+        (Part::Denoiser, 6, &[Term::Denoising]),
+    ] {
+        let config = config(&[part]);
+        let (reports, gaussians) = train(&config, &load(folder.path(), &config));
+        assert_eq!(gaussians.shape.features.channels(), channels);
+        for &term in terms {
+            let [begin, end] = fall(&config, &reports, term);
+            assert!(end < begin, "{}: {term:?} went from {begin} to {end}", part.name());
+        }
+        let [begin, end] = fall(&config, &reports, Term::L1);
+        assert!(end < begin, "{}: L1 went from {begin} to {end}", part.name());
+    }
+    assert_no_validation_messages();
+}
+
+#[test]
+fn the_whole_model_gives_the_same_bits_every_time_on_crops_too() {
+    let folder = tempfile::tempdir().unwrap();
+    make_set(folder.path(), true);
+    let mut config = TrainConfig { steps: 20, ..config(&Part::ALL) };
+    config.model.denoiser_crop = 12;
+    let dataset = load(folder.path(), &config);
+    let (reports, gaussians) = train(&config, &dataset);
+    assert_eq!(gaussians.shape.features.channels(), 11);
+    assert!(reports.iter().all(|report| report.loss.is_finite() && report.terms.len() == 9));
+    let (again, same) = train(&config, &dataset);
+    assert_eq!(gaussians, same);
+    assert!(reports.iter().zip(again).all(|(a, b)| a.terms == b.terms));
+    assert_no_validation_messages();
+}
+
+/// A crop that covers the view is the view: the estimate becomes the mean itself.
+#[test]
+fn a_crop_of_everything_is_no_crop() {
+    let folder = tempfile::tempdir().unwrap();
+    make_set(folder.path(), false);
+    let parts = [Part::Denoiser, Part::Tonemapper];
+    let whole = TrainConfig { steps: 6, ..config(&parts) };
+    let mut cropped = whole.clone();
+    cropped.model.denoiser_crop = 40;
+    let dataset = load(folder.path(), &whole);
+    assert_eq!(train(&whole, &dataset).1, train(&cropped, &dataset).1);
+}
+
+/// The terms are means over pixels, so crops of the same step come to the whole view's on average. The weights of the
+/// tonemapper follow from the seed: each seed is compared with itself.
+#[test]
+fn crops_estimate_the_losses_of_the_whole_view() {
+    let folder = tempfile::tempdir().unwrap();
+    make_set(folder.path(), false);
+    let first_loss = |crop: u32, seed: u64| {
+        let mut config = TrainConfig { steps: 1, seed, ..config(&[Part::Tonemapper]) };
+        config.model.denoiser_crop = crop;
+        let (reports, _) = train(&config, &load(folder.path(), &config));
+        let column = config.terms().iter().position(|&(t, _)| t == Term::LowL1).unwrap();
+        reports[0].terms[column]
+    };
+    let differences: Vec<f64> =
+        (0..24).map(|seed| first_loss(16, seed) - first_loss(0, seed)).collect();
+    let count = differences.len() as f64;
+    let mean = differences.iter().sum::<f64>() / count;
+    let variance = differences.iter().map(|d| (d - mean).powi(2)).sum::<f64>() / (count - 1.0);
+    let error = (variance / count).sqrt();
+    assert!(mean.abs() < 4.0 * error, "off by {mean}, four standard errors are {}", 4.0 * error);
+}
+
+#[test]
+fn depth_maps_are_found_resized_negated_and_left_out_where_they_say_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    make_set(folder.path(), true);
+    let mut config = config(&[Part::Depth]);
+    let dataset = load(folder.path(), &config);
+    let views: Vec<_> = dataset.train_views().collect();
+    assert!(dataset.test_views().all(|view| view.depth.is_none()));
+    let depth = views[0].depth.as_ref().unwrap();
+    assert_eq!(depth.len(), 40 * 30);
+    assert!(depth[0] > depth[39 + 40 * 29], "larger is farther");
+
+    config.model.depth_is_disparity = true;
+    let negated = load(folder.path(), &config);
+    let negated = negated.train_views().next().unwrap().depth.clone().unwrap();
+    assert!(depth.iter().zip(&negated).all(|(a, b)| *a == -b));
+    config.model.depth_is_disparity = false;
+
+    let name = &views[0].name;
+    let constant = Image::filled(40, 30, [0.5; 3]);
+    constant.save_png8(folder.path().join(format!("depth/depth_{name}.png"))).unwrap();
+    let dataset = load(folder.path(), &config);
+    let with_depth = dataset.train_views().filter(|view| view.depth.is_some()).count();
+    assert_eq!(with_depth, views.len() - 1);
+    // Trains on: the view without depth leaves the term out.
+    let (reports, _) = train(&TrainConfig { steps: 10, ..config.clone() }, &dataset);
+    let column = config.terms().iter().position(|&(t, _)| t == Term::Depth).unwrap();
+    for report in &reports {
+        assert_eq!(report.terms[column] == 0.0, report.view == *name, "{report:?}");
+    }
+
+    config.model.depth_folder = Some(folder.path().join("nowhere"));
+    let error = Dataset::load(folder.path(), &config.load_options()).unwrap_err().to_string();
+    assert!(error.contains("nowhere") && error.contains("depth"), "{error}");
+}
+
+#[test]
+fn float_depth_keeps_its_values_and_its_sign() {
+    let folder = tempfile::tempdir().unwrap();
+    make_set(folder.path(), false);
+    let maps = folder.path().join("estimates");
+    std::fs::create_dir(&maps).unwrap();
+    let map = Image::from_fn(40, 30, |x, _| [x as f32 - 20.0; 3]);
+    for file in std::fs::read_dir(folder.path().join("low")).unwrap() {
+        let name = file.unwrap().path().file_stem().unwrap().to_str().unwrap().to_owned();
+        map.save_exr_as_stored(maps.join(format!("{name}.exr"))).unwrap();
+    }
+    let mut config = config(&[Part::Depth]);
+    config.model.depth_folder = Some(maps);
+    let dataset = load(folder.path(), &config);
+    let depth = dataset.train_views().next().unwrap().depth.clone().unwrap();
+    assert_eq!((depth[0], depth[39]), (-20.0, 19.0));
+}
+
+#[test]
+fn without_depth_maps_there_is_no_depth_part() {
+    let folder = tempfile::tempdir().unwrap();
+    make_set(folder.path(), false);
+    let config = TrainConfig { steps: 2, ..config(&[Part::Depth, Part::Structure]) };
+    let (reports, gaussians) = train(&config, &load(folder.path(), &config));
+    assert_eq!(gaussians.shape.features.channels(), 4);
+    assert_eq!(reports[0].terms.len(), 3);
+}
+
+#[test]
+fn raw_colors_train_and_are_saved_as_viewers_show_them() {
+    let folder = tempfile::tempdir().unwrap();
+    make_set(folder.path(), false);
+    let mut config = TrainConfig { steps: 20, ..config(&[]) };
+    config.model.raw_colors = true;
+    let (reports, mut gaussians) = train(&config, &load(folder.path(), &config));
+    let [begin, end] = fall(&config, &reports, Term::L1);
+    assert!(end < begin, "L1 went from {begin} to {end}");
+    let before = gaussians.dc()[0].x;
+    gaussians.shift_colors(-0.5);
+    assert!((gaussians.dc()[0].x - (before - 0.5 / 0.282_094_8)).abs() < 1e-5);
+}
+
+// ---------------------------------------------------------------------------
+// The command line
+
+fn nightsplat(arguments: &str) -> Output {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_nightsplat"));
+    command.args(arguments.split_whitespace()).output().unwrap()
+}
+
+fn succeed(arguments: &str) -> String {
+    let output = nightsplat(arguments);
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{arguments}: {stderr}");
+    String::from_utf8(output.stdout).unwrap()
+}
+
+const SMALL: &str =
+    "--steps 12 --sh-degree 0 --denoiser-channels 4 --denoiser-stages 1 --denoiser-repeats 2";
+
+#[test]
+fn a_run_with_networks_is_saved_scored_and_shown_layer_by_layer() {
+    let folder = tempfile::tempdir().unwrap();
+    let set = folder.path().join("set");
+    make_set(&set, true);
+    let (set, run) = (set.display(), folder.path().join("run"));
+    let at = run.display();
+    succeed(&format!("train {set} --out {at} --model lita --denoiser-crop 16 {SMALL}"));
+    let header = std::fs::read_to_string(run.join("train.csv")).unwrap();
+    let columns = "step,view,loss,l1,ssim,low_l1,low_ssim,structure,depth,depth_local,denoising,\
+                   total_variation,gaussians,milliseconds";
+    assert_eq!(header.lines().next().unwrap(), columns);
+    let read = |path: &Path| -> serde_json::Value {
+        serde_json::from_str(&std::fs::read_to_string(path).unwrap()).unwrap()
+    };
+    let trained = read(&run.join("metrics.json"));
+    assert!(trained["mean"]["r0"]["psnr"].as_f64().unwrap() > 0.0, "{trained}");
+    let scored: serde_json::Value =
+        serde_json::from_str(&succeed(&format!("eval {at} --json"))).unwrap();
+    assert_eq!(scored["views"], trained["views"], "the saved networks are those that were trained");
+
+    for (layer, format) in [
+        ("rgb", "png"),
+        ("denoised", "png"),
+        ("depth", "png"),
+        ("structure", "exr"),
+        ("illumination", "png"),
+        ("noise", "exr"),
+    ] {
+        let out = folder.path().join(layer);
+        let to = out.display();
+        succeed(&format!("render {at} --split test --out {to} --layer {layer} --format {format}"));
+        let file = std::fs::read_dir(&out).unwrap().next().unwrap().unwrap().path();
+        assert_eq!(Image::size_of(file).unwrap(), (40, 30), "{layer}");
+    }
+
+    // Networks of another configuration.
+    let config = std::fs::read_to_string(run.join("config.toml")).unwrap();
+    std::fs::write(run.join("config.toml"), config.replace("channels = 4", "channels = 5"))
+        .unwrap();
+    let output = nightsplat(&format!("eval {at}"));
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1));
+    assert!(
+        stderr.contains("networks.safetensors") && stderr.contains("\"channels\":4"),
+        "{stderr}"
+    );
+}
+
+#[test]
+fn a_layer_that_the_model_lacks_is_named_with_those_it_has() {
+    let folder = tempfile::tempdir().unwrap();
+    let set = folder.path().join("set");
+    make_set(&set, false);
+    let (set, run) = (set.display(), folder.path().join("run"));
+    let at = run.display();
+    succeed(&format!("train {set} --out {at} --parts structure {SMALL}"));
+    let output = nightsplat(&format!("render {at} --split test --out {at}/out --layer denoised"));
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert!(stderr.contains("no denoised") && stderr.contains("rgb, structure"), "{stderr}");
+}
+
+#[test]
+fn ablate_trains_every_model_and_leaves_a_page() {
+    let folder = tempfile::tempdir().unwrap();
+    let set = folder.path().join("set");
+    make_set(&set, true);
+    let (set, out) = (set.display(), folder.path().join("ablation"));
+    let at = out.display();
+    let table = succeed(&format!("ablate {set} --out {at} {SMALL}"));
+    for (name, title) in [
+        ("plain", "plain"),
+        ("denoiser", "+ denoiser"),
+        ("tonemapper", "+ tonemapper"),
+        ("structure", "+ structure"),
+        ("depth", "+ depth"),
+        ("lita", "all parts"),
+    ] {
+        assert!(out.join(name).join("metrics.json").is_file(), "{name}");
+        assert!(table.contains(title), "{table}");
+    }
+    let markdown = std::fs::read_to_string(out.join("table.md")).unwrap();
+    assert!(markdown.contains("peak, MiB") && markdown.contains("Gaussians"), "{markdown}");
+    let page = std::fs::read_to_string(out.join("index.html")).unwrap();
+    assert!(page.contains("all parts") && page.contains("data:image/png"));
+    let again = nightsplat(&format!("ablate {set} --out {at} {SMALL}"));
+    let stderr = String::from_utf8_lossy(&again.stderr);
+    assert!(!again.status.success() && stderr.contains("--overwrite"), "{stderr}");
+}
+
+#[test]
+fn a_preset_sets_what_the_paper_states_and_options_win() {
+    let folder = tempfile::tempdir().unwrap();
+    let set = folder.path().join("shrub");
+    make_set(&set, false);
+    let run = folder.path().join("run");
+    let (set, at) = (set.display(), run.display());
+    succeed(&format!("train {set} --out {at} --preset lom --model plain {SMALL}"));
+    let config = std::fs::read_to_string(run.join("config.toml")).unwrap();
+    for line in
+        ["steps = 12", "ssim_weight = 0.4", "seed = 10", "means_rate_steps = 20000", "stages = 1"]
+    {
+        assert!(config.contains(line), "no `{line}` in {config}");
+    }
+}
