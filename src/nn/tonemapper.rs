@@ -16,7 +16,7 @@ const STREAM: u64 = 6;
 /// Feature maps of both inner layers.
 const CHANNELS: u32 = 16;
 
-/// conv 3 to 16, ReLU, conv 16 to 16, ReLU, conv 16 to 3, nothing behind it; zero padding 1.
+/// conv 3 to 16, `ReLU`, conv 16 to 16, `ReLU`, conv 16 to 3, nothing behind it; zero padding 1.
 #[derive(Debug)]
 pub struct Tonemapper {
     gpu: Gpu,
