@@ -208,7 +208,7 @@ impl Denoiser {
         Ok(())
     }
 
-    /// `R_K` of the last forward pass, (3, H, W); empty before memory is reserved.
+    /// `R_K` of the last forward pass, (3, H, W), at the beginning of a buffer that is as long as what was reserved.
     pub fn denoised(&self) -> &Buffer<f32> {
         &self.memory.denoised[self.memory.denoised.len() - 1]
     }

@@ -117,7 +117,8 @@ impl Tonemapper {
         lengths(size).into_iter().zip(self.reserved).all(|(needed, held)| needed <= held)
     }
 
-    /// The image of the last forward pass, (3, H, W), not clamped; empty before memory is reserved.
+    /// The image of the last forward pass, (3, H, W), not clamped, at the beginning of a buffer that is as long as what
+    /// was reserved.
     pub fn output(&self) -> &Buffer<f32> {
         &self.memory.output
     }
