@@ -153,7 +153,7 @@ fn the_tonemapper_matches_its_reference_forward_and_backward() {
     assert_no_validation_messages();
 }
 
-/// The loss looks at what comes out: a ReLU or a clamp that made a number of a NaN would hide it.
+/// The loss looks at what comes out: a `ReLU` or a clamp that made a number of a NaN would hide it.
 #[test]
 fn a_value_that_is_not_a_number_reaches_the_output() {
     let gpu = gpu();
