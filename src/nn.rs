@@ -18,7 +18,6 @@ use glam::UVec2;
 use crate::gpu::{Buffer, Gpu};
 use crate::{Error, Result};
 
-pub use conv::shape;
 pub use denoiser::{Denoiser, DenoiserSettings};
 pub use file::{load, save};
 pub use parameters::{Parameters, Tensor};
@@ -26,6 +25,18 @@ pub use tonemapper::Tonemapper;
 
 /// Red, green, blue.
 const RGB: u32 = 3;
+
+/// The columns and rows of pixels that one lane of `conv3x3` owns.
+///
+/// On a processor a load costs the most, and a lane's neighbouring columns share theirs; on a GPU neighbouring lanes
+/// read neighbouring pixels, and registers are what a block may fill.
+const CPU_SHAPE: [u32; 2] = [4, 4];
+const GPU_SHAPE: [u32; 2] = [1, 8];
+
+/// The columns and rows of pixels that suit the device.
+pub(crate) fn conv_shape(gpu: &Gpu) -> [u32; 2] {
+    if gpu.properties().is_cpu { CPU_SHAPE } else { GPU_SHAPE }
+}
 
 /// Pixels of a view.
 ///

@@ -38,7 +38,8 @@ const uint WEIGHT_LOADS = (TAPS * OUT_BLOCK + SUBGROUP_SIZE - 1) / SUBGROUP_SIZE
 
 float activate(float x) {
     uint activation = ACTIVATION;
-    if (activation == RELU) return max(x, 0.0);
+    // Phrased so that a NaN stays one.
+    if (activation == RELU) return x < 0.0 ? 0.0 : x;
     if (activation == SIGMOID) return 1.0 / (1.0 + exp(-x));
     return x;
 }

@@ -20,6 +20,8 @@ void main() {
     uint plane = CHANNEL * pixel_count;
     for (uint i = chunk_begin(); i < chunk_end(); i += SUBGROUP_SIZE) {
         float normalised = (source[plane + i] - of_channel.mean) * of_channel.inverse_deviation;
-        target[plane + i] = shortcut[plane + i] + max(gamma * normalised + beta, 0.0);
+        float y = gamma * normalised + beta;
+        // Phrased so that a NaN stays one.
+        target[plane + i] = shortcut[plane + i] + (y < 0.0 ? 0.0 : y);
     }
 }

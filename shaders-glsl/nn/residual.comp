@@ -19,5 +19,8 @@ layout(binding = 3) writeonly buffer Denoised   { float denoised[]; };     // R,
 
 void main() {
     uint i = THREAD_INDEX;
-    if (i < value_count) denoised[i] = clamp(render[i] - (stage_input[i] + update[i]), 0.0, 1.0);
+    if (i >= value_count) return;
+    float difference = render[i] - (stage_input[i] + update[i]);
+    // Phrased so that a NaN stays one.
+    denoised[i] = difference < 0.0 ? 0.0 : difference > 1.0 ? 1.0 : difference;
 }

@@ -2,27 +2,16 @@
 
 use glam::UVec2;
 
+use super::conv_shape;
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::{conv3x3, conv3x3_weight_gradient, reduce_strips};
-
-/// The columns and rows of pixels that one lane of `conv3x3` owns.
-///
-/// On a processor a load costs the most, and a lane's neighbouring columns share theirs; on a GPU neighbouring lanes
-/// read neighbouring pixels, and registers are what a block may fill.
-const CPU_SHAPE: [u32; 2] = [4, 4];
-const GPU_SHAPE: [u32; 2] = [1, 8];
 
 /// The most output channels that one subgroup takes.
 const OUT_BLOCK: u32 = 8;
 
 /// Rows whose pixels make one partial sum of the gradient of the weights.
 const STRIP_ROWS: u32 = 16;
-
-/// The columns and rows of pixels that suit the device.
-pub fn shape(gpu: &Gpu) -> [u32; 2] {
-    if gpu.properties().is_cpu { CPU_SHAPE } else { GPU_SHAPE }
-}
 
 /// What follows the sum of a convolution.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -63,7 +52,7 @@ impl Conv {
         activation: Activation,
         adds: bool,
     ) -> Result<Self> {
-        let [columns, rows] = shape(gpu);
+        let [columns, rows] = conv_shape(gpu);
         let forward = conv3x3::Constants {
             columns,
             rows,

@@ -7,7 +7,7 @@
 //! ```
 //!
 //! Activations are kept for one stage at a time: the backward pass computes those of the earlier stages again, from
-//! their inputs R_k.
+//! their inputs `R_k`.
 
 use glam::UVec2;
 use serde::{Deserialize, Serialize};
@@ -116,12 +116,12 @@ struct Memory {
     norm: NormMemory,
     /// u, (3, H, W).
     update: Buffer<f32>,
-    /// R_1 to R_K, each (3, H, W).
+    /// `R_1` to `R_K`, each (3, H, W).
     denoised: Vec<Buffer<f32>>,
     d_features: Buffer<f32>,
     d_convolved: Buffer<f32>,
     d_update: Buffer<f32>,
-    /// dL/dR_k, by turns, each (3, H, W).
+    /// `dL/dR_k`, by turns, each (3, H, W).
     d_denoised: [Buffer<f32>; 2],
     partials: Buffer<f32>,
 }
@@ -208,7 +208,7 @@ impl Denoiser {
         Ok(())
     }
 
-    /// R_K of the last forward pass, (3, H, W); empty before memory is reserved.
+    /// `R_K` of the last forward pass, (3, H, W), at the beginning of a buffer that is as long as what was reserved.
     pub fn denoised(&self) -> &Buffer<f32> {
         &self.memory.denoised[self.memory.denoised.len() - 1]
     }
@@ -250,7 +250,7 @@ impl Denoiser {
         Ok(())
     }
 
-    /// Records the passes from dL/dR_K back: overwrites the gradients of the parameters, writes `d_noise` and adds to
+    /// Records the passes from `dL/dR_K` back: overwrites the gradients of the parameters, writes `d_noise` and adds to
     /// `d_render`, each (3, H, W). Inputs and parameters are those of the forward pass before it.
     ///
     /// # Errors

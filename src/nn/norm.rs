@@ -1,4 +1,4 @@
-//! Norm, ReLU and shortcut of a repeat: f' = f + relu(gamma (z - mean) / deviation + beta) with statistics of the image.
+//! Norm, `ReLU` and shortcut of a repeat: f' = f + relu(gamma (z - mean) / deviation + beta) with statistics of the image.
 
 use glam::Vec2;
 

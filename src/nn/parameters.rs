@@ -4,7 +4,7 @@ use crate::Result;
 use crate::gpu::{Buffer, Gpu};
 use crate::random::Stream;
 
-/// Where a tensor lies in the array, under its name in PyTorch.
+/// Where a tensor lies in the array, under its name in `PyTorch`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Tensor {
     /// For example `0.conv_in.weight`.

@@ -16,7 +16,7 @@ const STREAM: u64 = 6;
 /// Feature maps of both inner layers.
 const CHANNELS: u32 = 16;
 
-/// conv 3 to 16, ReLU, conv 16 to 16, ReLU, conv 16 to 3, nothing behind it; zero padding 1.
+/// conv 3 to 16, `ReLU`, conv 16 to 16, `ReLU`, conv 16 to 3, nothing behind it; zero padding 1.
 #[derive(Debug)]
 pub struct Tonemapper {
     gpu: Gpu,
@@ -117,7 +117,8 @@ impl Tonemapper {
         lengths(size).into_iter().zip(self.reserved).all(|(needed, held)| needed <= held)
     }
 
-    /// The image of the last forward pass, (3, H, W), not clamped; empty before memory is reserved.
+    /// The image of the last forward pass, (3, H, W), not clamped, at the beginning of a buffer that is as long as what
+    /// was reserved.
     pub fn output(&self) -> &Buffer<f32> {
         &self.memory.output
     }

@@ -66,7 +66,8 @@ pub fn data_gradient(
 /// What the kernel's constant `ACTIVATION` stands for.
 pub fn activate(activation: u32, x: f64) -> f64 {
     match activation {
-        1 => x.max(0.0),
+        // A NaN stays one.
+        1 if x < 0.0 => 0.0,
         2 => 1.0 / (1.0 + (-x).exp()),
         _ => x,
     }

@@ -1,4 +1,6 @@
-//! The norm of one channel in double precision: statistics of the image itself, biased variance, affine, ReLU.
+//! The norm of one channel in double precision: statistics of the image itself, biased variance, affine, `ReLU`.
+
+use super::conv3x3::activate;
 
 /// Mean and 1 / standard deviation.
 #[derive(Clone, Copy, Debug)]
@@ -36,7 +38,7 @@ impl Statistics {
 }
 
 impl Affine {
-    /// gamma n + beta: what the ReLU sees.
+    /// gamma n + beta: what the `ReLU` sees.
     pub fn apply(&self, normalised: f64) -> f64 {
         self.gamma * normalised + self.beta
     }
@@ -50,10 +52,10 @@ pub(super) fn moments(values: &[f64]) -> [f64; 2] {
 
 /// relu(gamma n + beta) of every value of a channel.
 pub fn forward(statistics: Statistics, affine: Affine, z: &[f64]) -> Vec<f64> {
-    z.iter().map(|&z| affine.apply(statistics.normalised(z)).max(0.0)).collect()
+    z.iter().map(|&z| activate(1, affine.apply(statistics.normalised(z)))).collect()
 }
 
-/// The sums over the values of d_y and of d_y n: the gradients of beta and of gamma.
+/// The sums over the values of `d_y` and of `d_y` n: the gradients of beta and of gamma.
 pub fn backward_sums(
     statistics: Statistics,
     affine: Affine,

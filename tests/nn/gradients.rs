@@ -23,11 +23,10 @@ fn check(what: &str, at: &[f64], gradient: &[f64], loss: &dyn Fn(&[f64]) -> f64)
     }
 }
 
-fn check_all(
-    forward: &dyn Fn(&[f64], &[f64], &[f64]) -> Vec<f64>,
-    gradients: &Gradients,
-    [values, first, second, d]: [&[f64]; 4],
-) {
+/// Parameters and two inputs to an output.
+type Forward<'a> = &'a dyn Fn(&[f64], &[f64], &[f64]) -> Vec<f64>;
+
+fn check_all(forward: Forward<'_>, gradients: &Gradients, [values, first, second, d]: [&[f64]; 4]) {
     let loss = |output: Vec<f64>| output.iter().zip(d).map(|(o, d)| o * d).sum::<f64>();
     check("values", values, &gradients.parameters, &|at| loss(forward(at, first, second)));
     check("first", first, &gradients.inputs[0], &|at| loss(forward(values, at, second)));

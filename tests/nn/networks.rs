@@ -153,6 +153,23 @@ fn the_tonemapper_matches_its_reference_forward_and_backward() {
     assert_no_validation_messages();
 }
 
+/// The loss looks at what comes out: a `ReLU` or a clamp that made a number of a NaN would hide it.
+#[test]
+fn a_value_that_is_not_a_number_reaches_the_output() {
+    let gpu = gpu();
+    let settings = DenoiserSettings { stages: 2, repeats: 1, channels: 8 };
+    let size = UVec2::new(21, 9);
+    let [mut first, second, d] = images(size, 9);
+    first[100] = f32::NAN;
+    let mut denoiser = Denoiser::new(&gpu, settings, 1).unwrap();
+    let outcome = run_denoiser(&mut denoiser, size, [&first, &second, &d]);
+    assert!(outcome.output[100].is_nan());
+    let mut tonemapper = Tonemapper::new(&gpu, 1).unwrap();
+    let outcome = run_tonemapper(&mut tonemapper, size, [&first, &second, &d]);
+    assert!(outcome.output[100].is_nan());
+    assert_no_validation_messages();
+}
+
 #[test]
 fn two_runs_give_the_same_bits() {
     let gpu = gpu();

@@ -7,7 +7,7 @@ use crate::cli::bench::check::check;
 use crate::cli::bench::{Bench, Timing};
 use crate::gpu::Threads;
 use crate::kernels::*;
-use crate::nn;
+use crate::nn::conv_shape;
 use crate::random::Stream;
 
 /// So small that the references keep up.
@@ -41,7 +41,7 @@ fn convolve(
     values: &[f32],
     source: &[f32],
 ) -> anyhow::Result<Vec<f32>> {
-    let [columns, rows] = nn::shape(&bench.gpu);
+    let [columns, rows] = conv_shape(&bench.gpu);
     let constants = conv3x3::Constants { columns, rows, ..Default::default() };
     let (values, source) = (values.to_vec(), source.to_vec());
     let target = vec![0.0_f32; source.len()];
