@@ -80,7 +80,7 @@ impl Trainer {
     /// The configuration makes no sense, or the device is out of memory or lost.
     pub fn new(gpu: &Gpu, config: TrainConfig, dataset: &Dataset) -> Result<Self> {
         config.check()?;
-        let mut pseudo_gt = PseudoGt::new(gpu, config.tone)?;
+        let mut pseudo_gt = PseudoGt::new(gpu, &config.tone)?;
         let views = Views::upload(gpu, &mut pseudo_gt, dataset)?;
         let gaussians = views.initial_gaussians(gpu, &pseudo_gt, dataset, &config)?;
         let settings = RenderSettings { sh_degree: config.sh_degree, ..RenderSettings::default() };
@@ -93,7 +93,7 @@ impl Trainer {
             views,
             model: Model::upload(gpu, &gaussians)?,
             renderer: Renderer::new(gpu, settings)?,
-            loss: Loss::new(gpu, config.tone.curve.constant(), config.ssim_weight, &sizes)?,
+            loss: Loss::new(gpu, config.tone.loss_curve(), config.ssim_weight, &sizes)?,
             adam: Adam::new(gpu)?,
             densifier: Densifier::new(gpu, density(&config, dataset.extent()))?,
             d_render: gpu.uninit("d_render", 3 * pixels.unwrap_or_default())?,
@@ -213,7 +213,7 @@ impl Trainer {
         let (render, status) = self.renderer.render_and_status();
         self.loss.record(
             pass,
-            LossInputs { size, render, low: &view.image, tone: &view.tone },
+            LossInputs { size, render, low: view.loss_input(), tone: &view.tone },
             &mut self.d_render,
             LossLog { log: &mut self.log, slot, status, not_finite_flag: Status::NOT_FINITE },
         )?;

@@ -13,7 +13,8 @@ use nightsplat::reference::tone::{CURVE_AP3, CURVE_ASE, CURVE_NONE};
 
 const SIZES: [[u32; 2]; 8] =
     [[1, 1], [3, 1], [1, 40], [5, 7], [17, 33], [16, 64], [33, 65], [131, 97]];
-const TONE: ToneParameters = ToneParameters { white: 0.12, offset: 0.05, gain: 1.07 };
+const TONE: ToneParameters =
+    ToneParameters { white: 0.12, offset: 0.05, gain: 1.07, constants: [0.0; 8] };
 const NOT_FINITE: u32 = 2;
 
 /// A dark photograph and a render that is off by a texture and by noise.

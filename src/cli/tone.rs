@@ -12,7 +12,7 @@ use crate::gpu::{Buffer, DeviceChoice, Gpu};
 use crate::image::Image;
 use crate::kernels::ToneParameters;
 use crate::pseudo_gt::PseudoGt;
-use crate::tone::{ToneCurve, ToneSettings};
+use crate::tone::{CurveChoice, ToneSettings};
 use crate::{Error, Result};
 
 /// Apply a tone curve to a photograph or to a folder of them.
@@ -20,9 +20,9 @@ use crate::{Error, Result};
 pub struct ToneArgs {
     /// A photograph (PNG, JPEG or EXR), or a folder of them.
     pub input: PathBuf,
-    /// The curve: linear, ase, ap3 or none.
-    #[arg(long)]
-    pub curve: ToneCurve,
+    /// The curve: a name that `nightsplat curves` lists, or a .toml, .csv or .cube file
+    #[arg(long, value_name = "NAME|FILE")]
+    pub curve: CurveChoice,
     /// The folder to write to; made if it does not exist. Images of the same names are replaced.
     #[arg(long)]
     pub out: PathBuf,
@@ -101,7 +101,7 @@ pub fn run(args: ToneArgs) -> Result<()> {
 /// would be written to one file; [`Error::Output`] where a file cannot be written or a photograph would be replaced;
 /// those of the device.
 pub fn apply(args: &ToneArgs) -> Result<BTreeMap<String, ToneReport>> {
-    let mut settings = ToneSettings::new(args.curve);
+    let mut settings = args.curve.settings()?;
     settings.theta = args.theta;
     settings.gain_c = args.gain.unwrap_or(settings.gain_c);
     settings.check()?;
@@ -194,7 +194,7 @@ impl Mapper {
     fn new(gpu: &Gpu, settings: ToneSettings) -> Result<Self> {
         Ok(Self {
             gpu: gpu.clone(),
-            pseudo_gt: PseudoGt::new(gpu, settings)?,
+            pseudo_gt: PseudoGt::new(gpu, &settings)?,
             parameters: gpu.uninit("tone parameters", 1)?,
         })
     }

@@ -12,6 +12,7 @@ use crate::kernels::ToneParameters;
 use crate::pseudo_gt::PseudoGt;
 use crate::random::Stream;
 use crate::scene::{Gaussians, init};
+use crate::tone::{Statistics, ToneCurve, ToneSettings};
 
 /// One training view.
 #[derive(Debug)]
@@ -22,7 +23,9 @@ pub(super) struct TrainView {
     pub(super) camera: Camera,
     /// The dark photograph, planar (3, H, W), sRGB-encoded.
     pub(super) image: Buffer<f32>,
-    /// The curve that its statistics give; one element.
+    /// The target, where the loss does not evaluate the curve.
+    baked: Option<Buffer<f32>>,
+    /// The curve that its statistics give; one element. Of a baked target none.
     pub(super) tone: Buffer<ToneParameters>,
 }
 
@@ -33,7 +36,7 @@ pub(super) struct Views(Vec<TrainView>);
 impl Views {
     /// Uploads every training photograph and takes its statistics once.
     pub(super) fn upload(gpu: &Gpu, pseudo_gt: &mut PseudoGt, dataset: &Dataset) -> Result<Self> {
-        let mut views = vec![];
+        let (mut views, mut statistics) = (vec![], vec![]);
         for (index, view) in dataset.views.iter().enumerate() {
             let Some(image) = view.image.as_ref().filter(|_| view.is_train()) else { continue };
             let pixels = gpu.buffer("low", &image.data)?;
@@ -42,7 +45,20 @@ impl Views {
                 pseudo_gt.statistics(pass, &pixels, [image.width, image.height], &mut tone, 0)
             })?;
             let (name, camera) = (view.name.clone(), view.camera);
-            views.push(TrainView { name, index, camera, image: pixels, tone });
+            statistics.push(pseudo_gt.measured()?);
+            views.push(TrainView { name, index, camera, image: pixels, baked: None, tone });
+        }
+        let settings = pseudo_gt.settings();
+        if let Some(scene) = Statistics::mean_of(&statistics).filter(|_| settings.scene_statistics) {
+            let parameters = settings.parameters(&scene);
+            for view in &mut views {
+                gpu.write(&mut view.tone, &[parameters])?;
+            }
+        }
+        if settings.needs_baking() {
+            for view in &mut views {
+                view.bake(gpu, pseudo_gt)?;
+            }
         }
         Ok(Self(views))
     }
@@ -102,11 +118,30 @@ impl Views {
 }
 
 impl TrainView {
-    /// The pseudo-GT of the view.
-    fn target(&self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<Image> {
+    /// What the loss applies its curve to.
+    pub(super) fn loss_input(&self) -> &Buffer<f32> {
+        self.baked.as_ref().unwrap_or(&self.image)
+    }
+
+    /// Makes the target now, in place of the loss kernels.
+    fn bake(&mut self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<()> {
+        self.baked = Some(self.mapped(gpu, pseudo_gt)?);
+        gpu.write(&mut self.tone, &[ToneSettings::new(ToneCurve::None).parameters(&Statistics::default())])
+    }
+
+    fn mapped(&self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<Buffer<f32>> {
         let mut target = gpu.uninit("target", self.image.len())?;
         gpu.run("target", |pass| pseudo_gt.map(pass, &self.image, &self.tone, 0, &mut target))?;
+        Ok(target)
+    }
+
+    /// The pseudo-GT of the view.
+    fn target(&self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<Image> {
+        let data = match &self.baked {
+            Some(target) => gpu.read(target)?,
+            None => gpu.read(&self.mapped(gpu, pseudo_gt)?)?,
+        };
         let Camera { width, height, .. } = self.camera;
-        Ok(Image { width, height, data: gpu.read(&target)? })
+        Ok(Image { width, height, data })
     }
 }
