@@ -171,6 +171,16 @@ fn ulps(found: f32, exact: f64) -> f64 {
     (f64::from(found) - exact).abs() / ulp
 }
 
+/// What exp, pow and cancellation may cost beyond 4 ulp: 4 ulp of one, and of tiny values, which the series keep,
+/// a few parts in a million. The terms of the polynomial of degree 5 reach 30 where their sum is 1.
+fn bound(family: &Family, t: f32, exact: f64) -> f64 {
+    match family.curve {
+        ToneCurve::Poly5Origin => 4e-6,
+        _ if t < 0.005 => 4e-6 * exact,
+        _ => 4.8e-7,
+    }
+}
+
 #[test]
 fn the_device_follows_every_family_in_double_precision() {
     let gpu = gpu();
@@ -185,19 +195,121 @@ fn the_device_follows_every_family_in_double_precision() {
         for (offset, gain) in [(0.0, 1.0), (0.0754, 1.16)] {
             let tone = ToneParameters { white: 1.0, offset, gain, constants: padded };
             let [found, host] = on_device(&gpu, family.curve, &grid, tone);
-            let [mut worst, mut worst_host] = [(0.0, 0.0); 2];
+            let mut worst = 0.0_f64;
             for ((&t, found), host) in grid.iter().zip(found).zip(host) {
                 let exact = family.curve.value(t.into(), offset.into(), gain.into(), &rounded);
-                for (worst, found) in [(&mut worst, found), (&mut worst_host, host)] {
-                    let error = ulps(found, exact);
-                    assert!(error.is_finite(), "{}({t}) = {found}", family.name);
-                    if error > worst.0 {
-                        *worst = (error, f64::from(t));
-                    }
+                for found in [found, host] {
+                    let error = (f64::from(found) - exact).abs();
+                    worst = worst.max(error);
+                    assert!(
+                        ulps(found, exact) <= 4.0 || error <= bound(family, t, exact),
+                        "{}({t}) = {found}, not {exact}",
+                        family.name
+                    );
                 }
             }
-            println!("{}: device {worst:?} ulp, host {worst_host:?} ulp", family.name);
+            println!("{}: off by {worst:.1e} at most", family.name);
         }
     }
     assert_no_validation_messages();
+}
+
+/// A photograph of 8-bit noise that crowds near black.
+fn photograph(pixels: usize) -> Vec<f32> {
+    let mut state = 5_u64;
+    let mut noise = move || {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (state >> 40) as f32 / (1_u64 << 24) as f32
+    };
+    (0..3 * pixels).map(|_| (noise().powi(3) * 255.0).round() / 255.0).collect()
+}
+
+#[test]
+fn tone_mix_matches_its_reference() {
+    let gpu = gpu();
+    for pixels in [1, 255, 1001] {
+        let mut image = photograph(pixels);
+        image[0] = f32::NAN;
+        image[pixels - 1] = 0.0;
+        for curve in [ToneCurve::LumPreserve, ToneCurve::PerChannel] {
+            let constants = tone_mix::Constants { tone_curve: curve.constant() };
+            let params = tone_mix::Params { pixel_count: pixels as u32, view: 0 };
+            let whites = [0.2, 0.3, 0.4, 0.0, 0.0, 0.0, 0.0, 0.0];
+            let tone = ToneParameters { white: 1.0, offset: 0.0, gain: 3.0, constants: whites };
+            let mut expected = vec![0.0; 3 * pixels];
+            let slices =
+                tone_mix::Slices { image: &image, parameters: &[tone], target: &mut expected };
+            tone_mix::Kernel::run(&params, &constants, slices);
+            let mut target = gpu.zeros("target", expected.len()).unwrap();
+            let buffers = tone_mix::Buffers {
+                image: &gpu.buffer("image", &image).unwrap(),
+                parameters: &gpu.buffer("parameters", &[tone]).unwrap(),
+                target: &mut target,
+            };
+            let pipeline = gpu.pipeline::<tone_mix::Kernel>(&constants).unwrap();
+            let threads = Threads::Exactly([pixels as u32, 1, 1]);
+            gpu.run("tone_mix", |pass| pass.dispatch(&pipeline, &params, buffers, threads)).unwrap();
+            for (found, expected) in gpu.read(&target).unwrap().into_iter().zip(expected) {
+                assert!((found - expected).abs() <= 1e-6, "{curve}: {found}, not {expected}");
+            }
+        }
+    }
+    assert_no_validation_messages();
+}
+
+fn table() -> Table {
+    Table {
+        input: TableInput::T,
+        x: vec![0.0, 0.1, 0.5, 0.6, 1.0, 2.5],
+        y: vec![vec![0.0, 0.3, 0.5, 0.5, 0.8, 1.0], vec![0.1; 6], vec![1.0, 0.9, 0.3, 0.2, 0.1, 0.0]],
+    }
+}
+
+#[test]
+fn tone_table_matches_its_reference_and_double_precision() {
+    let gpu = gpu();
+    let (table, pixels) = (table(), 1003);
+    let mut image = photograph(pixels);
+    image[..6].copy_from_slice(&[f32::NAN, -1.0, 0.0, 0.4, f32::INFINITY, 0.04]);
+    let tone = ToneParameters { white: 0.4, offset: 0.0, gain: 1.0, constants: [0.0; 8] };
+    let knots: Vec<glam::Vec3> = table.knots();
+    let params = tone_table::Params { pixel_count: pixels as u32, view: 0, knot_count: 6 };
+    let mut expected = vec![0.0; 3 * pixels];
+    let slices = tone_table::Slices {
+        image: &image,
+        parameters: &[tone],
+        knots: &knots,
+        target: &mut expected,
+    };
+    tone_table::Kernel::run(&params, &tone_table::Constants::default(), slices);
+    let mut target = gpu.zeros("target", expected.len()).unwrap();
+    let buffers = tone_table::Buffers {
+        image: &gpu.buffer("image", &image).unwrap(),
+        parameters: &gpu.buffer("parameters", &[tone]).unwrap(),
+        knots: &gpu.buffer("knots", &knots).unwrap(),
+        target: &mut target,
+    };
+    let pipeline = gpu.pipeline::<tone_table::Kernel>(&tone_table::Constants::default()).unwrap();
+    let threads = Threads::Exactly([3 * pixels as u32, 1, 1]);
+    gpu.run("tone_table", |pass| pass.dispatch(&pipeline, &params, buffers, threads)).unwrap();
+    for (i, found) in gpu.read(&target).unwrap().into_iter().enumerate() {
+        let exact = table.value(f64::from(image[i]) / 0.4, i / pixels);
+        assert!((found - expected[i]).abs() <= 1e-6, "{i}: {found}, not {}", expected[i]);
+        assert!((f64::from(found) - exact).abs() <= 1e-6, "{i}: {found}, not {exact}");
+    }
+    assert_no_validation_messages();
+}
+
+#[test]
+fn a_table_goes_through_its_knots_and_rises_where_they_do() {
+    let table = table();
+    for channel in 0..3 {
+        for (x, y) in table.x.iter().zip(&table.y[channel]) {
+            assert!((table.value(*x, channel) - y).abs() < 1e-12);
+        }
+    }
+    let values: Vec<f64> = (0..=2600).map(|i| table.value(f64::from(i) / 1000.0, 0)).collect();
+    assert!(values.windows(2).all(|pair| pair[1] >= pair[0] - 1e-12), "it overshoots");
+    assert_eq!(table.value(9.0, 0), 1.0);
+    assert_eq!(table.value(f64::NAN, 0), 0.0);
 }

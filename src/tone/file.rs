@@ -1,5 +1,6 @@
 //! Curves from files: settings in TOML, tables in CSV or .cube.
 
+use std::fmt;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
@@ -31,6 +32,15 @@ impl FromStr for CurveChoice {
             )),
             Ok(curve) => Ok(Self::Named(curve)),
             Err(error) => Err(Error::Usage(format!("{error}, or a .toml, .csv or .cube file"))),
+        }
+    }
+}
+
+impl fmt::Display for CurveChoice {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Named(curve) => curve.fmt(f),
+            Self::File(path) => f.pad(&path.file_stem().unwrap_or_default().to_string_lossy()),
         }
     }
 }

@@ -181,6 +181,27 @@ impl ToneSettings {
         }
     }
 
+    /// The curve at t = x / p90, in [0, 1], for a photograph with these statistics; of a table of three channels green.
+    /// `lum_preserve` and `per_channel` are shown as they map grey.
+    pub fn value(&self, t: f64, statistics: &Statistics) -> f64 {
+        let ToneParameters { mut white, offset, gain, .. } = self.parameters(statistics);
+        if self.white() == White::ChannelMeans {
+            white = (f64::from(statistics.mean) + EPSILON) as f32 / self.theta as f32;
+        }
+        let t = t * f64::from(statistics.p90) / f64::from(white);
+        match &self.table {
+            Some(table) => table.value(t, 1),
+            None => self.curve.value(t, offset.into(), gain.into(), &self.constants),
+        }
+    }
+
+    /// Statistics that leave a curve as its formula has it: no black level, gain 1, and t = 1 where it has white.
+    pub fn plain_statistics(&self) -> Statistics {
+        let theta = self.theta as f32;
+        let means = Statistics { mean: theta, channel_means: [theta; 3], ..Statistics::default() };
+        Statistics { p10: 1.0, p80: theta, p90: 1.0, ..means }
+    }
+
     /// Whether the target is made once, at upload, instead of in the loss kernels: tables, and curves whose channels
     /// depend on each other.
     pub fn needs_baking(&self) -> bool {

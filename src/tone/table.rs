@@ -125,7 +125,7 @@ impl Table {
     }
 
     /// (3, K) knots (x, y, slope) as the kernel takes them.
-    pub(crate) fn knots(&self) -> Vec<Vec3> {
+    pub fn knots(&self) -> Vec<Vec3> {
         let channels = (0..3).map(|channel| self.channel(channel));
         channels.flatten().map(|[x, y, slope]| Vec3::new(x as f32, y as f32, slope as f32)).collect()
     }
