@@ -289,13 +289,15 @@ fn from_exr(path: &Path, bytes: Vec<u8>) -> Result<(Image, Vec<usize>)> {
                 "this EXR file has subsampled channels; save it as plain RGB",
             ));
         }
-        data.extend(channel.sample_data.values_as_f32().zip(&mut is_gap).map(|(linear, is_gap)| {
-            *is_gap |= !linear.is_finite();
-            // Positive phrasing: a NaN fails the test too.
-            let usable = linear >= 0.0 && linear.is_finite();
-            replaced += usize::from(!usable);
-            if usable { srgb_from_linear(linear) } else { 0.0 }
-        }));
+        data.extend(channel.sample_data.values_as_f32().zip(&mut is_gap).map(
+            |(linear, is_gap)| {
+                *is_gap |= !linear.is_finite();
+                // Positive phrasing: a NaN fails the test too.
+                let usable = linear >= 0.0 && linear.is_finite();
+                replaced += usize::from(!usable);
+                if usable { srgb_from_linear(linear) } else { 0.0 }
+            },
+        ));
     }
     if replaced > 0 {
         tracing::warn!(

@@ -15,6 +15,7 @@
 //! one photograph, or the means over a scene's, see [`Statistics`]. [`FAMILIES`] is the table of all curves; a [`Table`]
 //! of values from a file is a curve too.
 
+mod catalogue;
 mod families;
 mod file;
 mod settings;
@@ -24,7 +25,8 @@ mod table;
 use std::fmt;
 use std::str::FromStr;
 
-pub use self::families::{Constant, FAMILIES, Family, Law, ToneCurve, White};
+pub use self::catalogue::FAMILIES;
+pub use self::families::{Constant, Family, Law, ToneCurve, White};
 pub use self::file::CurveChoice;
 pub use self::settings::ToneSettings;
 pub(crate) use self::statistics::Rank;

@@ -19,7 +19,10 @@ fn load(name: &str, text: &str) -> Result<ToneSettings, Error> {
 #[test]
 fn a_family_with_its_own_constants_is_read_from_toml() {
     let settings = load("my.toml", "family = \"gamma\"\n[constants]\na = 0.9\nb = 0.4\n").unwrap();
-    assert_eq!((settings.curve, settings.constants.as_slice()), (ToneCurve::Gamma, &[0.9, 0.4][..]));
+    assert_eq!(
+        (settings.curve, settings.constants.as_slice()),
+        (ToneCurve::Gamma, &[0.9, 0.4][..])
+    );
     assert_eq!([settings.alpha, settings.gain_c], [0.0, 0.0]);
     let cubic = "curve = \"cubic\"\nalpha = 0.1\nconstants = { a = 0.1, b = -0.5, c = 1, d = 0.0 }";
     let settings = load("c.toml", cubic).unwrap();
@@ -72,9 +75,17 @@ fn what_is_wrong_with_a_file_is_named() {
     let wrong = [
         ("a.toml", "curve = \"gama\"", "unknown curve `gama`"),
         ("a.toml", "curve = \"gamma\"\nconstants = { a = 1.0 }", "needs the constant `b`"),
-        ("a.toml", "curve = \"gamma\"\nconstants = { a = 1.0, b = 1.0, q = 1.0 }", "no constant `q`"),
+        (
+            "a.toml",
+            "curve = \"gamma\"\nconstants = { a = 1.0, b = 1.0, q = 1.0 }",
+            "no constant `q`",
+        ),
         ("a.toml", "curve = \"gamma\"\nconstants = { a = inf, b = 1.0 }", "constant a of `gamma`"),
-        ("a.toml", "curve = \"reinhard\"\nconstants = { a = 1.0, b = -0.5 }", "undefined at t = 0.5"),
+        (
+            "a.toml",
+            "curve = \"reinhard\"\nconstants = { a = 1.0, b = -0.5 }",
+            "undefined at t = 0.5",
+        ),
         ("a.toml", "gain_c = 1.0", "names no curve"),
         ("a.toml", "curve = \"ap3\"\ngain = 1.0", "unknown field `gain`"),
         ("a.toml", "curve = \"table\"", "needs a file of values"),

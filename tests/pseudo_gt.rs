@@ -77,8 +77,7 @@ fn luminance_matches_the_reference() {
         image[pixels / 2] = -0.5;
         image[2 * pixels] = f32::INFINITY;
         for thread_count in [1024, 2048] {
-            let params =
-                luminance::Params {
+            let params = luminance::Params {
                 ranks: [0, 1, 2, 3],
                 pixel_count: pixels as u32,
                 thread_count,

@@ -13,8 +13,7 @@ use nightsplat::image::Image;
 use nightsplat::tone::{Statistics, ToneCurve, ToneParameters, ToneSettings, percentile};
 
 /// The paper's curves and none: what the loss evaluates without a detour.
-const PAPER: [ToneCurve; 4] =
-    [ToneCurve::Linear, ToneCurve::Ase, ToneCurve::Ap3, ToneCurve::None];
+const PAPER: [ToneCurve; 4] = [ToneCurve::Linear, ToneCurve::Ase, ToneCurve::Ap3, ToneCurve::None];
 
 /// Chair, sofa and shrub of LOM, or a note that they are absent.
 fn lom() -> Option<PathBuf> {
@@ -282,9 +281,9 @@ fn the_training_photographs_have_the_paper_s_statistics() {
         let mut mean = [0.0; 4];
         for name in &names {
             let statistics = Statistics::of(&load(&lom.join(scene).join("low").join(name)));
-            let ratio = statistics.ratio();
+            let ratio = statistics.printed_ratio();
             let values = [
-                statistics.p90.into(),
+                statistics.percentiles()[1],
                 ratio,
                 settings.offset(ratio),
                 statistics.mean_luminance.into(),

@@ -24,7 +24,12 @@ pub struct CurvesArgs {
     #[arg(long)]
     pub table: bool,
     /// The values of t = x / p90 that --table prints
-    #[arg(long, value_name = "T,..", value_delimiter = ',', default_values_t = [0.05, 0.1, 0.25, 0.5, 1.0, 1.5, 2.0, 3.0])]
+    #[arg(
+        long,
+        value_name = "T,..",
+        value_delimiter = ',',
+        default_values_t = [0.05, 0.1, 0.25, 0.5, 1.0, 1.5, 2.0, 3.0]
+    )]
     pub at: Vec<f64>,
     /// A dataset: its mean statistics give the curves black level and gain, and are marked on the plot
     #[arg(long, value_name = "DIR")]
@@ -40,8 +45,18 @@ struct Curve {
 /// Lists, prints or plots.
 ///
 /// # Errors
-/// A file cannot be read or written, or a value of t makes no sense.
+/// As [`text`], or standard output cannot be written to.
 pub fn run(args: &CurvesArgs) -> Result<()> {
+    write!(std::io::stdout().lock(), "{}", text(args)?)
+        .map_err(|error| Error::output("standard output", error.to_string()))
+}
+
+/// What the command prints; the plot is written.
+///
+/// # Errors
+/// A file cannot be read or written, or a value of t makes no sense.
+pub fn text(args: &CurvesArgs) -> Result<String> {
+    // Positive phrasing: a NaN fails the test too.
     if let Some(t) = args.at.iter().find(|&&t| !(t >= 0.0)) {
         return Err(Error::Usage(format!("--at {t}: t must be 0 or more")));
     }
@@ -59,16 +74,14 @@ pub fn run(args: &CurvesArgs) -> Result<()> {
     if !args.table && args.plot.is_none() {
         text = listing(&curves);
     }
-    write!(std::io::stdout().lock(), "{text}")
-        .map_err(|error| Error::output("standard output", error.to_string()))
+    Ok(text)
 }
 
 fn chosen(choices: &[CurveChoice]) -> Result<Vec<Curve>> {
     let all: Vec<CurveChoice> = ToneCurve::ALL.map(CurveChoice::Named).to_vec();
     let choices = if choices.is_empty() { &all } else { choices };
-    let curve = |choice: &CurveChoice| {
-        Ok(Curve { name: choice.to_string(), settings: choice.settings()? })
-    };
+    let curve =
+        |choice: &CurveChoice| Ok(Curve { name: choice.to_string(), settings: choice.settings()? });
     choices.iter().map(curve).collect()
 }
 
@@ -76,7 +89,8 @@ fn chosen(choices: &[CurveChoice]) -> Result<Vec<Curve>> {
 fn scene_statistics(root: &std::path::Path) -> Result<Statistics> {
     let photographs = Dataset::photographs(root, &LoadOptions::default())?;
     let training = photographs.iter().filter(|photograph| photograph.split == Split::Train);
-    let statistics = training.map(|photograph| Ok(Statistics::of(&Image::load(&photograph.input)?.data)));
+    let statistics =
+        training.map(|photograph| Ok(Statistics::of(&Image::load(&photograph.input)?.data)));
     let statistics = statistics.collect::<Result<Vec<_>>>()?;
     Statistics::mean_of(&statistics)
         .ok_or_else(|| Error::input(root, "has no training photograph to take statistics of"))
@@ -91,7 +105,8 @@ fn listing(curves: &[Curve]) -> String {
             text += &format!("{name}\n    a table of values, monotone cubics between them\n");
             continue;
         }
-        let also = if aliases.is_empty() { String::new() } else { format!(" ({})", aliases.join(", ")) };
+        let also =
+            if aliases.is_empty() { String::new() } else { format!(" ({})", aliases.join(", ")) };
         let rises = if *monotone { "monotone" } else { "not monotone" };
         let clips = if *bounded { "bounded" } else { "clips" };
         text += &format!("{name}{also}\n    {formula}\n");
@@ -104,7 +119,8 @@ fn listing(curves: &[Curve]) -> String {
         text += &format!("    {rises}, {clips}; {source}\n");
     }
     if curves.len() == FAMILIES.len() {
-        text += "\nt = x / p90, Y the mean luminance, delta0 = alpha (1 - p10 / p90)^beta; every curve is clamped to [0, 1].\n";
+        text += "\nt = x / p90, Y the mean luminance, delta0 = alpha (1 - p10 / p90)^beta.\n\
+                 Every curve is clamped to [0, 1].\n";
     }
     text
 }

@@ -65,11 +65,11 @@ pub struct ToneArgs {
 /// What is measured of a photograph or of what a curve made of it, on sRGB-encoded values.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct Measures {
-    /// The 10th percentile of the luminance, plus 1e-6.
+    /// The 10th percentile of the luminance.
     pub p10: f64,
-    /// The 90th percentile of the luminance, plus 1e-6.
+    /// The 90th percentile of the luminance.
     pub p90: f64,
-    /// p10 / p90.
+    /// p10 / p90; 1 where all is black.
     pub r: f64,
     /// The mean of the luminance.
     pub mean_luminance: f64,
@@ -114,10 +114,11 @@ impl Measures {
         let mut distribution = Distribution::new("");
         distribution.add(planes);
         let clipped = planes.iter().filter(|&&value| value >= 1.0).count();
+        let [p10, p90] = statistics.percentiles();
         Self {
-            p10: statistics.p10.into(),
-            p90: statistics.p90.into(),
-            r: statistics.ratio(),
+            p10,
+            p90,
+            r: statistics.printed_ratio(),
             mean_luminance: statistics.mean_luminance.into(),
             mean: statistics.mean.into(),
             clipped_fraction: clipped as f64 / planes.len().max(1) as f64,
@@ -161,7 +162,8 @@ fn text_table(output: &ToneOutput) -> String {
     let views = output.views.iter().map(|(name, report)| (name.as_str(), report));
     for (name, report) in views.chain([("scene", &output.scene)]) {
         let ToneReport { before, delta0, after, scores, .. } = report;
-        let score = |value: fn(&Scores) -> String| scores.as_ref().map_or_else(|| "-".to_owned(), value);
+        let score =
+            |value: fn(&Scores) -> String| scores.as_ref().map_or_else(|| "-".to_owned(), value);
         rows.push(vec![
             name.to_owned(),
             format!("{:.4}", before.p10),
@@ -200,7 +202,7 @@ pub fn apply(args: &ToneArgs) -> Result<ToneOutput> {
     let mut mapper = Mapper::new(&gpu, &settings)?;
     let mut page = args.report.as_ref().map(|_| Page::new(&gpu, args, &photographs)).transpose()?;
     if settings.scene_statistics {
-        let scene = scene_statistics(&mut mapper, &photographs)?;
+        let scene = scene_statistics(&photographs)?;
         mapper.set_scene(&scene);
         if let Some(page) = &mut page {
             page.set_scene(&scene);
@@ -292,11 +294,12 @@ impl Mapped {
             }
             Scores::of(image, reference)
         });
-        let alpha = if settings.alpha > 0.0 { settings.alpha } else { ToneSettings::default().alpha };
+        let alpha =
+            if settings.alpha > 0.0 { settings.alpha } else { ToneSettings::default().alpha };
         let black_level = ToneSettings { alpha, ..settings.clone() };
         Ok(ToneReport {
             before: Measures::of(&usable, statistics),
-            delta0: black_level.offset(statistics.ratio()),
+            delta0: black_level.offset(statistics.printed_ratio()),
             unusable_pixels: gaps.len(),
             after: Measures::of(&result, &Statistics::of(&result)),
             scores: scores.transpose()?,
@@ -315,11 +318,11 @@ fn without<'a>(image: &'a Image, gaps: &[usize]) -> std::borrow::Cow<'a, [f32]> 
 }
 
 /// The means over the training photographs.
-fn scene_statistics(mapper: &mut Mapper, photographs: &[Listed]) -> Result<Statistics> {
+fn scene_statistics(photographs: &[Listed]) -> Result<Statistics> {
     let mut statistics = vec![];
     for listed in photographs.iter().filter(|listed| listed.split != Some(Split::Test)) {
         let (image, gaps) = Image::load_with_gaps(&listed.input)?;
-        statistics.push(mapper.statistics(&without(&image, &gaps))?);
+        statistics.push(Statistics::of(&without(&image, &gaps)));
     }
     Statistics::mean_of(&statistics).ok_or_else(|| {
         Error::Usage("--scene-statistics needs training photographs; there are none".to_owned())

@@ -59,3 +59,20 @@ fn is_whole(bytes: &[u8]) -> bool {
     }
     false
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_damaged_jpeg_is_refused_by_name() {
+        let path = Path::new("photo.jpg");
+        // Start and end of an image with nothing between, and a frame header of no size.
+        let empty = [0xFF, 0xD8, 0xFF, 0xD9];
+        let no_size = [0xFF, 0xD8, 0xFF, 0xC0, 0, 11, 8, 0, 0, 0, 0, 1, 1, 0x11, 0, 0xFF, 0xD9];
+        for bytes in [&empty[..], &no_size] {
+            let message = load(path, bytes).unwrap_err().to_string();
+            assert!(message.contains("photo.jpg") && message.contains("damaged"), "{message}");
+        }
+    }
+}

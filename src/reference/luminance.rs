@@ -8,7 +8,8 @@ use crate::kernels::luminance::{Constants, Kernel, Params, Slices};
 impl Reference for Kernel {
     fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
         let Slices { image, luminances, sums, searches, histograms } = slices;
-        for (search, rank) in searches[params.first_search as usize..].iter_mut().zip(params.ranks) {
+        for (search, rank) in searches[params.first_search as usize..].iter_mut().zip(params.ranks)
+        {
             *search = RankSearch { prefix: 0, rank, histogram: 0 };
         }
         let pixel_count = params.pixel_count as usize;

@@ -184,8 +184,7 @@ impl Real for Dual {
     fn power(self, p: Self) -> Self {
         if self.value > 0.0 {
             let value = self.value.powf(p.value);
-            let relative =
-                p.value * self.derivative / self.value + self.value.ln() * p.derivative;
+            let relative = p.value * self.derivative / self.value + self.value.ln() * p.derivative;
             Self { value, derivative: value * relative }
         } else {
             Self::of(0.0)

@@ -23,8 +23,7 @@ pub fn curve_at<T: Real>(curve: u32, t: T, [offset, gain]: [T; 2], c: &[T; MAX_C
         CURVE_TANH => offset + (one - offset) * (gain * within(t)).tanh(),
         CURVE_ASE_FLOOR => {
             let (t, share, white) = (within(t), c[0], gain.one_minus_exp());
-            let scale =
-                (one - offset) * white / ((one - share) * white + share + T::of(1e-8));
+            let scale = (one - offset) * white / ((one - share) * white + share + T::of(1e-8));
             offset + scale * ((one - share) * (gain * t).one_minus_exp() + share * t)
         }
         _ => offset + gain * curve_shape(curve, within(t), c),

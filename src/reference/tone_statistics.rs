@@ -1,8 +1,6 @@
 use super::CompensatedSum;
 use super::real::Real;
-use super::tone::{
-    CURVE_LINEAR, CURVE_LUM_PRESERVE, CURVE_NONE, CURVE_P80, CURVE_PER_CHANNEL,
-};
+use super::tone::{CURVE_LINEAR, CURVE_LUM_PRESERVE, CURVE_NONE, CURVE_P80, CURVE_PER_CHANNEL};
 use crate::gpu::Reference;
 use crate::kernels::tone_statistics::{Constants, Kernel, Params, Slices};
 use crate::kernels::{ToneParameters, ToneStatistics};

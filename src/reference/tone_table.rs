@@ -33,7 +33,8 @@ impl Reference for Kernel {
         let knots: Vec<[f32; 3]> = knots.iter().map(|knot| knot.to_array()).collect();
         for i in 0..3 * params.pixel_count as usize {
             let channel = i / params.pixel_count as usize;
-            let of_channel = &knots[channel * params.knot_count as usize..][..params.knot_count as usize];
+            let of_channel =
+                &knots[channel * params.knot_count as usize..][..params.knot_count as usize];
             target[i] = clamped(interpolate(of_channel, image[i] / white));
         }
     }

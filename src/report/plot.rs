@@ -33,7 +33,8 @@ const BOTTOM: f64 = 34.0;
 /// The colours that the page's style defines.
 const COLORS: usize = 5;
 /// How lines of one colour differ.
-const DASHES: [&str; 4] = ["", " stroke-dasharray=\"7 3\"", " stroke-dasharray=\"2 3\"", " stroke-dasharray=\"9 3 2 3\""];
+const DASHES: [&str; 4] =
+    ["", " stroke-dasharray=\"7 3\"", " stroke-dasharray=\"2 3\"", " stroke-dasharray=\"9 3 2 3\""];
 
 /// Draws `y_name` against `x_name` (loss or PSNR against the step, say); the colours are those of the page's style.
 pub fn plot(x_name: &str, y_name: &str, series: &[Series]) -> String {
@@ -53,7 +54,7 @@ pub fn plot_with_marks(x_name: &str, y_name: &str, series: &[Series], marks: &[M
     let mut svg = format!(
         "<svg viewBox=\"0 {} {WIDTH} {}\" role=\"img\" aria-label=\"{} against {}\" \
          font-size=\"12\" fill=\"var(--quiet)\">\n",
-        -legend_height,
+        0.0 - legend_height,
         HEIGHT + legend_height,
         escape(y_name),
         escape(x_name)
@@ -87,7 +88,8 @@ pub fn plot_with_marks(x_name: &str, y_name: &str, series: &[Series], marks: &[M
         escape(x_name),
         escape(y_name)
     );
-    for Mark { x, name } in marks.iter().filter(|mark| (x_axis.low..=x_axis.high).contains(&mark.x)) {
+    for Mark { x, name } in marks.iter().filter(|mark| (x_axis.low..=x_axis.high).contains(&mark.x))
+    {
         let x = x_axis.place(*x);
         let (bottom, below) = (HEIGHT - BOTTOM, TOP + 12.0);
         let _ = writeln!(
@@ -98,7 +100,9 @@ pub fn plot_with_marks(x_name: &str, y_name: &str, series: &[Series], marks: &[M
             escape(name)
         );
     }
-    for (index, (Series { name, points }, [text_x, text_y])) in series.iter().zip(legend).enumerate() {
+    for (index, (Series { name, points }, [text_x, text_y])) in
+        series.iter().zip(legend).enumerate()
+    {
         let color = format!("var(--series-{})", index % COLORS);
         let dashes = DASHES[index / COLORS % DASHES.len()];
         let line = points.iter().filter(|point| is_drawable(point));

@@ -11,6 +11,9 @@ use crate::{Error, Result};
 /// The least value that linear scaling maps to 1: it keeps a black photograph black.
 const LEAST_WHITE: f64 = 1e-12;
 
+/// A shape that passes this near p90 has a pole there.
+const LARGEST_SHAPE: f64 = 1e8;
+
 /// Added to a mean before it divides.
 const EPSILON: f64 = 1e-6;
 
@@ -103,7 +106,8 @@ impl ToneSettings {
         match (&self.table, self.curve) {
             (Some(table), ToneCurve::Table) => table.check()?,
             (None, ToneCurve::Table) => {
-                return Err("the curve `table` needs a file of values; name a .csv or .cube file".to_owned());
+                return Err("the curve `table` needs a file of values; name a .csv or .cube file"
+                    .to_owned());
             }
             (Some(_), _) => return Err(format!("the curve `{name}` takes no table of values")),
             (None, _) => {}
@@ -114,12 +118,15 @@ impl ToneSettings {
         }
         for (constant, value) in family.constants.iter().zip(&self.constants) {
             if !(*value as f32).is_finite() {
-                return Err(format!("the constant {} of `{name}` is {value}; it must be finite", constant.name));
+                return Err(format!(
+                    "the constant {} of `{name}` is {value}; it must be finite",
+                    constant.name
+                ));
             }
         }
-        let undefined = (0..=1000).map(|i| f64::from(i) * 0.01).find(|&t| {
-            !(family.shape(t, &self.constants).abs() <= f64::from(f32::MAX))
-        });
+        let undefined = (0..=1000)
+            .map(|i| f64::from(i) * 0.01)
+            .find(|&t| !(family.shape(t, &self.constants).abs() <= LARGEST_SHAPE));
         match undefined {
             Some(t) => Err(format!(
                 "the constants of `{name}` leave it undefined at t = {t}; its formula is {}",

@@ -66,6 +66,17 @@ impl Statistics {
         })
     }
 
+    /// p10 and p90 as they are, without the 1e-6: what the paper prints.
+    pub fn percentiles(&self) -> [f64; 2] {
+        [self.p10, self.p90].map(|value| (f64::from(value) - f64::from(EPSILON)).max(0.0))
+    }
+
+    /// r of [`Statistics::percentiles`]; 1 for a black photograph.
+    pub fn printed_ratio(&self) -> f64 {
+        let [p10, p90] = self.percentiles();
+        if p90 > 0.0 { p10 / p90 } else { 1.0 }
+    }
+
     /// r = p10 / p90, in [0, 1]: how little the shadows are crushed.
     pub fn ratio(&self) -> f64 {
         (f64::from(self.p10) / f64::from(self.p90)).clamp(0.0, 1.0)

@@ -56,7 +56,9 @@ impl Table {
                     "t" => TableInput::T,
                     "x" => TableInput::X,
                     other => {
-                        return Err(format!("line {line}: the first column is `{other}`; it must be t (x / p90) or x"));
+                        return Err(format!(
+                            "line {line}: the first column is `{other}`; it must be t (x / p90) or x"
+                        ));
                     }
                 };
                 continue;
@@ -82,7 +84,9 @@ impl Table {
             match cells[0] {
                 "TITLE" => {}
                 "LUT_1D_SIZE" => size = number(1)? as usize,
-                "LUT_3D_SIZE" => return Err(format!("line {line}: a 3D table is no tone curve; save a 1D one")),
+                "LUT_3D_SIZE" => {
+                    return Err(format!("line {line}: a 3D table is no tone curve; save a 1D one"));
+                }
                 "DOMAIN_MIN" | "DOMAIN_MAX" => {
                     let bound = number(1)?;
                     if number(2)? != bound || number(3)? != bound {
@@ -105,7 +109,10 @@ impl Table {
 
     pub(super) fn check(&self) -> Result<(), String> {
         if self.x.len() < 2 {
-            return Err(format!("a table of {} values is no curve; give at least two", self.x.len()));
+            return Err(format!(
+                "a table of {} values is no curve; give at least two",
+                self.x.len()
+            ));
         }
         if !matches!(self.y.len(), 1 | 3) || self.y.iter().any(|y| y.len() != self.x.len()) {
             return Err("a table needs one value, or red, green and blue, for every x".to_owned());
@@ -127,7 +134,10 @@ impl Table {
     /// (3, K) knots (x, y, slope) as the kernel takes them.
     pub fn knots(&self) -> Vec<Vec3> {
         let channels = (0..3).map(|channel| self.channel(channel));
-        channels.flatten().map(|[x, y, slope]| Vec3::new(x as f32, y as f32, slope as f32)).collect()
+        channels
+            .flatten()
+            .map(|[x, y, slope]| Vec3::new(x as f32, y as f32, slope as f32))
+            .collect()
     }
 
     /// The table at `x`, in [0, 1], of a channel from 0 to 2.
@@ -163,11 +173,17 @@ impl Rows {
         };
         let mut numbers = cells.iter().map(number).collect::<Result<Vec<f64>, _>>()?;
         let x = x.unwrap_or_else(|| numbers.remove(0));
-        if !matches!(numbers.len(), 1 | 3) || (!self.y.is_empty() && self.y.len() != numbers.len()) {
-            return Err(format!("line {line}: {} values; one, or red, green and blue, are needed, in every line alike", numbers.len()));
+        if !matches!(numbers.len(), 1 | 3) || (!self.y.is_empty() && self.y.len() != numbers.len())
+        {
+            return Err(format!(
+                "line {line}: {} values; one, or red, green and blue, are needed, in every line alike",
+                numbers.len()
+            ));
         }
         if let Some(last) = self.x.last().filter(|&&last| !(x > last)) {
-            return Err(format!("line {line}: the first column must ascend, but {x} follows {last}; sort it"));
+            return Err(format!(
+                "line {line}: the first column must ascend, but {x} follows {last}; sort it"
+            ));
         }
         self.x.push(x);
         self.y.resize(numbers.len(), vec![]);

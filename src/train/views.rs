@@ -49,7 +49,8 @@ impl Views {
             views.push(TrainView { name, index, camera, image: pixels, baked: None, tone });
         }
         let settings = pseudo_gt.settings();
-        if let Some(scene) = Statistics::mean_of(&statistics).filter(|_| settings.scene_statistics) {
+        if let Some(scene) = Statistics::mean_of(&statistics).filter(|_| settings.scene_statistics)
+        {
             let parameters = settings.parameters(&scene);
             for view in &mut views {
                 gpu.write(&mut view.tone, &[parameters])?;
@@ -126,7 +127,10 @@ impl TrainView {
     /// Makes the target now, in place of the loss kernels.
     fn bake(&mut self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<()> {
         self.baked = Some(self.mapped(gpu, pseudo_gt)?);
-        gpu.write(&mut self.tone, &[ToneSettings::new(ToneCurve::None).parameters(&Statistics::default())])
+        gpu.write(
+            &mut self.tone,
+            &[ToneSettings::new(ToneCurve::None).parameters(&Statistics::default())],
+        )
     }
 
     fn mapped(&self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<Buffer<f32>> {

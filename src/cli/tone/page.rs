@@ -5,6 +5,7 @@ use std::path::Path;
 use super::mapper::Mapper;
 use super::photographs::Listed;
 use super::{Mapped, Measures, ToneArgs, ToneOutput, settings, without};
+use crate::Result;
 use crate::export;
 use crate::gpu::Gpu;
 use crate::image::Image;
@@ -13,7 +14,6 @@ use crate::report::{
     Best, Column, Comparison, Distribution, Picture, Report, Table, distributions,
 };
 use crate::tone::Statistics;
-use crate::Result;
 
 /// The widest picture on the page, pixels.
 const PICTURE_WIDTH: u32 = 480;
@@ -67,10 +67,8 @@ impl Page {
         }
         self.input.add(&without(photograph, gaps));
         self.result.add(&without(image, gaps));
-        let mut pictures = vec![
-            picture("photograph", None, photograph),
-            picture(&self.curve, scores, image),
-        ];
+        let mut pictures =
+            vec![picture("photograph", None, photograph), picture(&self.curve, scores, image)];
         for (mapper, distribution) in &mut self.compared {
             mapper.statistics(&without(photograph, gaps))?;
             let image = mapper.map(photograph)?;
@@ -82,8 +80,7 @@ impl Page {
             self.reference.add(&without(reference, gaps));
             pictures.push(picture("reference", None, reference));
         }
-        self.comparison
-            .get_or_insert_with(|| Comparison { title: listed.name.clone(), pictures });
+        self.comparison.get_or_insert_with(|| Comparison { title: listed.name.clone(), pictures });
         Ok(())
     }
 
@@ -98,7 +95,10 @@ impl Page {
         )];
         if self.only_referenced {
             drawn.push(self.reference);
-            intro.push("Distributions and pictures are those of the photographs with a reference image.".to_owned());
+            intro.push(
+                "Distributions and pictures are those of the photographs with a reference image."
+                    .to_owned(),
+            );
         }
         let report = Report {
             title: format!("Tone curve {}", self.curve),
@@ -114,7 +114,8 @@ impl Page {
 fn picture(caption: &str, scores: Option<Scores>, image: &Image) -> Picture {
     let scores = scores.map(|Scores { psnr, ssim, .. }| format!("{psnr:.2} dB, SSIM {ssim:.3}"));
     let width = image.width.min(PICTURE_WIDTH);
-    let height = (u64::from(image.height) * u64::from(width) / u64::from(image.width.max(1))) as u32;
+    let height =
+        (u64::from(image.height) * u64::from(width) / u64::from(image.width.max(1))) as u32;
     Picture {
         caption: caption.to_owned(),
         scores: scores.unwrap_or_default(),
@@ -123,21 +124,22 @@ fn picture(caption: &str, scores: Option<Scores>, image: &Image) -> Picture {
 }
 
 fn table(output: &ToneOutput) -> Table {
-    let column = |name: &str, digits| Column {
-        name: name.to_owned(),
-        digits,
-        best: Best::Unmarked,
-    };
+    let column =
+        |name: &str, digits| Column { name: name.to_owned(), digits, best: Best::Unmarked };
     let measured = |Measures { mean_luminance, clipped_fraction, skewness, .. }: Measures| {
         [Some(mean_luminance), Some(skewness), Some(100.0 * clipped_fraction)]
     };
     let views = output.views.iter().map(|(name, report)| (name.clone(), *report));
     let rows = views.chain([("scene".to_owned(), output.scene)]).map(|(name, report)| {
         let before = report.before;
-        let mut values = vec![Some(before.p10), Some(before.p90), Some(before.r), Some(report.delta0)];
+        let mut values =
+            vec![Some(before.p10), Some(before.p90), Some(before.r), Some(report.delta0)];
         values.extend(measured(before));
         values.extend(measured(report.after));
-        values.extend([report.scores.map(|scores| scores.psnr), report.scores.map(|scores| scores.ssim)]);
+        values.extend([
+            report.scores.map(|scores| scores.psnr),
+            report.scores.map(|scores| scores.ssim),
+        ]);
         (name, values)
     });
     Table {

@@ -89,7 +89,8 @@ fn set_targets(photographs: &mut [Listed], out: &Path, format: ImageFormat) -> R
     let extension = format.extension();
     let mut sources: Vec<PathBuf> = vec![];
     for listed in &*photographs {
-        sources.extend([Some(listed.input.clone()), listed.reference.clone()].into_iter().flatten());
+        sources
+            .extend([Some(listed.input.clone()), listed.reference.clone()].into_iter().flatten());
     }
     let mut seen: BTreeMap<String, PathBuf> = BTreeMap::new();
     for listed in photographs {
