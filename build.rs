@@ -39,7 +39,19 @@ fn main() {
             .expect("OUT_DIR is ours");
         kernel.write(&mut kernels);
     }
-    fs::write(out_dir.join("kernels.rs"), structs.to_string() + &kernels).expect("OUT_DIR is ours");
+    let kernels = structs.to_string() + &curve_numbers() + &kernels;
+    fs::write(out_dir.join("kernels.rs"), kernels).expect("OUT_DIR is ours");
+}
+
+/// The numbers of the tone curves, so that host and shaders cannot number them differently.
+fn curve_numbers() -> String {
+    let (_, source) = include("curves.glsl").expect("the curves have an include");
+    let number = |line: &str| {
+        let (name, value) = line.strip_prefix("const uint ")?.split_once('=')?;
+        let (name, value) = (name.trim(), value.trim().trim_end_matches(';'));
+        Some(format!("/// See `include/curves.glsl`.\npub const {name}: u32 = {value};\n"))
+    };
+    source.lines().filter_map(number).collect()
 }
 
 /// Every `.comp` below `dir`, in a stable order.

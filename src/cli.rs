@@ -11,6 +11,7 @@ use crate::image::Image;
 pub mod ablate;
 pub mod bench;
 mod comparison;
+pub mod curves;
 pub mod demo;
 pub mod doctor;
 pub mod eval;
@@ -45,6 +46,7 @@ enum Command {
     Eval(eval::EvalArgs),
     Render(render::RenderArgs),
     Tone(tone::ToneArgs),
+    Curves(curves::CurvesArgs),
     Synth(synth::SynthArgs),
     Ablate(Box<ablate::AblateArgs>),
     Demo(demo::DemoArgs),
@@ -67,7 +69,8 @@ impl Cli {
             Command::Train(args) => train::run(&args),
             Command::Eval(args) => eval::run(&args),
             Command::Render(args) => render::run(&args),
-            Command::Tone(args) => Ok(tone::run(args)?),
+            Command::Tone(args) => Ok(tone::run(&args)?),
+            Command::Curves(args) => Ok(curves::run(&args)?),
             Command::Synth(args) => Ok(synth::run(args)?),
             Command::Ablate(args) => ablate::run(&args),
             Command::Demo(args) => demo::run(&args),
@@ -83,6 +86,8 @@ pub enum ImageFormat {
     /// 8 bits a channel, sRGB-encoded, clamped.
     #[default]
     Png,
+    /// 16 bits a channel, sRGB-encoded, clamped.
+    Png16,
     /// 32-bit float, linear light.
     Exr,
 }
@@ -91,7 +96,7 @@ impl ImageFormat {
     /// The extension of its files.
     pub fn extension(self) -> &'static str {
         match self {
-            Self::Png => "png",
+            Self::Png | Self::Png16 => "png",
             Self::Exr => "exr",
         }
     }
@@ -99,6 +104,7 @@ impl ImageFormat {
     fn save(self, image: &Image, path: &Path) -> crate::Result<()> {
         match self {
             Self::Png => image.save_png8(path),
+            Self::Png16 => image.save_png16(path),
             Self::Exr => image.save_exr(path),
         }
     }

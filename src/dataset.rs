@@ -71,6 +71,19 @@ pub enum Split {
     Test,
 }
 
+/// The files of one view.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Photograph {
+    /// The file name without extension; unique.
+    pub name: String,
+    /// Whether it is trained on or scored.
+    pub split: Split,
+    /// The dark photograph.
+    pub input: PathBuf,
+    /// The normal-light photograph to score against; test views only.
+    pub reference: Option<PathBuf>,
+}
+
 /// A triangulated point of the scene.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Point {
@@ -189,6 +202,33 @@ impl Dataset {
             skipped.len()
         );
         Ok(Self { root: root.to_owned(), views, points, skipped })
+    }
+
+    /// Whether `root` is a folder that [`Dataset::load`] finds cameras in.
+    pub fn is_at(root: &Path) -> bool {
+        !transforms::find(root).is_empty() || colmap::find(root, &["cameras", "images"]).is_some()
+    }
+
+    /// The files of the views below `root`, sorted by name, without reading a pixel.
+    ///
+    /// # Errors
+    /// As [`Dataset::load`], but for what is wrong with pixels.
+    pub fn photographs(root: &Path, options: &LoadOptions) -> Result<Vec<Photograph>> {
+        options.check()?;
+        let files = Files::default();
+        let Listing { mut frames, mut skipped } = list(root, &files)?;
+        refuse_two_of_one_name(root, &frames)?;
+        frames.sort_by(|a, b| a.name.cmp(&b.name));
+        split(root, &mut frames)?;
+        let sources = sources(root, &frames, options, &files, &mut skipped);
+        for line in &skipped {
+            tracing::warn!("skipped {line}");
+        }
+        let photograph = |source: Source| {
+            let Source { name, split, input, reference, .. } = source;
+            Some(Photograph { name, split, input: input?, reference })
+        };
+        Ok(sources.into_iter().filter_map(photograph).collect())
     }
 
     /// The training views.

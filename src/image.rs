@@ -4,6 +4,8 @@
 //! convention; they are encoded on the way in and decoded on the way out (IEC 61966-2-1, linear toe included,
 //! the power law continued above 1).
 
+mod jpeg;
+
 use std::io::Cursor;
 use std::path::Path;
 
@@ -76,6 +78,15 @@ impl Image {
     /// # Errors
     /// [`Error::Input`] names the file when it cannot be read, is cut short or is of another format.
     pub fn load(path: impl AsRef<Path>) -> Result<Self> {
+        Ok(Self::load_with_gaps(path)?.0)
+    }
+
+    /// As [`Image::load`], with the pixels of which a value is NaN or infinite: indices into a plane, ascending. They are
+    /// black.
+    ///
+    /// # Errors
+    /// As [`Image::load`].
+    pub fn load_with_gaps(path: impl AsRef<Path>) -> Result<(Self, Vec<usize>)> {
         let path = path.as_ref();
         let bytes = std::fs::read(path)
             .map_err(|error| Error::input(path, format!("cannot be read: {error}")))?;
@@ -91,19 +102,25 @@ impl Image {
         let path = path.as_ref();
         let bytes = std::fs::read(path)
             .map_err(|error| Error::input(path, format!("cannot be read: {error}")))?;
-        Self::decode(path, bytes, Some)
+        Ok(Self::decode(path, bytes, Some)?.0)
     }
 
-    fn decode(path: &Path, bytes: Vec<u8>, from_exr_value: FromExrValue) -> Result<Self> {
+    fn decode(
+        path: &Path,
+        bytes: Vec<u8>,
+        from_exr_value: FromExrValue,
+    ) -> Result<(Self, Vec<usize>)> {
         if bytes.starts_with(&EXR_MAGIC) {
             return from_exr(path, bytes, from_exr_value);
         }
-        if bytes.starts_with(&[0xFF, 0xD8]) && !jpeg_is_whole(&bytes) {
-            return Err(Error::input(path, "this JPEG is cut short; copy it again"));
+        if bytes.starts_with(&jpeg::MAGIC)
+            && let Some(image) = jpeg::load(path, &bytes)?
+        {
+            return Ok((image, vec![]));
         }
         let reader = ImageReader::new(Cursor::new(bytes)).with_guessed_format();
         let decoded = reader.map_err(::image::ImageError::from).and_then(ImageReader::decode);
-        Ok(from_decoded(decoded.map_err(|error| not_an_image(path, &error))?))
+        Ok((from_decoded(decoded.map_err(|error| not_an_image(path, &error))?), vec![]))
     }
 
     /// Width and height of an image file, from its header alone.
@@ -258,7 +275,6 @@ fn not_an_image(path: &Path, error: &dyn std::error::Error) -> Error {
 
 fn from_decoded(decoded: DynamicImage) -> Image {
     let (width, height) = (decoded.width(), decoded.height());
-    let pixels = width as usize * height as usize;
     let wide = decoded.color().bytes_per_pixel() > decoded.color().channel_count();
     let interleaved: Vec<f32> = if wide {
         decoded
@@ -270,15 +286,23 @@ fn from_decoded(decoded: DynamicImage) -> Image {
     } else {
         decoded.into_rgb8().into_raw().into_iter().map(|value| f32::from(value) / 255.0).collect()
     };
-    let data =
-        (0..3 * pixels).map(|index| interleaved[3 * (index % pixels) + index / pixels]).collect();
+    from_interleaved(width, height, &interleaved)
+}
+
+/// Planes from pixels of red, green and blue.
+fn from_interleaved(width: u32, height: u32, values: &[f32]) -> Image {
+    let data = (0..3).flat_map(|plane| values.iter().skip(plane).step_by(3).copied()).collect();
     Image { width, height, data }
 }
 
 /// What a finite value of an EXR file means; none where it makes no sense.
 type FromExrValue = fn(f32) -> Option<f32>;
 
-fn from_exr(path: &Path, bytes: Vec<u8>, from_exr_value: FromExrValue) -> Result<Image> {
+fn from_exr(
+    path: &Path,
+    bytes: Vec<u8>,
+    from_exr_value: FromExrValue,
+) -> Result<(Image, Vec<usize>)> {
     use exr::prelude::{ReadChannels, ReadLayers};
     let image = exr::prelude::read()
         .no_deep_data()
@@ -293,6 +317,7 @@ fn from_exr(path: &Path, bytes: Vec<u8>, from_exr_value: FromExrValue) -> Result
     let channel = |name: &str| layer.channel_data.list.iter().find(|channel| channel.name.eq(name));
     let mut data = Vec::with_capacity(3 * pixels);
     let mut replaced = 0_usize;
+    let mut is_gap = vec![false; pixels];
     for name in ["R", "G", "B"] {
         let channel = channel(name).or_else(|| channel("Y"));
         let channel = channel
@@ -303,7 +328,9 @@ fn from_exr(path: &Path, bytes: Vec<u8>, from_exr_value: FromExrValue) -> Result
                 "this EXR file has subsampled channels; save it as plain RGB",
             ));
         }
-        data.extend(channel.sample_data.values_as_f32().map(|value| {
+        let values = channel.sample_data.values_as_f32().zip(&mut is_gap);
+        data.extend(values.map(|(value, is_gap)| {
+            *is_gap |= !value.is_finite();
             let usable = Some(value).filter(|value| value.is_finite()).and_then(from_exr_value);
             replaced += usize::from(usable.is_none());
             usable.unwrap_or(0.0)
@@ -315,28 +342,9 @@ fn from_exr(path: &Path, bytes: Vec<u8>, from_exr_value: FromExrValue) -> Result
             path.display()
         );
     }
-    Ok(Image { width: layer.size.width() as u32, height: layer.size.height() as u32, data })
-}
-
-/// Whether a JPEG reaches its end-of-image marker: the decoder paints what is missing grey and says nothing.
-///
-/// Segments are stepped over by their length, so a thumbnail's own marker does not count.
-fn jpeg_is_whole(bytes: &[u8]) -> bool {
-    let mut at = 2;
-    let mut in_scan = false;
-    while let [marker, rest @ ..] = bytes.get(at..).unwrap_or_default() {
-        match (marker, rest) {
-            (0xFF, [0xD9, ..]) => return true,
-            (0xFF, [0x00 | 0xD0..=0xD7, ..]) if in_scan => at += 2,
-            (0xFF, [0xFF, ..]) => at += 1,
-            (0xFF, [kind, high, low, ..]) => {
-                in_scan = *kind == 0xDA;
-                at += 2 + usize::from(u16::from_be_bytes([*high, *low]));
-            }
-            _ => at += 1,
-        }
-    }
-    false
+    let gaps = (0..pixels).filter(|&pixel| is_gap[pixel]).collect();
+    let (width, height) = (layer.size.width() as u32, layer.size.height() as u32);
+    Ok((Image { width, height, data }, gaps))
 }
 
 /// Under a temporary name first, so that a full disk leaves nothing that looks complete.

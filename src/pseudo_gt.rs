@@ -5,19 +5,20 @@
 //! ```
 //!
 //! Percentiles are exact: luminance is not negative, so its bits sort as integers, and a radix select finds both
-//! neighbours of both ranks in three digits of 11, 10 and 10 bits. Nothing is read back; the same photograph gives the same bits every time.
+//! neighbours of both ranks in three digits of 11, 10 and 10 bits. Nothing is read back; the same photograph gives the
+//! same bits every time. A photograph beyond the device's limits comes in tiles, whose counts and sums add up.
 
-use glam::Vec2;
+use glam::Vec3;
 
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::{self, RankSearch, ToneParameters, ToneStatistics};
-use crate::tone::{Rank, Statistics, ToneSettings};
+use crate::tone::{Rank, Statistics, ToneCurve, ToneSettings, White};
 use crate::{Error, Result};
 
 /// Threads that share an image: enough to fill a large GPU, few enough that their partial sums add up quickly.
 const THREADS: u32 = 128 * 256;
 
-/// Both neighbours of p10 and of p90.
+/// Both neighbours of two percentiles.
 const SEARCHES: usize = 4;
 
 /// The values of a ten-bit digit of the radix select.
@@ -32,12 +33,38 @@ pub struct PseudoGt {
     histogram: Pipeline<kernels::luminance_histogram::Kernel>,
     select: Pipeline<kernels::percentile_select::Kernel>,
     statistics: Pipeline<kernels::tone_statistics::Kernel>,
-    map: Pipeline<kernels::tone_map::Kernel>,
-    luminances: Buffer<f32>,
-    sums: Buffer<Vec2>,
+    map: Map,
+    /// One for each tile.
+    luminances: Vec<Buffer<f32>>,
+    sums: Buffer<Vec3>,
     searches: Buffer<RankSearch>,
     histograms: Buffer<u32>,
     measured: Buffer<ToneStatistics>,
+}
+
+/// What applies the curve to a whole image.
+#[derive(Debug)]
+enum Map {
+    Formula(Pipeline<kernels::tone_map::Kernel>),
+    Mix(Pipeline<kernels::tone_mix::Kernel>),
+    /// (3, K) knots.
+    Table(Pipeline<kernels::tone_table::Kernel>, Buffer<Vec3>),
+}
+
+impl Map {
+    fn new(gpu: &Gpu, settings: &ToneSettings) -> Result<Self> {
+        let tone_curve = settings.curve.constant();
+        Ok(match &settings.table {
+            Some(table) => Self::Table(
+                gpu.pipeline(&kernels::tone_table::Constants::default())?,
+                gpu.buffer("tone table", &table.knots())?,
+            ),
+            None if settings.needs_baking() => {
+                Self::Mix(gpu.pipeline(&kernels::tone_mix::Constants { tone_curve })?)
+            }
+            None => Self::Formula(gpu.pipeline(&kernels::tone_map::Constants { tone_curve })?),
+        })
+    }
 }
 
 impl PseudoGt {
@@ -45,22 +72,24 @@ impl PseudoGt {
     ///
     /// # Errors
     /// The settings leave the curve undefined ([`ToneSettings::check`]), or the device is out of memory.
-    pub fn new(gpu: &Gpu, settings: ToneSettings) -> Result<Self> {
+    pub fn new(gpu: &Gpu, settings: &ToneSettings) -> Result<Self> {
         settings.check()?;
-        let tone_curve = settings.curve.constant();
+        let takes_none = settings.white() == White::One;
+        let tone_curve =
+            if takes_none { ToneCurve::None.constant() } else { settings.curve.constant() };
         Ok(Self {
             gpu: gpu.clone(),
-            settings,
             luminance: gpu.pipeline(&kernels::luminance::Constants {})?,
             histogram: gpu.pipeline(&kernels::luminance_histogram::Constants {})?,
             select: gpu.pipeline(&kernels::percentile_select::Constants {})?,
             statistics: gpu.pipeline(&kernels::tone_statistics::Constants { tone_curve })?,
-            map: gpu.pipeline(&kernels::tone_map::Constants { tone_curve })?,
-            luminances: gpu.uninit("luminances", 0)?,
-            sums: gpu.uninit("luminance sums", THREADS as usize)?,
-            searches: gpu.uninit("rank searches", SEARCHES)?,
+            map: Map::new(gpu, settings)?,
+            luminances: vec![],
+            sums: gpu.uninit("channel sums", 0)?,
+            searches: gpu.uninit("rank searches", 2 * SEARCHES)?,
             histograms: gpu.zeros("luminance histograms", SEARCHES * BINS)?,
             measured: gpu.uninit("tone statistics", 1)?,
+            settings: settings.clone(),
         })
     }
 
@@ -89,27 +118,49 @@ impl PseudoGt {
                 "buffer `{name}` holds {len} values, not a {width}x{height} image"
             )));
         }
+        self.statistics_of_tiles(pass, &[image], parameters, view)
+    }
+
+    /// As [`PseudoGt::statistics`], of a photograph in parts, each planar `(3, pixels)`; in which parts does not matter
+    /// but for the last bit of the means.
+    ///
+    /// # Errors
+    /// As there; a photograph has less than 2^32 pixels.
+    pub fn statistics_of_tiles(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        tiles: &[&Buffer<f32>],
+        parameters: &mut Buffer<ToneParameters>,
+        view: u32,
+    ) -> Result<()> {
         in_range(parameters, view)?;
-        if (self.luminances.len() as u64) < pixels {
-            self.luminances = self.gpu.uninit("luminances", pixels as usize)?;
+        let pixels: usize = tiles.iter().map(|tile| tile.len() / 3).sum();
+        let is_planar = tiles.iter().all(|tile| tile.len() % 3 == 0);
+        let Some(pixel_count) = u32::try_from(pixels).ok().filter(|&count| count > 0 && is_planar)
+        else {
+            return Err(Error::Usage(format!("{pixels} pixels are no photograph")));
+        };
+        self.reserve(tiles)?;
+        let [p10, p80, p90] = [1, 8, 9].map(|tenths| Rank::of(tenths, pixels));
+        self.search_ranks(pass, tiles, [p10, p90], 0)?;
+        if self.settings.white() == White::P80 {
+            self.search_ranks(pass, tiles, [p80, p80], SEARCHES as u32)?;
         }
-        // The three planes fit a buffer, so a third of their count fits 32 bits.
-        let pixel_count = pixels as u32;
-        self.search_ranks(pass, image, pixel_count)?;
         let settings = &self.settings;
-        let [p10, p90] = percentile_ranks(pixel_count);
+        let constants = settings.parameters(&Statistics::default()).constants;
         pass.dispatch(
             &self.statistics,
             &kernels::tone_statistics::Params {
                 view,
                 pixel_count,
-                thread_count: THREADS,
-                weights: Vec2::new(p10.weight, p90.weight),
+                sum_count: THREADS * tiles.len() as u32,
+                weights: Vec3::new(p10.weight, p90.weight, p80.weight),
                 gain_c: settings.gain_c as f32,
                 theta: settings.theta as f32,
                 alpha: settings.alpha as f32,
                 beta: settings.beta as f32,
-                base_gain: settings.base_gain as f32,
+                least_gain: settings.least_gain() as f32,
+                constants,
             },
             kernels::tone_statistics::Buffers {
                 searches: &self.searches,
@@ -121,49 +172,86 @@ impl PseudoGt {
         )
     }
 
-    /// Luminance with its partial sums, then the neighbours of both percentiles, digit by digit.
+    /// Scratch memory for the tiles.
+    fn reserve(&mut self, tiles: &[&Buffer<f32>]) -> Result<()> {
+        for (index, tile) in tiles.iter().enumerate() {
+            let pixels = tile.len() / 3;
+            if self.luminances.get(index).is_none_or(|luminances| luminances.len() < pixels) {
+                let luminances = self.gpu.uninit("luminances", pixels)?;
+                self.luminances.truncate(index);
+                self.luminances.push(luminances);
+            }
+        }
+        let sums = THREADS as usize * tiles.len();
+        if self.sums.len() < sums {
+            self.sums = self.gpu.uninit("channel sums", sums)?;
+        }
+        Ok(())
+    }
+
+    /// Luminance with partial sums of the channels, then the neighbours of both ranks, digit by digit.
     fn search_ranks(
         &mut self,
         pass: &mut Recorder<'_>,
-        image: &Buffer<f32>,
-        pixel_count: u32,
+        tiles: &[&Buffer<f32>],
+        [low, high]: [Rank; 2],
+        first_search: u32,
     ) -> Result<()> {
-        let [p10, p90] = percentile_ranks(pixel_count);
-        let ranks = [p10.lower, p10.upper, p90.lower, p90.upper].map(|rank| rank as u32);
-        pass.dispatch(
-            &self.luminance,
-            &kernels::luminance::Params { ranks, pixel_count, thread_count: THREADS },
-            kernels::luminance::Buffers {
-                image,
-                luminances: &mut self.luminances,
-                sums: &mut self.sums,
-                searches: &mut self.searches,
-                histograms: &mut self.histograms,
-            },
-            Threads::Exactly([THREADS, 1, 1]),
-        )?;
-        self.select_digit(pass, 11)?;
-        for shift in [10, 0] {
+        let ranks = [low.lower, low.upper, high.lower, high.upper].map(|rank| rank as u32);
+        for (index, image) in tiles.iter().enumerate() {
             pass.dispatch(
-                &self.histogram,
-                &kernels::luminance_histogram::Params { pixel_count, thread_count: THREADS, shift },
-                kernels::luminance_histogram::Buffers {
-                    luminances: &self.luminances,
-                    searches: &self.searches,
+                &self.luminance,
+                &kernels::luminance::Params {
+                    ranks,
+                    pixel_count: (image.len() / 3) as u32,
+                    thread_count: THREADS,
+                    first_search,
+                    first_sum: THREADS * index as u32,
+                },
+                kernels::luminance::Buffers {
+                    image,
+                    luminances: &mut self.luminances[index],
+                    sums: &mut self.sums,
+                    searches: &mut self.searches,
                     histograms: &mut self.histograms,
                 },
                 Threads::Exactly([THREADS, 1, 1]),
             )?;
-            self.select_digit(pass, 10)?;
+        }
+        self.select_digit(pass, 11, first_search)?;
+        for shift in [10, 0] {
+            for (tile, luminances) in tiles.iter().zip(&self.luminances) {
+                pass.dispatch(
+                    &self.histogram,
+                    &kernels::luminance_histogram::Params {
+                        pixel_count: (tile.len() / 3) as u32,
+                        thread_count: THREADS,
+                        shift,
+                        first_search,
+                    },
+                    kernels::luminance_histogram::Buffers {
+                        luminances,
+                        searches: &self.searches,
+                        histograms: &mut self.histograms,
+                    },
+                    Threads::Exactly([THREADS, 1, 1]),
+                )?;
+            }
+            self.select_digit(pass, 10, first_search)?;
         }
         Ok(())
     }
 
     /// Takes one digit of every search from the histograms and clears them.
-    fn select_digit(&mut self, pass: &mut Recorder<'_>, digit_bits: u32) -> Result<()> {
+    fn select_digit(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        digit_bits: u32,
+        first_search: u32,
+    ) -> Result<()> {
         pass.dispatch(
             &self.select,
-            &kernels::percentile_select::Params { digit_bits },
+            &kernels::percentile_select::Params { digit_bits, first_search },
             kernels::percentile_select::Buffers {
                 searches: &mut self.searches,
                 histograms: &mut self.histograms,
@@ -172,7 +260,7 @@ impl PseudoGt {
         )
     }
 
-    /// Records `target = curve(image)` with `parameters[view]`; `image` and `target` may be of any shape.
+    /// Records `target = curve(image)` with `parameters[view]`; `image` and `target` are planar `(3, pixels)`.
     ///
     /// # Errors
     /// `target` is shorter than `image`, or `parameters` ends before `view`.
@@ -193,12 +281,31 @@ impl PseudoGt {
             )));
         }
         let value_count = image.len() as u32;
-        pass.dispatch(
-            &self.map,
-            &kernels::tone_map::Params { value_count, view },
-            kernels::tone_map::Buffers { image, parameters, target },
-            Threads::Exactly([value_count, 1, 1]),
-        )
+        let pixel_count = value_count / 3;
+        match &self.map {
+            Map::Formula(pipeline) => pass.dispatch(
+                pipeline,
+                &kernels::tone_map::Params { value_count, view },
+                kernels::tone_map::Buffers { image, parameters, target },
+                Threads::Exactly([value_count, 1, 1]),
+            ),
+            Map::Mix(pipeline) => pass.dispatch(
+                pipeline,
+                &kernels::tone_mix::Params { pixel_count, view },
+                kernels::tone_mix::Buffers { image, parameters, target },
+                Threads::Exactly([pixel_count, 1, 1]),
+            ),
+            Map::Table(pipeline, knots) => pass.dispatch(
+                pipeline,
+                &kernels::tone_table::Params {
+                    pixel_count,
+                    view,
+                    knot_count: (knots.len() / 3) as u32,
+                },
+                kernels::tone_table::Buffers { image, parameters, knots, target },
+                Threads::Exactly([value_count, 1, 1]),
+            ),
+        }
     }
 
     /// The statistics measured last; waits for them.
@@ -209,11 +316,6 @@ impl PseudoGt {
         let read = self.gpu.read(&self.measured)?;
         Ok(Statistics::from(read[0]))
     }
-}
-
-/// Where p10 and p90 lie among the sorted luminances.
-fn percentile_ranks(pixel_count: u32) -> [Rank; 2] {
-    [1, 9].map(|tenths| Rank::of(tenths, pixel_count as usize))
 }
 
 fn in_range(parameters: &Buffer<ToneParameters>, view: u32) -> Result<()> {

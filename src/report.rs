@@ -4,10 +4,12 @@ use std::fmt::Write as _;
 
 use crate::image::Image;
 
-pub use self::plot::{Series, plot};
+pub use self::distribution::{Distribution, distributions};
+pub use self::plot::{Mark, Series, plot, plot_with_marks, svg_file};
 pub use self::table::{Best, Column, Table};
 
 mod data_uri;
+mod distribution;
 mod plot;
 mod table;
 

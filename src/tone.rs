@@ -7,79 +7,86 @@
 //! linear  x theta / mean(x)
 //! ASE     delta0 + (1 - delta0) (1 - exp(-g t))              g = g0 + c Y
 //! AP3     delta0 + b (0.0720 t^3 - 0.4376 t^2 + 0.9948 t)    b = 1 + c Y
+//! others  delta0 + b f(t)                                    delta0 = 0, b = 1 unless told
 //! ```
 //!
 //! clamped to [0, 1], where t = x / p90, Y is the mean luminance, and the black level
 //! delta0 = alpha (1 - p10 / p90)^beta is high where shadows are crushed. The statistics are those of
-//! one photograph, see [`Statistics`].
+//! one photograph, or the means over a scene's, see [`Statistics`]. [`FAMILIES`] is the table of all curves; a [`Table`]
+//! of values from a file is a curve too.
 
+mod catalogue;
+mod families;
+mod file;
+mod settings;
 mod statistics;
+mod table;
 
 use std::fmt;
 use std::str::FromStr;
 
-use serde::{Deserialize, Serialize};
-
+pub use self::catalogue::FAMILIES;
+pub use self::families::{Constant, Family, Law, ToneCurve, White};
+pub use self::file::CurveChoice;
+pub use self::settings::ToneSettings;
 pub(crate) use self::statistics::Rank;
 pub use self::statistics::{Statistics, percentile};
+pub use self::table::{Table, TableInput};
 pub use crate::kernels::ToneParameters;
 use crate::reference::tone;
 use crate::{Error, Result};
 
-/// The least value that linear scaling maps to 1: it keeps a black photograph black.
-const LEAST_WHITE: f64 = 1e-12;
-
-/// A family of tone curves, by the name the command line and the run directory use.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum ToneCurve {
-    /// The photograph as it is.
-    None,
-    /// One gain for all values: the mean becomes theta, bright values clip.
-    Linear,
-    /// Adaptive soft exponential: bounded, concave.
-    Ase,
-    /// Adaptive cubic: nearly proportional in the shadows, rolls off above p90.
-    Ap3,
-}
+/// The name of the curve that a table of values makes.
+const TABLE_NAME: &str = "table";
 
 impl ToneCurve {
-    /// Every curve, in the order that help texts list them.
-    pub const ALL: [Self; 4] = [Self::Linear, Self::Ase, Self::Ap3, Self::None];
+    /// Every curve that has a name of its own, in the table's order.
+    pub const ALL: [Self; Self::Table as usize] = {
+        let mut all = [Self::None; Self::Table as usize];
+        let mut index = 0;
+        while index < all.len() {
+            all[index] = FAMILIES[index].curve;
+            index += 1;
+        }
+        all
+    };
+
+    /// The curve's row in the table; of a [`Table`] that of `none`, as it has no formula.
+    pub fn family(self) -> &'static Family {
+        &FAMILIES[self as usize % FAMILIES.len()]
+    }
 
     /// The name on the command line.
     pub fn name(self) -> &'static str {
-        match self {
-            Self::None => "none",
-            Self::Linear => "linear",
-            Self::Ase => "ase",
-            Self::Ap3 => "ap3",
-        }
+        if self == Self::Table { TABLE_NAME } else { self.family().name }
     }
 
-    /// The curve's number in `include/tone.glsl`: the specialization constant `TONE_CURVE`.
+    /// The curve's number in `include/curves.glsl`: the specialization constant `TONE_CURVE`.
     pub fn constant(self) -> u32 {
-        match self {
-            Self::None => tone::CURVE_NONE,
-            Self::Linear => tone::CURVE_LINEAR,
-            Self::Ase => tone::CURVE_ASE,
-            Self::Ap3 => tone::CURVE_AP3,
-        }
+        self as u32
     }
 
-    /// The curve at t = x / white, in [0, 1], as exact as f64 allows; a NaN becomes 0.
-    pub fn value(self, t: f64, offset: f64, gain: f64) -> f64 {
-        let y = match self {
-            Self::None | Self::Linear => t,
-            Self::Ase => offset - (1.0 - offset) * (-gain * t).exp_m1(),
-            Self::Ap3 => offset + gain * (((0.0720 * t - 0.4376) * t + 0.9948) * t),
-        };
-        if y > 0.0 { y.min(1.0) } else { 0.0 }
+    /// The curve at t = x / white, in [0, 1], as exact as f64 allows.
+    ///
+    /// `lum_preserve` and `per_channel` are straight lines here: what they do depends on more than one value.
+    pub fn value(self, t: f64, offset: f64, gain: f64, constants: &[f64]) -> f64 {
+        let constants = families::padded(constants);
+        tone::clamped(tone::curve_at(self.constant(), t, [offset, gain], &constants))
     }
 
     /// The curve at the sRGB-encoded value `x`, in the arithmetic of the kernels.
     pub fn apply(self, x: f32, parameters: &ToneParameters) -> f32 {
         tone::tone_curve(self.constant(), x, parameters)
+    }
+
+    /// Whether each value of the target depends on one value of the photograph alone, by a formula.
+    pub(crate) fn is_formula(self) -> bool {
+        !matches!(self, Self::Table | Self::LumPreserve | Self::PerChannel)
+    }
+
+    /// All names, for help texts and errors.
+    pub fn names() -> String {
+        Self::ALL.map(Self::name).join(", ")
     }
 }
 
@@ -93,85 +100,25 @@ impl FromStr for ToneCurve {
     type Err = Error;
 
     fn from_str(name: &str) -> Result<Self> {
-        Self::ALL.into_iter().find(|curve| curve.name() == name).ok_or_else(|| {
-            let names = Self::ALL.map(Self::name).join(", ");
-            Error::Usage(format!("unknown curve `{name}`; the curves are {names}"))
+        if name == TABLE_NAME {
+            return Ok(Self::Table);
+        }
+        Family::find(name).map(|family| family.curve).ok_or_else(|| {
+            Error::Usage(format!("unknown curve `{name}`; the curves are {}", Self::names()))
         })
     }
 }
 
-/// A curve and its constants; what a photograph adds to them are its [`Statistics`].
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct ToneSettings {
-    /// The family.
-    pub curve: ToneCurve,
-    /// c: how much a brighter photograph raises the gain of ASE and AP3.
-    pub gain_c: f64,
-    /// theta: the mean over all channels that the linear curve aims at, before clipping.
-    pub theta: f64,
-    /// alpha: the highest black level.
-    pub alpha: f64,
-    /// beta: how fast the black level falls as p10 approaches p90.
-    pub beta: f64,
-    /// g0: the gain of ASE on a black photograph.
-    pub base_gain: f64,
-}
+impl TryFrom<String> for ToneCurve {
+    type Error = Error;
 
-impl ToneSettings {
-    /// The paper's constants for LOM; c is 3 for ASE and 1 for AP3.
-    pub fn new(curve: ToneCurve) -> Self {
-        let gain_c = match curve {
-            ToneCurve::Ase => 3.0,
-            ToneCurve::Ap3 => 1.0,
-            ToneCurve::None | ToneCurve::Linear => 0.0,
-        };
-        Self { curve, gain_c, theta: 0.49, alpha: 0.12, beta: 2.5, base_gain: 1.0 }
-    }
-
-    /// Refuses constants that leave a curve undefined, decreasing or above white at black.
-    pub fn check(&self) -> Result<()> {
-        let rules = [
-            ("--gain (c)", self.gain_c, self.gain_c >= 0.0, "at least 0"),
-            ("--theta", self.theta, self.theta > 0.0, "above 0"),
-            ("alpha", self.alpha, (0.0..=1.0).contains(&self.alpha), "from 0 to 1"),
-            ("beta", self.beta, self.beta > 0.0, "above 0"),
-            ("base_gain (g0)", self.base_gain, self.base_gain > 0.0, "above 0"),
-        ];
-        for (name, value, holds, rule) in rules {
-            if !(holds && (value as f32).is_finite()) {
-                return Err(Error::Usage(format!(
-                    "{name} is {value}; it must be finite and {rule}"
-                )));
-            }
-        }
-        Ok(())
-    }
-
-    /// delta0 = alpha (1 - r)^beta: the black level of a photograph with r = p10 / p90.
-    pub fn offset(&self, ratio: f64) -> f64 {
-        self.alpha * (1.0 - ratio).powf(self.beta)
-    }
-
-    /// The curve that these settings give a photograph with these statistics.
-    pub fn parameters(&self, statistics: &Statistics) -> ToneParameters {
-        let gain = |base: f64| base + self.gain_c * f64::from(statistics.mean_luminance);
-        let p90 = f64::from(statistics.p90);
-        let offset = self.offset(statistics.ratio());
-        let (white, offset, gain) = match self.curve {
-            ToneCurve::None => (1.0, 0.0, 1.0),
-            ToneCurve::Linear => {
-                ((f64::from(statistics.mean) / self.theta).max(LEAST_WHITE), 0.0, 1.0)
-            }
-            ToneCurve::Ase => (p90, offset, gain(self.base_gain)),
-            ToneCurve::Ap3 => (p90, offset, gain(1.0)),
-        };
-        ToneParameters { white: white as f32, offset: offset as f32, gain: gain as f32 }
+    fn try_from(name: String) -> Result<Self> {
+        name.parse()
     }
 }
 
-impl Default for ToneSettings {
-    fn default() -> Self {
-        Self::new(ToneCurve::Ap3)
+impl From<ToneCurve> for String {
+    fn from(curve: ToneCurve) -> Self {
+        curve.name().to_owned()
     }
 }

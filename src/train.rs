@@ -117,7 +117,7 @@ impl Trainer {
     pub fn new(gpu: &Gpu, mut config: TrainConfig, dataset: &Dataset) -> Result<Self> {
         config.check()?;
         config.leave_out_what_is_missing(dataset);
-        let mut pseudo_gt = PseudoGt::new(gpu, config.tone)?;
+        let mut pseudo_gt = PseudoGt::new(gpu, &config.tone)?;
         let views = Views::upload(gpu, &mut pseudo_gt, dataset, config.model.features())?;
         let sizes = views.sizes();
         say_what_parts_see(&config.model, &sizes);
@@ -266,7 +266,7 @@ impl Trainer {
             size,
             interior: Interior::whole(size),
             render,
-            low: &view.image,
+            low: view.loss_input(),
             tone: &view.tone,
         };
         if model.shape().features != Features::NONE {
@@ -380,7 +380,7 @@ fn say_what_parts_see(model: &ModelConfig, sizes: &[UVec2]) {
 /// L1 and SSIM of the render against the pseudo-GT.
 fn loss_settings(config: &TrainConfig) -> LossSettings {
     LossSettings {
-        tone_curve: config.tone.curve.constant(),
+        tone_curve: config.tone.loss_curve(),
         ssim_weight: config.ssim_weight,
         terms: [Term::L1, Term::Ssim],
     }

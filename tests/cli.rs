@@ -337,7 +337,8 @@ fn demo_touches_no_folder_of_somebody_else() {
 
 #[test]
 fn help_teaches_every_command_in_lines_that_fit() {
-    let commands = ["", "train", "eval", "render", "tone", "synth", "demo", "doctor", "bench"];
+    let commands =
+        ["", "train", "eval", "render", "tone", "curves", "synth", "demo", "doctor", "bench"];
     for command in commands {
         let help = succeed(&format!("{command} --help"));
         assert!(help.lines().all(|line| line.chars().count() < 100), "{help}");

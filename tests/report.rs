@@ -1,7 +1,10 @@
 //! The page stands alone, escapes what it is given and marks what is best.
 
 use nightsplat::image::Image;
-use nightsplat::report::{Best, Column, Comparison, Picture, Report, Series, Table, plot};
+use nightsplat::report::{
+    Best, Column, Comparison, Distribution, Picture, Report, Series, Table, distributions, plot,
+    svg_file,
+};
 
 fn column(name: &str, digits: usize, best: Best) -> Column {
     Column { name: name.into(), digits, best }
@@ -148,4 +151,37 @@ fn plots_of_nothing_of_one_value_and_of_extremes_stay_well_formed() {
         let svg = plot("step", "PSNR", &[Series { name: "a".into(), points }]);
         assert!(!svg.contains("NaN") && !svg.contains("inf"), "{svg}");
     }
+}
+
+#[test]
+fn a_distribution_has_the_skewness_of_its_luminances_and_draws_its_density() {
+    let of = |values: &[f32]| {
+        let mut distribution = Distribution::new("grey");
+        distribution.add(&[values, values, values].concat());
+        distribution
+    };
+    // Three at 0 and one at 1: mean 1/4, variance 3/16, third moment 3/32.
+    let skewness = of(&[0.0, 0.0, 0.0, 1.0]).skewness();
+    assert!((skewness - 3.0 / 32.0 / (3.0_f64 / 16.0).powf(1.5)).abs() < 1e-6, "{skewness}");
+    assert!((of(&[0.2, 0.3, 0.7, 0.8]).skewness()).abs() < 1e-5);
+    for constant in [&[][..], &[0.3], &[0.0; 9], &[1.0; 9]] {
+        assert_eq!(of(constant).skewness(), 0.0, "{constant:?}");
+    }
+    let svg = distributions(&[of(&[0.0, 0.1, 0.1, 0.9]), Distribution::new("nothing")]);
+    assert!(svg.contains("grey (skewness") && svg.matches("<polyline").count() == 2, "{svg}");
+    assert!(!svg.contains("NaN"));
+}
+
+#[test]
+fn a_legend_of_many_names_takes_rows_and_a_plot_can_be_a_file() {
+    let series = |index: usize| Series {
+        name: format!("a curve with number {index}"),
+        points: vec![(0.0, 0.0), (1.0, 1.0)],
+    };
+    let svg = svg_file(&plot("t", "y", &(0..12).map(series).collect::<Vec<_>>()));
+    assert!(
+        svg.starts_with("<svg xmlns=\"http://www.w3.org/2000/svg\"") && svg.contains("<style>")
+    );
+    assert!(svg.contains("--series-0") && !svg.contains("viewBox=\"0 0 "), "{svg}");
+    assert!(svg.contains("stroke-dasharray"));
 }

@@ -12,6 +12,9 @@ use nightsplat::Error;
 use nightsplat::image::Image;
 use nightsplat::tone::{Statistics, ToneCurve, ToneParameters, ToneSettings, percentile};
 
+/// The paper's curves and none: what the loss evaluates without a detour.
+const PAPER: [ToneCurve; 4] = [ToneCurve::Linear, ToneCurve::Ase, ToneCurve::Ap3, ToneCurve::None];
+
 /// Chair, sofa and shrub of LOM, or a note that they are absent.
 fn lom() -> Option<PathBuf> {
     let root = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../shared/data/lom"));
@@ -69,31 +72,33 @@ fn the_offset_has_the_paper_s_values() {
 
 #[test]
 fn the_cubic_has_the_paper_s_values() {
-    let p = |t| ToneCurve::Ap3.value(t, 0.0, 1.0);
+    let p = |t| ToneCurve::Ap3.value(t, 0.0, 1.0, &[]);
     assert!((p(1.0) - 0.6292).abs() < 1e-12);
     // With delta0 = 0.075 white begins at t = 2.76, 2.42 and 1.97 for b = 1, 1.07 and 1.14.
     for (gain, white) in [(1.0, 2.76), (1.07, 2.42), (1.14, 1.97)] {
-        assert!(ToneCurve::Ap3.value(white - 0.01, 0.075, gain) < 1.0, "b = {gain}");
-        assert_eq!(ToneCurve::Ap3.value(white + 0.01, 0.075, gain), 1.0, "b = {gain}");
+        assert!(ToneCurve::Ap3.value(white - 0.01, 0.075, gain, &[]) < 1.0, "b = {gain}");
+        assert_eq!(ToneCurve::Ap3.value(white + 0.01, 0.075, gain, &[]), 1.0, "b = {gain}");
     }
 }
 
 #[test]
 fn ase_starts_at_the_offset_and_never_clips() {
-    assert_eq!(ToneCurve::Ase.value(0.0, 0.0753, 1.2), 0.0753);
-    assert!((ToneCurve::Ase.value(1.0, 0.0, 1.0) - 0.632_120_558_828_557_7).abs() < 1e-15);
-    assert!(ToneCurve::Ase.value(20.0, 0.1, 1.2) < 1.0);
+    assert_eq!(ToneCurve::Ase.value(0.0, 0.0753, 1.2, &[]), 0.0753);
+    assert!((ToneCurve::Ase.value(1.0, 0.0, 1.0, &[]) - 0.632_120_558_828_557_7).abs() < 1e-15);
+    assert!(ToneCurve::Ase.value(20.0, 0.1, 1.2, &[]) < 1.0);
 }
 
 #[test]
 fn every_curve_rises_within_zero_and_one() {
-    let curves = ToneCurve::ALL.iter().flat_map(|&curve| {
+    let rising = ToneCurve::ALL.into_iter().filter(|curve| curve.family().monotone);
+    let curves = rising.flat_map(|curve| {
         [(0.0, 1.0), (0.12, 1.0), (0.05, 1.3), (0.0, 4.0)]
             .map(|(offset, gain)| (curve, offset, gain))
     });
     for (curve, offset, gain) in curves {
-        let values: Vec<f64> =
-            (0..4000).map(|i| curve.value(f64::from(i) / 1000.0, offset, gain)).collect();
+        let constants = curve.family().defaults();
+        let value = |i| curve.value(f64::from(i) / 1000.0, offset, gain, &constants);
+        let values: Vec<f64> = (0..4000).map(value).collect();
         assert!(values.is_sorted(), "{curve} falls, offset {offset}, gain {gain}");
         assert!(values.iter().all(|y| (0.0..=1.0).contains(y)), "{curve}");
     }
@@ -103,12 +108,12 @@ fn every_curve_rises_within_zero_and_one() {
 fn the_f32_curves_follow_the_f64_curves() {
     let mut grid: Vec<f32> = (0..=20_000).map(|i| i as f32 / 5000.0).collect();
     grid.extend([0.0, 1e-12, 1e-9, 1e-6, 0.009_999, 0.01, 0.010_001, 65.0, 1e6, f32::MAX]);
-    for curve in ToneCurve::ALL {
+    for curve in PAPER {
         for (white, offset, gain) in [(1.0, 0.0, 1.0), (0.0816, 0.0754, 1.16), (1e-6, 0.12, 4.0)] {
-            let parameters = ToneParameters { white, offset, gain };
+            let parameters = ToneParameters { white, offset, gain, constants: [0.0; 8] };
             for &x in &grid {
                 let t = f64::from(x) / f64::from(white);
-                let exact = curve.value(t, offset.into(), gain.into());
+                let exact = curve.value(t, offset.into(), gain.into(), &[]);
                 let error = (f64::from(curve.apply(x, &parameters)) - exact).abs();
                 // Relative where the value is tiny; a few ulps of one elsewhere.
                 let bound = 4e-7 * if offset == 0.0 && t < 1e-3 { exact } else { 1.0 };
@@ -126,8 +131,14 @@ fn a_value_that_is_no_number_or_negative_maps_into_the_range() {
             let y = curve.apply(x, &parameters);
             assert!((0.0..=1.0).contains(&y), "{curve}({x}) = {y}");
         }
+        // As a black value, or black.
+        let of_nan = curve.apply(f32::NAN, &parameters);
+        assert!(of_nan == 0.0 || of_nan == curve.apply(0.0, &parameters), "{curve}: {of_nan}");
+    }
+    for curve in PAPER {
+        let parameters = ToneSettings::new(curve).parameters(&Statistics::of(&[0.1; 12]));
         assert_eq!(curve.apply(f32::NAN, &parameters), 0.0);
-        assert_eq!(curve.value(f64::NAN, 0.1, 1.0), 0.0);
+        assert_eq!(curve.value(f64::NAN, 0.1, 1.0, &[]), 0.0);
     }
 }
 
@@ -136,10 +147,10 @@ fn curves_are_found_by_name_and_an_unknown_name_lists_them() {
     for curve in ToneCurve::ALL {
         assert_eq!(curve.to_string().parse::<ToneCurve>().unwrap(), curve);
     }
-    let error = "gamma".parse::<ToneCurve>().unwrap_err();
+    let error = "gama".parse::<ToneCurve>().unwrap_err();
     assert!(matches!(error, Error::Usage(_)));
     let message = error.to_string();
-    for part in ["gamma", "linear", "ase", "ap3", "none"] {
+    for part in ["gama", "linear", "ase", "ap3", "none"] {
         assert!(message.contains(part), "{message}");
     }
 }
@@ -159,15 +170,15 @@ fn settings_that_leave_a_curve_undefined_are_refused() {
     let good = ToneSettings::default();
     good.check().unwrap();
     for bad in [
-        ToneSettings { gain_c: -0.1, ..good },
-        ToneSettings { gain_c: f64::NAN, ..good },
-        ToneSettings { gain_c: 1e300, ..good },
-        ToneSettings { theta: 0.0, ..good },
-        ToneSettings { theta: f64::INFINITY, ..good },
-        ToneSettings { alpha: 1.1, ..good },
-        ToneSettings { alpha: -0.1, ..good },
-        ToneSettings { beta: 0.0, ..good },
-        ToneSettings { base_gain: 0.0, ..good },
+        ToneSettings { gain_c: -0.1, ..good.clone() },
+        ToneSettings { gain_c: f64::NAN, ..good.clone() },
+        ToneSettings { gain_c: 1e300, ..good.clone() },
+        ToneSettings { theta: 0.0, ..good.clone() },
+        ToneSettings { theta: f64::INFINITY, ..good.clone() },
+        ToneSettings { alpha: 1.1, ..good.clone() },
+        ToneSettings { alpha: -0.1, ..good.clone() },
+        ToneSettings { beta: 0.0, ..good.clone() },
+        ToneSettings { base_gain: 0.0, ..good.clone() },
     ] {
         assert!(matches!(bad.check(), Err(Error::Usage(_))), "{bad:?}");
     }
@@ -213,7 +224,7 @@ fn degenerate_photographs_have_finite_curves() {
     ];
     for (name, planes) in photographs {
         let statistics = Statistics::of(&planes);
-        let Statistics { p10, p90, mean_luminance, mean } = statistics;
+        let Statistics { p10, p90, mean_luminance, mean, .. } = statistics;
         assert!(
             [p10, p90, mean_luminance, mean].iter().all(|x| x.is_finite()),
             "{name}: {statistics:?}"
@@ -241,7 +252,9 @@ fn a_constant_photograph_has_no_offset_and_black_stays_black() {
         for curve in ToneCurve::ALL {
             let parameters = ToneSettings::new(curve).parameters(&statistics);
             assert_eq!(parameters.offset, 0.0);
-            assert_eq!(curve.apply(0.0, &parameters), 0.0, "{curve}");
+            let family = curve.family();
+            let black = family.shape(0.0, &family.defaults()) as f32;
+            assert!((curve.apply(0.0, &parameters) - black.min(1.0)).abs() < 1e-6, "{curve}");
         }
     }
 }
@@ -268,9 +281,9 @@ fn the_training_photographs_have_the_paper_s_statistics() {
         let mut mean = [0.0; 4];
         for name in &names {
             let statistics = Statistics::of(&load(&lom.join(scene).join("low").join(name)));
-            let ratio = statistics.ratio();
+            let ratio = statistics.printed_ratio();
             let values = [
-                statistics.p90.into(),
+                statistics.percentiles()[1],
                 ratio,
                 settings.offset(ratio),
                 statistics.mean_luminance.into(),
@@ -281,7 +294,7 @@ fn the_training_photographs_have_the_paper_s_statistics() {
         }
         println!("{scene}: {mean:.5?}");
         for ((mean, expected), digit) in mean.iter().zip(expected).zip([1e-4, 1e-3, 1e-4, 1e-4]) {
-            assert!((mean - expected).abs() <= digit, "{scene}: {mean}, not {expected}");
+            assert!((mean - expected).abs() <= 0.51 * digit, "{scene}: {mean}, not {expected}");
         }
     }
 }
@@ -322,10 +335,8 @@ fn a_curve_alone_reaches_its_known_psnr_on_the_test_views() {
             });
             let score = scores.sum::<f64>() / views.len() as f64;
             println!("{scene} {curve} c = {gain_c}: {score:.3}");
-            // The crate's JPEG decoder rounds chroma up where libjpeg alternates: blue is 0.4 code values
-            // higher on chair, worth up to 0.1 dB. From libjpeg's pixels the table holds to 0.005 dB.
             assert!(
-                (score - expected[column]).abs() < 0.11,
+                (score - expected[column]).abs() < 0.0075,
                 "{scene} {curve} c = {gain_c}: {score}"
             );
         }

@@ -2,13 +2,13 @@
 // `precise`, because a reordering would cancel the carry.
 
 struct CompensatedSum {
-    vec2 sum;
-    vec2 carry;
+    vec3 sum;
+    vec3 carry;
 };
 
-CompensatedSum add(CompensatedSum total, vec2 x) {
-    precise vec2 corrected = x - total.carry;
-    precise vec2 sum = total.sum + corrected;
-    precise vec2 carry = (sum - total.sum) - corrected;
+CompensatedSum add(CompensatedSum total, vec3 x) {
+    precise vec3 corrected = x - total.carry;
+    precise vec3 sum = total.sum + corrected;
+    precise vec3 carry = (sum - total.sum) - corrected;
     return CompensatedSum(sum, carry);
 }

@@ -7,7 +7,7 @@ struct RankSearch {
     uint histogram;  // the first search with the same prefix: its histogram serves both
 };
 
-const uint SEARCHES   = 4;                  // the lower and the upper neighbour of p10, then of p90
+const uint SEARCHES   = 4;                  // at a time: the lower and the upper neighbour of two percentiles
 const uint DIGIT_BITS = 10;                 // of the second and the third digit
 const uint BINS       = 1u << DIGIT_BITS;   // of one search's histogram
 const uint FIRST_BINS = 2 * BINS;           // of the first digit, which all searches share

@@ -1,32 +1,48 @@
 // The tone curves: sRGB-encoded dark value in, pseudo-GT value in [0, 1] out.
 // The statistics behind the parameters are taken once per view; `tone::ToneCurve` is the host side.
 
-const uint CURVE_NONE   = 0;  // the photograph as it is
-const uint CURVE_LINEAR = 1;  // x theta / mean
-const uint CURVE_ASE    = 2;  // adaptive SoftExp
-const uint CURVE_AP3    = 3;  // adaptive cubic
+#include "curves.glsl"
 
 layout(constant_id = 10) const uint TONE_CURVE = 3;
 
 struct ToneParameters {
-    float white;   // t = x / white: p90 for ASE and AP3, mean / theta for linear, 1 for none
-    float offset;  // delta0
-    float gain;    // g of ASE, b of AP3
+    float white;         // t = x / white: p90, or what the curve puts in its place
+    float offset;        // delta0, the black level
+    float gain;          // g where black is rescaled, b where it is added
+    float constants[8];  // of the family
 };
 
-// 1 - exp(-x) for x >= 0, without cancellation where x is tiny.
-float one_minus_exp(float x) {
-    // Two terms beyond the linear one keep the error below an ulp up to 0.01.
-    return x < 0.01 ? x * (1.0 - x * (0.5 - x * (1.0 / 6.0))) : 1.0 - exp(-x);
+// What lies outside (0, LARGEST_T), or is no number, counts as the end it is at, a NaN as black.
+float within(float t) {
+    return t > 0.0 ? min(t, LARGEST_T) : 0.0;
 }
 
 float tone_curve(float x, ToneParameters tone) {
     float t = x / tone.white;
-    float y = t;
-    if (TONE_CURVE == CURVE_ASE) {
+    float y;
+    switch (TONE_CURVE) {
+    case CURVE_NONE:
+    case CURVE_LINEAR:
+        y = t;
+        break;
+    case CURVE_ASE:
         y = tone.offset + (1.0 - tone.offset) * one_minus_exp(tone.gain * t);
-    } else if (TONE_CURVE == CURVE_AP3) {
-        y = tone.offset + tone.gain * (((0.0720 * t - 0.4376) * t + 0.9948) * t);
+        break;
+    case CURVE_AP3:
+        y = tone.offset + tone.gain * ap3(t);
+        break;
+    case CURVE_TANH:
+        y = tone.offset + (1.0 - tone.offset) * tanh_of(tone.gain * within(t));
+        break;
+    case CURVE_ASE_FLOOR:
+        float floor_share = tone.constants[0];
+        float white = one_minus_exp(tone.gain);
+        float scale = (1.0 - tone.offset) * white / ((1.0 - floor_share) * white + floor_share + 1e-8);
+        t = within(t);
+        y = tone.offset + scale * ((1.0 - floor_share) * one_minus_exp(tone.gain * t) + floor_share * t);
+        break;
+    default:
+        y = tone.offset + tone.gain * curve_shape(TONE_CURVE, within(t), tone.constants);
     }
     // Positive phrasing: a NaN becomes black.
     return y > 0.0 ? min(y, 1.0) : 0.0;

@@ -4,7 +4,7 @@
 #include "compensated_sum.glsl"
 #include "rank_search.glsl"
 
-//! Luminance: BT.601 on encoded values, per pixel, with the partial sums of its mean and the first digit's histogram.
+//! Luminance: BT.601 on encoded values, per pixel, with partial sums of the channels and the first digit's histogram.
 //!
 //! `thread_count` threads each take every `thread_count`-th pixel, so that the order of every sum is fixed; counts are
 //! integers, so theirs does not matter. NaN and negative values count as 0, values above 65504 as 65504.
@@ -13,14 +13,16 @@
 layout(local_size_x = 256) in;
 
 layout(push_constant) uniform Params {
-    uvec4 ranks;  // of the four searches
+    uvec4 ranks;        // of the four searches
     uint pixel_count;
     uint thread_count;
+    uint first_search;  // of the four
+    uint first_sum;     // of the threads'
 };
 
 layout(binding = 0) readonly buffer Image       { float image[]; };      // (3, H, W), sRGB
 layout(binding = 1) writeonly buffer Luminances { float luminances[]; }; // (H, W)
-layout(binding = 2) writeonly buffer Sums       { vec2 sums[]; };        // (threads) luminance; red + green + blue
+layout(binding = 2) writeonly buffer Sums       { vec3 sums[]; };        // (threads) red, green, blue
 layout(binding = 3) writeonly buffer Searches   { RankSearch searches[]; };
 layout(binding = 4) buffer Histograms           { uint histograms[]; };  // (FIRST_BINS)
 
@@ -33,23 +35,20 @@ float measurable(float x) {
 
 void main() {
     uint thread = THREAD_INDEX;
-    if (thread < SEARCHES) searches[thread] = RankSearch(0, ranks[thread], 0);
+    if (thread < SEARCHES) searches[first_search + thread] = RankSearch(0, ranks[thread], 0);
     for (uint bin = gl_LocalInvocationID.x; bin < FIRST_BINS; bin += gl_WorkGroupSize.x) counts[bin] = 0;
     barrier();
 
-    CompensatedSum total = CompensatedSum(vec2(0), vec2(0));
+    CompensatedSum total = CompensatedSum(vec3(0), vec3(0));
     for (uint i = thread; i < pixel_count; i += thread_count) {
-        float r = measurable(image[i]);
-        float g = measurable(image[pixel_count + i]);
-        float b = measurable(image[2 * pixel_count + i]);
+        vec3 rgb = vec3(measurable(image[i]), measurable(image[pixel_count + i]), measurable(image[2 * pixel_count + i]));
         // `precise`: a fused multiply-add would move a percentile by an ulp between devices.
-        precise float luminance = 0.299 * r + 0.587 * g + 0.114 * b;
-        precise float sum = r + g + b;
+        precise float luminance = 0.299 * rgb.r + 0.587 * rgb.g + 0.114 * rgb.b;
         luminances[i] = luminance;
-        total = add(total, vec2(luminance, sum));
+        total = add(total, rgb);
         atomicAdd(counts[floatBitsToUint(luminance) >> FIRST_SHIFT], 1);
     }
-    sums[thread] = total.sum;
+    sums[first_sum + thread] = total.sum;
     barrier();
 
     for (uint bin = gl_LocalInvocationID.x; bin < FIRST_BINS; bin += gl_WorkGroupSize.x) {

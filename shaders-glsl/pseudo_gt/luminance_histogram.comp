@@ -13,7 +13,8 @@ layout(local_size_x = 256) in;
 layout(push_constant) uniform Params {
     uint pixel_count;
     uint thread_count;
-    uint shift;  // of the digit: 10, then 0
+    uint shift;         // of the digit: 10, then 0
+    uint first_search;  // of the four
 };
 
 layout(binding = 0) readonly buffer Luminances { float luminances[]; };
@@ -25,7 +26,7 @@ shared uint counts[SEARCHES * BINS];
 void main() {
     for (uint bin = gl_LocalInvocationID.x; bin < SEARCHES * BINS; bin += gl_WorkGroupSize.x) counts[bin] = 0;
     RankSearch search[SEARCHES];
-    [[unroll]] for (uint s = 0; s < SEARCHES; ++s) search[s] = searches[s];
+    [[unroll]] for (uint s = 0; s < SEARCHES; ++s) search[s] = searches[first_search + s];
     barrier();
 
     for (uint i = THREAD_INDEX; i < pixel_count; i += thread_count) {

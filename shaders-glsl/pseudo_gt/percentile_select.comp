@@ -10,7 +10,8 @@
 layout(local_size_x = 256) in;
 
 layout(push_constant) uniform Params {
-    uint digit_bits;  // 11, then 10
+    uint digit_bits;    // 11, then 10
+    uint first_search;  // of the four
 };
 
 layout(binding = 0) buffer Searches   { RankSearch searches[]; };
@@ -29,7 +30,7 @@ void main() {
 
     uint rank = 0;
     if (thread < SEARCHES) {
-        RankSearch search = searches[thread];
+        RankSearch search = searches[first_search + thread];
         rank = search.rank;
         uint first = search.histogram * BINS;
         uint digit = 0;
@@ -44,6 +45,6 @@ void main() {
     if (thread < SEARCHES) {
         uint histogram = 0;
         while (prefixes[histogram] != prefixes[thread]) ++histogram;
-        searches[thread] = RankSearch(prefixes[thread], rank, histogram);
+        searches[first_search + thread] = RankSearch(prefixes[thread], rank, histogram);
     }
 }

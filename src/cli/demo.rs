@@ -114,10 +114,10 @@ fn dark_scores(dataset: &Dataset) -> crate::Result<Vec<ViewScore>> {
 fn title(curve: ToneCurve) -> String {
     let ToneSettings { gain_c, theta, .. } = ToneSettings::new(curve);
     match curve {
-        ToneCurve::None => "as it is".to_owned(),
         ToneCurve::Linear => format!("linear, theta {theta}"),
         ToneCurve::Ase => format!("ASE, c {gain_c}"),
         ToneCurve::Ap3 => format!("AP3, c {gain_c}"),
+        other => other.name().to_owned(),
     }
 }
 

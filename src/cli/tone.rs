@@ -1,125 +1,229 @@
-//! `nightsplat tone`: apply a tone curve to photographs.
+//! `nightsplat tone`: measure photographs and apply a tone curve to them.
+
+mod mapper;
+mod page;
+mod photographs;
 
 use std::collections::BTreeMap;
-use std::ffi::OsStr;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
-use super::{ImageFormat, progress_bar};
-use crate::gpu::{Buffer, DeviceChoice, Gpu};
+use self::mapper::Mapper;
+use self::page::Page;
+use self::photographs::{Listed, listed};
+use super::{ImageFormat, progress_bar, table};
+use crate::dataset::Split;
+use crate::gpu::{DeviceChoice, Gpu};
 use crate::image::Image;
-use crate::kernels::ToneParameters;
-use crate::pseudo_gt::PseudoGt;
-use crate::tone::{ToneCurve, ToneSettings};
+use crate::metrics::Scores;
+use crate::report::Distribution;
+use crate::tone::{CurveChoice, Statistics, ToneSettings};
 use crate::{Error, Result};
 
-/// Apply a tone curve to a photograph or to a folder of them.
+/// Apply a tone curve to a photograph, a folder of them or a dataset, and tell what that does.
 #[derive(Clone, Debug, clap::Args)]
 pub struct ToneArgs {
-    /// A photograph (PNG, JPEG or EXR), or a folder of them.
+    /// A photograph (PNG, JPEG or EXR), a folder of them, or a dataset; taken as stored, not undistorted
     pub input: PathBuf,
-    /// The curve: linear, ase, ap3 or none.
-    #[arg(long)]
-    pub curve: ToneCurve,
-    /// The folder to write to; made if it does not exist. Images of the same names are replaced.
-    #[arg(long)]
-    pub out: PathBuf,
-    /// c of ASE and AP3: how much a brighter photograph raises the gain [default: 3 for ase, 1 for ap3].
+    /// The curve: a name that `nightsplat curves` lists, or a .toml, .csv or .cube file
+    #[arg(long, value_name = "NAME|FILE", default_value = "ap3")]
+    pub curve: CurveChoice,
+    /// The folder to write to, names are kept; made if it does not exist. Without it nothing is written
+    #[arg(long, value_name = "DIR")]
+    pub out: Option<PathBuf>,
+    /// c: how much a brighter photograph raises the gain [default: 3 for ase, 1 for ap3, else 0]
     #[arg(long, value_name = "C")]
     pub gain: Option<f64>,
-    /// The mean that the linear curve aims at.
-    #[arg(long, default_value_t = ToneSettings::default().theta)]
-    pub theta: f64,
-    /// Print the statistics of every photograph as JSON.
+    /// The mean that linear scaling aims at [default: 0.49]
+    #[arg(long, value_name = "T")]
+    pub theta: Option<f64>,
+    /// One curve for all: percentiles and means are averaged over the training photographs
+    #[arg(long)]
+    pub scene_statistics: bool,
+    /// Normal-light photographs to score against: a folder with the same names, or a file for one photograph
+    #[arg(long, value_name = "DIR|FILE")]
+    pub reference: Option<PathBuf>,
+    /// Print what was measured as JSON
     #[arg(long)]
     pub json: bool,
-    /// The files to write: 8-bit PNG, or float EXR in linear light.
+    /// Write a page with the measurements and the distributions of luminance
+    #[arg(long, value_name = "FILE.html")]
+    pub report: Option<PathBuf>,
+    /// Further curves on the page
+    #[arg(long, value_name = "NAME|FILE,..", value_delimiter = ',', requires = "report")]
+    pub compare: Vec<CurveChoice>,
+    /// The files to write: 8- or 16-bit PNG, or float EXR in linear light
     #[arg(long, value_enum, default_value_t)]
     pub format: ImageFormat,
-    /// The device, by a part of its name or by index [default: the best].
+    /// The device, by a part of its name or by index [default: the best]
     #[arg(long, value_name = "NAME|INDEX")]
     pub device: Option<DeviceChoice>,
 }
 
-/// What `tone` tells of a photograph.
+/// What is measured of a photograph or of what a curve made of it, on sRGB-encoded values.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct Measures {
+    /// The 10th percentile of the luminance.
+    pub p10: f64,
+    /// The 90th percentile of the luminance.
+    pub p90: f64,
+    /// p10 / p90; 1 where all is black.
+    pub r: f64,
+    /// The mean of the luminance.
+    pub mean_luminance: f64,
+    /// The mean over all channels.
+    pub mean: f64,
+    /// The fraction of the values, over all channels, that are 1 or more.
+    pub clipped_fraction: f64,
+    /// The skewness of the luminance.
+    pub skewness: f64,
+}
+
+/// What `tone` tells of a photograph, or of a scene as the mean over its views.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct ToneReport {
-    /// The 10th percentile of the luminance, plus 1e-6.
-    pub p10: f32,
-    /// The 90th percentile of the luminance, plus 1e-6.
-    pub p90: f32,
-    /// p10 / p90.
-    pub r: f64,
-    /// The black level that ASE and AP3 give a photograph with this r.
+    /// Of the photograph.
+    #[serde(flatten)]
+    pub before: Measures,
+    /// The black level that the settings' alpha and beta give this r; the paper's alpha where the curve has none.
     pub delta0: f64,
-    /// The mean of the luminance.
-    pub mean_luminance: f32,
-    /// The mean over all channels.
-    pub mean: f32,
-    /// The fraction of the mapped values, over all channels, that are 1.
-    pub clipped_fraction: f64,
+    /// Pixels with a value that is NaN or infinite: black in the result, and in no measure.
+    pub unusable_pixels: usize,
+    /// Of the result.
+    pub after: Measures,
+    /// The result against the reference image.
+    #[serde(flatten)]
+    pub scores: Option<Scores>,
+}
+
+/// What `tone` tells.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct ToneOutput {
+    /// The curve.
+    pub curve: ToneSettings,
+    /// Means: of measures over the training views, of scores over the test views; over all where nothing says which.
+    pub scene: ToneReport,
+    /// By name.
+    pub views: BTreeMap<String, ToneReport>,
+}
+
+impl Measures {
+    fn of(planes: &[f32], statistics: &Statistics) -> Self {
+        let mut distribution = Distribution::new("");
+        distribution.add(planes);
+        let clipped = planes.iter().filter(|&&value| value >= 1.0).count();
+        let [p10, p90] = statistics.percentiles();
+        Self {
+            p10,
+            p90,
+            r: statistics.printed_ratio(),
+            mean_luminance: statistics.mean_luminance.into(),
+            mean: statistics.mean.into(),
+            clipped_fraction: clipped as f64 / planes.len().max(1) as f64,
+            skewness: distribution.skewness(),
+        }
+    }
+
+    fn mean_of(all: &[Self]) -> Self {
+        let mean = |of: fn(&Self) -> f64| all.iter().map(of).sum::<f64>() / all.len() as f64;
+        Self {
+            p10: mean(|one| one.p10),
+            p90: mean(|one| one.p90),
+            r: mean(|one| one.r),
+            mean_luminance: mean(|one| one.mean_luminance),
+            mean: mean(|one| one.mean),
+            clipped_fraction: mean(|one| one.clipped_fraction),
+            skewness: mean(|one| one.skewness),
+        }
+    }
 }
 
 /// Applies the curve and prints what was measured, as a table or as JSON.
 ///
 /// # Errors
 /// As [`apply`], or standard output cannot be written to.
-pub fn run(args: ToneArgs) -> Result<()> {
-    let views = apply(&args)?;
-    let mut text = String::new();
-    if args.json {
-        #[derive(Serialize)]
-        struct Output {
-            views: BTreeMap<String, ToneReport>,
-        }
-        let json = serde_json::to_string_pretty(&Output { views });
-        text += &json.map_err(|error| Error::output("standard output", error.to_string()))?;
+pub fn run(args: &ToneArgs) -> Result<()> {
+    let output = apply(args)?;
+    let text = if args.json {
+        let json = serde_json::to_string_pretty(&output);
+        json.map_err(|error| Error::output("standard output", error.to_string()))? + "\n"
     } else {
-        let width = views.keys().map(|name| name.chars().count()).max().unwrap_or(0).max(4);
-        text +=
-            &format!("{:width$}     p10     p90      r  delta0  mean Y    mean  clipped", "name");
-        for (name, view) in &views {
-            let ToneReport { p10, p90, r, delta0, mean_luminance, mean, clipped_fraction } = view;
-            let clipped = 100.0 * clipped_fraction;
-            text += &format!(
-                "\n{name:width$}  {p10:.4}  {p90:.4}  {r:.3}  {delta0:.4}  {mean_luminance:.4}  {mean:.4}  {clipped:5.1} %"
-            );
-        }
-    }
-    writeln!(std::io::stdout().lock(), "{text}")
+        text_table(&output)
+    };
+    write!(std::io::stdout().lock(), "{text}")
         .map_err(|error| Error::output("standard output", error.to_string()))
 }
 
-/// Maps every photograph and writes it to `args.out` under its own name; what was measured, by name.
+fn text_table(output: &ToneOutput) -> String {
+    let heading = "name p10 p90 r delta0 Y skewness -> Y skewness clipped PSNR SSIM";
+    let mut rows = vec![heading.split(' ').map(str::to_owned).collect::<Vec<_>>()];
+    let views = output.views.iter().map(|(name, report)| (name.as_str(), report));
+    for (name, report) in views.chain([("scene", &output.scene)]) {
+        let ToneReport { before, delta0, after, scores, .. } = report;
+        let score =
+            |value: fn(&Scores) -> String| scores.as_ref().map_or_else(|| "-".to_owned(), value);
+        rows.push(vec![
+            name.to_owned(),
+            format!("{:.4}", before.p10),
+            format!("{:.4}", before.p90),
+            format!("{:.3}", before.r),
+            format!("{delta0:.4}"),
+            format!("{:.4}", before.mean_luminance),
+            format!("{:.2}", before.skewness),
+            String::new(),
+            format!("{:.4}", after.mean_luminance),
+            format!("{:.2}", after.skewness),
+            format!("{:.1} %", 100.0 * after.clipped_fraction),
+            score(|scores| format!("{:.2}", scores.psnr)),
+            score(|scores| format!("{:.3}", scores.ssim)),
+        ]);
+    }
+    table::aligned(&rows)
+}
+
+/// Maps every photograph and writes it to `args.out` under its own name.
 ///
-/// A photograph of a folder that cannot be used is named in a warning and left out.
+/// A photograph of several that cannot be used is named in a warning and left out.
 ///
 /// # Errors
-/// [`Error::Usage`] for settings that make no sense; [`Error::Input`] where there is nothing to map or two photographs
-/// would be written to one file; [`Error::Output`] where a file cannot be written or a photograph would be replaced;
-/// those of the device.
-pub fn apply(args: &ToneArgs) -> Result<BTreeMap<String, ToneReport>> {
-    let mut settings = ToneSettings::new(args.curve);
-    settings.theta = args.theta;
-    settings.gain_c = args.gain.unwrap_or(settings.gain_c);
-    settings.check()?;
-    let photographs = photographs(&args.input)?;
-    let targets = targets(&photographs, &args.out, args.format)?;
-    std::fs::create_dir_all(&args.out)
-        .map_err(|error| Error::output(&args.out, format!("cannot be made: {error}")))?;
+/// [`Error::Usage`] for settings that make no sense; [`Error::Input`] where there is nothing to map, two photographs
+/// would be written to one file, or a reference image is of another size; [`Error::Output`] where a file cannot be
+/// written or a photograph would be replaced; those of the device.
+pub fn apply(args: &ToneArgs) -> Result<ToneOutput> {
+    let settings = settings(args, &args.curve)?;
+    let photographs = listed(args)?;
+    if let Some(out) = &args.out {
+        std::fs::create_dir_all(out)
+            .map_err(|error| Error::output(out, format!("cannot be made: {error}")))?;
+    }
+    let gpu = Gpu::new(&args.device.clone().unwrap_or_default())?;
+    let mut mapper = Mapper::new(&gpu, &settings)?;
+    let mut page = args.report.as_ref().map(|_| Page::new(&gpu, args, &photographs)).transpose()?;
+    if settings.scene_statistics {
+        let scene = scene_statistics(&photographs)?;
+        mapper.set_scene(&scene);
+        if let Some(page) = &mut page {
+            page.set_scene(&scene);
+        }
+    }
 
-    let mut mapper = Mapper::new(&Gpu::new(&args.device.clone().unwrap_or_default())?, settings)?;
     let progress = progress_bar(photographs.len());
-    let mut views = BTreeMap::new();
+    let mut views = vec![];
     let mut unusable = None;
-    for (photograph, (name, target)) in photographs.iter().zip(targets) {
-        progress.set_message(name.clone());
-        match mapper.map(photograph) {
-            Ok((report, image)) => {
-                args.format.save(&image, &target)?;
-                views.insert(name, report);
+    for photograph in &photographs {
+        progress.set_message(photograph.name.clone());
+        match mapped(&mut mapper, photograph) {
+            Ok(mapped) => {
+                if let Some(target) = &photograph.target {
+                    args.format.save(&mapped.image, target)?;
+                }
+                let report = mapped.report(&settings, photograph)?;
+                if let Some(page) = &mut page {
+                    page.add(photograph, &mapped, report.scores)?;
+                }
+                views.push((photograph, report));
             }
             Err(error @ Error::Input { .. }) if photographs.len() > 1 => {
                 progress.suspend(|| tracing::warn!("left out: {error}"));
@@ -130,106 +234,127 @@ pub fn apply(args: &ToneArgs) -> Result<BTreeMap<String, ToneReport>> {
         progress.inc(1);
     }
     progress.finish_and_clear();
-    match unusable {
-        Some(error) if views.is_empty() => Err(error),
-        _ => Ok(views),
-    }
-}
-
-/// The photographs of `input`: itself, or those of a folder by name.
-fn photographs(input: &Path) -> Result<Vec<PathBuf>> {
-    let unreadable =
-        |error: std::io::Error| Error::input(input, format!("cannot be read: {error}"));
-    if !std::fs::metadata(input).map_err(unreadable)?.is_dir() {
-        return Ok(vec![input.to_owned()]);
-    }
-    let entries = std::fs::read_dir(input).map_err(unreadable)?;
-    let paths = entries.map(|entry| entry.map(|entry| entry.path()));
-    let mut paths: Vec<PathBuf> = paths.collect::<std::io::Result<_>>().map_err(unreadable)?;
-    paths.retain(|path| {
-        let extension =
-            path.extension().and_then(OsStr::to_str).unwrap_or_default().to_ascii_lowercase();
-        ["png", "jpg", "jpeg", "exr"].contains(&extension.as_str()) && path.is_file()
-    });
-    paths.sort();
-    if paths.is_empty() {
-        return Err(Error::input(input, "holds no PNG, JPEG or EXR image"));
-    }
-    Ok(paths)
-}
-
-/// The name of every photograph and the file it is written to, all different and none of them a photograph.
-fn targets(
-    photographs: &[PathBuf],
-    out: &Path,
-    format: ImageFormat,
-) -> Result<Vec<(String, PathBuf)>> {
-    let extension = format.extension();
-    let sources: Vec<_> = photographs.iter().filter_map(|path| path.canonicalize().ok()).collect();
-    let mut seen = BTreeMap::new();
-    let mut target = |photograph: &PathBuf| {
-        let name = photograph.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-        let target = out.join(format!("{name}.{extension}"));
-        if let Some(other) = seen.insert(name.clone(), photograph.clone()) {
-            let problem =
-                format!("would be written to the same file as {}; rename one", other.display());
-            return Err(Error::input(photograph, problem));
-        }
-        if target.canonicalize().is_ok_and(|target| sources.contains(&target)) {
-            return Err(Error::output(target, "is one of the photographs; choose another --out"));
-        }
-        Ok((name, target))
+    let Some(scene) = scene(&views) else {
+        let nothing = || Error::input(&args.input, "holds no photograph");
+        return Err(unusable.unwrap_or_else(nothing));
     };
-    photographs.iter().map(&mut target).collect()
+    let views = views.into_iter().map(|(listed, report)| (listed.name.clone(), report)).collect();
+    let output = ToneOutput { curve: settings, scene, views };
+    if let (Some(page), Some(path)) = (page, &args.report) {
+        page.write(path, &output)?;
+    }
+    Ok(output)
 }
 
-/// Maps photographs on the device, one at a time.
-struct Mapper {
-    gpu: Gpu,
-    pseudo_gt: PseudoGt,
-    parameters: Buffer<ToneParameters>,
+/// The settings of a curve under the options of the command line.
+fn settings(args: &ToneArgs, curve: &CurveChoice) -> Result<ToneSettings> {
+    let mut settings = curve.settings()?;
+    settings.theta = args.theta.unwrap_or(settings.theta);
+    settings.gain_c = args.gain.unwrap_or(settings.gain_c);
+    settings.scene_statistics |= args.scene_statistics;
+    settings.check()?;
+    Ok(settings)
 }
 
-impl Mapper {
-    fn new(gpu: &Gpu, settings: ToneSettings) -> Result<Self> {
-        Ok(Self {
-            gpu: gpu.clone(),
-            pseudo_gt: PseudoGt::new(gpu, settings)?,
-            parameters: gpu.uninit("tone parameters", 1)?,
+/// A photograph, what was measured of it, and what the curve made of it.
+struct Mapped {
+    photograph: Image,
+    gaps: Vec<usize>,
+    statistics: Statistics,
+    image: Image,
+    reference: Option<Image>,
+}
+
+fn mapped(mapper: &mut Mapper, listed: &Listed) -> Result<Mapped> {
+    let (photograph, gaps) = Image::load_with_gaps(&listed.input)?;
+    if gaps.len() == photograph.pixel_count() {
+        return Err(Error::input(&listed.input, "has no pixel that is a number; export it anew"));
+    }
+    let reference = listed.reference.as_ref().map(Image::load).transpose()?;
+    let statistics = mapper.statistics(&without(&photograph, &gaps))?;
+    let image = mapper.map(&photograph)?;
+    Ok(Mapped { photograph, gaps, statistics, image, reference })
+}
+
+impl Mapped {
+    fn report(&self, settings: &ToneSettings, listed: &Listed) -> Result<ToneReport> {
+        let Self { photograph, gaps, statistics, image, reference } = self;
+        let (usable, result) = (without(photograph, gaps), without(image, gaps));
+        let scores = reference.as_ref().map(|reference| {
+            let size = |image: &Image| format!("{}x{}", image.width, image.height);
+            if size(reference) != size(image) {
+                let path = listed.reference.as_deref().unwrap_or(&listed.input);
+                let (own, other) = (size(reference), size(image));
+                // A wrong folder, not a bad file: it stops the command.
+                return Err(Error::Usage(format!(
+                    "{}: is {own} but {} is {other}; references must be of the photographs' size",
+                    path.display(),
+                    listed.input.display()
+                )));
+            }
+            Scores::of(image, reference)
+        });
+        let alpha =
+            if settings.alpha > 0.0 { settings.alpha } else { ToneSettings::default().alpha };
+        let black_level = ToneSettings { alpha, ..settings.clone() };
+        Ok(ToneReport {
+            before: Measures::of(&usable, statistics),
+            delta0: black_level.offset(statistics.printed_ratio()),
+            unusable_pixels: gaps.len(),
+            after: Measures::of(&result, &Statistics::of(&result)),
+            scores: scores.transpose()?,
         })
     }
+}
 
-    /// The photograph's statistics, and what the curve makes of it.
-    fn map(&mut self, photograph: &Path) -> Result<(ToneReport, Image)> {
-        let mut image = Image::load(photograph)?;
-        let Image { width, height, .. } = image;
-        let too_large = |error| match error {
-            Error::BufferTooLarge { limit, device, .. } => {
-                let problem = format!(
-                    "{width}x{height} pixels exceed the {limit} bytes that {device} binds; resize it"
-                );
-                Error::input(photograph, problem)
-            }
-            error => error,
-        };
-        let source = self.gpu.buffer("photograph", &image.data).map_err(too_large)?;
-        let mut target = self.gpu.uninit("pseudo-GT", source.len())?;
-        self.gpu.run("tone", |pass| {
-            self.pseudo_gt.statistics(pass, &source, [width, height], &mut self.parameters, 0)?;
-            self.pseudo_gt.map(pass, &source, &self.parameters, 0, &mut target)
-        })?;
-        image.data = self.gpu.read(&target)?;
-        let statistics = self.pseudo_gt.measured()?;
-        let clipped = image.data.iter().filter(|&&value| value >= 1.0).count();
-        let report = ToneReport {
-            p10: statistics.p10,
-            p90: statistics.p90,
-            r: statistics.ratio(),
-            delta0: self.pseudo_gt.settings().offset(statistics.ratio()),
-            mean_luminance: statistics.mean_luminance,
-            mean: statistics.mean,
-            clipped_fraction: clipped as f64 / image.data.len() as f64,
-        };
-        Ok((report, image))
+/// The planes without some pixels, ascending.
+fn without<'a>(image: &'a Image, gaps: &[usize]) -> std::borrow::Cow<'a, [f32]> {
+    if gaps.is_empty() {
+        return (&image.data).into();
     }
+    let pixels = image.pixel_count();
+    let is_usable = |index: &usize| gaps.binary_search(&(index % pixels)).is_err();
+    (0..image.data.len()).filter(is_usable).map(|index| image.data[index]).collect()
+}
+
+/// The means over the training photographs.
+fn scene_statistics(photographs: &[Listed]) -> Result<Statistics> {
+    let mut statistics = vec![];
+    for listed in photographs.iter().filter(|listed| listed.split != Some(Split::Test)) {
+        let (image, gaps) = Image::load_with_gaps(&listed.input)?;
+        statistics.push(Statistics::of(&without(&image, &gaps)));
+    }
+    Statistics::mean_of(&statistics).ok_or_else(|| {
+        Error::Usage("--scene-statistics needs training photographs; there are none".to_owned())
+    })
+}
+
+/// The means over the views; none of nothing.
+fn scene(views: &[(&Listed, ToneReport)]) -> Option<ToneReport> {
+    let in_split = |split: Split| {
+        let chosen: Vec<ToneReport> = views
+            .iter()
+            .filter(|(listed, _)| listed.split.is_none_or(|own| own == split))
+            .map(|(_, report)| *report)
+            .collect();
+        // A dataset whose photographs of one split are all absent or unusable.
+        if chosen.is_empty() { views.iter().map(|(_, report)| *report).collect() } else { chosen }
+    };
+    let (training, test) = (in_split(Split::Train), in_split(Split::Test));
+    let measures = |of: fn(&ToneReport) -> Measures| {
+        Measures::mean_of(&training.iter().map(of).collect::<Vec<_>>())
+    };
+    let scores: Vec<Scores> = test.iter().filter_map(|report| report.scores).collect();
+    (!views.is_empty()).then(|| ToneReport {
+        before: measures(|report| report.before),
+        delta0: training.iter().map(|report| report.delta0).sum::<f64>() / training.len() as f64,
+        unusable_pixels: views.iter().map(|(_, report)| report.unusable_pixels).sum(),
+        after: measures(|report| report.after),
+        scores: Scores::mean(&scores),
+    })
+}
+
+/// Whether two paths are one file.
+fn is_same_file(a: &Path, b: &Path) -> bool {
+    a.canonicalize().ok().zip(b.canonicalize().ok()).is_some_and(|(a, b)| a == b)
 }

@@ -11,7 +11,7 @@ use crate::dataset::Dataset;
 use crate::eval::{self, ViewScore};
 use crate::export::RunDirectory;
 use crate::gpu::{DeviceChoice, Gpu};
-use crate::tone::{ToneCurve, ToneSettings};
+use crate::tone::CurveChoice;
 use crate::train::{Background, ModelName, Part, Preset, TrainConfig, Trainer};
 
 /// Train a 3D Gaussian Splatting model from dark photographs.
@@ -35,10 +35,10 @@ pub struct TrainArgs {
 /// The options of a run; each wins over the configuration file.
 #[derive(Clone, Debug, Default, clap::Args)]
 pub(crate) struct TrainOptions {
-    /// The tone curve: linear, ase, ap3 or none [default: ap3]
-    #[arg(long)]
-    curve: Option<ToneCurve>,
-    /// c: how much a brighter photograph raises the curve's gain [default: 3 for ase, 1 for ap3]
+    /// The tone curve: a name that `nightsplat curves` lists, or a .toml, .csv or .cube file [default: ap3]
+    #[arg(long, value_name = "NAME|FILE")]
+    curve: Option<CurveChoice>,
+    /// c: how much a brighter photograph raises the curve's gain [default: 3 for ase, 1 for ap3, else 0]
     #[arg(long, value_name = "C")]
     gain: Option<f64>,
     /// The mean that the linear curve aims at [default: 0.49]
@@ -159,10 +159,10 @@ impl TrainOptions {
         let mut config =
             self.config.as_deref().map_or_else(|| Ok(TrainConfig::default()), TrainConfig::load)?;
         config.dataset = dataset;
-        if let Some(curve) = self.curve.filter(|&curve| curve != config.tone.curve) {
-            // Another curve brings its own c; the other constants stay.
-            config.tone =
-                ToneSettings { curve, gain_c: ToneSettings::new(curve).gain_c, ..config.tone };
+        match &self.curve {
+            Some(CurveChoice::Named(curve)) => config.tone = config.tone.with_curve(*curve),
+            Some(file) => config.tone = file.settings()?,
+            None => {}
         }
         self.model.apply(&mut config);
         set(&mut config.tone.gain_c, &self.gain);

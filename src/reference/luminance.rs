@@ -1,4 +1,4 @@
-use glam::Vec2;
+use glam::Vec3;
 
 use super::CompensatedSum;
 use crate::gpu::Reference;
@@ -8,7 +8,8 @@ use crate::kernels::luminance::{Constants, Kernel, Params, Slices};
 impl Reference for Kernel {
     fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
         let Slices { image, luminances, sums, searches, histograms } = slices;
-        for (search, rank) in searches.iter_mut().zip(params.ranks) {
+        for (search, rank) in searches[params.first_search as usize..].iter_mut().zip(params.ranks)
+        {
             *search = RankSearch { prefix: 0, rank, histogram: 0 };
         }
         let pixel_count = params.pixel_count as usize;
@@ -19,9 +20,9 @@ impl Reference for Kernel {
                 let [r, g, b] = [0, 1, 2].map(|plane| measurable(image[plane * pixel_count + i]));
                 luminances[i] = luminance([r, g, b]);
                 histograms[(luminances[i].to_bits() >> 20) as usize] += 1;
-                total.add(Vec2::new(luminances[i], r + g + b));
+                total.add(Vec3::new(r, g, b));
             }
-            sums[thread] = total.sum;
+            sums[params.first_sum as usize + thread] = total.sum;
         }
     }
 }

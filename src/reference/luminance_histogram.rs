@@ -7,6 +7,7 @@ impl Reference for Kernel {
         _: &Constants,
         Slices { luminances, searches, histograms }: Slices<'_>,
     ) {
+        let searches = &searches[params.first_search as usize..][..4];
         for luminance in &luminances[..params.pixel_count as usize] {
             let digits = luminance.to_bits() >> params.shift;
             let mut matching = searches.iter().filter(|search| search.prefix == digits >> 10);

@@ -4,6 +4,7 @@ use crate::kernels::percentile_select::{Constants, Kernel, Params, Slices};
 
 impl Reference for Kernel {
     fn run(params: &Params, _: &Constants, Slices { searches, histograms }: Slices<'_>) {
+        let searches = &mut searches[params.first_search as usize..][..4];
         for search in searches.iter_mut() {
             let first = search.histogram * 1024;
             let mut digit = 0;

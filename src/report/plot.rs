@@ -13,6 +13,15 @@ pub struct Series {
     pub points: Vec<(f64, f64)>,
 }
 
+/// A value of x that a vertical line marks.
+#[derive(Clone, Debug, Default)]
+pub struct Mark {
+    /// Where.
+    pub x: f64,
+    /// What it is.
+    pub name: String,
+}
+
 /// The drawing area, SVG user units.
 const WIDTH: f64 = 720.0;
 const HEIGHT: f64 = 300.0;
@@ -23,9 +32,17 @@ const BOTTOM: f64 = 34.0;
 
 /// The colours that the page's style defines.
 const COLORS: usize = 5;
+/// How lines of one colour differ.
+const DASHES: [&str; 4] =
+    ["", " stroke-dasharray=\"7 3\"", " stroke-dasharray=\"2 3\"", " stroke-dasharray=\"9 3 2 3\""];
 
 /// Draws `y_name` against `x_name` (loss or PSNR against the step, say); the colours are those of the page's style.
 pub fn plot(x_name: &str, y_name: &str, series: &[Series]) -> String {
+    plot_with_marks(x_name, y_name, series, &[])
+}
+
+/// As [`plot`], with vertical lines where `marks` lie within the x axis.
+pub fn plot_with_marks(x_name: &str, y_name: &str, series: &[Series], marks: &[Mark]) -> String {
     // Positive phrasing: a NaN fails the test too. The bound keeps differences of values finite.
     let is_drawable = |&(x, y): &(f64, f64)| x.abs() <= 1e30 && y.abs() <= 1e30;
     let points =
@@ -33,9 +50,12 @@ pub fn plot(x_name: &str, y_name: &str, series: &[Series]) -> String {
     let x_axis = Axis::around(points().map(|(x, _)| x), LEFT, WIDTH - RIGHT);
     let y_axis = Axis::around(points().map(|(_, y)| y), HEIGHT - BOTTOM, TOP);
 
+    let (legend, legend_height) = legend_places(series);
     let mut svg = format!(
-        "<svg viewBox=\"0 0 {WIDTH} {HEIGHT}\" role=\"img\" aria-label=\"{} against {}\" \
+        "<svg viewBox=\"0 {} {WIDTH} {}\" role=\"img\" aria-label=\"{} against {}\" \
          font-size=\"12\" fill=\"var(--quiet)\">\n",
+        0.0 - legend_height,
+        HEIGHT + legend_height,
         escape(y_name),
         escape(x_name)
     );
@@ -68,22 +88,61 @@ pub fn plot(x_name: &str, y_name: &str, series: &[Series]) -> String {
         escape(x_name),
         escape(y_name)
     );
-    let mut legend = LEFT + 60.0;
-    for (index, Series { name, points }) in series.iter().enumerate() {
+    for Mark { x, name } in marks.iter().filter(|mark| (x_axis.low..=x_axis.high).contains(&mark.x))
+    {
+        let x = x_axis.place(*x);
+        let (bottom, below) = (HEIGHT - BOTTOM, TOP + 12.0);
+        let _ = writeln!(
+            svg,
+            "<line x1=\"{x:.1}\" x2=\"{x:.1}\" y1=\"{TOP}\" y2=\"{bottom}\" stroke=\"var(--quiet)\" stroke-dasharray=\"4 3\"/>\
+             <text x=\"{:.1}\" y=\"{below}\">{}</text>",
+            x + 4.0,
+            escape(name)
+        );
+    }
+    for (index, (Series { name, points }, [text_x, text_y])) in
+        series.iter().zip(legend).enumerate()
+    {
         let color = format!("var(--series-{})", index % COLORS);
+        let dashes = DASHES[index / COLORS % DASHES.len()];
         let line = points.iter().filter(|point| is_drawable(point));
         let line = line.map(|&(x, y)| format!("{:.1},{:.1}", x_axis.place(x), y_axis.place(y)));
         let _ = writeln!(
             svg,
-            "<polyline fill=\"none\" stroke=\"{color}\" stroke-width=\"2\" stroke-linejoin=\"round\" points=\"{}\"/>\
-             <text x=\"{legend}\" y=\"14\" fill=\"{color}\">{}</text>",
+            "<polyline fill=\"none\" stroke=\"{color}\" stroke-width=\"2\"{dashes} stroke-linejoin=\"round\" points=\"{}\"/>\
+             <text x=\"{text_x}\" y=\"{text_y}\" fill=\"{color}\">{}</text>",
             line.collect::<Vec<_>>().join(" "),
             escape(name)
         );
-        legend += 8.0 * name.chars().count() as f64 + 24.0;
     }
     svg.push_str("</svg>");
     svg
+}
+
+/// Where each name of the legend begins, and by how much its rows rise above the drawing.
+fn legend_places(series: &[Series]) -> (Vec<[f64; 2]>, f64) {
+    const ROW: f64 = 16.0;
+    let (mut x, mut y) = (LEFT + 60.0, 14.0);
+    let mut places = vec![];
+    for Series { name, .. } in series {
+        let width = 8.0 * name.chars().count() as f64 + 24.0;
+        if x + width > WIDTH && x > LEFT + 60.0 {
+            (x, y) = (LEFT + 60.0, y - ROW);
+        }
+        places.push([x, y]);
+        x += width;
+    }
+    (places, 14.0 - y)
+}
+
+/// A plot as a file of its own, in the colours of the page's style.
+pub fn svg_file(plot: &str) -> String {
+    let style = include_str!("style.css");
+    // The custom properties stand before the first rule that is not theirs.
+    let colors = style.split("* {").next().unwrap_or_default();
+    let begin = "<svg xmlns=\"http://www.w3.org/2000/svg\" style=\"background: var(--ground)\" font-family=\"sans-serif\" ";
+    let whole = plot.replacen("<svg ", begin, 1);
+    whole.replacen(">\n", &format!(">\n<style>\n{colors}</style>\n"), 1)
 }
 
 /// A range of values and where it lies on the drawing.

@@ -1,4 +1,4 @@
-//! What a curve knows of a photograph: two percentiles and two means.
+//! What a curve knows of a photograph: percentiles and means.
 
 use crate::kernels::ToneStatistics;
 use crate::reference::luminance::{luminance, measurable};
@@ -9,16 +9,20 @@ const EPSILON: f32 = 1e-6;
 /// The statistics of one photograph, over all its pixels, on sRGB-encoded values.
 ///
 /// They are finite for every input: NaN and negative values count as 0, and values above 65504 as 65504.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Statistics {
     /// The 10th percentile of the BT.601 luminance, plus 1e-6.
     pub p10: f32,
+    /// The 80th percentile of the luminance, plus 1e-6; the device takes it for the curve `p80` only, else it is 0.
+    pub p80: f32,
     /// The 90th percentile of the luminance, plus 1e-6.
     pub p90: f32,
     /// The mean of the luminance.
     pub mean_luminance: f32,
     /// The mean over all pixels of all three channels.
     pub mean: f32,
+    /// The mean over all pixels of each channel.
+    pub channel_means: [f32; 3],
 }
 
 impl Statistics {
@@ -27,21 +31,50 @@ impl Statistics {
         let (red, rest) = planes.split_at(planes.len() / 3);
         let (green, blue) = rest.split_at(red.len());
         let mut luminances = Vec::with_capacity(red.len());
-        let (mut luminance_sum, mut sum) = (0.0, 0.0);
+        let mut sums = [0.0; 3];
         for ((&r, &g), &b) in red.iter().zip(green).zip(blue) {
             let rgb = [r, g, b].map(measurable);
-            let y = luminance(rgb);
-            luminances.push(y);
-            luminance_sum += f64::from(y);
-            sum += rgb.iter().map(|&x| f64::from(x)).sum::<f64>();
+            luminances.push(luminance(rgb));
+            for (sum, x) in sums.iter_mut().zip(rgb) {
+                *sum += f64::from(x);
+            }
         }
-        let pixels = luminances.len().max(1) as f64;
+        let [red, green, blue] = sums.map(|sum| sum / luminances.len().max(1) as f64);
         Self {
             p10: percentile(&mut luminances, 1) + EPSILON,
+            p80: percentile(&mut luminances, 8) + EPSILON,
             p90: percentile(&mut luminances, 9) + EPSILON,
-            mean_luminance: (luminance_sum / pixels) as f32,
-            mean: (sum / (3.0 * pixels)) as f32,
+            mean_luminance: (0.299 * red + 0.587 * green + 0.114 * blue) as f32,
+            mean: ((red + green + blue) / 3.0) as f32,
+            channel_means: [red, green, blue].map(|mean| mean as f32),
         }
+    }
+
+    /// The mean of each: the statistics of a scene, from those of its training views; none of nothing.
+    pub fn mean_of(views: &[Self]) -> Option<Self> {
+        let mean = |of: &dyn Fn(&Self) -> f32| {
+            let sum: f64 = views.iter().map(|view| f64::from(of(view))).sum();
+            (sum / views.len() as f64) as f32
+        };
+        (!views.is_empty()).then(|| Self {
+            p10: mean(&|view| view.p10),
+            p80: mean(&|view| view.p80),
+            p90: mean(&|view| view.p90),
+            mean_luminance: mean(&|view| view.mean_luminance),
+            mean: mean(&|view| view.mean),
+            channel_means: [0, 1, 2].map(|channel| mean(&|view| view.channel_means[channel])),
+        })
+    }
+
+    /// p10 and p90 as they are, without the 1e-6: what the paper prints.
+    pub fn percentiles(&self) -> [f64; 2] {
+        [self.p10, self.p90].map(|value| (f64::from(value) - f64::from(EPSILON)).max(0.0))
+    }
+
+    /// r of [`Statistics::percentiles`]; 1 for a black photograph.
+    pub fn printed_ratio(&self) -> f64 {
+        let [p10, p90] = self.percentiles();
+        if p90 > 0.0 { p10 / p90 } else { 1.0 }
     }
 
     /// r = p10 / p90, in [0, 1]: how little the shadows are crushed.
@@ -51,8 +84,9 @@ impl Statistics {
 }
 
 impl From<ToneStatistics> for Statistics {
-    fn from(ToneStatistics { p10, p90, mean_luminance, mean }: ToneStatistics) -> Self {
-        Self { p10, p90, mean_luminance, mean }
+    fn from(found: ToneStatistics) -> Self {
+        let ToneStatistics { p10, p80, p90, mean_luminance, mean, channel_means } = found;
+        Self { p10, p80, p90, mean_luminance, mean, channel_means: channel_means.into() }
     }
 }
 

@@ -13,6 +13,7 @@ use crate::pseudo_gt::PseudoGt;
 use crate::random::Stream;
 use crate::scene::{Features, Gaussians, Shape, init};
 use crate::structure::StructureTarget;
+use crate::tone::{Statistics, ToneCurve, ToneSettings};
 
 /// One training view.
 #[derive(Debug)]
@@ -23,7 +24,9 @@ pub(super) struct TrainView {
     pub(super) camera: Camera,
     /// The dark photograph, planar (3, H, W), sRGB-encoded.
     pub(super) image: Buffer<f32>,
-    /// The curve that its statistics give; one element.
+    /// The target, where the loss does not evaluate the curve.
+    baked: Option<Buffer<f32>>,
+    /// The curve that its statistics give; one element. Of a baked target none.
     pub(super) tone: Buffer<ToneParameters>,
     /// The edges of the pseudo-GT, (H, W), where the model has structure.
     pub(super) structure: Option<Buffer<f32>>,
@@ -43,8 +46,7 @@ impl Views {
         dataset: &Dataset,
         features: Features,
     ) -> Result<Self> {
-        let mut structures = features.structure.then(|| StructureTarget::new(gpu)).transpose()?;
-        let mut views = vec![];
+        let (mut views, mut statistics) = (vec![], vec![]);
         for (index, view) in dataset.views.iter().enumerate() {
             let Some(image) = view.image.as_ref().filter(|_| view.is_train()) else { continue };
             let pixels = gpu.buffer("low", &image.data)?;
@@ -53,19 +55,36 @@ impl Views {
                 pseudo_gt.statistics(pass, &pixels, [image.width, image.height], &mut tone, 0)
             })?;
             let depth = view.depth.as_ref().filter(|_| features.depth);
-            let mut view = TrainView {
+            statistics.push(pseudo_gt.measured()?);
+            views.push(TrainView {
                 name: view.name.clone(),
                 index,
                 camera: view.camera,
                 image: pixels,
+                baked: None,
                 tone,
                 structure: None,
                 depth: depth.map(|depth| gpu.buffer("depth", depth)).transpose()?,
-            };
-            if let Some(structures) = &mut structures {
-                view.structure = Some(view.edges(gpu, pseudo_gt, structures)?);
+            });
+        }
+        let settings = pseudo_gt.settings();
+        if let Some(scene) = Statistics::mean_of(&statistics).filter(|_| settings.scene_statistics)
+        {
+            let parameters = settings.parameters(&scene);
+            for view in &mut views {
+                gpu.write(&mut view.tone, &[parameters])?;
             }
-            views.push(view);
+        }
+        if settings.needs_baking() {
+            for view in &mut views {
+                view.bake(gpu, pseudo_gt)?;
+            }
+        }
+        if features.structure {
+            let mut structures = StructureTarget::new(gpu)?;
+            for view in &mut views {
+                view.structure = Some(view.edges(gpu, pseudo_gt, &mut structures)?);
+            }
         }
         Ok(Self(views))
     }
@@ -132,6 +151,11 @@ impl TrainView {
         UVec2::new(self.camera.width, self.camera.height)
     }
 
+    /// What the loss applies its curve to.
+    pub(super) fn loss_input(&self) -> &Buffer<f32> {
+        self.baked.as_ref().unwrap_or(&self.image)
+    }
+
     /// The structure of the pseudo-GT.
     fn edges(
         &self,
@@ -139,20 +163,41 @@ impl TrainView {
         pseudo_gt: &PseudoGt,
         structures: &mut StructureTarget,
     ) -> Result<Buffer<f32>> {
-        let mut target = gpu.uninit("target", self.image.len())?;
+        let mapped;
+        let target = match &self.baked {
+            Some(target) => target,
+            None => {
+                mapped = self.mapped(gpu, pseudo_gt)?;
+                &mapped
+            }
+        };
         let mut structure = gpu.uninit("structure", self.image.len() / 3)?;
-        gpu.run("structure", |pass| {
-            pseudo_gt.map(pass, &self.image, &self.tone, 0, &mut target)?;
-            structures.record(pass, &target, self.size(), &mut structure)
-        })?;
+        gpu.run("structure", |pass| structures.record(pass, target, self.size(), &mut structure))?;
         Ok(structure)
+    }
+
+    /// Makes the target now, in place of the loss kernels.
+    fn bake(&mut self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<()> {
+        self.baked = Some(self.mapped(gpu, pseudo_gt)?);
+        gpu.write(
+            &mut self.tone,
+            &[ToneSettings::new(ToneCurve::None).parameters(&Statistics::default())],
+        )
+    }
+
+    fn mapped(&self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<Buffer<f32>> {
+        let mut target = gpu.uninit("target", self.image.len())?;
+        gpu.run("target", |pass| pseudo_gt.map(pass, &self.image, &self.tone, 0, &mut target))?;
+        Ok(target)
     }
 
     /// The pseudo-GT of the view.
     fn target(&self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<Image> {
-        let mut target = gpu.uninit("target", self.image.len())?;
-        gpu.run("target", |pass| pseudo_gt.map(pass, &self.image, &self.tone, 0, &mut target))?;
+        let data = match &self.baked {
+            Some(target) => gpu.read(target)?,
+            None => gpu.read(&self.mapped(gpu, pseudo_gt)?)?,
+        };
         let Camera { width, height, .. } = self.camera;
-        Ok(Image { width, height, data: gpu.read(&target)? })
+        Ok(Image { width, height, data })
     }
 }

@@ -13,7 +13,8 @@ use super::{NOT_FINITE, Torch, assert_close, bits, central_differences, largest,
 
 const SIZES: [[u32; 2]; 8] =
     [[1, 1], [3, 1], [1, 40], [5, 7], [17, 33], [16, 64], [33, 65], [131, 97]];
-const TONE: ToneParameters = ToneParameters { white: 0.12, offset: 0.05, gain: 1.07 };
+const TONE: ToneParameters =
+    ToneParameters { white: 0.12, offset: 0.05, gain: 1.07, constants: [0.0; 8] };
 
 /// A dark photograph and a render that is off by a texture and by noise.
 fn images([width, height]: [u32; 2]) -> [Vec<f32>; 2] {

@@ -9,7 +9,7 @@ mod losses;
 mod nn;
 mod window;
 
-use glam::Vec2;
+use glam::Vec3;
 
 use super::check::Rule::{Close, Exact};
 use super::check::check;
@@ -17,7 +17,7 @@ use super::scene::{self, Scene};
 use super::{Bench, Timing};
 use crate::gpu::Threads;
 use crate::kernels::*;
-use crate::tone::{ToneCurve, ToneSettings};
+use crate::tone::{Table, ToneCurve, ToneSettings};
 
 /// The constants that the kernels of the rasteriser share.
 macro_rules! constants {
@@ -53,7 +53,7 @@ fn statistics(bench: &Bench, timings: &mut Vec<Timing>) -> anyhow::Result<TonePa
     let last = pixel_count - 1;
     let [p10, p90] = [1, 9].map(|tenths| last / 10 * tenths + last % 10 * tenths / 10);
     let luminances = vec![0.0_f32; pixel_count as usize];
-    let sums = vec![Vec2::ZERO; THREADS as usize];
+    let sums = vec![Vec3::ZERO; THREADS as usize];
     let (searches, histograms) = (vec![RankSearch::default(); 4], vec![0_u32; 4096]);
     let (luminances, sums, searches, histograms) = check!(
         bench,
@@ -63,7 +63,9 @@ fn statistics(bench: &Bench, timings: &mut Vec<Timing>) -> anyhow::Result<TonePa
         luminance::Params {
             ranks: [p10, p10 + 1, p90, p90 + 1],
             pixel_count,
-            thread_count: THREADS
+            thread_count: THREADS,
+            first_search: 0,
+            first_sum: 0,
         },
         Threads::Exactly([THREADS, 1, 1]),
         [image],
@@ -74,7 +76,7 @@ fn statistics(bench: &Bench, timings: &mut Vec<Timing>) -> anyhow::Result<TonePa
         timings,
         percentile_select,
         percentile_select::Constants::default(),
-        percentile_select::Params { digit_bits: 11 },
+        percentile_select::Params { digit_bits: 11, first_search: 0 },
         Threads::Workgroups([1, 1, 1]),
         [],
         [searches: Exact, histograms: Exact]
@@ -85,7 +87,7 @@ fn statistics(bench: &Bench, timings: &mut Vec<Timing>) -> anyhow::Result<TonePa
             timings,
             luminance_histogram,
             luminance_histogram::Constants::default(),
-            luminance_histogram::Params { pixel_count, thread_count: THREADS, shift },
+            luminance_histogram::Params { pixel_count, thread_count: THREADS, shift, first_search: 0 },
             Threads::Exactly([THREADS, 1, 1]),
             [luminances, searches],
             [histograms: Exact]
@@ -96,7 +98,7 @@ fn statistics(bench: &Bench, timings: &mut Vec<Timing>) -> anyhow::Result<TonePa
             timings,
             percentile_select,
             percentile_select::Constants::default(),
-            percentile_select::Params { digit_bits: 10 },
+            percentile_select::Params { digit_bits: 10, first_search: 0 },
             Threads::Workgroups([1, 1, 1]),
             [],
             [searches: Exact, histograms: Exact]
@@ -114,13 +116,14 @@ fn statistics(bench: &Bench, timings: &mut Vec<Timing>) -> anyhow::Result<TonePa
         tone_statistics::Params {
             view: 0,
             pixel_count,
-            thread_count: THREADS,
-            weights: Vec2::new(weight(1), weight(9)),
+            sum_count: THREADS,
+            weights: Vec3::new(weight(1), weight(9), weight(8)),
             gain_c: settings.gain_c as f32,
             theta: settings.theta as f32,
             alpha: settings.alpha as f32,
             beta: settings.beta as f32,
-            base_gain: settings.base_gain as f32,
+            least_gain: 1.0,
+            constants: [0.0; 8],
         },
         Threads::Workgroups([1, 1, 1]),
         [searches, sums],
@@ -135,6 +138,32 @@ fn statistics(bench: &Bench, timings: &mut Vec<Timing>) -> anyhow::Result<TonePa
         tone_map::Params { value_count: image.len() as u32, view: 0 },
         Threads::Exactly([image.len() as u32, 1, 1]),
         [image, parameters],
+        [target: Close(1e-5)]
+    );
+    check!(
+        bench,
+        timings,
+        tone_mix,
+        tone_mix::Constants { tone_curve: ToneCurve::LumPreserve.constant() },
+        tone_mix::Params { pixel_count, view: 0 },
+        Threads::Exactly([pixel_count, 1, 1]),
+        [image, parameters],
+        [target: Close(1e-5)]
+    );
+    let knots = Table {
+        x: (0..64).map(|i| f64::from(i) / 16.0).collect(),
+        y: vec![(0..64).map(|i| 1.0 - (-f64::from(i) / 16.0).exp()).collect()],
+        ..Table::default()
+    }
+    .knots();
+    check!(
+        bench,
+        timings,
+        tone_table,
+        tone_table::Constants::default(),
+        tone_table::Params { pixel_count, view: 0, knot_count: 64 },
+        Threads::Exactly([image.len() as u32, 1, 1]),
+        [image, parameters, knots],
         [target: Close(1e-5)]
     );
     Ok(parameters[0])

@@ -93,7 +93,7 @@ fn sort(bench: &Bench) -> Result<f64> {
 fn tone_statistics(bench: &Bench) -> Result<f64> {
     let gpu = &bench.gpu;
     let image = gpu.buffer("low", &scene::dark(1920, 1080).data)?;
-    let mut pseudo_gt = PseudoGt::new(gpu, ToneSettings::default())?;
+    let mut pseudo_gt = PseudoGt::new(gpu, &ToneSettings::default())?;
     let mut parameters = gpu.zeros("tone", 1)?;
     bench.median(|| {
         let times = gpu.profile("statistics", |pass| {
@@ -131,7 +131,7 @@ impl<'s> Step<'s> {
         renderer.reserve(gaussians.count, [camera])?;
         // Grows the memory as the scene demands.
         renderer.render_image(&parameters, camera, &OPTIONS)?;
-        let mut pseudo_gt = PseudoGt::new(gpu, ToneSettings::new(curve))?;
+        let mut pseudo_gt = PseudoGt::new(gpu, &ToneSettings::new(curve))?;
         let image = gpu.buffer("low", &low.data)?;
         let mut tone = gpu.zeros("tone", 1)?;
         let size = [low.width, low.height];

@@ -1,0 +1,36 @@
+#version 460
+#extension GL_GOOGLE_include_directive : require
+#include "kernel.glsl"
+#include "tone.glsl"
+
+//! Tone mix: one thread per pixel applies a curve whose channels depend on more than their own value.
+//!
+//! `lum_preserve` scales a pixel by what its luminance gains, `per_channel` each channel by its own white.
+
+layout(local_size_x = 256) in;
+
+layout(push_constant) uniform Params {
+    uint pixel_count;
+    uint view;  // the element of `parameters`
+};
+
+layout(binding = 0) readonly buffer Image      { float image[]; };  // (3, H, W), sRGB
+layout(binding = 1) readonly buffer Parameters { ToneParameters parameters[]; };
+layout(binding = 2) writeonly buffer Target    { float target[]; };
+
+void main() {
+    uint i = THREAD_INDEX;
+    if (i >= pixel_count) return;
+    ToneParameters tone = parameters[view];
+    vec3 rgb = vec3(image[i], image[pixel_count + i], image[2 * pixel_count + i]);
+    // Positive phrasing: a NaN becomes black.
+    vec3 known = mix(vec3(0.0), min(rgb, vec3(65504.0)), greaterThan(rgb, vec3(0.0)));
+    float y = 0.299 * known.r + 0.587 * known.g + 0.114 * known.b;
+    vec3 scale = vec3(y * tone.gain / (y + 1e-6));
+    uint curve = TONE_CURVE;
+    if (curve == CURVE_PER_CHANNEL) scale = 1.0 / vec3(tone.constants[0], tone.constants[1], tone.constants[2]);
+    vec3 mapped = min(known * scale, vec3(1.0));
+    target[i] = mapped.r;
+    target[pixel_count + i] = mapped.g;
+    target[2 * pixel_count + i] = mapped.b;
+}

@@ -1,0 +1,160 @@
+//! `nightsplat curves`: the table of tone curves, their values and their plots.
+
+use std::io::Write;
+use std::path::PathBuf;
+
+use super::table;
+use crate::dataset::{Dataset, LoadOptions, Split};
+use crate::export;
+use crate::image::Image;
+use crate::report::{Mark, Series, plot_with_marks, svg_file};
+use crate::tone::{CurveChoice, FAMILIES, Family, Statistics, ToneCurve, ToneSettings};
+use crate::{Error, Result};
+
+/// List the tone curves, print their values or plot them.
+#[derive(Clone, Debug, clap::Args)]
+pub struct CurvesArgs {
+    /// Which: names, or .toml, .csv and .cube files [default: all of the table]
+    #[arg(value_name = "NAME|FILE")]
+    pub curves: Vec<CurveChoice>,
+    /// Draw them into an SVG file
+    #[arg(long, value_name = "FILE.svg")]
+    pub plot: Option<PathBuf>,
+    /// Print their values
+    #[arg(long)]
+    pub table: bool,
+    /// The values of t = x / p90 that --table prints
+    #[arg(
+        long,
+        value_name = "T,..",
+        value_delimiter = ',',
+        default_values_t = [0.05, 0.1, 0.25, 0.5, 1.0, 1.5, 2.0, 3.0]
+    )]
+    pub at: Vec<f64>,
+    /// A dataset: its mean statistics give the curves black level and gain, and are marked on the plot
+    #[arg(long, value_name = "DIR")]
+    pub dataset: Option<PathBuf>,
+}
+
+/// A curve with what it is called here.
+struct Curve {
+    name: String,
+    settings: ToneSettings,
+}
+
+/// Lists, prints or plots.
+///
+/// # Errors
+/// As [`text`], or standard output cannot be written to.
+pub fn run(args: &CurvesArgs) -> Result<()> {
+    write!(std::io::stdout().lock(), "{}", text(args)?)
+        .map_err(|error| Error::output("standard output", error.to_string()))
+}
+
+/// What the command prints; the plot is written.
+///
+/// # Errors
+/// A file cannot be read or written, or a value of t makes no sense.
+pub fn text(args: &CurvesArgs) -> Result<String> {
+    // Positive phrasing: a NaN fails the test too.
+    if let Some(t) = args.at.iter().find(|&&t| !(t >= 0.0)) {
+        return Err(Error::Usage(format!("--at {t}: t must be 0 or more")));
+    }
+    let curves = chosen(&args.curves)?;
+    let scene = args.dataset.as_deref().map(scene_statistics).transpose()?;
+    let mut text = String::new();
+    if args.table {
+        text += &values(&curves, &args.at, scene.as_ref());
+    }
+    if let Some(path) = &args.plot {
+        let svg = svg_file(&drawing(&curves, scene.as_ref()));
+        export::write_whole(path, svg.as_bytes())?;
+        text += &format!("{}\n", path.display());
+    }
+    if !args.table && args.plot.is_none() {
+        text = listing(&curves);
+    }
+    Ok(text)
+}
+
+fn chosen(choices: &[CurveChoice]) -> Result<Vec<Curve>> {
+    let all: Vec<CurveChoice> = ToneCurve::ALL.map(CurveChoice::Named).to_vec();
+    let choices = if choices.is_empty() { &all } else { choices };
+    let curve =
+        |choice: &CurveChoice| Ok(Curve { name: choice.to_string(), settings: choice.settings()? });
+    choices.iter().map(curve).collect()
+}
+
+/// The means over the training photographs of a dataset, as stored.
+fn scene_statistics(root: &std::path::Path) -> Result<Statistics> {
+    let photographs = Dataset::photographs(root, &LoadOptions::default())?;
+    let training = photographs.iter().filter(|photograph| photograph.split == Split::Train);
+    let statistics =
+        training.map(|photograph| Ok(Statistics::of(&Image::load(&photograph.input)?.data)));
+    let statistics = statistics.collect::<Result<Vec<_>>>()?;
+    Statistics::mean_of(&statistics)
+        .ok_or_else(|| Error::input(root, "has no training photograph to take statistics of"))
+}
+
+fn listing(curves: &[Curve]) -> String {
+    let mut text = String::new();
+    for Curve { name, settings } in curves {
+        let Family { formula, source, monotone, bounded, constants, aliases, .. } =
+            settings.curve.family();
+        if settings.table.is_some() {
+            text += &format!("{name}\n    a table of values, monotone cubics between them\n");
+            continue;
+        }
+        let also =
+            if aliases.is_empty() { String::new() } else { format!(" ({})", aliases.join(", ")) };
+        let rises = if *monotone { "monotone" } else { "not monotone" };
+        let clips = if *bounded { "bounded" } else { "clips" };
+        text += &format!("{name}{also}\n    {formula}\n");
+        let values = constants.iter().zip(&settings.constants);
+        let values: Vec<String> =
+            values.map(|(constant, value)| format!("{} = {value}", constant.name)).collect();
+        if !values.is_empty() {
+            text += &format!("    {}\n", values.join(", "));
+        }
+        text += &format!("    {rises}, {clips}; {source}\n");
+    }
+    if curves.len() == FAMILIES.len() {
+        text += "\nt = x / p90, Y the mean luminance, delta0 = alpha (1 - p10 / p90)^beta.\n\
+                 Every curve is clamped to [0, 1].\n";
+    }
+    text
+}
+
+fn value(settings: &ToneSettings, t: f64, scene: Option<&Statistics>) -> f64 {
+    settings.value(t, &scene.copied().unwrap_or_else(|| settings.plain_statistics()))
+}
+
+fn values(curves: &[Curve], at: &[f64], scene: Option<&Statistics>) -> String {
+    let mut rows = vec![vec!["t".to_owned()]];
+    rows[0].extend(at.iter().map(f64::to_string));
+    for Curve { name, settings } in curves {
+        let mut row = vec![name.clone()];
+        row.extend(at.iter().map(|&t| format!("{:.3}", value(settings, t, scene))));
+        rows.push(row);
+    }
+    table::aligned(&rows)
+}
+
+fn drawing(curves: &[Curve], scene: Option<&Statistics>) -> String {
+    const LAST: f64 = 3.0;
+    const POINTS: u32 = 300;
+    let series = |curve: &Curve| Series {
+        name: curve.name.clone(),
+        points: (0..=POINTS)
+            .map(|i| LAST * f64::from(i) / f64::from(POINTS))
+            .map(|t| (t, value(&curve.settings, t, scene)))
+            .collect(),
+    };
+    let mark = |x: f64, name: &str| Mark { x, name: name.to_owned() };
+    let marks = scene.map(|scene| {
+        let mean = f64::from(scene.mean_luminance) / f64::from(scene.p90);
+        vec![mark(scene.ratio(), "p10"), mark(mean, "mean Y"), mark(1.0, "p90")]
+    });
+    let series: Vec<Series> = curves.iter().map(series).collect();
+    plot_with_marks("t = x / p90", "target", &series, &marks.unwrap_or_default())
+}

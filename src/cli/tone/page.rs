@@ -1,0 +1,164 @@
+//! The page of `tone`: measurements, distributions of luminance, pictures side by side.
+
+use std::path::Path;
+
+use super::mapper::Mapper;
+use super::photographs::Listed;
+use super::{Mapped, Measures, ToneArgs, ToneOutput, settings, without};
+use crate::Result;
+use crate::export;
+use crate::gpu::Gpu;
+use crate::image::Image;
+use crate::metrics::Scores;
+use crate::report::{
+    Best, Column, Comparison, Distribution, Picture, Report, Table, distributions,
+};
+use crate::tone::Statistics;
+
+/// The widest picture on the page, pixels.
+const PICTURE_WIDTH: u32 = 480;
+
+/// What the page gathers while photographs are mapped.
+pub(super) struct Page {
+    curve: String,
+    /// Where some photographs have a reference image, only those are drawn, so that like is compared with like.
+    only_referenced: bool,
+    input: Distribution,
+    result: Distribution,
+    compared: Vec<(Mapper, Distribution)>,
+    reference: Distribution,
+    comparison: Option<Comparison>,
+}
+
+impl Page {
+    pub(super) fn new(gpu: &Gpu, args: &ToneArgs, photographs: &[Listed]) -> Result<Self> {
+        let compared = args.compare.iter().map(|curve| {
+            let mapper = Mapper::new(gpu, &settings(args, curve)?)?;
+            Ok((mapper, Distribution::new(curve.to_string())))
+        });
+        let curve = args.curve.to_string();
+        Ok(Self {
+            only_referenced: photographs.iter().any(|listed| listed.reference.is_some()),
+            input: Distribution::new("photograph"),
+            result: Distribution::new(curve.clone()),
+            compared: compared.collect::<Result<_>>()?,
+            reference: Distribution::new("reference"),
+            comparison: None,
+            curve,
+        })
+    }
+
+    pub(super) fn set_scene(&mut self, scene: &Statistics) {
+        for (mapper, _) in &mut self.compared {
+            mapper.set_scene(scene);
+        }
+    }
+
+    /// Adds a photograph and its result; the first one's pictures are shown.
+    pub(super) fn add(
+        &mut self,
+        listed: &Listed,
+        mapped: &Mapped,
+        scores: Option<Scores>,
+    ) -> Result<()> {
+        let Mapped { photograph, gaps, image, reference, .. } = mapped;
+        if self.only_referenced && reference.is_none() {
+            return Ok(());
+        }
+        self.input.add(&without(photograph, gaps));
+        self.result.add(&without(image, gaps));
+        let mut pictures =
+            vec![picture("photograph", None, photograph), picture(&self.curve, scores, image)];
+        for (mapper, distribution) in &mut self.compared {
+            mapper.statistics(&without(photograph, gaps))?;
+            let image = mapper.map(photograph)?;
+            distribution.add(&without(&image, gaps));
+            let scores = reference.as_ref().map(|reference| Scores::of(&image, reference));
+            pictures.push(picture(&distribution.name, scores.transpose()?, &image));
+        }
+        if let Some(reference) = reference {
+            self.reference.add(&without(reference, gaps));
+            pictures.push(picture("reference", None, reference));
+        }
+        self.comparison.get_or_insert_with(|| Comparison { title: listed.name.clone(), pictures });
+        Ok(())
+    }
+
+    /// Writes the page.
+    pub(super) fn write(self, path: &Path, output: &ToneOutput) -> Result<()> {
+        let mut drawn = vec![self.input, self.result];
+        drawn.extend(self.compared.into_iter().map(|(_, distribution)| distribution));
+        let mut intro = vec![format!(
+            "The curve {} on {} photographs, and how their luminance is distributed before and after.",
+            self.curve,
+            output.views.len()
+        )];
+        if self.only_referenced {
+            drawn.push(self.reference);
+            intro.push(
+                "Distributions and pictures are those of the photographs with a reference image."
+                    .to_owned(),
+            );
+        }
+        let report = Report {
+            title: format!("Tone curve {}", self.curve),
+            intro,
+            tables: vec![table(output)],
+            plots: vec![distributions(&drawn)],
+            comparisons: self.comparison.into_iter().collect(),
+        };
+        export::write_whole(path, report.html().as_bytes())
+    }
+}
+
+fn picture(caption: &str, scores: Option<Scores>, image: &Image) -> Picture {
+    let scores = scores.map(|Scores { psnr, ssim, .. }| format!("{psnr:.2} dB, SSIM {ssim:.3}"));
+    let width = image.width.min(PICTURE_WIDTH);
+    let height =
+        (u64::from(image.height) * u64::from(width) / u64::from(image.width.max(1))) as u32;
+    Picture {
+        caption: caption.to_owned(),
+        scores: scores.unwrap_or_default(),
+        image: image.resized(width, height),
+    }
+}
+
+fn table(output: &ToneOutput) -> Table {
+    let column =
+        |name: &str, digits| Column { name: name.to_owned(), digits, best: Best::Unmarked };
+    let measured = |Measures { mean_luminance, clipped_fraction, skewness, .. }: Measures| {
+        [Some(mean_luminance), Some(skewness), Some(100.0 * clipped_fraction)]
+    };
+    let views = output.views.iter().map(|(name, report)| (name.clone(), *report));
+    let rows = views.chain([("scene".to_owned(), output.scene)]).map(|(name, report)| {
+        let before = report.before;
+        let mut values =
+            vec![Some(before.p10), Some(before.p90), Some(before.r), Some(report.delta0)];
+        values.extend(measured(before));
+        values.extend(measured(report.after));
+        values.extend([
+            report.scores.map(|scores| scores.psnr),
+            report.scores.map(|scores| scores.ssim),
+        ]);
+        (name, values)
+    });
+    Table {
+        title: "Per photograph, and the means of the scene".to_owned(),
+        label: "photograph".to_owned(),
+        columns: vec![
+            column("p10", 4),
+            column("p90", 4),
+            column("r", 3),
+            column("delta0", 4),
+            column("mean Y", 4),
+            column("skewness", 2),
+            column("clipped, %", 1),
+            column("mean Y after", 4),
+            column("skewness after", 2),
+            column("clipped after, %", 1),
+            column("PSNR, dB", 2),
+            column("SSIM", 3),
+        ],
+        rows: rows.collect(),
+    }
+}

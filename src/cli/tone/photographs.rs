@@ -1,0 +1,109 @@
+//! Which photographs `tone` reads, and where each goes.
+
+use std::collections::BTreeMap;
+use std::ffi::OsStr;
+use std::path::{Path, PathBuf};
+
+use super::{ToneArgs, is_same_file};
+use crate::cli::ImageFormat;
+use crate::dataset::{Dataset, LoadOptions, Photograph, Split};
+use crate::{Error, Result};
+
+/// A photograph to map.
+pub(super) struct Listed {
+    /// The file name without extension.
+    pub(super) name: String,
+    pub(super) input: PathBuf,
+    pub(super) reference: Option<PathBuf>,
+    /// Of a dataset's view.
+    pub(super) split: Option<Split>,
+    /// The file to write.
+    pub(super) target: Option<PathBuf>,
+}
+
+const EXTENSIONS: [&str; 4] = ["png", "jpg", "jpeg", "exr"];
+
+/// The photographs of the input: itself, those of a folder by name, or a dataset's.
+pub(super) fn listed(args: &ToneArgs) -> Result<Vec<Listed>> {
+    let input = &args.input;
+    let unreadable =
+        |error: std::io::Error| Error::input(input, format!("cannot be read: {error}"));
+    let is_folder = std::fs::metadata(input).map_err(unreadable)?.is_dir();
+    let mut photographs = if !is_folder {
+        vec![plain(input, args.reference.as_deref())?]
+    } else if Dataset::is_at(input) {
+        let options = LoadOptions { reference: args.reference.clone(), ..LoadOptions::default() };
+        let of_view = |Photograph { name, split, input, reference }| Listed {
+            name,
+            input,
+            reference,
+            split: Some(split),
+            target: None,
+        };
+        Dataset::photographs(input, &options)?.into_iter().map(of_view).collect()
+    } else {
+        let files = images_in(input)?;
+        files.iter().map(|file| plain(file, args.reference.as_deref())).collect::<Result<_>>()?
+    };
+    if photographs.is_empty() {
+        return Err(Error::input(input, "holds no PNG, JPEG or EXR image"));
+    }
+    if let Some(out) = &args.out {
+        set_targets(&mut photographs, out, args.format)?;
+    }
+    Ok(photographs)
+}
+
+/// A photograph that belongs to no dataset.
+fn plain(input: &Path, reference: Option<&Path>) -> Result<Listed> {
+    let stem = input.file_stem().unwrap_or_default();
+    let reference = match reference {
+        Some(folder) if folder.is_dir() => {
+            images_in(folder)?.into_iter().find(|file| file.file_stem() == Some(stem))
+        }
+        Some(file) if file.is_file() => Some(file.to_owned()),
+        Some(absent) => return Err(Error::input(absent, "is neither a folder nor a file")),
+        None => None,
+    };
+    let name = stem.to_string_lossy().into_owned();
+    Ok(Listed { name, input: input.to_owned(), reference, split: None, target: None })
+}
+
+/// The images of a folder, by name.
+fn images_in(folder: &Path) -> Result<Vec<PathBuf>> {
+    let unreadable =
+        |error: std::io::Error| Error::input(folder, format!("cannot be read: {error}"));
+    let entries = std::fs::read_dir(folder).map_err(unreadable)?;
+    let paths = entries.map(|entry| entry.map(|entry| entry.path()));
+    let mut paths: Vec<PathBuf> = paths.collect::<std::io::Result<_>>().map_err(unreadable)?;
+    paths.retain(|path| {
+        let extension = path.extension().and_then(OsStr::to_str).unwrap_or_default();
+        EXTENSIONS.contains(&extension.to_ascii_lowercase().as_str()) && path.is_file()
+    });
+    paths.sort();
+    Ok(paths)
+}
+
+/// The file that each is written to, all different and none of them a photograph.
+fn set_targets(photographs: &mut [Listed], out: &Path, format: ImageFormat) -> Result<()> {
+    let extension = format.extension();
+    let mut sources: Vec<PathBuf> = vec![];
+    for listed in &*photographs {
+        sources
+            .extend([Some(listed.input.clone()), listed.reference.clone()].into_iter().flatten());
+    }
+    let mut seen: BTreeMap<String, PathBuf> = BTreeMap::new();
+    for listed in photographs {
+        let target = out.join(format!("{}.{extension}", listed.name));
+        if let Some(other) = seen.insert(listed.name.clone(), listed.input.clone()) {
+            let problem =
+                format!("would be written to the same file as {}; rename one", other.display());
+            return Err(Error::input(&listed.input, problem));
+        }
+        if target.exists() && sources.iter().any(|source| is_same_file(source, &target)) {
+            return Err(Error::output(target, "is one of the photographs; choose another --out"));
+        }
+        listed.target = Some(target);
+    }
+    Ok(())
+}

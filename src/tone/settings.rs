@@ -1,0 +1,309 @@
+//! A curve with all its constants, as the command line, TOML files and run directories give it.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use super::families::{Law, White};
+use super::{Statistics, Table, ToneCurve, ToneParameters};
+use crate::{Error, Result};
+
+/// The least value that linear scaling maps to 1: it keeps a black photograph black.
+const LEAST_WHITE: f64 = 1e-12;
+
+/// A shape that passes this near p90 has a pole there.
+const LARGEST_SHAPE: f64 = 1e8;
+
+/// Added to a mean before it divides.
+const EPSILON: f64 = 1e-6;
+
+/// The gains that `p80` and `lum_preserve` may take.
+const GAINS: [f64; 2] = [1.0, 6.0];
+
+/// A curve and its constants; what a photograph adds to them are its [`Statistics`].
+///
+/// In TOML everything but `curve` may be left out; where there are `[constants]`, all of the family's must be there.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "Written", into = "Written")]
+pub struct ToneSettings {
+    /// The family.
+    pub curve: ToneCurve,
+    /// c: how much a brighter photograph raises the gain.
+    pub gain_c: f64,
+    /// theta: the mean over all channels that the linear curve aims at, before clipping.
+    pub theta: f64,
+    /// alpha: the highest black level.
+    pub alpha: f64,
+    /// beta: how fast the black level falls as p10 approaches p90.
+    pub beta: f64,
+    /// g0: the gain of ASE on a black photograph.
+    pub base_gain: f64,
+    /// Whether one curve serves a scene: its statistics are the means over the training views.
+    pub scene_statistics: bool,
+    /// The family's constants in the order of [`super::Family::constants`].
+    pub constants: Vec<f64>,
+    /// The values of [`ToneCurve::Table`].
+    pub table: Option<Table>,
+}
+
+impl ToneSettings {
+    /// The family's constants, and the paper's for LOM; c is 3 for ASE and 1 for AP3.
+    pub fn new(curve: ToneCurve) -> Self {
+        let family = curve.family();
+        Self {
+            curve,
+            gain_c: family.gain_c,
+            theta: 0.49,
+            alpha: family.alpha,
+            beta: 2.5,
+            base_gain: 1.0,
+            scene_statistics: false,
+            constants: family.defaults(),
+            table: None,
+        }
+    }
+
+    /// Another family with its own constants, c and alpha; theta, beta, g0 and the choice of statistics stay. The same
+    /// family keeps everything.
+    #[must_use]
+    pub fn with_curve(&self, curve: ToneCurve) -> Self {
+        if curve == self.curve {
+            return self.clone();
+        }
+        let Self { theta, beta, base_gain, scene_statistics, .. } = *self;
+        Self { theta, beta, base_gain, scene_statistics, ..Self::new(curve) }
+    }
+
+    /// The curve of a table of values.
+    pub fn of_table(table: Table) -> Self {
+        Self { table: Some(table), ..Self::new(ToneCurve::Table) }
+    }
+
+    /// Refuses constants that leave a curve undefined, decreasing or above white at black.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] names the constant.
+    pub fn check(&self) -> Result<()> {
+        let rules = [
+            ("--gain (c)", self.gain_c, self.gain_c >= 0.0, "at least 0"),
+            ("--theta", self.theta, self.theta > 0.0, "above 0"),
+            ("alpha", self.alpha, (0.0..=1.0).contains(&self.alpha), "from 0 to 1"),
+            ("beta", self.beta, self.beta > 0.0, "above 0"),
+            ("base_gain (g0)", self.base_gain, self.base_gain > 0.0, "above 0"),
+        ];
+        for (name, value, holds, rule) in rules {
+            if !(holds && (value as f32).is_finite()) {
+                return Err(Error::Usage(format!(
+                    "{name} is {value}; it must be finite and {rule}"
+                )));
+            }
+        }
+        self.check_constants().map_err(Error::Usage)
+    }
+
+    fn check_constants(&self) -> Result<(), String> {
+        let (name, family) = (self.curve.name(), self.curve.family());
+        match (&self.table, self.curve) {
+            (Some(table), ToneCurve::Table) => table.check()?,
+            (None, ToneCurve::Table) => {
+                return Err("the curve `table` needs a file of values; name a .csv or .cube file"
+                    .to_owned());
+            }
+            (Some(_), _) => return Err(format!("the curve `{name}` takes no table of values")),
+            (None, _) => {}
+        }
+        if self.constants.len() != family.constants.len() {
+            let (given, needed) = (self.constants.len(), family.constants.len());
+            return Err(format!("the curve `{name}` has {needed} constants, not {given}"));
+        }
+        for (constant, value) in family.constants.iter().zip(&self.constants) {
+            if !(*value as f32).is_finite() {
+                return Err(format!(
+                    "the constant {} of `{name}` is {value}; it must be finite",
+                    constant.name
+                ));
+            }
+        }
+        let undefined = (0..=1000)
+            .map(|i| f64::from(i) * 0.01)
+            .find(|&t| !(family.shape(t, &self.constants).abs() <= LARGEST_SHAPE));
+        match undefined {
+            Some(t) => Err(format!(
+                "the constants of `{name}` leave it undefined at t = {t}; its formula is {}",
+                family.formula
+            )),
+            None => Ok(()),
+        }
+    }
+
+    /// delta0 = alpha (1 - r)^beta: the black level of a photograph with r = p10 / p90.
+    pub fn offset(&self, ratio: f64) -> f64 {
+        self.alpha * (1.0 - ratio).powf(self.beta)
+    }
+
+    /// g0 where black is rescaled, 1 where it is added: the gain of a black photograph.
+    pub(crate) fn least_gain(&self) -> f64 {
+        match self.curve.family().law {
+            Law::Added => 1.0,
+            Law::Rescaled => self.base_gain,
+        }
+    }
+
+    /// The curve that these settings give a photograph with these statistics.
+    pub fn parameters(&self, statistics: &Statistics) -> ToneParameters {
+        let mean_luminance = f64::from(statistics.mean_luminance);
+        let bounded_gain = |value: f64| (self.theta / value).clamp(GAINS[0], GAINS[1]);
+        let stored = [1.0, 0.0, 1.0];
+        let mut constants = super::families::padded(&self.constants);
+        let [white, offset, gain] = match self.white() {
+            White::One => stored,
+            White::Mean => [(f64::from(statistics.mean) / self.theta).max(LEAST_WHITE), 0.0, 1.0],
+            White::MeanLuminance => [1.0, 0.0, bounded_gain(mean_luminance + EPSILON)],
+            White::ChannelMeans => {
+                for (white, mean) in constants.iter_mut().zip(statistics.channel_means) {
+                    *white = (f64::from(mean) + EPSILON) / self.theta;
+                }
+                stored
+            }
+            White::P80 => [1.0 / bounded_gain(statistics.p80.into()), 0.0, 1.0],
+            White::P90 => [
+                f64::from(statistics.p90),
+                self.offset(statistics.ratio()),
+                self.least_gain() + self.gain_c * mean_luminance,
+            ],
+        };
+        ToneParameters {
+            white: white as f32,
+            offset: offset as f32,
+            gain: gain as f32,
+            constants: constants.map(|constant| constant as f32),
+        }
+    }
+
+    /// The value that t = 1 stands for.
+    pub fn white(&self) -> White {
+        match &self.table {
+            Some(table) => table.input.white(),
+            None => self.curve.family().white,
+        }
+    }
+
+    /// The curve at t = x / p90, in [0, 1], for a photograph with these statistics; of a table of three channels green.
+    /// `lum_preserve` and `per_channel` are shown as they map grey.
+    pub fn value(&self, t: f64, statistics: &Statistics) -> f64 {
+        let ToneParameters { mut white, offset, gain, .. } = self.parameters(statistics);
+        if self.white() == White::ChannelMeans {
+            white = (f64::from(statistics.mean) + EPSILON) as f32 / self.theta as f32;
+        }
+        let t = t * f64::from(statistics.p90) / f64::from(white);
+        match &self.table {
+            Some(table) => table.value(t, 1),
+            None => self.curve.value(t, offset.into(), gain.into(), &self.constants),
+        }
+    }
+
+    /// Statistics that leave a curve as its formula has it: no black level, gain 1, and t = 1 where it has white.
+    pub fn plain_statistics(&self) -> Statistics {
+        let theta = self.theta as f32;
+        let means = Statistics { mean: theta, channel_means: [theta; 3], ..Statistics::default() };
+        Statistics { p10: 1.0, p80: theta, p90: 1.0, ..means }
+    }
+
+    /// Whether the target is made once, at upload, instead of in the loss kernels: tables, and curves whose channels
+    /// depend on each other.
+    pub fn needs_baking(&self) -> bool {
+        !self.curve.is_formula()
+    }
+
+    /// The curve that the loss kernels evaluate, as a `CURVE_*`: none on a target that is baked.
+    pub fn loss_curve(&self) -> u32 {
+        if self.needs_baking() { ToneCurve::None.constant() } else { self.curve.constant() }
+    }
+}
+
+impl Default for ToneSettings {
+    fn default() -> Self {
+        Self::new(ToneCurve::Ap3)
+    }
+}
+
+/// The settings as TOML has them.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Written {
+    #[serde(alias = "family")]
+    curve: Option<ToneCurve>,
+    gain_c: Option<f64>,
+    theta: Option<f64>,
+    alpha: Option<f64>,
+    beta: Option<f64>,
+    base_gain: Option<f64>,
+    scene_statistics: Option<bool>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    constants: Option<BTreeMap<String, f64>>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    table: Option<Table>,
+}
+
+impl TryFrom<Written> for ToneSettings {
+    type Error = String;
+
+    fn try_from(written: Written) -> Result<Self, String> {
+        let given = if written.table.is_some() { ToneCurve::Table } else { ToneCurve::Ap3 };
+        let defaults = Self::new(written.curve.unwrap_or(given));
+        let family = defaults.curve.family();
+        let constants = match written.constants {
+            None => defaults.constants,
+            Some(mut values) => {
+                let value = |constant: &super::Constant| {
+                    values.remove(constant.name).ok_or_else(|| {
+                        format!(
+                            "the curve `{}` needs the constant `{}`; its formula is {}",
+                            family.name, constant.name, family.formula
+                        )
+                    })
+                };
+                let constants = family.constants.iter().map(value).collect::<Result<_, _>>()?;
+                if let Some(name) = values.keys().next() {
+                    return Err(format!(
+                        "the curve `{}` has no constant `{name}`; its formula is {}",
+                        family.name, family.formula
+                    ));
+                }
+                constants
+            }
+        };
+        let settings = Self {
+            curve: defaults.curve,
+            gain_c: written.gain_c.unwrap_or(defaults.gain_c),
+            theta: written.theta.unwrap_or(defaults.theta),
+            alpha: written.alpha.unwrap_or(defaults.alpha),
+            beta: written.beta.unwrap_or(defaults.beta),
+            base_gain: written.base_gain.unwrap_or(defaults.base_gain),
+            scene_statistics: written.scene_statistics.unwrap_or(defaults.scene_statistics),
+            constants,
+            table: written.table,
+        };
+        settings.check_constants()?;
+        Ok(settings)
+    }
+}
+
+impl From<ToneSettings> for Written {
+    fn from(settings: ToneSettings) -> Self {
+        let names = settings.curve.family().constants.iter();
+        let constants: BTreeMap<String, f64> =
+            names.map(|constant| constant.name.to_owned()).zip(settings.constants).collect();
+        Self {
+            curve: Some(settings.curve),
+            gain_c: Some(settings.gain_c),
+            theta: Some(settings.theta),
+            alpha: Some(settings.alpha),
+            beta: Some(settings.beta),
+            base_gain: Some(settings.base_gain),
+            scene_statistics: Some(settings.scene_statistics),
+            constants: Some(constants).filter(|constants| !constants.is_empty()),
+            table: settings.table,
+        }
+    }
+}

@@ -1,0 +1,222 @@
+//! A curve as a table of values, from a CSV or a .cube file.
+
+use glam::Vec3;
+use serde::{Deserialize, Serialize};
+
+use super::families::White;
+use crate::reference::tone_table::interpolate;
+
+/// What a table's first column holds.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum TableInput {
+    /// t = x / p90, as for the families.
+    #[default]
+    T,
+    /// The stored value x itself.
+    X,
+}
+
+impl TableInput {
+    pub(super) fn white(self) -> White {
+        match self {
+            Self::T => White::P90,
+            Self::X => White::One,
+        }
+    }
+}
+
+/// Values of a curve between which it is interpolated by monotone cubics (Fritsch and Carlson 1980); beyond its ends it
+/// is constant.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Table {
+    /// What `x` holds.
+    #[serde(default)]
+    pub input: TableInput,
+    /// Ascending, at least two.
+    pub x: Vec<f64>,
+    /// The curve's values at `x`, in [0, 1] where they are not to clip: one row for all channels, or one per channel.
+    pub y: Vec<Vec<f64>>,
+}
+
+impl Table {
+    /// Reads lines of `t,y` or `t,red,green,blue`. A first line of names may say `x` in place of `t`: the table then acts
+    /// on stored values. Blank lines and lines that begin with `#` are passed over.
+    ///
+    /// # Errors
+    /// What is wrong, with the line.
+    pub fn from_csv(text: &str) -> Result<Self, String> {
+        let mut rows = Rows::default();
+        let mut input = TableInput::T;
+        for (line, text) in content(text) {
+            let cells: Vec<&str> = text.split([',', ';', '\t']).map(str::trim).collect();
+            if rows.x.is_empty() && cells[0].parse::<f64>().is_err() {
+                input = match cells[0].to_ascii_lowercase().as_str() {
+                    "t" => TableInput::T,
+                    "x" => TableInput::X,
+                    other => {
+                        return Err(format!(
+                            "line {line}: the first column is `{other}`; it must be t (x / p90) or x"
+                        ));
+                    }
+                };
+                continue;
+            }
+            rows.push(line, &cells, None)?;
+        }
+        rows.table(input)
+    }
+
+    /// Reads a one-dimensional .cube file; it acts on stored values.
+    ///
+    /// # Errors
+    /// What is wrong, with the line.
+    pub fn from_cube(text: &str) -> Result<Self, String> {
+        let mut rows = Rows::default();
+        let (mut size, mut low, mut high) = (0, 0.0, 1.0);
+        for (line, text) in content(text) {
+            let cells: Vec<&str> = text.split_whitespace().collect();
+            let number = |index: usize| {
+                let cell = cells.get(index).copied().unwrap_or_default();
+                cell.parse::<f64>().map_err(|_| format!("line {line}: `{cell}` is no number"))
+            };
+            match cells[0] {
+                "TITLE" => {}
+                "LUT_1D_SIZE" => size = number(1)? as usize,
+                "LUT_3D_SIZE" => {
+                    return Err(format!("line {line}: a 3D table is no tone curve; save a 1D one"));
+                }
+                "DOMAIN_MIN" | "DOMAIN_MAX" => {
+                    let bound = number(1)?;
+                    if number(2)? != bound || number(3)? != bound {
+                        return Err(format!("line {line}: the channels must share one domain"));
+                    }
+                    *(if cells[0] == "DOMAIN_MIN" { &mut low } else { &mut high }) = bound;
+                }
+                "LUT_1D_INPUT_RANGE" => (low, high) = (number(1)?, number(2)?),
+                _ => {
+                    let step = (high - low) / (size.max(2) - 1) as f64;
+                    rows.push(line, &cells, Some(low + step * rows.x.len() as f64))?;
+                }
+            }
+        }
+        if rows.x.len() != size {
+            return Err(format!("LUT_1D_SIZE is {size} but there are {} values", rows.x.len()));
+        }
+        rows.table(TableInput::X)
+    }
+
+    pub(super) fn check(&self) -> Result<(), String> {
+        if self.x.len() < 2 {
+            return Err(format!(
+                "a table of {} values is no curve; give at least two",
+                self.x.len()
+            ));
+        }
+        if !matches!(self.y.len(), 1 | 3) || self.y.iter().any(|y| y.len() != self.x.len()) {
+            return Err("a table needs one value, or red, green and blue, for every x".to_owned());
+        }
+        let mut values = self.x.iter().chain(self.y.iter().flatten());
+        if let Some(value) = values.find(|value| !(value.abs() <= 1e30)) {
+            return Err(format!("a table holds {value}; every value must be finite"));
+        }
+        // Also as the device has them.
+        match self.x.windows(2).find(|pair| !((pair[0] as f32) < pair[1] as f32)) {
+            Some(pair) => Err(format!(
+                "the first column of a table must ascend, but {} follows {}; sort it",
+                pair[1], pair[0]
+            )),
+            None => Ok(()),
+        }
+    }
+
+    /// (3, K) knots (x, y, slope) as the kernel takes them.
+    pub fn knots(&self) -> Vec<Vec3> {
+        let channels = (0..3).map(|channel| self.channel(channel));
+        channels
+            .flatten()
+            .map(|[x, y, slope]| Vec3::new(x as f32, y as f32, slope as f32))
+            .collect()
+    }
+
+    /// The table at `x`, in [0, 1], of a channel from 0 to 2.
+    pub fn value(&self, x: f64, channel: usize) -> f64 {
+        crate::reference::tone::clamped(interpolate(&self.channel(channel), x))
+    }
+
+    fn channel(&self, channel: usize) -> Vec<[f64; 3]> {
+        let y = &self.y[channel.min(self.y.len() - 1)];
+        let slopes = slopes(&self.x, y);
+        (0..y.len()).map(|i| [self.x[i], y[i], slopes[i]]).collect()
+    }
+}
+
+/// The lines that say something, with their number from 1.
+fn content(text: &str) -> impl Iterator<Item = (usize, &str)> {
+    let lines = text.trim_start_matches('\u{feff}').lines().map(str::trim);
+    (1..).zip(lines).filter(|(_, line)| !line.is_empty() && !line.starts_with('#'))
+}
+
+#[derive(Default)]
+struct Rows {
+    x: Vec<f64>,
+    y: Vec<Vec<f64>>,
+}
+
+impl Rows {
+    /// Takes a line of numbers; the first is the input where `x` does not give it.
+    fn push(&mut self, line: usize, cells: &[&str], x: Option<f64>) -> Result<(), String> {
+        let number = |cell: &&str| {
+            let value = cell.parse::<f64>().ok().filter(|value| value.is_finite());
+            value.ok_or_else(|| format!("line {line}: `{cell}` is no number"))
+        };
+        let mut numbers = cells.iter().map(number).collect::<Result<Vec<f64>, _>>()?;
+        let x = x.unwrap_or_else(|| numbers.remove(0));
+        if !matches!(numbers.len(), 1 | 3) || (!self.y.is_empty() && self.y.len() != numbers.len())
+        {
+            return Err(format!(
+                "line {line}: {} values; one, or red, green and blue, are needed, in every line alike",
+                numbers.len()
+            ));
+        }
+        if let Some(last) = self.x.last().filter(|&&last| !(x > last)) {
+            return Err(format!(
+                "line {line}: the first column must ascend, but {x} follows {last}; sort it"
+            ));
+        }
+        self.x.push(x);
+        self.y.resize(numbers.len(), vec![]);
+        for (channel, value) in self.y.iter_mut().zip(numbers) {
+            channel.push(value);
+        }
+        Ok(())
+    }
+
+    fn table(self, input: TableInput) -> Result<Table, String> {
+        let table = Table { input, x: self.x, y: self.y };
+        table.check()?;
+        Ok(table)
+    }
+}
+
+/// The slopes at the knots: 0 at extrema, elsewhere the weighted harmonic mean of the neighbouring secants.
+fn slopes(x: &[f64], y: &[f64]) -> Vec<f64> {
+    let width: Vec<f64> = x.windows(2).map(|pair| pair[1] - pair[0]).collect();
+    let secant: Vec<f64> = y.windows(2).zip(&width).map(|(y, h)| (y[1] - y[0]) / h).collect();
+    let last = secant.len();
+    let inner = |i: usize| {
+        let (before, after) = (secant[i - 1], secant[i]);
+        if before * after <= 0.0 {
+            return 0.0;
+        }
+        let (w1, w2) = (2.0 * width[i] + width[i - 1], width[i] + 2.0 * width[i - 1]);
+        (w1 + w2) / (w1 / before + w2 / after)
+    };
+    let slope = |i: usize| match i {
+        0 => secant[0],
+        i if i == last => secant[last - 1],
+        i => inner(i),
+    };
+    (0..x.len()).map(slope).collect()
+}

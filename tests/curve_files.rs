@@ -1,0 +1,125 @@
+//! Curves from files: TOML settings, CSV and .cube tables, and what is wrong with them.
+
+#![expect(clippy::unwrap_used, reason = "what fails here fails the test")]
+
+use std::path::PathBuf;
+
+use nightsplat::Error;
+use nightsplat::tone::{CurveChoice, Family, TableInput, ToneCurve, ToneSettings};
+use nightsplat::train::TrainConfig;
+
+/// A curve read from a file of that name and text.
+fn load(name: &str, text: &str) -> Result<ToneSettings, Error> {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join(name);
+    std::fs::write(&path, text).unwrap();
+    path.to_str().unwrap().parse::<CurveChoice>().unwrap().settings()
+}
+
+#[test]
+fn a_family_with_its_own_constants_is_read_from_toml() {
+    let settings = load("my.toml", "family = \"gamma\"\n[constants]\na = 0.9\nb = 0.4\n").unwrap();
+    assert_eq!(
+        (settings.curve, settings.constants.as_slice()),
+        (ToneCurve::Gamma, &[0.9, 0.4][..])
+    );
+    assert_eq!([settings.alpha, settings.gain_c], [0.0, 0.0]);
+    let cubic = "curve = \"cubic\"\nalpha = 0.1\nconstants = { a = 0.1, b = -0.5, c = 1, d = 0.0 }";
+    let settings = load("c.toml", cubic).unwrap();
+    assert_eq!(settings.curve, ToneCurve::FittedCubic);
+    assert_eq!(settings.constants, [0.1, -0.5, 1.0, 0.0]);
+    assert_eq!(settings.alpha, 0.1);
+    let plain = load("p.toml", "curve = \"hybrid\"").unwrap();
+    assert_eq!(plain, ToneSettings::new(ToneCurve::Hybrid));
+}
+
+#[test]
+fn tables_are_read_from_csv_and_cube() {
+    let settings = load("a.csv", "# made by hand\nt,y\n0,0\n0.5, 0.4\n1;0.8\n\n2,1\n").unwrap();
+    let table = settings.table.unwrap();
+    assert_eq!((table.input, table.x.as_slice()), (TableInput::T, &[0.0, 0.5, 1.0, 2.0][..]));
+    assert_eq!(table.y, [[0.0, 0.4, 0.8, 1.0]]);
+    let of_x = load("b.csv", "x,r,g,b\n0,0,0,0\n1,1,0.5,0.2\n").unwrap().table.unwrap();
+    assert_eq!((of_x.input, of_x.y.len()), (TableInput::X, 3));
+    let cube = "TITLE \"lift\"\nLUT_1D_SIZE 3\nDOMAIN_MIN 0 0 0\nDOMAIN_MAX 2 2 2\n0 0 0\n0.5 0.6 0.7\n1 1 1\n";
+    let settings = load("c.cube", cube).unwrap();
+    assert!(settings.needs_baking());
+    let table = settings.table.unwrap();
+    assert_eq!((table.input, table.x.as_slice()), (TableInput::X, &[0.0, 1.0, 2.0][..]));
+    assert_eq!(table.y[2], [0.0, 0.7, 1.0]);
+}
+
+#[test]
+fn a_configuration_holds_the_whole_curve() {
+    let csv = load("a.csv", "0,0.1\n0.30000000000000004,0.7\n1,1\n").unwrap();
+    let constants = vec![0.1 + 0.2, -1.0 / 3.0, 1.0, 1e-3];
+    let cubic = ToneSettings { constants, ..ToneSettings::new(ToneCurve::FittedCubic) };
+    for tone in [csv, cubic, ToneSettings::new(ToneCurve::PerChannel)] {
+        let config = TrainConfig { tone, ..TrainConfig::default() };
+        let text = config.to_toml().unwrap();
+        assert_eq!(toml::from_str::<TrainConfig>(&text).unwrap(), config, "{text}");
+        // A run's configuration is a file with a curve, too.
+        assert_eq!(load("config.toml", &text).unwrap(), config.tone);
+    }
+}
+
+#[test]
+fn configurations_of_earlier_versions_load() {
+    let text = "steps = 7\n[tone]\ncurve = \"ase\"\ngain_c = 3.0\ntheta = 0.49\nalpha = 0.12\nbeta = 2.5\nbase_gain = 1.0\n";
+    let config: TrainConfig = toml::from_str(text).unwrap();
+    assert_eq!(config.tone, ToneSettings::new(ToneCurve::Ase));
+}
+
+#[test]
+fn what_is_wrong_with_a_file_is_named() {
+    let wrong = [
+        ("a.toml", "curve = \"gama\"", "unknown curve `gama`"),
+        ("a.toml", "curve = \"gamma\"\nconstants = { a = 1.0 }", "needs the constant `b`"),
+        (
+            "a.toml",
+            "curve = \"gamma\"\nconstants = { a = 1.0, b = 1.0, q = 1.0 }",
+            "no constant `q`",
+        ),
+        ("a.toml", "curve = \"gamma\"\nconstants = { a = inf, b = 1.0 }", "constant a of `gamma`"),
+        (
+            "a.toml",
+            "curve = \"reinhard\"\nconstants = { a = 1.0, b = -0.5 }",
+            "undefined at t = 0.5",
+        ),
+        ("a.toml", "gain_c = 1.0", "names no curve"),
+        ("a.toml", "curve = \"ap3\"\ngain = 1.0", "unknown field `gain`"),
+        ("a.toml", "curve = \"table\"", "needs a file of values"),
+        ("a.toml", "curve = ", "is no tone curve"),
+        ("a.csv", "0,0\n0.5,0.2\n0.4,0.3\n", "line 3: the first column must ascend"),
+        ("a.csv", "0,0\n0,1\n", "must ascend"),
+        ("a.csv", "0,0\n1,nan\n", "line 2: `nan` is no number"),
+        ("a.csv", "0,0\n", "at least two"),
+        ("a.csv", "", "at least two"),
+        ("a.csv", "luma,y\n0,0\n", "`luma`"),
+        ("a.csv", "0,0,1\n1,1,1\n", "line 1: 2 values"),
+        ("a.cube", "LUT_3D_SIZE 2\n0 0 0\n", "3D"),
+        ("a.cube", "LUT_1D_SIZE 3\n0 0 0\n1 1 1\n", "LUT_1D_SIZE is 3 but there are 2"),
+    ];
+    for (name, text, part) in wrong {
+        let error = load(name, text).unwrap_err();
+        let message = error.to_string();
+        assert!(message.contains(part) && message.contains(name), "{message}");
+        assert!(!message.contains('\n'), "{message}");
+        assert_eq!(error.exit_code(), 1, "{message}");
+    }
+    let absent = CurveChoice::File(PathBuf::from("absent.toml")).settings().unwrap_err();
+    assert!(absent.to_string().contains("absent.toml"));
+    for name in ["gama", "table", ""] {
+        assert!(matches!(name.parse::<CurveChoice>(), Err(Error::Usage(_))), "{name}");
+    }
+}
+
+#[test]
+fn another_curve_brings_its_own_constants_and_the_same_keeps_them() {
+    let mine = ToneSettings { gain_c: 2.0, theta: 0.4, ..ToneSettings::new(ToneCurve::Ap3) };
+    assert_eq!(mine.with_curve(ToneCurve::Ap3), mine);
+    let ase = mine.with_curve(ToneCurve::Ase);
+    assert_eq!([ase.gain_c, ase.theta, ase.alpha], [3.0, 0.4, 0.12]);
+    let gamma = mine.with_curve(ToneCurve::Gamma);
+    assert_eq!(gamma.constants, Family::find("gamma").unwrap().defaults());
+}
