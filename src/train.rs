@@ -2,6 +2,7 @@
 
 mod config;
 mod model;
+mod overrides;
 mod views;
 
 use std::time::Instant;

@@ -166,7 +166,7 @@ fn settings_that_leave_a_curve_undefined_are_refused() {
         ToneSettings { theta: f64::INFINITY, ..good },
         ToneSettings { alpha: 1.1, ..good },
         ToneSettings { alpha: -0.1, ..good },
-        ToneSettings { beta: 0.0, ..good },
+        ToneSettings { beta: -0.1, ..good },
         ToneSettings { base_gain: 0.0, ..good },
     ] {
         assert!(matches!(bad.check(), Err(Error::Usage(_))), "{bad:?}");

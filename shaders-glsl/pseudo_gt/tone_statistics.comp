@@ -50,8 +50,8 @@ ToneParameters curve_of(ToneStatistics of) {
     // The floor keeps a black photograph black.
     if (TONE_CURVE == CURVE_LINEAR) return ToneParameters(max(of.mean / theta, 1e-12), 0.0, 1.0);
     float crushed = 1.0 - clamp(of.p10 / of.p90, 0.0, 1.0);
-    // pow(0, beta) may be computed as exp2(beta * -inf).
-    float offset = crushed > 0.0 ? alpha * pow(crushed, beta) : 0.0;
+    // pow(0, beta) may be computed as exp2(beta * -inf), and is 1 where beta is 0.
+    float offset = crushed > 0.0 ? alpha * pow(crushed, beta) : beta > 0.0 ? 0.0 : alpha;
     float base = TONE_CURVE == CURVE_ASE ? base_gain : 1.0;
     return ToneParameters(of.p90, offset, base + gain_c * of.mean_luminance);
 }

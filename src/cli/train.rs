@@ -78,6 +78,9 @@ pub(crate) struct TrainOptions {
     /// Score the test views every N steps as well as at the end
     #[arg(long, value_name = "N")]
     eval_every: Option<u64>,
+    /// Any other setting by its place in config.toml, such as tone.alpha=0.1; may be repeated, wins over all else
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
 }
 
 impl TrainOptions {
@@ -110,6 +113,7 @@ impl TrainOptions {
         if self.reference.is_some() {
             config.reference.clone_from(&self.reference);
         }
+        let config = config.with(&self.set)?;
         config.check()?;
         Ok(config)
     }

@@ -43,7 +43,7 @@ fn curve_of(curve: u32, params: &Params, of: &ToneStatistics) -> ToneParameters 
         };
     }
     let crushed = 1.0 - (of.p10 / of.p90).clamp(0.0, 1.0);
-    let offset = if crushed > 0.0 { params.alpha * crushed.powf(params.beta) } else { 0.0 };
+    let offset = params.alpha * crushed.powf(params.beta);
     let base = if curve == CURVE_ASE { params.base_gain } else { 1.0 };
     ToneParameters { white: of.p90, offset, gain: base + params.gain_c * of.mean_luminance }
 }
