@@ -4,14 +4,17 @@ use std::fmt::Write as _;
 
 use crate::image::Image;
 
-pub use self::plot::{Series, plot};
+pub use self::bars::{Bar, bars};
+pub use self::plot::{Mark, Series, plot, plot_points};
 pub use self::table::{Best, Column, Table};
 
+mod axis;
+mod bars;
 mod data_uri;
 mod plot;
 mod table;
 
-/// A page. Every text is escaped; `plots` are SVG as [`plot`] gives it.
+/// A page. Every text is escaped; `plots` are SVG as [`plot`] and [`bars`] give it.
 #[derive(Clone, Debug, Default)]
 pub struct Report {
     /// The heading, also the window's title.

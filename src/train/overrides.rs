@@ -16,7 +16,9 @@ impl TrainConfig {
         let mut config = self.clone();
         for assignment in assignments {
             let (key, value) = assignment.split_once('=').ok_or_else(|| {
-                Error::Usage(format!("`{assignment}` sets nothing; write KEY=VALUE, as in tone.alpha=0.1"))
+                Error::Usage(format!(
+                    "`{assignment}` sets nothing; write KEY=VALUE, as in tone.alpha=0.1"
+                ))
             })?;
             config = config.with_one(key.trim(), value.trim())?;
         }
@@ -29,9 +31,9 @@ impl TrainConfig {
         let known = keys("", &table);
         let (sections, name) = key.rsplit_once('.').map_or(("", key), |(path, name)| (path, name));
         let path = sections.split('.').filter(|_| !sections.is_empty());
-        let section = path.into_iter().try_fold(&mut table, |table, name| {
-            table.get_mut(name).and_then(Value::as_table_mut)
-        });
+        let section = path
+            .into_iter()
+            .try_fold(&mut table, |table, name| table.get_mut(name).and_then(Value::as_table_mut));
         let Some(section) = section else { return Err(unknown(key, &known)) };
         let value = match section.get(name) {
             Some(Value::Table(inner)) => {
