@@ -14,6 +14,7 @@ pub mod doctor;
 pub mod eval;
 mod finished_run;
 pub mod render;
+pub mod sweep;
 pub mod synth;
 mod table;
 pub mod tone;
@@ -35,7 +36,8 @@ const EXAMPLES: &str = "Start with:
   nightsplat doctor                                 which devices there are
   nightsplat train photos --out run                 train from a folder of dark photographs
   nightsplat eval run --save-images                 score it where there are references
-  nightsplat render run --split all --out pictures  see the model from every camera";
+  nightsplat render run --split all --out pictures  see the model from every camera
+  nightsplat sweep photos --out sweep --curves all  train with every curve, and rank them";
 
 #[derive(Debug, Subcommand)]
 enum Command {
@@ -43,6 +45,7 @@ enum Command {
     Eval(eval::EvalArgs),
     Render(render::RenderArgs),
     Tone(tone::ToneArgs),
+    Sweep(Box<sweep::SweepArgs>),
     Synth(synth::SynthArgs),
     Demo(demo::DemoArgs),
     Doctor(doctor::DoctorArgs),
@@ -65,6 +68,7 @@ impl Cli {
             Command::Eval(args) => eval::run(&args),
             Command::Render(args) => render::run(&args),
             Command::Tone(args) => Ok(tone::run(args)?),
+            Command::Sweep(args) => sweep::run(&args),
             Command::Synth(args) => Ok(synth::run(args)?),
             Command::Demo(args) => demo::run(&args),
             Command::Doctor(args) => doctor::run(&args),

@@ -71,7 +71,7 @@ pub fn run(args: &DemoArgs) -> Result<()> {
     let page = args.out.join("index.html");
     export::write_whole(&page, report(&gpu, &dataset, &dark, &runs).html().as_bytes())?;
     let mut out = std::io::stdout().lock();
-    write!(out, "{}\n{}\n", terminal_table(&dark, &runs), page.display())?;
+    write!(out, "{}\n{}\n", table::of(&score_table(&dark, &runs)), page.display())?;
     Ok(())
 }
 
@@ -230,18 +230,4 @@ fn comparison(view: &View, dark: &[ViewScore], runs: &[Run]) -> Comparison {
     pictures.extend(runs.iter().filter_map(|run| picture(title(run.curve), &run.scored)));
     pictures.extend(view.reference.as_ref().map(reference));
     Comparison { title: format!("Test view {}", view.name), pictures }
-}
-
-fn terminal_table(dark: &[ViewScore], runs: &[Run]) -> String {
-    let Table { label, columns, rows, .. } = score_table(dark, runs);
-    let mut lines = vec![vec![label]];
-    lines[0].extend(columns.iter().map(|column| column.name.clone()));
-    for (name, values) in rows {
-        let cells = columns.iter().zip(values);
-        let cell = |(column, value): (&Column, Option<f64>)| {
-            value.map_or_else(|| "-".to_owned(), |value| format!("{value:.*}", column.digits))
-        };
-        lines.push(std::iter::once(name).chain(cells.map(cell)).collect());
-    }
-    table::aligned(&lines)
 }
