@@ -104,6 +104,9 @@ pub fn run(args: &SweepArgs) -> Result<()> {
     }
     let first = &runs[0].config;
     let dataset = Dataset::load(&first.dataset, &first.load_options())?;
+    if !args.dry_run && !left.is_empty() {
+        Gpu::new(&first.device.parse::<DeviceChoice>()?)?;
+    }
     claim(&args.out, &manifest(args, &runs)?, args.dry_run)?;
     let mut out = std::io::stdout().lock();
     if args.dry_run {
@@ -111,9 +114,6 @@ pub fn run(args: &SweepArgs) -> Result<()> {
             writeln!(out, "{}", run.command_line()?)?;
         }
         return Ok(());
-    }
-    if !left.is_empty() {
-        Gpu::new(&first.device.parse::<DeviceChoice>()?)?;
     }
     let bar = progress_bar(left.len());
     let failures = runner::train(&left, args.jobs.into(), &bar);
