@@ -109,9 +109,8 @@ impl Leaderboard {
         let baseline = self.baseline_row();
         for score in &self.scores {
             let column = column(score);
-            let name = column.name.clone();
             let beside = |what: &str| Column {
-                name: format!("{name} {what}"),
+                name: what.to_owned(),
                 best: Best::Unmarked,
                 ..column.clone()
             };
