@@ -65,7 +65,7 @@ pub struct SweepArgs {
     /// Fixed black levels delta0, and `adaptive` for that of alpha and beta
     #[arg(long, value_name = "LIST", help_heading = "The grid")]
     offset: Option<String>,
-    /// Values of any setting by its place in config.toml, such as density.min_opacity=0.005,0.01; may be repeated
+    /// Values of any setting by its place in config.toml, such as `density.min_opacity=0.005,0.01`; may be repeated
     #[arg(long, value_name = "KEY=LIST", help_heading = "The grid")]
     grid: Vec<String>,
     #[command(flatten, next_help_heading = "What every point is trained with")]
@@ -121,9 +121,9 @@ pub fn run(args: &SweepArgs) -> Result<()> {
     let baseline = args.table.and_then(PaperTable::baseline);
     let leaderboard = Leaderboard::new(&runs, baseline, adaptive_offset(&runs, &dataset));
     leaderboard.save(&args.out, &failures)?;
-    write!(
+    writeln!(
         out,
-        "{}{}\n",
+        "{}{}",
         super::table::of(&leaderboard.table()),
         args.out.join("index.html").display()
     )?;

@@ -131,7 +131,7 @@ fn draw(x_name: &str, y_name: &str, series: &[Series], dot: f64, marks: &[Mark])
 /// The outline of a star with five points around (x, y).
 fn star(x: f64, y: f64) -> String {
     let corner = |index: u32| {
-        let radius = if index % 2 == 0 { 9.0 } else { 4.0 };
+        let radius = if index.is_multiple_of(2) { 9.0 } else { 4.0 };
         let (sin, cos) = (std::f64::consts::PI * f64::from(index) / 5.0).sin_cos();
         format!("{:.1} {:.1}", x + radius * sin, y - radius * cos)
     };
