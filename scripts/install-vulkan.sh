@@ -35,7 +35,7 @@ has_validation() {
 }
 
 command -v cargo > /dev/null ||
-    fail 'cargo is missing: install Rust 1.88 or newer from https://rustup.rs'
+    fail 'cargo is missing: install Rust 1.89 or newer from https://rustup.rs'
 command -v "${CXX:-c++}" > /dev/null ||
     fail 'a C++ compiler is missing: on Debian and Ubuntu `apt install g++`, on Fedora `dnf install gcc-c++`,' \
         'on Arch `pacman -S gcc`, on macOS `xcode-select --install`'

@@ -17,6 +17,7 @@ pub mod doctor;
 pub mod eval;
 mod finished_run;
 pub mod render;
+pub mod sweep;
 pub mod synth;
 mod table;
 pub mod tone;
@@ -38,7 +39,8 @@ const EXAMPLES: &str = "Start with:
   nightsplat doctor                                 which devices there are
   nightsplat train photos --out run                 train from a folder of dark photographs
   nightsplat eval run --save-images                 score it where there are references
-  nightsplat render run --split all --out pictures  see the model from every camera";
+  nightsplat render run --split all --out pictures  see the model from every camera
+  nightsplat sweep photos --out sweep --curves all  train with every curve, and rank them";
 
 #[derive(Debug, Subcommand)]
 enum Command {
@@ -47,6 +49,7 @@ enum Command {
     Render(render::RenderArgs),
     Tone(tone::ToneArgs),
     Curves(curves::CurvesArgs),
+    Sweep(Box<sweep::SweepArgs>),
     Synth(synth::SynthArgs),
     Ablate(Box<ablate::AblateArgs>),
     Demo(demo::DemoArgs),
@@ -71,6 +74,7 @@ impl Cli {
             Command::Render(args) => render::run(&args),
             Command::Tone(args) => Ok(tone::run(&args)?),
             Command::Curves(args) => Ok(curves::run(&args)?),
+            Command::Sweep(args) => sweep::run(&args),
             Command::Synth(args) => Ok(synth::run(args)?),
             Command::Ablate(args) => ablate::run(&args),
             Command::Demo(args) => demo::run(&args),

@@ -15,6 +15,7 @@ use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
 use crate::gpu::Gpu;
+use crate::loss::Term;
 use crate::scene::{Gaussians, ply};
 use crate::train::{ModelConfig, Networks, StepReport, TrainConfig};
 use crate::{Error, Result};
@@ -24,6 +25,8 @@ use crate::{Error, Result};
 pub struct RunDirectory {
     path: PathBuf,
     log: BufWriter<File>,
+    /// The columns of the log between loss and Gaussians.
+    terms: Vec<Term>,
 }
 
 /// The files of a run that a new run replaces; nothing else in the directory is touched.
@@ -50,9 +53,10 @@ impl RunDirectory {
         write_whole(&path.join("config.toml"), config.to_toml()?.as_bytes())?;
         let log_path = path.join("train.csv");
         let log = File::create(&log_path).map_err(|error| unwritable(&log_path, &error))?;
-        let mut run = Self { path: path.to_owned(), log: BufWriter::new(log) };
-        let terms: Vec<&str> = config.terms().iter().map(|(term, _)| term.column()).collect();
-        run.log_line(&format!("step,view,loss,{},gaussians,milliseconds", terms.join(",")))?;
+        let terms = config.terms().into_iter().map(|(term, _)| term).collect();
+        let mut run = Self { path: path.to_owned(), log: BufWriter::new(log), terms };
+        let columns: String = run.terms.iter().map(|term| format!("{},", term.column())).collect();
+        run.log_line(&format!("step,view,loss,{columns}gaussians,milliseconds"))?;
         Ok(run)
     }
 
@@ -61,8 +65,9 @@ impl RunDirectory {
     /// # Errors
     /// The disk is full or gone.
     pub fn log(&mut self, report: &StepReport) -> Result<()> {
-        let StepReport { step, view, loss, terms, gaussians, milliseconds } = report;
-        let terms: String = terms.iter().map(|term| format!("{term:.6},")).collect();
+        let StepReport { step, view, loss, gaussians, milliseconds, .. } = report;
+        let terms: String =
+            self.terms.iter().map(|&term| format!("{:.6},", report.term(term))).collect();
         self.log_line(&format!("{step},{view},{loss:.6},{terms}{gaussians},{milliseconds:.2}"))
     }
 

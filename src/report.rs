@@ -4,16 +4,19 @@ use std::fmt::Write as _;
 
 use crate::image::Image;
 
+pub use self::bars::{Bar, bars};
 pub use self::distribution::{Distribution, distributions};
-pub use self::plot::{Mark, Series, plot, plot_with_marks, svg_file};
+pub use self::plot::{Mark, Series, VerticalLine, plot, plot_points, plot_with_lines, svg_file};
 pub use self::table::{Best, Column, Table};
 
+mod axis;
+mod bars;
 mod data_uri;
 mod distribution;
 mod plot;
 mod table;
 
-/// A page. Every text is escaped; `plots` are SVG as [`plot`] gives it.
+/// A page. Every text is escaped; `plots` are SVG as [`plot`] and [`bars`] give it.
 #[derive(Clone, Debug, Default)]
 pub struct Report {
     /// The heading, also the window's title.

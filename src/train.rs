@@ -3,6 +3,7 @@
 mod config;
 mod model;
 mod networks;
+mod overrides;
 mod parts;
 mod preset;
 mod terms;
@@ -73,6 +74,13 @@ impl From<Image> for Rendered {
     }
 }
 
+impl StepReport {
+    /// The value of a term; 0 where the model does not have it.
+    pub fn term(&self, term: Term) -> f64 {
+        self.terms.iter().find(|(own, _)| *own == term).map_or(0.0, |&(_, value)| value)
+    }
+}
+
 /// What one step did.
 #[derive(Clone, Debug)]
 pub struct StepReport {
@@ -82,8 +90,8 @@ pub struct StepReport {
     pub view: String,
     /// The weighted sum of the terms.
     pub loss: f64,
-    /// Every term that the model has, unweighted: [`TrainConfig::terms`].
-    pub terms: Vec<f64>,
+    /// Every term that the model has, unweighted.
+    pub terms: Vec<(Term, f64)>,
     /// The number of Gaussians it rendered.
     pub gaussians: usize,
     /// Its share of the time its submission took, in milliseconds.
@@ -347,7 +355,7 @@ impl Trainer {
             step,
             view: self.views.of_step(self.config.seed, step).name.clone(),
             loss: terms.iter().map(|&(term, weight)| weight * distance(term, losses)).sum(),
-            terms: terms.iter().map(|&(term, _)| f64::from(losses.get(term))).collect(),
+            terms: terms.iter().map(|&(term, _)| (term, f64::from(losses.get(term)))).collect(),
             gaussians: self.model.count(),
             milliseconds,
         }

@@ -57,10 +57,9 @@ fn train(config: &TrainConfig, dataset: &Dataset) -> (Vec<StepReport>, Gaussians
 }
 
 /// The mean of a term over the first and over the last epoch.
-fn fall(config: &TrainConfig, reports: &[StepReport], term: Term) -> [f64; 2] {
-    let column = config.terms().iter().position(|&(t, _)| t == term).unwrap();
+fn fall(reports: &[StepReport], term: Term) -> [f64; 2] {
     let mean = |reports: &[StepReport]| {
-        reports.iter().map(|report| report.terms[column]).sum::<f64>() / reports.len() as f64
+        reports.iter().map(|report| report.term(term)).sum::<f64>() / reports.len() as f64
     };
     [mean(&reports[..5]), mean(&reports[reports.len() - 5..])]
 }
@@ -79,10 +78,10 @@ fn each_part_alone_has_its_channels_and_its_terms_fall() {
         let (reports, gaussians) = train(&config, &load(folder.path(), &config));
         assert_eq!(gaussians.shape.features.channels(), channels);
         for &term in terms {
-            let [begin, end] = fall(&config, &reports, term);
+            let [begin, end] = fall(&reports, term);
             assert!(end < begin, "{}: {term:?} went from {begin} to {end}", part.name());
         }
-        let [begin, end] = fall(&config, &reports, Term::L1);
+        let [begin, end] = fall(&reports, Term::L1);
         assert!(end < begin, "{}: L1 went from {begin} to {end}", part.name());
     }
     assert_no_validation_messages();
@@ -127,8 +126,7 @@ fn crops_estimate_the_losses_of_the_whole_view() {
         let mut config = TrainConfig { steps: 1, seed, ..config(&[Part::Tonemapper]) };
         config.model.denoiser_crop = crop;
         let (reports, _) = train(&config, &load(folder.path(), &config));
-        let column = config.terms().iter().position(|&(t, _)| t == Term::LowL1).unwrap();
-        reports[0].terms[column]
+        reports[0].term(Term::LowL1)
     };
     let differences: Vec<f64> =
         (0..24).map(|seed| first_loss(16, seed) - first_loss(0, seed)).collect();
@@ -165,9 +163,8 @@ fn depth_maps_are_found_resized_negated_and_left_out_where_they_say_nothing() {
     assert_eq!(with_depth, views.len() - 1);
     // Trains on: the view without depth leaves the term out.
     let (reports, _) = train(&TrainConfig { steps: 10, ..config.clone() }, &dataset);
-    let column = config.terms().iter().position(|&(t, _)| t == Term::Depth).unwrap();
     for report in &reports {
-        assert_eq!(report.terms[column] == 0.0, report.view == *name, "{report:?}");
+        assert_eq!((report.term(Term::Depth) == 0.0), report.view == *name, "{report:?}");
     }
 
     config.model.depth_folder = Some(folder.path().join("nowhere"));
@@ -210,7 +207,7 @@ fn raw_colors_train_and_are_saved_as_viewers_show_them() {
     let mut config = TrainConfig { steps: 20, ..config(&[]) };
     config.model.raw_colors = true;
     let (reports, mut gaussians) = train(&config, &load(folder.path(), &config));
-    let [begin, end] = fall(&config, &reports, Term::L1);
+    let [begin, end] = fall(&reports, Term::L1);
     assert!(end < begin, "L1 went from {begin} to {end}");
     let before = gaussians.dc()[0].x;
     gaussians.shift_colors(-0.5);

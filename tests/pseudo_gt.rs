@@ -492,3 +492,15 @@ fn a_real_photograph_maps_on_the_device_as_on_the_host() {
         assert!(worst < 5e-6, "{curve}: off by {worst:e}");
     }
 }
+
+#[test]
+fn a_fixed_offset_is_that_of_every_photograph() {
+    let gpu = gpu();
+    let settings = ToneSettings { alpha: 0.07, beta: 0.0, ..ToneSettings::default() };
+    for image in [dark(400, 5), vec![0.0; 300], vec![0.2; 300]] {
+        let expected = settings.parameters(&Statistics::of(&image));
+        assert_eq!(expected.offset, 0.07);
+        let (found, ..) = on_device(&gpu, settings.clone(), &image).unwrap();
+        assert!(near(&found, &expected), "{found:?}, not {expected:?}");
+    }
+}

@@ -2,8 +2,8 @@
 
 use nightsplat::image::Image;
 use nightsplat::report::{
-    Best, Column, Comparison, Distribution, Picture, Report, Series, Table, distributions, plot,
-    svg_file,
+    Bar, Best, Column, Comparison, Distribution, Mark, Picture, Report, Series, Table, bars,
+    distributions, plot, plot_points, svg_file,
 };
 
 fn column(name: &str, digits: usize, best: Best) -> Column {
@@ -184,4 +184,32 @@ fn a_legend_of_many_names_takes_rows_and_a_plot_can_be_a_file() {
     );
     assert!(svg.contains("--series-0") && !svg.contains("viewBox=\"0 0 "), "{svg}");
     assert!(svg.contains("stroke-dasharray"));
+}
+
+#[test]
+fn few_points_have_dots_and_the_special_one_a_star() {
+    let series = [Series { name: "ap3".into(), points: vec![(0.0, 20.0), (0.1, 24.0)] }];
+    let mark = |name: &str, point| Mark { name: name.into(), point };
+    let marks = [mark("adaptive <0.2>", (0.2, 30.0)), mark("nowhere", (f64::NAN, 1.0))];
+    let svg = plot_points("delta0", "PSNR", &series, &marks);
+    assert_eq!((svg.matches("<circle").count(), svg.matches("<path").count()), (2, 1));
+    assert!(svg.contains("adaptive &lt;0.2&gt;") && !svg.contains("NaN"), "{svg}");
+    // The axes reach to the mark.
+    assert!(svg.contains(">0.20<") && svg.contains(">30<"), "{svg}");
+    assert_eq!(plot("delta0", "PSNR", &series).matches("<circle").count(), 0);
+}
+
+#[test]
+fn bars_begin_at_zero_and_are_as_long_as_their_values() {
+    let bar = |name: &str, value| Bar { name: name.into(), value };
+    let rows = [bar("a", 20.0), bar("b & c", 5.0), bar("d", -5.0), bar("failed", f64::NAN)];
+    let svg = bars("PSNR, dB", 2, &rows);
+    let widths = svg.split(" width=\"").skip(1).map(|rest| rest.split('"').next().unwrap());
+    let widths: Vec<f64> = widths.map(|width| width.parse().unwrap()).collect();
+    assert_eq!(widths.len(), 3);
+    assert!((widths[0] - 4.0 * widths[1]).abs() < 0.3 && widths[1] == widths[2], "{widths:?}");
+    for text in [">20.00<", ">b &amp; c<", ">failed<", ">-5.00<"] {
+        assert!(svg.contains(text), "{text} is missing in {svg}");
+    }
+    assert!(!bars("PSNR", 2, &[]).contains("NaN"));
 }

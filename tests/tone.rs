@@ -177,7 +177,7 @@ fn settings_that_leave_a_curve_undefined_are_refused() {
         ToneSettings { theta: f64::INFINITY, ..good.clone() },
         ToneSettings { alpha: 1.1, ..good.clone() },
         ToneSettings { alpha: -0.1, ..good.clone() },
-        ToneSettings { beta: 0.0, ..good.clone() },
+        ToneSettings { beta: -0.1, ..good.clone() },
         ToneSettings { base_gain: 0.0, ..good.clone() },
     ] {
         assert!(matches!(bad.check(), Err(Error::Usage(_))), "{bad:?}");

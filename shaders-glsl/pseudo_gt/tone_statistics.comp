@@ -74,7 +74,8 @@ ToneParameters curve_of(ToneStatistics of) {
     default:
         float crushed = 1.0 - clamp(of.p10 / of.p90, 0.0, 1.0);
         tone.white = of.p90;
-        tone.offset = alpha * power(crushed, beta);
+        // beta 0 is a fixed black level, also where nothing is crushed.
+        tone.offset = beta > 0.0 ? alpha * power(crushed, beta) : alpha;
         tone.gain = least_gain + gain_c * of.mean_luminance;
     }
     return tone;

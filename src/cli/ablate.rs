@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use anyhow::Result;
 
 use super::comparison::{self, Run};
+use super::table;
 use super::train::{TrainOptions, train_into};
 use crate::Error;
 use crate::dataset::Dataset;
@@ -93,8 +94,7 @@ pub fn run(args: &AblateArgs) -> Result<()> {
     export::write_whole(&index, page.html().as_bytes())?;
     export::write_whole(&args.out.join("table.md"), table.markdown().as_bytes())?;
     let mut out = std::io::stdout().lock();
-    let text = comparison::terminal_table("model", &dark, &runs);
-    write!(out, "{text}\n{}\n", index.display())?;
+    write!(out, "{}\n{}\n", table::of(&table), index.display())?;
     Ok(())
 }
 

@@ -1,6 +1,5 @@
 //! Runs of one dataset side by side: the tables, curves and pictures of `demo` and `ablate`.
 
-use super::table;
 use super::train::Trained;
 use crate::dataset::View;
 use crate::eval::{self, ViewScore};
@@ -100,19 +99,4 @@ pub(super) fn of_view(view: &View, dark: &[ViewScore], runs: &[Run]) -> Comparis
     pictures.extend(runs.iter().filter_map(|run| picture(&run.title, &run.scored)));
     pictures.extend(view.reference.as_ref().map(reference));
     Comparison { title: format!("Test view {}", view.name), pictures }
-}
-
-/// The score table as text.
-pub(super) fn terminal_table(label: &str, dark: &[ViewScore], runs: &[Run]) -> String {
-    let Table { label, columns, rows, .. } = score_table(label, dark, runs);
-    let mut lines = vec![vec![label]];
-    lines[0].extend(columns.iter().map(|column| column.name.clone()));
-    for (name, values) in rows {
-        let cells = columns.iter().zip(values);
-        let cell = |(column, value): (&Column, Option<f64>)| {
-            value.map_or_else(|| "-".to_owned(), |value| format!("{value:.*}", column.digits))
-        };
-        lines.push(std::iter::once(name).chain(cells.map(cell)).collect());
-    }
-    table::aligned(&lines)
 }

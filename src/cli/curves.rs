@@ -7,7 +7,7 @@ use super::table;
 use crate::dataset::{Dataset, LoadOptions, Split};
 use crate::export;
 use crate::image::Image;
-use crate::report::{Mark, Series, plot_with_marks, svg_file};
+use crate::report::{Series, VerticalLine, plot_with_lines, svg_file};
 use crate::tone::{CurveChoice, FAMILIES, Family, Statistics, ToneCurve, ToneSettings};
 use crate::{Error, Result};
 
@@ -150,11 +150,11 @@ fn drawing(curves: &[Curve], scene: Option<&Statistics>) -> String {
             .map(|t| (t, value(&curve.settings, t, scene)))
             .collect(),
     };
-    let mark = |x: f64, name: &str| Mark { x, name: name.to_owned() };
+    let mark = |x: f64, name: &str| VerticalLine { x, name: name.to_owned() };
     let marks = scene.map(|scene| {
         let mean = f64::from(scene.mean_luminance) / f64::from(scene.p90);
         vec![mark(scene.ratio(), "p10"), mark(mean, "mean Y"), mark(1.0, "p90")]
     });
     let series: Vec<Series> = curves.iter().map(series).collect();
-    plot_with_marks("t = x / p90", "target", &series, &marks.unwrap_or_default())
+    plot_with_lines("t = x / p90", "target", &series, &marks.unwrap_or_default())
 }

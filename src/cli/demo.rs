@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Result;
 
 use super::comparison::{self, Run};
-use super::train;
+use super::{table, train};
 use crate::Error;
 use crate::dataset::Dataset;
 use crate::dataset::synthetic::{self, SyntheticOptions};
@@ -60,7 +60,8 @@ pub fn run(args: &DemoArgs) -> Result<()> {
     let page = args.out.join("index.html");
     export::write_whole(&page, report(&gpu, &dataset, &dark, &runs).html().as_bytes())?;
     let mut out = std::io::stdout().lock();
-    write!(out, "{}\n{}\n", comparison::terminal_table("target", &dark, &runs), page.display())?;
+    let table = table::of(&comparison::score_table("target", &dark, &runs));
+    write!(out, "{table}\n{}\n", page.display())?;
     Ok(())
 }
 

@@ -1,5 +1,22 @@
 //! Tables for the terminal.
 
+use crate::report::{Column, Table};
+
+/// A table of the report, as the terminal shows it.
+pub(super) fn of(table: &Table) -> String {
+    let Table { label, columns, rows, .. } = table;
+    let mut lines = vec![vec![label.clone()]];
+    lines[0].extend(columns.iter().map(|column| column.name.clone()));
+    for (name, values) in rows {
+        let cell = |(column, value): (&Column, &Option<f64>)| {
+            value.map_or_else(|| "-".to_owned(), |value| format!("{value:.*}", column.digits))
+        };
+        let cells = columns.iter().zip(values).map(cell);
+        lines.push(std::iter::once(name.clone()).chain(cells).collect());
+    }
+    aligned(&lines)
+}
+
 /// The rows with their columns aligned: the first to the left, the others to the right.
 pub(super) fn aligned(rows: &[Vec<String>]) -> String {
     let columns = rows.iter().map(Vec::len).max().unwrap_or(0);

@@ -79,6 +79,9 @@ pub(crate) struct TrainOptions {
     /// Score the test views every N steps as well as at the end
     #[arg(long, value_name = "N")]
     eval_every: Option<u64>,
+    /// Any other setting by its place in config.toml, such as tone.alpha=0.1; may be repeated, wins over all else
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
 }
 
 /// The options that say what the model has beside colour.
@@ -179,6 +182,7 @@ impl TrainOptions {
         if self.reference.is_some() {
             config.reference.clone_from(&self.reference);
         }
+        let config = config.with(&self.set)?;
         config.check()?;
         Ok(config)
     }
@@ -189,10 +193,9 @@ impl TrainOptions {
 /// # Errors
 /// Whatever keeps the run from its end, in one line.
 pub fn run(args: &TrainArgs) -> Result<()> {
-    let mut config = args.options.config(args.dataset.clone())?;
+    let config = args.options.config(args.dataset.clone())?;
     let gpu = Gpu::new(&config.device.parse::<DeviceChoice>()?)?;
     let dataset = Dataset::load(&config.dataset, &config.load_options())?;
-    config.leave_out_what_is_missing(&dataset);
     let (trained, _) = train_into(&args.out, &gpu, &config, &dataset, args.overwrite)?;
     let Trained { trainer, scored, seconds, .. } = trained;
     let gaussians = trainer.gaussian_count();

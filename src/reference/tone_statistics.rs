@@ -52,7 +52,10 @@ fn curve_of(curve: u32, params: &Params, of: &ToneStatistics) -> ToneParameters 
         _ => {
             let crushed = 1.0 - (of.p10 / of.p90).clamp(0.0, 1.0);
             tone.white = of.p90;
-            tone.offset = params.alpha * crushed.power(params.beta);
+            tone.offset = params.alpha;
+            if params.beta > 0.0 {
+                tone.offset *= crushed.power(params.beta);
+            }
             tone.gain = params.least_gain + params.gain_c * of.mean_luminance;
         }
     }

@@ -1,7 +1,10 @@
 //! Line plots as inline SVG.
+//!
+//! A line through many points is a line alone; one through few shows where they are, and which of them is special.
 
 use std::fmt::Write as _;
 
+use super::axis::Axis;
 use super::escape;
 
 /// A line of a plot.
@@ -15,7 +18,7 @@ pub struct Series {
 
 /// A value of x that a vertical line marks.
 #[derive(Clone, Debug, Default)]
-pub struct Mark {
+pub struct VerticalLine {
     /// Where.
     pub x: f64,
     /// What it is.
@@ -36,17 +39,53 @@ const COLORS: usize = 5;
 const DASHES: [&str; 4] =
     ["", " stroke-dasharray=\"7 3\"", " stroke-dasharray=\"2 3\"", " stroke-dasharray=\"9 3 2 3\""];
 
-/// Draws `y_name` against `x_name` (loss or PSNR against the step, say); the colours are those of the page's style.
-pub fn plot(x_name: &str, y_name: &str, series: &[Series]) -> String {
-    plot_with_marks(x_name, y_name, series, &[])
+/// A point apart from the lines, drawn as a star.
+#[derive(Clone, Debug, Default)]
+pub struct Mark {
+    /// What it is, written beside it.
+    pub name: String,
+    /// (x, y); left out where it is not finite.
+    pub point: (f64, f64),
 }
 
-/// As [`plot`], with vertical lines where `marks` lie within the x axis.
-pub fn plot_with_marks(x_name: &str, y_name: &str, series: &[Series], marks: &[Mark]) -> String {
+/// Draws `y_name` against `x_name` (loss or PSNR against the step, say); the colours are those of the page's style.
+pub fn plot(x_name: &str, y_name: &str, series: &[Series]) -> String {
+    draw(x_name, y_name, series, &Extras::default())
+}
+
+/// As [`plot`], with `lines` where they lie within the x axis.
+pub fn plot_with_lines(
+    x_name: &str,
+    y_name: &str,
+    series: &[Series],
+    lines: &[VerticalLine],
+) -> String {
+    draw(x_name, y_name, series, &Extras { lines, ..Extras::default() })
+}
+
+/// As [`plot`], for few points (PSNR against a setting, say): each has a dot, and `marks` are drawn as stars.
+pub fn plot_points(x_name: &str, y_name: &str, series: &[Series], marks: &[Mark]) -> String {
+    draw(x_name, y_name, series, &Extras { dot: 3.5, marks, ..Extras::default() })
+}
+
+/// What a plot has beside its lines.
+#[derive(Default)]
+struct Extras<'a> {
+    /// The radius of the points; 0: none.
+    dot: f64,
+    marks: &'a [Mark],
+    lines: &'a [VerticalLine],
+}
+
+fn draw(x_name: &str, y_name: &str, series: &[Series], extras: &Extras<'_>) -> String {
+    let &Extras { dot, marks, lines } = extras;
     // Positive phrasing: a NaN fails the test too. The bound keeps differences of values finite.
     let is_drawable = |&(x, y): &(f64, f64)| x.abs() <= 1e30 && y.abs() <= 1e30;
-    let points =
-        || series.iter().flat_map(|series| series.points.iter().copied().filter(is_drawable));
+    let marked = || marks.iter().map(|mark| mark.point);
+    let points = || {
+        let lines = series.iter().flat_map(|series| series.points.iter().copied());
+        lines.chain(marked()).filter(is_drawable)
+    };
     let x_axis = Axis::around(points().map(|(x, _)| x), LEFT, WIDTH - RIGHT);
     let y_axis = Axis::around(points().map(|(_, y)| y), HEIGHT - BOTTOM, TOP);
 
@@ -88,8 +127,7 @@ pub fn plot_with_marks(x_name: &str, y_name: &str, series: &[Series], marks: &[M
         escape(x_name),
         escape(y_name)
     );
-    for Mark { x, name } in marks.iter().filter(|mark| (x_axis.low..=x_axis.high).contains(&mark.x))
-    {
+    for VerticalLine { x, name } in lines.iter().filter(|line| x_axis.contains(line.x)) {
         let x = x_axis.place(*x);
         let (bottom, below) = (HEIGHT - BOTTOM, TOP + 12.0);
         let _ = writeln!(
@@ -105,13 +143,31 @@ pub fn plot_with_marks(x_name: &str, y_name: &str, series: &[Series], marks: &[M
     {
         let color = format!("var(--series-{})", index % COLORS);
         let dashes = DASHES[index / COLORS % DASHES.len()];
-        let line = points.iter().filter(|point| is_drawable(point));
-        let line = line.map(|&(x, y)| format!("{:.1},{:.1}", x_axis.place(x), y_axis.place(y)));
+        let places = points.iter().filter(|point| is_drawable(point));
+        let places: Vec<(f64, f64)> =
+            places.map(|&(x, y)| (x_axis.place(x), y_axis.place(y))).collect();
+        let line = places.iter().map(|(x, y)| format!("{x:.1},{y:.1}"));
         let _ = writeln!(
             svg,
             "<polyline fill=\"none\" stroke=\"{color}\" stroke-width=\"2\"{dashes} stroke-linejoin=\"round\" points=\"{}\"/>\
              <text x=\"{text_x}\" y=\"{text_y}\" fill=\"{color}\">{}</text>",
             line.collect::<Vec<_>>().join(" "),
+            escape(name)
+        );
+        for (x, y) in places.iter().filter(|_| dot > 0.0) {
+            let _ =
+                writeln!(svg, "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"{dot}\" fill=\"{color}\"/>");
+        }
+    }
+    for Mark { name, point } in marks.iter().filter(|mark| is_drawable(&mark.point)) {
+        let (x, y) = (x_axis.place(point.0), y_axis.place(point.1));
+        let _ = writeln!(
+            svg,
+            "<path d=\"{}\" fill=\"var(--best)\"/><text x=\"{:.1}\" y=\"{:.1}\" fill=\"var(--best)\">{}</text>",
+            star(x, y),
+            // Towards the middle, where there is room.
+            if x > WIDTH / 2.0 { x - 10.0 - 7.0 * name.chars().count() as f64 } else { x + 12.0 },
+            y - 8.0,
             escape(name)
         );
     }
@@ -145,51 +201,12 @@ pub fn svg_file(plot: &str) -> String {
     whole.replacen(">\n", &format!(">\n<style>\n{colors}</style>\n"), 1)
 }
 
-/// A range of values and where it lies on the drawing.
-struct Axis {
-    low: f64,
-    high: f64,
-    /// Between ticks; a round number.
-    step: f64,
-    from: f64,
-    to: f64,
-}
-
-impl Axis {
-    /// The axis from `from` to `to` that holds all of the values, with round ends.
-    fn around(values: impl Iterator<Item = f64>, from: f64, to: f64) -> Self {
-        const TICKS: f64 = 5.0;
-        let (low, high) = values
-            .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(v), high.max(v)));
-        let (low, high) = match (low <= high, low < high) {
-            (false, _) => (0.0, 1.0),
-            // All values are one; the margin must not vanish in rounding.
-            (true, false) => (low - 0.5 - 0.01 * low.abs(), high + 0.5 + 0.01 * high.abs()),
-            (true, true) => (low, high),
-        };
-        let rough = high / TICKS - low / TICKS;
-        let power = 10f64.powf(rough.log10().floor());
-        let step = power
-            * [1.0, 2.0, 5.0].into_iter().find(|factor| factor * power >= rough).unwrap_or(10.0);
-        Self { low: (low / step).floor() * step, high: (high / step).ceil() * step, step, from, to }
-    }
-
-    fn ticks(&self) -> impl Iterator<Item = f64> {
-        let count = ((self.high - self.low) / self.step).round() as u32;
-        (0..=count).map(|tick| self.low + f64::from(tick) * self.step)
-    }
-
-    fn place(&self, value: f64) -> f64 {
-        self.from + (value - self.low) / (self.high - self.low) * (self.to - self.from)
-    }
-
-    fn label(&self, tick: f64) -> String {
-        let digits = (-self.step.log10().floor()).clamp(0.0, 6.0) as usize;
-        let label = format!("{tick:.digits$}");
-        if label.trim_start_matches('-').chars().all(|digit| matches!(digit, '0' | '.')) {
-            "0".to_owned()
-        } else {
-            label
-        }
-    }
+/// The outline of a star with five points around (x, y).
+fn star(x: f64, y: f64) -> String {
+    let corner = |index: u32| {
+        let radius = if index.is_multiple_of(2) { 9.0 } else { 4.0 };
+        let (sin, cos) = (std::f64::consts::PI * f64::from(index) / 5.0).sin_cos();
+        format!("{:.1} {:.1}", x + radius * sin, y - radius * cos)
+    };
+    format!("M{}Z", (0..10).map(corner).collect::<Vec<_>>().join("L"))
 }

@@ -34,7 +34,7 @@ pub struct ToneSettings {
     pub theta: f64,
     /// alpha: the highest black level.
     pub alpha: f64,
-    /// beta: how fast the black level falls as p10 approaches p90.
+    /// beta: how fast the black level falls as p10 approaches p90; 0: it is alpha for every photograph.
     pub beta: f64,
     /// g0: the gain of ASE on a black photograph.
     pub base_gain: f64,
@@ -88,7 +88,7 @@ impl ToneSettings {
             ("--gain (c)", self.gain_c, self.gain_c >= 0.0, "at least 0"),
             ("--theta", self.theta, self.theta > 0.0, "above 0"),
             ("alpha", self.alpha, (0.0..=1.0).contains(&self.alpha), "from 0 to 1"),
-            ("beta", self.beta, self.beta > 0.0, "above 0"),
+            ("beta", self.beta, self.beta >= 0.0, "at least 0"),
             ("base_gain (g0)", self.base_gain, self.base_gain > 0.0, "above 0"),
         ];
         for (name, value, holds, rule) in rules {

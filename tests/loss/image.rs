@@ -389,7 +389,7 @@ fn an_interior_that_is_not_inside_is_refused() {
 fn l1_and_ssim_are_those_of_pytorch() {
     let (gpu, torch) = (gpu(), Torch::read());
     let images = [torch.get("image.render").to_vec(), torch.get("image.target").to_vec()];
-    let identity = ToneParameters { white: 1.0, offset: 0.0, gain: 1.0 };
+    let identity = ToneParameters { white: 1.0, offset: 0.0, gain: 1.0, constants: [0.0; 8] };
     let whole = Interior::whole([23, 19].into());
     let evaluate = |weight: f64| {
         evaluate_interior(&gpu, CURVE_NONE, weight, [23, 19], whole, identity, &images)

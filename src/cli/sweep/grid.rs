@@ -1,0 +1,353 @@
+//! The points of a sweep: every combination of the values of its axes, and the grids of the paper's tables.
+
+use std::path::Path;
+
+use crate::tone::ToneCurve;
+use crate::{Error, Result};
+
+use super::options::pair;
+
+/// The axis whose points are averaged.
+pub(super) const SEED: &str = "seed";
+/// The axis of fixed black levels.
+pub(super) const OFFSET: &str = "offset";
+/// On that axis: the black level of alpha and beta.
+pub(super) const ADAPTIVE: &str = "adaptive";
+
+/// The axes with a name of their own, in the order of a point's name, and the setting behind each.
+const AXES: [(&str, &str); 8] = [
+    ("curve", "tone.curve"),
+    ("alpha", "tone.alpha"),
+    ("beta", "tone.beta"),
+    ("gain", "tone.gain_c"),
+    ("base_gain", "tone.base_gain"),
+    ("theta", "tone.theta"),
+    (OFFSET, OFFSET),
+    (SEED, SEED),
+];
+
+/// A setting and the values it takes.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Axis {
+    /// A name of [`AXES`], or the dotted path of any other setting.
+    pub(super) key: String,
+    pub(super) values: Vec<String>,
+}
+
+impl Axis {
+    /// The axis of a comma-separated list; commas within brackets and quotes separate nothing.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] for a value that is empty or there twice.
+    pub(super) fn new(key: &str, list: &str) -> Result<Self> {
+        let key = key.trim();
+        let name = AXES.iter().find(|(_, setting)| *setting == key).map_or(key, |(name, _)| name);
+        let mut axis = Self { key: name.to_owned(), values: vec![] };
+        for value in split(list) {
+            let all = if name == "curve" && value == "all" { all_curves() } else { vec![value] };
+            for value in all {
+                let refused =
+                    |problem| Err(Error::Usage(format!("{name} takes {list}: {problem}")));
+                if value.is_empty() {
+                    return refused(
+                        "a value is empty; separate values by single commas".to_owned(),
+                    );
+                }
+                if axis.values.contains(&value) {
+                    return refused(format!("{value} is there twice"));
+                }
+                axis.values.push(value);
+            }
+        }
+        Ok(axis)
+    }
+
+    fn of(key: &str, values: &[&str]) -> Self {
+        Self { key: key.to_owned(), values: values.iter().map(|&value| value.to_owned()).collect() }
+    }
+
+    /// Where its values stand in a point's name: those of [`AXES`] first, the seed last.
+    fn order(&self) -> (usize, &str) {
+        let named = AXES.iter().position(|(name, _)| *name == self.key && *name != SEED);
+        (named.unwrap_or(AXES.len() + usize::from(self.key == SEED)), &self.key)
+    }
+}
+
+/// The parts of a list.
+fn split(list: &str) -> Vec<String> {
+    let (mut parts, mut depth, mut quote) = (vec![String::new()], 0, None);
+    for character in list.chars() {
+        match (character, quote) {
+            ('"' | '\'', None) => quote = Some(character),
+            (_, Some(open)) if character == open => quote = None,
+            ('[' | '{', None) => depth += 1,
+            (']' | '}', None) => depth -= 1,
+            (',', None) if depth == 0 => {
+                parts.push(String::new());
+                continue;
+            }
+            _ => {}
+        }
+        if let Some(part) = parts.last_mut() {
+            part.push(character);
+        }
+    }
+    parts.iter().map(|part| part.trim().to_owned()).collect()
+}
+
+/// The names of all curves.
+fn all_curves() -> Vec<String> {
+    ToneCurve::ALL.iter().map(|curve| curve.name().to_owned()).collect()
+}
+
+/// A curve as a point names it: a file from anywhere, any other by its name.
+fn curve(name: &str) -> String {
+    let is_file = name.contains(['.', '/']) && Path::new(name).is_file();
+    let path = is_file.then(|| std::path::absolute(name).ok()).flatten();
+    path.and_then(|path| path.to_str().map(str::to_owned)).unwrap_or_else(|| name.to_owned())
+}
+
+/// A run of the sweep: what distinguishes it from the others.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Point {
+    /// Axis and value, in the order of the name.
+    pub(super) values: Vec<(String, String)>,
+}
+
+impl Point {
+    pub(super) fn value(&self, key: &str) -> Option<&str> {
+        self.values.iter().find(|(own, _)| own == key).map(|(_, value)| value.as_str())
+    }
+
+    /// The name of its run directory, such as `curve=ap3,seed=10`: the same in every sweep that has the point, and no
+    /// other point's.
+    pub(super) fn name(&self) -> String {
+        const LONGEST: usize = 120;
+        let pairs: Vec<String> =
+            self.values.iter().map(|(key, value)| format!("{key}={value}")).collect();
+        let exact = pairs.join(",");
+        let plain =
+            |c: char| if c.is_ascii_alphanumeric() || "-_.=,+".contains(c) { c } else { '_' };
+        let name: String = exact.chars().map(plain).take(LONGEST).collect();
+        if name == exact {
+            return name;
+        }
+        // FNV-1a tells apart what the replacements made alike.
+        let hash = exact
+            .bytes()
+            .fold(0x811c_9dc5_u32, |hash, byte| (hash ^ u32::from(byte)).wrapping_mul(0x0100_0193));
+        format!("{name}-{hash:08x}")
+    }
+
+    /// What it adds to the arguments of `train`.
+    pub(super) fn arguments(&self) -> Vec<String> {
+        let set = |key: &str, value: &str| pair("set", &format!("{key}={value}"));
+        let of = |(key, value): &(String, String)| match key.as_str() {
+            "curve" => pair(key, &curve(value)),
+            "gain" | "theta" | SEED => pair(key, value),
+            OFFSET if value == ADAPTIVE => vec![],
+            OFFSET => [set("tone.alpha", value), set("tone.beta", "0")].concat(),
+            key => {
+                let setting = AXES.iter().find(|(name, _)| *name == key);
+                set(setting.map_or(key, |(_, setting)| setting), value)
+            }
+        };
+        self.values.iter().flat_map(of).collect()
+    }
+}
+
+/// The grids of the paper's tables.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub(super) enum PaperTable {
+    /// Every curve
+    Leaderboard,
+    /// AP3 with fixed black levels from 0 to 0.2, and the adaptive one
+    Offset,
+    /// AP3 with alpha from 0.04 to 0.3, and linear
+    Alpha,
+    /// ASE with g0 from 1 to 4 at c = 0 and c from 1 to 4 at g0 = 1, and linear
+    Gain,
+}
+
+impl PaperTable {
+    /// The curve that the others are compared with.
+    pub(super) fn baseline(self) -> Option<&'static str> {
+        match self {
+            // The paper's, where the library has it.
+            Self::Leaderboard if all_curves().iter().any(|name| name == "softexp") => {
+                Some("softexp")
+            }
+            Self::Leaderboard | Self::Alpha | Self::Gain => Some("linear"),
+            Self::Offset => None,
+        }
+    }
+
+    fn grids(self) -> Vec<Vec<Axis>> {
+        let curve = |name| Axis::of("curve", &[name]);
+        match self {
+            Self::Leaderboard => vec![vec![Axis { key: "curve".to_owned(), values: all_curves() }]],
+            // 0.103 is the fixed offset of earlier work that the paper marks.
+            Self::Offset => {
+                let levels =
+                    ["0", "0.02", "0.04", "0.06", "0.08", "0.103", "0.12", "0.16", "0.2", ADAPTIVE];
+                vec![vec![curve("ap3"), Axis::of(OFFSET, &levels)]]
+            }
+            Self::Alpha => {
+                let alphas = ["0.04", "0.08", "0.12", "0.16", "0.2", "0.3"];
+                vec![vec![curve("ap3"), Axis::of("alpha", &alphas)]]
+            }
+            Self::Gain => {
+                let gains = |c: &[&str], base: &[&str]| {
+                    vec![curve("ase"), Axis::of("gain", c), Axis::of("base_gain", base)]
+                };
+                vec![gains(&["0"], &["1", "2", "3", "4"]), gains(&["1", "2", "3", "4"], &["1"])]
+            }
+        }
+    }
+}
+
+/// The points of the axes, the first varying slowest; those of a paper's table, where `given` replaces its axes of the
+/// same key and adds to the others.
+///
+/// # Errors
+/// [`Error::Usage`] where there is no axis, one is given twice, or a fixed black level meets alpha or beta.
+pub(super) fn points(given: &[Axis], table: Option<PaperTable>) -> Result<Vec<Point>> {
+    for (index, axis) in given.iter().enumerate() {
+        if given[..index].iter().any(|other| other.key == axis.key) {
+            return Err(Error::Usage(format!("{} is given twice; give one list", axis.key)));
+        }
+    }
+    let mut grids = table.map_or_else(|| vec![vec![]], PaperTable::grids);
+    for grid in &mut grids {
+        grid.retain(|axis| given.iter().all(|own| own.key != axis.key));
+        grid.extend(given.iter().cloned());
+    }
+    let has = |curve: &str| {
+        let mut axes = grids.iter().flatten().filter(|axis| axis.key == "curve");
+        axes.any(|axis| axis.values.iter().any(|value| value == curve))
+    };
+    if let Some(curve) = table.and_then(PaperTable::baseline).filter(|curve| !has(curve)) {
+        // What shapes the other curves is nothing to the baseline.
+        let of_others = ["curve", "alpha", "beta", "gain", "base_gain", OFFSET];
+        let shared = given.iter().filter(|axis| !of_others.contains(&axis.key.as_str())).cloned();
+        grids.push(std::iter::once(Axis::of("curve", &[curve])).chain(shared).collect());
+    }
+    let mut points: Vec<Point> = vec![];
+    for grid in &mut grids {
+        grid.sort_by(|a, b| a.order().cmp(&b.order()));
+        check(grid)?;
+        let point = |values| Point { values };
+        let product = product(grid).into_iter().map(point);
+        let fresh: Vec<Point> = product.filter(|point| !points.contains(point)).collect();
+        points.extend(fresh);
+    }
+    Ok(points)
+}
+
+fn check(grid: &[Axis]) -> Result<()> {
+    let has = |key: &str| grid.iter().any(|axis| axis.key == key);
+    if grid.is_empty() {
+        let problem = "the grid is empty; give --curves, --alpha, --grid, --seeds or --table";
+        return Err(Error::Usage(problem.to_owned()));
+    }
+    if has(OFFSET) && (has("alpha") || has("beta")) {
+        let problem =
+            "--offset fixes the black level, which --alpha and --beta shape; give one or the other";
+        return Err(Error::Usage(problem.to_owned()));
+    }
+    Ok(())
+}
+
+fn product(axes: &[Axis]) -> Vec<Vec<(String, String)>> {
+    axes.iter().fold(vec![vec![]], |points, axis| {
+        let with = |point: &Vec<(String, String)>| {
+            let extended = axis.values.iter().map(|value| {
+                let mut point = point.clone();
+                point.push((axis.key.clone(), value.clone()));
+                point
+            });
+            extended.collect::<Vec<_>>()
+        };
+        points.iter().flat_map(with).collect()
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn names(given: &[(&str, &str)], table: Option<PaperTable>) -> Vec<String> {
+        let axes: Vec<Axis> =
+            given.iter().map(|(key, list)| Axis::new(key, list).unwrap()).collect();
+        points(&axes, table).unwrap().iter().map(Point::name).collect()
+    }
+
+    fn refused(given: &[(&str, &str)], part: &str) {
+        let axes: Result<Vec<Axis>> =
+            given.iter().map(|(key, list)| Axis::new(key, list)).collect();
+        let message = axes.and_then(|axes| points(&axes, None)).unwrap_err().to_string();
+        assert!(message.contains(part), "no `{part}` in: {message}");
+    }
+
+    #[test]
+    fn points_are_all_combinations_in_an_order_of_their_own() {
+        let expected = [
+            "curve=ap3,alpha=0.1,steps=2,seed=1",
+            "curve=ap3,alpha=0.1,steps=2,seed=2",
+            "curve=ase,alpha=0.1,steps=2,seed=1",
+            "curve=ase,alpha=0.1,steps=2,seed=2",
+        ];
+        let given = [("seed", "1,2"), ("steps", "2"), ("tone.curve", "ap3, ase"), ("alpha", "0.1")];
+        assert_eq!(names(&given, None), expected);
+    }
+
+    #[test]
+    fn a_point_is_a_list_of_arguments() {
+        let axes = [("curve", "my.toml"), ("beta", "1"), ("steps", "2"), ("seed", "3")];
+        let axes = axes.map(|(key, list)| Axis::new(key, list).unwrap());
+        let arguments = points(&axes, None).unwrap()[0].arguments().join(" ");
+        assert_eq!(arguments, "--curve my.toml --set tone.beta=1 --set steps=2 --seed 3");
+        let offsets = points(&[Axis::new("offset", "0.1,adaptive").unwrap()], None).unwrap();
+        assert_eq!(offsets[0].arguments().join(" "), "--set tone.alpha=0.1 --set tone.beta=0");
+        assert!(offsets[1].arguments().is_empty());
+    }
+
+    #[test]
+    fn names_are_those_of_files_and_never_alike() {
+        let names = names(&[("curve", "a/b.toml,a_b.toml,ap3,é")], None);
+        assert_eq!(names[1..3], ["curve=a_b.toml", "curve=ap3"]);
+        assert!(names[0].starts_with("curve=a_b.toml-") && names[3].starts_with("curve=_-"));
+        let long = Point { values: vec![("key".to_owned(), "x".repeat(500))] };
+        assert!(long.name().len() < 200);
+    }
+
+    #[test]
+    fn a_list_is_split_outside_of_brackets_and_quotes() {
+        assert_eq!(split("[1,2], [3,4]"), ["[1,2]", "[3,4]"]);
+        assert_eq!(split("\"a,b\",'c,]',d"), ["\"a,b\"", "'c,]'", "d"]);
+        assert_eq!(split("a,,b"), ["a", "", "b"]);
+    }
+
+    #[test]
+    fn grids_that_make_no_sense_are_refused() {
+        refused(&[], "empty");
+        refused(&[("alpha", "")], "empty");
+        refused(&[("alpha", "0.1,,0.2")], "empty");
+        refused(&[("seed", "1,2,1")], "1 is there twice");
+        refused(&[("alpha", "0.1"), ("tone.alpha", "0.2")], "alpha is given twice");
+        refused(&[("alpha", "0.1"), ("offset", "0.2")], "--offset");
+    }
+
+    #[test]
+    fn the_paper_s_tables_have_their_points() {
+        let leaderboard = names(&[], Some(PaperTable::Leaderboard));
+        assert_eq!(leaderboard.len(), ToneCurve::ALL.len());
+        let offset = names(&[("seed", "1")], Some(PaperTable::Offset));
+        assert_eq!(offset.last().unwrap(), "curve=ap3,offset=adaptive,seed=1");
+        let alpha = names(&[("curve", "ase"), ("alpha", "0.1")], Some(PaperTable::Alpha));
+        assert_eq!(alpha, ["curve=ase,alpha=0.1", "curve=linear"]);
+        let gain = names(&[], Some(PaperTable::Gain));
+        assert_eq!(gain.len(), 9);
+        assert!(gain.contains(&"curve=ase,gain=0,base_gain=2".to_owned()), "{gain:?}");
+    }
+}

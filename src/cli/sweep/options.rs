@@ -1,0 +1,110 @@
+//! The options of `train` as `sweep` takes them: checked like there, kept as text for the command lines of the points.
+
+use std::path::{Path, PathBuf};
+
+use clap::builder::ValueParser;
+use clap::error::ErrorKind;
+use clap::parser::ValueSource;
+use clap::{Arg, ArgMatches, Args, Command, Error, FromArgMatches, ValueHint};
+
+use crate::cli::train::TrainOptions;
+
+/// The options of `train` that take a list here: their name there, their name here, and what the list holds.
+const LISTS: [(&str, &str, &str); 4] = [
+    ("curve", "curves", "Tone curves by name or file, or `all` [default: ap3]"),
+    ("gain", "gain", "Values of c: how much a brighter photograph raises the curve's gain"),
+    ("theta", "theta", "Means that the linear curve aims at"),
+    (
+        "seed",
+        "seeds",
+        "Seeds; the leaderboard has the mean over them, and their standard deviation",
+    ),
+];
+
+/// What the command line says of the options of `train`.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Options {
+    /// What every point is trained with, as arguments in the order of `train --help`.
+    pub(super) shared: Vec<String>,
+    /// The option's name in `train` and the list that was given for it.
+    pub(super) lists: Vec<(&'static str, String)>,
+}
+
+impl Args for Options {
+    fn augment_args(command: Command) -> Command {
+        LISTS.iter().fold(TrainOptions::augment_args(command), |command, &(option, name, help)| {
+            command.mut_arg(option, |arg| {
+                let arg = arg.long(name).value_name("LIST").help(help).help_heading("The grid");
+                let arg = if name == option { arg } else { arg.visible_alias(option) };
+                arg.value_parser(ValueParser::string())
+            })
+        })
+    }
+
+    fn augment_args_for_update(command: Command) -> Command {
+        Self::augment_args(command)
+    }
+}
+
+impl FromArgMatches for Options {
+    fn from_arg_matches(matches: &ArgMatches) -> Result<Self, Error> {
+        let mut options = Self::default();
+        let train = TrainOptions::augment_args(Command::new("train"));
+        for arg in train.get_arguments() {
+            let id = arg.get_id().as_str();
+            if matches.value_source(id) != Some(ValueSource::CommandLine) {
+                continue;
+            }
+            let list = LISTS.iter().find(|(option, ..)| *option == id);
+            for value in matches.get_raw(id).unwrap_or_default() {
+                let value = text(value.as_ref())?;
+                match list {
+                    Some((option, ..)) => options.lists.push((option, value)),
+                    None => options.push(arg, value)?,
+                }
+            }
+        }
+        Ok(options)
+    }
+
+    fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> Result<(), Error> {
+        *self = Self::from_arg_matches(matches)?;
+        Ok(())
+    }
+}
+
+impl Options {
+    fn push(&mut self, arg: &Arg, value: String) -> Result<(), Error> {
+        let long = arg.get_long().unwrap_or_default();
+        if !arg.get_action().takes_values() {
+            // A flag's raw value is whether it was given.
+            self.shared.push(format!("--{long}"));
+            return Ok(());
+        }
+        let is_path = arg.get_value_hint() == ValueHint::AnyPath;
+        let value = if is_path { text(&absolute(Path::new(&value))?)? } else { value };
+        self.shared.extend(pair(long, &value));
+        Ok(())
+    }
+}
+
+/// An option with its value, as arguments; a value that looks like an option itself is joined to it.
+pub(super) fn pair(long: &str, value: &str) -> Vec<String> {
+    if value.starts_with('-') {
+        vec![format!("--{long}={value}")]
+    } else {
+        vec![format!("--{long}"), value.to_owned()]
+    }
+}
+
+fn absolute(path: &Path) -> Result<PathBuf, Error> {
+    std::path::absolute(path).map_err(|error| {
+        Error::raw(ErrorKind::ValueValidation, format!("{}: {error}", path.display()))
+    })
+}
+
+fn text(value: &Path) -> Result<String, Error> {
+    value.to_str().map(str::to_owned).ok_or_else(|| {
+        Error::raw(ErrorKind::InvalidUtf8, format!("{} is not Unicode", value.display()))
+    })
+}

@@ -1,0 +1,162 @@
+//! `KEY=VALUE`: any one setting of a run by its dotted path, as `config.toml` spells it.
+
+use toml::{Table, Value};
+
+use super::TrainConfig;
+use crate::{Error, Result};
+
+impl TrainConfig {
+    /// The configuration with each `KEY=VALUE` of `assignments` in turn, such as `tone.alpha=0.1`. A value is TOML, or
+    /// else a string; nothing is checked but its type.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] for a key that no configuration has, with the nearest one that it has, or a value of another
+    /// type.
+    pub fn with(&self, assignments: &[String]) -> Result<Self> {
+        let mut config = self.clone();
+        for assignment in assignments {
+            let (key, value) = assignment.split_once('=').ok_or_else(|| {
+                Error::Usage(format!(
+                    "`{assignment}` sets nothing; write KEY=VALUE, as in tone.alpha=0.1"
+                ))
+            })?;
+            config = config.with_one(key.trim(), value.trim())?;
+        }
+        Ok(config)
+    }
+
+    fn with_one(&self, key: &str, text: &str) -> Result<Self> {
+        let refused = |problem: &str| Error::Usage(format!("{key}={text}: {problem}"));
+        let mut table = Table::try_from(self).map_err(|error| Error::Usage(error.to_string()))?;
+        let known = keys("", &table);
+        let (sections, name) = key.rsplit_once('.').map_or(("", key), |(path, name)| (path, name));
+        let path = sections.split('.').filter(|_| !sections.is_empty());
+        let section = path
+            .into_iter()
+            .try_fold(&mut table, |table, name| table.get_mut(name).and_then(Value::as_table_mut));
+        let Some(section) = section else { return Err(unknown(key, &known)) };
+        let value = match section.get(name) {
+            Some(Value::Table(inner)) => {
+                let inner = keys(&format!("{key}."), inner).join(", ");
+                return Err(refused(&format!("this is a section; set one of {inner}")));
+            }
+            // A device may be named 0.
+            Some(Value::String(_)) => string(text),
+            _ => value(text).unwrap_or_else(|| Value::String(text.to_owned())),
+        };
+        section.insert(name.to_owned(), value);
+        table.try_into().map_err(|error: toml::de::Error| {
+            let is_known = known.iter().any(|known| known == key);
+            if is_known { refused(error.message().trim()) } else { unknown(key, &known) }
+        })
+    }
+}
+
+/// A TOML value; none where the text is no single one.
+fn value(text: &str) -> Option<Value> {
+    let mut table: Table = toml::from_str(&format!("value = {text}")).ok()?;
+    (table.len() == 1).then(|| table.remove("value")).flatten()
+}
+
+/// The text, without the quotes it may have.
+fn string(text: &str) -> Value {
+    value(text).filter(Value::is_str).unwrap_or_else(|| Value::String(text.to_owned()))
+}
+
+/// The dotted path of every setting that is not a section itself.
+fn keys(prefix: &str, table: &Table) -> Vec<String> {
+    let of = |(name, value): (&String, &Value)| match value {
+        Value::Table(inner) => keys(&format!("{prefix}{name}."), inner),
+        _ => vec![format!("{prefix}{name}")],
+    };
+    table.iter().flat_map(of).collect()
+}
+
+fn unknown(key: &str, known: &[String]) -> Error {
+    let name = |key: &str| key.rsplit('.').next().unwrap_or_default().to_owned();
+    // Whoever forgets the section means the key of that name.
+    let far = |known: &&String| distance(key, known).min(distance(&name(key), &name(known)));
+    let nearest = known.iter().min_by_key(far);
+    let hint = nearest.map(|nearest| format!("; the nearest is `{nearest}`")).unwrap_or_default();
+    Error::Usage(format!("no setting is called `{key}`{hint}"))
+}
+
+/// Levenshtein's distance: the insertions, deletions and replacements that turn one text into the other.
+fn distance(from: &str, to: &str) -> usize {
+    let to: Vec<char> = to.chars().collect();
+    let mut row: Vec<usize> = (0..=to.len()).collect();
+    for (deleted, from) in from.chars().enumerate() {
+        let mut diagonal = std::mem::replace(&mut row[0], deleted + 1);
+        for (column, &to) in to.iter().enumerate() {
+            let replaced = diagonal + usize::from(from != to);
+            diagonal = row[column + 1];
+            row[column + 1] = replaced.min(diagonal + 1).min(row[column] + 1);
+        }
+    }
+    row[to.len()]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn with(assignments: &[&str]) -> Result<TrainConfig> {
+        let assignments: Vec<String> = assignments.iter().map(|&text| text.to_owned()).collect();
+        TrainConfig::default().with(&assignments)
+    }
+
+    #[test]
+    fn a_setting_is_set_and_nothing_else() {
+        let config = with(&[
+            "tone.alpha=0.25",
+            "density.gradient_threshold = 1e-4",
+            "downscale=4",
+            "background=random",
+            "device=0",
+            "schedule.damping_steps=[1, 2]",
+            "reference=pictures/high",
+            "steps=3",
+            "steps=4",
+        ])
+        .unwrap();
+        let mut expected = TrainConfig::default();
+        expected.tone.alpha = 0.25;
+        expected.density.gradient_threshold = 1e-4;
+        expected.downscale = 4.0;
+        expected.background = crate::train::Background::Random;
+        expected.device = "0".to_owned();
+        expected.schedule.damping_steps = [1, 2];
+        expected.reference = Some("pictures/high".into());
+        expected.steps = 4;
+        assert_eq!(config, expected);
+        assert_eq!(with(&[]).unwrap(), TrainConfig::default());
+    }
+
+    #[test]
+    fn what_cannot_be_set_is_named_with_its_neighbour() {
+        let refused = |assignment: &str, parts: &[&str]| {
+            let message = with(&[assignment]).unwrap_err().to_string();
+            for part in parts {
+                assert!(message.contains(part), "no `{part}` in: {message}");
+            }
+        };
+        refused("tone.alhpa=0.1", &["`tone.alhpa`", "`tone.alpha`"]);
+        refused("alpha=0.1", &["`alpha`", "`tone.alpha`"]);
+        refused("stepz=1", &["`steps`"]);
+        refused("steps.more=1", &["`steps.more`"]);
+        refused("nothing.at.all=1", &["`nothing.at.all`"]);
+        refused("=1", &["``"]);
+        refused("tone={}", &["section", "tone.beta"]);
+        refused("steps=many", &["steps=many", "string"]);
+        refused("steps=1\nseed=2", &["string"]);
+        refused("background=blue", &["blue", "random"]);
+        refused("steps", &["KEY=VALUE"]);
+    }
+
+    #[test]
+    fn distances_count_edits() {
+        assert_eq!(distance("kitten", "sitting"), 3);
+        assert_eq!(distance("", "abc"), 3);
+        assert_eq!(distance("abc", ""), 3);
+    }
+}
