@@ -25,7 +25,6 @@
 //! - [`render`]: the differentiable rasteriser
 //! - [`window`]: the rectangle of a view that networks run on
 //! - [`nn`]: denoiser and tonemapper, forward and backward
-//! - [`loss`]: L1 and SSIM with their gradients
 //! - [`loss`]: the loss terms with their gradients, and their log
 //! - [`optimizer`]: Adam and the schedules of its learning rates
 //! - [`densify`]: clone, split, prune

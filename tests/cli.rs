@@ -337,8 +337,10 @@ fn demo_touches_no_folder_of_somebody_else() {
 
 #[test]
 fn help_teaches_every_command_in_lines_that_fit() {
-    let commands =
-        ["", "train", "eval", "render", "tone", "curves", "synth", "demo", "doctor", "bench"];
+    let commands = [
+        "", "train", "eval", "render", "tone", "curves", "sweep", "ablate", "synth", "demo",
+        "doctor", "bench",
+    ];
     for command in commands {
         let help = succeed(&format!("{command} --help"));
         assert!(help.lines().all(|line| line.chars().count() < 100), "{help}");
@@ -503,7 +505,7 @@ fn misuse_is_said_in_one_line_with_exit_code_2() {
     let set = fixture().set();
     let train =
         |options: &str, parts: &[&str]| refuses_to_train(Path::new(&set), options, 2, parts);
-    train("--curve gamma", &["gamma", "linear, ase, ap3, none"]);
+    train("--curve sepia", &["sepia", "linear, ase, ap3", "--help"]);
     train("--steps 0", &["--steps"]);
     train("--sh-degree 4", &["--sh-degree", "0 to 3"]);
     train("--downscale 0.5", &["downscale"]);
