@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use nightsplat::Error;
 use nightsplat::cli::ImageFormat;
-use nightsplat::cli::tone::{ToneArgs, apply};
+use nightsplat::cli::tone::{ToneArgs, ToneReport, apply};
 use nightsplat::image::Image;
 use nightsplat::tone::{Statistics, ToneCurve, ToneSettings};
 
@@ -266,8 +266,8 @@ fn a_dataset_is_measured_on_its_training_and_scored_on_its_test_views() {
     args.out = None;
     let output = apply(&args).unwrap();
     assert!(output.scene.scores.is_some());
-    let (test, training): (Vec<_>, Vec<_>) =
-        output.views.values().partition(|view| view.scores.is_some());
+    let (test, training): (Vec<ToneReport>, Vec<ToneReport>) =
+        output.views.into_values().partition(|view| view.scores.is_some());
     assert!(!test.is_empty() && training.len() > test.len());
     let p90 = training.iter().map(|view| view.before.p90).sum::<f64>() / training.len() as f64;
     assert!((output.scene.before.p90 - p90).abs() < 1e-12);
