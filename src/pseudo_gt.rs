@@ -45,7 +45,10 @@ pub struct PseudoGt {
 /// What applies the curve to a whole image.
 #[derive(Debug)]
 enum Map {
-    Formula(Pipeline<kernels::tone_map::Kernel>),
+    Formula {
+        pipeline: Pipeline<kernels::tone_map::Kernel>,
+        values_per_thread: u32,
+    },
     Mix(Pipeline<kernels::tone_mix::Kernel>),
     /// (3, K) knots.
     Table(Pipeline<kernels::tone_table::Kernel>, Buffer<Vec3>),
@@ -62,7 +65,11 @@ impl Map {
             None if settings.needs_baking() => {
                 Self::Mix(gpu.pipeline(&kernels::tone_mix::Constants { tone_curve })?)
             }
-            None => Self::Formula(gpu.pipeline(&kernels::tone_map::Constants { tone_curve })?),
+            None => {
+                let constants = kernels::tone_map::Constants { tone_curve, ..Default::default() };
+                let values_per_thread = constants.values_per_thread;
+                Self::Formula { pipeline: gpu.pipeline(&constants)?, values_per_thread }
+            }
         })
     }
 }
@@ -283,11 +290,11 @@ impl PseudoGt {
         let value_count = image.len() as u32;
         let pixel_count = value_count / 3;
         match &self.map {
-            Map::Formula(pipeline) => pass.dispatch(
+            Map::Formula { pipeline, values_per_thread } => pass.dispatch(
                 pipeline,
                 &kernels::tone_map::Params { value_count, view },
                 kernels::tone_map::Buffers { image, parameters, target },
-                Threads::Exactly([value_count, 1, 1]),
+                Threads::Exactly([value_count.div_ceil(*values_per_thread), 1, 1]),
             ),
             Map::Mix(pipeline) => pass.dispatch(
                 pipeline,

@@ -289,7 +289,7 @@ fn tone_map_follows_the_reference_from_tiny_to_huge_values() {
     grid.extend([0.0, 1e-12, 1e-9, 1e-6, 0.009_999, 0.01, 0.010_001, 65.0, 1e6, f32::MAX]);
     grid.extend([f32::NAN, f32::INFINITY, f32::NEG_INFINITY, -1.0, -1e-9]);
     for curve in [ToneCurve::Linear, ToneCurve::Ase, ToneCurve::Ap3, ToneCurve::None] {
-        let constants = tone_map::Constants { tone_curve: curve.constant() };
+        let constants = tone_map::Constants { tone_curve: curve.constant(), ..Default::default() };
         let pipeline = gpu.pipeline::<tone_map::Kernel>(&constants).unwrap();
         for (white, offset, gain) in [(1.0, 0.0, 1.0), (0.0816, 0.0754, 1.16), (1e-6, 0.12, 4.0)] {
             let tone = ToneParameters { white, offset, gain, constants: [0.0; 8] };
@@ -310,7 +310,11 @@ fn tone_map_follows_the_reference_from_tiny_to_huge_values() {
                     &pipeline,
                     &params,
                     bound,
-                    Threads::Exactly([params.value_count, 1, 1]),
+                    Threads::Exactly([
+                        params.value_count.div_ceil(constants.values_per_thread),
+                        1,
+                        1,
+                    ]),
                 )
             })
             .unwrap();

@@ -1,5 +1,6 @@
 //! `nightsplat tone`, in process.
 #![cfg(feature = "cli")]
+#![expect(clippy::unwrap_used, reason = "what fails in a helper fails the test")]
 
 use std::path::{Path, PathBuf};
 
@@ -266,8 +267,8 @@ fn a_dataset_is_measured_on_its_training_and_scored_on_its_test_views() {
     args.out = None;
     let output = apply(&args).unwrap();
     assert!(output.scene.scores.is_some());
-    let (test, training): (Vec<&ToneReport>, Vec<&ToneReport>) =
-        output.views.values().partition(|view| view.scores.is_some());
+    let (test, training): (Vec<ToneReport>, Vec<ToneReport>) =
+        output.views.into_values().partition(|view| view.scores.is_some());
     assert!(!test.is_empty() && training.len() > test.len());
     let p90 = training.iter().map(|view| view.before.p90).sum::<f64>() / training.len() as f64;
     assert!((output.scene.before.p90 - p90).abs() < 1e-12);

@@ -12,3 +12,18 @@ const uint DIGIT_BITS = 10;                 // of the second and the third digit
 const uint BINS       = 1u << DIGIT_BITS;   // of one search's histogram
 const uint FIRST_BINS = 2 * BINS;           // of the first digit, which all searches share
 const uint FIRST_SHIFT = 2 * DIGIT_BITS;
+
+const uint WORKGROUP = 256;  // threads in a workgroup of the kernels that read pixels
+
+// The pixels of a workgroup: neighbours, so that they share cache lines and pages.
+struct Run {
+    uint first;
+    uint end;
+};
+
+Run run_of_workgroup(uint workgroup, uint workgroup_count, uint pixel_count) {
+    uint rows = (pixel_count + WORKGROUP - 1) / WORKGROUP;
+    uint length = (rows + workgroup_count - 1) / workgroup_count * WORKGROUP;
+    uint first = min(workgroup * length, pixel_count);
+    return Run(first, min(first + length, pixel_count));
+}

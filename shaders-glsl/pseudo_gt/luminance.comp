@@ -6,11 +6,11 @@
 
 //! Luminance: BT.601 on encoded values, per pixel, with partial sums of the channels and the first digit's histogram.
 //!
-//! `thread_count` threads each take every `thread_count`-th pixel, so that the order of every sum is fixed; counts are
-//! integers, so theirs does not matter. NaN and negative values count as 0, values above 65504 as 65504.
+//! A workgroup takes a run of pixels and each of its threads every 256th of them, so that the order of every sum is
+//! fixed; counts are integers, so theirs does not matter. NaN and negative values count as 0, values above 65504 as 65504.
 //! `histograms` must be zero before.
 
-layout(local_size_x = 256) in;
+layout(local_size_x = WORKGROUP) in;
 
 layout(push_constant) uniform Params {
     uvec4 ranks;        // of the four searches
@@ -36,11 +36,12 @@ float measurable(float x) {
 void main() {
     uint thread = THREAD_INDEX;
     if (thread < SEARCHES) searches[first_search + thread] = RankSearch(0, ranks[thread], 0);
-    for (uint bin = gl_LocalInvocationID.x; bin < FIRST_BINS; bin += gl_WorkGroupSize.x) counts[bin] = 0;
+    for (uint bin = gl_LocalInvocationID.x; bin < FIRST_BINS; bin += WORKGROUP) counts[bin] = 0;
     barrier();
 
     CompensatedSum total = CompensatedSum(vec3(0), vec3(0));
-    for (uint i = thread; i < pixel_count; i += thread_count) {
+    Run run = run_of_workgroup(thread / WORKGROUP, thread_count / WORKGROUP, pixel_count);
+    for (uint i = run.first + gl_LocalInvocationID.x; i < run.end; i += WORKGROUP) {
         vec3 rgb = vec3(measurable(image[i]), measurable(image[pixel_count + i]), measurable(image[2 * pixel_count + i]));
         // `precise`: a fused multiply-add would move a percentile by an ulp between devices.
         precise float luminance = 0.299 * rgb.r + 0.587 * rgb.g + 0.114 * rgb.b;
@@ -51,7 +52,7 @@ void main() {
     sums[first_sum + thread] = total.sum;
     barrier();
 
-    for (uint bin = gl_LocalInvocationID.x; bin < FIRST_BINS; bin += gl_WorkGroupSize.x) {
+    for (uint bin = gl_LocalInvocationID.x; bin < FIRST_BINS; bin += WORKGROUP) {
         if (counts[bin] > 0) atomicAdd(histograms[bin], counts[bin]);
     }
 }

@@ -5,10 +5,9 @@
 
 //! Luminance histogram: counts the second or third digit of the luminances that begin with a search's prefix.
 //!
-//! `thread_count` threads each take every `thread_count`-th pixel; a workgroup counts in shared memory first. Counts are
-//! integers, so their order does not matter. `histograms` must be zero before.
+//! A workgroup takes a run of pixels and counts in shared memory first. Counts are integers, so their order does not matter. `histograms` must be zero before.
 
-layout(local_size_x = 256) in;
+layout(local_size_x = WORKGROUP) in;
 
 layout(push_constant) uniform Params {
     uint pixel_count;
@@ -24,12 +23,13 @@ layout(binding = 2) buffer Histograms          { uint histograms[]; };  // (SEAR
 shared uint counts[SEARCHES * BINS];
 
 void main() {
-    for (uint bin = gl_LocalInvocationID.x; bin < SEARCHES * BINS; bin += gl_WorkGroupSize.x) counts[bin] = 0;
+    for (uint bin = gl_LocalInvocationID.x; bin < SEARCHES * BINS; bin += WORKGROUP) counts[bin] = 0;
     RankSearch search[SEARCHES];
     [[unroll]] for (uint s = 0; s < SEARCHES; ++s) search[s] = searches[first_search + s];
     barrier();
 
-    for (uint i = THREAD_INDEX; i < pixel_count; i += thread_count) {
+    Run run = run_of_workgroup(WORKGROUP_INDEX, thread_count / WORKGROUP, pixel_count);
+    for (uint i = run.first + gl_LocalInvocationID.x; i < run.end; i += WORKGROUP) {
         uint digits = floatBitsToUint(luminances[i]) >> shift;
         uint histogram = SEARCHES;
         [[unroll]] for (uint s = 0; s < SEARCHES; ++s) {
@@ -39,7 +39,7 @@ void main() {
     }
     barrier();
 
-    for (uint bin = gl_LocalInvocationID.x; bin < SEARCHES * BINS; bin += gl_WorkGroupSize.x) {
+    for (uint bin = gl_LocalInvocationID.x; bin < SEARCHES * BINS; bin += WORKGROUP) {
         if (counts[bin] > 0) atomicAdd(histograms[bin], counts[bin]);
     }
 }

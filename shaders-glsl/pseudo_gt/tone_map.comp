@@ -3,9 +3,11 @@
 #include "kernel.glsl"
 #include "tone.glsl"
 
-//! Tone map: one thread per value applies a view's curve to a whole image.
+//! Tone map: applies a view's curve to a whole image; a thread takes `VALUES_PER_THREAD` values, a workgroup apart, so
+//! that it loads the curve once.
 
 layout(local_size_x = 256) in;
+layout(constant_id = 0) const uint VALUES_PER_THREAD = 16;
 
 layout(push_constant) uniform Params {
     uint value_count;
@@ -17,6 +19,10 @@ layout(binding = 1) readonly buffer Parameters { ToneParameters parameters[]; };
 layout(binding = 2) writeonly buffer Target    { float target[]; };
 
 void main() {
-    uint i = THREAD_INDEX;
-    if (i < value_count) target[i] = tone_curve(image[i], parameters[view]);
+    ToneParameters tone = parameters[view];
+    uint first = WORKGROUP_INDEX * gl_WorkGroupSize.x * VALUES_PER_THREAD + gl_LocalInvocationID.x;
+    for (uint k = 0; k < VALUES_PER_THREAD; ++k) {
+        uint i = first + k * gl_WorkGroupSize.x;
+        if (i < value_count) target[i] = tone_curve(image[i], tone);
+    }
 }

@@ -56,8 +56,7 @@ pub fn run(args: &CurvesArgs) -> Result<()> {
 /// # Errors
 /// A file cannot be read or written, or a value of t makes no sense.
 pub fn text(args: &CurvesArgs) -> Result<String> {
-    // Positive phrasing: a NaN fails the test too.
-    if let Some(t) = args.at.iter().find(|&&t| !(t >= 0.0)) {
+    if let Some(t) = args.at.iter().find(|&&t| t.is_nan() || t < 0.0) {
         return Err(Error::Usage(format!("--at {t}: t must be 0 or more")));
     }
     let curves = chosen(&args.curves)?;

@@ -16,7 +16,11 @@ impl Reference for Kernel {
         let thread_count = params.thread_count as usize;
         for thread in 0..thread_count {
             let mut total = CompensatedSum::default();
-            for i in (thread..pixel_count).step_by(thread_count) {
+            // A workgroup of 256 takes a run of pixels, a thread every 256th of them.
+            let run = pixel_count.div_ceil(256).div_ceil(thread_count / 256) * 256;
+            let (workgroup, local) = (thread / 256, thread % 256);
+            let end = pixel_count.min((workgroup + 1) * run);
+            for i in (workgroup * run + local..end).step_by(256) {
                 let [r, g, b] = [0, 1, 2].map(|plane| measurable(image[plane * pixel_count + i]));
                 luminances[i] = luminance([r, g, b]);
                 histograms[(luminances[i].to_bits() >> 20) as usize] += 1;

@@ -7,13 +7,8 @@ use crate::kernels::tone_table::{Constants, Kernel, Params, Slices};
 pub(crate) fn interpolate<T: Real>(knots: &[[T; 3]], x: T) -> T {
     let [first, last] = [knots[0], knots[knots.len() - 1]];
     // Positive phrasing: a NaN counts as the lower end.
-    if !(x > first[0]) {
-        return first[1];
-    }
-    if x >= last[0] {
-        return last[1];
-    }
-    let upper = knots.partition_point(|knot| knot[0] <= x);
+    let x = if x > first[0] { x.at_most(last[0]) } else { first[0] };
+    let upper = knots.partition_point(|knot| knot[0] <= x).min(knots.len() - 1);
     let ([x0, y0, d0], [x1, y1, d1]) = (knots[upper - 1], knots[upper]);
     let width = x1 - x0;
     let s = (x - x0) / width;

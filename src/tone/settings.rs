@@ -124,9 +124,9 @@ impl ToneSettings {
                 ));
             }
         }
-        let undefined = (0..=1000)
-            .map(|i| f64::from(i) * 0.01)
-            .find(|&t| !(family.shape(t, &self.constants).abs() <= LARGEST_SHAPE));
+        // Positive phrasing: a NaN fails the test too.
+        let is_defined = |t: f64| family.shape(t, &self.constants).abs() <= LARGEST_SHAPE;
+        let undefined = (0..=1000).map(|i| f64::from(i) * 0.01).find(|&t| !is_defined(t));
         match undefined {
             Some(t) => Err(format!(
                 "the constants of `{name}` leave it undefined at t = {t}; its formula is {}",

@@ -118,11 +118,11 @@ impl Table {
             return Err("a table needs one value, or red, green and blue, for every x".to_owned());
         }
         let mut values = self.x.iter().chain(self.y.iter().flatten());
-        if let Some(value) = values.find(|value| !(value.abs() <= 1e30)) {
+        if let Some(value) = values.find(|value| value.is_nan() || value.abs() > 1e30) {
             return Err(format!("a table holds {value}; every value must be finite"));
         }
         // Also as the device has them.
-        match self.x.windows(2).find(|pair| !((pair[0] as f32) < pair[1] as f32)) {
+        match self.x.windows(2).find(|pair| pair[0] as f32 >= pair[1] as f32) {
             Some(pair) => Err(format!(
                 "the first column of a table must ascend, but {} follows {}; sort it",
                 pair[1], pair[0]
@@ -180,7 +180,7 @@ impl Rows {
                 numbers.len()
             ));
         }
-        if let Some(last) = self.x.last().filter(|&&last| !(x > last)) {
+        if let Some(last) = self.x.last().filter(|&&last| x <= last) {
             return Err(format!(
                 "line {line}: the first column must ascend, but {x} follows {last}; sort it"
             ));

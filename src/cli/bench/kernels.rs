@@ -130,13 +130,15 @@ fn statistics(bench: &Bench, timings: &mut Vec<Timing>) -> anyhow::Result<TonePa
         [statistics: Close(1e-5), parameters: Close(1e-5)]
     );
     let target = vec![0.0_f32; image.len()];
+    let map_constants = tone_map::Constants { tone_curve, ..Default::default() };
+    let threads = (image.len() as u32).div_ceil(map_constants.values_per_thread);
     check!(
         bench,
         timings,
         tone_map,
-        tone_map::Constants { tone_curve },
+        map_constants,
         tone_map::Params { value_count: image.len() as u32, view: 0 },
-        Threads::Exactly([image.len() as u32, 1, 1]),
+        Threads::Exactly([threads, 1, 1]),
         [image, parameters],
         [target: Close(1e-5)]
     );
