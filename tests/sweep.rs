@@ -241,7 +241,7 @@ fn misuse_is_refused_before_anything_is_trained() {
     refused("--grid tone.alhpa=0.1", 2, &["tone.alhpa", "tone.alpha"]);
     refused("--grid steps", 2, &["--grid steps", "KEY=V1,V2"]);
     refused("--grid steps=many", 2, &["steps=many"]);
-    refused("--curves ap3,gamma", 2, &["curve=gamma", "unknown curve", "linear"]);
+    refused("--curves ap3,sepia", 2, &["curve=sepia", "unknown curve", "linear"]);
     refused("--alpha 0.1,0.10", 2, &["alpha=0.1 and alpha=0.10", "same run"]);
     refused("--alpha 0.1 --offset 0.1", 2, &["--offset"]);
     refused("--alpha 2", 2, &["alpha is 2"]);
