@@ -13,6 +13,7 @@ pub mod demo;
 pub mod doctor;
 pub mod eval;
 mod finished_run;
+pub mod fit;
 pub mod render;
 pub mod synth;
 mod table;
@@ -43,6 +44,7 @@ enum Command {
     Eval(eval::EvalArgs),
     Render(render::RenderArgs),
     Tone(tone::ToneArgs),
+    Fit(fit::FitArgs),
     Synth(synth::SynthArgs),
     Demo(demo::DemoArgs),
     Doctor(doctor::DoctorArgs),
@@ -65,6 +67,7 @@ impl Cli {
             Command::Eval(args) => eval::run(&args),
             Command::Render(args) => render::run(&args),
             Command::Tone(args) => Ok(tone::run(args)?),
+            Command::Fit(args) => Ok(fit::run(&args)?),
             Command::Synth(args) => Ok(synth::run(args)?),
             Command::Demo(args) => demo::run(&args),
             Command::Doctor(args) => doctor::run(&args),
