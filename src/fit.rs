@@ -9,7 +9,7 @@
 //! A histogram's column holds all pixels of one t, so that the cost of a fit does not depend on how many there are.
 //! Bounds hold by construction (each constant is a logistic function of what is solved for), monotonicity by a penalty
 //! that grows until it holds. Residuals beyond `huber` times their scale (1.4826 times their median size) weigh as much
-//! less as they are larger (Huber 1964).
+//! less as they are larger (Huber 1964). Photographs weigh as [`Weighting`] says.
 //!
 //! Standard errors are those of Huber's estimator (Huber 1973) for an effective number of values: pixels of one photograph
 //! err together, and their intraclass correlation rho, from the photographs' mean residuals, makes N values in groups of m
@@ -26,10 +26,10 @@ mod validate;
 use serde::Serialize;
 
 pub use self::histogram::{Cell, Column, Histogram};
+use self::model::Model;
 pub use self::model::psnr;
-use self::model::{Frame, Model};
 pub use self::pairs::{Pair, Scene};
-use self::solve::{Solver, groups, parts, quantile};
+use self::solve::{Solution, Solver, pair_residuals, parts, quantile};
 pub use self::validate::{Fold, HeldOut, cross_validate};
 use crate::tone::{Family, ToneCurve, ToneSettings};
 use crate::{Error, Result};
@@ -45,11 +45,25 @@ pub enum Channels {
     Luminance,
 }
 
+/// What each photograph weighs in a fit.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Weighting {
+    /// One over the mean of its squared residuals, found with the constants: the likeliest constants where photographs
+    /// differ in how far they are from any curve, and the best mean of their PSNRs.
+    #[default]
+    Photographs,
+    /// Every pixel the same: the least mean squared error.
+    Pixels,
+}
+
 /// How a curve is fitted.
 #[derive(Clone, Copy, Debug)]
 pub struct FitOptions {
     /// Which values are fitted.
     pub channels: Channels,
+    /// What each photograph weighs.
+    pub weighting: Weighting,
     /// Residuals beyond this many times their scale weigh less; infinite for plain least squares.
     pub huber: f64,
     /// Columns of the histogram.
@@ -63,7 +77,14 @@ pub struct FitOptions {
 impl Default for FitOptions {
     /// 1.345 is Huber's for 95 % efficiency where errors are normal.
     fn default() -> Self {
-        Self { channels: Channels::Rgb, huber: 1.345, bins: 512, bounded: false, adapt: false }
+        Self {
+            channels: Channels::Rgb,
+            weighting: Weighting::Photographs,
+            huber: 1.345,
+            bins: 512,
+            bounded: false,
+            adapt: false,
+        }
     }
 }
 
@@ -112,11 +133,11 @@ pub struct Fit {
     pub effective_values: f64,
     /// The root of the mean squared residual, of values in [0, 1].
     pub rmse: f64,
-    /// The median and the 95th percentile of the residuals' sizes.
+    /// The median and the 95th percentile of the residuals' sizes, under the photographs' weights.
     pub residual_quantiles: [f64; 2],
     /// Where residuals begin to weigh less; none without robust weights.
     pub huber_delta: Option<f64>,
-    /// The mean of Huber's loss; of half the squares without robust weights.
+    /// The mean of Huber's loss under the photographs' weights; of half the squares without robust weights.
     pub robust_loss: f64,
     /// The share of the references' variance that the curve explains; none where there is no variance.
     pub r_squared: Option<f64>,
@@ -165,9 +186,11 @@ pub fn fit(family: &'static Family, pairs: &[&Pair], options: &FitOptions) -> Re
     let Some(first) = pairs.first() else {
         return Err(Error::Usage("there are no pairs to fit to".to_owned()));
     };
-    let groups = groups(&model, pairs, options);
-    let (columns, needed) =
-        (groups.iter().map(|group| group.histogram.columns.len()).sum::<usize>(), model.free.len());
+    let mut solver = Solver::new(&model, pairs, options);
+    let (columns, needed) = (
+        solver.groups.iter().map(|group| group.histogram.columns.len()).sum::<usize>(),
+        model.free.len(),
+    );
     if columns < needed {
         let problem = format!(
             "all pairs together hold {columns} different values of t, too few for the {needed} constants of `{}`; \
@@ -176,19 +199,18 @@ pub fn fit(family: &'static Family, pairs: &[&Pair], options: &FitOptions) -> Re
         );
         return Err(Error::input(&first.path, problem));
     }
-    let solver = Solver::new(&model, &groups, pairs, options);
-    let solution = solver.solve(options.huber);
+    let solution = solver.solve();
     let settings = model.settings(&solution.values);
     settings.check()?;
 
-    let residuals = Residuals::of(&model, &solution.values, pairs, options.channels);
+    let residuals = Residuals::of(&model, &solution, pairs, options.channels);
     let mut sizes = solver.sizes(&solution.values);
     let limit = solution.delta.unwrap_or(f64::INFINITY);
     let huber_loss =
         |size: f64| if size <= limit { 0.5 * size * size } else { limit * (size - 0.5 * limit) };
     let robust_loss =
         sizes.iter().map(|(size, count)| count * huber_loss(*size)).sum::<f64>() / residuals.count;
-    let confidence = confidence::of(&model, &groups, &solution, &residuals);
+    let confidence = confidence::of(&model, &solver.groups, &solution, &residuals);
     Ok(Fit {
         constants: confidence.estimates,
         values: residuals.count,
@@ -210,43 +232,31 @@ pub fn fit(family: &'static Family, pairs: &[&Pair], options: &FitOptions) -> Re
 struct Residuals {
     count: f64,
     squares: f64,
+    /// The same, each pair times its weight.
+    weighted_squares: f64,
     /// Of the reference values.
     variance: f64,
-    /// Of each pair, how many values it has and the mean of its residuals.
+    /// Of each pair, how many values it has and the mean of its residuals times the root of its weight.
     means: Vec<(f64, f64)>,
 }
 
 impl Residuals {
-    fn of(model: &Model, values: &[f64], pairs: &[&Pair], channels: Channels) -> Self {
-        let (mut all, mut means) = ([0.0; 4], vec![]);
-        for pair in pairs {
-            let mut of_pair = [0.0; 2];
-            let parts = parts(model, pair, channels).into_iter();
-            for (frame, histogram) in
-                parts.flat_map(|(frame, parts)| parts.into_iter().map(move |part| (frame, part)))
-            {
-                let pooled = if model.differs_by_photograph() { frame } else { Frame::POOLED };
-                let [sum, squares] =
-                    histogram.residuals(|x| model.value(values, &pooled, x / frame.p90()));
-                let sums = histogram
-                    .columns
-                    .iter()
-                    .fold([0.0; 2], |[y, y2], column| [y + column.sum_y, y2 + column.sum_y2]);
-                of_pair = [of_pair[0] + histogram.count(), of_pair[1] + sum];
-                for (total, part) in
-                    all.iter_mut().zip([histogram.count(), squares, sums[0], sums[1]])
-                {
-                    *total += part;
-                }
+    fn of(model: &Model, solution: &Solution, pairs: &[&Pair], channels: Channels) -> Self {
+        let (mut count, mut squares, mut weighted_squares, mut means) = (0.0, 0.0, 0.0, vec![]);
+        let [mut sum_y, mut sum_y2] = [0.0; 2];
+        for (pair, weight) in pairs.iter().zip(&solution.weights) {
+            let (of_pair, sums) = pair_residuals(model, &solution.values, pair, channels);
+            count += of_pair;
+            squares += sums[1];
+            weighted_squares += weight * sums[1];
+            means.push((of_pair, weight.sqrt() * sums[0] / of_pair));
+            let histograms = parts(model, pair, channels).into_iter().flat_map(|(_, parts)| parts);
+            for column in histograms.flat_map(|histogram| &histogram.columns) {
+                sum_y += column.sum_y;
+                sum_y2 += column.sum_y2;
             }
-            means.push((of_pair[0], of_pair[1] / of_pair[0]));
         }
-        let [count, squares, sum_y, sum_y2] = all;
-        Self {
-            count,
-            squares: squares.max(0.0),
-            variance: sum_y2 / count - (sum_y / count).powi(2),
-            means,
-        }
+        let variance = sum_y2 / count - (sum_y / count).powi(2);
+        Self { count, squares: squares.max(0.0), weighted_squares, variance, means }
     }
 }

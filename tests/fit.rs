@@ -6,7 +6,9 @@
 use std::path::Path;
 
 use nightsplat::Error;
-use nightsplat::fit::{Channels, Fit, FitOptions, Pair, Scene, cross_validate, fit, psnr};
+use nightsplat::fit::{
+    Channels, Fit, FitOptions, Pair, Scene, Weighting, cross_validate, fit, psnr,
+};
 use nightsplat::image::Image;
 use nightsplat::random::Stream;
 use nightsplat::tone::{FAMILIES, Family, Statistics, ToneCurve, ToneSettings, White};
@@ -61,6 +63,7 @@ fn fitted_on_t() -> impl Iterator<Item = &'static Family> {
 
 const PLAIN: FitOptions = FitOptions {
     channels: Channels::Rgb,
+    weighting: Weighting::Pixels,
     huber: f64::INFINITY,
     bins: 512,
     bounded: false,
@@ -382,7 +385,7 @@ fn constants_fitted_to_real_pairs_beat_the_published_ones_on_others() {
 mod command {
     use std::path::PathBuf;
 
-    use nightsplat::cli::fit::{ChannelChoice, FamilyChoice, FitArgs, apply};
+    use nightsplat::cli::fit::{ChannelChoice, FamilyChoice, FitArgs, WeightingChoice, apply};
     use nightsplat::tone::CurveChoice;
 
     use super::*;
@@ -394,6 +397,7 @@ mod command {
             family: FamilyChoice::One(ToneCurve::Reinhard),
             out: None,
             channels: ChannelChoice::Rgb,
+            weigh: WeightingChoice::Photographs,
             huber: 1.345,
             bins: 512,
             bounded: false,

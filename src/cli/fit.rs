@@ -7,7 +7,9 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use super::table::aligned;
-use crate::fit::{Channels, Estimate, Fit, FitOptions, HeldOut, Pair, Scene, cross_validate, fit};
+use crate::fit::{
+    Channels, Estimate, Fit, FitOptions, HeldOut, Pair, Scene, Weighting, cross_validate, fit,
+};
 use crate::tone::{FAMILIES, Family, ToneCurve};
 use crate::{Error, Result};
 
@@ -31,6 +33,9 @@ pub struct FitArgs {
     /// What is fitted: every channel's values, or the luminance
     #[arg(long, value_enum, default_value_t)]
     pub channels: ChannelChoice,
+    /// What each photograph weighs: less the further it is from the curve, or as many as its pixels
+    #[arg(long, value_enum, default_value_t)]
+    pub weigh: WeightingChoice,
     /// Residuals beyond D times their scale weigh less; inf for plain least squares
     #[arg(long, value_name = "D", default_value_t = FitOptions::default().huber)]
     pub huber: f64,
@@ -98,6 +103,16 @@ pub enum ChannelChoice {
     Luminance,
 }
 
+/// [`Weighting`] on the command line.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum WeightingChoice {
+    /// Each by its own residuals
+    #[default]
+    Photographs,
+    /// Every pixel the same
+    Pixels,
+}
+
 /// A fitted family.
 #[derive(Clone, Debug, Serialize)]
 pub struct Fitted {
@@ -149,6 +164,10 @@ pub fn apply(args: &FitArgs) -> Result<Vec<Fitted>> {
         channels: match args.channels {
             ChannelChoice::Rgb => Channels::Rgb,
             ChannelChoice::Luminance => Channels::Luminance,
+        },
+        weighting: match args.weigh {
+            WeightingChoice::Photographs => Weighting::Photographs,
+            WeightingChoice::Pixels => Weighting::Pixels,
         },
         huber: args.huber,
         bins: args.bins,

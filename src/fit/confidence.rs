@@ -76,7 +76,7 @@ pub(super) fn of(
 
 /// N / (1 + (m - 1) rho), rho the intraclass correlation of residuals by the analysis of variance of one way.
 fn effective_values(residuals: &Residuals) -> f64 {
-    let Residuals { count, squares, means, .. } = residuals;
+    let Residuals { count, weighted_squares: squares, means, .. } = residuals;
     let photographs = means.len() as f64;
     if means.len() < 2 {
         return *count;

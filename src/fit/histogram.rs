@@ -16,7 +16,7 @@ const LARGEST_KEY: usize = (65504.0_f32.to_bits() >> KEY_SHIFT) as usize;
 #[derive(Clone, Copy, Debug)]
 pub struct Cell {
     level: u8,
-    count: u64,
+    count: f64,
 }
 
 impl Cell {
@@ -25,9 +25,9 @@ impl Cell {
         f64::from(self.level) / (LEVELS - 1) as f64
     }
 
-    /// How many pixels.
+    /// How many pixels, each times its weight.
     pub fn count(self) -> f64 {
-        self.count as f64
+        self.count
     }
 }
 
@@ -57,21 +57,18 @@ pub struct Histogram {
 #[derive(Clone)]
 struct Open {
     sums: [f64; 3],
-    counts: [u64; LEVELS],
+    counts: [f64; LEVELS],
 }
 
 impl Open {
-    const EMPTY: Self = Self { sums: [0.0; 3], counts: [0; LEVELS] };
+    const EMPTY: Self = Self { sums: [0.0; 3], counts: [0.0; LEVELS] };
 
     fn closed(&self) -> Option<Column> {
-        let count: u64 = self.counts.iter().sum();
-        let cells = self.counts.iter().zip(0..=u8::MAX).filter(|&(&count, _)| count > 0);
+        let count: f64 = self.counts.iter().sum();
+        let cells = self.counts.iter().zip(0..=u8::MAX).filter(|&(&count, _)| count > 0.0);
         let cells = cells.map(|(&count, level)| Cell { level, count }).collect();
         let [sum_x, sum_y, sum_y2] = self.sums;
-        (count > 0).then(|| {
-            let count = count as f64;
-            Column { x: sum_x / count, count, sum_y, sum_y2, cells }
-        })
+        (count > 0.0).then(|| Column { x: sum_x / count, count, sum_y, sum_y2, cells })
     }
 }
 
@@ -93,7 +90,7 @@ impl Histogram {
         for (&x, &y) in dark.iter().zip(reference) {
             let column = &mut open[columns[key(x)] as usize];
             let y = measurable(y).min(1.0);
-            column.counts[(y * (LEVELS - 1) as f32).round() as usize] += 1;
+            column.counts[(y * (LEVELS - 1) as f32).round() as usize] += 1.0;
             let y = f64::from(y);
             for (sum, value) in column.sums.iter_mut().zip([f64::from(measurable(x)), y, y * y]) {
                 *sum += value;
@@ -102,23 +99,23 @@ impl Histogram {
         Self { columns: open.iter().filter_map(Open::closed).collect() }
     }
 
-    /// Several histograms in one of `bins` columns, each with its dark values times its factor.
+    /// Several histograms in one of `bins` columns, each with a factor for its dark values and a weight for its counts.
     ///
     /// Of a value t the bin is that of t / (1 + t): fine in the shadows, and the few values far above 1 have bins of
     /// their own instead of deciding the width of all.
-    pub fn pooled<'a>(parts: impl IntoIterator<Item = (&'a Self, f64)>, bins: usize) -> Self {
+    pub fn pooled<'a>(parts: impl IntoIterator<Item = (&'a Self, [f64; 2])>, bins: usize) -> Self {
         let mut open = vec![Open::EMPTY; bins];
-        for (histogram, factor) in parts {
+        for (histogram, [factor, weight]) in parts {
             for column in &histogram.columns {
                 let t = column.x * factor;
                 let bin = (t / (1.0 + t) * bins as f64) as usize;
                 let into = &mut open[bin.min(bins - 1)];
                 let sums = [t * column.count, column.sum_y, column.sum_y2];
                 for (sum, value) in into.sums.iter_mut().zip(sums) {
-                    *sum += value;
+                    *sum += weight * value;
                 }
                 for cell in &column.cells {
-                    into.counts[usize::from(cell.level)] += cell.count;
+                    into.counts[usize::from(cell.level)] += weight * cell.count;
                 }
             }
         }
@@ -156,7 +153,7 @@ mod tests {
             found.iter().zip(direct).all(|(a, b)| (a - b).abs() < 1e-8 * b.abs().max(1.0))
         };
         assert!(close(histogram.residuals(f)));
-        let pooled = Histogram::pooled([(&histogram, 4.0), (&histogram, 4.0)], 4096);
+        let pooled = Histogram::pooled([(&histogram, [4.0, 0.5]), (&histogram, [4.0, 1.5])], 4096);
         assert_eq!((pooled.count(), pooled.columns.len()), (10_000.0, 61));
         assert!(close(pooled.residuals(|t| f(t / 4.0)).map(|sum| sum / 2.0)));
         // Every column's cells are its pixels.

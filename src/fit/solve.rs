@@ -4,7 +4,7 @@ use levenberg_marquardt::{LeastSquaresProblem, LevenbergMarquardt};
 use nalgebra::{DMatrix, DVector, Dyn, Owned};
 
 use super::model::{Frame, Model};
-use super::{Channels, FitOptions, Histogram, Pair};
+use super::{Channels, FitOptions, Histogram, Pair, Weighting};
 use crate::random::Stream;
 use crate::tone::Statistics;
 
@@ -15,26 +15,20 @@ pub(super) struct Group {
     pub(super) histogram: Histogram,
 }
 
-/// The pairs as the model sees them: all in one group where t alone decides.
-pub(super) fn groups(model: &Model, pairs: &[&Pair], options: &FitOptions) -> Vec<Group> {
-    let bins = options.bins;
-    if model.differs_by_photograph() {
-        let group = |(frame, histograms): (Frame, Vec<&Histogram>)| {
-            let factor = 1.0 / frame.p90();
-            let parts = histograms.into_iter().map(|histogram| (histogram, factor));
-            Group { frame, histogram: Histogram::pooled(parts, bins) }
-        };
-        return pairs
-            .iter()
-            .flat_map(|pair| parts(model, pair, options.channels))
-            .map(group)
-            .collect();
-    }
-    let all = pairs.iter().flat_map(|pair| {
-        let (frame, histograms) = parts(model, pair, options.channels).remove(0);
-        histograms.into_iter().map(move |histogram| (histogram, 1.0 / frame.p90()))
+/// The pairs with their weights as the model sees them: all in one group where t alone decides.
+fn groups(model: &Model, pairs: &[&Pair], weights: &[f64], options: &FitOptions) -> Vec<Group> {
+    let all = pairs.iter().zip(weights).flat_map(|(pair, &weight)| {
+        parts(model, pair, options.channels).into_iter().map(move |(frame, histograms)| {
+            let scaled = |histogram| (histogram, [1.0 / frame.p90(), weight]);
+            (frame, histograms.into_iter().map(scaled).collect::<Vec<_>>())
+        })
     });
-    vec![Group { frame: Frame::POOLED, histogram: Histogram::pooled(all, bins) }]
+    let group = |(frame, parts)| Group { frame, histogram: Histogram::pooled(parts, options.bins) };
+    if model.differs_by_photograph() {
+        all.map(group).collect()
+    } else {
+        vec![group((Frame::POOLED, all.flat_map(|(_, parts)| parts).collect()))]
+    }
 }
 
 /// The histograms of a pair that are fitted, by the frame they share.
@@ -54,9 +48,31 @@ pub(super) fn parts<'a>(
     vec![(frame(0), histograms)]
 }
 
+/// How many values of a pair are fitted, and the sums of their residuals and of the squares.
+pub(super) fn pair_residuals(
+    model: &Model,
+    values: &[f64],
+    pair: &Pair,
+    channels: Channels,
+) -> (f64, [f64; 2]) {
+    let parts = parts(model, pair, channels).into_iter();
+    let mut found = (0.0, [0.0; 2]);
+    for (frame, histogram) in
+        parts.flat_map(|(frame, parts)| parts.into_iter().map(move |part| (frame, part)))
+    {
+        let pooled = if model.differs_by_photograph() { frame } else { Frame::POOLED };
+        let [sum, squares] = histogram.residuals(|x| model.value(values, &pooled, x / frame.p90()));
+        found.0 += histogram.count();
+        found.1 = [found.1[0] + sum, found.1[1] + squares];
+    }
+    found
+}
+
 /// What a fit found.
 pub(super) struct Solution {
     pub(super) values: Vec<f64>,
+    /// Of each pair; of all values together the mean is 1.
+    pub(super) weights: Vec<f64>,
     /// Residuals beyond it weigh less; none where all weigh the same.
     pub(super) delta: Option<f64>,
     /// Whether the clamped curve never falls, to within [`TOLERANCE`].
@@ -88,25 +104,24 @@ const STARTS: usize = 3;
 /// Rounds of reweighting, and those of them that estimate the residuals' scale anew.
 const ROUNDS: usize = 30;
 const SCALE_ROUNDS: usize = 6;
+/// A round that moves no constant by more than this share of its range is the last.
+const SETTLED: f64 = 1e-6;
 /// The least scale of the residuals: a quarter of an 8-bit code value, as rounding leaves it.
 const LEAST_SCALE: f64 = 0.25 / 255.0;
 
 pub(super) struct Solver<'a> {
     model: &'a Model,
-    groups: &'a [Group],
-    bounded: bool,
+    pairs: &'a [&'a Pair],
+    options: &'a FitOptions,
+    pub(super) groups: Vec<Group>,
     /// Where constraints are tested, of a photograph like the mean of all.
     grid: Vec<f64>,
     frame: Frame,
 }
 
 impl<'a> Solver<'a> {
-    pub(super) fn new(
-        model: &'a Model,
-        groups: &'a [Group],
-        pairs: &[&Pair],
-        options: &FitOptions,
-    ) -> Self {
+    pub(super) fn new(model: &'a Model, pairs: &'a [&'a Pair], options: &'a FitOptions) -> Self {
+        let groups = groups(model, pairs, &vec![1.0; pairs.len()], options);
         let frame = if model.differs_by_photograph() {
             let statistics: Vec<Statistics> = pairs.iter().map(|pair| pair.statistics).collect();
             Frame::of(Statistics::mean_of(&statistics).unwrap_or_default(), 0)
@@ -120,38 +135,53 @@ impl<'a> Solver<'a> {
             let share = i as f64 / (GRID - 1) as f64 * end / (1.0 + end);
             share / (1.0 - share)
         };
-        Self { model, groups, bounded: options.bounded, grid: (0..GRID).map(t).collect(), frame }
+        let grid = (0..GRID).map(t).collect();
+        Self { model, pairs, options, groups, grid, frame }
     }
 
-    pub(super) fn solve(&self, huber: f64) -> Solution {
-        let mut rows = self.rows(&|_| 1.0, &[]);
-        let mut values = self.from_many_starts(&rows);
+    pub(super) fn solve(&mut self) -> Solution {
+        let FitOptions { huber, weighting, .. } = *self.options;
+        let mut weights = vec![1.0; self.pairs.len()];
+        let mut values = self.from_many_starts(&self.rows(&|_| 1.0, &[]));
         let mut delta = None;
         for round in 0..ROUNDS {
-            if !huber.is_finite() {
+            if weighting == Weighting::Photographs {
+                weights = self.weights(&values);
+                self.groups = groups(self.model, self.pairs, &weights, self.options);
+            } else if huber.is_infinite() {
                 break;
             }
-            if round < SCALE_ROUNDS {
+            if huber.is_finite() && round < SCALE_ROUNDS {
                 delta = Some(huber * self.scale(&values));
             }
             let limit = delta.unwrap_or(f64::INFINITY);
-            rows = self.rows(
-                &|residual| if residual.abs() > limit { limit / residual.abs() } else { 1.0 },
-                &values,
-            );
-            let after = self.minimize(&rows, &values);
+            let weight =
+                |residual: f64| if residual.abs() > limit { limit / residual.abs() } else { 1.0 };
+            let after = self.minimize(&self.rows(&weight, &values), &values);
             let before = std::mem::replace(&mut values, after);
             let moved = self.model.free.iter().zip(before.iter().zip(&values)).map(
                 |(constant, (before, after))| {
                     (before - after).abs() / (constant.bounds[1] - constant.bounds[0])
                 },
             );
-            if round >= SCALE_ROUNDS && moved.fold(0.0, f64::max) < 1e-7 {
+            if round >= SCALE_ROUNDS && moved.fold(0.0, f64::max) < SETTLED {
                 break;
             }
         }
         let [fall, excess] = self.violations(&values);
-        Solution { values, delta, rises: fall <= TOLERANCE, bounded: excess <= TOLERANCE }
+        Solution { values, weights, delta, rises: fall <= TOLERANCE, bounded: excess <= TOLERANCE }
+    }
+
+    /// The weight of every pair: one over the mean of its squared residuals.
+    fn weights(&self, values: &[f64]) -> Vec<f64> {
+        let of_pair = |pair: &&Pair| {
+            let (count, squares) = pair_residuals(self.model, values, pair, self.options.channels);
+            (count, 1.0 / (squares[1] / count).max(LEAST_SCALE * LEAST_SCALE))
+        };
+        let weights: Vec<(f64, f64)> = self.pairs.iter().map(of_pair).collect();
+        let mean = weights.iter().map(|(count, weight)| count * weight).sum::<f64>()
+            / weights.iter().map(|(count, _)| count).sum::<f64>();
+        weights.into_iter().map(|(_, weight)| weight / mean).collect()
     }
 
     /// The residuals' scale: 1.4826 times the median of their sizes, the standard deviation were they normal.
@@ -162,7 +192,7 @@ impl<'a> Solver<'a> {
     /// The size of every cell's residual, with its count.
     pub(super) fn sizes(&self, values: &[f64]) -> Vec<(f64, f64)> {
         let mut sizes = vec![];
-        for group in self.groups {
+        for group in &self.groups {
             for column in &group.histogram.columns {
                 let y = self.model.value(values, &group.frame, column.x);
                 sizes.extend(column.cells.iter().map(|cell| ((cell.y() - y).abs(), cell.count())));
@@ -240,7 +270,7 @@ impl<'a> Solver<'a> {
             );
             values = problem.values;
             let [fall, excess] = self.violations(&values);
-            if fall <= TOLERANCE && !(self.bounded && excess > TOLERANCE) {
+            if fall <= TOLERANCE && !(self.options.bounded && excess > TOLERANCE) {
                 break;
             }
         }
@@ -323,14 +353,14 @@ impl Problem<'_> {
     }
 
     fn all_residuals(&self) -> DVector<f64> {
-        let Solver { model, groups, bounded, .. } = *self.solver;
+        let Solver { model, ref groups, options, .. } = *self.solver;
         let residual = |row: &Row| {
             row.weight.sqrt() * (model.value(&self.values, &groups[row.group].frame, row.t) - row.y)
         };
         let mut residuals: Vec<f64> = self.rows.iter().map(residual).collect();
         if self.is_constrained() {
             let broken = self.solver.broken(&self.values);
-            let excess = |excess: f64| if bounded { excess } else { 0.0 };
+            let excess = |excess: f64| if options.bounded { excess } else { 0.0 };
             let broken = broken.into_iter().flat_map(|[fall, above]| [fall, excess(above)]);
             residuals.extend(broken.map(|amount| self.strength * amount));
         }
@@ -359,7 +389,7 @@ impl LeastSquaresProblem<f64, Dyn, Dyn> for Problem<'_> {
     }
 
     fn jacobian(&self) -> Option<DMatrix<f64>> {
-        let Solver { model, groups, bounded, ref grid, ref frame } = *self.solver;
+        let Solver { model, ref groups, options, ref grid, ref frame, .. } = *self.solver;
         let values = &self.values;
         let constrained = if self.is_constrained() { 2 * grid.len() } else { 0 };
         let mut jacobian = DMatrix::zeros(self.rows.len() + constrained, values.len());
@@ -383,7 +413,7 @@ impl LeastSquaresProblem<f64, Dyn, Dyn> for Problem<'_> {
                     set(row, self.strength, model.gradient(values, frame, grid[index]));
                     set(row, -self.strength, model.gradient(values, frame, grid[index + 1]));
                 }
-                if bounded && excess > 0.0 {
+                if options.bounded && excess > 0.0 {
                     set(row + 1, self.strength, model.raw_gradient(values, frame, grid[index]));
                 }
             }

@@ -33,7 +33,7 @@ pub(super) fn svg(fitted: &Fitted, pairs: &[&Pair], options: &FitOptions) -> Str
             Channels::Rgb => pair.channels.iter().collect(),
             Channels::Luminance => vec![&pair.luminance],
         };
-        of_pair.into_iter().map(move |histogram| (histogram, factor))
+        of_pair.into_iter().map(move |histogram| (histogram, [factor, 1.0]))
     });
     let pooled = Histogram::pooled(histograms, BINS);
     let count = pooled.count();
