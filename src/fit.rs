@@ -64,6 +64,8 @@ pub struct FitOptions {
     pub channels: Channels,
     /// What each photograph weighs.
     pub weighting: Weighting,
+    /// How many photographs the family's own constants count as: the fit is drawn to them, the less the more pairs.
+    pub prior: f64,
     /// Residuals beyond this many times their scale weigh less; infinite for plain least squares.
     pub huber: f64,
     /// Columns of the histogram.
@@ -80,6 +82,7 @@ impl Default for FitOptions {
         Self {
             channels: Channels::Rgb,
             weighting: Weighting::Photographs,
+            prior: 0.0,
             huber: 1.345,
             bins: 512,
             bounded: false,
@@ -96,6 +99,10 @@ impl FitOptions {
                 "--huber is {}; it must be above 0, inf for plain least squares",
                 self.huber
             )));
+        }
+        if !(self.prior >= 0.0 && self.prior.is_finite()) {
+            let problem = format!("--prior is {}; it must be finite and at least 0", self.prior);
+            return Err(Error::Usage(problem));
         }
         if !(8..=65_536).contains(&self.bins) {
             return Err(Error::Usage(format!(
@@ -149,7 +156,7 @@ pub struct Fit {
     pub psnr: Scores,
 }
 
-/// The same score of three curves, dB.
+/// The same score of three curves.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Scores {
     /// The fitted constants.
@@ -161,17 +168,33 @@ pub struct Scores {
 }
 
 impl Scores {
-    /// The mean over the pairs.
-    fn of(settings: &ToneSettings, pairs: &[&Pair]) -> Self {
-        let mean = |settings: &ToneSettings| {
-            pairs.iter().map(|pair| psnr(settings, pair)).sum::<f64>() / pairs.len() as f64
-        };
+    /// The scores of the fitted settings, of their family and of AP3.
+    fn of(settings: &ToneSettings, score: impl Fn(&ToneSettings) -> f64) -> Self {
         Self {
-            fitted: mean(settings),
-            frozen: mean(&ToneSettings::new(settings.curve)),
-            ap3: mean(&ToneSettings::new(ToneCurve::Ap3)),
+            fitted: score(settings),
+            frozen: score(&ToneSettings::new(settings.curve)),
+            ap3: score(&ToneSettings::new(ToneCurve::Ap3)),
         }
     }
+
+    /// The mean of each.
+    fn mean<'a>(scores: impl Iterator<Item = &'a Self> + Clone) -> Self {
+        let mean = |score: fn(&Self) -> f64| {
+            scores.clone().map(score).sum::<f64>() / scores.clone().count() as f64
+        };
+        Self { fitted: mean(|s| s.fitted), frozen: mean(|s| s.frozen), ap3: mean(|s| s.ap3) }
+    }
+}
+
+/// The mean of the pairs' PSNRs over all channels, dB.
+fn mean_psnr(settings: &ToneSettings, pairs: &[&Pair]) -> f64 {
+    pairs.iter().map(|pair| psnr(settings, pair)).sum::<f64>() / pairs.len() as f64
+}
+
+/// The mean over the pairs of their mean squared errors.
+fn mean_squared_error(settings: &ToneSettings, pairs: &[&Pair]) -> f64 {
+    let error = |pair: &&Pair| 10f64.powf(-0.1 * psnr(settings, pair));
+    pairs.iter().map(error).sum::<f64>() / pairs.len() as f64
 }
 
 /// Fits the family's constants to the pairs: for curves that adapt to a photograph also black level (alpha) and gain
@@ -223,7 +246,7 @@ pub fn fit(family: &'static Family, pairs: &[&Pair], options: &FitOptions) -> Re
             .then(|| 1.0 - residuals.squares / residuals.count / residuals.variance),
         rises: solution.rises,
         bounded: solution.bounded,
-        psnr: Scores::of(&settings, pairs),
+        psnr: Scores::of(&settings, |settings| mean_psnr(settings, pairs)),
         settings,
     })
 }

@@ -64,6 +64,7 @@ fn fitted_on_t() -> impl Iterator<Item = &'static Family> {
 const PLAIN: FitOptions = FitOptions {
     channels: Channels::Rgb,
     weighting: Weighting::Pixels,
+    prior: 0.0,
     huber: f64::INFINITY,
     bins: 512,
     bounded: false,
@@ -398,6 +399,7 @@ mod command {
             out: None,
             channels: ChannelChoice::Rgb,
             weigh: WeightingChoice::Photographs,
+            prior: 0.0,
             huber: 1.345,
             bins: 512,
             bounded: false,

@@ -8,7 +8,8 @@ use serde::Serialize;
 
 use super::table::aligned;
 use crate::fit::{
-    Channels, Estimate, Fit, FitOptions, HeldOut, Pair, Scene, Weighting, cross_validate, fit,
+    Channels, Estimate, Fit, FitOptions, HeldOut, Pair, Scene, Scores, Weighting, cross_validate,
+    fit,
 };
 use crate::tone::{FAMILIES, Family, ToneCurve};
 use crate::{Error, Result};
@@ -36,6 +37,9 @@ pub struct FitArgs {
     /// What each photograph weighs: less the further it is from the curve, or as many as its pixels
     #[arg(long, value_enum, default_value_t)]
     pub weigh: WeightingChoice,
+    /// Draw the fit to the family's own constants, as if they were N more photographs
+    #[arg(long, value_name = "N", default_value_t = FitOptions::default().prior)]
+    pub prior: f64,
     /// Residuals beyond D times their scale weigh less; inf for plain least squares
     #[arg(long, value_name = "D", default_value_t = FitOptions::default().huber)]
     pub huber: f64,
@@ -169,6 +173,7 @@ pub fn apply(args: &FitArgs) -> Result<Vec<Fitted>> {
             WeightingChoice::Photographs => Weighting::Photographs,
             WeightingChoice::Pixels => Weighting::Pixels,
         },
+        prior: args.prior,
         huber: args.huber,
         bins: args.bins,
         bounded: args.bounded,
@@ -293,15 +298,19 @@ fn told(fitted: &[Fitted]) -> String {
         fit.values, fit.effective_values
     );
     if let Some(held_out) = held_out {
-        let row = |fold: &crate::fit::Fold| {
-            let psnr = [fold.psnr.fitted, fold.psnr.frozen, fold.psnr.ap3]
-                .map(|score| format!("{score:.2}"));
-            [vec![fold.name.clone(), fold.pairs.to_string()], psnr.to_vec()].concat()
+        let row = |name: &str, pairs: usize, psnr: &Scores, squared_error: &Scores| {
+            let of = |scores: &Scores| [scores.fitted, scores.frozen, scores.ap3];
+            let psnr = of(psnr).map(|score| format!("{score:.2}"));
+            let rmse = of(squared_error).map(|error| format!("{:.4}", error.sqrt()));
+            [vec![name.to_owned(), pairs.to_string()], psnr.to_vec(), rmse.to_vec()].concat()
         };
-        let header =
-            ["held out", "pairs", "fitted dB", "own dB", "AP3 dB"].map(str::to_owned).to_vec();
-        let rows: Vec<Vec<String>> =
-            std::iter::once(header).chain(held_out.folds.iter().map(row)).collect();
+        let header = ["held out", "pairs", "fitted dB", "own dB", "AP3 dB", "RMSE", "own", "AP3"];
+        let header = header.map(str::to_owned).to_vec();
+        let folds = held_out.folds.iter();
+        let pairs = folds.clone().map(|fold| fold.pairs).sum();
+        let folds = folds.map(|fold| row(&fold.name, fold.pairs, &fold.psnr, &fold.squared_error));
+        let all = row("all", pairs, &held_out.psnr, &held_out.squared_error);
+        let rows: Vec<Vec<String>> = std::iter::once(header).chain(folds).chain([all]).collect();
         text += "\n";
         text += &aligned(&rows);
     }

@@ -95,12 +95,12 @@ fn effective_values(residuals: &Residuals) -> f64 {
 fn diagonal_of_inverse(normal: &DMatrix<f64>) -> Option<Vec<f64>> {
     let size = normal.nrows();
     let scale: Vec<f64> = (0..size).map(|i| normal[(i, i)].sqrt()).collect();
-    if scale.iter().any(|&scale| !(scale > 0.0 && scale.is_finite())) {
+    if size == 0 || scale.iter().any(|&scale| !(scale > 0.0 && scale.is_finite())) {
         return None;
     }
     let correlations = DMatrix::from_fn(size, size, |i, j| normal[(i, j)] / (scale[i] * scale[j]));
     let SymmetricEigen { eigenvectors, eigenvalues } = SymmetricEigen::new(correlations);
-    if size == 0 || eigenvalues.min() < SINGULAR * eigenvalues.max() {
+    if eigenvalues.min() < SINGULAR * eigenvalues.max() {
         return None;
     }
     let diagonal = |i: usize| {

@@ -17,14 +17,14 @@ enum Place {
     BaseGain,
 }
 
-/// The settings that no family lists as its own; `default` is replaced by the family's.
-const fn setting(name: &'static str, start: f64, low: f64, high: f64) -> Constant {
-    Constant { name, default: start, start, bounds: [low, high] }
+/// A setting that no family lists among its constants; it starts where the family has it.
+const fn setting(name: &'static str, low: f64, high: f64) -> Constant {
+    Constant { name, default: low, start: low, bounds: [low, high] }
 }
-const THETA: Constant = setting("theta", 0.49, 0.05, 1.0);
-const ALPHA: Constant = setting("alpha", 0.06, 0.0, 0.5);
-const GAIN_C: Constant = setting("gain_c", 1.0, 0.0, 20.0);
-const BASE_GAIN: Constant = setting("base_gain", 1.0, 0.1, 10.0);
+const THETA: Constant = setting("theta", 0.05, 1.0);
+const ALPHA: Constant = setting("alpha", 0.0, 0.5);
+const GAIN_C: Constant = setting("gain_c", 0.0, 20.0);
+const BASE_GAIN: Constant = setting("base_gain", 0.1, 10.0);
 
 /// A family with the list of what is fitted.
 #[derive(Clone, Debug)]
@@ -100,12 +100,14 @@ impl Model {
             )));
         }
         let settings = ToneSettings::new(family.curve);
+        let own =
+            |constant: Constant, value: f64| Constant { default: value, start: value, ..constant };
         let free = places.iter().map(|&place| match place {
             Place::Shape(index) => family.constants[index],
-            Place::Theta => Constant { default: settings.theta, ..THETA },
-            Place::Alpha => Constant { default: settings.alpha, ..ALPHA },
-            Place::GainC => Constant { default: settings.gain_c, ..GAIN_C },
-            Place::BaseGain => Constant { default: settings.base_gain, ..BASE_GAIN },
+            Place::Theta => own(THETA, settings.theta),
+            Place::Alpha => own(ALPHA, settings.alpha),
+            Place::GainC => own(GAIN_C, settings.gain_c),
+            Place::BaseGain => own(BASE_GAIN, settings.base_gain),
         });
         Ok(Self { free: free.collect(), family, places })
     }

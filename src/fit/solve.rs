@@ -101,6 +101,8 @@ const LEAST_END: f64 = 3.0;
 /// Random places that are looked at, and the best of them that a fit begins from, beside the table's start.
 const PLACES: usize = 24;
 const STARTS: usize = 3;
+/// Evaluations of a descent, per constant.
+const PATIENCE: usize = 30;
 /// Rounds of reweighting, and those of them that estimate the residuals' scale anew.
 const ROUNDS: usize = 30;
 const SCALE_ROUNDS: usize = 6;
@@ -201,7 +203,7 @@ impl<'a> Solver<'a> {
         sizes
     }
 
-    /// A row per column: within one the model has one value, so the weighted mean is all that counts. Without values
+    /// A row per column, towards the family's own curve as far as the options say: within one the model has one value, so the weighted mean is all that counts. Without values
     /// every cell weighs by its count.
     fn rows(&self, weight: &dyn Fn(f64) -> f64, values: &[f64]) -> Vec<Row> {
         let mut rows = vec![];
@@ -228,8 +230,14 @@ impl<'a> Solver<'a> {
             }
         }
         let total: f64 = rows.iter().map(|row| row.weight).sum();
+        let start: Vec<f64> = self.model.free.iter().map(|constant| constant.start).collect();
+        let prior = self.options.prior / self.pairs.len() as f64;
         for row in &mut rows {
             row.weight /= total;
+            if prior > 0.0 {
+                let own = self.model.value(&start, &self.groups[row.group].frame, row.t);
+                row.y = (row.y + prior * own) / (1.0 + prior);
+            }
         }
         rows
     }
@@ -261,7 +269,8 @@ impl<'a> Solver<'a> {
         let mut values = start.to_vec();
         for strength in STRENGTHS {
             let problem = self.problem(rows, &values, strength);
-            let (problem, report) = LevenbergMarquardt::new().with_tol(1e-12).minimize(problem);
+            let (problem, report) =
+                LevenbergMarquardt::new().with_tol(1e-10).with_patience(PATIENCE).minimize(problem);
             tracing::trace!(
                 "{}: {:?} after {}",
                 self.model.family.name,

@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use super::{FitOptions, Pair, Scene, Scores, fit};
+use super::{FitOptions, Pair, Scene, Scores, fit, mean_psnr, mean_squared_error};
 use crate::tone::Family;
 use crate::{Error, Result};
 
@@ -16,8 +16,10 @@ pub struct Fold {
     pub name: String,
     /// How many pairs it holds.
     pub pairs: usize,
-    /// The means over its pairs; the fit is to all others.
+    /// The means over its pairs, dB; the fit is to all others.
     pub psnr: Scores,
+    /// The means of its pairs' mean squared errors, of values in [0, 1].
+    pub squared_error: Scores,
 }
 
 /// Scores on held-out pairs.
@@ -25,8 +27,10 @@ pub struct Fold {
 pub struct HeldOut {
     /// One per fit.
     pub folds: Vec<Fold>,
-    /// The means over the folds.
+    /// The means over the folds, dB.
     pub psnr: Scores,
+    /// The means over the folds, of values in [0, 1].
+    pub squared_error: Scores,
 }
 
 /// Fits to all scenes but one, once for each; of a single scene to all but every fifth pair, five times.
@@ -52,16 +56,16 @@ pub fn cross_validate(
         Ok(Fold {
             name: name.clone(),
             pairs: pairs.len(),
-            psnr: Scores::of(&fitted.settings, pairs),
+            psnr: Scores::of(&fitted.settings, |settings| mean_psnr(settings, pairs)),
+            squared_error: Scores::of(&fitted.settings, |settings| {
+                mean_squared_error(settings, pairs)
+            }),
         })
     };
     let folds = (0..folds.len()).map(held_out).collect::<Result<Vec<Fold>>>()?;
-    let mean = |score: fn(&Scores) -> f64| {
-        folds.iter().map(|fold| score(&fold.psnr)).sum::<f64>() / folds.len() as f64
-    };
-    let psnr =
-        Scores { fitted: mean(|s| s.fitted), frozen: mean(|s| s.frozen), ap3: mean(|s| s.ap3) };
-    Ok(HeldOut { folds, psnr })
+    let psnr = Scores::mean(folds.iter().map(|fold| &fold.psnr));
+    let squared_error = Scores::mean(folds.iter().map(|fold| &fold.squared_error));
+    Ok(HeldOut { folds, psnr, squared_error })
 }
 
 fn folds(scenes: &[Scene]) -> Result<Vec<(String, Vec<&Pair>)>> {
