@@ -16,6 +16,7 @@ pub mod demo;
 pub mod doctor;
 pub mod eval;
 mod finished_run;
+pub mod fit;
 pub mod render;
 pub mod sweep;
 pub mod synth;
@@ -50,6 +51,7 @@ enum Command {
     Tone(tone::ToneArgs),
     Curves(curves::CurvesArgs),
     Sweep(Box<sweep::SweepArgs>),
+    Fit(fit::FitArgs),
     Synth(synth::SynthArgs),
     Ablate(Box<ablate::AblateArgs>),
     Demo(demo::DemoArgs),
@@ -74,6 +76,7 @@ impl Cli {
             Command::Render(args) => render::run(&args),
             Command::Tone(args) => Ok(tone::run(&args)?),
             Command::Curves(args) => Ok(curves::run(&args)?),
+            Command::Fit(args) => Ok(fit::run(&args)?),
             Command::Sweep(args) => sweep::run(&args),
             Command::Synth(args) => Ok(synth::run(args)?),
             Command::Ablate(args) => ablate::run(&args),

@@ -18,6 +18,7 @@
 //! - [`image`]: float images and their files
 //! - [`camera`]: pinhole cameras and lens distortion
 //! - [`tone`]: curves that brighten a photograph
+//! - [`fit`]: the constants of a curve from pairs of photographs
 //! - [`dataset`]: photographs with their cameras and points, from disk
 //! - [`scene`]: Gaussians on the host, the one table of their attributes, PLY
 //! - [`pseudo_gt`]: dark photograph and curve to target, on the device
@@ -43,6 +44,7 @@ pub mod densify;
 pub mod error;
 pub mod eval;
 pub mod export;
+pub mod fit;
 #[expect(unsafe_code, reason = "the only module that speaks Vulkan")]
 pub mod gpu;
 pub mod image;

@@ -338,7 +338,7 @@ fn demo_touches_no_folder_of_somebody_else() {
 #[test]
 fn help_teaches_every_command_in_lines_that_fit() {
     let commands = [
-        "", "train", "eval", "render", "tone", "curves", "sweep", "ablate", "synth", "demo",
+        "", "train", "eval", "render", "tone", "curves", "fit", "sweep", "ablate", "synth", "demo",
         "doctor", "bench",
     ];
     for command in commands {

@@ -109,7 +109,7 @@ pub(crate) struct ModelOptions {
     /// Repeats of the inner convolution in a stage [default: 6]
     #[arg(long, value_name = "N")]
     denoiser_repeats: Option<u32>,
-    /// A folder of depth maps, NAME.* or depth_NAME.*, larger is farther [default: depth/ or depth_maps/ of the dataset]
+    /// A folder of depth maps, `NAME.*` or `depth_NAME.*`, larger is farther [default: `depth/` or `depth_maps/` of the dataset]
     #[arg(long, value_name = "DIR")]
     depth: Option<PathBuf>,
     /// The depth maps hold disparity: larger is nearer

@@ -104,7 +104,7 @@ pub struct ModelConfig {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Weights {
-    /// Of mean (R_K - R_0)^2.
+    /// Of mean `(R_K - R_0)^2`.
     pub denoising: f64,
     /// Of the total variation of R_K.
     pub total_variation: f64,

@@ -1,0 +1,318 @@
+//! `nightsplat fit`: fit a tone curve to pairs of photographs.
+
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use rayon::prelude::*;
+use serde::Serialize;
+
+use super::table::aligned;
+use crate::fit::{
+    Channels, Estimate, Fit, FitOptions, HeldOut, Pair, Scene, Scores, Weighting, cross_validate,
+    fit,
+};
+use crate::tone::{FAMILIES, Family, ToneCurve};
+use crate::{Error, Result};
+
+mod plot;
+
+/// Fit the constants of a tone curve to pairs of photographs, dark and in normal light
+#[derive(Clone, Debug, clap::Args)]
+pub struct FitArgs {
+    /// Folders of pairs: each with `low` and `high` (or `normal`, or `images`) inside, files of the same names
+    #[arg(required = true)]
+    pub pairs: Vec<PathBuf>,
+    /// The folder of the normal-light photographs; PAIRS is then that of the dark ones
+    #[arg(long, value_name = "DIR")]
+    pub normal: Option<PathBuf>,
+    /// The curve, by a name that `nightsplat curves` lists, or `all`
+    #[arg(long, value_name = "NAME|all", default_value_t = FamilyChoice::One(ToneCurve::FittedCubic))]
+    pub family: FamilyChoice,
+    /// Write the curve to a file that --curve takes; of several families the best
+    #[arg(long, value_name = "FILE.toml")]
+    pub out: Option<PathBuf>,
+    /// What is fitted: every channel's values, or the luminance
+    #[arg(long, value_enum, default_value_t)]
+    pub channels: ChannelChoice,
+    /// What each photograph weighs: less the further it is from the curve, or as many as its pixels
+    #[arg(long, value_enum, default_value_t)]
+    pub weigh: WeightingChoice,
+    /// Draw the fit to the family's own constants, as if they were N more photographs
+    #[arg(long, value_name = "N", default_value_t = FitOptions::default().prior)]
+    pub prior: f64,
+    /// Residuals beyond D times their scale weigh less; inf for plain least squares
+    #[arg(long, value_name = "D", default_value_t = FitOptions::default().huber)]
+    pub huber: f64,
+    /// Columns of the histogram that is fitted to
+    #[arg(long, value_name = "N", default_value_t = FitOptions::default().bins)]
+    pub bins: usize,
+    /// Keep the curve at 1 or below, so that nothing clips
+    #[arg(long)]
+    pub bounded: bool,
+    /// Fit the black level (alpha) and the gain by brightness (c) as well, where a family has none of its own
+    #[arg(long)]
+    pub adapt: bool,
+    /// Score on pairs that were not fitted to: on every scene in turn, or on every fifth pair of one
+    #[arg(long)]
+    pub cross_validate: bool,
+    /// Draw the pairs and the curves
+    #[arg(long, value_name = "FILE.svg")]
+    pub plot: Option<PathBuf>,
+    /// Print JSON
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Which families are fitted.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum FamilyChoice {
+    /// Every family that has constants to fit.
+    All,
+    /// One.
+    One(ToneCurve),
+}
+
+impl std::str::FromStr for FamilyChoice {
+    type Err = Error;
+
+    fn from_str(name: &str) -> Result<Self> {
+        if name == "all" {
+            return Ok(Self::All);
+        }
+        match name.parse()? {
+            ToneCurve::Table => {
+                Err(Error::Usage("a table of values has no constants to fit".to_owned()))
+            }
+            curve => Ok(Self::One(curve)),
+        }
+    }
+}
+
+impl std::fmt::Display for FamilyChoice {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::All => f.write_str("all"),
+            Self::One(curve) => curve.fmt(f),
+        }
+    }
+}
+
+/// [`Channels`] on the command line.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum ChannelChoice {
+    /// Red, green and blue
+    #[default]
+    Rgb,
+    /// BT.601 luminance
+    Luminance,
+}
+
+/// [`Weighting`] on the command line.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum WeightingChoice {
+    /// Each by its own residuals
+    #[default]
+    Photographs,
+    /// Every pixel the same
+    Pixels,
+}
+
+/// A fitted family.
+#[derive(Clone, Debug, Serialize)]
+pub struct Fitted {
+    /// The family's name.
+    pub family: &'static str,
+    /// Its formula.
+    pub formula: &'static str,
+    /// The fit to all pairs.
+    pub fit: Fit,
+    /// Scores on pairs that were not fitted to.
+    pub held_out: Option<HeldOut>,
+}
+
+impl Fitted {
+    /// What families are ranked by: the score on held-out pairs where there is one.
+    fn score(&self) -> f64 {
+        self.held_out.as_ref().map_or(self.fit.psnr.fitted, |held_out| held_out.psnr.fitted)
+    }
+}
+
+/// Fits and prints what was found, as tables or as JSON.
+///
+/// # Errors
+/// As [`apply`], or standard output cannot be written to.
+pub fn run(args: &FitArgs) -> Result<()> {
+    let fitted = apply(args)?;
+    let text = if args.json {
+        let json = serde_json::to_string_pretty(&fitted);
+        json.map_err(|error| Error::output("standard output", error.to_string()))?
+    } else {
+        told(&fitted)
+    };
+    writeln!(std::io::stdout().lock(), "{}", text.trim_end())
+        .map_err(|error| Error::output("standard output", error.to_string()))
+}
+
+/// Fits every family that `args` names, best first, and writes the files that it asks for.
+///
+/// # Errors
+/// [`Error::Usage`] for options that make no sense; [`Error::Input`] for pairs that cannot be used; [`Error::Output`]
+/// where a file cannot be written.
+pub fn apply(args: &FitArgs) -> Result<Vec<Fitted>> {
+    if args.normal.is_some() && args.pairs.len() > 1 {
+        return Err(Error::Usage(
+            "--normal goes with one folder of dark photographs, not with several".to_owned(),
+        ));
+    }
+    let options = FitOptions {
+        channels: match args.channels {
+            ChannelChoice::Rgb => Channels::Rgb,
+            ChannelChoice::Luminance => Channels::Luminance,
+        },
+        weighting: match args.weigh {
+            WeightingChoice::Photographs => Weighting::Photographs,
+            WeightingChoice::Pixels => Weighting::Pixels,
+        },
+        prior: args.prior,
+        huber: args.huber,
+        bins: args.bins,
+        bounded: args.bounded,
+        adapt: args.adapt,
+    };
+    let scenes = args.pairs.iter().map(|folder| Scene::load(folder, args.normal.as_deref()));
+    let scenes = scenes.collect::<Result<Vec<Scene>>>()?;
+    let pairs: Vec<&Pair> = scenes.iter().flat_map(|scene| &scene.pairs).collect();
+    let families: Vec<&'static Family> = match args.family {
+        FamilyChoice::One(curve) => vec![curve.family()],
+        FamilyChoice::All => {
+            FAMILIES.iter().filter(|family| family.curve != ToneCurve::None).collect()
+        }
+    };
+    let fit_one = |family: &&'static Family| {
+        Ok(Fitted {
+            family: family.name,
+            formula: family.formula,
+            fit: fit(family, &pairs, &options)?,
+            held_out: args
+                .cross_validate
+                .then(|| cross_validate(family, &scenes, &options))
+                .transpose()?,
+        })
+    };
+    let mut fitted = families.par_iter().map(fit_one).collect::<Result<Vec<Fitted>>>()?;
+    fitted.sort_by(|a, b| b.score().total_cmp(&a.score()));
+    if let Some(path) = &args.out {
+        write(path, &toml(&fitted[0])?)?;
+    }
+    if let Some(path) = &args.plot {
+        write(path, &plot::svg(&fitted[0], &pairs, &options))?;
+    }
+    Ok(fitted)
+}
+
+fn write(path: &Path, text: &str) -> Result<()> {
+    std::fs::write(path, text)
+        .map_err(|error| Error::output(path, format!("cannot be written: {error}")))
+}
+
+/// The curve with what is known of it in comments.
+fn toml(fitted: &Fitted) -> Result<String> {
+    let Fitted { family, formula, fit, .. } = fitted;
+    let settings = toml::to_string(&fit.settings).map_err(|error| {
+        Error::output("the curve", format!("cannot be written as TOML: {error}"))
+    })?;
+    let mut text = format!(
+        "# {family}: {formula}\n# Fitted to {} values; RMSE {:.4}, {:.2} dB.\n",
+        fit.values, fit.rmse, fit.psnr.fitted
+    );
+    if let Some(held_out) = &fitted.held_out {
+        text += &format!(
+            "# On held-out pairs {:.2} dB, AP3 {:.2} dB.\n",
+            held_out.psnr.fitted, held_out.psnr.ap3
+        );
+    }
+    for constant in &fit.constants {
+        text += &format!("# {} = {}\n", constant.name, with_error(constant));
+    }
+    Ok(text + &settings)
+}
+
+fn with_error(constant: &Estimate) -> String {
+    match (constant.standard_error, constant.at_bound) {
+        (Some(error), _) => format!("{:.5} +- {error:.2e}", constant.value),
+        (None, true) => format!("{:.5} (at its bound)", constant.value),
+        (None, false) => format!("{:.5} (not determined alone)", constant.value),
+    }
+}
+
+/// A table of the families, then the best in detail.
+fn told(fitted: &[Fitted]) -> String {
+    let is_scored = fitted.iter().any(|fitted| fitted.held_out.is_some());
+    let mut header = vec!["family", "RMSE", "R2", "fitted dB", "own dB"];
+    if is_scored {
+        header.extend(["held out dB", "own dB"]);
+    }
+    header.extend(["rises", "clips"]);
+    let mut rows = vec![header.into_iter().map(str::to_owned).collect::<Vec<_>>()];
+    let yes = |holds: bool| if holds { "yes" } else { "no" }.to_owned();
+    for Fitted { family, fit, held_out, .. } in fitted {
+        let mut row = vec![
+            (*family).to_owned(),
+            format!("{:.4}", fit.rmse),
+            fit.r_squared.map_or_else(|| "-".to_owned(), |r_squared| format!("{r_squared:.4}")),
+            format!("{:.2}", fit.psnr.fitted),
+            format!("{:.2}", fit.psnr.frozen),
+        ];
+        if let Some(HeldOut { psnr, .. }) = held_out {
+            row.extend([format!("{:.2}", psnr.fitted), format!("{:.2}", psnr.frozen)]);
+        }
+        row.extend([yes(fit.rises), yes(!fit.bounded)]);
+        rows.push(row);
+    }
+    let Some(Fitted { family, formula, fit, held_out }) = fitted.first() else {
+        return String::new();
+    };
+    let mut text = aligned(&rows);
+    text += &format!(
+        "\nAP3 as it is: {:.2} dB on all pairs{}\n",
+        fit.psnr.ap3,
+        held_out.as_ref().map_or_else(String::new, |held_out| format!(
+            ", {:.2} dB on held-out pairs",
+            held_out.psnr.ap3
+        ))
+    );
+    text += &format!("\n{family}: {formula}\n");
+    for constant in &fit.constants {
+        text += &format!("  {:9} {}\n", constant.name, with_error(constant));
+    }
+    let [median, high] = fit.residual_quantiles;
+    text += &format!(
+        "residuals: RMSE {:.4}, median {median:.4}, 95th percentile {high:.4}, robust loss {:.3e}{}\n",
+        fit.rmse,
+        fit.robust_loss,
+        fit.huber_delta
+            .map_or_else(String::new, |delta| format!(", weighing less beyond {delta:.4}"))
+    );
+    text += &format!(
+        "{} values, worth {:.0} independent ones by how photographs differ; errors assume independent photographs\n",
+        fit.values, fit.effective_values
+    );
+    if let Some(held_out) = held_out {
+        let row = |name: &str, pairs: usize, psnr: &Scores, squared_error: &Scores| {
+            let of = |scores: &Scores| [scores.fitted, scores.frozen, scores.ap3];
+            let psnr = of(psnr).map(|score| format!("{score:.2}"));
+            let rmse = of(squared_error).map(|error| format!("{:.4}", error.sqrt()));
+            [vec![name.to_owned(), pairs.to_string()], psnr.to_vec(), rmse.to_vec()].concat()
+        };
+        let header = ["held out", "pairs", "fitted dB", "own dB", "AP3 dB", "RMSE", "own", "AP3"];
+        let header = header.map(str::to_owned).to_vec();
+        let folds = held_out.folds.iter();
+        let pairs = folds.clone().map(|fold| fold.pairs).sum();
+        let folds = folds.map(|fold| row(&fold.name, fold.pairs, &fold.psnr, &fold.squared_error));
+        let all = row("all", pairs, &held_out.psnr, &held_out.squared_error);
+        let rows: Vec<Vec<String>> = std::iter::once(header).chain(folds).chain([all]).collect();
+        text += "\n";
+        text += &aligned(&rows);
+    }
+    text
+}

@@ -1,0 +1,318 @@
+//! A family as a function of the numbers that a fit may change.
+
+use super::{FitOptions, Pair};
+use crate::reference::curves::MAX_CONSTANTS;
+use crate::reference::real::{Dual, Real};
+use crate::reference::tone::{clamped, curve_at};
+use crate::tone::{Constant, Family, Law, Statistics, ToneSettings, White};
+use crate::{Error, Result};
+
+/// Where a number belongs among the [`ToneSettings`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Place {
+    Shape(usize),
+    Theta,
+    Alpha,
+    GainC,
+    BaseGain,
+}
+
+/// A setting that no family lists among its constants; it starts where the family has it.
+const fn setting(name: &'static str, low: f64, high: f64) -> Constant {
+    Constant { name, default: low, start: low, bounds: [low, high] }
+}
+const THETA: Constant = setting("theta", 0.05, 1.0);
+const ALPHA: Constant = setting("alpha", 0.0, 0.5);
+const GAIN_C: Constant = setting("gain_c", 0.0, 20.0);
+const BASE_GAIN: Constant = setting("base_gain", 0.1, 10.0);
+
+/// A family with the list of what is fitted.
+#[derive(Clone, Debug)]
+pub(super) struct Model {
+    pub(super) family: &'static Family,
+    places: Vec<Place>,
+    /// In the order of every vector of values.
+    pub(super) free: Vec<Constant>,
+}
+
+/// All numbers of a curve, in any arithmetic.
+struct Numbers<T> {
+    shape: [T; MAX_CONSTANTS],
+    theta: T,
+    alpha: T,
+    gain_c: T,
+    base_gain: T,
+    beta: f64,
+}
+
+/// What a photograph makes of a curve.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Frame {
+    statistics: Statistics,
+    channel: usize,
+}
+
+impl Frame {
+    /// Of several photographs together: t is all there is.
+    pub(super) const POOLED: Self = Self {
+        statistics: Statistics {
+            p10: 1.0,
+            p80: 1.0,
+            p90: 1.0,
+            mean_luminance: 0.0,
+            mean: 1.0,
+            channel_means: [1.0; 3],
+        },
+        channel: 0,
+    };
+
+    pub(super) fn of(statistics: Statistics, channel: usize) -> Self {
+        Self { statistics, channel }
+    }
+
+    pub(super) fn p90(&self) -> f64 {
+        self.statistics.p90.into()
+    }
+}
+
+impl Model {
+    /// # Errors
+    /// [`Error::Usage`] where the family has nothing to fit.
+    pub(super) fn new(family: &'static Family, options: &FitOptions) -> Result<Self> {
+        let mut places: Vec<Place> = (0..family.constants.len()).map(Place::Shape).collect();
+        match family.white {
+            White::One => {}
+            White::P90 if options.adapt || family.alpha > 0.0 || family.gain_c > 0.0 => {
+                places.extend([Place::Alpha, Place::GainC]);
+                if family.law == Law::Rescaled {
+                    places.push(Place::BaseGain);
+                }
+            }
+            White::P90 => {}
+            White::Mean | White::P80 | White::MeanLuminance | White::ChannelMeans => {
+                places.push(Place::Theta)
+            }
+        }
+        if places.is_empty() {
+            return Err(Error::Usage(format!(
+                "the curve `{}` has no constants to fit",
+                family.name
+            )));
+        }
+        let settings = ToneSettings::new(family.curve);
+        let own =
+            |constant: Constant, value: f64| Constant { default: value, start: value, ..constant };
+        let free = places.iter().map(|&place| match place {
+            Place::Shape(index) => family.constants[index],
+            Place::Theta => own(THETA, settings.theta),
+            Place::Alpha => own(ALPHA, settings.alpha),
+            Place::GainC => own(GAIN_C, settings.gain_c),
+            Place::BaseGain => own(BASE_GAIN, settings.base_gain),
+        });
+        Ok(Self { free: free.collect(), family, places })
+    }
+
+    /// Whether photographs with different statistics have different curves of t.
+    pub(super) fn differs_by_photograph(&self) -> bool {
+        self.places.iter().any(|place| !matches!(place, Place::Shape(_)))
+    }
+
+    /// Whether the channels of a photograph have different curves.
+    pub(super) fn differs_by_channel(&self) -> bool {
+        self.family.white == White::ChannelMeans
+    }
+
+    /// Whether the shape f has constants; otherwise the curve rises whatever black level, white and gain are.
+    pub(super) fn has_shape(&self) -> bool {
+        !self.family.constants.is_empty()
+    }
+
+    /// The curve with these values.
+    pub(super) fn settings(&self, values: &[f64]) -> ToneSettings {
+        let mut settings = ToneSettings::new(self.family.curve);
+        for (&place, &value) in self.places.iter().zip(values) {
+            match place {
+                Place::Shape(index) => settings.constants[index] = value,
+                Place::Theta => settings.theta = value,
+                Place::Alpha => settings.alpha = value,
+                Place::GainC => settings.gain_c = value,
+                Place::BaseGain => settings.base_gain = value,
+            }
+        }
+        settings
+    }
+
+    /// The curve at t = x / p90, clamped.
+    pub(super) fn value(&self, values: &[f64], frame: &Frame, t: f64) -> f64 {
+        clamped(self.raw_value(values, frame, t))
+    }
+
+    /// The curve at t = x / p90, before it is clamped.
+    pub(super) fn raw_value(&self, values: &[f64], frame: &Frame, t: f64) -> f64 {
+        self.at(&numbers(&self.settings(values)), frame, t)
+    }
+
+    /// The derivatives of the clamped curve by every value; those that are no numbers count as 0.
+    pub(super) fn gradient(&self, values: &[f64], frame: &Frame, t: f64) -> Vec<f64> {
+        self.derivatives(values, frame, t, clamped)
+    }
+
+    /// The derivatives of the curve before it is clamped.
+    pub(super) fn raw_gradient(&self, values: &[f64], frame: &Frame, t: f64) -> Vec<f64> {
+        self.derivatives(values, frame, t, |y| y)
+    }
+
+    fn derivatives(
+        &self,
+        values: &[f64],
+        frame: &Frame,
+        t: f64,
+        of: impl Fn(Dual) -> Dual,
+    ) -> Vec<f64> {
+        let settings = self.settings(values);
+        let derivative = |&place: &Place| {
+            let mut numbers: Numbers<Dual> = numbers(&settings);
+            let variable = match place {
+                Place::Shape(index) => &mut numbers.shape[index],
+                Place::Theta => &mut numbers.theta,
+                Place::Alpha => &mut numbers.alpha,
+                Place::GainC => &mut numbers.gain_c,
+                Place::BaseGain => &mut numbers.base_gain,
+            };
+            variable.derivative = 1.0;
+            let derivative = of(self.at(&numbers, frame, t)).derivative;
+            if derivative.is_finite() { derivative } else { 0.0 }
+        };
+        self.places.iter().map(derivative).collect()
+    }
+
+    /// As `ToneSettings::parameters` and the kernels have it, for any number.
+    fn at<T: Real>(&self, numbers: &Numbers<T>, frame: &Frame, t: f64) -> T {
+        let Statistics { p80, p90, mean_luminance, mean, channel_means, .. } = frame.statistics;
+        let number = |x: f32| T::of(x.into());
+        let x = T::of(t) * number(p90);
+        let bounded = |gain: T| gain.at_least(T::of(1.0)).at_most(T::of(6.0));
+        let epsilon = T::of(1e-6);
+        let plain = [T::of(0.0), T::of(1.0)];
+        let (t, law) = match self.family.white {
+            White::One => (x, plain),
+            White::Mean => (x * numbers.theta / number(mean).at_least(T::of(1e-12)), plain),
+            White::P80 => (x * bounded(numbers.theta / number(p80)), plain),
+            White::MeanLuminance => {
+                (x * bounded(numbers.theta / (number(mean_luminance) + epsilon)), plain)
+            }
+            White::ChannelMeans => {
+                (x * numbers.theta / (number(channel_means[frame.channel]) + epsilon), plain)
+            }
+            White::P90 => {
+                let black = T::of((1.0 - frame.statistics.ratio()).powf(numbers.beta));
+                let least = match self.family.law {
+                    Law::Added => T::of(1.0),
+                    Law::Rescaled => numbers.base_gain,
+                };
+                (T::of(t), [numbers.alpha * black, least + numbers.gain_c * number(mean_luminance)])
+            }
+        };
+        curve_at(self.family.curve as u32, t, law, &numbers.shape)
+    }
+}
+
+fn numbers<T: Real>(settings: &ToneSettings) -> Numbers<T> {
+    let shape = |index: usize| T::of(settings.constants.get(index).copied().unwrap_or(0.0));
+    Numbers {
+        shape: std::array::from_fn(shape),
+        theta: T::of(settings.theta),
+        alpha: T::of(settings.alpha),
+        gain_c: T::of(settings.gain_c),
+        base_gain: T::of(settings.base_gain),
+        beta: settings.beta,
+    }
+}
+
+/// The PSNR over all pixels and channels of what `settings` makes of the dark photograph, dB.
+pub fn psnr(settings: &ToneSettings, pair: &Pair) -> f64 {
+    let model = Model { family: settings.curve.family(), places: vec![], free: vec![] };
+    let numbers = numbers::<f64>(settings);
+    let [mut count, mut squares] = [0.0; 2];
+    for (channel, histogram) in pair.channels.iter().enumerate() {
+        let frame = Frame::of(pair.statistics, channel);
+        let value = |x: f64| clamped(model.at(&numbers, &frame, x / frame.p90()));
+        squares += histogram.residuals(value)[1];
+        count += histogram.count();
+    }
+    -10.0 * (squares.max(0.0) / count).log10()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::tone::{FAMILIES, ToneCurve};
+
+    #[test]
+    fn every_family_is_what_the_kernels_make_of_it() {
+        let statistics = Statistics {
+            p10: 0.01,
+            p80: 0.11,
+            p90: 0.13,
+            mean_luminance: 0.06,
+            mean: 0.055,
+            channel_means: [0.05, 0.06, 0.055],
+        };
+        for family in &FAMILIES {
+            let settings = ToneSettings::new(family.curve);
+            let parameters = settings.parameters(&statistics);
+            let model = Model { family, places: vec![], free: vec![] };
+            for x in [0.0, 0.004, 0.03, 0.13, 0.3, 0.9] {
+                for channel in 0..3 {
+                    let frame = Frame::of(statistics, channel);
+                    let found =
+                        clamped(model.at(&numbers::<f64>(&settings), &frame, x / frame.p90()));
+                    let expected = if family.curve == ToneCurve::PerChannel {
+                        clamped(x as f32 / parameters.constants[channel])
+                    } else {
+                        family.curve.apply(x as f32, &parameters)
+                    };
+                    let error = (found - f64::from(expected)).abs();
+                    assert!(error < 2e-6, "{}({x}): {found}, not {expected}", family.name);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn gradients_are_those_of_central_differences() {
+        let statistics = Statistics {
+            p10: 0.02,
+            p80: 0.2,
+            p90: 0.3,
+            mean_luminance: 0.15,
+            mean: 0.14,
+            channel_means: [0.14; 3],
+        };
+        let frame = Frame::of(statistics, 1);
+        for family in FAMILIES.iter().filter(|family| family.white != White::One) {
+            let model =
+                Model::new(family, &FitOptions { adapt: true, ..FitOptions::default() }).unwrap();
+            let values: Vec<f64> = model.free.iter().map(|constant| constant.start).collect();
+            for t in [0.05, 0.17, 0.61] {
+                for (index, exact) in model.raw_gradient(&values, &frame, t).into_iter().enumerate()
+                {
+                    let h = 1e-6 * values[index].abs().max(1e-3);
+                    let at = |shift: f64| {
+                        let mut values = values.clone();
+                        values[index] += shift;
+                        model.raw_value(&values, &frame, t)
+                    };
+                    let difference = (at(h) - at(-h)) / (2.0 * h);
+                    let what = model.free[index].name;
+                    let error = (exact - difference).abs();
+                    assert!(
+                        error < 1e-6 * (1.0 + exact.abs()),
+                        "{} by {what}: {exact}, not {difference}",
+                        family.name
+                    );
+                }
+            }
+        }
+    }
+}
