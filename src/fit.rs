@@ -49,12 +49,12 @@ pub enum Channels {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Weighting {
-    /// One over the mean of its squared residuals, found with the constants: the likeliest constants where photographs
-    /// differ in how far they are from any curve, and the best mean of their PSNRs.
-    #[default]
-    Photographs,
     /// Every pixel the same: the least mean squared error.
+    #[default]
     Pixels,
+    /// One over the mean of its squared residuals, found with the constants: the likeliest constants where photographs
+    /// differ in how far they are from any curve. There may be several such fits, each close to some of the photographs.
+    Photographs,
 }
 
 /// How a curve is fitted.
@@ -81,7 +81,7 @@ impl Default for FitOptions {
     fn default() -> Self {
         Self {
             channels: Channels::Rgb,
-            weighting: Weighting::Photographs,
+            weighting: Weighting::Pixels,
             prior: 0.0,
             huber: 1.345,
             bins: 512,

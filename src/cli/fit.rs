@@ -34,7 +34,7 @@ pub struct FitArgs {
     /// What is fitted: every channel's values, or the luminance
     #[arg(long, value_enum, default_value_t)]
     pub channels: ChannelChoice,
-    /// What each photograph weighs: less the further it is from the curve, or as many as its pixels
+    /// What each photograph weighs: as much as it has pixels, or less the further it is from the curve
     #[arg(long, value_enum, default_value_t)]
     pub weigh: WeightingChoice,
     /// Draw the fit to the family's own constants, as if they were N more photographs
@@ -52,9 +52,12 @@ pub struct FitArgs {
     /// Fit the black level (alpha) and the gain by brightness (c) as well, where a family has none of its own
     #[arg(long)]
     pub adapt: bool,
-    /// Score on pairs that were not fitted to: on every scene in turn, or on every fifth pair of one
+    /// Score on pairs that were not fitted to: on every scene in turn, or on parts of one
     #[arg(long)]
     pub cross_validate: bool,
+    /// The parts of a single scene; as many as pairs to leave out one at a time
+    #[arg(long, value_name = "N", default_value_t = 5)]
+    pub folds: usize,
     /// Draw the pairs and the curves
     #[arg(long, value_name = "FILE.svg")]
     pub plot: Option<PathBuf>,
@@ -110,11 +113,11 @@ pub enum ChannelChoice {
 /// [`Weighting`] on the command line.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
 pub enum WeightingChoice {
-    /// Each by its own residuals
-    #[default]
-    Photographs,
     /// Every pixel the same
+    #[default]
     Pixels,
+    /// Each by its own residuals
+    Photographs,
 }
 
 /// A fitted family.
@@ -195,7 +198,7 @@ pub fn apply(args: &FitArgs) -> Result<Vec<Fitted>> {
             fit: fit(family, &pairs, &options)?,
             held_out: args
                 .cross_validate
-                .then(|| cross_validate(family, &scenes, &options))
+                .then(|| cross_validate(family, &scenes, args.folds, &options))
                 .transpose()?,
         })
     };

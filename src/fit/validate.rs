@@ -6,9 +6,6 @@ use super::{FitOptions, Pair, Scene, Scores, fit, mean_psnr, mean_squared_error}
 use crate::tone::Family;
 use crate::{Error, Result};
 
-/// Folds of a single scene's pairs, at most.
-const FOLDS: usize = 5;
-
 /// A scene, or a part of one, that was held out.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Fold {
@@ -33,16 +30,17 @@ pub struct HeldOut {
     pub squared_error: Scores,
 }
 
-/// Fits to all scenes but one, once for each; of a single scene to all but every fifth pair, five times.
+/// Fits to all scenes but one, once for each; of a single scene to all but every `folds`-th pair, as many times.
 ///
 /// # Errors
-/// [`Error::Usage`] where there is a single pair; those of [`fit`].
+/// [`Error::Usage`] where there is a single pair, or fewer than two folds; those of [`fit`].
 pub fn cross_validate(
     family: &'static Family,
     scenes: &[Scene],
+    folds: usize,
     options: &FitOptions,
 ) -> Result<HeldOut> {
-    let folds = folds(scenes)?;
+    let folds = split(scenes, folds)?;
     let held_out = |index: usize| {
         let (name, pairs) = &folds[index];
         let others: Vec<&Pair> = folds
@@ -68,13 +66,14 @@ pub fn cross_validate(
     Ok(HeldOut { folds, psnr, squared_error })
 }
 
-fn folds(scenes: &[Scene]) -> Result<Vec<(String, Vec<&Pair>)>> {
+fn split(scenes: &[Scene], folds: usize) -> Result<Vec<(String, Vec<&Pair>)>> {
     if let [scene] = scenes {
-        let count = scene.pairs.len().min(FOLDS);
+        let count = scene.pairs.len().min(folds);
         if count < 2 {
-            return Err(Error::Usage(
-                "a single pair leaves none to validate on; give more pairs or leave out --cross-validate".to_owned(),
-            ));
+            return Err(Error::Usage(format!(
+                "{} pairs in {folds} folds leave none to fit to or none to validate on; it takes two pairs and --folds 2",
+                scene.pairs.len()
+            )));
         }
         let fold = |index: usize| {
             let pairs = scene.pairs.iter().skip(index).step_by(count).collect();
