@@ -94,7 +94,8 @@ impl Default for FitOptions {
 impl FitOptions {
     fn check(&self) -> Result<()> {
         // Positive phrasing: a NaN fails the test too.
-        if !(self.huber > 0.0) {
+        let is_positive = self.huber > 0.0;
+        if !is_positive {
             return Err(Error::Usage(format!(
                 "--huber is {}; it must be above 0, inf for plain least squares",
                 self.huber

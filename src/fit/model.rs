@@ -90,7 +90,7 @@ impl Model {
             }
             White::P90 => {}
             White::Mean | White::P80 | White::MeanLuminance | White::ChannelMeans => {
-                places.push(Place::Theta)
+                places.push(Place::Theta);
             }
         }
         if places.is_empty() {

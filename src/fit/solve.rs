@@ -144,7 +144,7 @@ impl<'a> Solver<'a> {
     pub(super) fn solve(&mut self) -> Solution {
         let FitOptions { huber, weighting, .. } = *self.options;
         let mut weights = vec![1.0; self.pairs.len()];
-        let mut values = self.from_many_starts(&self.rows(&|_| 1.0, &[]));
+        let mut values = self.best_of_many_starts(&self.rows(&|_| 1.0, &[]));
         let mut delta = None;
         for round in 0..ROUNDS {
             if weighting == Weighting::Photographs {
@@ -243,7 +243,7 @@ impl<'a> Solver<'a> {
     }
 
     /// The best of what several starts lead to.
-    fn from_many_starts(&self, rows: &[Row]) -> Vec<f64> {
+    fn best_of_many_starts(&self, rows: &[Row]) -> Vec<f64> {
         let free = &self.model.free;
         let start: Vec<f64> = free.iter().map(|constant| constant.start).collect();
         let stream = Stream::new(u64::from(self.model.family.curve.constant()), 0);

@@ -24,7 +24,7 @@ const COLORS: [(&str, &str); 7] = [
     ("--series-4", "#a08010"),
 ];
 
-/// The reference against t: the pairs' mean and the spread about it, the fitted curve, and AP3 as it is. Curves that adapt
+/// The reference against t: the pairs' mean and one standard deviation to either side, the fitted curve, and AP3 as it is. Curves that adapt
 /// are drawn for a photograph with the mean statistics.
 pub(super) fn svg(fitted: &Fitted, pairs: &[&Pair], options: &FitOptions) -> String {
     let histograms = pairs.iter().flat_map(|pair| {
@@ -68,8 +68,8 @@ pub(super) fn svg(fitted: &Fitted, pairs: &[&Pair], options: &FitOptions) -> Str
         curve(&format!("{} fitted", fitted.family), &fitted.fit.settings),
         line("pairs, mean", 0.0),
         curve("AP3", &ToneSettings::new(ToneCurve::Ap3)),
-        line("mean - deviation", -1.0),
-        line("mean + deviation", 1.0),
+        line("mean - 1 sd", -1.0),
+        line("mean + 1 sd", 1.0),
     ];
     let mut svg = plot("t = x / p90", "reference", &series);
     for (name, color) in COLORS {
