@@ -105,7 +105,7 @@ impl PartTerms {
         self.networks.as_mut().map(|terms| &mut terms.networks)
     }
 
-    /// Records every term of a step: adds to dL/dR_0 and writes the planes of the features in `d_render`, (channels, H, W).
+    /// Records every term of a step: adds to the gradient of R_0 and writes the planes of the features in `d_render`, (channels, H, W).
     pub(super) fn record(
         &mut self,
         pass: &mut Recorder<'_>,
