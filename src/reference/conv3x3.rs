@@ -23,7 +23,7 @@ pub(super) fn for_each_tap(
     }
 }
 
-/// output[o](p) = bias[o] + sum over i and t of weight[o, i, t] input[i](p + t) for images (C, H, W); zero padding.
+/// `output[o](p) = bias[o] + sum over i and t of weight[o, i, t] input[i](p + t)` for images (C, H, W); zero padding.
 pub fn conv3x3(
     size: [usize; 2],
     [inputs, outputs]: [usize; 2],
