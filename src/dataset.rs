@@ -6,6 +6,7 @@
 
 mod colmap;
 mod files;
+mod options;
 mod pixels;
 mod similarity;
 pub mod synthetic;
@@ -21,6 +22,7 @@ use crate::camera::{Camera, Lens};
 use crate::image::Image;
 use crate::{Error, Result};
 use files::Files;
+pub use options::{DepthOptions, LoadOptions};
 use pixels::Source;
 use similarity::Similarity;
 
@@ -91,41 +93,6 @@ pub struct Point {
     pub position: DVec3,
     /// Indices into [`Dataset::views`] of those that see it, ascending; may be empty.
     pub views: Vec<u32>,
-}
-
-/// How a dataset is loaded.
-#[derive(Clone, Debug)]
-pub struct LoadOptions {
-    /// Factor by which width and height shrink, at least 1; sizes are rounded to whole pixels.
-    pub downscale: f64,
-    /// A folder of reference images by name, in place of what is found beside the input.
-    pub reference: Option<PathBuf>,
-    /// Whether test views load their dark photograph too, where there is one.
-    pub load_low_test: bool,
-    /// What is looked for as the training views' depth.
-    pub depth: DepthOptions,
-}
-
-/// Where depth maps come from: `STEM.*` or `depth_STEM.*` in a folder.
-#[derive(Clone, Debug, Default)]
-pub struct DepthOptions {
-    /// Whether depth is loaded at all.
-    pub load: bool,
-    /// The folder; none: `depth/` or `depth_maps/` of the dataset.
-    pub folder: Option<PathBuf>,
-    /// The maps hold disparity, larger is nearer: they are negated.
-    pub is_disparity: bool,
-}
-
-impl Default for LoadOptions {
-    fn default() -> Self {
-        Self {
-            downscale: 1.0,
-            reference: None,
-            load_low_test: true,
-            depth: DepthOptions::default(),
-        }
-    }
 }
 
 /// One view as a listing describes it, before any pixel is read.
@@ -248,29 +215,6 @@ impl Dataset {
         let mean = centers.iter().sum::<DVec3>() / centers.len() as f64;
         let radius = centers.iter().map(|center| center.distance(mean)).fold(0.0, f64::max);
         if radius > 0.0 { 1.1 * radius } else { 1.0 }
-    }
-}
-
-impl LoadOptions {
-    fn check(&self) -> Result<()> {
-        // Positive phrasing: a NaN fails the test too.
-        if !(self.downscale >= 1.0 && self.downscale.is_finite()) {
-            let problem =
-                format!("downscale {} makes no image; give a factor of 1 or more", self.downscale);
-            return Err(Error::Usage(problem));
-        }
-        match &self.reference {
-            Some(folder) if !folder.is_dir() => {
-                Err(Error::input(folder, "is not a folder of reference images"))
-            }
-            _ => Ok(()),
-        }?;
-        match &self.depth.folder {
-            Some(folder) if !folder.is_dir() => {
-                Err(Error::input(folder, "is not a folder of depth maps"))
-            }
-            _ => Ok(()),
-        }
     }
 }
 

@@ -3,7 +3,6 @@
 use std::path::Path;
 use std::str::FromStr;
 
-use glam::UVec2;
 use serde_json::{Map, Value, json};
 
 use crate::dataset::{Dataset, View};
@@ -69,16 +68,10 @@ impl Player {
     /// # Errors
     /// The device is out of memory or lost.
     pub fn render(&mut self, view: &View) -> Result<Rendered> {
-        let (width, height) = (view.camera.width, view.camera.height);
-        let mut data = self.channels(view)?;
-        data.truncate(3 * width as usize * height as usize);
-        let denoised = match &mut self.networks {
-            Some(networks) => {
-                networks.denoised_image(self.renderer.render(), UVec2::new(width, height))?
-            }
-            None => None,
-        };
-        Ok(Rendered { colors: Image { width, height, data }, denoised })
+        let (camera, options) = (&view.camera, self.options());
+        self.renderer.reserve(self.count, [camera])?;
+        let networks = self.networks.as_mut();
+        Rendered::new(&mut self.renderer, &self.parameters, camera, &options, networks)
     }
 
     /// One layer of what the view's camera sees; a feature of one channel is repeated.
@@ -102,7 +95,9 @@ impl Player {
         let planes = self.features.channels_of(feature).ok_or_else(lacks)?;
         let (width, height) = (view.camera.width, view.camera.height);
         let pixels = width as usize * height as usize;
-        let channels = self.channels(view)?;
+        self.renderer.reserve(self.count, [&view.camera])?;
+        let options = self.options();
+        let channels = self.renderer.render_channels(&self.parameters, &view.camera, &options)?;
         let plane = |c: usize| {
             let plane = planes.start + c.min(planes.len() - 1);
             channels[plane * pixels..][..pixels].iter().copied()
@@ -119,10 +114,8 @@ impl Player {
         format!("it has {}", names.join(", "))
     }
 
-    fn channels(&mut self, view: &View) -> Result<Vec<f32>> {
-        let options = RenderOptions { sh_degree: self.sh_degree, background: [0.0; 3] };
-        self.renderer.reserve(self.count, [&view.camera])?;
-        self.renderer.render_channels(&self.parameters, &view.camera, &options)
+    fn options(&self) -> RenderOptions {
+        RenderOptions { sh_degree: self.sh_degree, background: [0.0; 3] }
     }
 }
 

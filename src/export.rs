@@ -16,6 +16,7 @@ use std::path::{Path, PathBuf};
 
 use crate::gpu::Gpu;
 use crate::loss::Term;
+use crate::output::write_whole;
 use crate::scene::{Gaussians, ply};
 use crate::train::{ModelConfig, Networks, StepReport, TrainConfig};
 use crate::{Error, Result};
@@ -159,18 +160,6 @@ pub fn write_json(path: &Path, value: &serde_json::Value) -> Result<()> {
         serde_json::to_string_pretty(value).map_err(|error| Error::Usage(error.to_string()))?;
     text.push('\n');
     write_whole(path, text.as_bytes())
-}
-
-/// Writes a file under another name first, so that it is never seen half-written.
-///
-/// # Errors
-/// The folder cannot be written.
-pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
-    let mut partial = path.as_os_str().to_owned();
-    partial.push(".partial");
-    std::fs::write(&partial, bytes)
-        .and_then(|()| std::fs::rename(&partial, path))
-        .map_err(|error| unwritable(path, &error))
 }
 
 fn unwritable(path: &Path, error: &std::io::Error) -> Error {

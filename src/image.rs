@@ -4,6 +4,7 @@
 //! convention; they are encoded on the way in and decoded on the way out (IEC 61966-2-1, linear toe included,
 //! the power law continued above 1).
 
+mod exr_file;
 mod jpeg;
 
 use std::io::Cursor;
@@ -15,6 +16,7 @@ use ::image::{
 };
 use rayon::prelude::*;
 
+use crate::output::write_whole;
 use crate::{Error, Result};
 
 /// A colour image: planes of red, green and blue, sRGB-encoded, [0, 1] but for EXR input, which may exceed 1.
@@ -108,10 +110,10 @@ impl Image {
     fn decode(
         path: &Path,
         bytes: Vec<u8>,
-        from_exr_value: FromExrValue,
+        from_exr_value: exr_file::FromExrValue,
     ) -> Result<(Self, Vec<usize>)> {
-        if bytes.starts_with(&EXR_MAGIC) {
-            return from_exr(path, bytes, from_exr_value);
+        if bytes.starts_with(&exr_file::MAGIC) {
+            return exr_file::load(path, bytes, from_exr_value);
         }
         if bytes.starts_with(&jpeg::MAGIC)
             && let Some(image) = jpeg::load(path, &bytes)?
@@ -168,7 +170,7 @@ impl Image {
     /// # Errors
     /// [`Error::Output`] names the file; nothing half-written is left under its name.
     pub fn save_exr(&self, path: impl AsRef<Path>) -> Result<()> {
-        self.encode_exr(path.as_ref(), linear_from_srgb)
+        exr_file::save(self, path.as_ref(), linear_from_srgb)
     }
 
     /// The same for numbers that are no colour: they are written as they are.
@@ -176,22 +178,7 @@ impl Image {
     /// # Errors
     /// As [`Image::save_exr`].
     pub fn save_exr_as_stored(&self, path: impl AsRef<Path>) -> Result<()> {
-        self.encode_exr(path.as_ref(), |value| value)
-    }
-
-    fn encode_exr(&self, path: &Path, to_linear: fn(f32) -> f32) -> Result<()> {
-        use exr::prelude::{SpecificChannels, Vec2, WritableImage};
-        let channels = SpecificChannels::rgb(|Vec2(x, y): Vec2<usize>| {
-            let [red, green, blue] = self.pixel(x as u32, y as u32).map(to_linear);
-            (red, green, blue)
-        });
-        let size = (self.width as usize, self.height as usize);
-        let mut file = Cursor::new(Vec::new());
-        exr::image::Image::from_channels(size, channels)
-            .write()
-            .to_buffered(&mut file)
-            .map_err(|error| Error::output(path, format!("cannot be encoded: {error}")))?;
-        write_whole(path, file.get_ref())
+        exr_file::save(self, path.as_ref(), |value| value)
     }
 
     /// The image at another size: every output pixel is the mean of the area it covers (a box filter, in float).
@@ -264,8 +251,6 @@ fn area_weights(input: u32, output: u32) -> Vec<Area> {
     (0..output).map(area).collect()
 }
 
-const EXR_MAGIC: [u8; 4] = [0x76, 0x2F, 0x31, 0x01];
-
 fn not_an_image(path: &Path, error: &dyn std::error::Error) -> Error {
     Error::input(
         path,
@@ -293,71 +278,6 @@ fn from_decoded(decoded: DynamicImage) -> Image {
 fn from_interleaved(width: u32, height: u32, values: &[f32]) -> Image {
     let data = (0..3).flat_map(|plane| values.iter().skip(plane).step_by(3).copied()).collect();
     Image { width, height, data }
-}
-
-/// What a finite value of an EXR file means; none where it makes no sense.
-type FromExrValue = fn(f32) -> Option<f32>;
-
-fn from_exr(
-    path: &Path,
-    bytes: Vec<u8>,
-    from_exr_value: FromExrValue,
-) -> Result<(Image, Vec<usize>)> {
-    use exr::prelude::{ReadChannels, ReadLayers};
-    let image = exr::prelude::read()
-        .no_deep_data()
-        .largest_resolution_level()
-        .all_channels()
-        .first_valid_layer()
-        .all_attributes()
-        .from_buffered(Cursor::new(bytes))
-        .map_err(|error| not_an_image(path, &error))?;
-    let layer = image.layer_data;
-    let pixels = layer.size.width() * layer.size.height();
-    let channel = |name: &str| layer.channel_data.list.iter().find(|channel| channel.name.eq(name));
-    let mut data = Vec::with_capacity(3 * pixels);
-    let mut replaced = 0_usize;
-    let mut is_gap = vec![false; pixels];
-    for name in ["R", "G", "B"] {
-        let channel = channel(name).or_else(|| channel("Y"));
-        let channel = channel
-            .ok_or_else(|| Error::input(path, format!("this EXR file has neither {name} nor Y")))?;
-        if channel.sample_data.len() != pixels {
-            return Err(Error::input(
-                path,
-                "this EXR file has subsampled channels; save it as plain RGB",
-            ));
-        }
-        let values = channel.sample_data.values_as_f32().zip(&mut is_gap);
-        data.extend(values.map(|(value, is_gap)| {
-            *is_gap |= !value.is_finite();
-            let usable = Some(value).filter(|value| value.is_finite()).and_then(from_exr_value);
-            replaced += usize::from(usable.is_none());
-            usable.unwrap_or(0.0)
-        }));
-    }
-    if replaced > 0 {
-        tracing::warn!(
-            "{}: {replaced} values are negative colours or not finite; they count as 0",
-            path.display()
-        );
-    }
-    let gaps = (0..pixels).filter(|&pixel| is_gap[pixel]).collect();
-    let (width, height) = (layer.size.width() as u32, layer.size.height() as u32);
-    Ok((Image { width, height, data }, gaps))
-}
-
-/// Under a temporary name first, so that a full disk leaves nothing that looks complete.
-fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
-    let mut partial = path.as_os_str().to_owned();
-    partial.push(".partial");
-    std::fs::write(&partial, bytes).and_then(|()| std::fs::rename(&partial, path)).map_err(
-        |error| {
-            // Whatever this leaves behind is reported by the error itself.
-            let _ = std::fs::remove_file(&partial);
-            Error::output(path, format!("cannot be written: {error}"))
-        },
-    )
 }
 
 #[cfg(test)]
@@ -495,7 +415,7 @@ mod tests {
             &b""[..],
             b"not an image",
             b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR",
-            &EXR_MAGIC,
+            &exr_file::MAGIC,
             &exr[..exr.len() / 2],
         ] {
             std::fs::write(&path, bytes).unwrap();

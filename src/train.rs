@@ -61,6 +61,26 @@ pub struct Rendered {
 }
 
 impl Rendered {
+    /// Renders what `camera` sees of `gaussians`, (columns x Gaussians), and what the networks make of it.
+    ///
+    /// # Errors
+    /// As [`Renderer::render_image`]; the device is out of memory for the networks.
+    pub fn new(
+        renderer: &mut Renderer,
+        gaussians: &Buffer<f32>,
+        camera: &Camera,
+        options: &RenderOptions,
+        networks: Option<&mut Networks>,
+    ) -> Result<Self> {
+        let colors = renderer.render_image(gaussians, camera, options)?;
+        let size = UVec2::new(camera.width, camera.height);
+        let denoised = match networks {
+            Some(networks) => networks.denoised_image(renderer.render(), size)?,
+            None => None,
+        };
+        Ok(Self { colors, denoised })
+    }
+
     /// What the model is scored on: R_K, or R_0 where there is no denoiser.
     pub fn output(&self) -> &Image {
         self.denoised.as_ref().unwrap_or(&self.colors)
@@ -71,13 +91,6 @@ impl Rendered {
 impl From<Image> for Rendered {
     fn from(colors: Image) -> Self {
         Self { colors, denoised: None }
-    }
-}
-
-impl StepReport {
-    /// The value of a term; 0 where the model does not have it.
-    pub fn term(&self, term: Term) -> f64 {
-        self.terms.iter().find(|(own, _)| *own == term).map_or(0.0, |&(_, value)| value)
     }
 }
 
@@ -96,6 +109,13 @@ pub struct StepReport {
     pub gaussians: usize,
     /// Its share of the time its submission took, in milliseconds.
     pub milliseconds: f64,
+}
+
+impl StepReport {
+    /// The value of a term; 0 where the model does not have it.
+    pub fn term(&self, term: Term) -> f64 {
+        self.terms.iter().find(|(own, _)| *own == term).map_or(0.0, |&(_, value)| value)
+    }
 }
 
 /// A model in training, and all that its steps need.
@@ -329,14 +349,8 @@ impl Trainer {
             background: [0.0; 3],
         };
         self.renderer.reserve(self.model.count(), [camera])?;
-        let colors =
-            self.renderer.render_image(&self.model.gaussians.parameters, camera, &options)?;
-        let size = UVec2::new(camera.width, camera.height);
-        let denoised = match self.parts.networks() {
-            Some(networks) => networks.denoised_image(self.renderer.render(), size)?,
-            None => None,
-        };
-        Ok(Rendered { colors, denoised })
+        let gaussians = &self.model.gaussians.parameters;
+        Rendered::new(&mut self.renderer, gaussians, camera, &options, self.parts.networks())
     }
 
     /// Density control acts after this step. Never so late that the run ends before what it added has settled.

@@ -11,9 +11,9 @@ use super::train::{TrainOptions, train_into};
 use crate::Error;
 use crate::dataset::Dataset;
 use crate::eval;
-use crate::export;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::image::Image;
+use crate::output::write_whole;
 use crate::report::{Report, plot};
 use crate::train::{Part, TrainConfig};
 
@@ -91,8 +91,8 @@ pub fn run(args: &AblateArgs) -> Result<()> {
         tables: vec![table.clone()],
     };
     let index = args.out.join("index.html");
-    export::write_whole(&index, page.html().as_bytes())?;
-    export::write_whole(&args.out.join("table.md"), table.markdown().as_bytes())?;
+    write_whole(&index, page.html().as_bytes())?;
+    write_whole(&args.out.join("table.md"), table.markdown().as_bytes())?;
     let mut out = std::io::stdout().lock();
     write!(out, "{}\n{}\n", table::of(&table), index.display())?;
     Ok(())

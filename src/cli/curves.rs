@@ -5,8 +5,8 @@ use std::path::PathBuf;
 
 use super::table;
 use crate::dataset::{Dataset, LoadOptions, Split};
-use crate::export;
 use crate::image::Image;
+use crate::output::write_whole;
 use crate::report::{Series, VerticalLine, plot_with_lines, svg_file};
 use crate::tone::{CurveChoice, FAMILIES, Family, Statistics, ToneCurve, ToneSettings};
 use crate::{Error, Result};
@@ -67,7 +67,7 @@ pub fn text(args: &CurvesArgs) -> Result<String> {
     }
     if let Some(path) = &args.plot {
         let svg = svg_file(&drawing(&curves, scene.as_ref()));
-        export::write_whole(path, svg.as_bytes())?;
+        write_whole(path, svg.as_bytes())?;
         text += &format!("{}\n", path.display());
     }
     if !args.table && args.plot.is_none() {

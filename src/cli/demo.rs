@@ -11,9 +11,9 @@ use crate::Error;
 use crate::dataset::Dataset;
 use crate::dataset::synthetic::{self, SyntheticOptions};
 use crate::eval::{self, ViewScore};
-use crate::export;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::optimizer::Schedule;
+use crate::output::write_whole;
 use crate::report::{Report, plot};
 use crate::tone::{ToneCurve, ToneSettings};
 use crate::train::TrainConfig;
@@ -58,7 +58,7 @@ pub fn run(args: &DemoArgs) -> Result<()> {
     }
     let dark = dark_scores(&dataset)?;
     let page = args.out.join("index.html");
-    export::write_whole(&page, report(&gpu, &dataset, &dark, &runs).html().as_bytes())?;
+    write_whole(&page, report(&gpu, &dataset, &dark, &runs).html().as_bytes())?;
     let mut out = std::io::stdout().lock();
     let table = table::of(&comparison::score_table("target", &dark, &runs));
     write!(out, "{table}\n{}\n", page.display())?;

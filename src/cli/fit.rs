@@ -1,7 +1,7 @@
 //! `nightsplat fit`: fit a tone curve to pairs of photographs.
 
 use std::io::Write;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use rayon::prelude::*;
 use serde::Serialize;
@@ -11,6 +11,7 @@ use crate::fit::{
     Channels, Estimate, Fit, FitOptions, HeldOut, Pair, Scene, Scores, Weighting, cross_validate,
     fit,
 };
+use crate::output::write_whole;
 use crate::tone::{FAMILIES, Family, ToneCurve};
 use crate::{Error, Result};
 
@@ -205,17 +206,12 @@ pub fn apply(args: &FitArgs) -> Result<Vec<Fitted>> {
     let mut fitted = families.par_iter().map(fit_one).collect::<Result<Vec<Fitted>>>()?;
     fitted.sort_by(|a, b| b.score().total_cmp(&a.score()));
     if let Some(path) = &args.out {
-        write(path, &toml(&fitted[0])?)?;
+        write_whole(path, toml(&fitted[0])?.as_bytes())?;
     }
     if let Some(path) = &args.plot {
-        write(path, &plot::svg(&fitted[0], &pairs, &options))?;
+        write_whole(path, plot::svg(&fitted[0], &pairs, &options).as_bytes())?;
     }
     Ok(fitted)
-}
-
-fn write(path: &Path, text: &str) -> Result<()> {
-    std::fs::write(path, text)
-        .map_err(|error| Error::output(path, format!("cannot be written: {error}")))
 }
 
 /// The curve with what is known of it in comments.

@@ -29,8 +29,9 @@ use super::progress_bar;
 use super::train::TrainArgs;
 use crate::Error;
 use crate::dataset::Dataset;
-use crate::export;
+use crate::export::load_config;
 use crate::gpu::{DeviceChoice, Gpu};
+use crate::output::write_whole;
 use crate::tone::Statistics;
 use crate::train::TrainConfig;
 
@@ -192,7 +193,7 @@ impl Run {
         if !path.exists() {
             return Ok(false);
         }
-        let found = export::load_config(&self.folder)?;
+        let found = load_config(&self.folder)?;
         if found != self.config {
             let differs = difference(&found.to_toml()?, &self.config.to_toml()?);
             let problem = format!("holds another run ({differs}); choose another --out");
@@ -256,7 +257,7 @@ fn claim(folder: &Path, manifest: &str, dry_run: bool) -> crate::Result<()> {
     }
     std::fs::create_dir_all(folder)
         .map_err(|error| Error::output(folder, format!("cannot be made: {error}")))?;
-    export::write_whole(&path, manifest.as_bytes())
+    write_whole(&path, manifest.as_bytes())
 }
 
 /// delta0, the mean over the training views, where the sweep has the adaptive black level.

@@ -22,7 +22,7 @@ use crate::train::{Background, ModelName, Part, Preset, TrainConfig, Trainer};
 pub struct TrainArgs {
     /// The dataset: a folder with transforms*.json (LOM, RealX3D, NeRF) or a COLMAP model in sparse/
     pub dataset: PathBuf,
-    /// The run directory to write: config.toml, model.ply, train.csv, metrics.json
+    /// The run directory to write: config.toml, model.ply, the networks, train.csv, metrics.json
     #[arg(long, value_name = "RUN")]
     pub out: PathBuf,
     /// Replace the run that RUN already holds

@@ -8,6 +8,7 @@ use serde_json::Value;
 
 use super::parameters::{Parameters, Tensor};
 use crate::gpu::Gpu;
+use crate::output::write_whole;
 use crate::{Error, Result};
 
 /// The key of the metadata that holds the settings of every network, as one JSON object.
@@ -39,12 +40,7 @@ pub fn save(path: &Path, networks: &[(&str, &Parameters)], gpu: &Gpu) -> Result<
     let settings = serde_json::json!(settings).to_string();
     let metadata = HashMap::from([(SETTINGS.to_owned(), settings)]);
     let bytes = safetensors::serialize(views, Some(metadata)).map_err(|error| failed(&error))?;
-    // A file appears under its name only once it is complete.
-    let mut partial = path.as_os_str().to_owned();
-    partial.push(".partial");
-    std::fs::write(&partial, bytes)
-        .and_then(|()| std::fs::rename(&partial, path))
-        .map_err(|error| failed(&error))
+    write_whole(path, &bytes)
 }
 
 /// Reads each network's values from the tensors `prefix.name`; all networks are read, or none is changed.

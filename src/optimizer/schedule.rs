@@ -22,6 +22,21 @@ pub struct LearningRates {
     pub rest: f64,
 }
 
+impl LearningRates {
+    /// One rate for every column.
+    pub const fn uniform(rate: f64) -> Self {
+        Self {
+            means: rate,
+            quats: rate,
+            log_scales: rate,
+            raw_opacities: rate,
+            dc: rate,
+            features: rate,
+            rest: rate,
+        }
+    }
+}
+
 /// Those of the attribute table.
 impl Default for LearningRates {
     fn default() -> Self {

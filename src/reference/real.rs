@@ -45,12 +45,30 @@ pub trait Real:
     }
 }
 
+/// What the primitive floats have of their own.
+macro_rules! standard_functions {
+    () => {
+        fn exp(self) -> Self {
+            self.exp()
+        }
+        fn ln_1p(self) -> Self {
+            self.ln_1p()
+        }
+        fn power(self, p: Self) -> Self {
+            if self > 0.0 { self.powf(p) } else { 0.0 }
+        }
+        fn sqrt(self) -> Self {
+            self.sqrt()
+        }
+        fn atan(self) -> Self {
+            self.atan()
+        }
+    };
+}
+
 impl Real for f32 {
     fn of(x: f64) -> Self {
         x as Self
-    }
-    fn exp(self) -> Self {
-        self.exp()
     }
     /// The shader's way.
     fn one_minus_exp(self) -> Self {
@@ -60,42 +78,17 @@ impl Real for f32 {
             1.0 - (-self).exp()
         }
     }
-    fn ln_1p(self) -> Self {
-        self.ln_1p()
-    }
-    fn power(self, p: Self) -> Self {
-        if self > 0.0 { self.powf(p) } else { 0.0 }
-    }
-    fn sqrt(self) -> Self {
-        self.sqrt()
-    }
-    fn atan(self) -> Self {
-        self.atan()
-    }
+    standard_functions!();
 }
 
 impl Real for f64 {
     fn of(x: f64) -> Self {
         x
     }
-    fn exp(self) -> Self {
-        self.exp()
-    }
     fn one_minus_exp(self) -> Self {
         -(-self).exp_m1()
     }
-    fn ln_1p(self) -> Self {
-        self.ln_1p()
-    }
-    fn power(self, p: Self) -> Self {
-        if self > 0.0 { self.powf(p) } else { 0.0 }
-    }
-    fn sqrt(self) -> Self {
-        self.sqrt()
-    }
-    fn atan(self) -> Self {
-        self.atan()
-    }
+    standard_functions!();
 }
 
 /// A value with its derivative with respect to one variable.

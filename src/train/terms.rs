@@ -352,7 +352,7 @@ impl Trained {
         parameters: &mut Parameters,
         status: &Buffer<u32>,
     ) -> Result<()> {
-        let rates = LearningRates { means: self.rate, ..LearningRates::default() };
+        let rates = LearningRates::uniform(self.rate);
         let len = parameters.values.len() as u32;
         let Parameters { values, gradients, .. } = parameters;
         adam.record(

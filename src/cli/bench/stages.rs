@@ -192,15 +192,7 @@ impl<'s> Step<'s> {
                 visit_counts: &mut self.visit_counts,
             },
         )?;
-        let still = LearningRates {
-            means: 0.0,
-            quats: 0.0,
-            log_scales: 0.0,
-            raw_opacities: 0.0,
-            dc: 0.0,
-            features: 0.0,
-            rest: 0.0,
-        };
+        let still = LearningRates::uniform(0.0);
         self.adam.record(
             pass,
             1,

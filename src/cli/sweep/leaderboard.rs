@@ -8,7 +8,7 @@ use super::Run;
 use super::grid::{ADAPTIVE, OFFSET, Point, SEED};
 use super::runner::Failure;
 use crate::Result;
-use crate::export::write_whole;
+use crate::output::write_whole;
 use crate::report::{Bar, Best, Column, Mark, Report, Series, Table, bars, plot_points};
 
 /// The files of a leaderboard.

@@ -6,10 +6,10 @@ use super::mapper::Mapper;
 use super::photographs::Listed;
 use super::{Mapped, Measures, ToneArgs, ToneOutput, settings, without};
 use crate::Result;
-use crate::export;
 use crate::gpu::Gpu;
 use crate::image::Image;
 use crate::metrics::Scores;
+use crate::output::write_whole;
 use crate::report::{
     Best, Column, Comparison, Distribution, Picture, Report, Table, distributions,
 };
@@ -107,7 +107,7 @@ impl Page {
             plots: vec![distributions(&drawn)],
             comparisons: self.comparison.into_iter().collect(),
         };
-        export::write_whole(path, report.html().as_bytes())
+        write_whole(path, report.html().as_bytes())
     }
 }
 
