@@ -279,7 +279,7 @@ impl Kernel {
                 let Type::Array(array) = &member.ty else {
                     panic!("{kernel}: {:?} is not an array", member.name)
                 };
-                let element = structs.rust_type(&array.element_ty, &kernel);
+                let element = structs.element_type(&array.element_ty, &kernel);
                 let size = array.element_ty.min_nbyte();
                 assert_eq!(array.stride, size, "{kernel}: {element} is padded");
                 self.buffers.push(Buffer {
@@ -346,6 +346,14 @@ impl Structs {
             })
             .collect();
         Struct { name: name.to_owned(), fields, size: ty.min_nbyte().expect("a sized struct") }
+    }
+
+    /// The element of a buffer: an array of `vec4` moves plain floats four at a time, and the host sees the floats.
+    fn element_type(&mut self, ty: &Type, kernel: &str) -> String {
+        match self.rust_type(ty, kernel).as_str() {
+            "[f32; 4]" => "f32".to_owned(),
+            other => other.to_owned(),
+        }
     }
 
     fn rust_type(&mut self, ty: &Type, kernel: &str) -> String {

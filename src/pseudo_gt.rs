@@ -47,7 +47,7 @@ pub struct PseudoGt {
 enum Map {
     Formula {
         pipeline: Pipeline<kernels::tone_map::Kernel>,
-        values_per_thread: u32,
+        quads_per_thread: u32,
     },
     Mix(Pipeline<kernels::tone_mix::Kernel>),
     /// (3, K) knots.
@@ -67,8 +67,8 @@ impl Map {
             }
             None => {
                 let constants = kernels::tone_map::Constants { tone_curve, ..Default::default() };
-                let values_per_thread = constants.values_per_thread;
-                Self::Formula { pipeline: gpu.pipeline(&constants)?, values_per_thread }
+                let quads_per_thread = constants.quads_per_thread;
+                Self::Formula { pipeline: gpu.pipeline(&constants)?, quads_per_thread }
             }
         })
     }
@@ -267,10 +267,10 @@ impl PseudoGt {
         )
     }
 
-    /// Records `target = curve(image)` with `parameters[view]`; `image` and `target` are planar `(3, pixels)`.
+    /// Records `target = curve(image)` with `parameters[view]`; both planar `(3, pixels)`.
     ///
     /// # Errors
-    /// `target` is shorter than `image`, or `parameters` ends before `view`.
+    /// `target` and `image` differ in length, or `parameters` ends before `view`.
     pub fn map(
         &self,
         pass: &mut Recorder<'_>,
@@ -280,7 +280,7 @@ impl PseudoGt {
         target: &mut Buffer<f32>,
     ) -> Result<()> {
         in_range(parameters, view)?;
-        if target.len() < image.len() {
+        if target.len() != image.len() {
             let (name, len) = (target.name(), target.len());
             return Err(Error::Usage(format!(
                 "buffer `{name}` holds {len} values, not {}",
@@ -290,11 +290,11 @@ impl PseudoGt {
         let value_count = image.len() as u32;
         let pixel_count = value_count / 3;
         match &self.map {
-            Map::Formula { pipeline, values_per_thread } => pass.dispatch(
+            Map::Formula { pipeline, quads_per_thread } => pass.dispatch(
                 pipeline,
                 &kernels::tone_map::Params { value_count, view },
                 kernels::tone_map::Buffers { image, parameters, target },
-                Threads::Exactly([value_count.div_ceil(*values_per_thread), 1, 1]),
+                Threads::Exactly([value_count.div_ceil(4 * quads_per_thread), 1, 1]),
             ),
             Map::Mix(pipeline) => pass.dispatch(
                 pipeline,

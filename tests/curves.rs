@@ -166,7 +166,7 @@ fn on_device(gpu: &Gpu, curve: ToneCurve, grid: &[f32], tone: ToneParameters) ->
         target: &mut target,
     };
     let threads =
-        Threads::Exactly([params.value_count.div_ceil(constants.values_per_thread), 1, 1]);
+        Threads::Exactly([params.value_count.div_ceil(4 * constants.quads_per_thread), 1, 1]);
     gpu.run("tone_map", |pass| pass.dispatch(&pipeline, &params, buffers, threads)).unwrap();
     [gpu.read(&target).unwrap(), expected]
 }

@@ -311,7 +311,7 @@ fn tone_map_follows_the_reference_from_tiny_to_huge_values() {
                     &params,
                     bound,
                     Threads::Exactly([
-                        params.value_count.div_ceil(constants.values_per_thread),
+                        params.value_count.div_ceil(4 * constants.quads_per_thread),
                         1,
                         1,
                     ]),

@@ -5,7 +5,8 @@
 
 //! Luminance histogram: counts the second or third digit of the luminances that begin with a search's prefix.
 //!
-//! A workgroup takes a run of pixels and counts in shared memory first. Counts are integers, so their order does not matter. `histograms` must be zero before.
+//! A workgroup takes a run of pixels, a thread four neighbours at a time, and counts in shared memory first. Counts are
+//! integers, so their order does not matter. `histograms` must be zero before.
 
 layout(local_size_x = WORKGROUP) in;
 
@@ -16,7 +17,7 @@ layout(push_constant) uniform Params {
     uint first_search;  // of the four
 };
 
-layout(binding = 0) readonly buffer Luminances { float luminances[]; };
+layout(binding = 0) readonly buffer Luminances { vec4 luminances[]; };  // (H, W)
 layout(binding = 1) readonly buffer Searches   { RankSearch searches[]; };
 layout(binding = 2) buffer Histograms          { uint histograms[]; };  // (SEARCHES, BINS)
 
@@ -29,13 +30,16 @@ void main() {
     barrier();
 
     Run run = run_of_workgroup(WORKGROUP_INDEX, thread_count / WORKGROUP, pixel_count);
-    for (uint i = run.first + gl_LocalInvocationID.x; i < run.end; i += WORKGROUP) {
-        uint digits = floatBitsToUint(luminances[i]) >> shift;
-        uint histogram = SEARCHES;
-        [[unroll]] for (uint s = 0; s < SEARCHES; ++s) {
-            if (digits >> DIGIT_BITS == search[s].prefix) histogram = search[s].histogram;
+    for (uint quad = run.first / 4 + gl_LocalInvocationID.x; 4 * quad < run.end; quad += WORKGROUP) {
+        uvec4 digits = floatBitsToUint(luminances[quad]) >> shift;
+        [[unroll]] for (uint c = 0; c < 4; ++c) {
+            uint histogram = SEARCHES;
+            [[unroll]] for (uint s = 0; s < SEARCHES; ++s) {
+                if (digits[c] >> DIGIT_BITS == search[s].prefix) histogram = search[s].histogram;
+            }
+            bool counts_it = histogram < SEARCHES && 4 * quad + c < run.end;
+            if (counts_it) atomicAdd(counts[histogram * BINS + digits[c] % BINS], 1);
         }
-        if (histogram < SEARCHES) atomicAdd(counts[histogram * BINS + digits % BINS], 1);
     }
     barrier();
 

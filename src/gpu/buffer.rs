@@ -217,8 +217,9 @@ impl Memory {
             | vk::BufferUsageFlags::INDIRECT_BUFFER
             | vk::BufferUsageFlags::TRANSFER_SRC
             | vk::BufferUsageFlags::TRANSFER_DST;
-        // Vulkan has no empty buffers; an empty array still binds.
-        let info = vk::BufferCreateInfo::default().size(bytes.max(16)).usage(usage);
+        // Vulkan has no empty buffers, an empty array still binds; whole quads, for kernels that read four values at a time.
+        let size = bytes.max(1).next_multiple_of(16);
+        let info = vk::BufferCreateInfo::default().size(size).usage(usage);
         let out_of_memory = || Error::OutOfMemory { buffer: name.to_owned(), bytes };
         // SAFETY: the device is live; the buffer is bound once to memory that satisfies its requirements.
         unsafe {

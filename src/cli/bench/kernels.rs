@@ -131,7 +131,7 @@ fn statistics(bench: &Bench, timings: &mut Vec<Timing>) -> anyhow::Result<TonePa
     );
     let target = vec![0.0_f32; image.len()];
     let map_constants = tone_map::Constants { tone_curve, ..Default::default() };
-    let threads = (image.len() as u32).div_ceil(map_constants.values_per_thread);
+    let threads = (image.len() as u32).div_ceil(4 * map_constants.quads_per_thread);
     check!(
         bench,
         timings,

@@ -47,12 +47,14 @@ pub(super) fn time(bench: &Bench, scene: &Scene) -> Result<Stages> {
         let times = gpu.profile("step", |pass| without_curve.record(pass))?;
         Ok(of_kernels(&times, &loss_kernels))
     })?;
+    let (tone_statistics, whole_pseudo_gt) = pseudo_gt(bench)?;
     let group = |name, milliseconds, bound| Timing { name, milliseconds, bound };
     let groups = vec![
         group("blend_forward", blend_forward, Some(60.0)),
         group("backward_with_reduction", backward, Some(130.0)),
         group("sort_65000_pairs", sort(bench)?, Some(10.0)),
-        group("tone_statistics_1920x1080", tone_statistics(bench)?, Some(60.0)),
+        group("tone_statistics_1920x1080", tone_statistics, Some(60.0)),
+        group("pseudo_gt_1920x1080", whole_pseudo_gt, Some(80.0)),
         group("loss", loss, None),
         group("loss_without_curve", loss_without_curve, None),
     ];
@@ -90,17 +92,24 @@ fn sort(bench: &Bench) -> Result<f64> {
     })
 }
 
-fn tone_statistics(bench: &Bench) -> Result<f64> {
+/// A Full-HD photograph: its statistics alone, and with the curve over every value.
+fn pseudo_gt(bench: &Bench) -> Result<(f64, f64)> {
     let gpu = &bench.gpu;
     let image = gpu.buffer("low", &scene::dark(1920, 1080).data)?;
     let mut pseudo_gt = PseudoGt::new(gpu, &ToneSettings::default())?;
     let mut parameters = gpu.zeros("tone", 1)?;
-    bench.median(|| {
-        let times = gpu.profile("statistics", |pass| {
-            pseudo_gt.statistics(pass, &image, [1920, 1080], &mut parameters, 0)
-        })?;
-        Ok(total(&times))
-    })
+    let mut target = gpu.uninit("target", image.len())?;
+    let mut of_kernels = |counts: fn(&PassTime) -> bool| {
+        bench.median(|| {
+            let mut times = gpu.profile("pseudo-GT", |pass| {
+                pseudo_gt.statistics(pass, &image, [1920, 1080], &mut parameters, 0)?;
+                pseudo_gt.map(pass, &image, &parameters, 0, &mut target)
+            })?;
+            times.retain(counts);
+            Ok(total(&times))
+        })
+    };
+    Ok((of_kernels(|time| time.name != "tone_map")?, of_kernels(|_| true)?))
 }
 
 /// What a training step works on; its learning rates are zero, so that every run does the same work.
