@@ -1,6 +1,6 @@
 //! Windows: the rectangle of a view that the networks run on.
 //!
-//! The networks' losses are means over pixels, so a random crop estimates them. What a crop's pixels get from the networks
+//! The networks' losses are means over pixels, so a random crop estimates them without bias. What a crop's pixels get from the networks
 //! depends on a margin around them, the receptive field: the window is the crop with its margin, cut off at the image,
 //! where the zero padding of the whole view is right anyway.
 
@@ -32,18 +32,27 @@ impl Window {
         Self { origin: UVec2::ZERO, size: view, crop_origin: UVec2::ZERO, crop_size: view }
     }
 
-    /// A square crop of `side` pixels, cut down to the view, with `margin` pixels around it: every corner is equally
-    /// likely. The draw depends on the stream and `draw` alone.
+    /// A random crop with `margin` pixels around it: one of the equal cells, at most `side` pixels wide and high, that
+    /// part the view. It is the cell of a uniformly drawn pixel, so that means over crops have the mean over the view
+    /// as their expectation: a crop at a random corner would see the view's middle more often than its edges.
+    /// The draw depends on the stream and `draw` alone.
     pub fn random(view: UVec2, side: u32, margin: u32, stream: &Stream, draw: u64) -> Self {
-        let crop_size = view.min(UVec2::splat(side));
-        let corner = |free: u32, offset: u64| {
-            (stream.uniform(2 * draw + offset) * f64::from(free + 1)) as u32
+        let cells = UVec2::new(view.x.div_ceil(side), view.y.div_ceil(side));
+        let uniform = |axis: u64, extent: u32| {
+            ((stream.uniform(2 * draw + axis) * f64::from(extent)) as u32).min(extent - 1)
         };
-        let free = view - crop_size;
-        let corner = UVec2::new(corner(free.x, 0), corner(free.y, 1)).min(free);
+        let pixel = UVec2::new(uniform(0, view.x), uniform(1, view.y));
+        // Cell i of n begins at floor(i view / n): its pixels x are those with floor(((x + 1) n - 1) / view) = i.
+        let cell = ((pixel + 1) * cells - 1) / view;
+        let [corner, crop_end] = [cell, cell + 1].map(|cell| cell * view / cells);
         let origin = corner.saturating_sub(UVec2::splat(margin));
-        let end = (corner + crop_size + margin).min(view);
-        Self { origin, size: end - origin, crop_origin: corner - origin, crop_size }
+        let end = crop_end.saturating_add(UVec2::splat(margin)).min(view);
+        Self {
+            origin,
+            size: end - origin,
+            crop_origin: corner - origin,
+            crop_size: crop_end - corner,
+        }
     }
 }
 

@@ -8,28 +8,56 @@ use nightsplat::random::Stream;
 use nightsplat::window::{Window, Windows};
 
 #[test]
-fn a_crop_lies_in_the_view_and_its_margin_is_cut_off_there() {
+fn a_crop_is_a_cell_of_the_view_and_its_margin_is_cut_off_there() {
     let stream = Stream::new(1, 2);
-    let view = UVec2::new(40, 25);
-    let mut corners = std::collections::BTreeSet::new();
-    for draw in 0..2000 {
+    let view = UVec2::new(43, 25);
+    let mut cells = std::collections::BTreeSet::new();
+    for draw in 0..500 {
         let window = Window::random(view, 20, 6, &stream, draw);
-        assert_eq!(window.crop_size, UVec2::splat(20));
         let corner = window.origin + window.crop_origin;
-        assert!((corner + window.crop_size).cmple(view).all());
+        let end = corner + window.crop_size;
         assert_eq!(window.origin, corner.saturating_sub(UVec2::splat(6)));
-        assert_eq!(window.origin + window.size, (corner + 26).min(view));
-        corners.insert(corner.to_array());
+        assert_eq!(window.origin + window.size, (end + 6).min(view));
+        cells.insert((corner.to_array(), end.to_array()));
     }
-    // 21 columns and 6 rows of corners.
-    assert_eq!(corners.len(), 126);
+    // Three columns of 14 or 15 pixels, two rows of 12 or 13.
+    let columns = [(0, 14), (14, 28), (28, 43)];
+    let all = columns.map(|(left, right)| [([left, 0], [right, 12]), ([left, 12], [right, 25])]);
+    assert_eq!(cells, all.into_iter().flatten().collect());
+}
+
+#[test]
+fn means_over_crops_estimate_the_mean_over_the_view() {
+    const DRAWS: u64 = 40_000;
+    let stream = Stream::new(7, 1);
+    // Far from a multiple of the side; and one pixel more than one cell.
+    for (view, side) in [(UVec2::new(17, 11), 5), (UVec2::new(8, 7), 7)] {
+        let mut weights = vec![0.0; view.element_product() as usize];
+        for draw in 0..DRAWS {
+            let window = Window::random(view, side, 1, &stream, draw);
+            let corner = window.origin + window.crop_origin;
+            let weight = 1.0 / f64::from(window.crop_size.element_product());
+            for y in corner.y..corner.y + window.crop_size.y {
+                for x in corner.x..corner.x + window.crop_size.x {
+                    weights[(y * view.x + x) as usize] += weight / DRAWS as f64;
+                }
+            }
+        }
+        // Every pixel weighs the same: four standard deviations of the rarest cell's count.
+        let even = 1.0 / weights.len() as f64;
+        for weight in weights {
+            assert!((weight / even - 1.0).abs() < 4.0 * (20.0 / DRAWS as f64).sqrt(), "{weight}");
+        }
+    }
 }
 
 #[test]
 fn a_crop_larger_than_the_view_is_the_view() {
     let view = UVec2::new(7, 300);
-    let window = Window::random(view, 500, 9, &Stream::new(1, 2), 3);
-    assert_eq!(window, Window::whole(view));
+    for side in [300, 500, u32::MAX] {
+        let window = Window::random(view, side, 9, &Stream::new(1, 2), 3);
+        assert_eq!(window, Window::whole(view));
+    }
 }
 
 #[test]

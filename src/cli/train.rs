@@ -97,7 +97,7 @@ pub(crate) struct ModelOptions {
     /// The constants that the paper and its code state for a benchmark: lom, realx3d or mip360-varying; other options win
     #[arg(long, value_name = "NAME")]
     preset: Option<Preset>,
-    /// Train the networks on a random crop of N x N pixels a step; 0: on the whole view [default: 0]
+    /// Train the networks on a random crop of at most N x N pixels a step; 0: on the whole view [default: 0]
     #[arg(long, value_name = "N")]
     denoiser_crop: Option<u32>,
     /// Feature maps of the denoiser [default: 64]

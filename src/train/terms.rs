@@ -205,7 +205,7 @@ impl NetworkTerms {
     fn reserve(&mut self, gpu: &Gpu, size: UVec2) -> Result<()> {
         let size = match self.crop {
             0 => size,
-            crop => size.min(UVec2::splat(crop + 2 * self.margin())),
+            crop => size.min(UVec2::splat(crop.saturating_add(2 * self.margin()))),
         };
         self.networks.reserve(size)?;
         self.denoising.reserve(size)?;
