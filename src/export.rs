@@ -5,6 +5,7 @@
 //!     model.ply      the Gaussians, as splat viewers open them
 //!     networks.safetensors    the weights of the networks, where the model has any
 //!     train.csv      one line per step
+//!     checkpoint.safetensors  what the run goes on from, overwritten every so many steps
 //!     metrics.json   scores of the test views
 //! ```
 //!
@@ -18,7 +19,7 @@ use crate::gpu::Gpu;
 use crate::loss::Term;
 use crate::output::write_whole;
 use crate::scene::{Gaussians, ply};
-use crate::train::{ModelConfig, Networks, StepReport, TrainConfig};
+use crate::train::{ModelConfig, Networks, StepReport, TrainConfig, Trainer};
 use crate::{Error, Result};
 
 /// A run directory and the log that grows in it.
@@ -28,13 +29,19 @@ pub struct RunDirectory {
     log: BufWriter<File>,
     /// The columns of the log between loss and Gaussians.
     terms: Vec<Term>,
+    /// What the steps took that the log held already.
+    seconds_before: f64,
 }
 
 /// The files of a run that a new run replaces; nothing else in the directory is touched.
-const FILES: [&str; 5] = ["metrics.json", "model.ply", NETWORKS, "train.csv", "config.toml"];
+const FILES: [&str; 6] =
+    ["metrics.json", "model.ply", NETWORKS, CHECKPOINT, "train.csv", "config.toml"];
 
 /// The weights of the networks.
 const NETWORKS: &str = "networks.safetensors";
+
+/// The state of an unfinished run, or of a finished one that may be made longer.
+const CHECKPOINT: &str = "checkpoint.safetensors";
 
 impl RunDirectory {
     /// Makes the directory and writes the configuration.
@@ -48,17 +55,57 @@ impl RunDirectory {
             return Err(Error::output(path, problem));
         }
         std::fs::create_dir_all(path).map_err(|error| unwritable(path, &error))?;
-        for file in FILES.map(|file| path.join(file)).iter().filter(|file| file.exists()) {
-            std::fs::remove_file(file).map_err(|error| unwritable(file, &error))?;
-        }
+        remove(path, &FILES)?;
         write_whole(&path.join("config.toml"), config.to_toml()?.as_bytes())?;
         let log_path = path.join("train.csv");
         let log = File::create(&log_path).map_err(|error| unwritable(&log_path, &error))?;
         let terms = config.terms().into_iter().map(|(term, _)| term).collect();
-        let mut run = Self { path: path.to_owned(), log: BufWriter::new(log), terms };
+        let log = BufWriter::new(log);
+        let mut run = Self { path: path.to_owned(), log, terms, seconds_before: 0.0 };
         let columns: String = run.terms.iter().map(|term| format!("{},", term.column())).collect();
         run.log_line(&format!("step,view,loss,{columns}gaussians,milliseconds"))?;
         Ok(run)
+    }
+
+    /// Takes up a run again after `step`: its log is cut there, and it is unfinished.
+    ///
+    /// # Errors
+    /// The directory cannot be written, or its log does not reach `step`.
+    pub fn resume(path: &Path, config: &TrainConfig, step: u64) -> Result<Self> {
+        let log_path = path.join("train.csv");
+        let text = std::fs::read_to_string(&log_path)
+            .map_err(|error| Error::input(&log_path, format!("cannot be read ({error})")))?;
+        // The header and a line per step; the last line may be cut short.
+        let lines: Vec<&str> = text.split_inclusive('\n').take(step as usize + 1).collect();
+        let last = lines.last().filter(|line| line.starts_with(&format!("{step},")));
+        if last.is_none_or(|line| !line.ends_with('\n')) {
+            let problem =
+                format!("ends before step {step} of the checkpoint; begin anew with --overwrite");
+            return Err(Error::input(&log_path, problem));
+        }
+        let milliseconds = |line: &&str| line.trim_end().rsplit(',').next()?.parse::<f64>().ok();
+        let seconds_before = lines.iter().filter_map(milliseconds).sum::<f64>() / 1e3;
+        remove(path, &["metrics.json", "model.ply", NETWORKS])?;
+        write_whole(&path.join("config.toml"), config.to_toml()?.as_bytes())?;
+        write_whole(&log_path, lines.concat().as_bytes())?;
+        let log = File::options().append(true).open(&log_path);
+        let log = BufWriter::new(log.map_err(|error| unwritable(&log_path, &error))?);
+        let terms = config.terms().into_iter().map(|(term, _)| term).collect();
+        Ok(Self { path: path.to_owned(), log, terms, seconds_before })
+    }
+
+    /// What the steps took that a resumed run had behind it, in seconds.
+    pub fn seconds_before(&self) -> f64 {
+        self.seconds_before
+    }
+
+    /// Writes what the run can go on from, behind a log that reaches as far.
+    ///
+    /// # Errors
+    /// The disk is full or gone, or the device was lost.
+    pub fn save_checkpoint(&mut self, trainer: &mut Trainer) -> Result<()> {
+        self.log.flush().map_err(|error| unwritable(&self.path, &error))?;
+        trainer.save_checkpoint(&self.path.join(CHECKPOINT))
     }
 
     /// Appends a step to `train.csv`.
@@ -106,6 +153,16 @@ impl RunDirectory {
     fn log_line(&mut self, line: &str) -> Result<()> {
         writeln!(self.log, "{line}").map_err(|error| unwritable(&self.path, &error))
     }
+}
+
+/// The checkpoint of a run; none where there is none.
+pub fn checkpoint(run: &Path) -> Option<PathBuf> {
+    Some(run.join(CHECKPOINT)).filter(|path| path.is_file())
+}
+
+/// Whether a directory holds a run that reached its end.
+pub fn is_finished(run: &Path) -> bool {
+    run.join("metrics.json").exists()
 }
 
 /// The configuration of a finished or unfinished run.
@@ -160,6 +217,13 @@ pub fn write_json(path: &Path, value: &serde_json::Value) -> Result<()> {
         serde_json::to_string_pretty(value).map_err(|error| Error::Usage(error.to_string()))?;
     text.push('\n');
     write_whole(path, text.as_bytes())
+}
+
+fn remove(run: &Path, files: &[&str]) -> Result<()> {
+    for file in files.iter().map(|file| run.join(file)).filter(|file| file.exists()) {
+        std::fs::remove_file(&file).map_err(|error| unwritable(&file, &error))?;
+    }
+    Ok(())
 }
 
 fn unwritable(path: &Path, error: &std::io::Error) -> Error {

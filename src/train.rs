@@ -1,5 +1,6 @@
 //! Training: one view a step, its pseudo-GT the target, the Gaussians what is learned.
 
+mod checkpoint;
 mod config;
 mod model;
 mod networks;

@@ -7,7 +7,7 @@ use anyhow::Result;
 
 use super::comparison::{self, Run};
 use super::table;
-use super::train::{TrainOptions, train_into};
+use super::train::{HeldRun, TrainOptions, train_into};
 use crate::Error;
 use crate::dataset::Dataset;
 use crate::eval;
@@ -66,7 +66,8 @@ pub fn run(args: &AblateArgs) -> Result<()> {
     for (i, Model { folder, title, config }) in models.iter().enumerate() {
         tracing::info!("{} of {}: {title}", i + 1, models.len());
         let out = args.out.join(folder);
-        let (trained, losses) = train_into(&out, &gpu, config, &dataset, args.overwrite)?;
+        let (trained, losses) =
+            train_into(&out, &gpu, config, &dataset, HeldRun::of(args.overwrite))?;
         runs.push(Run::new(title.clone(), trained, losses));
     }
     let dark = eval::score(&dataset, |view| {

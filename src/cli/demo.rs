@@ -101,7 +101,7 @@ fn config(curve: ToneCurve, dataset: &Dataset, gpu: &Gpu) -> TrainConfig {
 fn train_with(curve: ToneCurve, gpu: &Gpu, dataset: &Dataset, out: &Path) -> crate::Result<Run> {
     let config = config(curve, dataset, gpu);
     let (trained, losses) =
-        train::train_into(&out.join(curve.name()), gpu, &config, dataset, true)?;
+        train::train_into(&out.join(curve.name()), gpu, &config, dataset, train::HeldRun::Replace)?;
     Ok(Run::new(title(curve), trained, losses))
 }
 

@@ -9,7 +9,7 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use crate::dataset::Dataset;
 use crate::eval::{self, ViewScore};
-use crate::export::RunDirectory;
+use crate::export::{self, RunDirectory};
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::tone::CurveChoice;
 use crate::train::{Background, ModelName, Part, Preset, TrainConfig, Trainer};
@@ -22,12 +22,15 @@ use crate::train::{Background, ModelName, Part, Preset, TrainConfig, Trainer};
 pub struct TrainArgs {
     /// The dataset: a folder with transforms*.json (LOM, RealX3D, NeRF) or a COLMAP model in sparse/
     pub dataset: PathBuf,
-    /// The run directory to write: config.toml, model.ply, the networks, train.csv, metrics.json
+    /// The run directory to write: config.toml, model.ply, the networks, train.csv, a checkpoint, metrics.json
     #[arg(long, value_name = "RUN")]
     pub out: PathBuf,
     /// Replace the run that RUN already holds
     #[arg(long)]
     pub overwrite: bool,
+    /// Go on from the checkpoint in RUN, or begin where there is none; the model gets the same bits as in one go
+    #[arg(long, conflicts_with = "overwrite")]
+    pub resume: bool,
     #[command(flatten)]
     pub(crate) options: TrainOptions,
 }
@@ -79,6 +82,9 @@ pub(crate) struct TrainOptions {
     /// Score the test views every N steps as well as at the end
     #[arg(long, value_name = "N")]
     eval_every: Option<u64>,
+    /// Write what --resume goes on from every N steps; 0: never [default: 1000]
+    #[arg(long, value_name = "N")]
+    checkpoint_every: Option<u64>,
     /// Any other setting by its place in config.toml, such as tone.alpha=0.1; may be repeated, wins over all else
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
@@ -179,6 +185,7 @@ impl TrainOptions {
         set(&mut config.background, &self.background);
         set(&mut config.device, &self.device);
         set(&mut config.eval_every, &self.eval_every);
+        set(&mut config.checkpoint_every, &self.checkpoint_every);
         if self.reference.is_some() {
             config.reference.clone_from(&self.reference);
         }
@@ -196,7 +203,8 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     let config = args.options.config(args.dataset.clone())?;
     let gpu = Gpu::new(&config.device.parse::<DeviceChoice>()?)?;
     let dataset = Dataset::load(&config.dataset, &config.load_options())?;
-    let (trained, _) = train_into(&args.out, &gpu, &config, &dataset, args.overwrite)?;
+    let held = if args.resume { HeldRun::Resume } else { HeldRun::of(args.overwrite) };
+    let (trained, _) = train_into(&args.out, &gpu, &config, &dataset, held)?;
     let Trained { trainer, scored, seconds, .. } = trained;
     let gaussians = trainer.gaussian_count();
     let mut out = std::io::stdout().lock();
@@ -222,67 +230,105 @@ pub(crate) struct Trained {
     pub(crate) peak_bytes: u64,
 }
 
+/// What becomes of a run that the directory already holds.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum HeldRun {
+    Refuse,
+    Replace,
+    Resume,
+}
+
+impl HeldRun {
+    /// What `--overwrite` says.
+    pub(crate) fn of(overwrite: bool) -> Self {
+        if overwrite { Self::Replace } else { Self::Refuse }
+    }
+}
+
 /// Trains into a run directory; gives the loss of every step as well.
 pub(crate) fn train_into(
     out: &Path,
     gpu: &Gpu,
     config: &TrainConfig,
     dataset: &Dataset,
-    overwrite: bool,
+    held: HeldRun,
 ) -> crate::Result<(Trained, Vec<f64>)> {
-    let mut directory = RunDirectory::create(out, config, overwrite)?;
-    let mut losses = vec![];
-    let mut trained = train(gpu, config, dataset, |step| {
-        losses.push(step.loss);
-        directory.log(step)
-    })?;
-    let trainer = &mut trained.trainer;
+    gpu.reset_peak_memory();
+    let (mut directory, mut trainer) = begin(out, gpu, config, dataset, held)?;
+    let (losses, seconds) = train_to_the_end(&mut trainer, &mut directory, config, dataset)?;
+    let peak_bytes = gpu.peak_memory();
+    let scored = eval::score(dataset, |view| trainer.render(&view.camera))?;
     directory.save_model(&trainer.gaussians()?, config.model.raw_colors)?;
     if let Some(networks) = trainer.networks() {
         directory.save_networks(networks)?;
     }
-    let gaussians = trainer.gaussian_count();
-    let metrics = eval::metrics(&trained.scored, trained.seconds, gaussians, config.steps);
+    let metrics = eval::metrics(&scored, seconds, trainer.gaussian_count(), config.steps);
     directory.save_metrics(&metrics)?;
-    Ok((trained, losses))
+    Ok((Trained { trainer, scored, seconds, peak_bytes }, losses))
 }
 
-/// Trains to the end, with a progress bar; `log` sees every step.
-fn train(
+/// A new run, or one that is taken up again.
+fn begin(
+    out: &Path,
     gpu: &Gpu,
     config: &TrainConfig,
     dataset: &Dataset,
-    mut log: impl FnMut(&crate::train::StepReport) -> crate::Result<()>,
-) -> crate::Result<Trained> {
-    gpu.reset_peak_memory();
-    let mut trainer = Trainer::new(gpu, config.clone(), dataset)?;
-    let bar = progress_bar(config.steps);
-    let mut seconds = Duration::ZERO;
+    held: HeldRun,
+) -> crate::Result<(RunDirectory, Trainer)> {
+    let checkpoint = export::checkpoint(out).filter(|_| held == HeldRun::Resume);
+    if let Some(checkpoint) = checkpoint {
+        let mut trainer = Trainer::new(gpu, config.clone(), dataset)?;
+        trainer.restore(&checkpoint)?;
+        let step = trainer.steps_done();
+        tracing::info!("{} goes on after step {step}", out.display());
+        return Ok((RunDirectory::resume(out, config, step)?, trainer));
+    }
+    // Without a checkpoint, an unfinished run is nothing to lose.
+    let replaces = match held {
+        HeldRun::Refuse => false,
+        HeldRun::Replace => true,
+        HeldRun::Resume => !export::is_finished(out),
+    };
+    let directory = RunDirectory::create(out, config, replaces)?;
+    Ok((directory, Trainer::new(gpu, config.clone(), dataset)?))
+}
+
+/// Trains with a progress bar, logs every step, and writes checkpoints; gives the losses and the seconds of all steps.
+fn train_to_the_end(
+    trainer: &mut Trainer,
+    directory: &mut RunDirectory,
+    config: &TrainConfig,
+    dataset: &Dataset,
+) -> crate::Result<(Vec<f64>, f64)> {
+    let bar = progress_bar(config.steps).with_position(trainer.steps_done());
+    let (mut losses, mut spent) = (vec![], Duration::ZERO);
     while trainer.steps_done() < config.steps {
-        let every = config.eval_every.max(1);
-        let next_eval = (trainer.steps_done() / every + 1) * every;
-        let until = if config.eval_every == 0 { config.steps } else { next_eval };
+        let next = |every| (trainer.steps_done() + 1).checked_next_multiple_of(every);
+        let until = [config.eval_every, config.checkpoint_every].into_iter().filter_map(next);
+        let until = until.min().unwrap_or(config.steps);
         let begin = Instant::now();
         let reports = trainer.advance(until)?;
-        seconds += begin.elapsed();
+        spent += begin.elapsed();
         for report in &reports {
-            log(report)?;
+            losses.push(report.loss);
+            directory.log(report)?;
         }
-        if let Some(last) = reports.last() {
-            bar.set_position(last.step);
-            bar.set_message(format!("loss {:.4}  {} Gaussians", last.loss, last.gaussians));
+        let Some(last) = reports.last() else { continue };
+        bar.set_position(last.step);
+        bar.set_message(format!("loss {:.4}  {} Gaussians", last.loss, last.gaussians));
+        let falls_on = |every: u64| every > 0 && last.step.is_multiple_of(every);
+        if falls_on(config.checkpoint_every) {
+            directory.save_checkpoint(trainer)?;
         }
-        if config.eval_every > 0 && trainer.steps_done() == next_eval && next_eval < config.steps {
+        if falls_on(config.eval_every) && last.step < config.steps {
             let scored = eval::score(dataset, |view| trainer.render(&view.camera))?;
             if let Some(line) = summary(&scored) {
-                bar.suspend(|| tracing::info!("step {next_eval}: {line}"));
+                bar.suspend(|| tracing::info!("step {}: {line}", last.step));
             }
         }
     }
     bar.finish_and_clear();
-    let peak_bytes = gpu.peak_memory();
-    let scored = eval::score(dataset, |view| trainer.render(&view.camera))?;
-    Ok(Trained { trainer, scored, seconds: seconds.as_secs_f64(), peak_bytes })
+    Ok((losses, directory.seconds_before() + spent.as_secs_f64()))
 }
 
 /// The mean scores in a line; none where nothing was scored.

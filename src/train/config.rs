@@ -60,6 +60,8 @@ pub struct TrainConfig {
     pub background: Background,
     /// Scores the test views every so many steps; 0: at the end only.
     pub eval_every: u64,
+    /// Writes a checkpoint every so many steps; 0: never.
+    pub checkpoint_every: u64,
     /// The device: a part of its name or its index; empty: the best.
     pub device: String,
     /// Random points to begin with where the dataset has none.
@@ -99,6 +101,7 @@ impl Default for TrainConfig {
             max_gaussians: 1_000_000,
             background: Background::Black,
             eval_every: 0,
+            checkpoint_every: 1000,
             device: String::new(),
             random_points: 20_000,
             tone: ToneSettings::default(),
@@ -123,10 +126,18 @@ impl TrainConfig {
     pub fn load(path: &Path) -> Result<Self> {
         let text = std::fs::read_to_string(path)
             .map_err(|error| Error::input(path, format!("cannot be read: {error}")))?;
-        toml::from_str(&text).map_err(|error| {
+        Self::from_toml(&text).map_err(|problem| Error::input(path, problem.to_string()))
+    }
+
+    /// Reads TOML; what it leaves out keeps its default.
+    ///
+    /// # Errors
+    /// It says something that no run has.
+    pub fn from_toml(text: &str) -> Result<Self> {
+        toml::from_str(text).map_err(|error| {
             let line = error.span().map(|span| text[..span.start].matches('\n').count() + 1);
             let place = line.map(|line| format!(" (line {line})")).unwrap_or_default();
-            Error::input(path, format!("is no configuration: {}{place}", error.message()))
+            Error::Usage(format!("is no configuration: {}{place}", error.message()))
         })
     }
 

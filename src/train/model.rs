@@ -32,6 +32,14 @@ impl Model {
         Self::new(gpu, on_device, gaussians.shape)
     }
 
+    /// A model of zeros, to be overwritten.
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub(super) fn zeros(gpu: &Gpu, count: usize, shape: Shape) -> Result<Self> {
+        Self::upload(gpu, &Gaussians { count, shape, parameters: vec![0.0; count * width(shape)] })
+    }
+
     fn new(gpu: &Gpu, gaussians: DeviceGaussians, shape: Shape) -> Result<Self> {
         let count = gaussians.count as usize;
         Ok(Self {

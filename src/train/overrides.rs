@@ -1,5 +1,7 @@
 //! `KEY=VALUE`: any one setting of a run by its dotted path, as `config.toml` spells it.
 
+use std::collections::BTreeMap;
+
 use toml::{Table, Value};
 
 use super::TrainConfig;
@@ -23,6 +25,21 @@ impl TrainConfig {
             config = config.with_one(key.trim(), value.trim())?;
         }
         Ok(config)
+    }
+
+    /// The first setting in which a run of `self` differs from one of `other`, with both values: `tone.alpha = 0.1, not
+    /// 0.12`. Left out is what changes no step: how long the run is, where the photographs lie, when it is scored and saved.
+    pub fn difference(&self, other: &Self) -> Option<String> {
+        const FREE: [&str; 6] =
+            ["steps", "dataset", "reference", "device", "eval_every", "checkpoint_every"];
+        let [own, others] =
+            [self, other].map(|config| settings("", &Table::try_from(config).unwrap_or_default()));
+        let value = |settings: &BTreeMap<String, Value>, key: &str| {
+            settings.get(key).map_or_else(|| "nothing".to_owned(), Value::to_string)
+        };
+        let mut keys = own.keys().chain(others.keys()).filter(|key| !FREE.contains(&key.as_str()));
+        keys.find(|&key| own.get(key) != others.get(key))
+            .map(|key| format!("{key} = {}, not {}", value(&own, key), value(&others, key)))
     }
 
     fn with_one(&self, key: &str, text: &str) -> Result<Self> {
@@ -63,13 +80,18 @@ fn string(text: &str) -> Value {
     value(text).filter(Value::is_str).unwrap_or_else(|| Value::String(text.to_owned()))
 }
 
-/// The dotted path of every setting that is not a section itself.
-fn keys(prefix: &str, table: &Table) -> Vec<String> {
+/// Every setting that is not a section itself, under its dotted path.
+fn settings(prefix: &str, table: &Table) -> BTreeMap<String, Value> {
     let of = |(name, value): (&String, &Value)| match value {
-        Value::Table(inner) => keys(&format!("{prefix}{name}."), inner),
-        _ => vec![format!("{prefix}{name}")],
+        Value::Table(inner) => settings(&format!("{prefix}{name}."), inner),
+        _ => BTreeMap::from([(format!("{prefix}{name}"), value.clone())]),
     };
     table.iter().flat_map(of).collect()
+}
+
+/// The dotted path of every setting.
+fn keys(prefix: &str, table: &Table) -> Vec<String> {
+    settings(prefix, table).into_keys().collect()
 }
 
 fn unknown(key: &str, known: &[String]) -> Error {
@@ -99,6 +121,32 @@ fn distance(from: &str, to: &str) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_difference_is_named_unless_it_changes_no_step() {
+        let config = TrainConfig::default();
+        let free = TrainConfig {
+            steps: 9,
+            device: "0".to_owned(),
+            dataset: "b".into(),
+            ..TrainConfig::default()
+        };
+        assert_eq!(config.difference(&free), None);
+        let mut other = free;
+        other.tone.alpha = 0.25;
+        assert_eq!(
+            config.difference(&other).unwrap(),
+            format!("tone.alpha = {}, not 0.25", config.tone.alpha)
+        );
+        let other = TrainConfig {
+            model: crate::train::ModelConfig {
+                depth_folder: Some("d".into()),
+                ..Default::default()
+            },
+            ..TrainConfig::default()
+        };
+        assert_eq!(config.difference(&other).unwrap(), "model.depth_folder = nothing, not \"d\"");
+    }
 
     fn with(assignments: &[&str]) -> Result<TrainConfig> {
         let assignments: Vec<String> = assignments.iter().map(|&text| text.to_owned()).collect();

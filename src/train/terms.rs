@@ -142,16 +142,18 @@ impl PartTerms {
         status: &Buffer<u32>,
     ) -> Result<()> {
         let Some(terms) = &mut self.networks else { return Ok(()) };
-        let networks = &mut terms.networks;
-        let denoiser = networks.denoiser.as_mut().map(Denoiser::parameters_mut);
-        let tonemapper = networks.tonemapper.as_mut().map(Tonemapper::parameters_mut);
-        let pairs = [(denoiser, &mut terms.denoiser), (tonemapper, &mut terms.tonemapper)];
-        for (parameters, trained) in pairs {
-            if let Some((parameters, trained)) = parameters.zip(trained.as_mut()) {
-                trained.update(pass, step, adam, parameters, status)?;
-            }
-        }
-        Ok(())
+        let mut trained = terms.trained();
+        trained.try_for_each(|(_, parameters, trained)| {
+            trained.update(pass, step, adam, parameters, status)
+        })
+    }
+
+    /// Every network's name, parameters and moments.
+    pub(super) fn trained_networks(
+        &mut self,
+    ) -> impl Iterator<Item = (&'static str, &mut Parameters, &mut Moments)> {
+        let trained = self.networks.iter_mut().flat_map(NetworkTerms::trained);
+        trained.map(|(name, parameters, trained)| (name, parameters, &mut trained.moments))
     }
 }
 
@@ -199,6 +201,18 @@ impl NetworkTerms {
             d_output: empty("d_window_output")?,
             networks,
         })
+    }
+
+    /// Every network that there is, with its name.
+    fn trained(&mut self) -> impl Iterator<Item = (&'static str, &mut Parameters, &mut Trained)> {
+        let Networks { denoiser, tonemapper, .. } = &mut self.networks;
+        let denoiser = denoiser.as_mut().map(Denoiser::parameters_mut).zip(self.denoiser.as_mut());
+        let tonemapper =
+            tonemapper.as_mut().map(Tonemapper::parameters_mut).zip(self.tonemapper.as_mut());
+        let denoiser = denoiser.map(|(parameters, trained)| ("denoiser", parameters, trained));
+        let tonemapper =
+            tonemapper.map(|(parameters, trained)| ("tonemapper", parameters, trained));
+        denoiser.into_iter().chain(tonemapper)
     }
 
     /// Memory for the windows of views of `size`.

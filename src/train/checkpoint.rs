@@ -1,0 +1,200 @@
+//! Checkpoints: a run goes on from one as if it had never stopped.
+//!
+//! Random numbers are functions of seed and step, so a checkpoint holds what a step leaves behind and no more: the
+//! Gaussians and the networks with their moments, and the statistics of density control.
+
+use std::collections::HashMap;
+use std::path::Path;
+
+use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use serde::{Deserialize, Serialize};
+
+use super::model::Model;
+use super::{TrainConfig, Trainer};
+use crate::densify::DeviceGaussians;
+use crate::gpu::{Buffer, Gpu};
+use crate::optimizer::Moments;
+use crate::output::write_whole_with;
+use crate::{Error, Result};
+
+/// The key of the metadata that holds a [`Header`] as JSON: several keys would come in another order every time.
+const HEADER: &str = "checkpoint";
+
+const FORMAT: &str = "nightsplat checkpoint 1";
+
+const VISIT_COUNTS: &str = "density.visit_counts";
+
+/// What a checkpoint says of itself.
+#[derive(Serialize, Deserialize)]
+struct Header {
+    format: String,
+    /// Steps done.
+    step: u64,
+    /// The settings of the run, as TOML.
+    config: String,
+}
+
+/// A tensor of the state.
+struct State<'a> {
+    name: String,
+    shape: Vec<usize>,
+    buffer: &'a mut Buffer<f32>,
+}
+
+impl Trainer {
+    /// Writes everything that the next step depends on as one safetensors file.
+    ///
+    /// # Errors
+    /// The file cannot be written, or the device was lost.
+    pub fn save_checkpoint(&mut self, path: &Path) -> Result<()> {
+        let gpu = self.gpu.clone();
+        let header =
+            Header { format: FORMAT.to_owned(), step: self.step, config: self.config.to_toml()? };
+        let header = serde_json::json!(header).to_string();
+        let metadata = HashMap::from([(HEADER.to_owned(), header)]);
+        let mut downloads = vec![];
+        for State { name, shape, buffer } in self.state() {
+            downloads.push((name, shape, gpu.read(buffer)?));
+        }
+        let visits = gpu.read(&self.model.visit_counts)?;
+        let view = |name: &str, shape: &[usize], dtype, bytes| -> std::io::Result<_> {
+            let view = TensorView::new(dtype, shape.to_vec(), bytes);
+            Ok((name.to_owned(), view.map_err(std::io::Error::other)?))
+        };
+        write_whole_with(path, |path| {
+            let mut views = vec![view(
+                VISIT_COUNTS,
+                &[visits.len()],
+                Dtype::U32,
+                bytemuck::cast_slice(&visits),
+            )?];
+            for (name, shape, values) in &downloads {
+                views.push(view(name, shape, Dtype::F32, bytemuck::cast_slice(values))?);
+            }
+            safetensors::serialize_to_file(views, Some(metadata), path)
+                .map_err(std::io::Error::other)?;
+            // A checkpoint is for the day the power fails.
+            std::fs::File::open(path)?.sync_all()
+        })
+    }
+
+    /// Takes over the state that [`Trainer::save_checkpoint`] wrote: further steps give the bits that the run would have
+    /// had without the interruption. A run that is longer than it was going to be may differ in one thing: density control
+    /// would have acted once more near the old end.
+    ///
+    /// # Errors
+    /// The file is missing, damaged or beyond the end of this run, or it was made with other settings; the trainer is
+    /// then as it was.
+    pub fn restore(&mut self, path: &Path) -> Result<()> {
+        let bytes = std::fs::read(path)
+            .map_err(|error| Error::input(path, format!("cannot be read ({error})")))?;
+        let damaged =
+            |problem: String| Error::input(path, format!("is no whole checkpoint ({problem})"));
+        let file = SafeTensors::deserialize(&bytes).map_err(|error| damaged(error.to_string()))?;
+        let step = self.step_of(path, &bytes)?;
+        let visits: Vec<u32> = values(&file, VISIT_COUNTS, Dtype::U32, None).map_err(damaged)?;
+        let gpu = self.gpu.clone();
+        let mut restored = Model::zeros(&gpu, visits.len(), self.model.shape())?;
+        gpu.write(&mut restored.visit_counts, &visits)?;
+        let fresh = std::mem::replace(&mut self.model, restored);
+        if let Err(error) = self.read_state(&gpu, &file, &damaged) {
+            self.model = fresh;
+            return Err(error);
+        }
+        self.step = step;
+        self.reserve()
+    }
+
+    /// The step of a checkpoint that this run can go on from.
+    fn step_of(&self, path: &Path, bytes: &[u8]) -> Result<u64> {
+        let refused = |problem: String| Error::input(path, problem);
+        let (_, metadata) = SafeTensors::read_metadata(bytes)
+            .map_err(|error| refused(format!("is no whole checkpoint ({error})")))?;
+        let header = metadata.metadata().as_ref().and_then(|metadata| metadata.get(HEADER));
+        let header = header.and_then(|header| serde_json::from_str(header).ok());
+        let Some(Header { step, config, .. }) = header.filter(|h: &Header| h.format == FORMAT)
+        else {
+            return Err(refused(format!("is no `{FORMAT}`; train the run again with --overwrite")));
+        };
+        let config = TrainConfig::from_toml(&config).map_err(|error| {
+            refused(format!(
+                "was made by another version ({error}); train the run again with --overwrite"
+            ))
+        })?;
+        if let Some(difference) = config.difference(&self.config) {
+            return Err(refused(format!(
+                "was made with {difference}; give the settings that the run began with, or begin anew with --overwrite"
+            )));
+        }
+        let steps = self.config.steps;
+        if step > steps {
+            return Err(refused(format!(
+                "is at step {step}, this run ends at {steps}; raise --steps"
+            )));
+        }
+        Ok(step)
+    }
+
+    /// Every tensor is read before one is changed, but for those of the model.
+    fn read_state(
+        &mut self,
+        gpu: &Gpu,
+        file: &SafeTensors<'_>,
+        damaged: &dyn Fn(String) -> Error,
+    ) -> Result<()> {
+        let read = |state: State<'_>| {
+            let values: Vec<f32> =
+                values(file, &state.name, Dtype::F32, Some(&state.shape)).map_err(damaged)?;
+            if values.iter().all(|value: &f32| value.is_finite()) {
+                return Ok(values);
+            }
+            Err(damaged(format!("`{}` holds values that are not finite", state.name)))
+        };
+        let values = self.state().into_iter().map(read).collect::<Result<Vec<_>>>()?;
+        self.state()
+            .into_iter()
+            .zip(values)
+            .try_for_each(|(state, values)| gpu.write(state.buffer, &values))
+    }
+
+    /// Everything that the next step depends on but the visit counts, which are integers.
+    fn state(&mut self) -> Vec<State<'_>> {
+        let Model { gaussians, grad_norm_sums, .. } = &mut self.model;
+        let DeviceGaussians { count, column_count, parameters, moments, .. } = gaussians;
+        let (count, columns) = (*count as usize, *column_count as usize);
+        let name = "density.grad_norm_sums".to_owned();
+        let mut state = vec![State { name, shape: vec![count], buffer: grad_norm_sums }];
+        state.extend(optimized("gaussians", &[columns, count], parameters, moments));
+        for (name, parameters, moments) in self.parts.trained_networks() {
+            let len = parameters.values.len();
+            state.extend(optimized(name, &[len], &mut parameters.values, moments));
+        }
+        state
+    }
+}
+
+/// What Adam works on.
+fn optimized<'a>(
+    owner: &str,
+    shape: &[usize],
+    parameters: &'a mut Buffer<f32>,
+    Moments { first, second }: &'a mut Moments,
+) -> [State<'a>; 3] {
+    [("parameters", parameters), ("first_moments", first), ("second_moments", second)].map(
+        |(name, buffer)| State { name: format!("{owner}.{name}"), shape: shape.to_vec(), buffer },
+    )
+}
+
+/// A tensor's elements, or what is wrong with it.
+fn values<T: bytemuck::Pod>(
+    file: &SafeTensors<'_>,
+    name: &str,
+    dtype: Dtype,
+    shape: Option<&[usize]>,
+) -> std::result::Result<Vec<T>, String> {
+    let tensor = file.tensor(name).map_err(|_| format!("it has no tensor `{name}`"))?;
+    if tensor.dtype() != dtype || shape.is_some_and(|shape| shape != tensor.shape()) {
+        return Err(format!("tensor `{name}` cannot be {:?} {}", tensor.shape(), tensor.dtype()));
+    }
+    Ok(bytemuck::pod_collect_to_vec(tensor.data()))
+}

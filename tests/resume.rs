@@ -1,0 +1,194 @@
+//! Runs that are interrupted and go on.
+
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+use std::time::Duration;
+
+use nightsplat::dataset::Dataset;
+use nightsplat::dataset::synthetic::{self, SyntheticOptions};
+use nightsplat::gpu::testing::{assert_no_validation_messages, gpu};
+use nightsplat::train::{Background, Part, StepReport, TrainConfig, Trainer};
+use safetensors::SafeTensors;
+
+/// A set of nine small views.
+fn make_set(folder: &Path) {
+    let options = SyntheticOptions { views: 9, width: 40, height: 30, seed: 2 };
+    synthetic::write(folder, &options).unwrap();
+}
+
+/// Density control acts after steps 10 and 20 of thirty.
+fn config(parts: &[Part]) -> TrainConfig {
+    let mut config =
+        TrainConfig { steps: 30, background: Background::Random, ..TrainConfig::default() };
+    config.schedule.densify_after = 5;
+    config.schedule.densify_interval = 10;
+    config.schedule.sh_degree_interval = 8;
+    config.model.set_parts(parts);
+    config.model.network.channels = 4;
+    config.model.network.stages = 2;
+    config.model.network.repeats = 2;
+    config.model.denoiser_crop = 16;
+    config
+}
+
+fn advance(trainer: &mut Trainer, until: u64) -> Vec<StepReport> {
+    let mut reports = vec![];
+    while trainer.steps_done() < until {
+        reports.extend(trainer.advance(until).unwrap());
+    }
+    reports
+}
+
+/// The whole state at the end, and what every step said.
+fn finished(trainer: &mut Trainer, folder: &Path) -> (Vec<u8>, Vec<StepReport>) {
+    let reports = advance(trainer, 30);
+    let path = folder.join("end.safetensors");
+    trainer.save_checkpoint(&path).unwrap();
+    (fs::read(path).unwrap(), reports)
+}
+
+#[test]
+fn a_restored_run_goes_on_bit_for_bit() {
+    let folder = tempfile::tempdir().unwrap();
+    make_set(folder.path());
+    let gpu = gpu();
+    for parts in [&[][..], &[Part::Denoiser, Part::Tonemapper, Part::Structure]] {
+        let config = config(parts);
+        let dataset = Dataset::load(folder.path(), &config.load_options()).unwrap();
+        let new = || Trainer::new(&gpu, config.clone(), &dataset).unwrap();
+        let (expected, all) = finished(&mut new(), folder.path());
+        // Between passes of density control, right behind one, and before the first.
+        for step in [17, 20, 3] {
+            let checkpoint = folder.path().join("checkpoint.safetensors");
+            let mut interrupted = new();
+            advance(&mut interrupted, step);
+            interrupted.save_checkpoint(&checkpoint).unwrap();
+            let mut restored = new();
+            // Whatever the trainer did before is gone.
+            advance(&mut restored, 12);
+            restored.restore(&checkpoint).unwrap();
+            assert_eq!(restored.steps_done(), step);
+            let (end, reports) = finished(&mut restored, folder.path());
+            assert!(end == expected, "{parts:?} from step {step}: another end");
+            let same = reports.iter().zip(&all[step as usize..]);
+            assert!(same.clone().all(|(a, b)| a.terms == b.terms && a.view == b.view));
+            assert_eq!(same.len() as u64, 30 - step);
+        }
+    }
+    assert_no_validation_messages();
+}
+
+#[test]
+fn a_checkpoint_that_does_not_fit_is_refused_and_changes_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    make_set(folder.path());
+    let (gpu, path) = (gpu(), folder.path().join("checkpoint.safetensors"));
+    let config = config(&[]);
+    let dataset = Dataset::load(folder.path(), &config.load_options()).unwrap();
+    let mut trainer = Trainer::new(&gpu, config.clone(), &dataset).unwrap();
+    advance(&mut trainer, 6);
+    trainer.save_checkpoint(&path).unwrap();
+    let whole = fs::read(&path).unwrap();
+    let (before, count) = (trainer.gaussians().unwrap(), trainer.gaussian_count());
+
+    let refuses = |trainer: &mut Trainer, bytes: &[u8], parts: &[&str]| {
+        fs::write(&path, bytes).unwrap();
+        let message = trainer.restore(&path).unwrap_err().to_string();
+        for part in parts.iter().chain(&["checkpoint.safetensors"]) {
+            assert!(message.contains(part), "`{part}` is not in: {message}");
+        }
+    };
+    let edited = |from: &str, to: &str| {
+        assert_eq!(from.len(), to.len());
+        let at = whole.windows(from.len()).position(|window| window == from.as_bytes()).unwrap();
+        [&whole[..at], to.as_bytes(), &whole[at + from.len()..]].concat()
+    };
+    refuses(&mut trainer, &whole[..whole.len() - 5], &["no whole checkpoint"]);
+    refuses(&mut trainer, b"", &["no whole checkpoint"]);
+    refuses(&mut trainer, &edited("checkpoint 1", "checkpoint 9"), &["is no `nightsplat"]);
+    refuses(&mut trainer, &edited("visit_counts", "visit_c0unts"), &["density.visit_counts"]);
+    refuses(&mut trainer, &edited("first_moments", "first_m0ments"), &["gaussians.first_moments"]);
+    refuses(&mut trainer, &edited("seed = 10", "seed = 11"), &["seed = 11, not 10", "--overwrite"]);
+    refuses(&mut trainer, &edited("steps = 30", "stepz = 30"), &["another version"]);
+    let file = SafeTensors::deserialize(&whole).unwrap();
+    let sums = file.tensor("density.grad_norm_sums").unwrap().data();
+    let at = sums.as_ptr() as usize - whole.as_ptr() as usize;
+    let mut spoiled = whole.clone();
+    spoiled[at..at + 4].copy_from_slice(&f32::NAN.to_le_bytes());
+    refuses(&mut trainer, &spoiled, &["not finite"]);
+    assert_eq!((trainer.gaussians().unwrap(), trainer.gaussian_count()), (before, count));
+
+    let shorter = TrainConfig { steps: 5, ..config };
+    let mut shorter = Trainer::new(&gpu, shorter, &dataset).unwrap();
+    refuses(&mut shorter, &whole, &["at step 6", "ends at 5", "--steps"]);
+    assert_no_validation_messages();
+}
+
+fn nightsplat(arguments: &str) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_nightsplat"));
+    command.args(arguments.split_whitespace()).stdout(Stdio::piped()).stderr(Stdio::piped());
+    command
+}
+
+fn succeed(arguments: &str) {
+    let Output { status, stderr, .. } = nightsplat(arguments).output().unwrap();
+    assert!(status.success(), "{arguments}: {}", String::from_utf8_lossy(&stderr));
+}
+
+fn refused(arguments: &str, code: i32, parts: &[&str]) {
+    let Output { status, stderr, .. } = nightsplat(arguments).output().unwrap();
+    let message = String::from_utf8_lossy(&stderr);
+    assert_eq!(status.code(), Some(code), "{arguments}: {message}");
+    for part in parts {
+        assert!(message.contains(part), "`{part}` is not in: {message}");
+    }
+}
+
+/// The log without the column of times.
+fn log(run: &Path) -> Vec<String> {
+    let text = fs::read_to_string(run.join("train.csv")).unwrap();
+    text.lines().map(|line| line.rsplit_once(',').unwrap().0.to_owned()).collect()
+}
+
+#[test]
+fn a_killed_run_is_resumed_to_the_same_model() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    make_set(&path("set"));
+    let set = path("set").display().to_string();
+    let train = |run: &PathBuf, options: &str| {
+        format!("train {set} --out {} --sh-degree 1 --checkpoint-every 10 {options}", run.display())
+    };
+    let (straight, killed) = (path("straight"), path("killed"));
+    succeed(&train(&straight, "--steps 400"));
+
+    // Without a checkpoint it begins; killed at some step behind one, it goes on.
+    let mut child = nightsplat(&train(&killed, "--steps 400 --resume")).spawn().unwrap();
+    let checkpoint = killed.join("checkpoint.safetensors");
+    while !checkpoint.exists() && child.try_wait().unwrap().is_none() {
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    child.kill().unwrap();
+    child.wait().unwrap();
+    assert!(!killed.join("metrics.json").exists(), "the run ended before it was killed");
+    succeed(&train(&killed, "--steps 400 --resume"));
+    let model = |run: &Path| fs::read(run.join("model.ply")).unwrap();
+    assert!(model(&killed) == model(&straight));
+    assert_eq!(log(&killed), log(&straight));
+
+    // A finished run is made longer; what it had written of its end is replaced.
+    succeed(&train(&killed, "--steps 403 --resume"));
+    assert_eq!(log(&killed).len(), 404);
+    assert!(model(&killed) != model(&straight));
+
+    refused(&train(&killed, "--steps 403 --resume --overwrite"), 2, &["--overwrite"]);
+    refused(&train(&killed, "--steps 500 --resume --seed 4"), 1, &["seed = 10, not 4"]);
+    refused(&train(&killed, "--steps 399 --resume"), 1, &["at step 400", "--steps"]);
+    fs::write(killed.join("train.csv"), "step,view\n1,000,1\n").unwrap();
+    refused(&train(&killed, "--steps 500 --resume"), 1, &["train.csv", "step 400"]);
+    fs::remove_file(&checkpoint).unwrap();
+    refused(&train(&killed, "--steps 500 --resume"), 1, &["already holds a run", "--overwrite"]);
+}
