@@ -320,6 +320,9 @@ fn ablate_trains_every_model_and_leaves_a_page() {
     let again = nightsplat(&format!("ablate {set} --out {at} {SMALL}"));
     let stderr = String::from_utf8_lossy(&again.stderr);
     assert!(!again.status.success() && stderr.contains("--overwrite"), "{stderr}");
+    let picked = nightsplat(&format!("ablate {set} --out {at} --overwrite --model lita"));
+    let stderr = String::from_utf8_lossy(&picked.stderr);
+    assert!(picked.status.code() == Some(2) && stderr.contains("leave out --model"), "{stderr}");
 }
 
 #[test]

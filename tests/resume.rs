@@ -163,10 +163,10 @@ fn a_killed_run_is_resumed_to_the_same_model() {
         format!("train {set} --out {} --sh-degree 1 --checkpoint-every 10 {options}", run.display())
     };
     let (straight, killed) = (path("straight"), path("killed"));
-    succeed(&train(&straight, "--steps 400"));
+    succeed(&train(&straight, "--steps 200"));
 
     // Without a checkpoint it begins; killed at some step behind one, it goes on.
-    let mut child = nightsplat(&train(&killed, "--steps 400 --resume")).spawn().unwrap();
+    let mut child = nightsplat(&train(&killed, "--steps 200 --resume")).spawn().unwrap();
     let checkpoint = killed.join("checkpoint.safetensors");
     while !checkpoint.exists() && child.try_wait().unwrap().is_none() {
         std::thread::sleep(Duration::from_millis(2));
@@ -174,21 +174,21 @@ fn a_killed_run_is_resumed_to_the_same_model() {
     child.kill().unwrap();
     child.wait().unwrap();
     assert!(!killed.join("metrics.json").exists(), "the run ended before it was killed");
-    succeed(&train(&killed, "--steps 400 --resume"));
+    succeed(&train(&killed, "--steps 200 --resume"));
     let model = |run: &Path| fs::read(run.join("model.ply")).unwrap();
     assert!(model(&killed) == model(&straight));
     assert_eq!(log(&killed), log(&straight));
 
     // A finished run is made longer; what it had written of its end is replaced.
-    succeed(&train(&killed, "--steps 403 --resume"));
-    assert_eq!(log(&killed).len(), 404);
+    succeed(&train(&killed, "--steps 203 --resume"));
+    assert_eq!(log(&killed).len(), 204);
     assert!(model(&killed) != model(&straight));
 
-    refused(&train(&killed, "--steps 403 --resume --overwrite"), 2, &["--overwrite"]);
-    refused(&train(&killed, "--steps 500 --resume --seed 4"), 1, &["seed = 10, not 4"]);
-    refused(&train(&killed, "--steps 399 --resume"), 1, &["at step 400", "--steps"]);
+    refused(&train(&killed, "--steps 203 --resume --overwrite"), 2, &["--overwrite"]);
+    refused(&train(&killed, "--steps 300 --resume --seed 4"), 1, &["seed = 10, not 4"]);
+    refused(&train(&killed, "--steps 199 --resume"), 1, &["at step 200", "--steps"]);
     fs::write(killed.join("train.csv"), "step,view\n1,000,1\n").unwrap();
-    refused(&train(&killed, "--steps 500 --resume"), 1, &["train.csv", "step 400"]);
+    refused(&train(&killed, "--steps 300 --resume"), 1, &["train.csv", "step 200"]);
     fs::remove_file(&checkpoint).unwrap();
-    refused(&train(&killed, "--steps 500 --resume"), 1, &["already holds a run", "--overwrite"]);
+    refused(&train(&killed, "--steps 300 --resume"), 1, &["already holds a run", "--overwrite"]);
 }

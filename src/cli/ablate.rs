@@ -46,8 +46,12 @@ struct Model {
 /// Trains every model and writes the page.
 ///
 /// # Errors
-/// The dataset or a setting is not usable, a run is there already, or a file cannot be written.
+/// A setting picks parts or is not usable, the dataset is not, a run is there already, or a file cannot be written.
 pub fn run(args: &AblateArgs) -> Result<()> {
+    if args.options.picks_parts() {
+        let problem = "ablate trains every part by itself; leave out --model and --parts (lita's L1 alone is --ssim-weight 0)";
+        return Err(Error::Usage(problem.to_owned()).into());
+    }
     let mut config = args.options.config(args.dataset.clone())?;
     // Whether there are depth maps is for the dataset to say.
     config.model.depth = true;

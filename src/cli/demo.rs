@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Result;
 
 use super::comparison::{self, Run};
+use super::tone::Mapper;
 use super::{table, train};
 use crate::Error;
 use crate::dataset::Dataset;
@@ -14,7 +15,7 @@ use crate::eval::{self, ViewScore};
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::optimizer::Schedule;
 use crate::output::write_whole;
-use crate::report::{Report, plot};
+use crate::report::{Distribution, Report, distributions, plot};
 use crate::tone::{ToneCurve, ToneSettings};
 use crate::train::TrainConfig;
 
@@ -58,7 +59,8 @@ pub fn run(args: &DemoArgs) -> Result<()> {
     }
     let dark = dark_scores(&dataset)?;
     let page = args.out.join("index.html");
-    write_whole(&page, report(&gpu, &dataset, &dark, &runs).html().as_bytes())?;
+    let luminances = luminances(&gpu, &dataset)?;
+    write_whole(&page, report(&gpu, &dataset, &dark, &runs, luminances).html().as_bytes())?;
     let mut out = std::io::stdout().lock();
     let table = table::of(&comparison::score_table("target", &dark, &runs));
     write!(out, "{table}\n{}\n", page.display())?;
@@ -125,7 +127,37 @@ fn title(curve: ToneCurve) -> String {
 // ---------------------------------------------------------------------------
 // The page
 
-fn report(gpu: &Gpu, dataset: &Dataset, dark: &[ViewScore], runs: &[Run]) -> Report {
+/// How the luminance of the photographs with a reference image is distributed, before and after each curve.
+fn luminances(gpu: &Gpu, dataset: &Dataset) -> crate::Result<String> {
+    let pairs: Vec<_> =
+        dataset.views.iter().filter_map(|v| v.image.as_ref().zip(v.reference.as_ref())).collect();
+    let mut photographs = Distribution::new("photograph");
+    let mut references = Distribution::new("reference");
+    for (photograph, reference) in &pairs {
+        photographs.add(&photograph.data);
+        references.add(&reference.data);
+    }
+    let mut drawn = vec![photographs];
+    for curve in CURVES {
+        let mut mapper = Mapper::new(gpu, &ToneSettings::new(curve))?;
+        let mut targets = Distribution::new(title(curve));
+        for (photograph, _) in &pairs {
+            mapper.statistics(&photograph.data)?;
+            targets.add(&mapper.map(photograph)?.data);
+        }
+        drawn.push(targets);
+    }
+    drawn.push(references);
+    Ok(distributions(&drawn))
+}
+
+fn report(
+    gpu: &Gpu,
+    dataset: &Dataset,
+    dark: &[ViewScore],
+    runs: &[Run],
+    luminances: String,
+) -> Report {
     let train_views = dataset.train_views().count();
     let size = dataset.views.first().map_or([0; 2], |view| [view.camera.width, view.camera.height]);
     let test_views = dataset.test_views().filter(|view| view.reference.is_some());
@@ -143,7 +175,7 @@ fn report(gpu: &Gpu, dataset: &Dataset, dark: &[ViewScore], runs: &[Run]) -> Rep
             format!("{STEPS} steps each, on {}.", gpu.properties().name),
         ],
         tables: vec![comparison::score_table("target", dark, runs)],
-        plots: vec![plot("step", "loss", &comparison::loss_series(runs, train_views))],
+        plots: vec![plot("step", "loss", &comparison::loss_series(runs, train_views)), luminances],
         comparisons: test_views.map(|view| comparison::of_view(view, dark, runs)).collect(),
     }
 }

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
-use self::mapper::Mapper;
+pub(super) use self::mapper::Mapper;
 use self::page::Page;
 use self::photographs::{Listed, listed};
 use super::{ImageFormat, progress_bar, table};

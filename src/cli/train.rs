@@ -163,6 +163,11 @@ fn set<T: Clone>(value: &mut T, option: &Option<T>) {
 }
 
 impl TrainOptions {
+    /// Whether the command line says which parts the model has.
+    pub(crate) fn picks_parts(&self) -> bool {
+        self.model.model.is_some() || self.model.parts.is_some()
+    }
+
     /// The configuration: defaults, then the file, then preset and model, then the other options.
     pub(crate) fn config(&self, dataset: PathBuf) -> crate::Result<TrainConfig> {
         let mut config =

@@ -8,7 +8,7 @@ use crate::pseudo_gt::PseudoGt;
 use crate::tone::{Statistics, ToneSettings};
 
 /// Measures and maps photographs.
-pub(super) struct Mapper {
+pub(in crate::cli) struct Mapper {
     gpu: Gpu,
     pseudo_gt: PseudoGt,
     parameters: Buffer<ToneParameters>,
@@ -18,7 +18,7 @@ pub(super) struct Mapper {
 }
 
 impl Mapper {
-    pub(super) fn new(gpu: &Gpu, settings: &ToneSettings) -> Result<Self> {
+    pub(in crate::cli) fn new(gpu: &Gpu, settings: &ToneSettings) -> Result<Self> {
         let bytes_per_pixel = 3 * size_of::<f32>() as u64;
         Ok(Self {
             gpu: gpu.clone(),
@@ -30,12 +30,12 @@ impl Mapper {
     }
 
     /// From now on every photograph gets the curve of these statistics.
-    pub(super) fn set_scene(&mut self, statistics: &Statistics) {
+    pub(in crate::cli) fn set_scene(&mut self, statistics: &Statistics) {
         self.scene = Some(self.pseudo_gt.settings().parameters(statistics));
     }
 
     /// The statistics of planes (3, pixels); what is mapped next gets the curve they give.
-    pub(super) fn statistics(&mut self, planes: &[f32]) -> Result<Statistics> {
+    pub(in crate::cli) fn statistics(&mut self, planes: &[f32]) -> Result<Statistics> {
         let tiles = self.tiles(planes)?;
         let tiles: Vec<&Buffer<f32>> = tiles.iter().collect();
         self.gpu.run("tone statistics", |pass| {
@@ -48,7 +48,7 @@ impl Mapper {
     }
 
     /// The photograph under the curve that the last statistics gave.
-    pub(super) fn map(&self, photograph: &Image) -> Result<Image> {
+    pub(in crate::cli) fn map(&self, photograph: &Image) -> Result<Image> {
         let pixels = photograph.pixel_count();
         let mut mapped = photograph.clone();
         let mut first = 0;
