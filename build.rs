@@ -72,6 +72,9 @@ fn kernel_paths(dir: &Path) -> Vec<PathBuf> {
 // ---------------------------------------------------------------------------
 // GLSL to SPIR-V
 
+/// Defined for `reflected`: a kernel can hide from the reflection what that does not understand.
+const REFLECTION: &str = "REFLECTION";
+
 /// One kernel's SPIR-V: `reflected` is unoptimised, so that every name survives; `shipped` is what the device runs.
 struct Spirv {
     reflected: Vec<u32>,
@@ -94,7 +97,7 @@ mod compiler {
         Target, VulkanVersion,
     };
 
-    use super::Spirv;
+    use super::{REFLECTION, Spirv};
 
     struct Includes;
 
@@ -119,15 +122,18 @@ mod compiler {
             },
             ..Default::default()
         };
+        let hides = source.contains(REFLECTION);
         let source = ShaderSource::from(source.to_owned());
-        let defines: Option<&[(&str, Option<&str>)]> = None;
-        let mut includes = Includes;
-        let words =
+        let build = |defines: Option<&[(&str, Option<&str>)]>| {
+            let mut includes = Includes;
             ShaderInput::new(&source, ShaderStage::Compute, &options, defines, Some(&mut includes))
                 .and_then(|input| Shader::new(compiler, input).parse())
                 .and_then(|shader| shader.compile())
-                .unwrap_or_else(|error| panic!("{}: {error}", path.display()));
-        Spirv { reflected: words.clone(), shipped: words }
+                .unwrap_or_else(|error| panic!("{}: {error}", path.display()))
+        };
+        let shipped = build(None);
+        let reflected = if hides { build(Some(&[(REFLECTION, None)])) } else { shipped.clone() };
+        Spirv { reflected, shipped }
     }
 }
 
@@ -140,7 +146,7 @@ mod compiler {
         SpirvVersion, TargetEnv,
     };
 
-    use super::Spirv;
+    use super::{REFLECTION, Spirv};
 
     pub(super) fn compile(path: &Path, source: &str) -> Spirv {
         let compiler = Compiler::new().expect("shaderc starts");
@@ -149,6 +155,9 @@ mod compiler {
             options.set_target_env(TargetEnv::Vulkan, EnvVersion::Vulkan1_3 as u32);
             options.set_target_spirv(SpirvVersion::V1_5);
             options.set_optimization_level(level);
+            if level == OptimizationLevel::Zero {
+                options.add_macro_definition(REFLECTION, None);
+            }
             options.set_include_callback(|name, _, _, _| {
                 let (resolved_name, content) =
                     super::include(name).ok_or_else(|| format!("{name} is not in include/"))?;

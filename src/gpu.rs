@@ -8,6 +8,7 @@
 //! - a borrowed device ([`Gpu::from_host`]) keeps everything that it had: we destroy what we created and nothing else.
 
 mod buffer;
+mod cooperative;
 mod device;
 mod kernel;
 mod pipeline;
@@ -24,6 +25,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use ash::{ext, khr, vk};
 
 pub use buffer::{Buffer, Download};
+pub use cooperative::CooperativeMatrix;
 pub use device::{DeviceChoice, DeviceReport, HostDevice, RequirementReport, devices};
 pub use kernel::{Binding, Kernel, Reference};
 pub use pipeline::Pipeline;
@@ -58,6 +60,8 @@ pub struct Properties {
     pub timestamp_period: f32,
     /// The device is a processor (lavapipe and the like).
     pub is_cpu: bool,
+    /// Products of 16-bit matrices; none where the device does not offer them or a host lends it.
+    pub cooperative_matrix: Option<CooperativeMatrix>,
 }
 
 /// Everything that buffers, pipelines and submissions need to outlive their [`Gpu`].

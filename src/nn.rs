@@ -18,6 +18,7 @@ use glam::UVec2;
 use crate::gpu::{Buffer, Gpu};
 use crate::{Error, Result};
 
+pub use conv::Precision;
 pub use denoiser::{Denoiser, DenoiserSettings};
 pub use file::{load, save};
 pub use parameters::{Parameters, Tensor};

@@ -17,6 +17,7 @@ mod ciconv_normalize;
 mod ciconv_rows;
 mod compensated_sum;
 pub mod conv3x3;
+mod conv3x3_half;
 pub mod conv3x3_weight_gradient;
 pub mod curves;
 mod denoising;

@@ -6,7 +6,7 @@ use anyhow::Result;
 use serde::Serialize;
 
 use crate::Error;
-use crate::gpu::{DeviceReport, devices};
+use crate::gpu::{CooperativeMatrix, DeviceReport, devices};
 
 /// List the Vulkan devices, what training requires, and whether each device offers it.
 #[derive(Clone, Copy, Debug, clap::Args)]
@@ -54,7 +54,8 @@ fn chosen(devices: &[DeviceReport]) -> Option<usize> {
 fn table(devices: &[DeviceReport], chosen: Option<usize>) -> String {
     let mut text = String::new();
     for (index, device) in devices.iter().enumerate() {
-        let DeviceReport { name, kind, api_version, subgroup_size, memory, requirements } = device;
+        let DeviceReport { name, kind, api_version, subgroup_size, memory, .. } = device;
+        let requirements = &device.requirements;
         let gib = *memory as f64 / f64::from(1 << 30);
         text += &format!(
             "{index}  {name}\n   {kind}, Vulkan {api_version}, subgroups of {subgroup_size}, {gib:.1} GiB\n"
@@ -65,6 +66,13 @@ fn table(devices: &[DeviceReport], chosen: Option<usize>) -> String {
             let met = if requirement.met { "yes" } else { "no" };
             text += &format!("   {met:3}  {:width$}  {}\n", requirement.name, requirement.why);
         }
+        // An option, not a requirement.
+        text += &match device.cooperative_matrix {
+            Some(CooperativeMatrix { m, n, k }) => {
+                format!("   also {m}x{n}x{k} matrices of 16 bits, for --denoiser-precision half\n")
+            }
+            None => "   no 16-bit matrices: --denoiser-precision half is single\n".to_owned(),
+        };
         text += "\n";
     }
     match chosen {
@@ -86,6 +94,7 @@ mod tests {
             api_version: "1.3.0".to_owned(),
             subgroup_size: 32,
             memory: 3 << 29,
+            cooperative_matrix: is_recent.then_some(CooperativeMatrix { m: 8, n: 16, k: 32 }),
             requirements: vec![requirement("Vulkan 1.3", true), requirement("shiny", is_recent)],
         }
     }
@@ -101,6 +110,7 @@ mod tests {
         assert!(
             table.contains("   yes  Vulkan 1.3  it is needed\n   no   shiny       it is needed\n")
         );
+        assert!(table.contains("also 8x16x32 matrices") && table.contains("no 16-bit matrices"));
         assert!(table.ends_with("device 1 is used unless --device picks another"));
     }
 

@@ -11,6 +11,7 @@ use crate::dataset::Dataset;
 use crate::eval::{self, ViewScore};
 use crate::export::{self, RunDirectory};
 use crate::gpu::{DeviceChoice, Gpu};
+use crate::nn::Precision;
 use crate::tone::CurveChoice;
 use crate::train::{Background, ModelName, Part, Preset, TrainConfig, Trainer};
 
@@ -115,6 +116,9 @@ pub(crate) struct ModelOptions {
     /// Repeats of the inner convolution in a stage [default: 6]
     #[arg(long, value_name = "N")]
     denoiser_repeats: Option<u32>,
+    /// single, or half: 16-bit factors in the inner convolution where the device has matrices of them [default: single]
+    #[arg(long, value_name = "P")]
+    denoiser_precision: Option<Precision>,
     /// A folder of depth maps, `NAME.*` or `depth_NAME.*`, larger is farther [default: `depth/` or `depth_maps/` of the dataset]
     #[arg(long, value_name = "DIR")]
     depth: Option<PathBuf>,
@@ -147,6 +151,7 @@ impl ModelOptions {
         set(&mut model.network.channels, &self.denoiser_channels);
         set(&mut model.network.stages, &self.denoiser_stages);
         set(&mut model.network.repeats, &self.denoiser_repeats);
+        set(&mut model.network.precision, &self.denoiser_precision);
         set(&mut model.raw_colors, &self.raw_colors);
         if self.depth.is_some() {
             model.depth_folder.clone_from(&self.depth);

@@ -10,6 +10,7 @@ use ash::vk::Handle as _;
 use ash::{ext, khr, vk};
 use gpu_allocator::vulkan::{Allocator, AllocatorCreateDesc};
 
+use super::cooperative::{self, CooperativeMatrix};
 use super::requirements::{EXTENSIONS, Offered, required_device_features};
 use super::{Gpu, Properties, Queue, REQUIREMENTS, Shared, lock, validation};
 use crate::{Error, Result};
@@ -56,6 +57,8 @@ pub struct DeviceReport {
     pub subgroup_size: u32,
     /// Bytes of device-local memory.
     pub memory: u64,
+    /// The matrices that `--denoiser-precision half` builds on, where the device offers any.
+    pub cooperative_matrix: Option<CooperativeMatrix>,
     /// Every requirement, in the order of [`REQUIREMENTS`].
     pub requirements: Vec<RequirementReport>,
 }
@@ -106,7 +109,7 @@ pub(super) struct Owned {
     messages: Box<validation::Messages>,
     cache_path: Option<PathBuf>,
     /// Last, because the instance's functions live in the library.
-    _entry: ash::Entry,
+    entry: ash::Entry,
 }
 
 impl Owned {
@@ -148,9 +151,8 @@ impl Owned {
 /// There is no Vulkan loader, or no device at all.
 pub fn devices() -> Result<Vec<DeviceReport>> {
     let owned = instance(false)?;
-    let reports = physical_devices(&owned.instance).and_then(|all| {
-        all.into_iter().map(|physical| report(&owned.instance, physical)).collect()
-    });
+    let reports = physical_devices(&owned.instance)
+        .and_then(|all| all.into_iter().map(|physical| report(&owned, physical)).collect());
     // SAFETY: no device was created from the instance.
     unsafe { owned.destroy() };
     reports
@@ -182,13 +184,19 @@ impl Gpu {
         let mut owned = instance(validate)?;
         let opened = choose(&owned.instance, choice).and_then(|(physical, offered)| {
             owned.cache_path = cache_path(&offered);
-            create_device(&owned.instance, physical, &offered)
-                .map(|(device, queue)| (physical, offered, device, queue))
+            let matrix = cooperative::offered(&owned.entry, &owned.instance, physical, &offered);
+            create_device(&owned.instance, physical, &offered, matrix.is_some()).map(
+                |(device, queue)| {
+                    let mut properties = properties(&owned.instance, physical, &offered);
+                    properties.cooperative_matrix = matrix;
+                    (physical, properties, device, queue)
+                },
+            )
         });
         match opened {
-            Ok((physical, offered, device, queue)) => {
+            Ok((physical, properties, device, queue)) => {
                 let instance = owned.instance.clone();
-                Self::assemble(&instance, physical, &offered, device, queue, Some(owned))
+                Self::assemble(&instance, physical, properties, device, queue, Some(owned))
             }
             Err(error) => {
                 // SAFETY: no device was created from the instance.
@@ -229,18 +237,18 @@ impl Gpu {
         offered.check()?;
         let queue =
             Queue { raw: vk::Queue::from_raw(host.queue), family: host.queue_family, submitted: 0 };
-        Self::assemble(&instance, physical, &offered, device, queue, None)
+        let properties = properties(&instance, physical, &offered);
+        Self::assemble(&instance, physical, properties, device, queue, None)
     }
 
     fn assemble(
         instance: &ash::Instance,
         physical: vk::PhysicalDevice,
-        offered: &Offered,
+        properties: Properties,
         device: ash::Device,
         queue: Queue,
         owned: Option<Owned>,
     ) -> Result<Self> {
-        let properties = properties(instance, physical, offered);
         let name = properties.name.clone();
         let fail = |call| move |result| Error::Vulkan { call, device: name.clone(), result };
         let allocator = Allocator::new(&AllocatorCreateDesc {
@@ -351,7 +359,7 @@ fn instance(validate: bool) -> Result<Owned> {
             })
             .transpose()
             .map_err(loader_error)?;
-        Ok(Owned { instance, messenger, messages, cache_path: None, _entry: entry })
+        Ok(Owned { instance, messenger, messages, cache_path: None, entry })
     }
 }
 
@@ -415,7 +423,10 @@ fn choose(
     Ok((physical, offered))
 }
 
-fn report(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Result<DeviceReport> {
+fn report(
+    Owned { instance, entry, .. }: &Owned,
+    physical: vk::PhysicalDevice,
+) -> Result<DeviceReport> {
     let offered = Offered::gather(instance, physical).map_err(loader_error)?;
     // SAFETY: the handle was just enumerated.
     let memory = unsafe { instance.get_physical_device_memory_properties(physical) };
@@ -442,6 +453,7 @@ fn report(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Result<Devi
             .filter(|heap| heap.flags.contains(vk::MemoryHeapFlags::DEVICE_LOCAL))
             .map(|heap| heap.size)
             .sum(),
+        cooperative_matrix: cooperative::offered(entry, instance, physical, &offered),
         requirements: REQUIREMENTS
             .iter()
             .map(|r| RequirementReport { name: r.name, why: r.why, met: r.met_by(&offered) })
@@ -477,6 +489,7 @@ fn properties(
             .min(limits.max_compute_work_group_count[1]),
         timestamp_period: limits.timestamp_period,
         is_cpu: offered.properties.device_type == vk::PhysicalDeviceType::CPU,
+        cooperative_matrix: None,
     }
 }
 
@@ -484,19 +497,25 @@ fn create_device(
     instance: &ash::Instance,
     physical: vk::PhysicalDevice,
     offered: &Offered,
+    with_cooperative_matrices: bool,
 ) -> Result<(ash::Device, Queue)> {
     let family = offered.compute_family.unwrap_or_default();
     let priorities = [1.0];
     let queues = [vk::DeviceQueueCreateInfo::default()
         .queue_family_index(family)
         .queue_priorities(&priorities)];
-    let extensions: Vec<_> = EXTENSIONS.iter().map(|name| name.as_ptr()).collect();
+    let mut extensions: Vec<_> = EXTENSIONS.iter().map(|name| name.as_ptr()).collect();
     let (mut vulkan12, mut vulkan13) = required_device_features();
-    let info = vk::DeviceCreateInfo::default()
-        .queue_create_infos(&queues)
-        .enabled_extension_names(&extensions)
-        .push_next(&mut vulkan12)
-        .push_next(&mut vulkan13);
+    let mut matrices =
+        vk::PhysicalDeviceCooperativeMatrixFeaturesKHR::default().cooperative_matrix(true);
+    let mut info = vk::DeviceCreateInfo::default().queue_create_infos(&queues);
+    if with_cooperative_matrices {
+        extensions.push(cooperative::EXTENSION.as_ptr());
+        vulkan12 = vulkan12.shader_float16(true).vulkan_memory_model(true);
+        info = info.push_next(&mut matrices);
+    }
+    let info =
+        info.enabled_extension_names(&extensions).push_next(&mut vulkan12).push_next(&mut vulkan13);
     let device = offered.device_name();
     // SAFETY: `info` points at live locals; the requirements were checked.
     unsafe {

@@ -1,14 +1,19 @@
 //! A 3x3 convolution: its kernels, forward and backward.
 
 use glam::UVec2;
+use serde::{Deserialize, Serialize};
 
 use super::conv_shape;
-use crate::Result;
-use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
-use crate::kernels::{conv3x3, conv3x3_weight_gradient, reduce_strips};
+use crate::gpu::{Buffer, CooperativeMatrix, Gpu, Pipeline, Recorder, Threads};
+use crate::kernels::{conv3x3, conv3x3_half, conv3x3_weight_gradient, reduce_strips};
+use crate::{Error, Result};
 
 /// The most output channels that one subgroup takes.
 const OUT_BLOCK: u32 = 8;
+
+/// The most matrices of output channels, and the rows of pixels, that one subgroup takes: sixteen sums in registers.
+const HALF_BLOCKS: u32 = 4;
+const HALF_ROWS: u32 = 4;
 
 /// Rows whose pixels make one partial sum of the gradient of the weights.
 const STRIP_ROWS: u32 = 16;
@@ -21,15 +26,37 @@ pub(super) enum Activation {
     Sigmoid = 2,
 }
 
+/// How precise the factors of a convolution are; its sums are in single precision.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Precision {
+    /// 32 bits.
+    #[default]
+    Single,
+    /// 16 bits, by cooperative matrices, where the device offers them, else as `Single`; the gradients of weights stay
+    /// at 32 bits.
+    Half,
+}
+
+impl std::str::FromStr for Precision {
+    type Err = Error;
+
+    fn from_str(name: &str) -> Result<Self> {
+        match name {
+            "single" => Ok(Self::Single),
+            "half" => Ok(Self::Half),
+            _ => Err(Error::Usage(format!("unknown precision `{name}`; single or half"))),
+        }
+    }
+}
+
 /// A convolution's kernels; its weights lie at an offset of the network's parameters.
 #[derive(Debug)]
 pub(super) struct Conv {
     inputs: u32,
     outputs: u32,
-    shape: [u32; 2],
-    subgroup_size: u32,
-    forward: Pipeline<conv3x3::Kernel>,
-    data_gradient: Pipeline<conv3x3::Kernel>,
+    forward: Product,
+    data_gradient: Product,
     weight_gradient: Pipeline<conv3x3_weight_gradient::Kernel>,
     reduce: Pipeline<reduce_strips::Kernel>,
 }
@@ -51,23 +78,10 @@ impl Conv {
         [inputs, outputs]: [u32; 2],
         activation: Activation,
         adds: bool,
+        precision: Precision,
     ) -> Result<Self> {
-        let [columns, rows] = conv_shape(gpu);
-        let forward = conv3x3::Constants {
-            columns,
-            rows,
-            out_block: outputs.min(OUT_BLOCK),
-            activation: activation as u32,
-            transposed: false,
-            accumulate: false,
-        };
-        let backward = conv3x3::Constants {
-            out_block: inputs.min(OUT_BLOCK),
-            activation: Activation::None as u32,
-            transposed: true,
-            accumulate: adds,
-            ..forward
-        };
+        let forward = Form { activation, transposed: false, accumulate: false };
+        let backward = Form { activation: Activation::None, transposed: true, accumulate: adds };
         let weights = conv3x3_weight_gradient::Constants {
             rows: STRIP_ROWS,
             out_block: outputs.min(OUT_BLOCK),
@@ -75,10 +89,8 @@ impl Conv {
         Ok(Self {
             inputs,
             outputs,
-            shape: [columns, rows],
-            subgroup_size: gpu.properties().subgroup_size,
-            forward: gpu.pipeline(&forward)?,
-            data_gradient: gpu.pipeline(&backward)?,
+            forward: Product::new(gpu, outputs, forward, precision)?,
+            data_gradient: Product::new(gpu, inputs, backward, precision)?,
             weight_gradient: gpu.pipeline(&weights)?,
             reduce: gpu.pipeline(&reduce_strips::Constants::default())?,
         })
@@ -94,13 +106,8 @@ impl Conv {
         source: &Buffer<f32>,
         target: &mut Buffer<f32>,
     ) -> Result<()> {
-        let (in_channels, out_channels) = (self.inputs, self.outputs);
-        pass.dispatch(
-            &self.forward,
-            &conv3x3::Params { size, in_channels, out_channels, offset },
-            conv3x3::Buffers { values, source, target },
-            self.tiles(size, out_channels),
-        )
+        let channels = [self.inputs, self.outputs];
+        self.forward.record(pass, size, channels, offset, values, source, target)
     }
 
     /// Writes or adds the gradient of the input, given that of the output before the activation.
@@ -113,13 +120,8 @@ impl Conv {
         d_target: &Buffer<f32>,
         d_source: &mut Buffer<f32>,
     ) -> Result<()> {
-        let (in_channels, out_channels) = (self.outputs, self.inputs);
-        pass.dispatch(
-            &self.data_gradient,
-            &conv3x3::Params { size, in_channels, out_channels, offset },
-            conv3x3::Buffers { values, source: d_target, target: d_source },
-            self.tiles(size, out_channels),
-        )
+        let channels = [self.outputs, self.inputs];
+        self.data_gradient.record(pass, size, channels, offset, values, d_target, d_source)
     }
 
     /// Adds the gradients of weights and biases; `partials` holds [`partial_count`] values.
@@ -151,13 +153,83 @@ impl Conv {
             Threads::Exactly([parameter_count, 1, 1]),
         )
     }
+}
 
-    /// The workgroups of `conv3x3`.
-    fn tiles(&self, size: UVec2, out_channels: u32) -> Threads<'static> {
-        let [columns, rows] = self.shape;
-        let blocks = out_channels.div_ceil(out_channels.min(OUT_BLOCK));
-        let across = size.x.div_ceil(columns * self.subgroup_size);
-        Threads::Workgroups([blocks, across, size.y.div_ceil(rows)])
+/// What a product is for.
+#[derive(Clone, Copy, Debug)]
+struct Form {
+    activation: Activation,
+    transposed: bool,
+    accumulate: bool,
+}
+
+/// A kernel that convolves, and the pixels and channels that a subgroup takes.
+#[derive(Debug)]
+enum Product {
+    Single { pipeline: Pipeline<conv3x3::Kernel>, columns: u32, rows: u32, channels: u32 },
+    Half { pipeline: Pipeline<conv3x3_half::Kernel>, columns: u32, rows: u32, channels: u32 },
+}
+
+impl Product {
+    fn new(gpu: &Gpu, outputs: u32, form: Form, precision: Precision) -> Result<Self> {
+        let Form { activation, transposed, accumulate } = form;
+        let matrix = gpu.properties().cooperative_matrix;
+        let matrix =
+            matrix.filter(|_| precision == Precision::Half && activation == Activation::None);
+        if let Some(CooperativeMatrix { m, n, k }) = matrix {
+            let (blocks, rows) = (outputs.div_ceil(m).min(HALF_BLOCKS), HALF_ROWS);
+            let constants =
+                conv3x3_half::Constants { m, n, k, blocks, rows, transposed, accumulate };
+            let pipeline = gpu.pipeline(&constants)?;
+            return Ok(Self::Half { pipeline, columns: n, rows, channels: blocks * m });
+        }
+        let [columns, rows] = conv_shape(gpu);
+        let channels = outputs.min(OUT_BLOCK);
+        let activation = activation as u32;
+        let constants = conv3x3::Constants {
+            columns,
+            rows,
+            out_block: channels,
+            activation,
+            transposed,
+            accumulate,
+        };
+        let columns = columns * gpu.properties().subgroup_size;
+        Ok(Self::Single { pipeline: gpu.pipeline(&constants)?, columns, rows, channels })
+    }
+
+    #[expect(clippy::too_many_arguments, reason = "a layer, its place and its images")]
+    fn record(
+        &self,
+        pass: &mut Recorder<'_>,
+        size: UVec2,
+        [in_channels, out_channels]: [u32; 2],
+        offset: u32,
+        values: &Buffer<f32>,
+        source: &Buffer<f32>,
+        target: &mut Buffer<f32>,
+    ) -> Result<()> {
+        let (Self::Single { columns, rows, channels, .. }
+        | Self::Half { columns, rows, channels, .. }) = *self;
+        let threads = Threads::Workgroups([
+            out_channels.div_ceil(channels),
+            size.x.div_ceil(columns),
+            size.y.div_ceil(rows),
+        ]);
+        match self {
+            Self::Single { pipeline, .. } => pass.dispatch(
+                pipeline,
+                &conv3x3::Params { size, in_channels, out_channels, offset },
+                conv3x3::Buffers { values, source, target },
+                threads,
+            ),
+            Self::Half { pipeline, .. } => pass.dispatch(
+                pipeline,
+                &conv3x3_half::Params { size, in_channels, out_channels, offset },
+                conv3x3_half::Buffers { values, source, target },
+                threads,
+            ),
+        }
     }
 }
 

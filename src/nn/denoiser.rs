@@ -12,11 +12,11 @@
 use glam::UVec2;
 use serde::{Deserialize, Serialize};
 
-use super::conv::{Activation, Conv, Seen, partial_count};
+use super::conv::{Activation, Conv, Precision, Seen, partial_count};
 use super::norm::{Backward, Forward, Norm, NormMemory, Use};
 use super::parameters::{Layout, Parameters};
 use super::{RGB, check_binding, check_images, float_bytes, out_of_turn, pixel_count};
-use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
+use crate::gpu::{Buffer, Gpu, Pipeline, Properties, Recorder, Threads};
 use crate::kernels::{relu_backward, residual, residual_backward};
 use crate::random::Stream;
 use crate::{Error, Result};
@@ -34,11 +34,13 @@ pub struct DenoiserSettings {
     pub repeats: u32,
     /// Feature maps.
     pub channels: u32,
+    /// Of the inner convolution.
+    pub precision: Precision,
 }
 
 impl Default for DenoiserSettings {
     fn default() -> Self {
-        Self { stages: 3, repeats: 6, channels: 64 }
+        Self { stages: 3, repeats: 6, channels: 64, precision: Precision::Single }
     }
 }
 
@@ -148,7 +150,7 @@ impl Denoiser {
             settings,
             parameters: layout.upload(gpu, serde_json::json!(settings).to_string())?,
             stages,
-            kernels: Kernels::new(gpu, channels)?,
+            kernels: Kernels::new(gpu, settings)?,
             reserved,
             memory: Memory::new(gpu, settings, reserved)?,
             recorded: None,
@@ -334,12 +336,18 @@ struct Ends<'a> {
 }
 
 impl Kernels {
-    fn new(gpu: &Gpu, channels: u32) -> Result<Self> {
+    fn new(gpu: &Gpu, settings: DenoiserSettings) -> Result<Self> {
+        let DenoiserSettings { channels, precision, .. } = settings;
+        let Properties { name, cooperative_matrix, .. } = gpu.properties();
+        if precision == Precision::Half && cooperative_matrix.is_none() {
+            tracing::warn!("{name} offers no 16-bit matrices: the denoiser is in single precision");
+        }
+        let ends = Precision::Single;
         Ok(Self {
             channels,
-            conv_in: Conv::new(gpu, [RGB, channels], Activation::Relu, true)?,
-            conv: Conv::new(gpu, [channels, channels], Activation::None, true)?,
-            conv_out: Conv::new(gpu, [channels, RGB], Activation::Sigmoid, false)?,
+            conv_in: Conv::new(gpu, [RGB, channels], Activation::Relu, true, ends)?,
+            conv: Conv::new(gpu, [channels, channels], Activation::None, true, precision)?,
+            conv_out: Conv::new(gpu, [channels, RGB], Activation::Sigmoid, false, ends)?,
             norm: Norm::new(gpu, channels)?,
             relu_backward: gpu.pipeline(&relu_backward::Constants::default())?,
             residual: gpu.pipeline(&residual::Constants::default())?,

@@ -2,7 +2,7 @@
 
 use glam::UVec2;
 
-use super::conv::{Activation, Conv, Seen, partial_count};
+use super::conv::{Activation, Conv, Precision, Seen, partial_count};
 use super::parameters::{Layout, Parameters};
 use super::{RGB, check_binding, check_images, out_of_turn, pixel_count};
 use crate::Result;
@@ -65,9 +65,9 @@ impl Tonemapper {
             parameters: layout.upload(gpu, "{}".to_owned())?,
             offsets,
             convs: [
-                Conv::new(gpu, [RGB, CHANNELS], Activation::Relu, false)?,
-                Conv::new(gpu, [CHANNELS, CHANNELS], Activation::Relu, false)?,
-                Conv::new(gpu, [CHANNELS, RGB], Activation::None, false)?,
+                Conv::new(gpu, [RGB, CHANNELS], Activation::Relu, false, Precision::Single)?,
+                Conv::new(gpu, [CHANNELS, CHANNELS], Activation::Relu, false, Precision::Single)?,
+                Conv::new(gpu, [CHANNELS, RGB], Activation::None, false, Precision::Single)?,
             ],
             product: gpu.pipeline(&product::Constants::default())?,
             product_backward: gpu.pipeline(&product_backward::Constants::default())?,

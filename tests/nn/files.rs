@@ -3,10 +3,11 @@
 use std::path::Path;
 
 use nightsplat::gpu::testing::gpu;
-use nightsplat::nn::{Denoiser, DenoiserSettings, Tonemapper, load, save};
+use nightsplat::nn::{Denoiser, DenoiserSettings, Precision, Tonemapper, load, save};
 use safetensors::SafeTensors;
 
-const SMALL: DenoiserSettings = DenoiserSettings { stages: 2, repeats: 1, channels: 4 };
+const SMALL: DenoiserSettings =
+    DenoiserSettings { stages: 2, repeats: 1, channels: 4, precision: Precision::Single };
 
 fn networks(settings: DenoiserSettings, seed: u64) -> (Denoiser, Tonemapper) {
     let gpu = gpu();

@@ -36,7 +36,7 @@ fn check_all(forward: Forward<'_>, gradients: &Gradients, [values, first, second
 #[test]
 fn the_gradient_of_the_denoiser_is_that_of_finite_differences() {
     for (size, stages) in [([4, 3], 1), ([3, 5], 2), ([4, 4], 3)] {
-        let settings = DenoiserSettings { stages, repeats: 2, channels: 4 };
+        let settings = DenoiserSettings { stages, repeats: 2, channels: 4, ..Default::default() };
         let denoiser = Denoiser { settings, size };
         let mut random = Random::new(11 + u64::from(stages));
         let mut draw = |count: usize, low: f64, high: f64| -> Vec<f64> {

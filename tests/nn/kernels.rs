@@ -1,8 +1,8 @@
 //! Every kernel against its reference, at sizes and channel counts that divide nothing.
 
 use glam::{UVec2, Vec2};
-use nightsplat::gpu::Threads;
 use nightsplat::gpu::testing::{assert_no_validation_messages, gpu};
+use nightsplat::gpu::{CooperativeMatrix, Threads};
 use nightsplat::kernels::*;
 
 use super::common::{Random, assert_close};
@@ -72,6 +72,61 @@ fn conv3x3_matches_its_reference_backward() {
     check_conv(conv3x3::Constants { accumulate: true, ..base }, [8, 8]);
     check_conv(conv3x3::Constants { out_block: 3, accumulate: true, ..base }, [17, 3]);
     check_conv(conv3x3::Constants { columns: 1, rows: 8, ..base }, [16, 17]);
+}
+
+/// Both factors of a product round by 2^-10 at most, and weights below 2^-22 may vanish; the sum rounds as a plain one.
+fn half_bound(terms: u32, magnitude: f32, largest_pixel: f32) -> f32 {
+    dot_product_bound(terms, magnitude)
+        + magnitude / 512.0
+        + terms as f32 * largest_pixel / 4_194_304.0
+}
+
+fn check_half(matrix: CooperativeMatrix, transposed: bool, in_out: [u32; 2], magnitude: f32) {
+    let mut random = Random::new(1);
+    let [in_channels, out_channels] = in_out;
+    let accumulate = transposed;
+    for size in SIZES.map(UVec2::from_array) {
+        let CooperativeMatrix { m, n, k } = matrix;
+        let constants =
+            conv3x3_half::Constants { m, n, k, blocks: 2, rows: 3, transposed, accumulate };
+        let pixels = size.element_product();
+        let len = (5 + 9 * in_channels * out_channels + out_channels) as usize;
+        let values_in = values(&mut random, len, -0.2, 0.2);
+        let values_of = |count: u32, random: &mut Random| -> Vec<f32> {
+            values(random, count as usize, -1.0, 1.0).iter().map(|x| x * magnitude).collect()
+        };
+        let source = values_of(in_channels * pixels, &mut random);
+        let target = values_of(out_channels * pixels, &mut random);
+        let params = conv3x3_half::Params { size, in_channels, out_channels, offset: 5 };
+        let values = values_in;
+        let expected = run_reference!(conv3x3_half, constants, params, [values, source], [target]);
+        let sum_of_magnitudes = {
+            let (values, source) = (magnitudes(&values), magnitudes(&source));
+            let target = magnitudes(&target);
+            run_reference!(conv3x3_half, constants, params, [values, source], [target])
+        };
+        let blocks = out_channels.div_ceil(2 * m);
+        let threads = Threads::Workgroups([blocks, size.x.div_ceil(n), size.y.div_ceil(3)]);
+        let actual =
+            run_kernel!(conv3x3_half, constants, params, threads, [values, source], [target]);
+        let (terms, largest) = (9 * in_channels + 1, largest(&source));
+        let bound = |i: usize, _| half_bound(terms, sum_of_magnitudes[i], largest);
+        let what = format!("{size} {in_out:?} times {magnitude:e} {constants:?}");
+        assert_close(&what, &actual, &expected, bound);
+    }
+    assert_no_validation_messages();
+}
+
+/// Runs where the device has cooperative matrices.
+#[test]
+fn conv3x3_half_matches_its_reference_at_every_magnitude() {
+    let Some(matrix) = gpu().properties().cooperative_matrix else { return };
+    for magnitude in [1.0, 1e-9, 1e-30, 1e6] {
+        check_half(matrix, false, [8, 17], magnitude);
+        check_half(matrix, true, [17, 8], magnitude);
+    }
+    check_half(matrix, false, [64, 64], 1.0);
+    check_half(matrix, true, [3, 1], 1.0);
 }
 
 #[test]

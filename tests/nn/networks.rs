@@ -2,7 +2,7 @@
 
 use glam::UVec2;
 use nightsplat::gpu::testing::{assert_no_validation_messages, gpu};
-use nightsplat::nn::{Denoiser, DenoiserSettings, Parameters, Tonemapper};
+use nightsplat::nn::{Denoiser, DenoiserSettings, Parameters, Precision, Tonemapper};
 
 use super::common::{Random, assert_close};
 use super::model;
@@ -108,11 +108,17 @@ fn the_denoiser_matches_its_reference_forward_and_backward() {
     let gpu = gpu();
     let all = [
         (
-            DenoiserSettings { stages: 3, repeats: 3, channels: 8 },
+            DenoiserSettings { stages: 3, repeats: 3, channels: 8, ..Default::default() },
             vec![[1, 1], [3, 1], [5, 7], [33, 17]],
         ),
-        (DenoiserSettings { stages: 1, repeats: 2, channels: 17 }, vec![[8, 8], [2, 19]]),
-        (DenoiserSettings { stages: 2, repeats: 1, channels: 3 }, vec![[5, 7]]),
+        (
+            DenoiserSettings { stages: 1, repeats: 2, channels: 17, ..Default::default() },
+            vec![[8, 8], [2, 19]],
+        ),
+        (
+            DenoiserSettings { stages: 2, repeats: 1, channels: 3, ..Default::default() },
+            vec![[5, 7]],
+        ),
     ];
     for (settings, sizes) in all {
         // One network for all sizes: its memory serves smaller views too.
@@ -157,7 +163,7 @@ fn the_tonemapper_matches_its_reference_forward_and_backward() {
 #[test]
 fn a_value_that_is_not_a_number_reaches_the_output() {
     let gpu = gpu();
-    let settings = DenoiserSettings { stages: 2, repeats: 1, channels: 8 };
+    let settings = DenoiserSettings { stages: 2, repeats: 1, channels: 8, ..Default::default() };
     let size = UVec2::new(21, 9);
     let [mut first, second, d] = images(size, 9);
     first[100] = f32::NAN;
@@ -173,7 +179,7 @@ fn a_value_that_is_not_a_number_reaches_the_output() {
 #[test]
 fn two_runs_give_the_same_bits() {
     let gpu = gpu();
-    let settings = DenoiserSettings { stages: 2, repeats: 2, channels: 8 };
+    let settings = DenoiserSettings { stages: 2, repeats: 2, channels: 8, ..Default::default() };
     let size = UVec2::new(61, 45);
     let [first, second, d] = images(size, 9);
     let denoise = |_| {
@@ -186,6 +192,47 @@ fn two_runs_give_the_same_bits() {
     };
     let ([a, b], [c, d]) = ([0, 1].map(denoise), [0, 1].map(tone));
     assert!(a == b && c == d);
+    assert_no_validation_messages();
+}
+
+/// Half precision is single precision on a device without 16-bit matrices. Gradients as small as a mean over a large
+/// view makes them lose no more than large ones.
+#[test]
+fn half_precision_stays_near_single_at_every_magnitude() {
+    let gpu = gpu();
+    let single = DenoiserSettings { stages: 2, repeats: 3, channels: 24, ..Default::default() };
+    let half = DenoiserSettings { precision: Precision::Half, ..single };
+    let size = UVec2::new(37, 26);
+    let [first, second, d] = images(size, 4);
+    for magnitude in [1.0, 1e-9] {
+        let d: Vec<f32> = d.iter().map(|d| d * magnitude).collect();
+        let run = |settings| {
+            let mut denoiser = Denoiser::new(&gpu, settings, 1).unwrap();
+            run_denoiser(&mut denoiser, size, [&first, &second, &d])
+        };
+        let (expected, actual, again) = (run(single), run(half), run(half));
+        assert!(actual == again, "two runs in half precision differ");
+        let distance = |actual: &[f32], expected: &[f32]| {
+            let square = |x: f32| f64::from(x) * f64::from(x);
+            let difference: f64 = actual.iter().zip(expected).map(|(a, e)| square(a - e)).sum();
+            (difference / expected.iter().map(|&e| square(e)).sum::<f64>()).sqrt()
+        };
+        let far = [
+            distance(&actual.output, &expected.output),
+            distance(&actual.parameters, &expected.parameters),
+            distance(&actual.inputs[0], &expected.inputs[0]),
+        ];
+        // Factors round by 2^-10 at most; a ReLU or a clamp near its kink may then let another gradient pass.
+        let bounds = [1e-3, 0.05, 0.05];
+        assert!(far.iter().zip(bounds).all(|(far, bound)| *far < bound), "{magnitude}: {far:?}");
+        println!("relative distances of output and gradients at {magnitude}: {far:?}");
+        let is_half = gpu.properties().cooperative_matrix.is_some();
+        assert_eq!(far.iter().any(|&far| far > 0.0), is_half);
+    }
+    let mut spoiled = first.clone();
+    spoiled[100] = f32::NAN;
+    let mut denoiser = Denoiser::new(&gpu, half, 1).unwrap();
+    assert!(run_denoiser(&mut denoiser, size, [&spoiled, &second, &d]).output[100].is_nan());
     assert_no_validation_messages();
 }
 
@@ -204,7 +251,7 @@ fn the_paper_s_denoiser_has_its_parameters_and_fits_a_gigabyte() {
 #[test]
 fn weights_begin_as_in_pytorch_and_follow_the_seed() {
     let gpu = gpu();
-    let settings = DenoiserSettings { stages: 2, repeats: 1, channels: 16 };
+    let settings = DenoiserSettings { stages: 2, repeats: 1, channels: 16, ..Default::default() };
     let values = |seed| {
         let denoiser = Denoiser::new(&gpu, settings, seed).unwrap();
         (gpu.read(&denoiser.parameters().values).unwrap(), denoiser.parameters().tensors().to_vec())
@@ -244,7 +291,7 @@ fn misuse_is_told_in_one_line() {
         let error = Denoiser::new(&gpu, settings, 0).unwrap_err().to_string();
         assert!(error.contains("must be within 1 and"), "{error}");
     }
-    let settings = DenoiserSettings { stages: 1, repeats: 1, channels: 4 };
+    let settings = DenoiserSettings { stages: 1, repeats: 1, channels: 4, ..Default::default() };
     let mut denoiser = Denoiser::new(&gpu, settings, 0).unwrap();
     let mut tonemapper = Tonemapper::new(&gpu, 0).unwrap();
     let size = UVec2::new(6, 5);

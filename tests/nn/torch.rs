@@ -64,7 +64,7 @@ impl Fixture {
 #[test]
 fn a_denoiser_stage_is_pytorch_s() {
     let fixture = Fixture::new("stage");
-    let settings = DenoiserSettings { stages: 1, repeats: 3, channels: 8 };
+    let settings = DenoiserSettings { stages: 1, repeats: 3, channels: 8, ..Default::default() };
     let mut denoiser = Denoiser::new(&gpu(), settings, 0).unwrap();
     let values = fixture.layers(denoiser.parameters(), "");
     gpu().write(&mut denoiser.parameters_mut().values, &values).unwrap();

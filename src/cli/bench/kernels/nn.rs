@@ -5,7 +5,7 @@ use glam::{UVec2, Vec2};
 use crate::cli::bench::check::Rule::Close;
 use crate::cli::bench::check::check;
 use crate::cli::bench::{Bench, Timing};
-use crate::gpu::Threads;
+use crate::gpu::{CooperativeMatrix, Threads};
 use crate::kernels::*;
 use crate::nn::conv_shape;
 use crate::random::Stream;
@@ -45,6 +45,25 @@ fn convolve(
     let constants = conv3x3::Constants { columns, rows, ..Default::default() };
     let (values, source) = (values.to_vec(), source.to_vec());
     let target = vec![0.0_f32; source.len()];
+    if let Some(CooperativeMatrix { m, n, k }) = bench.gpu.properties().cooperative_matrix {
+        let constants = conv3x3_half::Constants { m, n, k, ..Default::default() };
+        let conv3x3_half::Constants { blocks, rows, .. } = constants;
+        let (in_channels, out_channels) = (CHANNELS, CHANNELS);
+        check!(
+            bench,
+            timings,
+            conv3x3_half,
+            constants,
+            conv3x3_half::Params { size: SIZE, in_channels, out_channels, offset: 0 },
+            Threads::Workgroups([
+                CHANNELS.div_ceil(blocks * m),
+                SIZE.x.div_ceil(n),
+                SIZE.y.div_ceil(rows)
+            ]),
+            [values, source],
+            [target: Close(1e-2)]
+        );
+    }
     let across = columns * bench.gpu.properties().subgroup_size;
     let (convolved,) = check!(
         bench,

@@ -1,0 +1,35 @@
+#!/usr/bin/env bash
+# Runs every test on the software device of another Debian suite, in a chroot under target/, and prints which one that is:
+#     scripts/test-on-mesa.sh sid
+# Newer Mesa offers more, such as cooperative matrices, and newer validation layers know more rules. Needs root and the
+# package debootstrap.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+suite=${1:?name a Debian suite, such as sid}
+root=$PWD/target/mesa/$suite
+
+packages=mesa-vulkan-drivers,vulkan-validationlayers
+if [ ! -e "$root/usr/share/vulkan" ]; then
+    rm -rf "$root"
+    debootstrap --variant=minbase --include=$packages "$suite" "$root" > /dev/null
+fi
+cargo build
+tests=$(cargo test --no-run --message-format=json-render-diagnostics |
+    sed -n '/"profile":{[^}]*"test":true}/s|.*"executable":"\([^"]*\)".*|\1|p')
+
+mkdir -p "$root$PWD" "$root/proc"
+trap 'umount "$root$PWD" "$root/proc"' EXIT
+mount --bind "$PWD" "$root$PWD"
+mount --bind /proc "$root/proc"
+inside() { chroot "$root" env HOME=/root bash -c "cd '$PWD' && \"\$@\"" bash "$@"; }
+
+inside target/debug/nightsplat doctor
+failed=()
+for test in $tests; do
+    inside "$test" || failed+=("$test")
+done
+if [ ${#failed[@]} -gt 0 ]; then
+    printf 'failed on %s: %s\n' "$suite" "${failed[@]}"
+    exit 1
+fi
+echo "every test passes on $suite"

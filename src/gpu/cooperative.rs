@@ -1,0 +1,66 @@
+//! Cooperative matrices of 16 bits: an option, which a device of our own gets where it offers it.
+
+use ash::{khr, vk};
+
+use super::requirements::Offered;
+
+/// Rows of the first factor, columns of the second, and what both share, of the products that kernels build on:
+/// 16-bit factors, sums in single precision, a subgroup's work.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
+pub struct CooperativeMatrix {
+    /// Rows of the first factor and of the sum.
+    pub m: u32,
+    /// Columns of the second factor and of the sum.
+    pub n: u32,
+    /// Columns of the first factor, rows of the second.
+    pub k: u32,
+}
+
+/// The largest side that a kernel's shared memory has room for.
+const MAX_SIDE: u32 = 16;
+
+/// The extension a device is created with to use [`CooperativeMatrix`].
+pub(super) const EXTENSION: &std::ffi::CStr = khr::cooperative_matrix::NAME;
+
+/// The largest product that the device offers; none without the extension or one of the features it needs.
+pub(super) fn offered(
+    entry: &ash::Entry,
+    instance: &ash::Instance,
+    physical: vk::PhysicalDevice,
+    offered: &Offered,
+) -> Option<CooperativeMatrix> {
+    let name = EXTENSION.to_string_lossy();
+    let vulkan12 = &offered.vulkan12;
+    let has_all = offered.extensions.contains(name.as_ref())
+        && vulkan12.shader_float16 == vk::TRUE
+        && vulkan12.vulkan_memory_model == vk::TRUE;
+    if !has_all {
+        return None;
+    }
+    let functions = khr::cooperative_matrix::Instance::new(entry, instance);
+    let mut feature = vk::PhysicalDeviceCooperativeMatrixFeaturesKHR::default();
+    let mut features = vk::PhysicalDeviceFeatures2::default().push_next(&mut feature);
+    // SAFETY: the chain points at a live local; the extension is there.
+    let shapes = unsafe {
+        instance.get_physical_device_features2(physical, &mut features);
+        functions.get_physical_device_cooperative_matrix_properties(physical)
+    };
+    if feature.cooperative_matrix == vk::FALSE {
+        return None;
+    }
+    let (half, single) = (vk::ComponentTypeKHR::FLOAT16, vk::ComponentTypeKHR::FLOAT32);
+    shapes
+        .ok()?
+        .iter()
+        .filter(|shape| {
+            [shape.a_type, shape.b_type] == [half; 2]
+                && [shape.c_type, shape.result_type] == [single; 2]
+                && shape.scope == vk::ScopeKHR::SUBGROUP
+                && [shape.m_size, shape.n_size, shape.k_size].iter().all(|&side| side <= MAX_SIDE)
+                // A row of the second factor begins at a multiple of sixteen bytes, one of the first too.
+                && shape.n_size % 8 == 0
+                && shape.k_size % 8 == 0
+        })
+        .map(|shape| CooperativeMatrix { m: shape.m_size, n: shape.n_size, k: shape.k_size })
+        .max_by_key(|shape| shape.m * shape.n * shape.k)
+}
