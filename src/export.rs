@@ -18,7 +18,7 @@ use std::path::{Path, PathBuf};
 use crate::gpu::Gpu;
 use crate::loss::Term;
 use crate::output::write_whole;
-use crate::scene::{Gaussians, ply};
+use crate::scene::{Features, Gaussians, ply};
 use crate::train::{ModelConfig, Networks, StepReport, TrainConfig, Trainer};
 use crate::{Error, Result};
 
@@ -195,15 +195,21 @@ pub fn load_model(run: &Path, raw_colors: bool) -> Result<Gaussians> {
     Ok(gaussians)
 }
 
-/// The trained networks of a run; none where its model has none.
+/// The trained networks of a run; none where its model has none. `features` are those that its Gaussians came to have:
+/// a part that found nothing to learn from has none, whatever the configuration asks for.
 ///
 /// # Errors
 /// Their file is missing or damaged, or holds networks of another configuration.
-pub fn load_networks(gpu: &Gpu, run: &Path, model: &ModelConfig) -> Result<Option<Networks>> {
+pub fn load_networks(
+    gpu: &Gpu,
+    run: &Path,
+    model: &ModelConfig,
+    features: Features,
+) -> Result<Option<Networks>> {
     if !model.denoiser && !model.tonemapper {
         return Ok(None);
     }
-    let mut networks = Networks::new(gpu, model, 0)?;
+    let mut networks = Networks::new(gpu, model, features, 0)?;
     networks.load(&run.join(NETWORKS))?;
     Ok(Some(networks))
 }

@@ -292,6 +292,28 @@ fn a_layer_that_the_model_lacks_is_named_with_those_it_has() {
     let output = nightsplat(&format!("render {at} --split test --out {at}/out --layer denoised"));
     let stderr = String::from_utf8_lossy(&output.stderr);
     assert!(stderr.contains("no denoised") && stderr.contains("rgb, structure"), "{stderr}");
+
+    let config = run.join("config.toml");
+    let text = std::fs::read_to_string(&config).unwrap();
+    std::fs::write(&config, text.replace("denoiser = false", "denoiser = true")).unwrap();
+    let output = nightsplat(&format!("eval {at}"));
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert!(stderr.contains("no noise, which the denoiser takes"), "{stderr}");
+}
+
+/// Without depth maps there is no depth channel, so that the others lie elsewhere than the configuration would have them.
+#[test]
+fn a_model_without_the_depth_it_asked_for_scores_the_same_afterwards() {
+    let folder = tempfile::tempdir().unwrap();
+    let (set, run) = (folder.path().join("set"), folder.path().join("run"));
+    make_set(&set, false);
+    let (set, at) = (set.display(), run.display());
+    succeed(&format!("train {set} --out {at} --model lita {SMALL}"));
+    let trained = std::fs::read_to_string(run.join("metrics.json")).unwrap();
+    let [trained, scored] = [trained, succeed(&format!("eval {at} --json"))]
+        .map(|text| serde_json::from_str::<serde_json::Value>(&text).unwrap()["mean"].clone());
+    assert!(trained["r0"]["psnr"].is_f64());
+    assert_eq!(trained, scored);
 }
 
 #[test]

@@ -42,7 +42,7 @@ impl FinishedRun {
                 &gpu,
                 &gaussians,
                 raw_colors,
-                export::load_networks(&gpu, run, &config.model)?,
+                export::load_networks(&gpu, run, &config.model, gaussians.shape.features)?,
             )?,
             config,
         })

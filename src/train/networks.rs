@@ -5,12 +5,12 @@ use std::path::Path;
 use glam::UVec2;
 
 use super::ModelConfig;
-use crate::Result;
 use crate::gpu::{Buffer, Gpu, Recorder};
 use crate::image::Image;
 use crate::nn::{self, Denoiser, Parameters, Tonemapper};
 use crate::scene::{COLOR_CHANNELS, Feature, Features};
 use crate::window::{Window, Windows};
+use crate::{Error, Result};
 
 /// The networks that a model has, with the windows of the render that they take.
 #[derive(Debug)]
@@ -27,16 +27,26 @@ pub struct Networks {
 }
 
 impl Networks {
-    /// The networks of the parts that are on, with fresh weights.
+    /// The networks of the parts that are on, with fresh weights, for renders of Gaussians with these features.
     ///
     /// # Errors
-    /// The device is out of memory.
-    pub fn new(gpu: &Gpu, model: &ModelConfig, seed: u64) -> Result<Self> {
+    /// The Gaussians lack what a network takes, or the device is out of memory.
+    pub fn new(gpu: &Gpu, model: &ModelConfig, features: Features, seed: u64) -> Result<Self> {
+        let takes = [
+            (model.denoiser, Feature::Noise, "denoiser", "noise"),
+            (model.tonemapper, Feature::Illumination, "tonemapper", "illumination"),
+        ];
+        for (is_on, feature, network, name) in takes {
+            if is_on && features.channels_of(feature).is_none() {
+                let problem = format!("the Gaussians have no {name}, which the {network} takes");
+                return Err(Error::Usage(problem));
+            }
+        }
         let denoiser = model.denoiser.then(|| Denoiser::new(gpu, model.network, seed));
         let tonemapper = model.tonemapper.then(|| Tonemapper::new(gpu, seed));
         Ok(Self {
             gpu: gpu.clone(),
-            features: model.features(),
+            features,
             denoiser: denoiser.transpose()?,
             tonemapper: tonemapper.transpose()?,
             windows: Windows::new(gpu)?,

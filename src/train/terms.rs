@@ -161,7 +161,7 @@ impl NetworkTerms {
     fn new(gpu: &Gpu, config: &TrainConfig) -> Result<Self> {
         let ModelConfig { weights, rates, denoiser_crop, .. } = &config.model;
         let seed = Stream::new(config.seed, streams::NETWORKS).bits(0);
-        let networks = Networks::new(gpu, &config.model, seed)?;
+        let networks = Networks::new(gpu, &config.model, config.model.features(), seed)?;
         let trained = |parameters: &Parameters, rate| -> Result<Trained> {
             Ok(Trained { moments: Moments::zeros(gpu, parameters.values.len())?, rate })
         };
