@@ -30,7 +30,8 @@ void main() {
     barrier();
 
     Run run = run_of_workgroup(WORKGROUP_INDEX, thread_count / WORKGROUP, pixel_count);
-    for (uint quad = run.first / 4 + gl_LocalInvocationID.x; 4 * quad < run.end; quad += WORKGROUP) {
+    // An empty run begins behind the last pixel, within its quad.
+    for (uint quad = (run.first + 3) / 4 + gl_LocalInvocationID.x; 4 * quad < run.end; quad += WORKGROUP) {
         uvec4 digits = floatBitsToUint(luminances[quad]) >> shift;
         [[unroll]] for (uint c = 0; c < 4; ++c) {
             uint histogram = SEARCHES;

@@ -52,7 +52,7 @@ fn networks_come_back_as_they_were_saved() {
     assert_eq!(file.len(), 2 * 8 + 6);
     let (_, header) = SafeTensors::read_metadata(&bytes).unwrap();
     let settings = &header.metadata().as_ref().unwrap()["networks"];
-    assert!(settings.contains(r#""denoiser":{"stages":2,"repeats":1,"channels":4}"#), "{settings}");
+    assert!(settings.contains(r#""denoiser":{"stages":2,"repeats":1,"channels":4,"#), "{settings}");
     let left: Vec<_> = std::fs::read_dir(folder.path()).unwrap().collect();
     assert_eq!(left.len(), 1, "no partial file remains");
 }
@@ -74,7 +74,7 @@ fn networks_of_another_configuration_are_refused_and_nothing_changes() {
         let mut others = networks(settings, 2);
         let before = values(&others);
         let error = load_both(&path, &mut others).unwrap_err().to_string();
-        let remedy = r#"use the settings it was made with: {"stages":2,"repeats":1,"channels":4}"#;
+        let remedy = r#"use the settings it was made with: {"stages":2,"repeats":1,"channels":4,"#;
         let own = serde_json::to_string(&settings).unwrap();
         for part in facts.iter().copied().chain(["networks.safetensors", remedy, own.as_str()]) {
             assert!(error.contains(part), "{part}: {error}");
