@@ -33,7 +33,8 @@ pub(super) fn offered(
     let vulkan12 = &offered.vulkan12;
     let has_all = offered.extensions.contains(name.as_ref())
         && vulkan12.shader_float16 == vk::TRUE
-        && vulkan12.vulkan_memory_model == vk::TRUE;
+        && vulkan12.vulkan_memory_model == vk::TRUE
+        && vulkan12.vulkan_memory_model_device_scope == vk::TRUE;
     if !has_all {
         return None;
     }

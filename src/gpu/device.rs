@@ -511,7 +511,11 @@ fn create_device(
     let mut info = vk::DeviceCreateInfo::default().queue_create_infos(&queues);
     if with_cooperative_matrices {
         extensions.push(cooperative::EXTENSION.as_ptr());
-        vulkan12 = vulkan12.shader_float16(true).vulkan_memory_model(true);
+        // Under the memory model, the atomics of other kernels need its device scope.
+        vulkan12 = vulkan12
+            .shader_float16(true)
+            .vulkan_memory_model(true)
+            .vulkan_memory_model_device_scope(true);
         info = info.push_next(&mut matrices);
     }
     let info =
