@@ -1,8 +1,8 @@
 //! Windows: the rectangle of a view that the networks run on.
 //!
-//! The networks' losses are means over pixels, so a random crop estimates them without bias. What a crop's pixels get from the networks
-//! depends on a margin around them, the receptive field: the window is the crop with its margin, cut off at the image,
-//! where the zero padding of the whole view is right anyway.
+//! The networks' losses are means over pixels, so a random crop estimates them without bias. What a crop's pixels get
+//! from the networks depends on a margin around them, the receptive field: the window is the crop with its margin, cut
+//! off at the image, where the zero padding of the whole view is right anyway.
 
 use std::ops::Range;
 

@@ -165,9 +165,17 @@ struct Form {
 
 /// A kernel that convolves, and the pixels and channels that a subgroup takes.
 #[derive(Debug)]
-enum Product {
-    Single { pipeline: Pipeline<conv3x3::Kernel>, columns: u32, rows: u32, channels: u32 },
-    Half { pipeline: Pipeline<conv3x3_half::Kernel>, columns: u32, rows: u32, channels: u32 },
+struct Product {
+    kernel: ProductKernel,
+    columns: u32,
+    rows: u32,
+    channels: u32,
+}
+
+#[derive(Debug)]
+enum ProductKernel {
+    Single(Pipeline<conv3x3::Kernel>),
+    Half(Pipeline<conv3x3_half::Kernel>),
 }
 
 impl Product {
@@ -180,8 +188,8 @@ impl Product {
             let (blocks, rows) = (outputs.div_ceil(m).min(HALF_BLOCKS), HALF_ROWS);
             let constants =
                 conv3x3_half::Constants { m, n, k, blocks, rows, transposed, accumulate };
-            let pipeline = gpu.pipeline(&constants)?;
-            return Ok(Self::Half { pipeline, columns: n, rows, channels: blocks * m });
+            let kernel = ProductKernel::Half(gpu.pipeline(&constants)?);
+            return Ok(Self { kernel, columns: n, rows, channels: blocks * m });
         }
         let [columns, rows] = conv_shape(gpu);
         let channels = outputs.min(OUT_BLOCK);
@@ -195,7 +203,8 @@ impl Product {
             accumulate,
         };
         let columns = columns * gpu.properties().subgroup_size;
-        Ok(Self::Single { pipeline: gpu.pipeline(&constants)?, columns, rows, channels })
+        let kernel = ProductKernel::Single(gpu.pipeline(&constants)?);
+        Ok(Self { kernel, columns, rows, channels })
     }
 
     #[expect(clippy::too_many_arguments, reason = "a layer, its place and its images")]
@@ -209,21 +218,19 @@ impl Product {
         source: &Buffer<f32>,
         target: &mut Buffer<f32>,
     ) -> Result<()> {
-        let (Self::Single { columns, rows, channels, .. }
-        | Self::Half { columns, rows, channels, .. }) = *self;
         let threads = Threads::Workgroups([
-            out_channels.div_ceil(channels),
-            size.x.div_ceil(columns),
-            size.y.div_ceil(rows),
+            out_channels.div_ceil(self.channels),
+            size.x.div_ceil(self.columns),
+            size.y.div_ceil(self.rows),
         ]);
-        match self {
-            Self::Single { pipeline, .. } => pass.dispatch(
+        match &self.kernel {
+            ProductKernel::Single(pipeline) => pass.dispatch(
                 pipeline,
                 &conv3x3::Params { size, in_channels, out_channels, offset },
                 conv3x3::Buffers { values, source, target },
                 threads,
             ),
-            Self::Half { pipeline, .. } => pass.dispatch(
+            ProductKernel::Half(pipeline) => pass.dispatch(
                 pipeline,
                 &conv3x3_half::Params { size, in_channels, out_channels, offset },
                 conv3x3_half::Buffers { values, source, target },
