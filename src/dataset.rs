@@ -5,7 +5,6 @@
 //! same name is a test view's reference image (`View::reference`), used for scores only and loaded for test views only.
 
 mod colmap;
-mod files;
 mod options;
 mod pixels;
 mod similarity;
@@ -20,8 +19,8 @@ use glam::{DAffine3, DVec3};
 
 use crate::camera::{Camera, Lens};
 use crate::image::Image;
+use crate::image::files::{self, Files};
 use crate::{Error, Result};
-use files::Files;
 pub use options::{DepthOptions, LoadOptions};
 use pixels::Source;
 use similarity::Similarity;

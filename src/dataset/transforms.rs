@@ -8,10 +8,10 @@ use std::path::{Path, PathBuf};
 use glam::{DAffine3, DMat3, DVec2, DVec3};
 use serde::Deserialize;
 
-use super::files::{Files, stem};
 use super::{Frame, Listing, Split};
 use crate::camera::{Distortion, Lens};
 use crate::image::Image;
+use crate::image::files::{Files, stem};
 use crate::{Error, Result};
 
 #[derive(Deserialize)]

@@ -235,8 +235,7 @@ impl Gpu {
         };
         let offered = Offered::gather(&instance, physical).map_err(loader_error)?;
         offered.check()?;
-        let queue =
-            Queue { raw: vk::Queue::from_raw(host.queue), family: host.queue_family, submitted: 0 };
+        let queue = Queue { raw: vk::Queue::from_raw(host.queue), family: host.queue_family };
         let properties = properties(&instance, physical, &offered);
         Self::assemble(&instance, physical, properties, device, queue, None)
     }
@@ -286,6 +285,7 @@ impl Gpu {
                 device,
                 allocator: Mutex::new(Some(allocator)),
                 queue: Mutex::new(queue),
+                progress: Mutex::default(),
                 timeline,
                 last_use: AtomicU64::new(0),
                 usage: super::buffer::MemoryUsage::default(),
@@ -527,7 +527,7 @@ fn create_device(
             .create_device(physical, &info, None)
             .map_err(|result| Error::Vulkan { call: "vkCreateDevice", device, result })?;
         let raw = device.get_device_queue(family, 0);
-        Ok((device, Queue { raw, family, submitted: 0 }))
+        Ok((device, Queue { raw, family }))
     }
 }
 
