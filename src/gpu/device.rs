@@ -163,6 +163,15 @@ impl Gpu {
     ///
     /// # Errors
     /// No loader, no such device, or one that lacks a requirement.
+    ///
+    /// ```no_run
+    /// use nightsplat::gpu::{DeviceChoice, Gpu};
+    ///
+    /// let gpu = Gpu::new(&DeviceChoice::Best)?;
+    /// let squares = gpu.buffer("squares", &[0u32, 1, 4, 9])?;
+    /// assert_eq!(gpu.read(&squares)?, [0, 1, 4, 9]);
+    /// # Ok::<(), nightsplat::Error>(())
+    /// ```
     pub fn new(choice: &DeviceChoice) -> Result<Self> {
         let validate = cfg!(debug_assertions) && validation_is_installed();
         Self::open(choice, validate)
