@@ -232,7 +232,7 @@ impl State {
         low: u32,
     ) -> Option<()> {
         let bit = 1i16 << low;
-        let mut refine = |value: &mut i16, bits: &mut Bits<'_>| {
+        let refine = |value: &mut i16, bits: &mut Bits<'_>| {
             if bits.take(1) == 1 && *value & bit == 0 {
                 *value = value.wrapping_add(if *value < 0 { -bit } else { bit });
             }
