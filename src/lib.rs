@@ -7,6 +7,9 @@
 //!                                                          └-> run, eval, render
 //! ```
 //!
+//! A program trains with [`run::train`], as `examples/train.rs` does, or lends its own Vulkan device and renders into its
+//! own command buffers, as `examples/embed.rs` does.
+//!
 //! Data flows one way: a module uses only modules above it in this list, which `tests/architecture.rs` reads and asserts.
 //!
 //! - [`error`]: what can go wrong, sorted by what the user can do about it
