@@ -11,18 +11,13 @@
 use glam::Vec3;
 
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
+use crate::kernels::rank_search::{BINS, SEARCHES};
 use crate::kernels::{self, RankSearch, ToneParameters, ToneStatistics};
 use crate::tone::{Rank, Statistics, ToneCurve, ToneSettings, White};
 use crate::{Error, Result};
 
 /// Threads that share an image: enough to fill a large GPU, few enough that their partial sums add up quickly.
 const THREADS: u32 = 128 * 256;
-
-/// Both neighbours of two percentiles.
-const SEARCHES: usize = 4;
-
-/// The values of a ten-bit digit of the radix select.
-const BINS: usize = 1024;
 
 /// Takes the statistics of photographs and applies a tone curve, with scratch memory for the largest so far.
 #[derive(Debug)]
@@ -93,8 +88,8 @@ impl PseudoGt {
             map: Map::new(gpu, settings)?,
             luminances: vec![],
             sums: gpu.uninit("channel sums", 0)?,
-            searches: gpu.uninit("rank searches", 2 * SEARCHES)?,
-            histograms: gpu.zeros("luminance histograms", SEARCHES * BINS)?,
+            searches: gpu.uninit("rank searches", 2 * SEARCHES as usize)?,
+            histograms: gpu.zeros("luminance histograms", (SEARCHES * BINS) as usize)?,
             measured: gpu.uninit("tone statistics", 1)?,
             settings: settings.clone(),
         })
@@ -151,7 +146,7 @@ impl PseudoGt {
         let [p10, p80, p90] = [1, 8, 9].map(|tenths| Rank::of(tenths, pixels));
         self.search_ranks(pass, tiles, [p10, p90], 0)?;
         if self.settings.white() == White::P80 {
-            self.search_ranks(pass, tiles, [p80, p80], SEARCHES as u32)?;
+            self.search_ranks(pass, tiles, [p80, p80], SEARCHES)?;
         }
         let settings = &self.settings;
         let constants = settings.parameters(&Statistics::default()).constants;

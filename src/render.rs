@@ -15,6 +15,7 @@ use glam::{DVec3, UVec2, Vec2};
 use crate::camera::Camera;
 use crate::gpu::{Buffer, Gpu, Kernel as _, Pipeline, Recorder, Threads};
 use crate::image::Image;
+use crate::kernels::splat::MAX_CHANNELS;
 use crate::kernels::{
     blend_backward, blend_forward, check_capacity, emit, order_counts, project, project_backward,
     reduce_records, tile_ranges,
@@ -25,9 +26,6 @@ use crate::{Error, Result};
 
 use frame::Frame;
 pub use frame::Status;
-
-/// Values per pixel that a background is given for.
-pub const MAX_CHANNELS: usize = 11;
 
 /// What a renderer is specialised for.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -286,7 +284,7 @@ impl Renderer {
         let view = self.view(camera)?;
         self.record_project(pass, gaussians, &view, options.sh_degree)?;
         self.record_bins(pass, &view)?;
-        let mut background = [0.0; MAX_CHANNELS];
+        let mut background = [0.0; MAX_CHANNELS as usize];
         background[..3].copy_from_slice(&options.background);
         let frame = &mut self.frame;
         pass.dispatch(

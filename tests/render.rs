@@ -8,19 +8,19 @@ use std::path::Path;
 use glam::{DVec2, DVec3, DVec4, UVec2, Vec2};
 use nightsplat::gpu::Threads;
 use nightsplat::gpu::testing::{assert_no_validation_messages, gpu};
+use nightsplat::kernels::emit::NO_TILE;
+use nightsplat::kernels::project::CULLED;
+use nightsplat::kernels::splat::ALPHA_MIN;
 use nightsplat::kernels::{
     ProjectedSplat, blend_forward, check_capacity, emit, order_counts, project, tile_ranges,
 };
 use nightsplat::reference::gaussian::Gaussian;
-use nightsplat::reference::splat::{ALPHA_MIN, Splat, splat_columns};
+use nightsplat::reference::splat::{Splat, splat_columns};
 
 #[macro_use]
 mod common;
 use common::model::{ROUNDING, model_tile};
 use common::{Frame, Random, Setup, UNWRITTEN, assert_close, forward};
-
-const CULLED: u32 = u32::MAX;
-const NO_TILE: u32 = u32::MAX;
 
 #[test]
 fn project_matches_the_reference() {

@@ -35,7 +35,7 @@ layout(binding = 3) writeonly buffer DepthKeys  { uint depth_keys[]; };
 layout(binding = 4) writeonly buffer Ids        { uint ids[]; };
 layout(binding = 5) writeonly buffer TileCounts { uint tile_counts[]; };
 
-const uint CULLED = 0xffffffffu;
+const uint CULLED = 0xffffffffu;  // the depth key of what is not seen: it sorts last
 const uint FEATURE_COUNT = CHANNELS - 3;
 
 vec3 sh_color(uint i, vec3 direction) {

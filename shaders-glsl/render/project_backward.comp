@@ -31,13 +31,12 @@ layout(binding = 0) readonly  buffer Parameters { float parameters[]; };  // (co
 layout(binding = 1) readonly  buffer Splats     { ProjectedSplat splats[]; };
 layout(binding = 2) readonly  buffer Colors     { float colors[]; };      // (gaussian_count, CHANNELS)
 layout(binding = 3) readonly  buffer TileCounts { uint tile_counts[]; };
-layout(binding = 4) readonly  buffer DSplats    { float d_splats[]; };    // (gaussian_count, 6 + CHANNELS)
+layout(binding = 4) readonly  buffer DSplats    { float d_splats[]; };    // (gaussian_count, RECORD)
 layout(binding = 5) readonly  buffer Status     { uint status[]; };
 layout(binding = 6) writeonly buffer Gradients  { float gradients[]; };   // (columns x gaussian_count)
 layout(binding = 7) buffer GradNormSums { float grad_norm_sums[]; };
 layout(binding = 8) buffer VisitCounts  { uint visit_counts[]; };
 
-const uint RECORD = 6 + CHANNELS;
 const uint FEATURE_COUNT = CHANNELS - 3;
 
 #define STORE_VEC3(column, i, v) { \
@@ -106,10 +105,10 @@ void main() {
         // A colour clamped at zero passes nothing on.
         bool passes = colors[CHANNELS * i + c] > 0.0;
         if (RAW_COLORS) passes = true;
-        d_color[c] = passes ? d_splats[record + 6 + c] : 0.0;
+        d_color[c] = passes ? d_splats[record + RECORD_HEAD + c] : 0.0;
     }
     uint features = FEATURES_COLUMN * gaussian_count + FEATURE_COUNT * i;
-    for (uint k = 0; k < FEATURE_COUNT; k++) gradients[features + k] = d_splats[record + 9 + k];
+    for (uint k = 0; k < FEATURE_COUNT; k++) gradients[features + k] = d_splats[record + RECORD_HEAD + 3 + k];
 
     // The forward pass again.
     mat3 view_rotation = mat3(view_from_world);

@@ -2,8 +2,7 @@
 
 use glam::{DMat3, DVec2, DVec3, DVec4, UVec2, Vec2};
 
-/// How far outside the image, in widths and heights, the Jacobian of the projection is still taken.
-pub const JACOBIAN_MARGIN: f64 = 0.15;
+use crate::kernels::camera::JACOBIAN_MARGIN;
 
 /// A view as the parameters of the projecting kernels describe it.
 #[derive(Clone, Debug)]

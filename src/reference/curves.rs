@@ -4,10 +4,7 @@
 use std::f64::consts::FRAC_PI_2;
 
 use super::real::Real;
-use crate::kernels::*;
-
-/// Beyond this t counts as this: the powers stay finite, and every curve is within an ulp of white or of its limit.
-pub const LARGEST_T: f64 = 1e7;
+use crate::kernels::curves::*;
 
 /// The most constants that a family has.
 pub const MAX_CONSTANTS: usize = 8;

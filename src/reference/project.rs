@@ -5,12 +5,11 @@ use glam::{DMat3, DVec2, DVec3, UVec2};
 use super::camera::{Camera, rotation, unit_quat};
 use super::gaussian::{Gaussian, Planes, sigmoid};
 use super::sh::sh_basis;
-use super::splat::{ALPHA_MIN, DILATION, Splat, splat_tile_rows, splat_tiles};
+use super::splat::{Splat, splat_tile_rows, splat_tiles};
 use crate::gpu::Reference;
 use crate::kernels::ProjectedSplat;
-use crate::kernels::project::{Constants, Kernel, Params, Slices};
-
-const CULLED: u32 = u32::MAX;
+use crate::kernels::project::{CULLED, Constants, Kernel, Params, Slices};
+use crate::kernels::splat::{ALPHA_MIN, DILATION};
 
 /// What one Gaussian is on the image plane.
 #[derive(Clone, Debug)]

@@ -1,9 +1,10 @@
 //! The tone curves of `include/tone.glsl`, for any [`Real`] in the shader's order of operations.
 
-use super::curves::{LARGEST_T, MAX_CONSTANTS, curve_shape};
+use super::curves::{MAX_CONSTANTS, curve_shape};
 use super::real::Real;
 use crate::kernels::ToneParameters;
-pub use crate::kernels::{
+use crate::kernels::curves::LARGEST_T;
+pub use crate::kernels::curves::{
     CURVE_AP3, CURVE_ASE, CURVE_ASE_FLOOR, CURVE_LINEAR, CURVE_LUM_PRESERVE, CURVE_NONE, CURVE_P80,
     CURVE_PER_CHANNEL, CURVE_TANH,
 };

@@ -1,6 +1,6 @@
 //! What a row of the table of curves holds, and the values, derivatives and gradients it gives.
 
-use crate::kernels::*;
+use crate::kernels::curves::*;
 use crate::reference::curves::{MAX_CONSTANTS, curve_shape};
 use crate::reference::real::{Dual, Real};
 use crate::reference::tone::within;

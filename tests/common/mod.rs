@@ -7,6 +7,7 @@ pub(crate) mod model;
 use glam::{UVec2, Vec2};
 use nightsplat::gpu::Threads;
 use nightsplat::gpu::testing::gpu;
+use nightsplat::kernels::splat::RECORD_HEAD;
 use nightsplat::kernels::{
     ProjectedSplat, blend_backward, blend_forward, check_capacity, emit, order_counts, project,
     project_backward, reduce_records, tile_ranges,
@@ -191,7 +192,7 @@ impl Setup {
     }
 
     pub(crate) fn record(&self) -> usize {
-        6 + self.channels as usize
+        (RECORD_HEAD + self.channels) as usize
     }
 }
 

@@ -1,7 +1,8 @@
 //! The rounding model of the blending kernels.
 
 use glam::UVec2;
-use nightsplat::reference::splat::{ALPHA_MIN, Fragment, Splat, TRANSMITTANCE_MIN, fragments};
+use nightsplat::kernels::splat::{ALPHA_MIN, TRANSMITTANCE_MIN};
+use nightsplat::reference::splat::{Fragment, Splat, fragments};
 
 use super::{Frame, Setup};
 

@@ -181,12 +181,7 @@ impl<'s> Step<'s> {
                 tone: &self.tone,
             },
             &mut self.d_render,
-            &mut LogSlot {
-                log: &mut self.log,
-                slot: 0,
-                status,
-                not_finite_flag: Status::NOT_FINITE,
-            },
+            &mut LogSlot { log: &mut self.log, slot: 0, status },
         )?;
         self.renderer.backward(
             pass,
