@@ -8,8 +8,6 @@
 //! - `build/reflection.rs`: SPIR-V to a description
 //! - `build/rust.rs`: a description to Rust
 
-#![allow(unreachable_pub, reason = "a build script is no one's dependency")]
-
 #[path = "build/compiler.rs"]
 mod compiler;
 #[path = "build/glsl.rs"]

@@ -5,10 +5,10 @@ use std::collections::BTreeMap;
 use crate::compiler;
 
 /// The block that the arrays of all buffers are members of.
-pub const BUFFER: &str = "buffer";
+pub(crate) const BUFFER: &str = "buffer";
 
 /// A `const` of a type that the host has too.
-pub struct Constant {
+pub(crate) struct Constant {
     name: String,
     ty: &'static str,
     /// One, or the elements of an array.
@@ -19,30 +19,30 @@ pub struct Constant {
 
 /// The constants of one shader or include, and the comments of its blocks' members.
 #[derive(Default)]
-pub struct Text {
-    pub constants: Vec<Constant>,
+pub(crate) struct Text {
+    pub(crate) constants: Vec<Constant>,
     /// By block (`Params`, a struct, [`BUFFER`]) and member; specialization constants are in block "".
     comments: BTreeMap<(String, String), String>,
 }
 
 impl Text {
     /// The comment behind a declaration, or in the lines above it.
-    pub fn comment(&self, block: &str, member: &str) -> &str {
+    pub(crate) fn comment(&self, block: &str, member: &str) -> &str {
         self.comments.get(&(block.to_owned(), member.to_owned())).map_or("", String::as_str)
     }
 
     /// The constants as Rust.
-    pub fn own_constants(&self) -> String {
+    pub(crate) fn own_constants(&self) -> String {
         self.constants.iter().map(ToString::to_string).collect()
     }
 
     /// Takes over the comments of another text.
-    pub fn add_comments(&mut self, other: Self) {
+    pub(crate) fn add_comments(&mut self, other: Self) {
         self.comments.extend(other.comments);
     }
 
     /// Reads the source alone, without what it includes.
-    pub fn read(source: &str) -> Self {
+    pub(crate) fn read(source: &str) -> Self {
         let mut text = Self::default();
         let (mut block, mut above, mut lines) = (None, vec![], source.lines());
         while let Some(line) = lines.next() {
@@ -85,7 +85,7 @@ impl Text {
     }
 
     /// Reads the source and, for comments, all that it includes.
-    pub fn read_with_includes(source: &str) -> Self {
+    pub(crate) fn read_with_includes(source: &str) -> Self {
         let mut text = Self::read(source);
         let name =
             |line: &'_ str| line.strip_prefix("#include \"")?.strip_suffix('"').map(str::to_owned);
@@ -160,7 +160,7 @@ impl std::fmt::Display for Constant {
 }
 
 /// The includes' constants, a module each, so that host and shaders cannot hold different ones.
-pub fn include_modules() -> String {
+pub(crate) fn include_modules() -> String {
     let modules = compiler::includes().into_iter().filter_map(|(name, source)| {
         let constants: String =
             Text::read(&source).constants.iter().map(ToString::to_string).collect();
@@ -173,7 +173,7 @@ pub fn include_modules() -> String {
 }
 
 /// A comment as documentation, or else `missing`.
-pub fn rustdoc(comment: &str, missing: &str) -> String {
+pub(crate) fn rustdoc(comment: &str, missing: &str) -> String {
     let comment = if comment.is_empty() { missing } else { comment };
     let escaped = comment.replace('[', "\\[").replace(']', "\\]").replace('<', "\\<");
     escaped.lines().map(|line| format!("/// {}\n", line.trim())).collect()

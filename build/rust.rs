@@ -7,7 +7,7 @@ use crate::reflection::{Buffer, Constant, Field, Kernel, Struct, Structs};
 
 impl Structs {
     /// The structs that kernels share, with what `text` says of them.
-    pub fn write(&self, text: &Text) -> String {
+    pub(crate) fn write(&self, text: &Text) -> String {
         let write = |(declared, _): &(Struct, String)| {
             let docs = format!("/// `{}` as the shaders' includes declare it.", declared.name);
             format!("{docs}\n{}", declared.write(text))
@@ -79,7 +79,7 @@ impl Constant {
 }
 
 impl Kernel {
-    pub fn write(&self, text: &Text, out: &mut String) {
+    pub(crate) fn write(&self, text: &Text, out: &mut String) {
         let Self { name, docs, workgroup_size, params, constants, subgroup_size_id, buffers } =
             self;
         let docs: String = docs.iter().map(|line| format!("///{line}\n")).collect();
