@@ -72,8 +72,8 @@ pub fn project_gaussian(
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
         let Slices { parameters, splats, colors, depth_keys, ids, tile_counts } = slices;
-        let &Params { view_from_world, focal, principal_point, size, near, .. } = params;
-        let camera = Camera::new(view_from_world, focal, principal_point, size);
+        let camera = Camera::from(&params.camera);
+        let (size, near) = (params.camera.size, params.near);
         let (channels, sh_degree) = (constants.channels as usize, constants.sh_degree);
         let feature_count = channels - 3;
         let planes = Planes { count: params.gaussian_count as usize, feature_count, sh_degree };

@@ -123,8 +123,7 @@ impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
         let Slices { parameters, splats, colors, tile_counts, d_splats, status, .. } = slices;
         let Slices { gradients, grad_norm_sums, visit_counts, .. } = slices;
-        let &Params { view_from_world, focal, principal_point, size, .. } = params;
-        let camera = Camera::new(view_from_world, focal, principal_point, size);
+        let camera = Camera::from(&params.camera);
         let (channels, sh_degree) = (constants.channels as usize, constants.sh_degree);
         let feature_count = channels - 3;
         let planes = Planes { count: params.gaussian_count as usize, feature_count, sh_degree };
