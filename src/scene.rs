@@ -6,6 +6,7 @@ use glam::Vec3;
 
 mod features;
 pub mod init;
+mod neighbours;
 pub mod ply;
 
 pub use features::{COLOR_CHANNELS, FEATURES, Feature, FeatureSpec, Features};
