@@ -5,6 +5,7 @@ use crate::gpu::Reference;
 use crate::kernels::RankSearch;
 use crate::kernels::luminance::{Constants, Kernel, Params, Slices};
 use crate::kernels::rank_search::{FIRST_SHIFT, WORKGROUP};
+use crate::tone::{luminance, measurable};
 
 impl Reference for Kernel {
     fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
@@ -31,15 +32,4 @@ impl Reference for Kernel {
             sums[params.first_sum as usize + thread] = total.sum;
         }
     }
-}
-
-/// BT.601 luminance of an RGB value, in the kernel's order of operations.
-pub(crate) fn luminance([r, g, b]: [f32; 3]) -> f32 {
-    0.299 * r + 0.587 * g + 0.114 * b
-}
-
-/// A value the statistics can take: finite, not negative.
-pub(crate) fn measurable(x: f32) -> f32 {
-    // Positive phrasing: a NaN fails it too.
-    if x > 0.0 { x.min(65504.0) } else { 0.0 }
 }
