@@ -49,9 +49,9 @@ impl Text {
             let (mut code, mut comment) = split_comment(line);
             if code.is_empty() {
                 if comment.is_empty() {
-                    above.clear()
+                    above.clear();
                 } else {
-                    above.push(comment)
+                    above.push(comment);
                 }
                 continue;
             }
@@ -155,7 +155,11 @@ impl std::fmt::Display for Constant {
             (true, list) => (format!("[{ty}; {}]", values.len()), format!("[{list}]")),
             (false, value) => ((*ty).to_owned(), value),
         };
-        writeln!(f, "{}pub const {name}: {ty} = {value};", rustdoc(comment, "See the shader."))
+        writeln!(
+            f,
+            "{}pub const {name}: {ty} = {value};",
+            rustdoc(comment, &format!("`{name}` of the shader."))
+        )
     }
 }
 

@@ -11,13 +11,13 @@
 use glam::Vec3;
 
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
-use crate::kernels::rank_search::{BINS, SEARCHES};
+use crate::kernels::rank_search::{BINS, SEARCHES, WORKGROUP};
 use crate::kernels::{self, RankSearch, ToneParameters, ToneStatistics};
 use crate::tone::{Rank, Statistics, ToneSettings, White};
 use crate::{Error, Result};
 
 /// Threads that share an image: enough to fill a large GPU, few enough that their partial sums add up quickly.
-const THREADS: u32 = 128 * 256;
+const THREADS: u32 = 128 * WORKGROUP;
 
 /// Takes the statistics of photographs and applies a tone curve, with scratch memory for the largest so far.
 #[derive(Debug)]

@@ -222,14 +222,11 @@ mod tests {
             let settings = ToneSettings::new(family.curve);
             let parameters = settings.parameters(&statistics);
             let model = Model { family, places: vec![], free: vec![] };
+            let numbers = Numbers::<f64>::from(&settings);
             for x in [0.0, 0.004, 0.03, 0.13, 0.3, 0.9] {
                 for channel in 0..3 {
                     let frame = Frame::of(statistics, channel);
-                    let found = clamped(model.at(
-                        &Numbers::<f64>::from(&settings),
-                        &frame,
-                        x / frame.p90(),
-                    ));
+                    let found = clamped(model.at(&numbers, &frame, x / frame.p90()));
                     let expected = if family.curve == ToneCurve::PerChannel {
                         clamped(x as f32 / parameters.constants[channel])
                     } else {
