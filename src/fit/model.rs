@@ -1,10 +1,10 @@
 //! A family as a function of the numbers that a fit may change.
 
 use super::{FitOptions, Pair};
-use crate::reference::curves::MAX_CONSTANTS;
-use crate::reference::real::{Dual, Real};
-use crate::reference::tone::{clamped, curve_at};
-use crate::tone::{Constant, Family, Law, Statistics, ToneSettings, White};
+use crate::tone::{
+    Constant, Dual, Family, Law, Numbers, Real, Statistics, ToneSettings, White, clamped, curve_at,
+    law,
+};
 use crate::{Error, Result};
 
 /// Where a number belongs among the [`ToneSettings`].
@@ -35,24 +35,14 @@ pub(super) struct Model {
     pub(super) free: Vec<Constant>,
 }
 
-/// All numbers of a curve, in any arithmetic.
-struct Numbers<T> {
-    shape: [T; MAX_CONSTANTS],
-    theta: T,
-    alpha: T,
-    gain_c: T,
-    base_gain: T,
-    beta: f64,
-}
-
-/// What a photograph makes of a curve.
+/// What the exposure of a photograph makes of a curve.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Frame {
+pub(super) struct Exposure {
     statistics: Statistics,
     channel: usize,
 }
 
-impl Frame {
+impl Exposure {
     /// Of several photographs together: t is all there is.
     pub(super) const POOLED: Self = Self {
         statistics: Statistics {
@@ -143,100 +133,70 @@ impl Model {
     }
 
     /// The curve at t = x / p90, clamped.
-    pub(super) fn value(&self, values: &[f64], frame: &Frame, t: f64) -> f64 {
-        clamped(self.raw_value(values, frame, t))
+    pub(super) fn value(&self, values: &[f64], exposure: &Exposure, t: f64) -> f64 {
+        clamped(self.raw_value(values, exposure, t))
     }
 
     /// The curve at t = x / p90, before it is clamped.
-    pub(super) fn raw_value(&self, values: &[f64], frame: &Frame, t: f64) -> f64 {
-        self.at(&numbers(&self.settings(values)), frame, t)
+    pub(super) fn raw_value(&self, values: &[f64], exposure: &Exposure, t: f64) -> f64 {
+        self.at(&Numbers::from(&self.settings(values)), exposure, t)
     }
 
     /// The derivatives of the clamped curve by every value; those that are no numbers count as 0.
-    pub(super) fn gradient(&self, values: &[f64], frame: &Frame, t: f64) -> Vec<f64> {
-        self.derivatives(values, frame, t, clamped)
+    pub(super) fn gradient(&self, values: &[f64], exposure: &Exposure, t: f64) -> Vec<f64> {
+        self.derivatives(values, exposure, t, clamped)
     }
 
     /// The derivatives of the curve before it is clamped.
-    pub(super) fn raw_gradient(&self, values: &[f64], frame: &Frame, t: f64) -> Vec<f64> {
-        self.derivatives(values, frame, t, |y| y)
+    pub(super) fn raw_gradient(&self, values: &[f64], exposure: &Exposure, t: f64) -> Vec<f64> {
+        self.derivatives(values, exposure, t, |y| y)
     }
 
     fn derivatives(
         &self,
         values: &[f64],
-        frame: &Frame,
+        exposure: &Exposure,
         t: f64,
         of: impl Fn(Dual) -> Dual,
     ) -> Vec<f64> {
         let settings = self.settings(values);
         let derivative = |&place: &Place| {
-            let mut numbers: Numbers<Dual> = numbers(&settings);
+            let mut numbers = Numbers::<Dual>::from(&settings);
             let variable = match place {
-                Place::Shape(index) => &mut numbers.shape[index],
+                Place::Shape(index) => &mut numbers.constants[index],
                 Place::Theta => &mut numbers.theta,
                 Place::Alpha => &mut numbers.alpha,
                 Place::GainC => &mut numbers.gain_c,
                 Place::BaseGain => &mut numbers.base_gain,
             };
             variable.derivative = 1.0;
-            let derivative = of(self.at(&numbers, frame, t)).derivative;
+            let derivative = of(self.at(&numbers, exposure, t)).derivative;
             if derivative.is_finite() { derivative } else { 0.0 }
         };
         self.places.iter().map(derivative).collect()
     }
 
-    /// As `ToneSettings::parameters` and the kernels have it, for any number.
-    fn at<T: Real>(&self, numbers: &Numbers<T>, frame: &Frame, t: f64) -> T {
-        let Statistics { p80, p90, mean_luminance, mean, channel_means, .. } = frame.statistics;
-        let number = |x: f32| T::of(x.into());
-        let x = T::of(t) * number(p90);
-        let bounded = |gain: T| gain.at_least(T::of(1.0)).at_most(T::of(6.0));
-        let epsilon = T::of(1e-6);
-        let plain = [T::of(0.0), T::of(1.0)];
-        let (t, law) = match self.family.white {
-            White::One => (x, plain),
-            White::Mean => (x * numbers.theta / number(mean).at_least(T::of(1e-12)), plain),
-            White::P80 => (x * bounded(numbers.theta / number(p80)), plain),
-            White::MeanLuminance => {
-                (x * bounded(numbers.theta / (number(mean_luminance) + epsilon)), plain)
-            }
-            White::ChannelMeans => {
-                (x * numbers.theta / (number(channel_means[frame.channel]) + epsilon), plain)
-            }
-            White::P90 => {
-                let black = T::of((1.0 - frame.statistics.ratio()).powf(numbers.beta));
-                let least = match self.family.law {
-                    Law::Added => T::of(1.0),
-                    Law::Rescaled => numbers.base_gain,
-                };
-                (T::of(t), [numbers.alpha * black, least + numbers.gain_c * number(mean_luminance)])
-            }
+    /// The curve at t = x / p90, for any number.
+    fn at<T: Real>(&self, numbers: &Numbers<T>, exposure: &Exposure, t: f64) -> T {
+        let family = self.family;
+        let curve = law(family, family.white, numbers, &exposure.statistics);
+        let white = match family.white {
+            White::ChannelMeans => curve.constants[exposure.channel],
+            _ => curve.white,
         };
-        curve_at(self.family.curve as u32, t, law, &numbers.shape)
-    }
-}
-
-fn numbers<T: Real>(settings: &ToneSettings) -> Numbers<T> {
-    let shape = |index: usize| T::of(settings.constants.get(index).copied().unwrap_or(0.0));
-    Numbers {
-        shape: std::array::from_fn(shape),
-        theta: T::of(settings.theta),
-        alpha: T::of(settings.alpha),
-        gain_c: T::of(settings.gain_c),
-        base_gain: T::of(settings.base_gain),
-        beta: settings.beta,
+        let t = T::of(t * exposure.p90()) / white;
+        curve_at(family.curve.constant(), t, [curve.offset, curve.gain], &curve.constants)
     }
 }
 
 /// The PSNR over all pixels and channels of what `settings` makes of the dark photograph, dB.
 pub fn psnr(settings: &ToneSettings, pair: &Pair) -> f64 {
     let model = Model { family: settings.curve.family(), places: vec![], free: vec![] };
-    let numbers = numbers::<f64>(settings);
+    let numbers = Numbers::<f64>::from(settings);
     let [mut count, mut squares] = [0.0; 2];
     for (channel, histogram) in pair.channels.iter().enumerate() {
-        let frame = Frame::of(pair.statistics, channel);
-        let value = |x: f64| clamped(model.at(&numbers, &frame, x / frame.p90()));
+        let exposure = Exposure::of(pair.statistics, channel);
+        let value = |x: f64| clamped(model.at(&numbers, &exposure, x / exposure.p90()));
         squares += histogram.residuals(value)[1];
         count += histogram.count();
     }
@@ -262,11 +222,11 @@ mod tests {
             let settings = ToneSettings::new(family.curve);
             let parameters = settings.parameters(&statistics);
             let model = Model { family, places: vec![], free: vec![] };
+            let numbers = Numbers::<f64>::from(&settings);
             for x in [0.0, 0.004, 0.03, 0.13, 0.3, 0.9] {
                 for channel in 0..3 {
-                    let frame = Frame::of(statistics, channel);
-                    let found =
-                        clamped(model.at(&numbers::<f64>(&settings), &frame, x / frame.p90()));
+                    let exposure = Exposure::of(statistics, channel);
+                    let found = clamped(model.at(&numbers, &exposure, x / exposure.p90()));
                     let expected = if family.curve == ToneCurve::PerChannel {
                         clamped(x as f32 / parameters.constants[channel])
                     } else {
@@ -289,19 +249,20 @@ mod tests {
             mean: 0.14,
             channel_means: [0.14; 3],
         };
-        let frame = Frame::of(statistics, 1);
+        let exposure = Exposure::of(statistics, 1);
         for family in FAMILIES.iter().filter(|family| family.white != White::One) {
             let model =
                 Model::new(family, &FitOptions { adapt: true, ..FitOptions::default() }).unwrap();
             let values: Vec<f64> = model.free.iter().map(|constant| constant.start).collect();
             for t in [0.05, 0.17, 0.61] {
-                for (index, exact) in model.raw_gradient(&values, &frame, t).into_iter().enumerate()
+                for (index, exact) in
+                    model.raw_gradient(&values, &exposure, t).into_iter().enumerate()
                 {
                     let h = 1e-6 * values[index].abs().max(1e-3);
                     let at = |shift: f64| {
                         let mut values = values.clone();
                         values[index] += shift;
-                        model.raw_value(&values, &frame, t)
+                        model.raw_value(&values, &exposure, t)
                     };
                     let difference = (at(h) - at(-h)) / (2.0 * h);
                     let what = model.free[index].name;

@@ -77,7 +77,8 @@ fn upsampled(
     let Component { size: [width, height], blocks, .. } = *component;
     let row = |y: usize| &plane[8 * blocks[0] * y..][..width];
     let near = row(y / down);
-    let beyond = if y % 2 == 0 { (y / 2).saturating_sub(1) } else { (y / 2 + 1).min(height - 1) };
+    let beyond =
+        if y.is_multiple_of(2) { (y / 2).saturating_sub(1) } else { (y / 2 + 1).min(height - 1) };
     match [across, down] {
         [2, 1] if width > 2 => doubled(|x| near[x].into(), width, [1, 2], 2, out),
         [2, 2] if width > 2 => {
@@ -98,7 +99,7 @@ fn upsampled(
 fn doubled(value: impl Fn(usize) -> u32, width: usize, bias: [u32; 2], shift: u32, out: &mut [u8]) {
     for (x, out) in out.iter_mut().enumerate() {
         let i = x / 2;
-        let other = if x % 2 == 0 { i.saturating_sub(1) } else { (i + 1).min(width - 1) };
+        let other = if x.is_multiple_of(2) { i.saturating_sub(1) } else { (i + 1).min(width - 1) };
         *out = ((3 * value(i) + value(other) + bias[x % 2]) >> shift) as u8;
     }
 }
