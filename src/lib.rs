@@ -22,13 +22,13 @@
 //! - [`fit`]: the constants of a curve from pairs of photographs
 //! - [`dataset`]: photographs with their cameras and points, from disk
 //! - [`scene`]: Gaussians on the host, the one table of their attributes, PLY
+//! - [`optimizer`]: Adam, what it learns beside the Gaussians, and the schedules of its rates
 //! - [`pseudo_gt`]: dark photograph and curve to target, on the device
 //! - [`structure`]: the edges of a pseudo-GT that do not depend on its illumination
 //! - [`render`]: the differentiable rasteriser
 //! - [`window`]: the rectangle of a view that networks run on
 //! - [`nn`]: denoiser and tonemapper, forward and backward
 //! - [`loss`]: the loss terms with their gradients, and their log
-//! - [`optimizer`]: Adam and the schedules of its learning rates
 //! - [`densify`]: clone, split, prune
 //! - [`train`]: one step after another
 //! - [`metrics`]: PSNR and SSIM of a render against its reference image

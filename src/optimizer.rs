@@ -1,7 +1,9 @@
-//! Adam over the Gaussians' planes, and the schedules of its learning rates.
+//! Adam over the Gaussians' planes and over what else is learned, and the schedules of its learning rates.
 
+mod learnable;
 mod schedule;
 
+pub use learnable::{Arrays, Learnable};
 pub use schedule::{LearningRates, Schedule};
 
 use crate::gpu::{Buffer, Gpu, Kernel, Pipeline, Recorder, Threads};

@@ -1,76 +1,9 @@
 //! The log of the loss terms: one row per step, one column per term, filled on the device.
 
+use super::Term;
 use crate::gpu::{Buffer, Download, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::loss_log;
 use crate::{Error, Result};
-
-/// A loss term that the log has a column for.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Term {
-    /// Mean |render - target|.
-    L1,
-    /// Mean SSIM of render and target.
-    Ssim,
-    /// Mean |render - photograph| of the dark reconstruction.
-    LowL1,
-    /// Mean SSIM of the dark reconstruction and the photograph.
-    LowSsim,
-    /// Mean |structure - that of the target|.
-    Structure,
-    /// 1 - correlation of depths over the view.
-    Depth,
-    /// Mean 1 - correlation of depths over boxes.
-    DepthLocal,
-    /// Mean squared difference of denoised and rendered image.
-    Denoising,
-    /// Total variation of the denoised image.
-    TotalVariation,
-}
-
-impl Term {
-    /// Every term, in the order of the columns.
-    pub const ALL: [Self; 9] = [
-        Self::L1,
-        Self::Ssim,
-        Self::LowL1,
-        Self::LowSsim,
-        Self::Structure,
-        Self::Depth,
-        Self::DepthLocal,
-        Self::Denoising,
-        Self::TotalVariation,
-    ];
-
-    /// The term's column in train.csv.
-    pub const fn column(self) -> &'static str {
-        match self {
-            Self::L1 => "l1",
-            Self::Ssim => "ssim",
-            Self::LowL1 => "low_l1",
-            Self::LowSsim => "low_ssim",
-            Self::Structure => "structure",
-            Self::Depth => "depth",
-            Self::DepthLocal => "depth_local",
-            Self::Denoising => "denoising",
-            Self::TotalVariation => "total_variation",
-        }
-    }
-
-    /// What the term is called in messages and tables.
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::L1 => "L1",
-            Self::Ssim => "SSIM",
-            Self::LowL1 => "L1 of the dark reconstruction",
-            Self::LowSsim => "SSIM of the dark reconstruction",
-            Self::Structure => "structure",
-            Self::Depth => "depth",
-            Self::DepthLocal => "local depth",
-            Self::Denoising => "denoising",
-            Self::TotalVariation => "total variation",
-        }
-    }
-}
 
 /// The terms of one step.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -83,7 +16,7 @@ pub struct StepLosses {
 impl StepLosses {
     /// The mean that `term` had; 0 if it was never recorded.
     pub fn get(&self, term: Term) -> f32 {
-        self.values[term as usize]
+        self.values[term.index()]
     }
 
     /// The first term that is NaN or infinite.
@@ -195,7 +128,7 @@ impl LogSlot<'_> {
             &loss_log::Params {
                 slot: self.slot,
                 term_count: Term::ALL.len() as u32,
-                terms: [first.term as u32, second.term as u32].into(),
+                terms: [first.term.index() as u32, second.term.index() as u32].into(),
                 partial_counts: [first.count, second.count].into(),
                 mean_scales: [first.scale, second.scale].into(),
                 not_finite_flag: self.not_finite_flag,

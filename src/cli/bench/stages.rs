@@ -145,7 +145,7 @@ impl<'s> Step<'s> {
         let mut tone = gpu.zeros("tone", 1)?;
         let size = [low.width, low.height];
         gpu.run("statistics", |pass| pseudo_gt.statistics(pass, &image, size, &mut tone, 0))?;
-        let terms = [Term::L1, Term::Ssim];
+        let terms = [Term::L1, Term::SSIM];
         let settings = LossSettings { tone_curve: curve.constant(), ssim_weight: 0.2, terms };
         let mut loss = Loss::new(gpu, settings)?;
         loss.reserve(UVec2::from_array(size))?;

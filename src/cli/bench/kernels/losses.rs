@@ -72,7 +72,7 @@ pub(super) fn image(
         loss_log::Params {
             slot: 0,
             term_count: Term::ALL.len() as u32,
-            terms: UVec2::new(Term::L1 as u32, Term::Ssim as u32),
+            terms: UVec2::new(Term::L1.index() as u32, Term::SSIM.index() as u32),
             partial_counts: UVec2::splat(workgroups),
             mean_scales: Vec2::splat(mean_scale),
             not_finite_flag: 2,
