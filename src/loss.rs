@@ -61,9 +61,12 @@ pub struct LossSpec {
     pub feature: Option<Feature>,
     /// What it logs.
     pub terms: &'static [Term],
-    /// Builds a term of the render; those of the networks' outputs are built and recorded with the networks.
-    pub on_render: Option<fn(&Gpu, &LossConfig) -> Result<Box<dyn LossTerm>>>,
+    /// Builds it where it is one of the render; those of the networks' outputs are built and recorded with the networks.
+    pub on_render: Option<BuildTerm>,
 }
+
+/// Builds a term of the render.
+pub type BuildTerm = fn(&Gpu, &LossConfig) -> Result<Box<dyn LossTerm>>;
 
 /// A value that a loss term logs, and how it enters the loss.
 #[derive(Clone, Copy)]
@@ -174,6 +177,7 @@ impl LossConfig {
 }
 
 /// A training view as the terms see it before the first step.
+#[expect(missing_debug_implementations, reason = "it holds a closure")]
 pub struct ViewSource<'a> {
     /// Width and height in pixels.
     pub size: UVec2,

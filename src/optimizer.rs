@@ -123,12 +123,6 @@ fn params(
         column_count,
         feature_count,
         second_correction: (1.0 / uncorrected(0.999).sqrt()) as f32,
-        means_rate: rate(rates.means),
-        quats_rate: rate(rates.quats),
-        log_scales_rate: rate(rates.log_scales),
-        raw_opacities_rate: rate(rates.raw_opacities),
-        dc_rate: rate(rates.dc),
-        features_rate: rate(rates.features),
-        rest_rate: rate(rates.rest),
+        rates: rates.0.map(rate),
     }
 }

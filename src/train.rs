@@ -19,7 +19,7 @@ use crate::dataset::Dataset;
 use crate::densify::{Densifier, DensifySettings};
 use crate::gpu::{Buffer, Gpu, PassTime, Recorder};
 use crate::image::Image;
-use crate::loss::{DepthBoxes, LogSlot, Losses, LossLog, StepLosses, Term, TermInputs};
+use crate::loss::{DepthBoxes, LogSlot, LossLog, Losses, StepLosses, Term, TermInputs};
 use crate::optimizer::{Adam, AdamBuffers, Learnable};
 use crate::pseudo_gt::PseudoGt;
 use crate::random::Stream;

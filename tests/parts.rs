@@ -5,6 +5,7 @@
 use std::path::Path;
 use std::process::{Command, Output};
 
+use nightsplat::attributes::Attribute;
 use nightsplat::dataset::Dataset;
 use nightsplat::dataset::synthetic::{self, SyntheticOptions};
 use nightsplat::gpu::testing::{assert_no_validation_messages, gpu};
@@ -39,7 +40,7 @@ fn config(parts: &[Part]) -> TrainConfig {
     config.model.network.repeats = 2;
     config.model.rates.denoiser = 1e-2;
     config.model.rates.tonemapper = 1e-2;
-    config.schedule.initial_rates.features = 5e-2;
+    config.schedule.initial_rates[Attribute::Features] = 5e-2;
     config
 }
 

@@ -22,8 +22,10 @@ pub fn save(path: &Path, networks: &[&Parameters], gpu: &Gpu) -> Result<()> {
     let mut settings = BTreeMap::new();
     let mut values = vec![];
     for parameters in networks {
-        settings
-            .insert(parameters.name, serde_json::from_str(parameters.settings()).unwrap_or(Value::Null));
+        settings.insert(
+            parameters.name,
+            serde_json::from_str(parameters.settings()).unwrap_or(Value::Null),
+        );
         values.push(gpu.read(&parameters.values)?);
     }
     let failed = |error: &dyn std::fmt::Display| {
@@ -34,7 +36,10 @@ pub fn save(path: &Path, networks: &[&Parameters], gpu: &Gpu) -> Result<()> {
         for tensor in parameters.tensors() {
             let bytes = bytemuck::cast_slice(&values[tensor.offset..][..tensor.len()]);
             let view = TensorView::new(Dtype::F32, tensor.shape.clone(), bytes);
-            views.push((format!("{}.{}", parameters.name, tensor.name), view.map_err(|e| failed(&e))?));
+            views.push((
+                format!("{}.{}", parameters.name, tensor.name),
+                view.map_err(|e| failed(&e))?,
+            ));
         }
     }
     let settings = serde_json::json!(settings).to_string();

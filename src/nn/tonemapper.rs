@@ -65,11 +65,7 @@ impl Tonemapper {
         ];
         Ok(Self {
             gpu: gpu.clone(),
-            parameters: layout.upload(
-                gpu,
-                ("tonemapper", Self::LEARNING_RATE),
-                "{}".to_owned(),
-            )?,
+            parameters: layout.upload(gpu, ("tonemapper", Self::LEARNING_RATE), "{}".to_owned())?,
             offsets,
             convs: [
                 Conv::new(gpu, [RGB, CHANNELS], Activation::Relu, false, Precision::Single)?,

@@ -1,8 +1,8 @@
-//! One Gaussian's attributes in the planes of `include/gaussian.glsl`.
+//! One Gaussian's attributes in the planes of [`attributes`](crate::attributes).
 
 use glam::{DVec3, DVec4};
 
-use super::sh::sh_count;
+use crate::attributes::{Attribute, column_count, planes};
 
 /// A Gaussian, or the gradient of one, in f64.
 #[derive(Clone, Debug, PartialEq)]
@@ -35,7 +35,7 @@ pub struct Planes {
 impl Planes {
     /// Floats of the whole array.
     pub fn len(self) -> usize {
-        self.count * (11 + self.feature_count + 3 * sh_count(self.sh_degree))
+        self.count * column_count(self.feature_count, self.sh_degree)
     }
 
     /// True where there is no Gaussian.
@@ -45,10 +45,19 @@ impl Planes {
 
     /// Where Gaussian `i` has its floats, in the order of [`Gaussian`].
     fn places(self, i: usize) -> impl Iterator<Item = usize> {
-        let (features, rest) = (self.feature_count, 3 * (sh_count(self.sh_degree) - 1));
-        let planes =
-            [(0, 3), (3, 4), (7, 3), (10, 1), (14, features), (11, 3), (14 + features, rest)];
-        planes.into_iter().flat_map(move |(column, width)| {
+        const ORDER: [Attribute; 7] = [
+            Attribute::Means,
+            Attribute::Quats,
+            Attribute::LogScales,
+            Attribute::RawOpacities,
+            Attribute::Features,
+            Attribute::Dc,
+            Attribute::Rest,
+        ];
+        let columns = column_count(self.feature_count, self.sh_degree);
+        let planes = planes(self.feature_count, columns);
+        ORDER.into_iter().flat_map(move |attribute| {
+            let (column, width) = planes[attribute as usize];
             let first = column * self.count + width * i;
             first..first + width
         })

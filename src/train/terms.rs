@@ -11,7 +11,7 @@ use crate::loss::{
     DenoisingGradients, DenoisingInputs, DenoisingLoss, DenoisingWeights, Interior, LogSlot, Loss,
     LossInputs, LossSettings, Term, TermInputs,
 };
-use crate::nn::{Denoiser, Tonemapper};
+use crate::nn::Denoiser;
 use crate::random::Stream;
 use crate::scene::{COLOR_CHANNELS, Feature};
 use crate::tone::ToneCurve;
@@ -123,7 +123,7 @@ impl NetworkTerms {
         denoiser + tonemapper.map_or(0, |tonemapper| tonemapper.margin() + SSIM_RADIUS)
     }
 
-    /// Records the networks' step: adds to dL/dR_0 and writes the planes of noise and illumination in `d_render`,
+    /// Records the networks' step: adds to `dL/dR_0` and writes the planes of noise and illumination in `d_render`,
     /// (channels, H, W). `photograph` is the dark one of the view, (3, H, W).
     pub(super) fn record(
         &mut self,

@@ -11,9 +11,9 @@ use crate::dataset::{Dataset, Point};
 use crate::gpu::{Buffer, Gpu};
 use crate::image::Image;
 use crate::kernels::ToneParameters;
+use crate::loss::ViewSource;
 use crate::pseudo_gt::PseudoGt;
 use crate::random::Stream;
-use crate::loss::ViewSource;
 use crate::scene::{Gaussians, Shape, init};
 use crate::tone::{Statistics, ToneCurve, ToneSettings};
 
