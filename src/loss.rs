@@ -86,34 +86,14 @@ pub struct Term {
 
 impl Term {
     /// Every term, in the order of the columns.
-    pub const ALL: [Self; term_count()] = {
-        let mut all = [Self::L1; term_count()];
-        let (mut spec, mut first) = (0, 0);
-        while spec < TERMS.len() {
-            let terms = TERMS[spec].terms;
-            let mut term = 0;
-            while term < terms.len() {
-                all[first + term] = terms[term];
-                term += 1;
-            }
-            (spec, first) = (spec + 1, first + terms.len());
-        }
-        all
-    };
+    pub fn all() -> impl Iterator<Item = Self> {
+        TERMS.iter().flat_map(|spec| spec.terms).copied()
+    }
 
     /// Its place among the columns.
     pub fn index(self) -> usize {
-        Self::ALL.iter().position(|term| *term == self).unwrap_or_default()
+        Self::all().position(|term| term == self).unwrap_or_default()
     }
-}
-
-const fn term_count() -> usize {
-    let (mut spec, mut count) = (0, 0);
-    while spec < TERMS.len() {
-        count += TERMS[spec].terms.len();
-        spec += 1;
-    }
-    count
 }
 
 impl PartialEq for Term {
@@ -163,7 +143,7 @@ impl LossConfig {
     /// # Errors
     /// [`Error::Usage`] names a setting that gives a term, whether the model has it or not, a weight that makes no sense.
     pub fn check(&self) -> Result<()> {
-        for term in Term::ALL {
+        for term in Term::all() {
             let weight = (term.weight)(self);
             check_weight(&format!("{} (by {})", term.name, term.setting), weight)?;
         }

@@ -69,82 +69,45 @@ impl Gaussians {
         planes(self.shape.features.width(), width(self.shape))[attribute as usize]
     }
 
-    /// Positions in the world, (count).
-    pub fn means(&self) -> &[Vec3] {
-        bytemuck::cast_slice(&self.parameters[self.plane(Attribute::Means)])
-    }
-
-    /// Positions in the world, (count), to change.
-    pub fn means_mut(&mut self) -> &mut [Vec3] {
-        let plane = self.plane(Attribute::Means);
-        bytemuck::cast_slice_mut(&mut self.parameters[plane])
-    }
-
-    /// Rotations (w, x, y, z), not normalised, (count).
-    pub fn quats(&self) -> &[[f32; 4]] {
-        bytemuck::cast_slice(&self.parameters[self.plane(Attribute::Quats)])
-    }
-
-    /// Rotations (w, x, y, z), (count), to change.
-    pub fn quats_mut(&mut self) -> &mut [[f32; 4]] {
-        let plane = self.plane(Attribute::Quats);
-        bytemuck::cast_slice_mut(&mut self.parameters[plane])
-    }
-
-    /// Natural logarithms of the standard deviations, (count).
-    pub fn log_scales(&self) -> &[Vec3] {
-        bytemuck::cast_slice(&self.parameters[self.plane(Attribute::LogScales)])
-    }
-
-    /// Natural logarithms of the standard deviations, (count), to change.
-    pub fn log_scales_mut(&mut self) -> &mut [Vec3] {
-        let plane = self.plane(Attribute::LogScales);
-        bytemuck::cast_slice_mut(&mut self.parameters[plane])
-    }
-
-    /// Opacities before the sigmoid, (count).
-    pub fn raw_opacities(&self) -> &[f32] {
-        &self.parameters[self.plane(Attribute::RawOpacities)]
-    }
-
-    /// Opacities before the sigmoid, (count), to change.
-    pub fn raw_opacities_mut(&mut self) -> &mut [f32] {
-        let plane = self.plane(Attribute::RawOpacities);
-        &mut self.parameters[plane]
-    }
-
-    /// SH coefficients of degree 0, RGB, (count).
-    pub fn dc(&self) -> &[Vec3] {
-        bytemuck::cast_slice(&self.parameters[self.plane(Attribute::Dc)])
-    }
-
-    /// SH coefficients of degree 0, RGB, (count), to change.
-    pub fn dc_mut(&mut self) -> &mut [Vec3] {
-        let plane = self.plane(Attribute::Dc);
-        bytemuck::cast_slice_mut(&mut self.parameters[plane])
-    }
-
     /// Adds a constant to the colour from every direction.
     pub fn shift_colors(&mut self, by: f32) {
         for dc in self.dc_mut() {
             *dc += by / SH_C0;
         }
     }
+}
 
-    /// What is blended beside colour, (count, features), to change.
-    pub fn features_mut(&mut self) -> &mut [f32] {
-        let plane = self.plane(Attribute::Features);
-        &mut self.parameters[plane]
-    }
+/// One way in and one way out of every plane, as the elements it is made of.
+macro_rules! accessors {
+    ($($(#[$doc:meta])* $attribute:ident: $read:ident, $write:ident -> $element:ty,)*) => {
+        impl Gaussians {$(
+            $(#[$doc])*
+            pub fn $read(&self) -> &[$element] {
+                bytemuck::cast_slice(&self.parameters[self.plane(Attribute::$attribute)])
+            }
 
+            $(#[$doc])*
+            pub fn $write(&mut self) -> &mut [$element] {
+                let plane = self.plane(Attribute::$attribute);
+                bytemuck::cast_slice_mut(&mut self.parameters[plane])
+            }
+        )*}
+    };
+}
+
+accessors! {
+    /// Positions in the world, (count).
+    Means: means, means_mut -> Vec3,
+    /// Rotations (w, x, y, z), not normalised, (count).
+    Quats: quats, quats_mut -> [f32; 4],
+    /// Natural logarithms of the standard deviations, (count).
+    LogScales: log_scales, log_scales_mut -> Vec3,
+    /// Opacities before the sigmoid, (count).
+    RawOpacities: raw_opacities, raw_opacities_mut -> f32,
+    /// SH coefficients of degree 0, RGB, (count).
+    Dc: dc, dc_mut -> Vec3,
+    /// What is blended beside colour, (count, features).
+    Features: features, features_mut -> f32,
     /// SH coefficients above degree 0, RGB, (count, [`rest_coefficients`]).
-    pub fn rest(&self) -> &[Vec3] {
-        bytemuck::cast_slice(&self.parameters[self.plane(Attribute::Rest)])
-    }
-
-    /// SH coefficients above degree 0, RGB, (count, [`rest_coefficients`]), to change.
-    pub fn rest_mut(&mut self) -> &mut [Vec3] {
-        let plane = self.plane(Attribute::Rest);
-        bytemuck::cast_slice_mut(&mut self.parameters[plane])
-    }
+    Rest: rest, rest_mut -> Vec3,
 }

@@ -6,11 +6,12 @@ use crate::kernels::loss_log;
 use crate::{Error, Result};
 
 /// The terms of one step.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct StepLosses {
     /// The status word behind the last term: the step counts only if it is 0.
     pub status: u32,
-    values: [f32; Term::ALL.len()],
+    /// One per term.
+    values: Vec<f32>,
 }
 
 impl StepLosses {
@@ -21,7 +22,7 @@ impl StepLosses {
 
     /// The first term that is NaN or infinite.
     pub fn first_not_finite(&self) -> Option<Term> {
-        Term::ALL.into_iter().find(|&term| !self.get(term).is_finite())
+        Term::all().find(|&term| !self.get(term).is_finite())
     }
 }
 
@@ -71,7 +72,7 @@ impl LossLog {
     pub fn new(gpu: &Gpu, slots: usize) -> Result<Self> {
         Ok(Self {
             pipeline: gpu.pipeline(&loss_log::Constants::default())?,
-            values: gpu.zeros("loss_log", slots * Term::ALL.len())?,
+            values: gpu.zeros("loss_log", slots * Term::all().count())?,
             statuses: gpu.zeros("step_statuses", slots)?,
         })
     }
@@ -100,8 +101,8 @@ impl LossLogDownload {
     /// The device was lost.
     pub fn wait(self) -> Result<Vec<StepLosses>> {
         let (values, statuses) = (self.values.wait()?, self.statuses.wait()?);
-        let rows = values.as_chunks().0.iter().zip(statuses);
-        Ok(rows.map(|(&values, status)| StepLosses { status, values }).collect())
+        let rows = values.chunks_exact(Term::all().count()).map(<[f32]>::to_vec).zip(statuses);
+        Ok(rows.map(|(values, status)| StepLosses { status, values }).collect())
     }
 }
 
@@ -127,7 +128,7 @@ impl LogSlot<'_> {
             &self.log.pipeline,
             &loss_log::Params {
                 slot: self.slot,
-                term_count: Term::ALL.len() as u32,
+                term_count: Term::all().count() as u32,
                 terms: [first.term.index() as u32, second.term.index() as u32].into(),
                 partial_counts: [first.count, second.count].into(),
                 mean_scales: [first.scale, second.scale].into(),
