@@ -326,8 +326,8 @@ impl Trainer {
                 parameters: &mut model.gaussians.parameters,
                 gradients: &model.gradients,
                 moments: &mut model.gaussians.moments,
-                status: self.renderer.status(),
             },
+            self.renderer.status(),
         )?;
         learnables(&mut self.networks).try_for_each(|learnable| {
             self.adam.update(pass, step, learnable, self.renderer.status())

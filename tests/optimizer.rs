@@ -59,9 +59,15 @@ impl Planes {
                 parameters: &mut parameters,
                 gradients: &gradients,
                 moments: &mut moments,
-                status: &status,
             };
-            adam.record(pass, step, &RATES, [gaussian_count, column_count, FEATURES], buffers)
+            adam.record(
+                pass,
+                step,
+                &RATES,
+                [gaussian_count, column_count, FEATURES],
+                buffers,
+                &status,
+            )
         })
         .unwrap();
         self.parameters = gpu.read(&parameters).unwrap();
@@ -264,9 +270,8 @@ fn a_buffer_that_is_too_short_is_refused() {
                 parameters: &mut parameters,
                 gradients: &gradients,
                 moments: &mut moments,
-                status: &status,
             };
-            adam.record(pass, step, &rates, [2, 14, 0], buffers)
+            adam.record(pass, step, &rates, [2, 14, 0], buffers, &status)
         });
         assert!(result.is_err(), "{lengths:?} {status_len} {step}");
     }

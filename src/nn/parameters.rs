@@ -2,7 +2,7 @@
 
 use crate::Result;
 use crate::gpu::{Buffer, Gpu};
-use crate::optimizer::{Arrays, Learnable, Moments};
+use crate::optimizer::{AdamBuffers, Learnable, Moments};
 use crate::random::Stream;
 
 /// Where a tensor lies in the array, under its name in `PyTorch`.
@@ -66,9 +66,9 @@ impl Learnable for Parameters {
         self.learning_rate
     }
 
-    fn arrays(&mut self) -> Arrays<'_> {
+    fn buffers(&mut self) -> AdamBuffers<'_> {
         let Self { values, gradients, moments, .. } = self;
-        Arrays { values, gradients, moments }
+        AdamBuffers { parameters: values, gradients, moments }
     }
 }
 

@@ -1,6 +1,6 @@
 //! What is learned beside the Gaussians.
 
-use super::{Adam, AdamBuffers, LearningRates, Moments};
+use super::{Adam, AdamBuffers, LearningRates};
 use crate::Result;
 use crate::gpu::{Buffer, Recorder};
 
@@ -12,23 +12,12 @@ pub trait Learnable {
     /// Adam's learning rate.
     fn learning_rate(&self) -> f64;
 
-    /// What is trained.
-    fn arrays(&mut self) -> Arrays<'_>;
-}
-
-/// The numbers of a [`Learnable`] and what belongs to each.
-#[derive(Debug)]
-pub struct Arrays<'a> {
-    /// What is learned.
-    pub values: &'a mut Buffer<f32>,
-    /// dL/d values of the step.
-    pub gradients: &'a Buffer<f32>,
-    /// What Adam keeps.
-    pub moments: &'a mut Moments,
+    /// What is learned, with the gradients of the step and what Adam keeps.
+    fn buffers(&mut self) -> AdamBuffers<'_>;
 }
 
 impl Adam {
-    /// Records step number `step`, from 1, of all values; nothing changes while `status` is set.
+    /// Records step number `step`, from 1, of all that is learned; nothing changes while `status` is set.
     ///
     /// # Errors
     /// As [`Adam::record`].
@@ -40,15 +29,9 @@ impl Adam {
         status: &Buffer<u32>,
     ) -> Result<()> {
         let rates = LearningRates::uniform(learnable.learning_rate());
-        let Arrays { values, gradients, moments } = learnable.arrays();
+        let buffers = learnable.buffers();
         // One column of planes.
-        let shape = [values.len() as u32, 1, 0];
-        self.record(
-            pass,
-            step,
-            &rates,
-            shape,
-            AdamBuffers { parameters: values, gradients, moments, status },
-        )
+        let shape = [buffers.parameters.len() as u32, 1, 0];
+        self.record(pass, step, &rates, shape, buffers, status)
     }
 }

@@ -13,7 +13,7 @@ use super::model::Model;
 use super::{TrainConfig, Trainer, learnables};
 use crate::densify::DeviceGaussians;
 use crate::gpu::{Buffer, Gpu};
-use crate::optimizer::{Arrays, Moments};
+use crate::optimizer::{AdamBuffers, Moments};
 use crate::output::write_whole_with;
 use crate::{Error, Result};
 
@@ -167,9 +167,9 @@ impl Trainer {
         state.extend(optimized("gaussians", &[columns, count], parameters, moments));
         for learnable in learnables(&mut self.networks) {
             let name = learnable.name();
-            let Arrays { values, moments, .. } = learnable.arrays();
-            let len = values.len();
-            state.extend(optimized(name, &[len], values, moments));
+            let AdamBuffers { parameters, moments, .. } = learnable.buffers();
+            let len = parameters.len();
+            state.extend(optimized(name, &[len], parameters, moments));
         }
         state
     }

@@ -211,8 +211,8 @@ impl<'s> Step<'s> {
                 parameters: &mut self.parameters,
                 gradients: &self.gradients,
                 moments: &mut self.moments,
-                status: self.renderer.status(),
             },
+            self.renderer.status(),
         )
     }
 }
