@@ -6,17 +6,17 @@ use glam::Vec3;
 
 mod features;
 pub mod init;
+mod neighbours;
 pub mod ply;
 
 pub use crate::attributes::{ATTRIBUTES, Attribute, rest_coefficients};
 use crate::attributes::{column_count, planes};
 pub use features::{COLOR_CHANNELS, FEATURES, Feature, FeatureSpec, Features};
 
-/// The constant basis function of the spherical harmonics, 1 / (2 sqrt(pi)).
-pub const SH_C0: f32 = 0.282_094_79;
+pub use crate::kernels::sh::MAX_SH_DEGREE;
 
-/// The highest SH degree that the kernels know.
-pub const MAX_SH_DEGREE: u32 = 3;
+/// The constant basis function of the spherical harmonics.
+pub const SH_C0: f32 = crate::kernels::sh::SH_C0 as f32;
 
 /// What the Gaussians of a scene are made of, beside the ellipsoid and its opacity.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

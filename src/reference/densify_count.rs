@@ -1,11 +1,7 @@
 use crate::attributes::{Attribute, planes};
 use crate::gpu::Reference;
 use crate::kernels::densify_count::{Constants, Kernel, Params, Slices};
-
-pub(super) const PRUNE: u32 = 0;
-pub(super) const KEEP: u32 = 1;
-pub(super) const CLONE: u32 = 2;
-pub(super) const SPLIT: u32 = 3;
+use crate::kernels::fate::{FATE_CLONE, FATE_KEEP, FATE_PRUNE, FATE_SPLIT};
 
 impl Reference for Kernel {
     fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
@@ -26,11 +22,11 @@ impl Reference for Kernel {
                 visits => slices.grad_norm_sums[i] / visits as f32,
             };
             let fate = if !is_finite || !is_visible {
-                PRUNE
+                FATE_PRUNE
             } else if mean_gradient > params.gradient_threshold {
-                if largest > params.split_log_scale { SPLIT } else { CLONE }
+                if largest > params.split_log_scale { FATE_SPLIT } else { FATE_CLONE }
             } else {
-                KEEP
+                FATE_KEEP
             };
             slices.mean_gradients[i] = mean_gradient;
             slices.fates[i] = fate;

@@ -7,6 +7,7 @@ use super::{ModelConfig, TrainConfig, streams};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Recorder};
 use crate::kernels::ToneParameters;
+use crate::kernels::ssim::RADIUS;
 use crate::loss::{
     DenoisingGradients, DenoisingInputs, DenoisingLoss, DenoisingWeights, Interior, LogSlot, Loss,
     LossInputs, LossSettings, Term, TermInputs,
@@ -16,9 +17,6 @@ use crate::random::Stream;
 use crate::scene::{COLOR_CHANNELS, Feature};
 use crate::tone::ToneCurve;
 use crate::window::Window;
-
-/// How far SSIM looks, in pixels.
-const SSIM_RADIUS: u32 = 5;
 
 /// The networks in training, and the terms that their outputs are held to.
 #[derive(Debug)]
@@ -120,7 +118,7 @@ impl NetworkTerms {
     fn margin(&self) -> u32 {
         let denoiser = self.networks.denoiser.as_ref().map_or(0, Denoiser::margin);
         let tonemapper = self.networks.tonemapper.as_ref();
-        denoiser + tonemapper.map_or(0, |tonemapper| tonemapper.margin() + SSIM_RADIUS)
+        denoiser + tonemapper.map_or(0, |tonemapper| tonemapper.margin() + RADIUS as u32)
     }
 
     /// Records the networks' step: adds to `dL/dR_0` and writes the planes of noise and illumination in `d_render`,
