@@ -60,7 +60,7 @@ impl RunDirectory {
         std::fs::create_dir_all(path).map_err(|error| unwritable(path, &error))?;
         remove(path, &FILES)?;
         let mut run = Self::open(path, config, "", 0.0)?;
-        let columns: String = run.terms.iter().map(|term| format!("{},", term.column())).collect();
+        let columns: String = run.terms.iter().map(|term| format!("{},", term.column)).collect();
         run.log_line(&format!("step,view,loss,{columns}gaussians,milliseconds"))?;
         Ok(run)
     }
@@ -95,7 +95,7 @@ impl RunDirectory {
         write_whole(&log_path, log.as_bytes())?;
         let log = File::options().append(true).open(&log_path);
         let log = BufWriter::new(log.map_err(|error| unwritable(&log_path, &error))?);
-        let terms = config.terms().into_iter().map(|(term, _)| term).collect();
+        let terms = config.loss().terms();
         Ok(Self { path: path.to_owned(), log, terms, seconds_before })
     }
 
