@@ -115,11 +115,6 @@ impl Gpu {
         &self.shared.properties
     }
 
-    /// Validation messages seen so far (own devices with validation only).
-    pub fn validation_messages(&self) -> Vec<String> {
-        self.shared.owned.as_ref().map(device::Owned::messages).unwrap_or_default()
-    }
-
     /// Waits until everything submitted so far is done.
     ///
     /// # Errors

@@ -23,7 +23,8 @@ use crate::scene::Shape;
 use crate::sort::{Count, DispatchArguments, RadixSort, Scan};
 use crate::{Error, Result};
 
-use frame::Frame;
+#[doc(hidden)]
+pub use frame::Frame;
 pub use frame::Status;
 
 /// Values per pixel that a background is given for.
@@ -207,6 +208,17 @@ impl Renderer {
     /// The last render, planar (channels, H, W): RGB, then the features.
     pub fn render(&self) -> &Buffer<f32> {
         &self.frame.render
+    }
+
+    /// How much of the background the last render lets through, (H, W): 1 where no splat is.
+    pub fn transmittances(&self) -> &Buffer<f32> {
+        &self.frame.transmittances
+    }
+
+    /// Everything that the passes of the last render handed each other.
+    #[doc(hidden)]
+    pub fn frame(&self) -> &Frame {
+        &self.frame
     }
 
     /// The status words: see [`Status`]. Kernels that change parameters look at the first and do nothing unless it is 0.

@@ -1,9 +1,7 @@
 //! The pseudo-GT kernels against their references, and the whole against the statistics on the host.
 
-use std::path::Path;
-
 use glam::Vec3;
-use nightsplat::gpu::testing::{assert_no_validation_messages, gpu};
+use nightsplat::gpu::testing::gpu;
 use nightsplat::gpu::{Gpu, Reference, Threads};
 use nightsplat::image::Image;
 use nightsplat::kernels::{
@@ -13,6 +11,9 @@ use nightsplat::kernels::{
 use nightsplat::pseudo_gt::PseudoGt;
 use nightsplat::tone::{Statistics, ToneCurve, ToneSettings};
 use nightsplat::{Error, Result};
+
+mod common;
+use common::{assert_close, fixture, shared};
 
 /// One curve for every way to find white, gain and black level.
 const CURVES: [ToneCurve; 8] = [
@@ -119,7 +120,6 @@ fn luminance_matches_the_reference() {
             assert_eq!(gpu.read(&buffers.3).unwrap(), histograms);
         }
     }
-    assert_no_validation_messages();
 }
 
 #[test]
@@ -199,7 +199,6 @@ fn luminance_histogram_and_percentile_select_match_their_references() {
         let found = searches.map(|search| f32::from_bits(search.prefix));
         assert_eq!(found, ranks.map(|rank| sorted[rank as usize]), "{pixels} pixels");
     }
-    assert_no_validation_messages();
 }
 
 #[test]
@@ -270,7 +269,6 @@ fn tone_statistics_matches_the_reference() {
             }
         }
     }
-    assert_no_validation_messages();
 }
 
 /// Equal but for the division behind white and the power behind the offset, which Vulkan allows many ulps.
@@ -332,7 +330,6 @@ fn tone_map_follows_the_reference_from_tiny_to_huge_values() {
             println!("{curve} {white}: {worst:e}");
         }
     }
-    assert_no_validation_messages();
 }
 
 #[test]
@@ -377,7 +374,6 @@ fn device_statistics_equal_the_host_s() {
             assert!(target.iter().all(|y| (0.0..=1.0).contains(y)), "{name}, {curve}");
         }
     }
-    assert_no_validation_messages();
 }
 
 #[test]
@@ -401,7 +397,6 @@ fn views_of_different_sizes_share_one_recording() {
         let expected = settings.parameters(&Statistics::of(image));
         assert!(near(found, &expected), "{found:?}, not {expected:?}");
     }
-    assert_no_validation_messages();
 }
 
 #[test]
@@ -433,7 +428,6 @@ fn a_photograph_in_tiles_has_the_statistics_of_the_whole() {
             assert!(near(&found, &expected), "{found:?}, not {expected:?}");
         }
     }
-    assert_no_validation_messages();
 }
 
 #[test]
@@ -475,25 +469,17 @@ fn what_cannot_be_measured_or_mapped_is_refused() {
 }
 
 #[test]
-fn a_real_photograph_maps_on_the_device_as_on_the_host() {
-    let path =
-        Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../shared/data/lom/chair/low/1.JPG"));
-    if !path.is_file() {
-        println!("skipped: {} is absent", path.display());
-        return;
-    }
-    let image = Image::load(path).unwrap().data;
-    for curve in [ToneCurve::Linear, ToneCurve::Ase, ToneCurve::Ap3, ToneCurve::Hybrid] {
-        let settings = ToneSettings::new(curve);
-        let (_, _, target) = on_device(&gpu(), settings.clone(), &image).unwrap();
-        let parameters = settings.parameters(&Statistics::of(&image));
-        let worst = image
-            .iter()
-            .zip(&target)
-            .map(|(&x, y)| (curve.apply(x, &parameters) - y).abs())
-            .fold(0.0, f32::max);
-        println!("{curve}: off by {worst:e} at most");
-        assert!(worst < 5e-6, "{curve}: off by {worst:e}");
+fn a_photograph_maps_on_the_device_as_on_the_host() {
+    let committed = ["000", "001", "002"].map(|name| fixture(&format!("lom/low/{name}.png")));
+    for path in committed.into_iter().chain(shared("data/lom/chair/low/1.JPG")) {
+        let image = Image::load(path).unwrap().data;
+        for curve in [ToneCurve::Linear, ToneCurve::Ase, ToneCurve::Ap3, ToneCurve::Hybrid] {
+            let settings = ToneSettings::new(curve);
+            let (_, _, target) = on_device(&gpu(), settings.clone(), &image).unwrap();
+            let parameters = settings.parameters(&Statistics::of(&image));
+            let mapped: Vec<f32> = image.iter().map(|&x| curve.apply(x, &parameters)).collect();
+            assert_close(curve.name(), &target, &mapped, |_, _| 5e-6);
+        }
     }
 }
 

@@ -5,8 +5,6 @@
 #[macro_use]
 #[path = "../common/mod.rs"]
 mod common;
-#[path = "../common/safetensors.rs"]
-mod safetensors;
 
 mod denoising;
 mod depth;
@@ -104,7 +102,7 @@ struct Torch(BTreeMap<String, Vec<f32>>);
 
 impl Torch {
     fn read() -> Self {
-        Self(safetensors::read("tests/fixtures/torch/losses.safetensors"))
+        Self(common::safetensors::read("tests/fixtures/torch/losses.safetensors"))
     }
 
     fn get(&self, name: &str) -> &[f32] {
