@@ -11,7 +11,7 @@ use nightsplat::metrics::Scores;
 use serde_json::Value;
 
 mod common;
-use common::command::{refused, refused_with, run, succeed};
+use common::command::{command, refused, refused_with, run, succeed};
 
 /// Work that the tests share, done once: a small set and a short run on it.
 struct Fixture {
@@ -505,6 +505,22 @@ fn no_device_and_an_unknown_one_are_said_with_the_remedy() {
     for arguments in ["doctor", "bench", "demo --out /nonexistent/demo"] {
         refused_with(arguments, &nothing, 1, &["no Vulkan device", "install"]);
     }
+}
+
+#[test]
+fn what_validation_says_fails_the_command() {
+    if !cfg!(debug_assertions) {
+        return common::not_run("commands are validated in debug builds alone");
+    }
+    // Advice on best practices, to which nothing here is held, finds something in every run.
+    let advice = "VK_VALIDATION_FEATURE_ENABLE_BEST_PRACTICES_EXT";
+    let photograph = common::fixture("lom/low/000.png");
+    let out = tempfile::tempdir().unwrap();
+    let arguments = format!("tone {} --out {}", photograph.display(), out.path().display());
+    let output = command(&arguments).env("VK_LAYER_ENABLES", advice).output().unwrap();
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(101), "{stderr}");
+    assert!(stderr.contains("validation failed in\nmain: "), "{stderr}");
 }
 
 #[test]

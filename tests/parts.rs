@@ -14,6 +14,7 @@ use nightsplat::train::{Part, StepReport, TrainConfig, Trainer};
 
 mod common;
 use common::command::{refused, succeed};
+use common::train::train;
 
 /// Six views of 40 x 30 pixels, with depth maps where asked.
 fn make_set(folder: &Path, with_depth: bool) {
@@ -47,15 +48,6 @@ fn config(parts: &[Part]) -> TrainConfig {
 
 fn load(folder: &Path, config: &TrainConfig) -> Dataset {
     Dataset::load(folder, &config.load_options()).unwrap()
-}
-
-fn train(config: &TrainConfig, dataset: &Dataset) -> (Vec<StepReport>, Gaussians) {
-    let mut trainer = Trainer::new(&gpu(), config.clone(), dataset).unwrap();
-    let mut reports = vec![];
-    while trainer.steps_done() < config.steps {
-        reports.extend(trainer.advance(config.steps).unwrap());
-    }
-    (reports, trainer.gaussians().unwrap())
 }
 
 /// The mean of a term over the first and over the last epoch.

@@ -15,6 +15,7 @@ use safetensors::SafeTensors;
 
 mod common;
 use common::command::{command, refused, succeed};
+use common::train::advance;
 
 /// A set of nine small views.
 fn make_set(folder: &Path) {
@@ -35,14 +36,6 @@ fn config(parts: &[Part]) -> TrainConfig {
     config.model.network.repeats = 2;
     config.model.denoiser_crop = 16;
     config
-}
-
-fn advance(trainer: &mut Trainer, until: u64) -> Vec<StepReport> {
-    let mut reports = vec![];
-    while trainer.steps_done() < until {
-        reports.extend(trainer.advance(until).unwrap());
-    }
-    reports
 }
 
 /// The whole state at the end, and what every step said.

@@ -12,18 +12,18 @@ use nightsplat::gpu::testing::gpu;
 use nightsplat::image::Image;
 use nightsplat::metrics::Scores;
 use nightsplat::scene::Gaussians;
-use nightsplat::train::{Background, StepReport, TrainConfig, Trainer};
+use nightsplat::train::{Background, TrainConfig, Trainer};
 
-/// Ten views of 64 x 48 pixels, loaded.
-fn dataset() -> Dataset {
-    let folder = tempfile::tempdir().unwrap();
-    let options = SyntheticOptions { views: 10, width: 64, height: 48, seed: 1 };
-    synthetic::write(folder.path(), &options).unwrap();
-    load(folder.path())
-}
+mod common;
+use common::train::{advance, train};
 
 fn load(folder: &Path) -> Dataset {
     Dataset::load(folder, &TrainConfig::default().load_options()).unwrap()
+}
+
+/// Ten views of 64 x 48 pixels.
+fn dataset() -> Dataset {
+    common::train::dataset(10, [64, 48])
 }
 
 /// Density control acts twice within sixty steps.
@@ -33,15 +33,6 @@ fn config() -> TrainConfig {
     config.schedule.densify_interval = 20;
     config.schedule.sh_degree_interval = 15;
     config
-}
-
-fn train(config: &TrainConfig, dataset: &Dataset) -> (Vec<StepReport>, Gaussians) {
-    let mut trainer = Trainer::new(&gpu(), config.clone(), dataset).unwrap();
-    let mut reports = vec![];
-    while trainer.steps_done() < config.steps {
-        reports.extend(trainer.advance(config.steps).unwrap());
-    }
-    (reports, trainer.gaussians().unwrap())
 }
 
 fn mean_psnr(dataset: &Dataset, gaussians: &Gaussians) -> f64 {
@@ -160,9 +151,7 @@ fn growth_stops_at_the_limit() {
 fn a_render_shows_what_its_model_was_trained_to() {
     let dataset = dataset();
     let mut trainer = Trainer::new(&gpu(), config(), &dataset).unwrap();
-    while trainer.steps_done() < 60 {
-        trainer.advance(60).unwrap();
-    }
+    advance(&mut trainer, 60);
     let view = &dataset.views[0];
     let in_training = trainer.render(&view.camera).unwrap();
     let mut player = Player::new(&gpu(), &trainer.gaussians().unwrap(), false, None).unwrap();

@@ -7,6 +7,7 @@ pub(crate) mod chain;
 pub(crate) mod command;
 pub(crate) mod safetensors;
 pub(crate) mod setup;
+pub(crate) mod train;
 
 use std::fmt::Display;
 use std::io::Write;
@@ -79,6 +80,18 @@ impl Random {
             self.0.normal(self.1)
         })
     }
+}
+
+pub(crate) fn largest(values: &[f32]) -> f32 {
+    values.iter().fold(0.0, |largest, value| value.abs().max(largest))
+}
+
+pub(crate) fn narrow(values: &[f64]) -> Vec<f32> {
+    values.iter().map(|&value| value as f32).collect()
+}
+
+pub(crate) fn widen(values: &[f32]) -> Vec<f64> {
+    values.iter().map(|&value| value.into()).collect()
 }
 
 /// Says which test, or what is left of it, is not run and why.
