@@ -47,9 +47,9 @@ fn a_colmap_model_made_by_hand_says_the_same_in_both_forms() {
         // (0.5, 0.5, 0.5, 0.5) takes x to y, y to z and z to x.
         let cycle = DMat3::from_cols(DVec3::Y, DVec3::Z, DVec3::X);
         let expected = [
-            ("a", [8, 6], [10.0, 11.0], [4.0, 3.0], half_turn, [0.0, 0.0, 5.0], 20.0),
-            ("b", [6, 8], [9.0, 9.0], [3.0, 4.0], DMat3::IDENTITY, [0.0, 0.0, 4.0], 40.0),
-            ("c", [8, 6], [10.0, 11.0], [4.0, 3.0], cycle, [1.0, 2.0, 3.0], 60.0),
+            ("a", [20, 16], [25.0, 27.0], [10.0, 8.5], half_turn, [0.0, 0.0, 5.0], 20.0),
+            ("b", [16, 20], [24.0, 24.0], [8.0, 10.0], DMat3::IDENTITY, [0.0, 0.0, 4.0], 40.0),
+            ("c", [20, 16], [25.0, 27.0], [10.0, 8.5], cycle, [1.0, 2.0, 3.0], 60.0),
         ];
         for (name, size, focal, principal_point, matrix3, translation, grey) in expected {
             let view = view(&dataset, name);
