@@ -3,9 +3,8 @@
 #![expect(clippy::unwrap_used, reason = "what fails here fails the test")]
 
 use nightsplat::dataset::Dataset;
-use nightsplat::gpu::testing::gpu;
 use nightsplat::tone::{Table, ToneCurve, ToneSettings};
-use nightsplat::train::{TrainConfig, Trainer};
+use nightsplat::train::TrainConfig;
 
 mod common;
 

@@ -6,11 +6,9 @@ use std::path::Path;
 
 use nightsplat::dataset::Dataset;
 use nightsplat::dataset::synthetic::{self, SyntheticOptions};
-use nightsplat::gpu::testing::gpu;
 use nightsplat::image::Image;
 use nightsplat::loss::Term;
-use nightsplat::scene::Gaussians;
-use nightsplat::train::{Part, StepReport, TrainConfig, Trainer};
+use nightsplat::train::{Part, StepReport, TrainConfig};
 
 mod common;
 use common::command::{refused, succeed};

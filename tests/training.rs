@@ -2,24 +2,17 @@
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
-use std::path::Path;
-
 use nightsplat::Error;
-use nightsplat::dataset::synthetic::{self, SyntheticOptions};
 use nightsplat::dataset::{Dataset, Split};
 use nightsplat::eval::{self, Player};
 use nightsplat::gpu::testing::gpu;
 use nightsplat::image::Image;
 use nightsplat::metrics::Scores;
 use nightsplat::scene::Gaussians;
-use nightsplat::train::{Background, TrainConfig, Trainer};
+use nightsplat::train::{Background, StepReport, TrainConfig, Trainer};
 
 mod common;
 use common::train::{advance, train};
-
-fn load(folder: &Path) -> Dataset {
-    Dataset::load(folder, &TrainConfig::default().load_options()).unwrap()
-}
 
 /// Ten views of 64 x 48 pixels.
 fn dataset() -> Dataset {
