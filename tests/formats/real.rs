@@ -63,8 +63,9 @@ fn a_colmap_model_made_by_hand_says_the_same_in_both_forms() {
         }
         let points =
             dataset.points.iter().map(|point| (point.position.to_array(), &point.views[..]));
+        // By id.
         let expected: [([f64; 3], &[u32]); 3] =
-            [([0.5, -0.25, 1.0], &[0, 1]), ([1.0, 2.0, 3.0], &[1, 2]), ([0.0; 3], &[0])];
+            [([0.0; 3], &[0]), ([0.5, -0.25, 1.0], &[0, 1]), ([1.0, 2.0, 3.0], &[1, 2])];
         assert!(points.eq(expected), "{form}: {:?}", dataset.points);
     }
 }
