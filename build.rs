@@ -4,11 +4,14 @@
 //! which `$OUT_DIR/kernels.rs` gets one typed module per kernel: host code that disagrees with a shader does not compile.
 //!
 //! - `build/compiler.rs`: GLSL to SPIR-V
+//! - `build/glsl.rs`: what GLSL says beside that: constants and comments
 //! - `build/reflection.rs`: SPIR-V to a description
 //! - `build/rust.rs`: a description to Rust
 
 #[path = "build/compiler.rs"]
 mod compiler;
+#[path = "build/glsl.rs"]
+mod glsl;
 #[path = "build/reflection.rs"]
 mod reflection;
 #[path = "build/rust.rs"]
@@ -18,6 +21,7 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::{env, fs};
 
+use glsl::Text;
 use reflection::{Kernel, Structs};
 
 const SHADERS: &str = "shaders-glsl";
@@ -29,6 +33,7 @@ fn main() {
     let out_dir = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets OUT_DIR"));
 
     let mut structs = Structs::default();
+    let mut text = Text::default();
     let mut kernels = String::new();
     let mut names = BTreeSet::new();
     for path in kernel_paths(Path::new(SHADERS)) {
@@ -39,21 +44,12 @@ fn main() {
         let bytes: Vec<u8> = compiled.shipped.iter().flat_map(|word| word.to_le_bytes()).collect();
         fs::write(out_dir.join(&kernel.name).with_extension("spv"), bytes)
             .expect("OUT_DIR is ours");
-        kernel.write(&mut kernels);
+        let says = Text::read_with_includes(&source);
+        kernel.write(&says, &mut kernels);
+        text.add_comments(says);
     }
-    let kernels = structs.to_string() + &curve_numbers() + &kernels;
+    let kernels = structs.write(&text) + &glsl::include_modules() + &kernels;
     fs::write(out_dir.join("kernels.rs"), kernels).expect("OUT_DIR is ours");
-}
-
-/// The numbers of the tone curves, so that host and shaders cannot number them differently.
-fn curve_numbers() -> String {
-    let (_, source) = compiler::include("curves.glsl").expect("the curves have an include");
-    let number = |line: &str| {
-        let (name, value) = line.strip_prefix("const uint ")?.split_once('=')?;
-        let (name, value) = (name.trim(), value.trim().trim_end_matches(';'));
-        Some(format!("/// See `include/curves.glsl`.\npub const {name}: u32 = {value};\n"))
-    };
-    source.lines().filter_map(number).collect()
 }
 
 /// Every `.comp` below `dir`, in a stable order.

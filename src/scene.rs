@@ -6,15 +6,15 @@ use glam::Vec3;
 
 mod features;
 pub mod init;
+mod neighbours;
 pub mod ply;
 
 pub use features::{COLOR_CHANNELS, FEATURES, Feature, FeatureSpec, Features};
 
-/// The constant basis function of the spherical harmonics, 1 / (2 sqrt(pi)).
-pub const SH_C0: f32 = 0.282_094_79;
+pub use crate::kernels::sh::MAX_SH_DEGREE;
 
-/// The highest SH degree that the kernels know.
-pub const MAX_SH_DEGREE: u32 = 3;
+/// The constant basis function of the spherical harmonics.
+pub const SH_C0: f32 = crate::kernels::sh::SH_C0 as f32;
 
 /// Something that every Gaussian has; the order is that of the planes in memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -289,8 +289,7 @@ impl Trainer {
         self.renderer.forward(pass, &model.gaussians.parameters, &view.camera, &options)?;
         let (render, status) = self.renderer.render_and_status();
         let d_render = &mut self.d_render;
-        let log =
-            &mut LogSlot { log: &mut self.log, slot, status, not_finite_flag: Status::NOT_FINITE };
+        let log = &mut LogSlot { log: &mut self.log, slot, status };
         let inputs = LossInputs {
             size,
             interior: Interior::whole(size),

@@ -9,9 +9,11 @@ use glam::{DAffine3, DMat3, DVec2, DVec3, DVec4, UVec2, Vec2, Vec3};
 use nightsplat::camera::Camera;
 use nightsplat::gpu::Threads;
 use nightsplat::gpu::testing::gpu;
+use nightsplat::kernels::splat::ALPHA_MIN;
+use nightsplat::kernels::status::{STATUS_NOT_FINITE, STATUS_OVERFLOWED};
 use nightsplat::kernels::{ProjectedSplat, check_capacity, emit, tile_ranges};
 use nightsplat::reference::gaussian::Gaussian;
-use nightsplat::reference::splat::{ALPHA_MIN, Splat, splat_columns};
+use nightsplat::reference::splat::{Splat, splat_columns};
 use nightsplat::render::Status;
 use nightsplat::scene::{Features, Shape};
 
@@ -45,7 +47,7 @@ fn an_overflow_renders_nothing_and_keeps_its_flag() {
     assert!(status.overflowed && status.intersections == total);
     assert_shows_nothing(&rendered, &setup);
     // A render that fits does not lower it, nor any other.
-    let flags = Status::OVERFLOWED | Status::NOT_FINITE;
+    let flags = STATUS_OVERFLOWED | STATUS_NOT_FINITE;
     gpu().write(rendered.renderer.render_and_status().1, &[flags, 7]).unwrap();
     rendered.renderer.set_intersection_capacity(total).unwrap();
     rendered.forward();

@@ -116,10 +116,8 @@ pub struct LogSlot<'a> {
     pub log: &'a mut LossLog,
     /// The row that this step fills.
     pub slot: u32,
-    /// The sticky status word; `not_finite_flag` is set in its first element if a term is NaN or infinite.
+    /// The status words; the first gets the bit `STATUS_NOT_FINITE` if a term is NaN or infinite.
     pub status: &'a mut Buffer<u32>,
-    /// The bits to set.
-    pub not_finite_flag: u32,
 }
 
 /// A term and the partial sums that it is the scaled sum of; with none of them its column is left as it is.
@@ -198,7 +196,6 @@ impl LogSlot<'_> {
                 terms: [first.term as u32, second.term as u32].into(),
                 partial_counts: [first.count, second.count].into(),
                 mean_scales: [first.scale, second.scale].into(),
-                not_finite_flag: self.not_finite_flag,
             },
             loss_log::Buffers {
                 first_partials: first.partials,

@@ -1,13 +1,8 @@
 use crate::gpu::Reference;
-use crate::kernels::adam::{Constants, Kernel, Params, Slices};
-
-const BETA1: f32 = 0.9;
-const BETA2: f32 = 0.999;
-const EPSILON: f32 = 1e-15;
-const GRADIENT_BOUND: f32 = 1e18;
-
-/// The bounds of the natural logarithm of a scale.
-pub(super) const LOG_SCALE_BOUNDS: [f32; 2] = [-30.0, 13.0];
+use crate::kernels::adam::{
+    BETA1, BETA2, Constants, EPSILON, GRADIENT_BOUND, Kernel, LOG_SCALE_MAX, LOG_SCALE_MIN, Params,
+    Slices,
+};
 
 fn rate_of(params: &Params, column: usize) -> f32 {
     match column {
@@ -30,23 +25,22 @@ impl Reference for Kernel {
         if status[0] != 0 {
             return;
         }
+        let [beta1, beta2, epsilon] = [BETA1, BETA2, EPSILON].map(|x| x as f32);
+        let bound = GRADIENT_BOUND as f32;
         let gaussian_count = params.gaussian_count as usize;
         for i in 0..params.column_count as usize * gaussian_count {
             let column = i / gaussian_count;
-            let gradient = if gradients[i].is_finite() {
-                gradients[i].clamp(-GRADIENT_BOUND, GRADIENT_BOUND)
-            } else {
-                0.0
-            };
-            let m = BETA1 * first_moments[i] + (1.0 - BETA1) * gradient;
-            let v = BETA2 * second_moments[i] + (1.0 - BETA2) * gradient * gradient;
+            let gradient =
+                if gradients[i].is_finite() { gradients[i].clamp(-bound, bound) } else { 0.0 };
+            let m = beta1 * first_moments[i] + (1.0 - beta1) * gradient;
+            let v = beta2 * second_moments[i] + (1.0 - beta2) * gradient * gradient;
             let step =
-                rate_of(params, column) * m / (v.sqrt() * params.second_correction + EPSILON);
+                rate_of(params, column) * m / (v.sqrt() * params.second_correction + epsilon);
             first_moments[i] = m;
             second_moments[i] = v;
             parameters[i] -= step;
             if (7..10).contains(&column) {
-                parameters[i] = parameters[i].clamp(LOG_SCALE_BOUNDS[0], LOG_SCALE_BOUNDS[1]);
+                parameters[i] = parameters[i].clamp(LOG_SCALE_MIN as f32, LOG_SCALE_MAX as f32);
             }
         }
     }

@@ -6,8 +6,9 @@ use super::blend_forward::tile_pixels;
 use super::splat::{Splat, fragments};
 use crate::gpu::Reference;
 use crate::kernels::blend_backward::{Constants, Kernel, Params, Slices};
+use crate::kernels::splat::RECORD_HEAD;
 
-/// Adds to `records` (splats, 6 + channels) what one pixel with the values `render` and the gradient `d_render` says:
+/// Adds to `records` (splats, record) what one pixel with the values `render` and the gradient `d_render` says:
 /// the gradients of mean2d, conic, opacity and colours.
 pub fn blend_pixel_backward(
     splats: &[Splat],
@@ -18,16 +19,16 @@ pub fn blend_pixel_backward(
     alpha_max: f64,
     records: &mut [f64],
 ) {
-    let channels = render.len();
+    let (channels, head) = (render.len(), RECORD_HEAD as usize);
     let mut light = render.to_vec();
     for fragment in fragments(splats, pixel, alpha_max).0 {
         let Splat { conic, opacity, .. } = splats[fragment.index];
-        let record = &mut records[(6 + channels) * fragment.index..][..6 + channels];
+        let record = &mut records[(head + channels) * fragment.index..][..head + channels];
         let weight = fragment.alpha * fragment.before;
         let mut d_alpha = 0.0;
         for c in 0..channels {
             let color = colors[channels * fragment.index + c];
-            record[6 + c] += weight * d_render[c];
+            record[head + c] += weight * d_render[c];
             d_alpha += (fragment.before * color - light[c]) * d_render[c];
             light[c] -= weight * color;
         }
@@ -50,7 +51,7 @@ impl Reference for Kernel {
         let Slices { tile_ranges, sorted_slots, owners, splats, colors, render, d_render, records } =
             slices;
         let channels = constants.channels as usize;
-        let record = 6 + channels;
+        let record = RECORD_HEAD as usize + channels;
         let [width, height] = params.size.as_usizevec2().to_array();
         let tile = UVec2::new(constants.tile_width, constants.tile_height);
         for (index, range) in tile_ranges.iter().enumerate() {

@@ -4,9 +4,7 @@ use glam::{Vec2, Vec3};
 
 use super::ciconv_rows::{correlate, taps};
 use crate::gpu::Reference;
-use crate::kernels::ciconv_columns::{Constants, Kernel, Params, Slices};
-
-const EPSILON: f64 = 1e-5;
+use crate::kernels::ciconv_columns::{Constants, EPSILON, Kernel, Params, Slices};
 
 impl Reference for Kernel {
     fn run(params: &Params, _: &Constants, slices: Slices<'_>) {

@@ -1,7 +1,7 @@
 use glam::Vec2;
 
 use crate::gpu::Reference;
-use crate::kernels::ciconv_moments::{Constants, Kernel, Params, Slices};
+use crate::kernels::ciconv_moments::{Constants, EPSILON, Kernel, Params, Slices};
 
 impl Reference for Kernel {
     fn run(params: &Params, _: &Constants, Slices { moments, norm }: Slices<'_>) {
@@ -12,7 +12,7 @@ impl Reference for Kernel {
         };
         let mean = chunks().map(|(count, of)| count * of.x).sum::<f64>() / pixels as f64;
         let squares: f64 = chunks().map(|(count, of)| of.y + count * (of.x - mean).powi(2)).sum();
-        let deviation = (squares / pixels as f64 + 1e-5).sqrt();
+        let deviation = (squares / pixels as f64 + EPSILON).sqrt();
         norm[0] = Vec2::new(mean as f32, (1.0 / deviation) as f32);
     }
 }

@@ -2,7 +2,7 @@
 
 use super::ssim_forward::widen;
 use crate::gpu::Reference;
-use crate::kernels::conv3x3::{Constants, Kernel, Params, Slices};
+use crate::kernels::conv3x3::{Constants, Kernel, Params, RELU, SIGMOID, Slices};
 
 /// Calls `visit(pixel, tap, neighbour)` for each of the nine neighbours of each pixel that lie in the image.
 pub(super) fn for_each_tap(
@@ -67,8 +67,8 @@ pub fn data_gradient(
 pub fn activate(activation: u32, x: f64) -> f64 {
     match activation {
         // A NaN stays one.
-        1 if x < 0.0 => 0.0,
-        2 => 1.0 / (1.0 + (-x).exp()),
+        RELU if x < 0.0 => 0.0,
+        SIGMOID => 1.0 / (1.0 + (-x).exp()),
         _ => x,
     }
 }

@@ -1,10 +1,6 @@
 use crate::gpu::Reference;
 use crate::kernels::densify_count::{Constants, Kernel, Params, Slices};
-
-pub(super) const PRUNE: u32 = 0;
-pub(super) const KEEP: u32 = 1;
-pub(super) const CLONE: u32 = 2;
-pub(super) const SPLIT: u32 = 3;
+use crate::kernels::fate::{FATE_CLONE, FATE_KEEP, FATE_PRUNE, FATE_SPLIT};
 
 /// First column and width of every plane.
 pub(super) fn planes(feature_count: usize, column_count: usize) -> [(usize, usize); 7] {
@@ -29,11 +25,11 @@ impl Reference for Kernel {
                 visits => slices.grad_norm_sums[i] / visits as f32,
             };
             let fate = if !is_finite || !is_visible {
-                PRUNE
+                FATE_PRUNE
             } else if mean_gradient > params.gradient_threshold {
-                if largest > params.split_log_scale { SPLIT } else { CLONE }
+                if largest > params.split_log_scale { FATE_SPLIT } else { FATE_CLONE }
             } else {
-                KEEP
+                FATE_KEEP
             };
             slices.mean_gradients[i] = mean_gradient;
             slices.fates[i] = fate;

@@ -2,10 +2,11 @@ use std::f32::consts::TAU;
 
 use glam::{Quat, Vec3};
 
-use super::densify_count::{CLONE, KEEP, SPLIT, planes};
+use super::densify_count::planes;
 use super::random::random_bits;
 use crate::gpu::Reference;
 use crate::kernels::densify_scatter::{Constants, Kernel, Params, Slices};
+use crate::kernels::fate::{FATE_CLONE, FATE_KEEP, FATE_SPLIT};
 
 fn random_uniform(key: u32) -> f32 {
     ((random_bits(key) >> 8) + 1) as f32 / 16_777_216.0
@@ -38,13 +39,13 @@ impl Reference for Kernel {
         for i in 0..n {
             let fate = slices.fates[i];
             let copies = match fate {
-                CLONE | SPLIT => 2,
-                KEEP => 1,
+                FATE_CLONE | FATE_SPLIT => 2,
+                FATE_KEEP => 1,
                 _ => 0,
             };
             for copy in 0..copies {
                 let to = slices.offsets[i] as usize + copy as usize;
-                let is_new = fate == SPLIT || copy > 0;
+                let is_new = fate == FATE_SPLIT || copy > 0;
                 for (column, width) in planes(features, columns) {
                     for k in 0..width {
                         let source = column * n + width * i + k;
@@ -61,7 +62,7 @@ impl Reference for Kernel {
                 let mean = draw_mean(params, slices.parameters, i, copy);
                 for k in 0..3 {
                     slices.new_parameters[3 * to + k] = mean[k];
-                    if fate == SPLIT {
+                    if fate == FATE_SPLIT {
                         slices.new_parameters[7 * new_n + 3 * to + k] -= 1.6f32.ln();
                     }
                 }

@@ -4,7 +4,7 @@ use glam::{DVec2, DVec3};
 
 use crate::gpu::Reference;
 use crate::kernels::DepthGradient;
-use crate::kernels::depth_correlation::{Constants, Kernel, Params, Slices};
+use crate::kernels::depth_correlation::{Constants, EPSILON, Kernel, Params, Slices};
 
 /// P, and what multiplies a - mean a and b - mean b in its gradient with respect to a.
 #[derive(Clone, Copy, Debug)]
@@ -23,7 +23,7 @@ pub fn pearson(n: f64, products: DVec3) -> Pearson {
         return Pearson { value: 1.0, a_scale: 0.0, b_scale: 0.0 };
     }
     let [deviation_a, deviation_b] = [products.x, products.z].map(|sum| (sum / (n - 1.0)).sqrt());
-    let [a, b] = [deviation_a, deviation_b].map(|deviation| deviation + 1e-6);
+    let [a, b] = [deviation_a, deviation_b].map(|deviation| deviation + EPSILON);
     let correlation = products.y / (n * a * b);
     Pearson {
         value: 1.0 - correlation,

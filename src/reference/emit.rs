@@ -2,9 +2,7 @@ use glam::UVec2;
 
 use super::splat::{splat_tile_rows, splat_tiles};
 use crate::gpu::Reference;
-use crate::kernels::emit::{Constants, Kernel, Params, Slices};
-
-const NO_TILE: u32 = u32::MAX;
+use crate::kernels::emit::{Constants, Kernel, NO_TILE, Params, Slices};
 
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {

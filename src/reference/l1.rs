@@ -1,7 +1,7 @@
 use super::inside;
-use super::tone::tone_curve;
 use crate::gpu::Reference;
 use crate::kernels::l1::{Constants, Kernel, Params, Slices};
+use crate::tone::tone_curve;
 
 impl Reference for Kernel {
     /// The whole sum goes into the first partial: how many there are is the device's choice.

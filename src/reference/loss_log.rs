@@ -1,5 +1,6 @@
 use crate::gpu::Reference;
 use crate::kernels::loss_log::{Constants, Kernel, Params, Slices};
+use crate::kernels::status::STATUS_NOT_FINITE;
 
 impl Reference for Kernel {
     fn run(
@@ -16,7 +17,7 @@ impl Reference for Kernel {
                 log[row + params.terms[term] as usize] = mean;
             }
             if !mean.is_finite() {
-                status[0] |= params.not_finite_flag;
+                status[0] |= STATUS_NOT_FINITE;
             }
         }
         statuses[params.slot as usize] = status[0];

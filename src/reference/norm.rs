@@ -1,13 +1,14 @@
 //! The norm of one channel in double precision: statistics of the image itself, biased variance, affine, `ReLU`.
 
 use super::conv3x3::activate;
+use crate::kernels::norm_merge::EPSILON;
 
 /// Mean and 1 / standard deviation.
 #[derive(Clone, Copy, Debug)]
 pub struct Statistics {
     /// Mean of the channel.
     pub mean: f64,
-    /// 1 / sqrt(variance + 1e-5).
+    /// 1 / sqrt(variance + EPSILON).
     pub inverse_deviation: f64,
 }
 
@@ -28,7 +29,7 @@ impl Statistics {
     }
 
     pub(super) fn new(mean: f64, variance: f64) -> Self {
-        Self { mean, inverse_deviation: 1.0 / (variance + 1e-5).sqrt() }
+        Self { mean, inverse_deviation: 1.0 / (variance + EPSILON).sqrt() }
     }
 
     /// (z - mean) / deviation.

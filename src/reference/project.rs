@@ -5,12 +5,11 @@ use glam::{DMat3, DVec2, DVec3, UVec2};
 use super::camera::{Camera, rotation, unit_quat};
 use super::gaussian::{Gaussian, Planes, sigmoid};
 use super::sh::sh_basis;
-use super::splat::{ALPHA_MIN, DILATION, Splat, splat_tile_rows, splat_tiles};
+use super::splat::{Splat, splat_tile_rows, splat_tiles};
 use crate::gpu::Reference;
 use crate::kernels::ProjectedSplat;
-use crate::kernels::project::{Constants, Kernel, Params, Slices};
-
-const CULLED: u32 = u32::MAX;
+use crate::kernels::project::{CULLED, Constants, Kernel, Params, Slices};
+use crate::kernels::splat::{ALPHA_MIN, DILATION};
 
 /// What one Gaussian is on the image plane.
 #[derive(Clone, Debug)]
@@ -73,8 +72,8 @@ pub fn project_gaussian(
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
         let Slices { parameters, splats, colors, depth_keys, ids, tile_counts } = slices;
-        let &Params { view_from_world, focal, principal_point, size, near, .. } = params;
-        let camera = Camera::new(view_from_world, focal, principal_point, size);
+        let camera = Camera::from(&params.camera);
+        let (size, near) = (params.camera.size, params.near);
         let (channels, sh_degree) = (constants.channels as usize, constants.sh_degree);
         let feature_count = channels - 3;
         let planes = Planes { count: params.gaussian_count as usize, feature_count, sh_degree };

@@ -8,6 +8,7 @@ use super::sh::{sh_basis, sh_basis_gradient};
 use super::splat::Splat;
 use crate::gpu::Reference;
 use crate::kernels::project_backward::{Constants, Kernel, Params, Slices};
+use crate::kernels::splat::RECORD_HEAD;
 
 /// The gradients that arrive at one splat.
 #[derive(Clone, Debug)]
@@ -122,27 +123,27 @@ impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
         let Slices { parameters, splats, colors, tile_counts, d_splats, status, .. } = slices;
         let Slices { gradients, grad_norm_sums, visit_counts, .. } = slices;
-        let &Params { view_from_world, focal, principal_point, size, .. } = params;
-        let camera = Camera::new(view_from_world, focal, principal_point, size);
+        let camera = Camera::from(&params.camera);
         let (channels, sh_degree) = (constants.channels as usize, constants.sh_degree);
         let feature_count = channels - 3;
         let planes = Planes { count: params.gaussian_count as usize, feature_count, sh_degree };
         let raw_colors = constants.raw_colors;
+        let head = RECORD_HEAD as usize;
+        let record = head + channels;
         gradients[..planes.len()].fill(0.0);
         for i in 0..planes.count {
             if tile_counts[i] == 0 {
                 continue;
             }
-            let d: Vec<f64> =
-                d_splats[(6 + channels) * i..][..6 + channels].iter().map(|&d| d.into()).collect();
+            let d: Vec<f64> = d_splats[record * i..][..record].iter().map(|&d| d.into()).collect();
             let is_free = |c: usize| raw_colors || colors[channels * i + c] > 0.0;
-            let passes = |c: usize| if is_free(c) { d[6 + c] } else { 0.0 };
+            let passes = |c: usize| if is_free(c) { d[head + c] } else { 0.0 };
             let d_splat = DSplat {
                 mean2d: DVec2::from_slice(&d[0..2]),
                 conic: DVec3::from_slice(&d[2..5]),
                 opacity: d[5],
                 color: DVec3::from_array([0, 1, 2].map(passes)),
-                features: d[9..].to_vec(),
+                features: d[head + 3..].to_vec(),
             };
             let gaussian = planes.load(parameters, i);
             let splat = Splat::from(&splats[i]);

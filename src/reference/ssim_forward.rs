@@ -3,13 +3,10 @@
 use glam::Vec3;
 
 use super::inside;
-use super::tone::tone_curve;
 use crate::gpu::Reference;
 use crate::kernels::ToneParameters;
-use crate::kernels::ssim_forward::{Constants, Kernel, Params, Slices};
-
-const C1: f64 = 0.0001;
-const C2: f64 = 0.0009;
+use crate::kernels::ssim_forward::{C1, C2, Constants, Kernel, Params, Slices};
+use crate::tone::tone_curve;
 
 /// SSIM at one pixel of one channel and its derivatives with respect to the blurred moments.
 #[derive(Clone, Copy, Debug)]

@@ -1,6 +1,6 @@
-use super::tone::tone_curve;
 use crate::gpu::Reference;
 use crate::kernels::tone_map::{Constants, Kernel, Params, Slices};
+use crate::tone::tone_curve;
 
 impl Reference for Kernel {
     fn run(

@@ -8,6 +8,7 @@ use super::{ModelConfig, TrainConfig, streams};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Recorder};
 use crate::kernels::ToneParameters;
+use crate::kernels::ssim::RADIUS;
 use crate::loss::{
     DenoisingGradients, DenoisingInputs, DenoisingLoss, DenoisingWeights, DepthInputs, DepthLoss,
     DepthSettings, Interior, LogSlot, Loss, LossInputs, LossSettings, StructureInputs,
@@ -19,9 +20,6 @@ use crate::random::Stream;
 use crate::scene::{COLOR_CHANNELS, Feature, Features};
 use crate::tone::ToneCurve;
 use crate::window::Window;
-
-/// How far SSIM looks, in pixels.
-const SSIM_RADIUS: u32 = 5;
 
 /// The terms of the parts that are on.
 #[derive(Debug)]
@@ -246,7 +244,7 @@ impl NetworkTerms {
     fn margin(&self) -> u32 {
         let denoiser = self.networks.denoiser.as_ref().map_or(0, Denoiser::margin);
         let tonemapper = self.networks.tonemapper.as_ref();
-        denoiser + tonemapper.map_or(0, |tonemapper| tonemapper.margin() + SSIM_RADIUS)
+        denoiser + tonemapper.map_or(0, |tonemapper| tonemapper.margin() + RADIUS as u32)
     }
 
     #[expect(

@@ -50,19 +50,19 @@ impl Views {
         for (index, view) in dataset.views.iter().enumerate() {
             let Some(image) = view.image.as_ref().filter(|_| view.is_train()) else { continue };
             let pixels = gpu.buffer("low", &image.data)?;
-            let mut tone = gpu.uninit("tone", 1)?;
             gpu.run("statistics", |pass| {
-                pseudo_gt.statistics(pass, &pixels, [image.width, image.height], &mut tone, 0)
+                pseudo_gt.statistics(pass, &pixels, [image.width, image.height])
             })?;
+            let measured = pseudo_gt.measured()?;
             let depth = view.depth.as_ref().filter(|_| features.depth);
-            statistics.push(pseudo_gt.measured()?);
+            statistics.push(measured);
             views.push(TrainView {
                 name: view.name.clone(),
                 index,
                 camera: view.camera,
                 image: pixels,
                 baked: None,
-                tone,
+                tone: gpu.buffer("tone", &[pseudo_gt.settings().parameters(&measured)])?,
                 structure: None,
                 depth: depth.map(|depth| gpu.buffer("depth", depth)).transpose()?,
             });

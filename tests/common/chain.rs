@@ -1,6 +1,7 @@
 //! The whole renderer once more in f64 and without tiles: every splat on every pixel, front to back, and its gradients.
 
 use glam::{DVec2, DVec3};
+use nightsplat::kernels::splat::RECORD_HEAD;
 use nightsplat::reference::blend_backward::blend_pixel_backward;
 use nightsplat::reference::blend_forward::blend_pixel;
 use nightsplat::reference::project::{Projection, project_gaussian};
@@ -107,7 +108,7 @@ impl<'a> Chain<'a> {
         let Projected { ids, splats, colors, depths } = self.project(parameters);
         let (channels, pixels, background) =
             (self.setup.channels(), self.setup.pixels(), self.background());
-        let record = 6 + channels;
+        let record = RECORD_HEAD as usize + channels;
         let mut records = vec![0.0; record * ids.len()];
         let mut results = Results {
             render: vec![0.0; channels * pixels],
@@ -146,7 +147,7 @@ impl<'a> Chain<'a> {
     /// What arrives at a splat, where clamped colours pass nothing on.
     fn d_splat(&self, record: &[f64], color: &[f64]) -> DSplat {
         let is_free = |c: usize| self.setup.settings.raw_colors || color[c] > 0.0;
-        let passes = |c: usize| if is_free(c) { record[6 + c] } else { 0.0 };
+        let passes = |c: usize| if is_free(c) { record[RECORD_HEAD as usize + c] } else { 0.0 };
         DSplat {
             mean2d: DVec2::from_slice(record),
             conic: DVec3::from_slice(&record[2..]),

@@ -3,11 +3,11 @@
 use glam::{UVec2, Vec3};
 use nightsplat::gpu::testing::gpu;
 use nightsplat::gpu::{Buffer, Gpu, Reference, Threads};
+use nightsplat::kernels::curves::{CURVE_AP3, CURVE_ASE, CURVE_NONE};
 use nightsplat::kernels::{ToneParameters, l1, ssim_backward, ssim_forward};
 use nightsplat::loss::{Interior, Loss, LossInputs, LossSettings, Term};
 use nightsplat::reference::ssim_backward::gradient;
 use nightsplat::reference::ssim_forward::ssim;
-use nightsplat::reference::tone::{CURVE_AP3, CURVE_ASE, CURVE_NONE};
 
 use super::{NOT_FINITE, Torch, assert_close, bits, central_differences, largest, log_step};
 

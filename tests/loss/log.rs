@@ -20,7 +20,6 @@ fn loss_log_matches_its_reference() {
                 terms: [2, 0].into(),
                 partial_counts: partial_counts.into(),
                 mean_scales: [1.0 / 300.0, 1.0 / 500.0].into(),
-                not_finite_flag: NOT_FINITE,
             };
             let constants = loss_log::Constants::default();
             let (log, statuses, status) = (vec![7.0f32; 12], vec![0u32; 4], vec![1u32]);

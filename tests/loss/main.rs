@@ -17,9 +17,8 @@ use std::collections::BTreeMap;
 use common::{largest, widen};
 use nightsplat::Result;
 use nightsplat::gpu::{Gpu, Recorder};
+use nightsplat::kernels::status::STATUS_NOT_FINITE as NOT_FINITE;
 use nightsplat::loss::{LogSlot, LossLog, StepLosses, Term};
-
-const NOT_FINITE: u32 = 2;
 
 /// What the terms of one step leave in the log.
 struct Logged {
@@ -36,8 +35,7 @@ fn log_step(
     let mut status = gpu.zeros("status", 1)?;
     let mut download = None;
     gpu.run("losses", |pass| {
-        let mut slot =
-            LogSlot { log: &mut log, slot: 1, status: &mut status, not_finite_flag: NOT_FINITE };
+        let mut slot = LogSlot { log: &mut log, slot: 1, status: &mut status };
         record(pass, &mut slot)?;
         download = Some(log.download(pass)?);
         Ok(())

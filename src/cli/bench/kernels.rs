@@ -106,29 +106,22 @@ fn statistics(bench: &Bench, timings: &mut Vec<Timing>) -> anyhow::Result<TonePa
     }
     let weight = |tenths: u32| (last % 10 * tenths % 10) as f32 / 10.0;
     let tone_curve = ToneCurve::Ap3.constant();
-    let (statistics, parameters) =
-        (vec![ToneStatistics::default()], vec![ToneParameters::default()]);
-    let (_, parameters) = check!(
+    let statistics = vec![ToneStatistics::default()];
+    let (statistics,) = check!(
         bench,
         timings,
         tone_statistics,
-        tone_statistics::Constants { tone_curve },
+        tone_statistics::Constants::default(),
         tone_statistics::Params {
-            view: 0,
+            weights: Vec3::new(weight(1), weight(9), weight(8)),
             pixel_count,
             sum_count: THREADS,
-            weights: Vec3::new(weight(1), weight(9), weight(8)),
-            gain_c: settings.gain_c as f32,
-            theta: settings.theta as f32,
-            alpha: settings.alpha as f32,
-            beta: settings.beta as f32,
-            least_gain: 1.0,
-            constants: [0.0; 8],
         },
         Threads::Workgroups([1, 1, 1]),
         [searches, sums],
-        [statistics: Close(1e-5), parameters: Close(1e-5)]
+        [statistics: Close(1e-5)]
     );
+    let parameters = vec![settings.parameters(&statistics[0].into())];
     let target = vec![0.0_f32; image.len()];
     let map_constants = tone_map::Constants { tone_curve, ..Default::default() };
     let threads = (image.len() as u32).div_ceil(4 * map_constants.quads_per_thread);

@@ -97,12 +97,12 @@ fn pseudo_gt(bench: &Bench) -> Result<(f64, f64)> {
     let gpu = &bench.gpu;
     let image = gpu.buffer("low", &scene::dark(1920, 1080).data)?;
     let mut pseudo_gt = PseudoGt::new(gpu, &ToneSettings::default())?;
-    let mut parameters = gpu.zeros("tone", 1)?;
+    let parameters = gpu.buffer("tone", &[ToneParameters { white: 1.0, ..Default::default() }])?;
     let mut target = gpu.uninit("target", image.len())?;
     let mut of_kernels = |counts: fn(&PassTime) -> bool| {
         bench.median(|| {
             let mut times = gpu.profile("pseudo-GT", |pass| {
-                pseudo_gt.statistics(pass, &image, [1920, 1080], &mut parameters, 0)?;
+                pseudo_gt.statistics(pass, &image, [1920, 1080])?;
                 pseudo_gt.map(pass, &image, &parameters, 0, &mut target)
             })?;
             times.retain(counts);
@@ -142,9 +142,10 @@ impl<'s> Step<'s> {
         renderer.render_image(&parameters, camera, &OPTIONS)?;
         let mut pseudo_gt = PseudoGt::new(gpu, &ToneSettings::new(curve))?;
         let image = gpu.buffer("low", &low.data)?;
-        let mut tone = gpu.zeros("tone", 1)?;
         let size = [low.width, low.height];
-        gpu.run("statistics", |pass| pseudo_gt.statistics(pass, &image, size, &mut tone, 0))?;
+        gpu.run("statistics", |pass| pseudo_gt.statistics(pass, &image, size))?;
+        let parameters_of = pseudo_gt.settings().parameters(&pseudo_gt.measured()?);
+        let tone = gpu.buffer("tone", &[parameters_of])?;
         let terms = [Term::L1, Term::Ssim];
         let settings = LossSettings { tone_curve: curve.constant(), ssim_weight: 0.2, terms };
         let mut loss = Loss::new(gpu, settings)?;
@@ -181,12 +182,7 @@ impl<'s> Step<'s> {
                 tone: &self.tone,
             },
             &mut self.d_render,
-            &mut LogSlot {
-                log: &mut self.log,
-                slot: 0,
-                status,
-                not_finite_flag: Status::NOT_FINITE,
-            },
+            &mut LogSlot { log: &mut self.log, slot: 0, status },
         )?;
         self.renderer.backward(
             pass,

@@ -47,10 +47,7 @@ pub(super) fn project_and_bin(
     let (splats, colors) = (vec![ProjectedSplat::default(); n], vec![0.0_f32; 3 * n]);
     let [depth_keys, ids, tile_counts] = [0; 3].map(|_| vec![0_u32; n]);
     let camera = project::Params {
-        view_from_world: kernel_transform(scene),
-        focal: camera.focal.as_vec2(),
-        principal_point: camera.principal_point.as_vec2(),
-        size,
+        camera: camera.into(),
         near,
         gaussian_count,
         sh_degree: gaussians.shape.sh_degree,
@@ -133,14 +130,6 @@ pub(super) fn project_and_bin(
         owners,
         tile_ranges,
     })
-}
-
-/// The columns of the rotation, then the translation.
-fn kernel_transform(scene: &Scene) -> [[f32; 3]; 4] {
-    let pose = &scene.camera.view_from_world;
-    let rotation = pose.matrix3;
-    [rotation.x_axis, rotation.y_axis, rotation.z_axis, pose.translation]
-        .map(|column| column.as_vec3().to_array())
 }
 
 /// The indices in the order of their keys, equal ones as they were.

@@ -23,7 +23,7 @@ pub(super) fn blend_and_back(
     let Frame { tile_columns, tile_count, splats, colors, sorted_slots, owners, .. } = frame;
     let Frame { tile_ranges, counts, sorted_ids, ordered_counts, offsets, .. } = frame;
     let Frame { tile_counts, camera, .. } = frame;
-    let (tile_columns, size) = (*tile_columns, camera.size);
+    let (tile_columns, size) = (*tile_columns, camera.camera.size);
     let pixels = (size.x * size.y) as usize;
     let per_tile = Threads::Workgroups([*tile_count, 1, 1]);
     let (render, transmittances) = (vec![0.0_f32; 3 * pixels], vec![0.0_f32; pixels]);
@@ -74,10 +74,7 @@ pub(super) fn blend_and_back(
         project_backward,
         constants!(bench, project_backward, sh_degree: scene.gaussians.shape.sh_degree, raw_colors: false),
         project_backward::Params {
-            view_from_world: camera.view_from_world,
-            focal: camera.focal,
-            principal_point: camera.principal_point,
-            size,
+            camera: camera.camera,
             gaussian_count,
             sh_degree: camera.sh_degree,
             damping_weight: 1.0,

@@ -75,7 +75,6 @@ pub(super) fn image(
             terms: UVec2::new(Term::L1 as u32, Term::Ssim as u32),
             partial_counts: UVec2::splat(workgroups),
             mean_scales: Vec2::splat(mean_scale),
-            not_finite_flag: 2,
         },
         Threads::Workgroups([1, 1, 1]),
         [first_partials, second_partials],
