@@ -3,11 +3,14 @@
 //! A kernel is declared once, in GLSL. Its SPIR-V tells us the parameters, buffers, constants and workgroup size, from
 //! which `$OUT_DIR/kernels.rs` gets one typed module per kernel: host code that disagrees with a shader does not compile.
 //!
+//! - `build/attributes.rs`: the table of attributes to GLSL
 //! - `build/compiler.rs`: GLSL to SPIR-V
 //! - `build/glsl.rs`: what GLSL says beside that: constants and comments
 //! - `build/reflection.rs`: SPIR-V to a description
 //! - `build/rust.rs`: a description to Rust
 
+#[path = "build/attributes.rs"]
+mod attributes;
 #[path = "build/compiler.rs"]
 mod compiler;
 #[path = "build/glsl.rs"]
@@ -30,6 +33,7 @@ fn main() {
     println!("cargo:rerun-if-changed={SHADERS}");
     println!("cargo:rerun-if-changed=build.rs");
     println!("cargo:rerun-if-changed=build");
+    println!("cargo:rerun-if-changed=src/attributes.rs");
     let out_dir = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets OUT_DIR"));
 
     let mut structs = Structs::default();

@@ -102,6 +102,24 @@ pub struct Gradients<'a> {
 }
 
 /// Renders Gaussians, forward and backward. Holds the memory of one view.
+///
+/// ```no_run
+/// use nightsplat::dataset::{Dataset, LoadOptions};
+/// use nightsplat::gpu::{DeviceChoice, Gpu};
+/// use nightsplat::render::{RenderOptions, RenderSettings, Renderer};
+/// use nightsplat::scene::ply;
+///
+/// let gpu = Gpu::new(&DeviceChoice::Best)?;
+/// let camera = Dataset::load("photos", &LoadOptions::default())?.views[0].camera;
+/// let gaussians = ply::load("run/model.ply")?;
+/// let settings = RenderSettings { shape: gaussians.shape, ..RenderSettings::default() };
+/// let mut renderer = Renderer::new(&gpu, settings)?;
+/// let parameters = gpu.buffer("parameters", &gaussians.parameters)?;
+/// renderer.reserve(gaussians.count, [&camera])?;
+/// let options = RenderOptions { sh_degree: gaussians.shape.sh_degree, background: [0.0; 3] };
+/// renderer.render_image(&parameters, &camera, &options)?.save_png8("view.png")?;
+/// # Ok::<(), nightsplat::Error>(())
+/// ```
 #[derive(Debug)]
 pub struct Renderer {
     gpu: Gpu,

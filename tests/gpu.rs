@@ -2,11 +2,14 @@
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
+use std::time::Duration;
+
 use glam::UVec2;
 use nightsplat::Error;
 use nightsplat::gpu::testing::{gpu, misuse};
 use nightsplat::gpu::{Buffer, DeviceChoice, Gpu, Pipeline, Threads, devices};
 use nightsplat::kernels::{blend_forward, order_counts};
+use nightsplat::render::{RenderSettings, Renderer};
 
 /// Threads of a workgroup of `order_counts`.
 const WORKGROUP: usize = 256;
@@ -162,6 +165,76 @@ fn what_a_failed_recording_drops_does_no_harm() {
     });
     assert_eq!(failed.unwrap_err().to_string(), "enough");
     assert_eq!(gpu.read(&kept).unwrap(), [1, 2, 3]);
+}
+
+// ---------------------------------------------------------------------------
+// Recording
+
+#[test]
+fn what_submits_by_itself_is_refused_within_a_recording_and_works_behind_it() {
+    let gpu = gpu();
+    let mut renderer = Renderer::new(&gpu, RenderSettings::default()).unwrap();
+    let mut inner = gpu.buffer("inner", &[1u32, 2, 3]).unwrap();
+    let mut outer: Buffer<u32> = gpu.zeros("outer", 3).unwrap();
+    gpu.run("the recording", |pass| {
+        let refusals = [
+            gpu.write(&mut inner, &[9; 3]).unwrap_err(),
+            gpu.read(&inner).unwrap_err(),
+            gpu.zeros::<u32>("newcomer", 3).unwrap_err(),
+            renderer.reserve(100, []).unwrap_err(),
+            gpu.run("another", |_| Ok(())).unwrap_err(),
+        ];
+        for error in refusals {
+            let message = error.to_string();
+            assert!(message.contains("`the recording`"), "{message}");
+            assert!(message.contains("before or behind"), "{message}");
+        }
+        pass.copy(&inner, &mut outer);
+        Ok(())
+    })
+    .unwrap();
+    assert_eq!(gpu.read(&outer).unwrap(), [1, 2, 3]);
+    renderer.reserve(100, []).unwrap();
+    // A recording that fails leaves nothing behind either.
+    gpu.run("fails", |_| Err(Error::Usage("enough".to_owned()))).unwrap_err();
+    gpu.write(&mut inner, &[9; 3]).unwrap();
+    assert_eq!(gpu.read(&inner).unwrap(), [9; 3]);
+}
+
+#[test]
+fn another_thread_that_submits_waits_for_the_recording_to_end() {
+    let gpu = gpu();
+    let mut buffer: Buffer<u32> = gpu.zeros("buffer", 3).unwrap();
+    let mut other: Buffer<u32> = gpu.zeros("other", 3).unwrap();
+    std::thread::scope(|scope| {
+        let writer = gpu.run("recording", |pass| {
+            pass.fill(&mut buffer, 5);
+            // It cannot be waited for in here.
+            let thread = scope.spawn(|| gpu.write(&mut other, &[7; 3]));
+            std::thread::sleep(Duration::from_millis(20));
+            assert!(!thread.is_finished());
+            drop(thread);
+            Ok(())
+        });
+        writer.unwrap();
+    });
+    assert_eq!(gpu.read(&buffer).unwrap(), [5; 3]);
+    assert_eq!(gpu.read(&other).unwrap(), [7; 3]);
+}
+
+#[test]
+fn a_download_that_was_not_submitted_is_not_waited_for() {
+    let gpu = gpu();
+    let buffer = gpu.buffer("buffer", &[1u32, 2, 3]).unwrap();
+    let mut kept = None;
+    gpu.run("too early", |pass| {
+        let message = pass.download(&buffer)?.wait().unwrap_err().to_string();
+        assert!(message.contains("`Gpu::run`"), "{message}");
+        kept = Some(pass.download(&buffer)?);
+        Ok(())
+    })
+    .unwrap();
+    assert_eq!(kept.unwrap().wait().unwrap(), [1, 2, 3]);
 }
 
 // ---------------------------------------------------------------------------

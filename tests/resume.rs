@@ -10,6 +10,7 @@ use std::time::Duration;
 use nightsplat::dataset::Dataset;
 use nightsplat::dataset::synthetic::{self, SyntheticOptions};
 use nightsplat::gpu::testing::gpu;
+use nightsplat::run::{self, Event, HeldRun};
 use nightsplat::train::{Background, Part, StepReport, TrainConfig, Trainer};
 use safetensors::SafeTensors;
 
@@ -106,7 +107,11 @@ fn a_checkpoint_that_does_not_fit_is_refused_and_changes_nothing() {
     refuses(&mut trainer, &edited("checkpoint 1", "checkpoint 9"), &["is no `nightsplat"]);
     refuses(&mut trainer, &edited("visit_counts", "visit_c0unts"), &["density.visit_counts"]);
     refuses(&mut trainer, &edited("first_moments", "first_m0ments"), &["gaussians.first_moments"]);
-    refuses(&mut trainer, &edited("seed = 10", "seed = 11"), &["seed = 11, not 10", "--overwrite"]);
+    refuses(
+        &mut trainer,
+        &edited("seed = 10", "seed = 11"),
+        &["seed = 11, not 10", "HeldRun::Replace"],
+    );
     refuses(&mut trainer, &edited("steps = 30", "stepz = 30"), &["another version"]);
     let file = SafeTensors::deserialize(&whole).unwrap();
     let sums = file.tensor("density.grad_norm_sums").unwrap().data();
@@ -118,7 +123,44 @@ fn a_checkpoint_that_does_not_fit_is_refused_and_changes_nothing() {
 
     let shorter = TrainConfig { steps: 5, ..config };
     let mut shorter = Trainer::new(&gpu, shorter, &dataset).unwrap();
-    refuses(&mut shorter, &whole, &["at step 6", "ends at 5", "--steps"]);
+    refuses(&mut shorter, &whole, &["at step 6", "ends at 5", "TrainConfig::steps"]);
+}
+
+#[test]
+fn a_run_tells_its_observer_everything_in_order() {
+    let folder = tempfile::tempdir().unwrap();
+    make_set(&folder.path().join("set"));
+    let config = TrainConfig { eval_every: 12, checkpoint_every: 20, ..config(&[]) };
+    let dataset = Dataset::load(folder.path().join("set"), &config.load_options()).unwrap();
+    let train = |config: &TrainConfig, held| {
+        let mut told = vec![];
+        let out = folder.path().join("run");
+        let trained = run::train(&gpu(), config, &dataset, &out, held, |event| {
+            told.push(match event {
+                Event::Started { step, steps } => format!("started {step} of {steps}"),
+                Event::Step(report) => format!("step {}", report.step),
+                Event::Checkpointed { step } => format!("checkpointed {step}"),
+                Event::Evaluated { step, scored } => format!("evaluated {step}: {}", scored.len()),
+                Event::Finished(trained) => format!("finished {}", trained.scored.len()),
+                _ => String::new(),
+            });
+        });
+        (trained.map(|trained| trained.losses.len()), told)
+    };
+    let mut expected = vec!["started 0 of 30".to_owned()];
+    for step in 1..=30 {
+        expected.push(format!("step {step}"));
+        expected.extend((step == 20).then(|| "checkpointed 20".to_owned()));
+        expected.extend((step % 12 == 0).then(|| format!("evaluated {step}: 2")));
+    }
+    expected.extend(["evaluated 30: 2", "finished 2"].map(str::to_owned));
+    let (steps, told) = train(&config, HeldRun::Refuse);
+    assert_eq!((steps.unwrap(), told), (30, expected));
+
+    let (refused, told) = train(&config, HeldRun::Refuse);
+    assert!(refused.unwrap_err().to_string().contains("already holds a run") && told.is_empty());
+    let (steps, told) = train(&TrainConfig { steps: 33, ..config }, HeldRun::Resume);
+    assert_eq!((steps.unwrap(), told[0].as_str()), (13, "started 20 of 33"));
 }
 
 /// The log without the column of times.

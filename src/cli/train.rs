@@ -2,18 +2,17 @@
 
 use std::io::{IsTerminal, Write};
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
 
 use anyhow::Result;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use crate::dataset::Dataset;
 use crate::eval::{self, ViewScore};
-use crate::export::{self, RunDirectory};
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::nn::Precision;
+use crate::run::{Event, HeldRun, Trained};
 use crate::tone::CurveChoice;
-use crate::train::{Background, ModelName, Part, Preset, TrainConfig, Trainer};
+use crate::train::{Background, ModelName, Part, Preset, TrainConfig};
 
 /// Train a 3D Gaussian Splatting model from dark photographs.
 ///
@@ -37,36 +36,37 @@ pub struct TrainArgs {
 }
 
 /// The options of a run; each wins over the configuration file.
+#[expect(clippy::doc_markdown, reason = "in help, {setting} stands for its default")]
 #[derive(Clone, Debug, Default, clap::Args)]
 pub(crate) struct TrainOptions {
-    /// The tone curve: a name that `nightsplat curves` lists, or a .toml, .csv or .cube file [default: ap3]
+    /// The tone curve: a name that `nightsplat curves` lists, or a .toml, .csv or .cube file [default: {tone.curve}]
     #[arg(long, value_name = "NAME|FILE")]
     curve: Option<CurveChoice>,
-    /// c: how much a brighter photograph raises the curve's gain [default: 3 for ase, 1 for ap3, else 0]
+    /// c: how much a brighter photograph raises the curve's gain [default: {tone.gain_c of ase} for ase, {tone.gain_c of ap3} for ap3, else {tone.gain_c of linear}]
     #[arg(long, value_name = "C")]
     gain: Option<f64>,
-    /// The mean that the linear curve aims at [default: 0.49]
+    /// The mean that the linear curve aims at [default: {tone.theta}]
     #[arg(long, value_name = "T")]
     theta: Option<f64>,
-    /// Training steps, one view each [default: 5000]
+    /// Training steps, one view each [default: {steps}]
     #[arg(long, value_name = "N")]
     steps: Option<u64>,
-    /// Shrink the photographs by this factor [default: 1]
+    /// Shrink the photographs by this factor [default: {downscale}]
     #[arg(long, value_name = "F")]
     downscale: Option<f64>,
-    /// Everything random follows from it; the same seed gives the same bits [default: 10]
+    /// Everything random follows from it; the same seed gives the same bits [default: {seed}]
     #[arg(long, value_name = "S")]
     seed: Option<u64>,
-    /// Highest degree of the spherical harmonics, 0 to 3 [default: 3]
+    /// Highest degree of the spherical harmonics, 0 to 3 [default: {sh_degree}]
     #[arg(long, value_name = "D")]
     sh_degree: Option<u32>,
-    /// Weight of 1 - SSIM beside L1, 0 to 1 [default: 0.2]
+    /// Weight of 1 - SSIM beside L1, 0 to 1 [default: {ssim_weight}]
     #[arg(long, value_name = "W")]
     ssim_weight: Option<f64>,
-    /// Never grow beyond this many Gaussians [default: 1000000]
+    /// Never grow beyond this many Gaussians [default: {max_gaussians}]
     #[arg(long, value_name = "N")]
     max_gaussians: Option<usize>,
-    /// black, or random: another colour every step [default: black]
+    /// black, or random: another colour every step [default: {background}]
     #[arg(long)]
     background: Option<Background>,
     /// A folder of reference images by name, for scores only
@@ -83,7 +83,7 @@ pub(crate) struct TrainOptions {
     /// Score the test views every N steps as well as at the end
     #[arg(long, value_name = "N")]
     eval_every: Option<u64>,
-    /// Write what --resume goes on from every N steps; 0: never [default: 1000]
+    /// Write what --resume goes on from every N steps; 0: never [default: {checkpoint_every}]
     #[arg(long, value_name = "N")]
     checkpoint_every: Option<u64>,
     /// Any other setting by its place in config.toml, such as tone.alpha=0.1; may be repeated, wins over all else
@@ -92,6 +92,7 @@ pub(crate) struct TrainOptions {
 }
 
 /// The options that say what the model has beside colour.
+#[expect(clippy::doc_markdown, reason = "in help, {setting} stands for its default")]
 #[derive(Clone, Debug, Default, clap::Args)]
 #[command(next_help_heading = "Model")]
 pub(crate) struct ModelOptions {
@@ -104,19 +105,19 @@ pub(crate) struct ModelOptions {
     /// The constants that the paper and its code state for a benchmark: lom, realx3d or mip360-varying; other options win
     #[arg(long, value_name = "NAME")]
     preset: Option<Preset>,
-    /// Train the networks on a random crop of at most N x N pixels a step; 0: on the whole view [default: 0]
+    /// Train the networks on a random crop of at most N x N pixels a step; 0: on the whole view [default: {model.denoiser_crop}]
     #[arg(long, value_name = "N")]
     denoiser_crop: Option<u32>,
-    /// Feature maps of the denoiser [default: 64]
+    /// Feature maps of the denoiser [default: {model.network.channels}]
     #[arg(long, value_name = "N")]
     denoiser_channels: Option<u32>,
-    /// Stages of the denoiser [default: 3]
+    /// Stages of the denoiser [default: {model.network.stages}]
     #[arg(long, value_name = "N")]
     denoiser_stages: Option<u32>,
-    /// Repeats of the inner convolution in a stage [default: 6]
+    /// Repeats of the inner convolution in a stage [default: {model.network.repeats}]
     #[arg(long, value_name = "N")]
     denoiser_repeats: Option<u32>,
-    /// single, or half: 16-bit factors in the inner convolution where the device has matrices of them [default: single]
+    /// single, or half: 16-bit factors in the inner convolution where the device has matrices of them [default: {model.network.precision}]
     #[arg(long, value_name = "P")]
     denoiser_precision: Option<Precision>,
     /// A folder of depth maps, `NAME.*` or `depth_NAME.*`, larger is farther [default: `depth/` or `depth_maps/` of the dataset]
@@ -125,7 +126,7 @@ pub(crate) struct ModelOptions {
     /// The depth maps hold disparity: larger is nearer
     #[arg(long)]
     depth_is_disparity: bool,
-    /// Colours are the bare SH sum of LITA-GS instead of max(SH + 0.5, 0) [default: false]
+    /// Colours are the bare SH sum of LITA-GS instead of max(SH + 0.5, 0) [default: {model.raw_colors}]
     #[arg(long, value_name = "BOOL")]
     raw_colors: Option<bool>,
 }
@@ -213,9 +214,9 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     let config = args.options.config(args.dataset.clone())?;
     let gpu = Gpu::new(&config.device.parse::<DeviceChoice>()?)?;
     let dataset = Dataset::load(&config.dataset, &config.load_options())?;
-    let held = if args.resume { HeldRun::Resume } else { HeldRun::of(args.overwrite) };
-    let (trained, _) = train_into(&args.out, &gpu, &config, &dataset, held)?;
-    let Trained { trainer, scored, seconds, .. } = trained;
+    let held = if args.resume { HeldRun::Resume } else { held_unless(args.overwrite) };
+    let Trained { trainer, scored, seconds, .. } =
+        train_with_bar(&gpu, &config, &dataset, &args.out, held)?;
     let gaussians = trainer.gaussian_count();
     let mut out = std::io::stdout().lock();
     if let Some(line) = summary(&scored) {
@@ -230,119 +231,38 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     Ok(())
 }
 
-/// What a training run made.
-pub(crate) struct Trained {
-    pub(crate) trainer: Trainer,
-    pub(crate) scored: Vec<ViewScore>,
-    /// Of the steps alone, without loading and scoring.
-    pub(crate) seconds: f64,
-    /// The most that buffers took on the device.
-    pub(crate) peak_bytes: u64,
+/// What `--overwrite` says.
+pub(crate) fn held_unless(overwrite: bool) -> HeldRun {
+    if overwrite { HeldRun::Replace } else { HeldRun::Refuse }
 }
 
-/// What becomes of a run that the directory already holds.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum HeldRun {
-    Refuse,
-    Replace,
-    Resume,
-}
-
-impl HeldRun {
-    /// What `--overwrite` says.
-    pub(crate) fn of(overwrite: bool) -> Self {
-        if overwrite { Self::Replace } else { Self::Refuse }
-    }
-}
-
-/// Trains into a run directory; gives the loss of every step as well.
-pub(crate) fn train_into(
-    out: &Path,
+/// Trains behind a progress bar; scores on the way go to the log.
+pub(crate) fn train_with_bar(
     gpu: &Gpu,
     config: &TrainConfig,
     dataset: &Dataset,
-    held: HeldRun,
-) -> crate::Result<(Trained, Vec<f64>)> {
-    gpu.reset_peak_memory();
-    let (mut directory, mut trainer) = begin(out, gpu, config, dataset, held)?;
-    let (losses, seconds) = train_to_the_end(&mut trainer, &mut directory, config, dataset)?;
-    let peak_bytes = gpu.peak_memory();
-    let scored = eval::score(dataset, |view| trainer.render(&view.camera))?;
-    directory.save_model(&trainer.gaussians()?, config.model.raw_colors)?;
-    if let Some(networks) = trainer.networks() {
-        directory.save_networks(networks)?;
-    }
-    let metrics = eval::metrics(&scored, seconds, trainer.gaussian_count(), config.steps);
-    directory.save_metrics(&metrics)?;
-    Ok((Trained { trainer, scored, seconds, peak_bytes }, losses))
-}
-
-/// A new run, or one that is taken up again.
-fn begin(
     out: &Path,
-    gpu: &Gpu,
-    config: &TrainConfig,
-    dataset: &Dataset,
     held: HeldRun,
-) -> crate::Result<(RunDirectory, Trainer)> {
-    let checkpoint = export::checkpoint(out).filter(|_| held == HeldRun::Resume);
-    if let Some(checkpoint) = checkpoint {
-        let mut trainer = Trainer::new(gpu, config.clone(), dataset)?;
-        trainer.restore(&checkpoint)?;
-        let step = trainer.steps_done();
-        tracing::info!("{} goes on after step {step}", out.display());
-        return Ok((RunDirectory::resume(out, config, step)?, trainer));
-    }
-    // Without a checkpoint, an unfinished run is nothing to lose.
-    let replaces = match held {
-        HeldRun::Refuse => false,
-        HeldRun::Replace => true,
-        HeldRun::Resume => !export::is_finished(out),
-    };
-    let directory = RunDirectory::create(out, config, replaces)?;
-    Ok((directory, Trainer::new(gpu, config.clone(), dataset)?))
-}
-
-/// Trains with a progress bar, logs every step, and writes checkpoints; gives the losses and the seconds of all steps.
-fn train_to_the_end(
-    trainer: &mut Trainer,
-    directory: &mut RunDirectory,
-    config: &TrainConfig,
-    dataset: &Dataset,
-) -> crate::Result<(Vec<f64>, f64)> {
-    let bar = progress_bar(config.steps).with_position(trainer.steps_done());
-    let (mut losses, mut spent) = (vec![], Duration::ZERO);
-    while trainer.steps_done() < config.steps {
-        let next = |every| (trainer.steps_done() + 1).checked_next_multiple_of(every);
-        let until = [config.eval_every, config.checkpoint_every].into_iter().filter_map(next);
-        let until = until.min().unwrap_or(config.steps);
-        let begin = Instant::now();
-        let reports = trainer.advance(until)?;
-        spent += begin.elapsed();
-        for report in &reports {
-            losses.push(report.loss);
-            directory.log(report)?;
+) -> crate::Result<Trained> {
+    let mut bar = ProgressBar::hidden();
+    crate::run::train(gpu, config, dataset, out, held, |event| match event {
+        Event::Started { step, steps } => bar = progress_bar(steps).with_position(step),
+        Event::Step(report) => {
+            bar.set_position(report.step);
+            bar.set_message(format!("loss {:.4}  {} Gaussians", report.loss, report.gaussians));
         }
-        let Some(last) = reports.last() else { continue };
-        bar.set_position(last.step);
-        bar.set_message(format!("loss {:.4}  {} Gaussians", last.loss, last.gaussians));
-        let falls_on = |every: u64| every > 0 && last.step.is_multiple_of(every);
-        if falls_on(config.checkpoint_every) {
-            directory.save_checkpoint(trainer)?;
-        }
-        if falls_on(config.eval_every) && last.step < config.steps {
-            let scored = eval::score(dataset, |view| trainer.render(&view.camera))?;
-            if let Some(line) = summary(&scored) {
-                bar.suspend(|| tracing::info!("step {}: {line}", last.step));
+        Event::Evaluated { step, scored } if step < config.steps => {
+            if let Some(line) = summary(scored) {
+                bar.suspend(|| tracing::info!("step {step}: {line}"));
             }
         }
-    }
-    bar.finish_and_clear();
-    Ok((losses, directory.seconds_before() + spent.as_secs_f64()))
+        Event::Evaluated { .. } => bar.finish_and_clear(),
+        _ => {}
+    })
 }
 
 /// The mean scores in a line; none where nothing was scored.
-pub(crate) fn summary(scored: &[ViewScore]) -> Option<String> {
+fn summary(scored: &[ViewScore]) -> Option<String> {
     let (mean, r0) = eval::means(scored);
     let mean = mean?;
     let before = r0.map(|r0| format!("; before the denoiser {:.2} dB, {:.3}", r0.psnr, r0.ssim));

@@ -157,6 +157,15 @@ impl Gpu {
     ///
     /// # Errors
     /// No loader, no such device, or one that lacks a requirement.
+    ///
+    /// ```no_run
+    /// use nightsplat::gpu::{DeviceChoice, Gpu};
+    ///
+    /// let gpu = Gpu::new(&DeviceChoice::Best)?;
+    /// let squares = gpu.buffer("squares", &[0u32, 1, 4, 9])?;
+    /// assert_eq!(gpu.read(&squares)?, [0, 1, 4, 9]);
+    /// # Ok::<(), nightsplat::Error>(())
+    /// ```
     pub fn new(choice: &DeviceChoice) -> Result<Self> {
         let validate = cfg!(debug_assertions) && validation_is_installed();
         Self::open(choice, validate)
@@ -229,8 +238,7 @@ impl Gpu {
         };
         let offered = Offered::gather(&instance, physical).map_err(loader_error)?;
         offered.check()?;
-        let queue =
-            Queue { raw: vk::Queue::from_raw(host.queue), family: host.queue_family, submitted: 0 };
+        let queue = Queue { raw: vk::Queue::from_raw(host.queue), family: host.queue_family };
         let properties = properties(&instance, physical, &offered);
         Self::assemble(&instance, physical, properties, device, queue, None)
     }
@@ -280,6 +288,7 @@ impl Gpu {
                 device,
                 allocator: Mutex::new(Some(allocator)),
                 queue: Mutex::new(queue),
+                progress: Mutex::default(),
                 timeline,
                 last_use: AtomicU64::new(0),
                 usage: super::buffer::MemoryUsage::default(),
@@ -520,7 +529,7 @@ fn create_device(
             .create_device(physical, &info, None)
             .map_err(|result| Error::Vulkan { call: "vkCreateDevice", device, result })?;
         let raw = device.get_device_queue(family, 0);
-        Ok((device, Queue { raw, family, submitted: 0 }))
+        Ok((device, Queue { raw, family }))
     }
 }
 

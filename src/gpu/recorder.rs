@@ -34,6 +34,9 @@ pub struct Recorder<'g> {
     pending: HashMap<vk::Buffer, bool>,
 }
 
+/// The timeline value of a recording that the host application submits: none of ours.
+pub(super) const HOST_SUBMITS: u64 = 0;
+
 /// Timestamps that fit one recording; passes beyond are not timed.
 pub(super) const MAX_TIMESTAMPS: u32 = 4096;
 
@@ -267,7 +270,7 @@ impl Gpu {
         record: impl FnOnce(&mut Recorder<'_>) -> Result<()>,
     ) -> Result<()> {
         let commands = vk::CommandBuffer::from_raw(commands);
-        let mut recorder = Recorder::new(&self.shared, commands, 0, None);
+        let mut recorder = Recorder::new(&self.shared, commands, HOST_SUBMITS, None);
         record(&mut recorder)?;
         recorder.finish();
         Ok(())

@@ -3,7 +3,8 @@
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::Path;
 
-use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use safetensors::SafeTensorError;
+use safetensors::tensor::{Dtype, Metadata, SafeTensors, TensorInfo, TensorView};
 use serde_json::Value;
 
 use super::parameters::{Parameters, Tensor};
@@ -14,27 +15,61 @@ use crate::{Error, Result};
 /// The key of the metadata that holds the settings of every network, as one JSON object.
 const SETTINGS: &str = "networks";
 
-/// Writes each network's tensors as `prefix.name`.
+/// A safetensors file whose header is read once.
+pub(crate) struct TensorFile<'a> {
+    metadata: Metadata,
+    /// Behind the header.
+    data: &'a [u8],
+}
+
+impl<'a> TensorFile<'a> {
+    /// # Errors
+    /// The header is damaged, or says that there is more or less than there is.
+    pub(crate) fn of(bytes: &'a [u8]) -> std::result::Result<Self, SafeTensorError> {
+        let (header_bytes, metadata) = SafeTensors::read_metadata(bytes)?;
+        // The length of the header stands before it.
+        Ok(Self { metadata, data: &bytes[size_of::<u64>() + header_bytes..] })
+    }
+
+    /// What the header says under `key` beside the tensors.
+    pub(crate) fn note(&self, key: &str) -> Option<&str> {
+        self.metadata.metadata().as_ref()?.get(key).map(String::as_str)
+    }
+
+    /// A tensor and its bytes.
+    pub(crate) fn tensor(&self, name: &str) -> Option<(&TensorInfo, &'a [u8])> {
+        let info = self.metadata.info(name)?;
+        let (begin, end) = info.data_offsets;
+        Some((info, &self.data[begin..end]))
+    }
+}
+
+/// Writes each network's tensors as `network.tensor`.
 ///
 /// # Errors
 /// The file cannot be written, or the device was lost.
-pub fn save(path: &Path, networks: &[(&str, &Parameters)], gpu: &Gpu) -> Result<()> {
+pub fn save(path: &Path, networks: &[&Parameters], gpu: &Gpu) -> Result<()> {
     let mut settings = BTreeMap::new();
     let mut values = vec![];
-    for (prefix, parameters) in networks {
-        settings
-            .insert(*prefix, serde_json::from_str(parameters.settings()).unwrap_or(Value::Null));
+    for parameters in networks {
+        settings.insert(
+            parameters.name,
+            serde_json::from_str(parameters.settings()).unwrap_or(Value::Null),
+        );
         values.push(gpu.read(&parameters.values)?);
     }
     let failed = |error: &dyn std::fmt::Display| {
         Error::output(path, format!("cannot be written ({error}); check the folder and the disk"))
     };
     let mut views = vec![];
-    for ((prefix, parameters), values) in networks.iter().zip(&values) {
+    for (parameters, values) in networks.iter().zip(&values) {
         for tensor in parameters.tensors() {
             let bytes = bytemuck::cast_slice(&values[tensor.offset..][..tensor.len()]);
             let view = TensorView::new(Dtype::F32, tensor.shape.clone(), bytes);
-            views.push((format!("{prefix}.{}", tensor.name), view.map_err(|e| failed(&e))?));
+            views.push((
+                format!("{}.{}", parameters.name, tensor.name),
+                view.map_err(|e| failed(&e))?,
+            ));
         }
     }
     let settings = serde_json::json!(settings).to_string();
@@ -43,22 +78,22 @@ pub fn save(path: &Path, networks: &[(&str, &Parameters)], gpu: &Gpu) -> Result<
     write_whole(path, &bytes)
 }
 
-/// Reads each network's values from the tensors `prefix.name`; all networks are read, or none is changed.
+/// Reads each network's values from the tensors `network.tensor`; all networks are read, or none is changed.
 ///
 /// # Errors
 /// The file is missing or damaged, a value is not finite, or the file holds a network of another configuration.
-pub fn load(path: &Path, networks: &mut [(&str, &mut Parameters)], gpu: &Gpu) -> Result<()> {
+pub fn load(path: &Path, networks: &mut [&mut Parameters], gpu: &Gpu) -> Result<()> {
     let bytes = std::fs::read(path)
         .map_err(|error| Error::input(path, format!("cannot be read ({error})")))?;
     let damaged = |error| Error::input(path, format!("is no whole safetensors file ({error})"));
-    let (_, header) = SafeTensors::read_metadata(&bytes).map_err(damaged)?;
-    let file = SafeTensors::deserialize(&bytes).map_err(damaged)?;
-    let settings = header.metadata().as_ref().and_then(|metadata| metadata.get(SETTINGS));
+    let file = TensorFile::of(&bytes).map_err(damaged)?;
+    let settings = file.note(SETTINGS);
     let settings: Value = settings.and_then(|s| serde_json::from_str(s).ok()).unwrap_or_default();
 
     let mut values = vec![];
-    for (prefix, parameters) in networks.iter() {
-        let remedy = match settings.get(*prefix) {
+    for parameters in networks.iter() {
+        let prefix = parameters.name;
+        let remedy = match settings.get(prefix) {
             Some(made_with) => format!("use the settings it was made with: {made_with}"),
             None => "use the settings it was made with".to_owned(),
         };
@@ -69,15 +104,14 @@ pub fn load(path: &Path, networks: &mut [(&str, &mut Parameters)], gpu: &Gpu) ->
         let read = |tensor: &Tensor| {
             let name = format!("{prefix}.{}", tensor.name);
             let expected = &tensor.shape;
-            let found = file.tensor(&name).map_err(|_| {
+            let (TensorInfo { shape, dtype, .. }, bytes) = file.tensor(&name).ok_or_else(|| {
                 other(format!("has no tensor `{name}`, which must be {expected:?}"))
             })?;
-            if found.shape() != expected || found.dtype() != Dtype::F32 {
-                let (shape, dtype) = (found.shape(), found.dtype());
+            if shape != expected || *dtype != Dtype::F32 {
                 let problem = format!("tensor `{name}` is {shape:?} {dtype}, not {expected:?} F32");
                 return Err(other(problem));
             }
-            let values = found.data().chunks_exact(4);
+            let values = bytes.chunks_exact(4);
             let values: Vec<f32> =
                 values.map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
             if values.iter().all(|value| value.is_finite()) {
@@ -94,12 +128,13 @@ pub fn load(path: &Path, networks: &mut [(&str, &mut Parameters)], gpu: &Gpu) ->
             is_own && !known.contains(*name)
         };
         values.push(parameters.tensors().iter().map(read).collect::<Result<Vec<_>>>()?.concat());
-        if let Some(stray) = file.names().into_iter().filter(is_stray).min() {
+        let names = file.metadata.tensors();
+        if let Some(stray) = names.keys().map(String::as_str).filter(is_stray).min() {
             return Err(other(format!("holds a tensor `{stray}` that this network lacks")));
         }
     }
     networks
         .iter_mut()
         .zip(values)
-        .try_for_each(|((_, parameters), values)| gpu.write(&mut parameters.values, &values))
+        .try_for_each(|(parameters, values)| gpu.write(&mut parameters.values, &values))
 }

@@ -1,25 +1,22 @@
+use crate::attributes::{Attribute, planes};
 use crate::gpu::Reference;
 use crate::kernels::densify_count::{Constants, Kernel, Params, Slices};
 use crate::kernels::fate::{FATE_CLONE, FATE_KEEP, FATE_PRUNE, FATE_SPLIT};
 
-/// First column and width of every plane.
-pub(super) fn planes(feature_count: usize, column_count: usize) -> [(usize, usize); 7] {
-    let rest = 14 + feature_count;
-    [(0, 3), (3, 4), (7, 3), (10, 1), (11, 3), (14, feature_count), (rest, column_count - rest)]
-}
-
 impl Reference for Kernel {
     fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
         let n = params.gaussian_count as usize;
+        let first = |attribute: Attribute| attribute.column(0) * n;
+        let (opacities, log_scales) = (first(Attribute::RawOpacities), first(Attribute::LogScales));
         for i in 0..n {
             let [features, columns] =
                 [params.feature_count, params.column_count].map(|n| n as usize);
             let is_finite = planes(features, columns).iter().all(|(column, width)| {
                 (0..*width).all(|k| slices.parameters[column * n + width * i + k].is_finite())
             });
-            let is_visible = slices.parameters[10 * n + i] >= params.min_raw_opacity;
-            let largest =
-                (0..3).map(|k| slices.parameters[7 * n + 3 * i + k]).fold(f32::MIN, f32::max);
+            let is_visible = slices.parameters[opacities + i] >= params.min_raw_opacity;
+            let largest = (0..3).map(|k| slices.parameters[log_scales + 3 * i + k]);
+            let largest = largest.fold(f32::MIN, f32::max);
             let mean_gradient = match slices.visit_counts[i] {
                 0 => 0.0,
                 visits => slices.grad_norm_sums[i] / visits as f32,

@@ -2,8 +2,8 @@ use std::f32::consts::TAU;
 
 use glam::{Quat, Vec3};
 
-use super::densify_count::planes;
 use super::random::random_bits;
+use crate::attributes::{Attribute, planes};
 use crate::gpu::Reference;
 use crate::kernels::densify_scatter::{Constants, Kernel, Params, Slices};
 use crate::kernels::fate::{FATE_CLONE, FATE_KEEP, FATE_SPLIT};
@@ -22,11 +22,12 @@ fn random_normal3(key: u32) -> Vec3 {
 /// A draw from the normal distribution that Gaussian `i` is.
 fn draw_mean(params: &Params, parameters: &[f32], i: usize, copy: u32) -> Vec3 {
     let n = params.gaussian_count as usize;
-    let mean = Vec3::from_slice(&parameters[3 * i..]);
-    let quat = &parameters[3 * n + 4 * i..];
+    let first = |attribute: Attribute| attribute.column(0) * n;
+    let mean = Vec3::from_slice(&parameters[first(Attribute::Means) + 3 * i..]);
+    let quat = &parameters[first(Attribute::Quats) + 4 * i..];
     let quat = Quat::from_xyzw(quat[1], quat[2], quat[3], quat[0]);
     let rotation = if quat.length() > 1e-12 { quat.normalize() } else { Quat::IDENTITY };
-    let scales = Vec3::from_slice(&parameters[7 * n + 3 * i..]).exp();
+    let scales = Vec3::from_slice(&parameters[first(Attribute::LogScales) + 3 * i..]).exp();
     let step_key = random_bits(random_bits(params.seed).wrapping_add(params.step));
     let key = random_bits(step_key.wrapping_add(2 * i as u32 + copy));
     mean + rotation * (scales * random_normal3(key))
@@ -60,10 +61,12 @@ impl Reference for Kernel {
                     continue;
                 }
                 let mean = draw_mean(params, slices.parameters, i, copy);
+                let [means, log_scales] = [Attribute::Means, Attribute::LogScales]
+                    .map(|attribute| attribute.column(0) * new_n);
                 for k in 0..3 {
-                    slices.new_parameters[3 * to + k] = mean[k];
+                    slices.new_parameters[means + 3 * to + k] = mean[k];
                     if fate == FATE_SPLIT {
-                        slices.new_parameters[7 * new_n + 3 * to + k] -= 1.6f32.ln();
+                        slices.new_parameters[log_scales + 3 * to + k] -= 1.6f32.ln();
                     }
                 }
             }

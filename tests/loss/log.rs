@@ -50,11 +50,11 @@ fn loss_log_matches_its_reference() {
 
 #[test]
 fn every_term_has_its_own_column_and_name() {
-    for (i, term) in Term::ALL.into_iter().enumerate() {
-        assert_eq!(term as usize, i);
-        assert!(Term::ALL[..i].iter().all(|other| other.name() != term.name()));
+    for (i, term) in Term::all().enumerate() {
+        assert_eq!(term.index(), i);
+        assert!(Term::all().take(i).all(|other| other.name != term.name));
     }
     let logged = log_step(&gpu(), |_, _| Ok(())).unwrap();
-    assert!(Term::ALL.iter().all(|&term| logged.losses.get(term) == 0.0));
+    assert!(Term::all().all(|term| logged.losses.get(term) == 0.0));
     assert_eq!(logged.losses.first_not_finite(), None);
 }

@@ -43,11 +43,11 @@ fn log_step(
     let steps = download.unwrap().wait()?;
     assert_eq!(steps.len(), 3);
     for other in [&steps[0], &steps[2]] {
-        assert!(Term::ALL.iter().all(|&term| other.get(term) == 0.0) && other.status == 0);
+        assert!(Term::all().all(|term| other.get(term) == 0.0) && other.status == 0);
     }
     let status = gpu.read(&status)?[0];
     assert_eq!(steps[1].status, status);
-    Ok(Logged { losses: steps[1], status })
+    Ok(Logged { losses: steps[1].clone(), status })
 }
 
 /// The first mismatches, so that a failure shows its pattern.

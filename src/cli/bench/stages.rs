@@ -146,7 +146,7 @@ impl<'s> Step<'s> {
         gpu.run("statistics", |pass| pseudo_gt.statistics(pass, &image, size))?;
         let parameters_of = pseudo_gt.settings().parameters(&pseudo_gt.measured()?);
         let tone = gpu.buffer("tone", &[parameters_of])?;
-        let terms = [Term::L1, Term::Ssim];
+        let terms = [Term::L1, Term::SSIM];
         let settings = LossSettings { tone_curve: curve.constant(), ssim_weight: 0.2, terms };
         let mut loss = Loss::new(gpu, settings)?;
         loss.reserve(UVec2::from_array(size))?;
@@ -207,8 +207,8 @@ impl<'s> Step<'s> {
                 parameters: &mut self.parameters,
                 gradients: &self.gradients,
                 moments: &mut self.moments,
-                status: self.renderer.status(),
             },
+            self.renderer.status(),
         )
     }
 }

@@ -63,7 +63,7 @@ pub(super) fn image(
         [d_render: Close(1e-2), partials: Sum(1e-4)]
     );
     let (first_partials, second_partials) = (l1_partials, ssim_partials);
-    let (log, statuses, status) = (vec![0.0_f32; Term::ALL.len()], vec![0_u32], vec![0_u32]);
+    let (log, statuses, status) = (vec![0.0_f32; Term::all().count()], vec![0_u32], vec![0_u32]);
     check!(
         bench,
         timings,
@@ -71,8 +71,8 @@ pub(super) fn image(
         loss_log::Constants::default(),
         loss_log::Params {
             slot: 0,
-            term_count: Term::ALL.len() as u32,
-            terms: UVec2::new(Term::L1 as u32, Term::Ssim as u32),
+            term_count: Term::all().count() as u32,
+            terms: UVec2::new(Term::L1.index() as u32, Term::SSIM.index() as u32),
             partial_counts: UVec2::splat(workgroups),
             mean_scales: Vec2::splat(mean_scale),
         },
