@@ -268,7 +268,7 @@ fn a_layer_that_the_model_lacks_is_named_with_those_it_has() {
     let config = run.join("config.toml");
     let text = std::fs::read_to_string(&config).unwrap();
     std::fs::write(&config, text.replace("denoiser = false", "denoiser = true")).unwrap();
-    refused(&format!("eval {at}"), 1, &["no noise, which the denoiser takes"]);
+    refused(&format!("eval {at}"), 2, &["no noise, which the denoiser takes"]);
 }
 
 /// Without depth maps there is no depth channel, so that the others lie elsewhere than the configuration would have them.
