@@ -464,35 +464,6 @@ fn same_world(folder: &Path, pairs: &[(DVec3, DVec3)]) -> Option<Box<dyn Fn(DVec
 mod tests {
     use super::*;
 
-    /// The model's cameras and the views they belong to, of a LOM scene, or `None` with a word on stdout.
-    fn lom_pairs(scene: &str) -> Option<Vec<(DVec3, DVec3)>> {
-        let root =
-            Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../shared/data/lom")).join(scene);
-        if !root.is_dir() {
-            println!("skipped: {} is absent", root.display());
-            return None;
-        }
-        let frames = list(&root, &Files::default()).unwrap().frames;
-        let images = colmap::read_images(&colmap::find(&root, &["images"]).unwrap()).unwrap();
-        let center = |pose: DAffine3| pose.inverse().translation;
-        let pairs = images.iter().map(|image| {
-            let frame = frames.iter().find(|frame| frame.name == files::stem(&image.name)).unwrap();
-            (center(image.view_from_world.unwrap()), center(frame.view_from_world))
-        });
-        Some(pairs.collect())
-    }
-
-    #[test]
-    fn loms_two_worlds_differ_by_an_exact_similarity() {
-        for (scene, count) in [("chair", 48), ("sofa", 33), ("shrub", 35)] {
-            if let Some(pairs) = lom_pairs(scene) {
-                let residual = Similarity::solve(&pairs).unwrap().residual;
-                assert!(residual < 1e-8, "{scene}: {residual}");
-                assert_eq!(pairs.len(), count);
-            }
-        }
-    }
-
     #[test]
     fn a_world_that_is_off_by_more_than_a_hundredth_gives_no_points() {
         let center = |i: i32| DVec3::new(f64::from(i % 3), f64::from(i / 3), f64::from(i * i % 5));

@@ -135,11 +135,6 @@ impl Gpu {
     pub fn properties(&self) -> &Properties {
         &self.shared.properties
     }
-
-    /// Validation messages seen so far (own devices with validation only).
-    pub fn validation_messages(&self) -> Vec<String> {
-        self.shared.owned.as_ref().map(device::Owned::messages).unwrap_or_default()
-    }
 }
 
 impl Shared {

@@ -24,7 +24,8 @@ use crate::scene::Shape;
 use crate::sort::{Count, DispatchArguments, RadixSort, Scan};
 use crate::{Error, Result};
 
-use frame::Frame;
+#[doc(hidden)]
+pub use frame::Frame;
 pub use frame::Status;
 
 /// What a renderer is specialised for.
@@ -225,9 +226,15 @@ impl Renderer {
         &self.frame.render
     }
 
-    /// What the last render lets through of the background, (H, W).
+    /// How much of the background the last render lets through, (H, W): 1 where no splat is.
     pub fn transmittances(&self) -> &Buffer<f32> {
         &self.frame.transmittances
+    }
+
+    /// Everything that the passes of the last render handed each other.
+    #[doc(hidden)]
+    pub fn frame(&self) -> &Frame {
+        &self.frame
     }
 
     /// The status words: see [`Status`]. Kernels that change parameters look at the first and do nothing unless it is 0.

@@ -4,15 +4,19 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output, Stdio};
+use std::process::Stdio;
 use std::time::Duration;
 
 use nightsplat::dataset::Dataset;
 use nightsplat::dataset::synthetic::{self, SyntheticOptions};
-use nightsplat::gpu::testing::{assert_no_validation_messages, gpu};
+use nightsplat::gpu::testing::gpu;
 use nightsplat::run::{self, Event, HeldRun};
 use nightsplat::train::{Background, Part, StepReport, TrainConfig, Trainer};
 use safetensors::SafeTensors;
+
+mod common;
+use common::command::{command, refused, succeed};
+use common::train::advance;
 
 /// A set of nine small views.
 fn make_set(folder: &Path) {
@@ -33,14 +37,6 @@ fn config(parts: &[Part]) -> TrainConfig {
     config.model.network.repeats = 2;
     config.model.denoiser_crop = 16;
     config
-}
-
-fn advance(trainer: &mut Trainer, until: u64) -> Vec<StepReport> {
-    let mut reports = vec![];
-    while trainer.steps_done() < until {
-        reports.extend(trainer.advance(until).unwrap());
-    }
-    reports
 }
 
 /// The whole state at the end, and what every step said.
@@ -79,7 +75,6 @@ fn a_restored_run_goes_on_bit_for_bit() {
             assert_eq!(same.len() as u64, 30 - step);
         }
     }
-    assert_no_validation_messages();
 }
 
 #[test]
@@ -129,7 +124,6 @@ fn a_checkpoint_that_does_not_fit_is_refused_and_changes_nothing() {
     let shorter = TrainConfig { steps: 5, ..config };
     let mut shorter = Trainer::new(&gpu, shorter, &dataset).unwrap();
     refuses(&mut shorter, &whole, &["at step 6", "ends at 5", "TrainConfig::steps"]);
-    assert_no_validation_messages();
 }
 
 #[test]
@@ -167,27 +161,6 @@ fn a_run_tells_its_observer_everything_in_order() {
     assert!(refused.unwrap_err().to_string().contains("already holds a run") && told.is_empty());
     let (steps, told) = train(&TrainConfig { steps: 33, ..config }, HeldRun::Resume);
     assert_eq!((steps.unwrap(), told[0].as_str()), (13, "started 20 of 33"));
-    assert_no_validation_messages();
-}
-
-fn nightsplat(arguments: &str) -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_nightsplat"));
-    command.args(arguments.split_whitespace()).stdout(Stdio::piped()).stderr(Stdio::piped());
-    command
-}
-
-fn succeed(arguments: &str) {
-    let Output { status, stderr, .. } = nightsplat(arguments).output().unwrap();
-    assert!(status.success(), "{arguments}: {}", String::from_utf8_lossy(&stderr));
-}
-
-fn refused(arguments: &str, code: i32, parts: &[&str]) {
-    let Output { status, stderr, .. } = nightsplat(arguments).output().unwrap();
-    let message = String::from_utf8_lossy(&stderr);
-    assert_eq!(status.code(), Some(code), "{arguments}: {message}");
-    for part in parts {
-        assert!(message.contains(part), "`{part}` is not in: {message}");
-    }
 }
 
 /// The log without the column of times.
@@ -209,7 +182,8 @@ fn a_killed_run_is_resumed_to_the_same_model() {
     succeed(&train(&straight, "--steps 200"));
 
     // Without a checkpoint it begins; killed at some step behind one, it goes on.
-    let mut child = nightsplat(&train(&killed, "--steps 200 --resume")).spawn().unwrap();
+    let mut child = command(&train(&killed, "--steps 200 --resume"));
+    let mut child = child.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
     let checkpoint = killed.join("checkpoint.safetensors");
     while !checkpoint.exists() && child.try_wait().unwrap().is_none() {
         std::thread::sleep(Duration::from_millis(2));

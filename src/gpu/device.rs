@@ -12,7 +12,7 @@ use gpu_allocator::vulkan::{Allocator, AllocatorCreateDesc};
 
 use super::cooperative::{self, CooperativeMatrix};
 use super::requirements::{EXTENSIONS, Offered, required_device_features};
-use super::{Gpu, Properties, Queue, REQUIREMENTS, Shared, lock, validation};
+use super::{Gpu, Properties, Queue, REQUIREMENTS, Shared, validation};
 use crate::{Error, Result};
 
 /// What to install where there is no Vulkan; the same words for a missing loader and a missing driver.
@@ -105,18 +105,12 @@ pub struct HostDevice {
 pub(super) struct Owned {
     instance: ash::Instance,
     messenger: Option<(ext::debug_utils::Instance, vk::DebugUtilsMessengerEXT)>,
-    /// The messenger points at it: a box does not move.
-    messages: Box<validation::Messages>,
     cache_path: Option<PathBuf>,
     /// Last, because the instance's functions live in the library.
     entry: ash::Entry,
 }
 
 impl Owned {
-    pub(super) fn messages(&self) -> Vec<String> {
-        lock(&self.messages).clone()
-    }
-
     pub(super) fn save_pipeline_cache(&self, device: &ash::Device, cache: vk::PipelineCache) {
         let Some(path) = &self.cache_path else { return };
         // SAFETY: the cache is live. A cache that cannot be kept costs time, never correctness.
@@ -339,7 +333,6 @@ fn validation_is_installed() -> bool {
 
 fn instance(validate: bool) -> Result<Owned> {
     let entry = entry()?;
-    let messages = Box::new(Mutex::new(vec![]));
     let app = vk::ApplicationInfo::default()
         .application_name(c"nightsplat")
         .api_version(vk::API_VERSION_1_3);
@@ -347,7 +340,7 @@ fn instance(validate: bool) -> Result<Owned> {
     let extensions = [ext::debug_utils::NAME.as_ptr(), ext::validation_features::NAME.as_ptr()];
     let checks = [vk::ValidationFeatureEnableEXT::SYNCHRONIZATION_VALIDATION];
     let mut features = vk::ValidationFeaturesEXT::default().enabled_validation_features(&checks);
-    let messenger_info = validation::messenger(&messages);
+    let messenger_info = validation::messenger();
     let mut early = messenger_info;
     let mut info = vk::InstanceCreateInfo::default().application_info(&app);
     if validate {
@@ -357,7 +350,7 @@ fn instance(validate: bool) -> Result<Owned> {
             .push_next(&mut features)
             .push_next(&mut early);
     }
-    // SAFETY: `info` points at live locals, `messages` outlives the instance.
+    // SAFETY: `info` points at live locals.
     unsafe {
         let instance = entry.create_instance(&info, None).map_err(loader_error)?;
         let messenger = validate
@@ -368,7 +361,7 @@ fn instance(validate: bool) -> Result<Owned> {
             })
             .transpose()
             .map_err(loader_error)?;
-        Ok(Owned { instance, messenger, messages, cache_path: None, entry })
+        Ok(Owned { instance, messenger, cache_path: None, entry })
     }
 }
 

@@ -1,7 +1,7 @@
 //! Every kernel against its reference, at sizes and channel counts that divide nothing.
 
 use glam::{UVec2, Vec2};
-use nightsplat::gpu::testing::{assert_no_validation_messages, gpu};
+use nightsplat::gpu::testing::gpu;
 use nightsplat::gpu::{CooperativeMatrix, Threads};
 use nightsplat::kernels::*;
 
@@ -53,7 +53,6 @@ fn check_conv(constants: conv3x3::Constants, [in_channels, out_channels]: [u32; 
         let what = format!("{size} {in_channels} to {out_channels} {constants:?}");
         assert_close(&what, &actual, &expected, bound);
     }
-    assert_no_validation_messages();
 }
 
 #[test]
@@ -114,13 +113,16 @@ fn check_half(matrix: CooperativeMatrix, transposed: bool, in_out: [u32; 2], mag
         let what = format!("{size} {in_out:?} times {magnitude:e} {constants:?}");
         assert_close(&what, &actual, &expected, bound);
     }
-    assert_no_validation_messages();
 }
 
 /// Runs where the device has cooperative matrices.
 #[test]
 fn conv3x3_half_matches_its_reference_at_every_magnitude() {
-    let Some(matrix) = gpu().properties().cooperative_matrix else { return };
+    let Some(matrix) = gpu().properties().cooperative_matrix else {
+        let device = gpu();
+        let name = &device.properties().name;
+        return super::common::not_run(format_args!("{name} has no cooperative matrices"));
+    };
     for magnitude in [1.0, 1e-9, 1e-30, 1e6] {
         check_half(matrix, false, [8, 17], magnitude);
         check_half(matrix, true, [17, 8], magnitude);
@@ -188,7 +190,6 @@ fn conv3x3_weight_gradient_and_reduce_strips_match_their_references() {
             assert_close("reduce_strips", &gradients, &expected, bound);
         }
     }
-    assert_no_validation_messages();
 }
 
 /// Runs the six norm kernels one after another, each on what the device made of the one before.
@@ -280,14 +281,12 @@ fn the_norm_kernels_match_their_references() {
         check_norm(size, 17, 64, -0.2, 0.7);
     }
     check_norm([83, 61], 8, 1024, 0.0, 1.0);
-    assert_no_validation_messages();
 }
 
 /// The mean of the squares minus the square of the mean would lose every digit here.
 #[test]
 fn a_large_mean_does_not_drown_a_small_deviation() {
     check_norm([83, 61], 3, 1024, 1000.0, 0.1);
-    assert_no_validation_messages();
 }
 
 #[test]
@@ -388,5 +387,4 @@ fn the_kernels_without_neighbours_match_their_references() {
         // A multiplication may be fused into the addition.
         assert_close("d_denoised", &actual.1, &expected.1, |_, _| 2.0 * UNIT);
     }
-    assert_no_validation_messages();
 }

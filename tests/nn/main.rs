@@ -13,17 +13,7 @@ mod model;
 mod networks;
 mod torch;
 
+use common::{largest, narrow, widen};
+
 /// The relative rounding of one operation in single precision.
 const UNIT: f32 = 1.0 / (1 << 24) as f32;
-
-fn largest(values: &[f32]) -> f32 {
-    values.iter().fold(0.0, |largest, value| value.abs().max(largest))
-}
-
-fn narrow(values: &[f64]) -> Vec<f32> {
-    values.iter().map(|&x| x as f32).collect()
-}
-
-fn widen(values: &[f32]) -> Vec<f64> {
-    values.iter().map(|&x| x.into()).collect()
-}
