@@ -17,6 +17,7 @@ pub mod demo;
 pub mod doctor;
 pub mod eval;
 mod finished_run;
+#[cfg(feature = "fit")]
 pub mod fit;
 pub mod render;
 pub mod sweep;
@@ -53,12 +54,24 @@ enum Command {
     Tone(tone::ToneArgs),
     Curves(curves::CurvesArgs),
     Sweep(Box<sweep::SweepArgs>),
+    #[cfg(feature = "fit")]
     Fit(fit::FitArgs),
+    /// Fit a curve to pairs of photographs: not in this build
+    #[cfg(not(feature = "fit"))]
+    Fit(Absent),
     Synth(synth::SynthArgs),
     Ablate(Box<ablate::AblateArgs>),
     Demo(demo::DemoArgs),
     Doctor(doctor::DoctorArgs),
     Bench(bench::BenchArgs),
+}
+
+/// Whatever is given to a subcommand that this build lacks.
+#[cfg(not(feature = "fit"))]
+#[derive(Debug, clap::Args)]
+struct Absent {
+    #[arg(hide = true, trailing_var_arg = true, allow_hyphen_values = true)]
+    arguments: Vec<String>,
 }
 
 impl Cli {
@@ -78,7 +91,13 @@ impl Cli {
             Command::Render(args) => render::run(&args),
             Command::Tone(args) => Ok(tone::run(&args)?),
             Command::Curves(args) => Ok(curves::run(&args)?),
+            #[cfg(feature = "fit")]
             Command::Fit(args) => Ok(fit::run(&args)?),
+            #[cfg(not(feature = "fit"))]
+            Command::Fit(Absent { .. }) => {
+                let remedy = "install nightsplat with the feature `fit`, which is on by default";
+                Err(crate::Error::Usage(format!("this build has no `fit`; {remedy}")).into())
+            }
             Command::Sweep(args) => sweep::run(&args),
             Command::Synth(args) => Ok(synth::run(args)?),
             Command::Ablate(args) => ablate::run(&args),

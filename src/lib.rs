@@ -8,7 +8,8 @@
 //! ```
 //!
 //! A program trains with [`run::train`], as `examples/train.rs` does, or lends its own Vulkan device and renders into its
-//! own command buffers, as `examples/embed.rs` does.
+//! own command buffers, as `examples/embed.rs` does. Without default features this crate is what a host embeds: everything
+//! up to the optimizer's step; feature `io` adds files, datasets and training runs, `fit` fits curves, `cli` is the command.
 //!
 //! Data flows one way: a module uses only modules above it in this list, which `tests/architecture.rs` reads and asserts.
 //!
@@ -45,10 +46,13 @@ pub mod attributes;
 pub mod camera;
 #[cfg(feature = "cli")]
 pub mod cli;
+#[cfg(feature = "io")]
 pub mod dataset;
 pub mod densify;
 pub mod error;
+#[cfg(feature = "io")]
 pub mod eval;
+#[cfg(feature = "fit")]
 pub mod fit;
 #[expect(unsafe_code, reason = "the only module that speaks Vulkan")]
 pub mod gpu;
@@ -63,12 +67,15 @@ pub mod pseudo_gt;
 pub mod random;
 pub mod reference;
 pub mod render;
+#[cfg(feature = "io")]
 pub mod report;
+#[cfg(feature = "io")]
 pub mod run;
 pub mod scene;
 pub mod sort;
 pub mod structure;
 pub mod tone;
+#[cfg(feature = "io")]
 pub mod train;
 pub mod window;
 

@@ -8,6 +8,7 @@
 
 mod conv;
 mod denoiser;
+#[cfg(feature = "io")]
 mod file;
 mod norm;
 mod parameters;
@@ -20,7 +21,9 @@ use crate::{Error, Result};
 
 pub use conv::Precision;
 pub use denoiser::{Denoiser, DenoiserSettings};
+#[cfg(feature = "io")]
 pub(crate) use file::TensorFile;
+#[cfg(feature = "io")]
 pub use file::{load, save};
 pub use parameters::{Parameters, Tensor};
 pub use tonemapper::Tonemapper;

@@ -5,7 +5,9 @@ use std::ops::Range;
 use glam::Vec3;
 
 mod features;
+#[cfg(feature = "io")]
 pub mod init;
+#[cfg(feature = "io")]
 mod neighbours;
 pub mod ply;
 

@@ -17,6 +17,7 @@
 
 mod catalogue;
 mod families;
+#[cfg(feature = "io")]
 mod file;
 mod law;
 mod real;
@@ -29,8 +30,12 @@ use std::str::FromStr;
 
 pub use self::catalogue::{FAMILIES, ToneCurve};
 pub use self::families::{Constant, Family, Law, White};
+#[cfg(feature = "io")]
 pub use self::file::CurveChoice;
-pub(crate) use self::law::{Numbers, clamped, curve_at, law, tone_curve};
+#[cfg(feature = "fit")]
+pub(crate) use self::law::{Numbers, law};
+pub(crate) use self::law::{clamped, curve_at, tone_curve};
+#[cfg(feature = "fit")]
 pub(crate) use self::real::{Dual, Real};
 pub use self::settings::ToneSettings;
 pub(crate) use self::statistics::{Rank, luminance, measurable};

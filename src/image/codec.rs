@@ -136,7 +136,7 @@ impl Image {
     }
 }
 
-fn not_an_image(path: &Path, error: &dyn std::error::Error) -> Error {
+pub(super) fn not_an_image(path: &Path, error: &dyn std::error::Error) -> Error {
     Error::input(
         path,
         format!("is not a readable PNG, JPEG or EXR image ({error}); replace or remove it"),
@@ -160,7 +160,7 @@ fn from_decoded(decoded: DynamicImage) -> Image {
 }
 
 /// Planes from pixels of red, green and blue.
-pub(super) fn from_interleaved(width: u32, height: u32, values: &[f32]) -> Image {
+fn from_interleaved(width: u32, height: u32, values: &[f32]) -> Image {
     let data = (0..3).flat_map(|plane| values.iter().skip(plane).step_by(3).copied()).collect();
     Image { width, height, data }
 }

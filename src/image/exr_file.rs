@@ -5,7 +5,8 @@ use std::path::Path;
 
 use exr::prelude::{ReadChannels, ReadLayers, SpecificChannels, Vec2, WritableImage};
 
-use super::{Image, not_an_image};
+use super::Image;
+use super::codec::not_an_image;
 use crate::output::write_whole;
 use crate::{Error, Result};
 
