@@ -41,7 +41,9 @@ fn main() {
             .expect("OUT_DIR is ours");
         kernel.write(&mut kernels);
     }
-    let kernels = structs.to_string() + &curve_numbers() + &kernels;
+    let names: Vec<&String> = names.iter().collect();
+    let all = format!("/// Every kernel, by name.\npub const NAMES: &[&str] = &{names:?};\n");
+    let kernels = structs.to_string() + &curve_numbers() + &all + &kernels;
     fs::write(out_dir.join("kernels.rs"), kernels).expect("OUT_DIR is ours");
 }
 

@@ -10,6 +10,7 @@ use crate::image::Image;
 
 pub mod ablate;
 pub mod bench;
+pub mod check;
 mod comparison;
 pub mod curves;
 pub mod demo;
@@ -57,6 +58,7 @@ enum Command {
     Demo(demo::DemoArgs),
     Doctor(doctor::DoctorArgs),
     Bench(bench::BenchArgs),
+    Check(Box<check::CheckArgs>),
 }
 
 impl Cli {
@@ -83,6 +85,7 @@ impl Cli {
             Command::Demo(args) => demo::run(&args),
             Command::Doctor(args) => doctor::run(&args),
             Command::Bench(args) => bench::run(&args),
+            Command::Check(args) => check::run(&args),
         }
     }
 }

@@ -8,7 +8,7 @@ use ash::vk;
 use gpu_allocator::MemoryLocation;
 use gpu_allocator::vulkan::{Allocation, AllocationCreateDesc, AllocationScheme};
 
-use super::{Gpu, Recorder, Retired, Shared, lock};
+use super::{Bound, Gpu, Recorder, Retired, Shared, lock};
 use crate::{Error, Result};
 
 /// An array of `T` in device memory. Dropping it frees the memory once no submission uses it.
@@ -62,6 +62,11 @@ impl<T: bytemuck::Pod> Buffer<T> {
     /// The size of the elements, in bytes.
     pub(super) fn size(&self) -> u64 {
         (self.len * size_of::<T>()) as u64
+    }
+
+    /// What a dispatch binds.
+    pub(crate) fn bound(&self) -> Bound {
+        Bound { raw: self.handle(), size: self.size() }
     }
 }
 
@@ -155,12 +160,22 @@ impl Recorder<'_> {
     /// # Errors
     /// The device is out of memory.
     pub fn download<T: bytemuck::Pod>(&mut self, buffer: &Buffer<T>) -> Result<Download<T>> {
-        let bytes = buffer.size();
-        let host = Memory::new(self.shared(), buffer.name(), bytes, MemoryLocation::GpuToCpu)?;
+        self.download_raw(buffer.name(), buffer.handle(), buffer.len)
+    }
+
+    /// The same for a buffer of which only the handle is at hand.
+    pub(super) fn download_raw<T: bytemuck::Pod>(
+        &mut self,
+        name: &str,
+        raw: vk::Buffer,
+        len: usize,
+    ) -> Result<Download<T>> {
+        let bytes = (len * size_of::<T>()) as u64;
+        let host = Memory::new(self.shared(), name, bytes, MemoryLocation::GpuToCpu)?;
         if bytes > 0 {
-            self.copy_raw(buffer.handle(), host.raw, bytes);
+            self.copy_raw(raw, host.raw, bytes);
         }
-        Ok(Download { host, len: buffer.len, value: self.value(), element: PhantomData })
+        Ok(Download { host, len, value: self.value(), element: PhantomData })
     }
 }
 

@@ -1,5 +1,7 @@
-use crate::gpu::Reference;
-use crate::kernels::adam::{Constants, Kernel, Params, Slices};
+use super::real::Real;
+use super::rounding::Rounded;
+use crate::gpu::{Reference, Tolerance};
+use crate::kernels::adam::{Constants, Kernel, Params, Slices, Tolerances};
 
 const BETA1: f32 = 0.9;
 const BETA2: f32 = 0.999;
@@ -21,6 +23,27 @@ fn rate_of(params: &Params, column: usize) -> f32 {
     }
 }
 
+/// The parameter and both moments after the step.
+fn updated<T: Real>(params: &Params, column: usize, [p, g, m, v]: [f32; 4]) -> [T; 3] {
+    let of = |x: f32| T::of(x.into());
+    let g = if g.is_finite() { g.clamp(-GRADIENT_BOUND, GRADIENT_BOUND) } else { 0.0 };
+    let m = of(BETA1) * of(m) + of(1.0 - BETA1) * of(g);
+    let v = of(BETA2) * of(v) + of(1.0 - BETA2) * of(g) * of(g);
+    let step =
+        of(rate_of(params, column)) * m / (v.sqrt() * of(params.second_correction) + of(EPSILON));
+    let p = of(p) - step;
+    let [low, high] = LOG_SCALE_BOUNDS.map(of);
+    // Phrased so that a NaN stays one.
+    let bounded = if p < low {
+        low
+    } else if p > high {
+        high
+    } else {
+        p
+    };
+    [if (7..10).contains(&column) { bounded } else { p }, m, v]
+}
+
 impl Reference for Kernel {
     fn run(
         params: &Params,
@@ -32,22 +55,25 @@ impl Reference for Kernel {
         }
         let gaussian_count = params.gaussian_count as usize;
         for i in 0..params.column_count as usize * gaussian_count {
-            let column = i / gaussian_count;
-            let gradient = if gradients[i].is_finite() {
-                gradients[i].clamp(-GRADIENT_BOUND, GRADIENT_BOUND)
-            } else {
-                0.0
-            };
-            let m = BETA1 * first_moments[i] + (1.0 - BETA1) * gradient;
-            let v = BETA2 * second_moments[i] + (1.0 - BETA2) * gradient * gradient;
-            let step =
-                rate_of(params, column) * m / (v.sqrt() * params.second_correction + EPSILON);
-            first_moments[i] = m;
-            second_moments[i] = v;
-            parameters[i] -= step;
-            if (7..10).contains(&column) {
-                parameters[i] = parameters[i].clamp(LOG_SCALE_BOUNDS[0], LOG_SCALE_BOUNDS[1]);
-            }
+            let before = [parameters[i], gradients[i], first_moments[i], second_moments[i]];
+            [parameters[i], first_moments[i], second_moments[i]] =
+                updated(params, i / gaussian_count, before);
         }
+    }
+
+    /// Twice the running error: the reference rounds too.
+    fn tolerances(params: &Params, _: &Constants, slices: Slices<'_>) -> Tolerances {
+        let Slices { parameters, gradients, first_moments, second_moments, status } = slices;
+        let count = if status[0] == 0 { params.column_count * params.gaussian_count } else { 0 };
+        let bounds = |which: usize| {
+            let of = |i: usize| {
+                let before = [parameters[i], gradients[i], first_moments[i], second_moments[i]];
+                let column = i / params.gaussian_count as usize;
+                2.0 * updated::<Rounded>(params, column, before)[which].error
+            };
+            Tolerance::Each((0..count as usize).map(of).collect())
+        };
+        let [parameters, first_moments, second_moments] = [0, 1, 2].map(bounds);
+        Tolerances { parameters, first_moments, second_moments }
     }
 }

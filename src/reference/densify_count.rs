@@ -1,5 +1,6 @@
-use crate::gpu::Reference;
-use crate::kernels::densify_count::{Constants, Kernel, Params, Slices};
+use super::rounding::UNIT;
+use crate::gpu::{Reference, Tolerance};
+use crate::kernels::densify_count::{Constants, Kernel, Params, Slices, Tolerances};
 
 pub(super) const PRUNE: u32 = 0;
 pub(super) const KEEP: u32 = 1;
@@ -12,6 +13,13 @@ pub(super) fn planes(feature_count: usize, column_count: usize) -> [(usize, usiz
     [(0, 3), (3, 4), (7, 3), (10, 1), (11, 3), (14, feature_count), (rest, column_count - rest)]
 }
 
+fn mean_gradient(slices: &Slices<'_>, i: usize) -> f32 {
+    match slices.visit_counts[i] {
+        0 => 0.0,
+        visits => slices.grad_norm_sums[i] / visits as f32,
+    }
+}
+
 impl Reference for Kernel {
     fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
         let n = params.gaussian_count as usize;
@@ -19,15 +27,12 @@ impl Reference for Kernel {
             let [features, columns] =
                 [params.feature_count, params.column_count].map(|n| n as usize);
             let is_finite = planes(features, columns).iter().all(|(column, width)| {
-                (0..*width).all(|k| slices.parameters[column * n + width * i + k].is_finite())
+                (0..*width).all(|k| slices.parameters[column * n + width * i + k].abs() < 3e38)
             });
             let is_visible = slices.parameters[10 * n + i] >= params.min_raw_opacity;
             let largest =
                 (0..3).map(|k| slices.parameters[7 * n + 3 * i + k]).fold(f32::MIN, f32::max);
-            let mean_gradient = match slices.visit_counts[i] {
-                0 => 0.0,
-                visits => slices.grad_norm_sums[i] / visits as f32,
-            };
+            let mean_gradient = mean_gradient(&slices, i);
             let fate = if !is_finite || !is_visible {
                 PRUNE
             } else if mean_gradient > params.gradient_threshold {
@@ -38,6 +43,21 @@ impl Reference for Kernel {
             slices.mean_gradients[i] = mean_gradient;
             slices.fates[i] = fate;
             slices.offspring_counts[i] = [0, 1, 2, 2][fate as usize];
+        }
+    }
+    /// A division is good to five roundings, and the reference's to one; the fate hangs on it at the threshold.
+    fn tolerances(params: &Params, _: &Constants, slices: Slices<'_>) -> Tolerances {
+        const ROUNDINGS: f64 = 6.0;
+        let threshold = f64::from(params.gradient_threshold);
+        let either = |i: usize| {
+            let distance = (f64::from(mean_gradient(&slices, i)) - threshold).abs();
+            if distance <= ROUNDINGS * UNIT * threshold { f64::from(SPLIT) } else { 0.0 }
+        };
+        let fates: Vec<f64> = (0..params.gaussian_count as usize).map(either).collect();
+        Tolerances {
+            mean_gradients: Tolerance::Roundings(ROUNDINGS),
+            offspring_counts: Tolerance::Each(fates.clone()),
+            fates: Tolerance::Each(fates),
         }
     }
 }

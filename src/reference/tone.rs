@@ -2,6 +2,7 @@
 
 use super::curves::{LARGEST_T, MAX_CONSTANTS, curve_shape};
 use super::real::Real;
+use super::rounding::Rounded;
 use crate::kernels::ToneParameters;
 pub use crate::kernels::{
     CURVE_AP3, CURVE_ASE, CURVE_ASE_FLOOR, CURVE_LINEAR, CURVE_LUM_PRESERVE, CURVE_NONE, CURVE_P80,
@@ -11,6 +12,13 @@ pub use crate::kernels::{
 /// The pseudo-GT value in [0, 1] of the sRGB-encoded value `x` under the curve `curve` (a `CURVE_*`).
 pub fn tone_curve(curve: u32, x: f32, tone: &ToneParameters) -> f32 {
     clamped(curve_at(curve, x / tone.white, [tone.offset, tone.gain], &tone.constants))
+}
+
+/// The same, and what single precision may make of it.
+pub(super) fn rounded_tone_curve(curve: u32, x: f32, tone: &ToneParameters) -> Rounded {
+    let [x, white, offset, gain] = [x, tone.white, tone.offset, tone.gain].map(Rounded::exact);
+    let y = curve_at(curve, x / white, [offset, gain], &tone.constants.map(Rounded::exact));
+    y.at_least(Rounded::of(0.0)).at_most(Rounded::of(1.0))
 }
 
 /// The curve at t = x / white, before it is clamped.

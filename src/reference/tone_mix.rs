@@ -1,7 +1,7 @@
 use super::luminance::{luminance, measurable};
 use super::tone::{CURVE_LUM_PRESERVE, clamped};
-use crate::gpu::Reference;
-use crate::kernels::tone_mix::{Constants, Kernel, Params, Slices};
+use crate::gpu::{Reference, Tolerance};
+use crate::kernels::tone_mix::{Constants, Kernel, Params, Slices, Tolerances};
 
 impl Reference for Kernel {
     fn run(
@@ -22,5 +22,10 @@ impl Reference for Kernel {
                 target[channel * n + i] = clamped(rgb[channel] * scale);
             }
         }
+    }
+
+    /// Luminance five roundings, the scale a product, a sum and a division of five, then a product; the reference as many.
+    fn tolerances(_: &Params, _: &Constants, _: Slices<'_>) -> Tolerances {
+        Tolerances { target: Tolerance::Roundings(30.0) }
     }
 }

@@ -1,8 +1,8 @@
 use super::CompensatedSum;
 use super::real::Real;
 use super::tone::{CURVE_LINEAR, CURVE_LUM_PRESERVE, CURVE_NONE, CURVE_P80, CURVE_PER_CHANNEL};
-use crate::gpu::Reference;
-use crate::kernels::tone_statistics::{Constants, Kernel, Params, Slices};
+use crate::gpu::{Reference, Tolerance};
+use crate::kernels::tone_statistics::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::{ToneParameters, ToneStatistics};
 
 impl Reference for Kernel {
@@ -32,6 +32,15 @@ impl Reference for Kernel {
             channel_means: means,
         };
         parameters[params.view as usize] = curve_of(constants.tone_curve, params, &statistics[0]);
+    }
+
+    /// The sums are the same bits; each statistic is a division of five and six more roundings, as in the reference, and
+    /// the curve's constants take a division, and a power of 6 + 6 |beta ln| more.
+    fn tolerances(_: &Params, _: &Constants, _: Slices<'_>) -> Tolerances {
+        Tolerances {
+            statistics: Tolerance::Roundings(22.0),
+            parameters: Tolerance::Roundings(100.0),
+        }
     }
 }
 

@@ -90,7 +90,8 @@ macro_rules! chain {
             $($threads::Workgroups([chunk_count, 1, 1]),)? [render, depth, regions], [moments]
         );
         let params = depth_correlation::Params {
-            width, first, view_chunks, box_chunks, chunk_size, view_weight, box_weight,
+            width, first, view_chunks, box_chunks, region_count: boxes + 1, chunk_size, view_weight,
+            box_weight,
         };
         let gradients = vec![DepthGradient::default(); regions.len()];
         let (view_values, box_values) = (vec![f32::NAN], vec![f32::NAN; boxes as usize]);
