@@ -3,19 +3,19 @@
 use std::fs;
 use std::path::Path;
 
-pub use implementation::compile;
+pub(crate) use implementation::compile;
 
 /// Defined for `reflected`: a kernel can hide from the reflection what that does not understand.
 const REFLECTION: &str = "REFLECTION";
 
 /// One kernel's SPIR-V: `reflected` is unoptimised, so that every name survives; `shipped` is what the device runs.
-pub struct Spirv {
-    pub reflected: Vec<u32>,
-    pub shipped: Vec<u32>,
+pub(crate) struct Spirv {
+    pub(crate) reflected: Vec<u32>,
+    pub(crate) shipped: Vec<u32>,
 }
 
 /// The text of an included file; includes are looked up by name in `shaders-glsl/include`.
-pub fn include(name: &str) -> Option<(String, String)> {
+pub(crate) fn include(name: &str) -> Option<(String, String)> {
     let path = Path::new(crate::SHADERS).join("include").join(name);
     Some((path.display().to_string(), fs::read_to_string(&path).ok()?))
 }
@@ -46,7 +46,7 @@ mod implementation {
         }
     }
 
-    pub fn compile(path: &Path, source: &str) -> Spirv {
+    pub(crate) fn compile(path: &Path, source: &str) -> Spirv {
         let compiler = Compiler::acquire().expect("glslang starts");
         let options = CompilerOptions {
             target: Target::Vulkan {
@@ -81,7 +81,7 @@ mod implementation {
 
     use super::{REFLECTION, Spirv};
 
-    pub fn compile(path: &Path, source: &str) -> Spirv {
+    pub(crate) fn compile(path: &Path, source: &str) -> Spirv {
         let compiler = Compiler::new().expect("shaderc starts");
         let build = |level| {
             let mut options = CompileOptions::new().expect("shaderc starts");

@@ -14,53 +14,53 @@ const MAX_PARAMS_SIZE: usize = 128;
 /// The specialization constant that the host sets to the device's subgroup size.
 const SUBGROUP_SIZE: &str = "SUBGROUP_SIZE";
 
-pub struct Kernel {
-    pub name: String,
-    pub docs: Vec<String>,
+pub(crate) struct Kernel {
+    pub(crate) name: String,
+    pub(crate) docs: Vec<String>,
     /// Along x, zero stands for the device's subgroup size.
-    pub workgroup_size: [u32; 3],
-    pub params: Struct,
-    pub constants: Vec<Constant>,
-    pub subgroup_size_id: Option<u32>,
-    pub buffers: Vec<Buffer>,
+    pub(crate) workgroup_size: [u32; 3],
+    pub(crate) params: Struct,
+    pub(crate) constants: Vec<Constant>,
+    pub(crate) subgroup_size_id: Option<u32>,
+    pub(crate) buffers: Vec<Buffer>,
 }
 
-pub struct Constant {
-    pub name: String,
-    pub id: u32,
-    pub ty: String,
-    pub default: u32,
+pub(crate) struct Constant {
+    pub(crate) name: String,
+    pub(crate) id: u32,
+    pub(crate) ty: String,
+    pub(crate) default: u32,
 }
 
-pub struct Buffer {
-    pub name: String,
-    pub binding: u32,
-    pub element: String,
-    pub writable: bool,
+pub(crate) struct Buffer {
+    pub(crate) name: String,
+    pub(crate) binding: u32,
+    pub(crate) element: String,
+    pub(crate) writable: bool,
     /// Its elements are made of floats; else of integers.
-    pub is_float: bool,
+    pub(crate) is_float: bool,
 }
 
 #[derive(PartialEq)]
-pub struct Struct {
-    pub name: String,
-    pub fields: Vec<Field>,
-    pub size: usize,
+pub(crate) struct Struct {
+    pub(crate) name: String,
+    pub(crate) fields: Vec<Field>,
+    pub(crate) size: usize,
 }
 
 #[derive(PartialEq)]
-pub struct Field {
-    pub name: String,
-    pub offset: usize,
-    pub ty: String,
+pub(crate) struct Field {
+    pub(crate) name: String,
+    pub(crate) offset: usize,
+    pub(crate) ty: String,
 }
 
 /// The structs that kernels share through includes, with the kernel that first declared each.
 #[derive(Default)]
-pub struct Structs(pub BTreeMap<String, (Struct, String)>);
+pub(crate) struct Structs(pub(crate) BTreeMap<String, (Struct, String)>);
 
 impl Kernel {
-    pub fn reflect(path: &Path, source: &str, spirv: &[u32], structs: &mut Structs) -> Self {
+    pub(crate) fn reflect(path: &Path, source: &str, spirv: &[u32], structs: &mut Structs) -> Self {
         let mut entries = ReflectConfig::new()
             .spv(spirv)
             .ref_all_rscs(true)

@@ -51,7 +51,7 @@ impl Constant {
 }
 
 impl Kernel {
-    pub fn write(&self, out: &mut String) {
+    pub(crate) fn write(&self, out: &mut String) {
         let Self { name, docs, workgroup_size, params, constants, subgroup_size_id, buffers } =
             self;
         let docs: String = docs.iter().map(|line| format!("///{line}\n")).collect();

@@ -81,7 +81,7 @@ fn assert_steps_agree(name: &str, config: &TrainConfig) -> BTreeSet<String> {
     while trainer.steps_done() < 3 {
         let (reports, report) = trainer.check_step();
         reports.unwrap();
-        all.passes.extend(report.passes);
+        all.extend(report);
     }
     assert_agrees(name, &all);
     kernels(&all).into_iter().map(str::to_owned).collect()

@@ -40,7 +40,7 @@ pub fn run(args: &CheckArgs) -> Result<()> {
     let mut trainer = trainer?;
     while trainer.steps_done() < steps {
         let (step, passes) = trainer.check_step();
-        report.passes.extend(passes.passes);
+        report.extend(passes);
         step?;
     }
     let mut out = std::io::stdout().lock();

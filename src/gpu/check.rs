@@ -83,6 +83,16 @@ impl CheckReport {
         self.passes.iter().find_map(|pass| pass.difference.as_ref())
     }
 
+    /// Takes over the passes of a later report.
+    pub fn extend(&mut self, later: Self) {
+        let before = self.passes.len();
+        self.passes.extend(later.passes.into_iter().map(|mut pass| {
+            pass.difference =
+                pass.difference.map(|own| Difference { pass: before + own.pass, ..own });
+            pass
+        }));
+    }
+
     /// # Errors
     /// [`Error::Disagrees`] with the first difference, if there is one.
     pub fn agree(&self) -> Result<()> {

@@ -59,7 +59,7 @@ impl Gpu {
         let result = work();
         let report = self.shared.checks.take().unwrap_or_default();
         if let Some(mut outer) = outer {
-            outer.passes.extend(report.passes.iter().cloned());
+            outer.extend(report.clone());
             self.shared.checks.put(outer);
         }
         (result, report)

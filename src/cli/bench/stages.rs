@@ -31,7 +31,7 @@ pub(super) fn check(bench: &Bench, trainers: &mut Trainers) -> Result<CheckRepor
     for trainer in [&mut trainers.plain, &mut trainers.lita] {
         let (reports, passes) = trainer.check_step();
         reports?;
-        report.passes.extend(passes.passes);
+        report.extend(passes);
     }
     Ok(report)
 }
