@@ -31,9 +31,11 @@ pub struct CheckArgs {
 /// # Errors
 /// [`crate::Error::Disagrees`] where something differs, or whatever keeps a run from training.
 pub fn run(args: &CheckArgs) -> Result<()> {
-    let steps = args.options.steps.unwrap_or(1);
-    let config =
-        TrainOptions { steps: None, ..args.options.clone() }.config(args.dataset.clone())?;
+    // The schedule is that of a whole run; so many of its steps are checked.
+    let mut options = args.options.clone();
+    let steps = options.steps.take().unwrap_or(1);
+    let config = options.config(args.dataset.clone())?;
+    let steps = steps.min(config.steps);
     let gpu = Gpu::new(&config.device.parse::<DeviceChoice>()?)?;
     let dataset = Dataset::load(&config.dataset, &config.load_options())?;
     let (trainer, mut report) = gpu.checked(|| Trainer::new(&gpu, config, &dataset));

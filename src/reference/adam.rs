@@ -3,8 +3,9 @@ use super::rounding::Rounded;
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::adam::{Constants, Kernel, Params, Slices, Tolerances};
 
-const BETA1: f32 = 0.9;
-const BETA2: f32 = 0.999;
+// A compiler folds 1 - beta in double precision.
+const BETA1: f64 = 0.9;
+const BETA2: f64 = 0.999;
 const EPSILON: f32 = 1e-15;
 const GRADIENT_BOUND: f32 = 1e18;
 
@@ -27,8 +28,10 @@ fn rate_of(params: &Params, column: usize) -> f32 {
 fn updated<T: Real>(params: &Params, column: usize, [p, g, m, v]: [f32; 4]) -> [T; 3] {
     let of = |x: f32| T::of(x.into());
     let g = if g.is_finite() { g.clamp(-GRADIENT_BOUND, GRADIENT_BOUND) } else { 0.0 };
-    let m = of(BETA1) * of(m) + of(1.0 - BETA1) * of(g);
-    let v = of(BETA2) * of(v) + of(1.0 - BETA2) * of(g) * of(g);
+    let [old, new] = [BETA1, 1.0 - BETA1].map(|beta| of(beta as f32));
+    let m = old * of(m) + new * of(g);
+    let [old, new] = [BETA2, 1.0 - BETA2].map(|beta| of(beta as f32));
+    let v = old * of(v) + new * of(g) * of(g);
     let step =
         of(rate_of(params, column)) * m / (v.sqrt() * of(params.second_correction) + of(EPSILON));
     let p = of(p) - step;

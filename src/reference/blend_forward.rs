@@ -81,7 +81,7 @@ impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, mut slices: Slices<'_>) {
         let background = background(params, constants);
         let pixels = params.size.element_product() as usize;
-        let (mut render, mut transmittances) =
+        let (render, transmittances) =
             (std::mem::take(&mut slices.render), std::mem::take(&mut slices.transmittances));
         for_each_tile(params, constants, &slices, |list, tile| {
             for pixel in tile {

@@ -32,8 +32,10 @@ impl Reference for Kernel {
         let mut log = vec![0.0; slices.log.len()];
         let partials = [slices.first_partials, slices.second_partials];
         for (term, partials) in partials.into_iter().enumerate() {
-            let at = params.slot * params.term_count + params.terms[term];
-            log[at as usize] = mean(params, partials, term).bound();
+            if params.partial_counts[term] > 0 {
+                let at = params.slot * params.term_count + params.terms[term];
+                log[at as usize] = mean(params, partials, term).bound();
+            }
         }
         Tolerances { log: Tolerance::Each(log), ..Tolerances::default() }
     }

@@ -225,7 +225,11 @@ impl Reference for Kernel {
             let d_splat = scene.d_splat(slices.colors, &scene.record(slices.d_splats, i), i);
             let gradient = scene.backward(&gaussian, &splat, &d_splat);
             scene.planes.store(&gradient, i, |at, value| gradients[at] = OFF * value.abs());
-            scene.planes.store(&one.load(&bounds, 0), i, |at, bound| gradients[at] += bound);
+            let mut moved = one.load(&bounds, 0);
+            // A basis is a polynomial of magnitude 3 and degree 3, which may vanish.
+            let basis = 64.0 * UNIT * d_splat.color.abs();
+            moved.sh.iter_mut().for_each(|bound| *bound += basis);
+            scene.planes.store(&moved, i, |at, bound| gradients[at] += bound);
             let norm = scene.damped_norm(&gaussian, &d_splat);
             let sum = f64::from(slices.grad_norm_sums[i].abs()) + norm;
             grad_norm_sums[i] = bounds[one.len()] + 16.0 * UNIT * norm + 2.0 * UNIT * sum;

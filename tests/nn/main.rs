@@ -13,9 +13,6 @@ mod model;
 mod networks;
 mod torch;
 
-/// The relative rounding of one operation in single precision.
-const UNIT: f32 = 1.0 / (1 << 24) as f32;
-
 fn largest(values: &[f32]) -> f32 {
     values.iter().fold(0.0, |largest, value| value.abs().max(largest))
 }

@@ -74,7 +74,7 @@ pub(super) struct Trainers {
 /// # Errors
 /// The device is out of memory or lost.
 pub(super) fn trainers(gpu: &Gpu, scene: &Scene) -> Result<Trainers> {
-    let plain = self::plain(gpu, scene, ToneCurve::Ap3)?;
+    let plain = plain(gpu, scene, ToneCurve::Ap3)?;
     Ok(Trainers { plain, lita: lita(gpu)?, intersections: intersections(gpu, scene)? })
 }
 
