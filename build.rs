@@ -3,12 +3,18 @@
 //! A kernel is declared once, in GLSL. Its SPIR-V tells us the parameters, buffers, constants and workgroup size, from
 //! which `$OUT_DIR/kernels.rs` gets one typed module per kernel: host code that disagrees with a shader does not compile.
 //!
+//! - `build/attributes.rs`: the table of attributes to GLSL
 //! - `build/compiler.rs`: GLSL to SPIR-V
+//! - `build/glsl.rs`: what GLSL says beside that: constants and comments
 //! - `build/reflection.rs`: SPIR-V to a description
 //! - `build/rust.rs`: a description to Rust
 
+#[path = "build/attributes.rs"]
+mod attributes;
 #[path = "build/compiler.rs"]
 mod compiler;
+#[path = "build/glsl.rs"]
+mod glsl;
 #[path = "build/reflection.rs"]
 mod reflection;
 #[path = "build/rust.rs"]
@@ -18,6 +24,7 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::{env, fs};
 
+use glsl::Text;
 use reflection::{Kernel, Structs};
 
 const SHADERS: &str = "shaders-glsl";
@@ -26,9 +33,11 @@ fn main() {
     println!("cargo:rerun-if-changed={SHADERS}");
     println!("cargo:rerun-if-changed=build.rs");
     println!("cargo:rerun-if-changed=build");
+    println!("cargo:rerun-if-changed=src/attributes.rs");
     let out_dir = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets OUT_DIR"));
 
     let mut structs = Structs::default();
+    let mut text = Text::default();
     let mut kernels = String::new();
     let mut names = BTreeSet::new();
     for path in kernel_paths(Path::new(SHADERS)) {
@@ -39,23 +48,14 @@ fn main() {
         let bytes: Vec<u8> = compiled.shipped.iter().flat_map(|word| word.to_le_bytes()).collect();
         fs::write(out_dir.join(&kernel.name).with_extension("spv"), bytes)
             .expect("OUT_DIR is ours");
-        kernel.write(&mut kernels);
+        let says = Text::read_with_includes(&source);
+        kernel.write(&says, &mut kernels);
+        text.add_comments(says);
     }
     let names: Vec<&String> = names.iter().collect();
     let all = format!("/// Every kernel, by name.\npub const NAMES: &[&str] = &{names:?};\n");
-    let kernels = structs.to_string() + &curve_numbers() + &all + &kernels;
+    let kernels = structs.write(&text) + &glsl::include_modules() + &all + &kernels;
     fs::write(out_dir.join("kernels.rs"), kernels).expect("OUT_DIR is ours");
-}
-
-/// The numbers of the tone curves, so that host and shaders cannot number them differently.
-fn curve_numbers() -> String {
-    let (_, source) = compiler::include("curves.glsl").expect("the curves have an include");
-    let number = |line: &str| {
-        let (name, value) = line.strip_prefix("const uint ")?.split_once('=')?;
-        let (name, value) = (name.trim(), value.trim().trim_end_matches(';'));
-        Some(format!("/// See `include/curves.glsl`.\npub const {name}: u32 = {value};\n"))
-    };
-    source.lines().filter_map(number).collect()
 }
 
 /// Every `.comp` below `dir`, in a stable order.

@@ -14,10 +14,26 @@ pub(crate) struct Spirv {
     pub(crate) shipped: Vec<u32>,
 }
 
-/// The text of an included file; includes are looked up by name in `shaders-glsl/include`.
+/// The text of an included file; includes are looked up by name in `shaders-glsl/include`, but for what is made here.
 pub(crate) fn include(name: &str) -> Option<(String, String)> {
+    if name == crate::attributes::INCLUDE {
+        return Some((name.to_owned(), crate::attributes::glsl()));
+    }
     let path = Path::new(crate::SHADERS).join("include").join(name);
     Some((path.display().to_string(), fs::read_to_string(&path).ok()?))
+}
+
+/// Stem and text of every include, in a stable order.
+pub(crate) fn includes() -> Vec<(String, String)> {
+    let folder = Path::new(crate::SHADERS).join("include");
+    let paths = fs::read_dir(folder).expect("the includes exist").map(|entry| {
+        let path = entry.expect("a folder can be listed").path();
+        let stem = path.file_stem().and_then(|stem| stem.to_str()).expect("an include has a name");
+        (stem.to_owned(), fs::read_to_string(&path).expect("a listed file can be read"))
+    });
+    let mut includes: Vec<_> = paths.collect();
+    includes.sort();
+    includes
 }
 
 #[cfg(not(feature = "shaderc"))]

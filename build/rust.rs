@@ -2,35 +2,63 @@
 
 use std::fmt::Write as _;
 
+use crate::glsl::{self, Text};
 use crate::reflection::{Buffer, Constant, Field, Kernel, Struct, Structs};
 
-impl std::fmt::Display for Structs {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        self.0.values().try_for_each(|(declared, _)| {
-            writeln!(f, "/// `{}` as the shaders' includes declare it.", declared.name)?;
-            write!(f, "{declared}")
-        })
+impl Structs {
+    /// The structs that kernels share, with what `text` says of them.
+    pub(crate) fn write(&self, text: &Text) -> String {
+        let write = |(declared, _): &(Struct, String)| {
+            let docs = format!("/// `{}` as the shaders' includes declare it.", declared.name);
+            format!("{docs}\n{}", declared.write(text))
+        };
+        self.0.values().map(write).collect()
     }
 }
 
-impl std::fmt::Display for Struct {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+impl Struct {
+    fn write(&self, text: &Text) -> String {
         let Self { name, fields, size } = self;
-        writeln!(f, "#[repr(C)]")?;
-        writeln!(f, "#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]")?;
-        writeln!(f, "pub struct {name} {{")?;
-        for Field { name, ty, .. } in fields {
-            writeln!(f, "    /// See the shader.\n    pub {name}: {ty},")?;
-        }
-        writeln!(f, "}}")?;
-        for Field { name: field, offset, .. } in fields {
-            writeln!(f, "const _: () = assert!(offset_of!({name}, {field}) == {offset});")?;
-        }
-        writeln!(f, "const _: () = assert!(size_of::<{name}>() == {size});\n")
+        let members: String = fields.iter().map(|field| member(text, name, field)).collect();
+        let offsets: String = fields
+            .iter()
+            .map(|Field { name: field, offset, .. }| {
+                format!("const _: () = assert!(offset_of!({name}, {field}) == {offset});\n")
+            })
+            .collect();
+        format!(
+            "#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+pub struct {name} {{
+{members}}}
+{offsets}const _: () = assert!(size_of::<{name}>() == {size});
+
+"
+        )
     }
+}
+
+/// A field with what its declaration says.
+fn member(text: &Text, block: &str, Field { name, ty, .. }: &Field) -> String {
+    let docs = glsl::rustdoc(text.comment(block, name), &format!("`{name}` of the shader."));
+    format!("{docs}    pub {name}: {ty},\n")
+}
+
+/// A buffer of a dispatch with its binding and what its declaration says.
+fn binding(text: &Text, Buffer { name, binding, .. }: &Buffer, ty: &str) -> String {
+    let comment = format!("Binding {binding}: {}", text.comment(glsl::BUFFER, name));
+    format!("{}    pub {name}: {ty},\n", glsl::rustdoc(comment.trim_end_matches(": "), ""))
 }
 
 impl Constant {
+    /// A field of `Constants` with what its declaration says.
+    fn field(&self, text: &Text) -> String {
+        let Self { name, id, ty, .. } = self;
+        let comment = text.comment("", &name.to_uppercase());
+        let comment = format!("Specialization constant {id}: {comment}");
+        format!("{}    pub {name}: {ty},\n", glsl::rustdoc(comment.trim_end_matches(": "), ""))
+    }
+
     /// The default value as a Rust expression.
     fn default(&self) -> String {
         match self.ty.as_str() {
@@ -51,22 +79,15 @@ impl Constant {
 }
 
 impl Kernel {
-    pub(crate) fn write(&self, out: &mut String) {
+    pub(crate) fn write(&self, text: &Text, out: &mut String) {
         let Self { name, docs, workgroup_size, params, constants, subgroup_size_id, buffers } =
             self;
         let docs: String = docs.iter().map(|line| format!("///{line}\n")).collect();
         let list = |line: &dyn Fn(&Buffer, &str) -> String| -> String {
             buffers.iter().map(|b| line(b, if b.writable { "mut " } else { "" })).collect()
         };
-        let device = list(&|b, m| {
-            format!(
-                "    /// Binding {}.\n    pub {}: &'a {m}gpu::Buffer<{}>,\n",
-                b.binding, b.name, b.element
-            )
-        });
-        let host = list(&|b, m| {
-            format!("    /// Binding {}.\n    pub {}: &'a {m}[{}],\n", b.binding, b.name, b.element)
-        });
+        let device = list(&|b, m| binding(text, b, &format!("&'a {m}gpu::Buffer<{}>", b.element)));
+        let host = list(&|b, m| binding(text, b, &format!("&'a {m}[{}]", b.element)));
         let bindings = list(&|b, _| {
             format!(
                 "gpu::Binding {{ name: {:?}, index: {}, writable: {}, is_float: {} }}, ",
@@ -84,15 +105,9 @@ impl Kernel {
         let tolerances =
             written(&|name| format!("    /// Of `{name}`.\n    pub {name}: gpu::Tolerance,\n"));
         let listed = written(&|name| format!("tolerances.{name}, "));
-        let fields: String = constants
-            .iter()
-            .map(|c| {
-                format!(
-                    "    /// Specialization constant {}.\n    pub {}: {},\n",
-                    c.id, c.name, c.ty
-                )
-            })
-            .collect();
+        let fields: String = constants.iter().map(|constant| constant.field(text)).collect();
+        let params = params.write(text);
+        let own_constants = text.own_constants();
         let defaults: String =
             constants.iter().map(|c| format!("{}: {}, ", c.name, c.default())).collect();
         let values: String =
@@ -103,7 +118,7 @@ impl Kernel {
             r#"{docs}pub mod {name} {{
 use super::*;
 
-/// `{name}.comp`
+{own_constants}/// `{name}.comp`
 #[derive(Debug)]
 pub enum Kernel {{}}
 

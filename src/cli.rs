@@ -13,6 +13,7 @@ pub mod bench;
 pub mod check;
 mod comparison;
 pub mod curves;
+mod defaults;
 pub mod demo;
 pub mod doctor;
 pub mod eval;
@@ -28,6 +29,7 @@ pub mod train;
 /// 3D Gaussian Splatting from dark photographs, on any Vulkan device.
 #[derive(Debug, Parser)]
 #[command(name = "nightsplat", version, max_term_width = 98, after_help = EXAMPLES)]
+#[command(mut_subcommands = defaults::shown)]
 pub struct Cli {
     #[command(subcommand)]
     command: Command,

@@ -4,15 +4,11 @@
 //! pruned. A pass makes new buffers of the exact new size; nothing of the old ones is changed.
 
 use crate::gpu::{Buffer, Gpu, Pipeline, Threads};
+use crate::kernels::fate::{FATE_CLONE, FATE_PRUNE, FATE_SPLIT};
 use crate::kernels::{densify_count, densify_scatter};
 use crate::optimizer::Moments;
 use crate::sort::{Count, Scan};
 use crate::{Error, Result};
-
-/// `FATE_*` of include/fate.glsl.
-const PRUNE: u32 = 0;
-const CLONE: u32 = 2;
-const SPLIT: u32 = 3;
 
 /// Which Gaussians multiply and which go.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -179,7 +175,7 @@ impl Densifier {
         let mut candidates: Vec<f32> = mean_gradients
             .into_iter()
             .zip(&decision.fates)
-            .filter_map(|(gradient, &fate)| (fate >= CLONE).then_some(gradient))
+            .filter_map(|(gradient, &fate)| (fate >= FATE_CLONE).then_some(gradient))
             .collect();
         // Each adds one Gaussian. Only those above the largest that finds no room may multiply.
         let (_, &mut threshold, _) = candidates.select_nth_unstable_by(room, |a, b| b.total_cmp(a));
@@ -239,7 +235,7 @@ impl Densifier {
 
 fn report(fates: &[u32]) -> DensifyReport {
     let with = |fate: u32| fates.iter().filter(|&&other| other == fate).count();
-    let (cloned, split, pruned) = (with(CLONE), with(SPLIT), with(PRUNE));
+    let (cloned, split, pruned) = (with(FATE_CLONE), with(FATE_SPLIT), with(FATE_PRUNE));
     DensifyReport { cloned, split, pruned, count: fates.len() - pruned + cloned + split }
 }
 

@@ -59,10 +59,10 @@ impl RunDirectory {
         write_whole(&path.join("config.toml"), config.to_toml()?.as_bytes())?;
         let log_path = path.join("train.csv");
         let log = File::create(&log_path).map_err(|error| unwritable(&log_path, &error))?;
-        let terms = config.terms().into_iter().map(|(term, _)| term).collect();
+        let terms = config.loss().terms();
         let log = BufWriter::new(log);
         let mut run = Self { path: path.to_owned(), log, terms, seconds_before: 0.0 };
-        let columns: String = run.terms.iter().map(|term| format!("{},", term.column())).collect();
+        let columns: String = run.terms.iter().map(|term| format!("{},", term.column)).collect();
         run.log_line(&format!("step,view,loss,{columns}gaussians,milliseconds"))?;
         Ok(run)
     }
@@ -90,7 +90,7 @@ impl RunDirectory {
         write_whole(&log_path, lines.concat().as_bytes())?;
         let log = File::options().append(true).open(&log_path);
         let log = BufWriter::new(log.map_err(|error| unwritable(&log_path, &error))?);
-        let terms = config.terms().into_iter().map(|(term, _)| term).collect();
+        let terms = config.loss().terms();
         Ok(Self { path: path.to_owned(), log, terms, seconds_before })
     }
 

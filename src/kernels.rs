@@ -1,9 +1,13 @@
-//! Every kernel of `shaders-glsl/`, as `build.rs` reflected it: `Params`, `Constants`, `Buffers`, `Slices`.
+//! Every kernel of `shaders-glsl/`, as `build.rs` reflected it: `Params`, `Constants`, `Buffers`, `Slices`; and the
+//! constants of every include, a module each. Floats are as they are written: a shader rounds them to `f32`.
 
 #![allow(
     clippy::doc_markdown,
+    clippy::approx_constant,
+    clippy::excessive_precision,
+    clippy::unnecessary_cast,
     rustdoc::broken_intra_doc_links,
-    reason = "a kernel's documentation is the comment of its shader"
+    reason = "documentation and numbers are the shaders'"
 )]
 #![allow(clippy::derivable_impls, reason = "`Default` is written alike with and without constants")]
 

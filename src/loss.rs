@@ -1,37 +1,251 @@
 //! The loss terms, their gradients, and their log.
 //!
-//! [`Loss`] compares a render with its pseudo-GT: L = (1 - w) mean|a - b| + w (1 - mean SSIM), means over all values of
-//! the interior; `a` is the render, not clamped, and `b` the tone curve of the dark photograph, evaluated inside the
-//! kernels. SSIM is that of 3DGS: 11 x 11 Gaussian window with sigma 1.5, per channel, zero padding. The other terms are
-//! one file each. Nothing is read back: each step leaves its terms in a slot of a log.
+//! A term is one file: what it logs and weighs, its kernels, its scratch memory, what it compares a view with. [`TERMS`]
+//! lists them, and the columns of train.csv, the reported loss, the checks of the weights and what a step records follow
+//! from the list. Nothing is read back: each step leaves its terms in a slot of a log.
 
 mod denoising;
 mod depth;
+mod image;
 mod log;
 mod structure;
 
-use glam::{UVec2, Vec3};
+use std::sync::Arc;
 
-use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
-use crate::kernels::{ToneParameters, l1, ssim_backward, ssim_forward};
+use glam::UVec2;
+use serde::{Deserialize, Serialize};
+
+use crate::gpu::{Buffer, Gpu, Recorder};
+use crate::kernels::ToneParameters;
+use crate::random::Stream;
+use crate::scene::{Feature, Features};
 use crate::{Error, Result};
 
 pub use denoising::{DenoisingGradients, DenoisingInputs, DenoisingLoss, DenoisingWeights};
 pub use depth::{DepthBoxes, DepthInputs, DepthLoss, DepthSettings};
-use log::PartialSums;
-pub use log::{LogSlot, LossLog, LossLogDownload, StepLosses, Term};
+pub use image::{Loss, LossInputs, LossSettings};
+pub use log::{LogSlot, LossLog, LossLogDownload, StepLosses};
 pub use structure::{StructureInputs, StructureLoss};
 
-/// The columns and rows of a view that one thread of the SSIM kernels takes.
-///
-/// On a processor a load costs the most, so wide strips, which share their borders' loads, win over registers that
-/// spill into the first-level cache; a GPU needs narrow ones that stay in registers.
-const CPU_STRIP: [u32; 2] = [16, 64];
-const GPU_STRIP: [u32; 2] = [2, 32];
+/// Every term, in the order of the columns.
+pub const TERMS: [LossSpec; 5] =
+    [image::TARGET, image::DARK, structure::SPEC, depth::SPEC, denoising::SPEC];
 
-/// The strip that suits the device.
-pub(crate) fn strip(gpu: &Gpu) -> [u32; 2] {
-    if gpu.properties().is_cpu { CPU_STRIP } else { GPU_STRIP }
+/// What the terms weigh beside (1 - w) L1 + w (1 - SSIM). The defaults are those of LITA-GS's code.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Weights {
+    /// Of mean `(R_K - R_0)^2`.
+    pub denoising: f64,
+    /// Of the total variation of R_K.
+    pub total_variation: f64,
+    /// The reconstruction of the dark photograph weighs 1: (1 - w) L1 + w (1 - SSIM); this is its w.
+    pub low_ssim: f64,
+    /// Of mean |structure - edges of the target|.
+    pub structure: f64,
+    /// Of 1 minus the correlation with the depth map, over the view and over boxes.
+    pub depth: f64,
+}
+
+impl Default for Weights {
+    fn default() -> Self {
+        Self { denoising: 1.0, total_variation: 1.0, low_ssim: 0.2, structure: 0.01, depth: 0.1 }
+    }
+}
+
+/// All that is to know about a term.
+#[derive(Debug)]
+pub struct LossSpec {
+    /// What the Gaussians carry for it; none: every model has the term.
+    pub feature: Option<Feature>,
+    /// What it logs.
+    pub terms: &'static [Term],
+    /// Builds it where it is one of the render; those of the networks' outputs are built and recorded with the networks.
+    pub on_render: Option<BuildTerm>,
+}
+
+/// Builds a term of the render.
+pub type BuildTerm = fn(&Gpu, &LossConfig) -> Result<Box<dyn LossTerm>>;
+
+/// A value that a loss term logs, and how it enters the loss.
+#[derive(Clone, Copy)]
+#[non_exhaustive]
+pub struct Term {
+    /// Its column in train.csv.
+    pub column: &'static str,
+    /// What it is called in messages and tables.
+    pub name: &'static str,
+    /// A likeness enters the loss as 1 - value, a distance as it is.
+    pub is_likeness: bool,
+    /// What it weighs.
+    pub weight: fn(&LossConfig) -> f64,
+    /// The setting that the weight follows from.
+    pub setting: &'static str,
+}
+
+impl Term {
+    /// Every term, in the order of the columns.
+    pub fn all() -> impl Iterator<Item = Self> {
+        TERMS.iter().flat_map(|spec| spec.terms).copied()
+    }
+
+    /// Its place among the columns.
+    pub fn index(self) -> usize {
+        Self::all().position(|term| term == self).unwrap_or_default()
+    }
+}
+
+impl PartialEq for Term {
+    fn eq(&self, other: &Self) -> bool {
+        self.column == other.column
+    }
+}
+
+impl std::fmt::Debug for Term {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(self.column)
+    }
+}
+
+/// What the terms of a model are built from.
+#[derive(Clone, Copy, Debug)]
+pub struct LossConfig {
+    /// A `CURVE_*` of include/tone.glsl.
+    pub tone_curve: u32,
+    /// w of (1 - w) L1 + w (1 - SSIM), in [0, 1].
+    pub ssim_weight: f64,
+    /// What the other terms weigh.
+    pub weights: Weights,
+    /// The side of the boxes of the local depth term, in pixels.
+    pub depth_box: u32,
+    /// The random numbers that place these boxes.
+    pub boxes: Stream,
+    /// What the Gaussians carry beside colour.
+    pub features: Features,
+}
+
+impl LossConfig {
+    /// The terms that the model has.
+    pub fn terms(&self) -> Vec<Term> {
+        self.specs().flat_map(|spec| spec.terms.iter().copied()).collect()
+    }
+
+    /// The weighted sum of a step's terms.
+    pub fn total(&self, losses: &StepLosses) -> f64 {
+        let of_term = |term: Term| {
+            let value = f64::from(losses.get(term));
+            (term.weight)(self) * if term.is_likeness { 1.0 - value } else { value }
+        };
+        self.terms().into_iter().map(of_term).sum()
+    }
+
+    /// # Errors
+    /// [`Error::Usage`] names a setting that gives a term, whether the model has it or not, a weight that makes no sense.
+    pub fn check(&self) -> Result<()> {
+        for term in Term::all() {
+            let weight = (term.weight)(self);
+            check_weight(&format!("{} (by {})", term.name, term.setting), weight)?;
+        }
+        Ok(())
+    }
+
+    fn specs(&self) -> impl Iterator<Item = &'static LossSpec> {
+        let features = self.features;
+        TERMS.iter().filter(move |spec| spec.feature.is_none_or(|feature| features.has(feature)))
+    }
+}
+
+/// A training view as the terms see it before the first step.
+#[expect(missing_debug_implementations, reason = "it holds a closure")]
+pub struct ViewSource<'a> {
+    /// Width and height in pixels.
+    pub size: UVec2,
+    /// Depth from elsewhere, (H, W), larger is farther.
+    pub depth: Option<&'a [f32]>,
+    /// Makes the pseudo-GT, (3, H, W).
+    pub target: Box<dyn Fn() -> Result<Arc<Buffer<f32>>> + 'a>,
+}
+
+/// What the terms read of one step.
+#[derive(Clone, Copy, Debug)]
+pub struct TermInputs<'a> {
+    /// Counted from 1.
+    pub step: u64,
+    /// The place of the view among those that the terms were prepared for.
+    pub view: usize,
+    /// Width and height in pixels.
+    pub size: UVec2,
+    /// What the render shows beside colour.
+    pub features: Features,
+    /// (channels, H, W), not clamped.
+    pub render: &'a Buffer<f32>,
+    /// (3, H, W), sRGB-encoded; its tone curve is the pseudo-GT.
+    pub low: &'a Buffer<f32>,
+    /// The curve of this view, one element.
+    pub tone: &'a Buffer<ToneParameters>,
+}
+
+impl TermInputs<'_> {
+    /// The first channel of the render that shows a feature, which it has.
+    fn plane(&self, feature: Feature) -> u32 {
+        self.features.channels_of(feature).unwrap_or_default().start as u32
+    }
+}
+
+/// A term of the render.
+pub trait LossTerm: std::fmt::Debug {
+    /// Takes scratch memory for these views, and what it compares each of them with.
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    fn prepare(&mut self, views: &[ViewSource<'_>]) -> Result<()>;
+
+    /// Records the term of a step: writes its channels of `d_render`, (channels, H, W), and its values to the log.
+    ///
+    /// # Errors
+    /// A buffer is shorter than the view, or the view is larger than those prepared for.
+    fn record_step(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        inputs: &TermInputs<'_>,
+        d_render: &mut Buffer<f32>,
+        log: &mut LogSlot<'_>,
+    ) -> Result<()>;
+}
+
+/// The terms of the render that a model has.
+#[derive(Debug)]
+pub struct Losses(Vec<Box<dyn LossTerm>>);
+
+impl Losses {
+    /// The terms, ready for these views.
+    ///
+    /// # Errors
+    /// A weight makes no sense, or the device is out of memory or lost.
+    pub fn new(gpu: &Gpu, config: &LossConfig, views: &[ViewSource<'_>]) -> Result<Self> {
+        let build = config.specs().filter_map(|spec| spec.on_render);
+        let mut terms = build.map(|build| build(gpu, config)).collect::<Result<Vec<_>>>()?;
+        terms.iter_mut().try_for_each(|term| term.prepare(views))?;
+        Ok(Self(terms))
+    }
+
+    /// Records every term of a step: dL/d render, (channels, H, W), and the values in the log.
+    ///
+    /// # Errors
+    /// As [`LossTerm::record_step`].
+    pub fn record(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        inputs: &TermInputs<'_>,
+        d_render: &mut Buffer<f32>,
+        log: &mut LogSlot<'_>,
+    ) -> Result<()> {
+        if inputs.features != Features::NONE {
+            // Not every term reaches every pixel of its planes.
+            pass.fill(d_render, 0);
+        }
+        self.0.iter_mut().try_for_each(|term| term.record_step(pass, inputs, d_render, log))
+    }
 }
 
 /// The rectangle of a view whose pixels a loss counts; the others are context.
@@ -72,258 +286,6 @@ impl Interior {
             )));
         }
         Ok(())
-    }
-}
-
-/// What a loss compares and how.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct LossSettings {
-    /// A `CURVE_*` of include/tone.glsl.
-    pub tone_curve: u32,
-    /// w, in [0, 1].
-    pub ssim_weight: f64,
-    /// The columns of the log for mean|a - b| and for mean SSIM.
-    pub terms: [Term; 2],
-}
-
-/// What one step's loss reads.
-#[derive(Clone, Copy, Debug)]
-pub struct LossInputs<'a> {
-    /// Width and height in pixels.
-    pub size: UVec2,
-    /// The pixels that count.
-    pub interior: Interior,
-    /// (3, H, W), not clamped.
-    pub render: &'a Buffer<f32>,
-    /// (3, H, W), sRGB-encoded.
-    pub low: &'a Buffer<f32>,
-    /// The curve of this view, one element.
-    pub tone: &'a Buffer<ToneParameters>,
-}
-
-/// The kernels of L1 and SSIM and their scratch memory.
-#[derive(Debug)]
-pub struct Loss {
-    gpu: Gpu,
-    terms: [Term; 2],
-    kernels: Kernels,
-    max_values: u32,
-    l1_partials: Buffer<f32>,
-    ssim_partials: Buffer<f32>,
-}
-
-#[derive(Debug)]
-enum Kernels {
-    /// The SSIM weight is zero: no SSIM is evaluated.
-    L1 {
-        whole: Pipeline<l1::Kernel>,
-        interior: Pipeline<l1::Kernel>,
-        values_per_workgroup: u32,
-    },
-    Ssim(Ssim),
-}
-
-#[derive(Debug)]
-struct Ssim {
-    weight: f64,
-    strip: [u32; 2],
-    subgroup_size: u32,
-    forward: Pipeline<ssim_forward::Kernel>,
-    backward: Pipeline<ssim_backward::Kernel>,
-    /// (3, H, W), dS/dE\[a\], dS/dE\[aa\], dS/dE\[ab\].
-    d_moments: Buffer<Vec3>,
-}
-
-impl Loss {
-    /// The kernels, without scratch memory: see [`Loss::reserve`].
-    ///
-    /// # Errors
-    /// The weight is outside [0, 1], or the device is out of memory.
-    pub fn new(gpu: &Gpu, settings: LossSettings) -> Result<Self> {
-        let LossSettings { tone_curve, ssim_weight, terms } = settings;
-        if !(0.0..=1.0).contains(&ssim_weight) {
-            return Err(Error::Usage(format!(
-                "the SSIM weight is {ssim_weight}; it must be within 0 and 1"
-            )));
-        }
-        let subgroup_size = gpu.properties().subgroup_size;
-        let kernels = if ssim_weight > 0.0 {
-            let [columns, rows] = strip(gpu);
-            Kernels::Ssim(Ssim {
-                weight: ssim_weight,
-                strip: [columns, rows],
-                subgroup_size,
-                forward: gpu.pipeline(&ssim_forward::Constants { columns, rows, tone_curve })?,
-                backward: gpu.pipeline(&ssim_backward::Constants { columns, rows, tone_curve })?,
-                d_moments: gpu.uninit("d_moments", 0)?,
-            })
-        } else {
-            let constants = l1::Constants { tone_curve, ..Default::default() };
-            Kernels::L1 {
-                whole: gpu.pipeline(&constants)?,
-                interior: gpu.pipeline(&l1::Constants { with_interior: true, ..constants })?,
-                values_per_workgroup: subgroup_size * constants.values_per_thread,
-            }
-        };
-        Ok(Self {
-            gpu: gpu.clone(),
-            terms,
-            kernels,
-            max_values: 0,
-            l1_partials: gpu.uninit("l1_partials", 0)?,
-            ssim_partials: gpu.uninit("ssim_partials", 0)?,
-        })
-    }
-
-    /// Scratch memory for views of `size`, and for those reserved for before.
-    ///
-    /// # Errors
-    /// The device is out of memory.
-    pub fn reserve(&mut self, size: UVec2) -> Result<()> {
-        let (values, workgroups) = (value_count(size), self.kernels.workgroups(size) as usize);
-        if values > self.max_values {
-            if let Kernels::Ssim(ssim) = &mut self.kernels {
-                ssim.d_moments = self.gpu.uninit("d_moments", values as usize)?;
-            }
-            self.max_values = values;
-        }
-        if workgroups > self.l1_partials.len() {
-            self.l1_partials = self.gpu.uninit("l1_partials", workgroups)?;
-            self.ssim_partials = self.gpu.uninit("ssim_partials", workgroups)?;
-        }
-        Ok(())
-    }
-
-    /// Writes dL/d render, (3, H, W), to `d_render`, also outside the interior, and the means of |a - b| and of SSIM to
-    /// the log. Where the SSIM weight is 0, SSIM is neither evaluated nor logged.
-    ///
-    /// # Errors
-    /// The view is empty or larger than those that scratch memory is reserved for, the interior is empty or not inside
-    /// it, a buffer is shorter than the view, or the log has no such slot.
-    pub fn record(
-        &mut self,
-        pass: &mut Recorder<'_>,
-        inputs: LossInputs<'_>,
-        d_render: &mut Buffer<f32>,
-        log: &mut LogSlot<'_>,
-    ) -> Result<()> {
-        self.check(&inputs, d_render, log)?;
-        let workgroups = self.kernels.workgroups(inputs.size);
-        let threads = Threads::Workgroups([workgroups, 1, 1]);
-        let [l1_partials, ssim_partials] = [&mut self.l1_partials, &mut self.ssim_partials];
-        let mut ssim_count = 0;
-        match &mut self.kernels {
-            Kernels::L1 { whole, interior, .. } => {
-                let LossInputs { size, render, low, tone, .. } = inputs;
-                let is_whole = inputs.interior == Interior::whole(size);
-                pass.dispatch(
-                    if is_whole { whole } else { interior },
-                    &l1::Params {
-                        value_count: value_count(size),
-                        l1_scale: 1.0 / inputs.interior.value_count() as f32,
-                        width: size.x,
-                        height: size.y,
-                        interior_begin: inputs.interior.origin,
-                        interior_end: inputs.interior.end(),
-                    },
-                    l1::Buffers { render, low, tone, d_render, partials: l1_partials },
-                    threads,
-                )?;
-            }
-            Kernels::Ssim(ssim) => {
-                ssim_count = workgroups;
-                ssim.record(pass, threads, inputs, d_render, [l1_partials, ssim_partials])?;
-            }
-        }
-        let scale = 1.0 / inputs.interior.value_count() as f32;
-        let [l1, ssim] = self.terms;
-        log.record(
-            pass,
-            [
-                PartialSums { term: l1, partials: &self.l1_partials, count: workgroups, scale },
-                PartialSums { term: ssim, partials: &self.ssim_partials, count: ssim_count, scale },
-            ],
-        )
-    }
-
-    /// A kernel that runs beyond a buffer corrupts its neighbours: refuse before anything is recorded.
-    fn check(
-        &self,
-        inputs: &LossInputs<'_>,
-        d_render: &Buffer<f32>,
-        log: &LogSlot<'_>,
-    ) -> Result<()> {
-        let values = value_count(inputs.size);
-        let fits = (1..=self.max_values).contains(&values)
-            && self.kernels.workgroups(inputs.size) as usize <= self.l1_partials.len();
-        if !fits {
-            return Err(no_scratch("loss", inputs.size));
-        }
-        inputs.interior.check(inputs.size)?;
-        for buffer in [inputs.render, inputs.low, d_render] {
-            holds(buffer, values as usize)?;
-        }
-        if inputs.tone.is_empty() {
-            return Err(Error::Usage("there are no tone parameters".to_owned()));
-        }
-        log.check()
-    }
-}
-
-impl Kernels {
-    /// One subgroup each; as many as there are partial sums.
-    fn workgroups(&self, size: UVec2) -> u32 {
-        match self {
-            Self::L1 { values_per_workgroup, .. } => {
-                value_count(size).div_ceil(*values_per_workgroup)
-            }
-            Self::Ssim(ssim) => {
-                let [columns, rows] = ssim.strip;
-                (3 * size.x.div_ceil(columns) * size.y.div_ceil(rows)).div_ceil(ssim.subgroup_size)
-            }
-        }
-    }
-}
-
-impl Ssim {
-    fn record(
-        &mut self,
-        pass: &mut Recorder<'_>,
-        threads: Threads<'_>,
-        LossInputs { size, interior, render, low, tone }: LossInputs<'_>,
-        d_render: &mut Buffer<f32>,
-        [l1_partials, ssim_partials]: [&mut Buffer<f32>; 2],
-    ) -> Result<()> {
-        let UVec2 { x: width, y: height } = size;
-        let (interior_begin, interior_end) = (interior.origin, interior.end());
-        let d_moments = &mut self.d_moments;
-        pass.dispatch(
-            &self.forward,
-            &ssim_forward::Params { width, height, interior_begin, interior_end },
-            ssim_forward::Buffers { render, low, tone, d_moments, partials: ssim_partials },
-            threads,
-        )?;
-        let mean_scale = 1.0 / f64::from(interior.value_count());
-        pass.dispatch(
-            &self.backward,
-            &ssim_backward::Params {
-                width,
-                height,
-                interior_begin,
-                interior_end,
-                l1_scale: ((1.0 - self.weight) * mean_scale) as f32,
-                ssim_scale: (self.weight * mean_scale) as f32,
-            },
-            ssim_backward::Buffers {
-                render,
-                low,
-                tone,
-                d_moments,
-                d_render,
-                partials: l1_partials,
-            },
-            threads,
-        )
     }
 }
 

@@ -1,7 +1,9 @@
-//! Adam over the Gaussians' planes, and the schedules of its learning rates.
+//! Adam over the Gaussians' planes and over what else is learned, and the schedules of its learning rates.
 
+mod learnable;
 mod schedule;
 
+pub use learnable::Learnable;
 pub use schedule::{LearningRates, Schedule};
 
 use crate::gpu::{Buffer, Gpu, Kernel, Pipeline, Recorder, Threads};
@@ -39,8 +41,6 @@ pub struct AdamBuffers<'a> {
     pub gradients: &'a Buffer<f32>,
     /// The moments, updated.
     pub moments: &'a mut Moments,
-    /// The sticky status word: nothing changes while its first element is not zero.
-    pub status: &'a Buffer<u32>,
 }
 
 /// Adam with beta 0.9 and 0.999, epsilon 1e-15 (Kingma and Ba 2015; the constants of 3DGS).
@@ -62,7 +62,7 @@ impl Adam {
     }
 
     /// Records step number `step`, from 1, over the first `column_count` columns of `gaussian_count` Gaussians, of which
-    /// `feature_count` are features.
+    /// `feature_count` are features. Nothing changes while the first element of `status`, the sticky word, is not zero.
     ///
     /// # Errors
     /// A buffer is shorter than that, or the step is 0.
@@ -72,9 +72,9 @@ impl Adam {
         step: u64,
         rates: &LearningRates,
         [gaussian_count, column_count, feature_count]: [u32; 3],
-        buffers: AdamBuffers<'_>,
+        AdamBuffers { parameters, gradients, moments }: AdamBuffers<'_>,
+        status: &Buffer<u32>,
     ) -> Result<()> {
-        let AdamBuffers { parameters, gradients, moments, status } = buffers;
         let Moments { first, second } = moments;
         let len = gaussian_count as usize * column_count as usize;
         if let Some(short) = [&*parameters, gradients, first, second].iter().find(|b| b.len() < len)
@@ -121,12 +121,6 @@ fn params(
         column_count,
         feature_count,
         second_correction: (1.0 / uncorrected(0.999).sqrt()) as f32,
-        means_rate: rate(rates.means),
-        quats_rate: rate(rates.quats),
-        log_scales_rate: rate(rates.log_scales),
-        raw_opacities_rate: rate(rates.raw_opacities),
-        dc_rate: rate(rates.dc),
-        features_rate: rate(rates.features),
-        rest_rate: rate(rates.rest),
+        rates: rates.0.map(rate),
     }
 }

@@ -1,28 +1,23 @@
 //! The pseudo-GT on the GPU: the statistics of a dark photograph, and the tone curve they give it.
 //!
 //! ```text
-//! luminance -> select -> histogram -> select -> histogram -> select -> tone_statistics -> curve, in the loss or tone_map
+//! luminance -> select -> histogram -> select -> histogram -> select -> tone_statistics -> host -> curve, in the loss or tone_map
 //! ```
 //!
 //! Percentiles are exact: luminance is not negative, so its bits sort as integers, and a radix select finds both
-//! neighbours of both ranks in three digits of 11, 10 and 10 bits. Nothing is read back; the same photograph gives the
-//! same bits every time. A photograph beyond the device's limits comes in tiles, whose counts and sums add up.
+//! neighbours of both ranks in three digits of 11, 10 and 10 bits; the same photograph gives the same bits every time. What
+//! curve the statistics give is said once, on the host ([`ToneSettings::parameters`]). A photograph beyond the device's limits comes in tiles, whose counts and sums add up.
 
 use glam::Vec3;
 
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
+use crate::kernels::rank_search::{BINS, SEARCHES, WORKGROUP};
 use crate::kernels::{self, RankSearch, ToneParameters, ToneStatistics};
-use crate::tone::{Rank, Statistics, ToneCurve, ToneSettings, White};
+use crate::tone::{Rank, Statistics, ToneSettings, White};
 use crate::{Error, Result};
 
 /// Threads that share an image: enough to fill a large GPU, few enough that their partial sums add up quickly.
-const THREADS: u32 = 128 * 256;
-
-/// Both neighbours of two percentiles.
-const SEARCHES: usize = 4;
-
-/// The values of a ten-bit digit of the radix select.
-const BINS: usize = 1024;
+const THREADS: u32 = 128 * WORKGROUP;
 
 /// Takes the statistics of photographs and applies a tone curve, with scratch memory for the largest so far.
 #[derive(Debug)]
@@ -81,20 +76,18 @@ impl PseudoGt {
     /// The settings leave the curve undefined ([`ToneSettings::check`]), or the device is out of memory.
     pub fn new(gpu: &Gpu, settings: &ToneSettings) -> Result<Self> {
         settings.check()?;
-        let takes_none = settings.white() == White::One;
-        let tone_curve =
-            if takes_none { ToneCurve::None.constant() } else { settings.curve.constant() };
+        let takes_p80 = settings.white() == White::P80;
         Ok(Self {
             gpu: gpu.clone(),
             luminance: gpu.pipeline(&kernels::luminance::Constants {})?,
             histogram: gpu.pipeline(&kernels::luminance_histogram::Constants {})?,
             select: gpu.pipeline(&kernels::percentile_select::Constants {})?,
-            statistics: gpu.pipeline(&kernels::tone_statistics::Constants { tone_curve })?,
+            statistics: gpu.pipeline(&kernels::tone_statistics::Constants { takes_p80 })?,
             map: Map::new(gpu, settings)?,
             luminances: vec![],
             sums: gpu.uninit("channel sums", 0)?,
-            searches: gpu.uninit("rank searches", 2 * SEARCHES)?,
-            histograms: gpu.zeros("luminance histograms", SEARCHES * BINS)?,
+            searches: gpu.uninit("rank searches", 2 * SEARCHES as usize)?,
+            histograms: gpu.zeros("luminance histograms", (SEARCHES * BINS) as usize)?,
             measured: gpu.uninit("tone statistics", 1)?,
             settings: settings.clone(),
         })
@@ -105,18 +98,16 @@ impl PseudoGt {
         &self.settings
     }
 
-    /// Records the statistics of `image`, planar `(3, height, width)`, sRGB-encoded, and writes the curve they give to
-    /// `parameters[view]`. Values that are NaN or negative count as 0, values above 65504 as 65504.
+    /// Records the statistics of `image`, planar `(3, height, width)`, sRGB-encoded; [`PseudoGt::measured`] reads them.
+    /// Values that are NaN or negative count as 0, values above 65504 as 65504.
     ///
     /// # Errors
-    /// The image has no pixels or `image` another size, `parameters` ends before `view`, or the device is out of memory.
+    /// The image has no pixels or `image` another size, or the device is out of memory.
     pub fn statistics(
         &mut self,
         pass: &mut Recorder<'_>,
         image: &Buffer<f32>,
         [width, height]: [u32; 2],
-        parameters: &mut Buffer<ToneParameters>,
-        view: u32,
     ) -> Result<()> {
         let pixels = u64::from(width) * u64::from(height);
         if pixels == 0 || 3 * pixels != image.len() as u64 {
@@ -125,7 +116,7 @@ impl PseudoGt {
                 "buffer `{name}` holds {len} values, not a {width}x{height} image"
             )));
         }
-        self.statistics_of_tiles(pass, &[image], parameters, view)
+        self.statistics_of_tiles(pass, &[image])
     }
 
     /// As [`PseudoGt::statistics`], of a photograph in parts, each planar `(3, pixels)`; in which parts does not matter
@@ -137,10 +128,7 @@ impl PseudoGt {
         &mut self,
         pass: &mut Recorder<'_>,
         tiles: &[&Buffer<f32>],
-        parameters: &mut Buffer<ToneParameters>,
-        view: u32,
     ) -> Result<()> {
-        in_range(parameters, view)?;
         let pixels: usize = tiles.iter().map(|tile| tile.len() / 3).sum();
         let is_planar = tiles.iter().all(|tile| tile.len() % 3 == 0);
         let Some(pixel_count) = u32::try_from(pixels).ok().filter(|&count| count > 0 && is_planar)
@@ -151,29 +139,19 @@ impl PseudoGt {
         let [p10, p80, p90] = [1, 8, 9].map(|tenths| Rank::of(tenths, pixels));
         self.search_ranks(pass, tiles, [p10, p90], 0)?;
         if self.settings.white() == White::P80 {
-            self.search_ranks(pass, tiles, [p80, p80], SEARCHES as u32)?;
+            self.search_ranks(pass, tiles, [p80, p80], SEARCHES)?;
         }
-        let settings = &self.settings;
-        let constants = settings.parameters(&Statistics::default()).constants;
         pass.dispatch(
             &self.statistics,
             &kernels::tone_statistics::Params {
-                view,
+                weights: Vec3::new(p10.weight, p90.weight, p80.weight),
                 pixel_count,
                 sum_count: THREADS * tiles.len() as u32,
-                weights: Vec3::new(p10.weight, p90.weight, p80.weight),
-                gain_c: settings.gain_c as f32,
-                theta: settings.theta as f32,
-                alpha: settings.alpha as f32,
-                beta: settings.beta as f32,
-                least_gain: settings.least_gain() as f32,
-                constants,
             },
             kernels::tone_statistics::Buffers {
                 searches: &self.searches,
                 sums: &self.sums,
                 statistics: &mut self.measured,
-                parameters,
             },
             Threads::Workgroups([1, 1, 1]),
         )

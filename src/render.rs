@@ -10,14 +10,15 @@
 
 mod frame;
 
-use glam::{DVec3, UVec2, Vec2};
+use glam::UVec2;
 
 use crate::camera::Camera;
 use crate::gpu::{Buffer, Gpu, Kernel as _, Pipeline, Recorder, Threads};
 use crate::image::Image;
+use crate::kernels::splat::MAX_CHANNELS;
 use crate::kernels::{
-    blend_backward, blend_forward, check_capacity, emit, order_counts, project, project_backward,
-    reduce_records, tile_ranges,
+    self, blend_backward, blend_forward, check_capacity, emit, order_counts, project,
+    project_backward, reduce_records, tile_ranges,
 };
 use crate::scene::Shape;
 use crate::sort::{Count, DispatchArguments, RadixSort, Scan};
@@ -25,9 +26,6 @@ use crate::{Error, Result};
 
 use frame::Frame;
 pub use frame::Status;
-
-/// Values per pixel that a background is given for.
-pub const MAX_CHANNELS: usize = 11;
 
 /// What a renderer is specialised for.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -286,12 +284,16 @@ impl Renderer {
         let view = self.view(camera)?;
         self.record_project(pass, gaussians, &view, options.sh_degree)?;
         self.record_bins(pass, &view)?;
-        let mut background = [0.0; MAX_CHANNELS];
+        let mut background = [0.0; MAX_CHANNELS as usize];
         background[..3].copy_from_slice(&options.background);
         let frame = &mut self.frame;
         pass.dispatch(
             &self.blend_forward,
-            &blend_forward::Params { size: view.size, tile_columns: view.tiles.x, background },
+            &blend_forward::Params {
+                size: view.camera.size,
+                tile_columns: view.tiles.x,
+                background,
+            },
             blend_forward::Buffers {
                 tile_ranges: &frame.tile_ranges,
                 sorted_slots: &frame.slots,
@@ -325,7 +327,7 @@ impl Renderer {
         let frame = &mut self.frame;
         pass.dispatch(
             &self.blend_backward,
-            &blend_backward::Params { size: view.size, tile_columns: view.tiles.x },
+            &blend_backward::Params { size: view.camera.size, tile_columns: view.tiles.x },
             blend_backward::Buffers {
                 tile_ranges: &frame.tile_ranges,
                 sorted_slots: &frame.slots,
@@ -354,10 +356,7 @@ impl Renderer {
         pass.dispatch(
             &self.project_backward,
             &project_backward::Params {
-                view_from_world: view.view_from_world,
-                focal: view.focal,
-                principal_point: view.principal_point,
-                size: view.size,
+                camera: view.camera,
                 gaussian_count,
                 sh_degree: options.sh_degree,
                 damping_weight: damping.weight,
@@ -390,10 +389,7 @@ impl Renderer {
         pass.dispatch(
             &self.project,
             &project::Params {
-                view_from_world: view.view_from_world,
-                focal: view.focal,
-                principal_point: view.principal_point,
-                size: view.size,
+                camera: view.camera,
                 near: self.settings.near,
                 gaussian_count,
                 sh_degree,
@@ -440,7 +436,7 @@ impl Renderer {
         )?;
         pass.dispatch(
             &self.emit,
-            &emit::Params { size: view.size, gaussian_count, tile_columns: view.tiles.x },
+            &emit::Params { size: view.camera.size, gaussian_count, tile_columns: view.tiles.x },
             emit::Buffers {
                 counts: &frame.counts,
                 sorted_ids: &frame.ids,
@@ -488,28 +484,13 @@ impl Renderer {
             let what = format!("a {width}x{height} image exceeds what the renderer reserved");
             return Err(Error::Usage(what));
         }
-        let columns = [
-            camera.view_from_world.matrix3.x_axis,
-            camera.view_from_world.matrix3.y_axis,
-            camera.view_from_world.matrix3.z_axis,
-            camera.view_from_world.translation,
-        ];
-        Ok(View {
-            view_from_world: columns.map(|column: DVec3| column.as_vec3().to_array()),
-            focal: camera.focal.as_vec2(),
-            principal_point: camera.principal_point.as_vec2(),
-            size: UVec2::new(camera.width, camera.height),
-            tiles,
-        })
+        Ok(View { camera: camera.into(), tiles })
     }
 }
 
-/// A camera as the kernels take it.
+/// A camera as the kernels take it, and the columns and rows of tiles of its image.
 struct View {
-    view_from_world: [[f32; 3]; 4],
-    focal: Vec2,
-    principal_point: Vec2,
-    size: UVec2,
+    camera: kernels::Camera,
     tiles: UVec2,
 }
 

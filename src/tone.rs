@@ -18,6 +18,8 @@
 mod catalogue;
 mod families;
 mod file;
+mod law;
+mod real;
 mod settings;
 mod statistics;
 mod table;
@@ -25,32 +27,24 @@ mod table;
 use std::fmt;
 use std::str::FromStr;
 
-pub use self::catalogue::FAMILIES;
-pub use self::families::{Constant, Family, Law, ToneCurve, White};
+pub use self::catalogue::{FAMILIES, ToneCurve};
+pub use self::families::{Constant, Family, Law, White};
 pub use self::file::CurveChoice;
+pub(crate) use self::law::{Numbers, clamped, curve_at, law, tone_curve};
+pub(crate) use self::real::Dual;
+pub use self::real::Real;
 pub use self::settings::ToneSettings;
-pub(crate) use self::statistics::Rank;
+pub(crate) use self::statistics::{Rank, luminance, measurable};
 pub use self::statistics::{Statistics, percentile};
+pub(crate) use self::table::interpolate;
 pub use self::table::{Table, TableInput};
 pub use crate::kernels::ToneParameters;
-use crate::reference::tone;
 use crate::{Error, Result};
 
 /// The name of the curve that a table of values makes.
 const TABLE_NAME: &str = "table";
 
 impl ToneCurve {
-    /// Every curve that has a name of its own, in the table's order.
-    pub const ALL: [Self; Self::Table as usize] = {
-        let mut all = [Self::None; Self::Table as usize];
-        let mut index = 0;
-        while index < all.len() {
-            all[index] = FAMILIES[index].curve;
-            index += 1;
-        }
-        all
-    };
-
     /// The curve's row in the table; of a [`Table`] that of `none`, as it has no formula.
     pub fn family(self) -> &'static Family {
         &FAMILIES[self as usize % FAMILIES.len()]
@@ -71,12 +65,12 @@ impl ToneCurve {
     /// `lum_preserve` and `per_channel` are straight lines here: what they do depends on more than one value.
     pub fn value(self, t: f64, offset: f64, gain: f64, constants: &[f64]) -> f64 {
         let constants = families::padded(constants);
-        tone::clamped(tone::curve_at(self.constant(), t, [offset, gain], &constants))
+        clamped(curve_at(self.constant(), t, [offset, gain], &constants))
     }
 
     /// The curve at the sRGB-encoded value `x`, in the arithmetic of the kernels.
     pub fn apply(self, x: f32, parameters: &ToneParameters) -> f32 {
-        tone::tone_curve(self.constant(), x, parameters)
+        tone_curve(self.constant(), x, parameters)
     }
 
     /// Whether each value of the target depends on one value of the photograph alone, by a formula.

@@ -19,22 +19,20 @@ use crate::dataset::Dataset;
 use crate::densify::{Densifier, DensifySettings};
 use crate::gpu::{Buffer, CheckReport, Gpu, PassTime, Recorder};
 use crate::image::Image;
-use crate::loss::{
-    DepthBoxes, Interior, LogSlot, Loss, LossInputs, LossLog, LossSettings, StepLosses, Term,
-};
-use crate::optimizer::{Adam, AdamBuffers};
+use crate::loss::{DepthBoxes, LogSlot, LossLog, Losses, StepLosses, Term, TermInputs};
+use crate::optimizer::{Adam, AdamBuffers, Learnable};
 use crate::pseudo_gt::PseudoGt;
 use crate::random::Stream;
 use crate::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer, Status};
-use crate::scene::{Features, Gaussians, Shape, width};
+use crate::scene::{Gaussians, Shape, width};
 use crate::{Error, Result};
 
 pub use config::{Background, CheckConfig, DensityConfig, TrainConfig};
 use model::Model;
 pub use networks::Networks;
-pub use parts::{ModelConfig, ModelName, NetworkRates, Part, Weights};
+pub use parts::{ModelConfig, ModelName, NetworkRates, Part};
 pub use preset::Preset;
-use terms::PartTerms;
+use terms::NetworkTerms;
 use views::Views;
 
 /// Steps that one submission holds at most: recording and reading back cost once for all of them.
@@ -130,8 +128,8 @@ pub struct Trainer {
     views: Views,
     model: Model,
     renderer: Renderer,
-    loss: Loss,
-    parts: PartTerms,
+    losses: Losses,
+    networks: Option<NetworkTerms>,
     adam: Adam,
     densifier: Densifier,
     d_render: Buffer<f32>,
@@ -169,7 +167,7 @@ impl Trainer {
         config.check()?;
         config.leave_out_what_is_missing(dataset);
         let mut pseudo_gt = PseudoGt::new(gpu, &config.tone)?;
-        let views = Views::upload(gpu, &mut pseudo_gt, dataset, config.model.features())?;
+        let views = Views::upload(gpu, &mut pseudo_gt, dataset)?;
         let sizes = views.sizes();
         say_what_parts_see(&config.model, &sizes);
         let shape = Shape { sh_degree: config.sh_degree, features: config.model.features() };
@@ -188,6 +186,9 @@ impl Trainer {
         };
         let pixels = sizes.iter().map(|size| size.x as usize * size.y as usize).max();
         let values = settings.channels() * pixels.unwrap_or_default();
+        let sources = views.sources(gpu, &pseudo_gt, dataset);
+        let losses = Losses::new(gpu, &config.loss(), &sources)?;
+        drop(sources);
         let mut trainer = Self {
             gpu: gpu.clone(),
             extent: dataset.extent(),
@@ -195,17 +196,14 @@ impl Trainer {
             views,
             model: Model::upload(gpu, &gaussians)?,
             renderer: Renderer::new(gpu, settings)?,
-            loss: Loss::new(gpu, loss_settings(&config))?,
-            parts: PartTerms::new(gpu, &config, &sizes)?,
+            losses,
+            networks: NetworkTerms::new(gpu, &config, &sizes)?,
             adam: Adam::new(gpu)?,
             densifier: Densifier::new(gpu, density(&config, dataset.extent()))?,
             d_render: gpu.uninit("d_render", values)?,
             log: LossLog::new(gpu, STEPS_PER_SUBMISSION as usize)?,
             config,
         };
-        for &size in &sizes {
-            trainer.loss.reserve(size)?;
-        }
         trainer.reserve()?;
         Ok(trainer)
     }
@@ -304,7 +302,7 @@ impl Trainer {
             })?;
         } else if status.not_finite {
             let step = self.step + 1;
-            let what = log[done].first_not_finite().map_or("the loss", Term::name).to_owned();
+            let what = log[done].first_not_finite().map_or("the loss", |term| term.name).to_owned();
             let view = self.views.of_step(self.config.seed, step).name.clone();
             return Err(Error::NotFinite { step, view, what });
         }
@@ -341,27 +339,25 @@ impl Trainer {
             background: background(&self.config, step),
         };
         let damping = Damping { weight: schedule.damping_weight(step), depth: self.extent as f32 };
-        let size = UVec2::new(view.camera.width, view.camera.height);
         let model = &mut self.model;
 
         self.renderer.forward(pass, &model.gaussians.parameters, &view.camera, &options)?;
         let (render, status) = self.renderer.render_and_status();
         let d_render = &mut self.d_render;
-        let log =
-            &mut LogSlot { log: &mut self.log, slot, status, not_finite_flag: Status::NOT_FINITE };
-        let inputs = LossInputs {
-            size,
-            interior: Interior::whole(size),
+        let log = &mut LogSlot { log: &mut self.log, slot, status };
+        let inputs = &TermInputs {
+            step,
+            view: view.number,
+            size: view.size(),
+            features: model.shape().features,
             render,
             low: view.loss_input(),
             tone: &view.tone,
         };
-        if model.shape().features != Features::NONE {
-            // Not every term reaches every pixel of its planes.
-            pass.fill(d_render, 0);
+        self.losses.record(pass, inputs, d_render, log)?;
+        if let Some(networks) = &mut self.networks {
+            networks.record(pass, inputs, &view.image, d_render, log)?;
         }
-        self.loss.record(pass, inputs, d_render, log)?;
-        self.parts.record(pass, step, view, render, d_render, log)?;
         self.renderer.backward(
             pass,
             &model.gaussians.parameters,
@@ -387,15 +383,17 @@ impl Trainer {
                 parameters: &mut model.gaussians.parameters,
                 gradients: &model.gradients,
                 moments: &mut model.gaussians.moments,
-                status: self.renderer.status(),
             },
+            self.renderer.status(),
         )?;
-        self.parts.update(pass, step, &self.adam, self.renderer.status())
+        learnables(&mut self.networks).try_for_each(|learnable| {
+            self.adam.update(pass, step, learnable, self.renderer.status())
+        })
     }
 
     /// The networks; none where the model has none.
     pub fn networks(&mut self) -> Option<&mut Networks> {
-        self.parts.networks()
+        self.networks.as_mut().map(|terms| &mut terms.networks)
     }
 
     /// Renders what `camera` sees, with every SH degree trained so far, before a black background.
@@ -409,7 +407,8 @@ impl Trainer {
         };
         self.renderer.reserve(self.model.count(), [camera])?;
         let gaussians = &self.model.gaussians.parameters;
-        Rendered::new(&mut self.renderer, gaussians, camera, &options, self.parts.networks())
+        let networks = self.networks.as_mut().map(|terms| &mut terms.networks);
+        Rendered::new(&mut self.renderer, gaussians, camera, &options, networks)
     }
 
     /// Density control acts after this step. Never so late that the run ends before what it added has settled.
@@ -423,22 +422,23 @@ impl Trainer {
     }
 
     fn report(&self, step: u64, losses: &StepLosses, milliseconds: f64) -> StepReport {
-        let terms = self.config.terms();
+        let config = self.config.loss();
+        let value = |term| (term, f64::from(losses.get(term)));
         StepReport {
             step,
             view: self.views.of_step(self.config.seed, step).name.clone(),
-            loss: terms.iter().map(|&(term, weight)| weight * distance(term, losses)).sum(),
-            terms: terms.iter().map(|&(term, _)| (term, f64::from(losses.get(term)))).collect(),
+            loss: config.total(losses),
+            terms: config.terms().into_iter().map(value).collect(),
             gaussians: self.model.count(),
             milliseconds,
         }
     }
 }
 
-/// What a term adds to the loss, before its weight: SSIM is a likeness, the others are distances.
-fn distance(term: Term, losses: &StepLosses) -> f64 {
-    let value = f64::from(losses.get(term));
-    if matches!(term, Term::Ssim | Term::LowSsim) { 1.0 - value } else { value }
+/// Everything that is learned beside the Gaussians: Adam trains it, and checkpoints keep it.
+fn learnables(networks: &mut Option<NetworkTerms>) -> impl Iterator<Item = &mut dyn Learnable> {
+    let networks = networks.iter_mut().flat_map(|terms| terms.networks.parameters_mut());
+    networks.map(|parameters| parameters as &mut dyn Learnable)
 }
 
 /// Says where the parts of a model see less than they are set to.
@@ -455,15 +455,6 @@ fn say_what_parts_see(model: &ModelConfig, sizes: &[UVec2]) {
     if (model.denoiser || model.tonemapper) && model.denoiser_crop > longest {
         let crop = model.denoiser_crop;
         tracing::warn!("a crop of {crop} pixels exceeds every view: the networks see whole views");
-    }
-}
-
-/// L1 and SSIM of the render against the pseudo-GT.
-fn loss_settings(config: &TrainConfig) -> LossSettings {
-    LossSettings {
-        tone_curve: config.tone.loss_curve(),
-        ssim_weight: config.ssim_weight,
-        terms: [Term::L1, Term::Ssim],
     }
 }
 

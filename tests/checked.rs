@@ -15,7 +15,7 @@ use nightsplat::image::Image;
 use nightsplat::pseudo_gt::PseudoGt;
 use nightsplat::random::Stream;
 use nightsplat::sort::{Count, RadixSort, Scan};
-use nightsplat::tone::{ToneCurve, ToneSettings};
+use nightsplat::tone::{Statistics, ToneCurve, ToneSettings};
 use nightsplat::train::{Background, Part, TrainConfig, Trainer};
 
 /// Six views of 40 x 30 pixels with depth maps.
@@ -163,10 +163,11 @@ fn every_pass_of_the_pseudo_gt_agrees_with_its_reference_for_every_curve() {
             let mut pseudo_gt = PseudoGt::new(&gpu, &settings)?;
             let image = gpu.buffer("image", &dark(47 * 33))?;
             // Longer than the image: what lies beyond is nobody's.
-            let mut parameters = gpu.zeros("tone", 3)?;
+            let curve = settings.parameters(&Statistics::of(&dark(47 * 33)));
+            let parameters = gpu.buffer("tone", &[curve; 3])?;
             let mut target = gpu.zeros("target", image.len())?;
             gpu.run("pseudo-GT", |pass| {
-                pseudo_gt.statistics(pass, &image, [47, 33], &mut parameters, 1)?;
+                pseudo_gt.statistics(pass, &image, [47, 33])?;
                 pseudo_gt.map(pass, &image, &parameters, 1, &mut target)
             })
         });

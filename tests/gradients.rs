@@ -61,7 +61,7 @@ impl Chain {
 
     /// Centre and gradient of each pixel.
     fn pixels(&self) -> impl Iterator<Item = (DVec2, Vec<f64>)> {
-        let (width, count) = (self.setup.params.size.x as usize, self.setup.pixels());
+        let (width, count) = (self.setup.params.camera.size.x as usize, self.setup.pixels());
         (0..count).map(move |at| {
             let center = DVec2::new((at % width) as f64, (at / width) as f64) + 0.5;
             (center, (0..self.channels()).map(|c| self.d_render[c * count + at]).collect())
@@ -287,7 +287,10 @@ fn blend_backward_and_its_reduction_match_the_references() {
         let records = run_reference!(
             blend_backward,
             constants!(blend_backward, setup),
-            blend_backward::Params { size: setup.params.size, tile_columns: setup.tiles().x },
+            blend_backward::Params {
+                size: setup.params.camera.size,
+                tile_columns: setup.tiles().x
+            },
             [tile_ranges, sorted_slots, owners, splats, colors, render, d_render],
             [records]
         );

@@ -2,6 +2,7 @@
 
 #![expect(clippy::unwrap_used, reason = "what fails here fails the test")]
 
+use nightsplat::attributes::Attribute;
 use nightsplat::gpu::testing::{assert_no_validation_messages, gpu};
 use nightsplat::gpu::{Gpu, Reference};
 use nightsplat::kernels::adam;
@@ -10,15 +11,8 @@ use nightsplat::optimizer::{Adam, AdamBuffers, LearningRates, Moments, Schedule}
 /// Two features and SH of degree 1.
 const COLUMNS: u32 = 25;
 const FEATURES: u32 = 2;
-const RATES: LearningRates = LearningRates {
-    means: 0.01,
-    quats: 0.02,
-    log_scales: 0.03,
-    raw_opacities: 0.04,
-    dc: 0.05,
-    features: 0.015,
-    rest: 0.06,
-};
+/// Of means, quats, log scales, raw opacities, dc, features, rest.
+const RATES: LearningRates = LearningRates([0.01, 0.02, 0.03, 0.04, 0.05, 0.015, 0.06]);
 
 /// Parameters, gradients and both moments of one step, in host memory.
 #[derive(Clone)]
@@ -65,9 +59,15 @@ impl Planes {
                 parameters: &mut parameters,
                 gradients: &gradients,
                 moments: &mut moments,
-                status: &status,
             };
-            adam.record(pass, step, &RATES, [gaussian_count, column_count, FEATURES], buffers)
+            adam.record(
+                pass,
+                step,
+                &RATES,
+                [gaussian_count, column_count, FEATURES],
+                buffers,
+                &status,
+            )
         })
         .unwrap();
         self.parameters = gpu.read(&parameters).unwrap();
@@ -84,13 +84,7 @@ impl Planes {
             column_count,
             feature_count: FEATURES,
             second_correction: (1.0 / (1.0 - 0.999f64.powi(step)).sqrt()) as f32,
-            means_rate: rate(RATES.means),
-            quats_rate: rate(RATES.quats),
-            log_scales_rate: rate(RATES.log_scales),
-            raw_opacities_rate: rate(RATES.raw_opacities),
-            dc_rate: rate(RATES.dc),
-            features_rate: rate(RATES.features),
-            rest_rate: rate(RATES.rest),
+            rates: RATES.0.map(rate),
         };
         let slices = adam::Slices {
             parameters: &mut self.parameters,
@@ -149,16 +143,21 @@ fn the_first_step_moves_every_attribute_by_its_own_rate() {
     let before = planes.clone();
     planes.step(&gpu, 1, [count, COLUMNS], 0);
     let rates = [
-        (0, RATES.means),
-        (2, RATES.means),
-        (3, RATES.quats),
-        (6, RATES.quats),
-        (7, RATES.log_scales),
+        (0, RATES[Attribute::Means]),
+        (2, RATES[Attribute::Means]),
+        (3, RATES[Attribute::Quats]),
+        (6, RATES[Attribute::Quats]),
+        (7, RATES[Attribute::LogScales]),
     ]
     .into_iter()
-    .chain([(9, RATES.log_scales), (10, RATES.raw_opacities), (11, RATES.dc), (13, RATES.dc)])
-    .chain([(14, RATES.features), (13 + FEATURES, RATES.features)])
-    .chain([(14 + FEATURES, RATES.rest), (COLUMNS - 1, RATES.rest)]);
+    .chain([
+        (9, RATES[Attribute::LogScales]),
+        (10, RATES[Attribute::RawOpacities]),
+        (11, RATES[Attribute::Dc]),
+        (13, RATES[Attribute::Dc]),
+    ])
+    .chain([(14, RATES[Attribute::Features]), (13 + FEATURES, RATES[Attribute::Features])])
+    .chain([(14 + FEATURES, RATES[Attribute::Rest]), (COLUMNS - 1, RATES[Attribute::Rest])]);
     for (column, rate) in rates {
         for i in (column * count) as usize..((column + 1) * count) as usize {
             let expected = before.parameters[i] - rate as f32 * before.gradients[i].signum();
@@ -271,9 +270,8 @@ fn a_buffer_that_is_too_short_is_refused() {
                 parameters: &mut parameters,
                 gradients: &gradients,
                 moments: &mut moments,
-                status: &status,
             };
-            adam.record(pass, step, &rates, [2, 14, 0], buffers)
+            adam.record(pass, step, &rates, [2, 14, 0], buffers, &status)
         });
         assert!(result.is_err(), "{lengths:?} {status_len} {step}");
     }

@@ -5,6 +5,7 @@
 use std::path::Path;
 use std::process::{Command, Output};
 
+use nightsplat::attributes::Attribute;
 use nightsplat::dataset::Dataset;
 use nightsplat::dataset::synthetic::{self, SyntheticOptions};
 use nightsplat::gpu::testing::{assert_no_validation_messages, gpu};
@@ -39,7 +40,7 @@ fn config(parts: &[Part]) -> TrainConfig {
     config.model.network.repeats = 2;
     config.model.rates.denoiser = 1e-2;
     config.model.rates.tonemapper = 1e-2;
-    config.schedule.initial_rates.features = 5e-2;
+    config.schedule.initial_rates[Attribute::Features] = 5e-2;
     config
 }
 
@@ -69,10 +70,10 @@ fn each_part_alone_has_its_channels_and_its_terms_fall() {
     let folder = tempfile::tempdir().unwrap();
     make_set(folder.path(), true);
     for (part, channels, terms) in [
-        (Part::Structure, 4, &[Term::Structure][..]),
-        (Part::Depth, 4, &[Term::Depth, Term::DepthLocal]),
-        (Part::Tonemapper, 6, &[Term::LowL1]),
-        (Part::Denoiser, 6, &[Term::Denoising]),
+        (Part::Structure, 4, &[Term::STRUCTURE][..]),
+        (Part::Depth, 4, &[Term::DEPTH, Term::DEPTH_LOCAL]),
+        (Part::Tonemapper, 6, &[Term::LOW_L1]),
+        (Part::Denoiser, 6, &[Term::DENOISING]),
     ] {
         let config = config(&[part]);
         let (reports, gaussians) = train(&config, &load(folder.path(), &config));
@@ -126,7 +127,7 @@ fn crops_estimate_the_losses_of_the_whole_view() {
         let mut config = TrainConfig { steps: 1, seed, ..config(&[Part::Tonemapper]) };
         config.model.denoiser_crop = crop;
         let (reports, _) = train(&config, &load(folder.path(), &config));
-        reports[0].term(Term::LowL1)
+        reports[0].term(Term::LOW_L1)
     };
     let differences: Vec<f64> =
         (0..24).map(|seed| first_loss(16, seed) - first_loss(0, seed)).collect();
@@ -164,7 +165,7 @@ fn depth_maps_are_found_resized_negated_and_left_out_where_they_say_nothing() {
     // Trains on: the view without depth leaves the term out.
     let (reports, _) = train(&TrainConfig { steps: 10, ..config.clone() }, &dataset);
     for report in &reports {
-        assert_eq!((report.term(Term::Depth) == 0.0), report.view == *name, "{report:?}");
+        assert_eq!((report.term(Term::DEPTH) == 0.0), report.view == *name, "{report:?}");
     }
 
     config.model.depth_folder = Some(folder.path().join("nowhere"));

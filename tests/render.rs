@@ -8,19 +8,19 @@ use std::path::Path;
 use glam::{DVec2, DVec3, DVec4, UVec2, Vec2};
 use nightsplat::gpu::Threads;
 use nightsplat::gpu::testing::{assert_no_validation_messages, gpu};
+use nightsplat::kernels::emit::NO_TILE;
+use nightsplat::kernels::project::CULLED;
+use nightsplat::kernels::splat::ALPHA_MIN;
 use nightsplat::kernels::{
     ProjectedSplat, blend_forward, check_capacity, emit, order_counts, project, tile_ranges,
 };
 use nightsplat::reference::gaussian::Gaussian;
-use nightsplat::reference::splat::{ALPHA_MIN, Splat, splat_columns};
+use nightsplat::reference::splat::{Splat, splat_columns};
 
 #[macro_use]
 mod common;
 use common::model::{ROUNDING, model_tile};
 use common::{Frame, Random, Setup, UNWRITTEN, assert_close, forward};
-
-const CULLED: u32 = u32::MAX;
-const NO_TILE: u32 = u32::MAX;
 
 #[test]
 fn project_matches_the_reference() {
@@ -38,7 +38,7 @@ fn project_matches_the_reference() {
             [splats, colors, depth_keys, ids, tile_counts]
         );
         assert_eq!(frame.ids, ids);
-        let size = params.size.max_element() as f32;
+        let size = params.camera.size.max_element() as f32;
         // exp of a log scale is good to 3 + 2 |x| units and enters cov2d squared; the rest are a few dozen roundings.
         let loose = 256.0 * ROUNDING as f32;
         let tight = 32.0 * ROUNDING as f32;
@@ -85,7 +85,7 @@ fn scaled(splat: &ProjectedSplat, factor: f32) -> ProjectedSplat {
 /// The tiles that the reference gives a splat.
 fn tiles_of(splat: &ProjectedSplat, setup: &Setup) -> Vec<u32> {
     use nightsplat::reference::splat::{splat_tile_rows, splat_tiles};
-    let UVec2 { x: width, y: height } = setup.params.size;
+    let UVec2 { x: width, y: height } = setup.params.camera.size;
     let [top, bottom] = splat_tile_rows(splat, height, setup.tile);
     let row = |row| {
         let [first, end] = splat_tiles(splat, row, width, setup.tile);
@@ -115,7 +115,7 @@ fn the_binning_kernels_match_their_references() {
             emit,
             constants!(emit, setup),
             emit::Params {
-                size: setup.params.size,
+                size: setup.params.camera.size,
                 gaussian_count: n,
                 tile_columns: setup.tiles().x
             },
@@ -358,7 +358,7 @@ fn no_visible_pixel_is_missed() {
     let setup = needles(2000);
     let frame = forward(&setup, None);
     let seen: HashSet<_> = frame.tiles.iter().copied().zip(frame.owners.iter().copied()).collect();
-    let UVec2 { x: width, y: height } = setup.params.size;
+    let UVec2 { x: width, y: height } = setup.params.camera.size;
     let (mut visible, mut missed) = (0, vec![]);
     for (id, projected) in frame.splats.iter().enumerate() {
         let splat = Splat::from(projected);
@@ -437,9 +437,9 @@ fn golden_renders_are_met() {
         let size = UVec2::new(123, 82);
         let mut setup = Setup::new(opacities.len(), size, 3, 0);
         let [x, y, z] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
-        setup.params.view_from_world = [x, y, z, [-0.123, -0.456, 8.0]];
-        setup.params.focal = Vec2::splat(0.5 * size.x as f32);
-        setup.params.principal_point = size.as_vec2() / 2.0;
+        setup.params.camera.view_from_world = [x, y, z, [-0.123, -0.456, 8.0]];
+        setup.params.camera.focal = Vec2::splat(0.5 * size.x as f32);
+        setup.params.camera.principal_point = size.as_vec2() / 2.0;
         setup.params.near = 0.01;
         setup.alpha_max = 0.999;
         setup.background = [0.0; 11];
@@ -476,7 +476,11 @@ fn a_count_that_wrapped_around_writes_no_slot_beyond_the_counted() {
     let (tiles, slots, owners) = run_kernel!(
         emit,
         constants!(emit, setup),
-        emit::Params { size: setup.params.size, gaussian_count: 3, tile_columns: setup.tiles().x },
+        emit::Params {
+            size: setup.params.camera.size,
+            gaussian_count: 3,
+            tile_columns: setup.tiles().x
+        },
         Threads::Exactly([3, 1, 1]),
         [counts, sorted_ids, ordered_counts, offsets, splats],
         [tiles, slots, owners]

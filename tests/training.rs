@@ -5,6 +5,7 @@
 use std::path::Path;
 
 use nightsplat::Error;
+use nightsplat::attributes::Attribute;
 use nightsplat::dataset::synthetic::{self, SyntheticOptions};
 use nightsplat::dataset::{Dataset, Split};
 use nightsplat::eval::{self, Player};
@@ -130,7 +131,7 @@ fn a_loss_that_is_not_finite_names_step_view_and_term() {
     let dataset = dataset();
     let mut config = config();
     // The colours of the second step are finite, their squares in SSIM are not.
-    config.schedule.initial_rates.dc = 1e30;
+    config.schedule.initial_rates[Attribute::Dc] = 1e30;
     let mut trainer = Trainer::new(&gpu(), config, &dataset).unwrap();
     let error = trainer.advance(20).unwrap_err();
     let Error::NotFinite { step, view, what } = &error else { panic!("{error}") };

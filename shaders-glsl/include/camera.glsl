@@ -4,11 +4,19 @@
 // beyond, the affine approximation of a splat explodes.
 const float JACOBIAN_MARGIN = 0.15;
 
+// It looks along +z, x to the right and y down.
+struct Camera {
+    mat4x3 view_from_world;
+    vec2  focal;            // pixels
+    vec2  principal_point;  // pixels
+    uvec2 size;             // pixels
+};
+
 // x / z and y / z, clamped to the image and its margin.
-vec2 clamped_slope(vec3 mean_in_view, vec2 focal, vec2 principal_point, uvec2 size) {
-    vec2 margin = JACOBIAN_MARGIN * vec2(size);
-    vec2 low = -(principal_point + margin) / focal;
-    vec2 high = (vec2(size) - principal_point + margin) / focal;
+vec2 clamped_slope(vec3 mean_in_view, Camera camera) {
+    vec2 margin = JACOBIAN_MARGIN * vec2(camera.size);
+    vec2 low = -(camera.principal_point + margin) / camera.focal;
+    vec2 high = (vec2(camera.size) - camera.principal_point + margin) / camera.focal;
     return clamp(mean_in_view.xy / mean_in_view.z, low, high);
 }
 

@@ -1,5 +1,5 @@
-// The shapes of the tone curves, f(t) for t >= 0, one function each; `reference/curves.rs` is the twin on the host and
-// `tone::Family` the table of names, formulas, constants and sources. `build.rs` gives the numbers to the host.
+// The shapes of the tone curves, f(t) for t >= 0: a number, a function and a case each. `src/tone/catalogue.rs` is the
+// host's side: a row each, with the same formula.
 
 const uint CURVE_NONE                = 0;
 const uint CURVE_LINEAR              = 1;
@@ -40,6 +40,8 @@ const uint CURVE_LUM_PRESERVE        = 35;
 const uint CURVE_PER_CHANNEL         = 36;
 const uint CURVE_TABLE               = 37;
 
+const uint MAX_CONSTANTS = 8;  // of a family
+
 // Beyond this t counts as this: the powers stay finite, and every curve is within an ulp of white or of its limit.
 const float LARGEST_T = 1e7;
 
@@ -78,115 +80,115 @@ float ap3(float t) {
     return ((0.0720 * t - 0.4376) * t + 0.9948) * t;
 }
 
-float fitted_cubic(float t, float c[8]) {
+float fitted_cubic(float t, float c[MAX_CONSTANTS]) {
     return ((c[0] * t + c[1]) * t + c[2]) * t + c[3];
 }
 
-float exp_plateau(float t, float c[8]) {
+float exp_plateau(float t, float c[MAX_CONSTANTS]) {
     return c[0] * one_minus_exp(c[1] * power(max(t, 1e-10), c[2]));
 }
 
-float power_softexp(float t, float c[8]) {
+float power_softexp(float t, float c[MAX_CONSTANTS]) {
     return power(one_minus_exp(c[0] * t), c[1]);
 }
 
-float log_curve(float t, float c[8]) {
+float log_curve(float t, float c[MAX_CONSTANTS]) {
     return c[0] * log_1p(c[1] * t);
 }
 
-float aces_filmic(float t, float c[8]) {
+float aces_filmic(float t, float c[MAX_CONSTANTS]) {
     return (c[0] * t + c[1]) * t / ((c[2] * t + c[3]) * t + c[4]);
 }
 
-float reinhard(float t, float c[8]) {
+float reinhard(float t, float c[MAX_CONSTANTS]) {
     return c[0] * t / (t + c[1] + 1e-10);
 }
 
-float softexp_gamma(float t, float c[8]) {
+float softexp_gamma(float t, float c[MAX_CONSTANTS]) {
     return c[0] * power(one_minus_exp(c[1] * t), c[2]);
 }
 
-float rational(float t, float c[8]) {
+float rational(float t, float c[MAX_CONSTANTS]) {
     return (c[0] + c[1] * t) * t / (1.0 + (c[2] + c[3] * t) * t + 1e-10);
 }
 
-float poly5_origin(float t, float c[8]) {
+float poly5_origin(float t, float c[MAX_CONSTANTS]) {
     return ((((c[0] * t + c[1]) * t + c[2]) * t + c[3]) * t + c[4]) * t;
 }
 
-float double_exp(float t, float c[8]) {
+float double_exp(float t, float c[MAX_CONSTANTS]) {
     return c[0] * one_minus_exp(c[1] * t) + c[2] * one_minus_exp(c[3] * t);
 }
 
-float gamma(float t, float c[8]) {
+float gamma(float t, float c[MAX_CONSTANTS]) {
     return c[0] * power(max(t, 1e-10), c[1]);
 }
 
 // sinh overflows: both sides are divided by exp(b t) / 2.
-float sinh_ratio(float t, float c[8]) {
+float sinh_ratio(float t, float c[MAX_CONSTANTS]) {
     float q = one_minus_exp(2.0 * c[1] * t);
     return c[0] * q / (q + 2.0 * c[2] * exp(-c[1] * t));
 }
 
-float hybrid(float t, float c[8]) {
+float hybrid(float t, float c[MAX_CONSTANTS]) {
     return c[0] * power(one_minus_exp(c[1] * t), c[2]) + c[3] * power(max(t, 1e-10), c[4]);
 }
 
-float poly3_origin(float t, float c[8]) {
+float poly3_origin(float t, float c[MAX_CONSTANTS]) {
     return ((c[0] * t + c[1]) * t + c[2]) * t;
 }
 
-float softexp_mod(float t, float c[8]) {
+float softexp_mod(float t, float c[MAX_CONSTANTS]) {
     return c[0] * one_minus_exp(c[1] * t) + c[2] * t;
 }
 
-float sqrt_blend(float t, float c[8]) {
+float sqrt_blend(float t, float c[MAX_CONSTANTS]) {
     return c[0] * sqrt(max(t, 1e-10)) + c[1] * t;
 }
 
-float softexp(float t, float c[8]) {
+float softexp(float t, float c[MAX_CONSTANTS]) {
     return one_minus_exp(c[0] * t);
 }
 
-float tanh_curve(float t, float c[8]) {
+float tanh_curve(float t, float c[MAX_CONSTANTS]) {
     return c[0] * tanh_of(c[1] * t);
 }
 
-float arctan_curve(float t, float c[8]) {
+float arctan_curve(float t, float c[MAX_CONSTANTS]) {
     return c[0] * arctan(c[1] * t) / HALF_PI;
 }
 
-float bezier3(float t, float c[8]) {
+float bezier3(float t, float c[MAX_CONSTANTS]) {
     float s = min(t, 1.0);
     float left = 1.0 - s;
     return s * (3.0 * left * left * c[0] * s + 3.0 * left * s * s * c[1] + s * s * s);
 }
 
-float piecewise3(float t, float c[8]) {
+float piecewise3(float t, float c[MAX_CONSTANTS]) {
     float first = min(t, c[3]);
     float second = min(max(t - c[3], 0.0), c[4] - c[3]);
     return c[0] * first + c[1] * second + c[2] * max(t - c[4], 0.0);
 }
 
-float hable(float t, float c[8]) {
+float hable(float t, float c[MAX_CONSTANTS]) {
     return c[0] * (c[1] * t + c[2]) * t / ((c[3] * t + c[4]) * t + c[5] + 1e-10);
 }
 
-float richards(float t, float c[8]) {
+float richards(float t, float c[MAX_CONSTANTS]) {
     return c[0] * power(1.0 + c[1] * exp(-c[2] * t), -1.0 / c[3]);
 }
 
-float arctan_standard(float t, float c[8]) {
+float arctan_standard(float t, float c[MAX_CONSTANTS]) {
     return arctan(HALF_PI * c[0] * t) / HALF_PI;
 }
 
-float bezier3_standard(float t, float c[8]) {
+float bezier3_standard(float t, float c[MAX_CONSTANTS]) {
     float s = min(t / c[2], 1.0);
     float left = 1.0 - s;
     return 3.0 * left * left * s * c[0] + 3.0 * left * s * s * c[1] + s * s * s;
 }
 
-float piecewise3_standard(float t, float c[8]) {
+float piecewise3_standard(float t, float c[MAX_CONSTANTS]) {
     float first = min(t / c[0], 1.0);
     float second = min(max(t - c[0], 0.0) / (c[2] - c[0]), 1.0);
     float third = min(max(t - c[2], 0.0) / (c[4] - c[2]), 1.0);
@@ -194,22 +196,22 @@ float piecewise3_standard(float t, float c[8]) {
 }
 
 // Without the constant E / F on both ends it would cancel at the black one.
-float hable_2010_part(float t, float c[8]) {
+float hable_2010_part(float t, float c[MAX_CONSTANTS]) {
     float d = c[3] * c[5];
     // (t (A t + C B) + D E) / (t (A t + B) + D F) - E / F over one denominator.
     return t * (c[0] * t * (1.0 - c[4] / c[5]) + c[1] * (c[2] - c[4] / c[5])) / ((c[0] * t + c[1]) * t + d);
 }
 
-float hable_2010(float t, float c[8]) {
+float hable_2010(float t, float c[MAX_CONSTANTS]) {
     return hable_2010_part(t, c) / hable_2010_part(c[6], c);
 }
 
-float richards_standard(float t, float c[8]) {
+float richards_standard(float t, float c[MAX_CONSTANTS]) {
     return c[0] * power(1.0 + c[1] * exp(-c[2] * (t - c[4])), -1.0 / c[3]);
 }
 
 // The shape of the curve `curve`, before black level, gain and clamp.
-float curve_shape(uint curve, float t, float c[8]) {
+float curve_shape(uint curve, float t, float c[MAX_CONSTANTS]) {
     switch (curve) {
     case CURVE_ASE:
     case CURVE_ASE_FLOOR:

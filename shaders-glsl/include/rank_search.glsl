@@ -11,7 +11,7 @@ const uint SEARCHES   = 4;                  // at a time: the lower and the uppe
 const uint DIGIT_BITS = 10;                 // of the second and the third digit
 const uint BINS       = 1u << DIGIT_BITS;   // of one search's histogram
 const uint FIRST_BINS = 2 * BINS;           // of the first digit, which all searches share
-const uint FIRST_SHIFT = 2 * DIGIT_BITS;
+const uint FIRST_SHIFT = 2 * DIGIT_BITS;    // how far right it lies
 
 const uint WORKGROUP = 256;  // threads in a workgroup of the kernels that read pixels
 

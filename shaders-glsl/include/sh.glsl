@@ -1,6 +1,8 @@
 // Real spherical harmonics to degree 3, in the order and with the signs that splat viewers use.
 
-const float SH_C0 = 0.28209479177387814;
+const uint MAX_SH_DEGREE = 3;
+
+const float SH_C0 = 0.28209479177387814;  // 1 / (2 sqrt(pi)): the constant basis function
 const float SH_C1 = 0.4886025119029199;
 const float SH_C2[5] = float[](
     1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396

@@ -10,9 +10,13 @@ const float DILATION = 0.3;
 
 // The largest alpha: keeps 1 / (1 - alpha) finite in the backward pass.
 layout(constant_id = 1) const float ALPHA_MAX = 0.99;
-// Values per pixel, at most MAX_CHANNELS: RGB first.
+// The most values per pixel.
 const uint MAX_CHANNELS = 11;
+// Values per pixel: RGB first.
 layout(constant_id = 2) const uint CHANNELS = 3;
+// Values of a gradient record before its channels: mean2d 2, conic 3, opacity 1.
+const uint RECORD_HEAD = 6;
+const uint RECORD = RECORD_HEAD + CHANNELS;
 // The tile that one subgroup owns, in pixels; at most 32 rows of lanes.
 layout(constant_id = 3) const uint TILE_WIDTH = 16;
 layout(constant_id = 4) const uint TILE_HEIGHT = 16;

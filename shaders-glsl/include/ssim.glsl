@@ -9,7 +9,7 @@
 layout(constant_id = 0) const uint COLUMNS = 8;  // outputs per row and thread
 layout(constant_id = 1) const uint ROWS = 32;    // rows per thread, beside 2 RADIUS rows of warm-up
 
-const int RADIUS = 5;
+const int RADIUS = 5;               // of the window, pixels
 const uint PENDING = 2 * RADIUS;    // rows of outputs in reach beside the one that completes
 const uint REACH = COLUMNS + PENDING;  // inputs along x
 

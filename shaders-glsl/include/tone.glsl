@@ -6,10 +6,10 @@
 layout(constant_id = 10) const uint TONE_CURVE = 3;
 
 struct ToneParameters {
-    float white;         // t = x / white: p90, or what the curve puts in its place
-    float offset;        // delta0, the black level
-    float gain;          // g where black is rescaled, b where it is added
-    float constants[8];  // of the family
+    float white;                     // t = x / white: p90, or what the curve puts in its place
+    float offset;                    // delta0, the black level
+    float gain;                      // g where black is rescaled, b where it is added
+    float constants[MAX_CONSTANTS];  // of the family
 };
 
 // What lies outside (0, LARGEST_T), or is no number, counts as the end it is at, a NaN as black.

@@ -1,10 +1,11 @@
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
+#include "status.glsl"
 
 //! The means of two loss terms from their partial sums, into the step's slot of the log.
 //!
-//! One subgroup, in a fixed order. A term that is NaN or infinite raises `not_finite_flag` in the sticky status word,
+//! One subgroup, in a fixed order. A term that is NaN or infinite raises a flag in the sticky status word,
 //! so that the steps recorded behind this one change nothing. Reference: `src/reference/loss_log.rs`.
 
 layout(local_size_x_id = 100) in;
@@ -16,7 +17,6 @@ layout(push_constant) uniform Params {
     uvec2 terms;           // a column each
     uvec2 partial_counts;  // 0: the term is not modelled and its column left as it is
     vec2  mean_scales;     // 1 / (number of values in the mean)
-    uint  not_finite_flag; // bits to set in status[0]
 };
 
 layout(binding = 0) readonly  buffer FirstPartials  { float first_partials[]; };
@@ -38,7 +38,7 @@ void main() {
         if (partial_counts.x > 0) log[slot * term_count + terms.x] = first;
         if (partial_counts.y > 0) log[slot * term_count + terms.y] = second;
         uint word = status[0];
-        if (!is_finite(first) || !is_finite(second)) word |= not_finite_flag;
+        if (!is_finite(first) || !is_finite(second)) word |= STATUS_NOT_FINITE;
         status[0] = word;
         statuses[slot] = word;
     }

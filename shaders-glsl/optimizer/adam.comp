@@ -19,13 +19,7 @@ layout(push_constant) uniform Params {
     uint  column_count;         // columns that take part, from the first: rows of the dispatch
     uint  feature_count;        // of these, from FEATURES_COLUMN on
     float second_correction;    // 1 / sqrt(1 - b2^t)
-    float means_rate;           // learning rates / (1 - b1^t)
-    float quats_rate;
-    float log_scales_rate;
-    float raw_opacities_rate;
-    float dc_rate;
-    float features_rate;
-    float rest_rate;
+    float rates[PLANE_COUNT];   // learning rates / (1 - b1^t), one per plane
 };
 
 layout(binding = 0)           buffer Parameters    { float parameters[]; };      // planes
@@ -44,13 +38,9 @@ const float LOG_SCALE_MIN = -30.0;
 const float LOG_SCALE_MAX = 13.0;
 
 float rate_of(uint column) {
-    if (column < QUATS_COLUMN) return means_rate;
-    if (column < LOG_SCALES_COLUMN) return quats_rate;
-    if (column < RAW_OPACITIES_COLUMN) return log_scales_rate;
-    if (column < DC_COLUMN) return raw_opacities_rate;
-    if (column < FEATURES_COLUMN) return dc_rate;
-    if (column < FEATURES_COLUMN + feature_count) return features_rate;
-    return rest_rate;
+    uint plane = 0;
+    while (plane + 1 < PLANE_COUNT && column >= plane_column(plane + 1, feature_count, column_count)) ++plane;
+    return rates[plane];
 }
 
 // Positive phrasing: an infinite or NaN gradient fails the test.
@@ -62,7 +52,7 @@ void main() {
     uint column = gl_WorkGroupID.y;
     if (column >= column_count || status[0] != 0) return;
     float rate = rate_of(column);
-    bool is_log_scale = column >= LOG_SCALES_COLUMN && column < RAW_OPACITIES_COLUMN;
+    bool is_log_scale = column >= LOG_SCALES_COLUMN && column < LOG_SCALES_COLUMN + 3;
     uint first = gl_WorkGroupID.x * gl_WorkGroupSize.x * FLOATS_PER_THREAD + gl_LocalInvocationID.x;
     for (uint k = 0; k < FLOATS_PER_THREAD; ++k) {
         uint row = first + k * gl_WorkGroupSize.x;

@@ -25,7 +25,6 @@ layout(binding = 6) readonly  buffer DRender { float d_render[]; };  // (CHANNEL
 // (slots, RECORD): mean2d 2, conic 3, opacity 1, colour CHANNELS
 layout(binding = 7) writeonly buffer Records { float records[]; };
 
-const uint RECORD = 6 + CHANNELS;
 
 void main() {
     uint tile = WORKGROUP_INDEX;
@@ -132,7 +131,7 @@ void main() {
             records[at + 3] = my_d_conic.y;
             records[at + 4] = my_d_conic.z;
             records[at + 5] = my_d_opacity;
-            [[unroll]] for (uint c = 0; c < CHANNELS; c++) records[at + 6 + c] = my_d_color[c];
+            [[unroll]] for (uint c = 0; c < CHANNELS; c++) records[at + RECORD_HEAD + c] = my_d_color[c];
         }
     }
     // Behind a tile that is done every gradient is zero.

@@ -1,6 +1,7 @@
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
+#include "status.glsl"
 
 //! Check capacity: one thread; more intersections than the buffers hold raise a flag that stays.
 //!
@@ -17,6 +18,6 @@ layout(binding = 2) buffer Status { uint status[]; };  // [0]: not zero once som
 void main() {
     bool fits = total[0] <= capacity;
     counts[0] = fits ? total[0] : 0;
-    if (!fits) status[0] |= 1;
+    if (!fits) status[0] |= STATUS_OVERFLOWED;
     status[1] = max(status[1], total[0]);
 }

@@ -16,13 +16,10 @@
 layout(local_size_x = 64) in;
 
 layout(push_constant, scalar) uniform Params {
-    mat4x3 view_from_world;
-    vec2  focal;            // pixels
-    vec2  principal_point;  // pixels
-    uvec2 size;             // pixels
-    float near;             // world units
+    Camera camera;
+    float near;       // world units
     uint  gaussian_count;
-    uint  sh_degree;        // in use; at most SH_DEGREE
+    uint  sh_degree;  // in use; at most SH_DEGREE
 };
 
 layout(constant_id = 0) const uint SH_DEGREE = 3;  // stored
@@ -35,7 +32,7 @@ layout(binding = 3) writeonly buffer DepthKeys  { uint depth_keys[]; };
 layout(binding = 4) writeonly buffer Ids        { uint ids[]; };
 layout(binding = 5) writeonly buffer TileCounts { uint tile_counts[]; };
 
-const uint CULLED = 0xffffffffu;
+const uint CULLED = 0xffffffffu;  // the depth key of what is not seen: it sorts last
 const uint FEATURE_COUNT = CHANNELS - 3;
 
 vec3 sh_color(uint i, vec3 direction) {
@@ -58,25 +55,25 @@ void main() {
     tile_counts[i] = 0;
 
     vec3 mean = LOAD_VEC3(parameters, MEANS_COLUMN, gaussian_count, i);
-    vec3 mean_in_view = view_from_world * vec4(mean, 1.0);
+    vec3 mean_in_view = camera.view_from_world * vec4(mean, 1.0);
     float opacity = sigmoid(parameters[RAW_OPACITIES_COLUMN * gaussian_count + i]);
     // Positive phrasing: a NaN depth or opacity fails the test too.
     if (!(mean_in_view.z > near && opacity > ALPHA_MIN)) return;
 
-    vec2 slope = clamped_slope(mean_in_view, focal, principal_point, size);
+    vec2 slope = clamped_slope(mean_in_view, camera);
     mat3 world_axes = rotation(unit_quat(LOAD_VEC4(parameters, QUATS_COLUMN, gaussian_count, i)));
     vec3 scale = exp(LOAD_VEC3(parameters, LOG_SCALES_COLUMN, gaussian_count, i));
-    mat3 view_axes = mat3(view_from_world) * world_axes;
+    mat3 view_axes = mat3(camera.view_from_world) * world_axes;
     for (uint k = 0; k < 3; k++) view_axes[k] *= scale[k];
     mat3 rows = transpose(view_axes);  // row k of W R S as rows[.][k]
-    vec3 u0 = focal.x / mean_in_view.z * (rows * vec3(1.0, 0.0, -slope.x));
-    vec3 u1 = focal.y / mean_in_view.z * (rows * vec3(0.0, 1.0, -slope.y));
+    vec3 u0 = camera.focal.x / mean_in_view.z * (rows * vec3(1.0, 0.0, -slope.x));
+    vec3 u1 = camera.focal.y / mean_in_view.z * (rows * vec3(0.0, 1.0, -slope.y));
 
     float xx = dot(u0, u0), xy = dot(u0, u1), yy = dot(u1, u1);
     vec3 normal = cross(u0, u1);
     float det = dot(normal, normal) + DILATION * (xx + yy) + DILATION * DILATION;
     vec3 cov2d = vec3(xx + DILATION, xy, yy + DILATION);
-    vec2 mean2d = focal * mean_in_view.xy / mean_in_view.z + principal_point;
+    vec2 mean2d = camera.focal * mean_in_view.xy / mean_in_view.z + camera.principal_point;
     // Positive phrasing: an overflow or a NaN is culled.
     if (!(det < 1e30 && all(lessThan(abs(mean2d), vec2(1e30))))) return;
 
@@ -87,16 +84,16 @@ void main() {
     splat.half_extent = sqrt(splat_level(opacity) * cov2d.xz) + 0.01;
     splats[i] = splat;
 
-    vec3 center = -transpose(mat3(view_from_world)) * view_from_world[3];
+    vec3 center = -transpose(mat3(camera.view_from_world)) * camera.view_from_world[3];
     vec3 color = sh_color(i, normalize(mean - center));
     for (uint c = 0; c < 3; c++) colors[CHANNELS * i + c] = color[c];
     uint features = FEATURES_COLUMN * gaussian_count + FEATURE_COUNT * i;
     for (uint k = 0; k < FEATURE_COUNT; k++) colors[CHANNELS * i + 3 + k] = parameters[features + k];
 
     uint count = 0;
-    uvec2 tile_rows = splat_tile_rows(splat, size.y);
+    uvec2 tile_rows = splat_tile_rows(splat, camera.size.y);
     for (uint row = tile_rows.x; row < tile_rows.y; row++) {
-        uvec2 columns = splat_tiles(splat, row, size.x);
+        uvec2 columns = splat_tiles(splat, row, camera.size.x);
         count += columns.y - columns.x;
     }
     tile_counts[i] = count;

@@ -14,14 +14,11 @@
 layout(local_size_x = 64) in;
 
 layout(push_constant, scalar) uniform Params {
-    mat4x3 view_from_world;
-    vec2  focal;            // pixels
-    vec2  principal_point;  // pixels
-    uvec2 size;             // pixels
+    Camera camera;
     uint  gaussian_count;
-    uint  sh_degree;        // in use; at most SH_DEGREE
-    float damping_weight;   // 0 to 1: how much of the gradient statistic is damped near the camera
-    float damping_depth;    // world units: no damping beyond
+    uint  sh_degree;       // in use; at most SH_DEGREE
+    float damping_weight;  // 0 to 1: how much of the gradient statistic is damped near the camera
+    float damping_depth;   // world units: no damping beyond
 };
 
 layout(constant_id = 0) const uint SH_DEGREE = 3;  // stored
@@ -31,13 +28,12 @@ layout(binding = 0) readonly  buffer Parameters { float parameters[]; };  // (co
 layout(binding = 1) readonly  buffer Splats     { ProjectedSplat splats[]; };
 layout(binding = 2) readonly  buffer Colors     { float colors[]; };      // (gaussian_count, CHANNELS)
 layout(binding = 3) readonly  buffer TileCounts { uint tile_counts[]; };
-layout(binding = 4) readonly  buffer DSplats    { float d_splats[]; };    // (gaussian_count, 6 + CHANNELS)
+layout(binding = 4) readonly  buffer DSplats    { float d_splats[]; };    // (gaussian_count, RECORD)
 layout(binding = 5) readonly  buffer Status     { uint status[]; };
 layout(binding = 6) writeonly buffer Gradients  { float gradients[]; };   // (columns x gaussian_count)
 layout(binding = 7) buffer GradNormSums { float grad_norm_sums[]; };
 layout(binding = 8) buffer VisitCounts  { uint visit_counts[]; };
 
-const uint RECORD = 6 + CHANNELS;
 const uint FEATURE_COUNT = CHANNELS - 3;
 
 #define STORE_VEC3(column, i, v) { \
@@ -106,18 +102,18 @@ void main() {
         // A colour clamped at zero passes nothing on.
         bool passes = colors[CHANNELS * i + c] > 0.0;
         if (RAW_COLORS) passes = true;
-        d_color[c] = passes ? d_splats[record + 6 + c] : 0.0;
+        d_color[c] = passes ? d_splats[record + RECORD_HEAD + c] : 0.0;
     }
     uint features = FEATURES_COLUMN * gaussian_count + FEATURE_COUNT * i;
-    for (uint k = 0; k < FEATURE_COUNT; k++) gradients[features + k] = d_splats[record + 9 + k];
+    for (uint k = 0; k < FEATURE_COUNT; k++) gradients[features + k] = d_splats[record + RECORD_HEAD + 3 + k];
 
     // The forward pass again.
-    mat3 view_rotation = mat3(view_from_world);
+    mat3 view_rotation = mat3(camera.view_from_world);
     vec3 mean = LOAD_VEC3(parameters, MEANS_COLUMN, gaussian_count, i);
-    vec3 mean_in_view = view_from_world * vec4(mean, 1.0);
+    vec3 mean_in_view = camera.view_from_world * vec4(mean, 1.0);
     float z = mean_in_view.z;
     vec2 free_slope = mean_in_view.xy / z;
-    vec2 slope = clamped_slope(mean_in_view, focal, principal_point, size);
+    vec2 slope = clamped_slope(mean_in_view, camera);
     vec4 quat = LOAD_VEC4(parameters, QUATS_COLUMN, gaussian_count, i);
     vec4 unit = unit_quat(quat);
     mat3 axes = rotation(unit);
@@ -125,8 +121,8 @@ void main() {
     mat3 scaled_axes = axes;
     for (uint k = 0; k < 3; k++) scaled_axes[k] *= scale[k];
     mat3 world_from_view = transpose(view_rotation);
-    vec3 t0 = world_from_view * (focal.x / z * vec3(1.0, 0.0, -slope.x));  // rows of J W
-    vec3 t1 = world_from_view * (focal.y / z * vec3(0.0, 1.0, -slope.y));
+    vec3 t0 = world_from_view * (camera.focal.x / z * vec3(1.0, 0.0, -slope.x));  // rows of J W
+    vec3 t1 = world_from_view * (camera.focal.y / z * vec3(0.0, 1.0, -slope.y));
     vec3 u0 = t0 * scaled_axes, u1 = t1 * scaled_axes;
 
     // conic = inverse(cov2d), cov2d = U U^T + 0.3 I
@@ -152,12 +148,12 @@ void main() {
     // J = focal / z (1, 0, -slope)
     vec3 d_j0 = view_rotation * (scaled_axes * d_u0);
     vec3 d_j1 = view_rotation * (scaled_axes * d_u1);
-    vec2 d_slope = -focal / z * vec2(d_j0.z, d_j1.z);
+    vec2 d_slope = -camera.focal / z * vec2(d_j0.z, d_j1.z);
     bvec2 is_free = equal(free_slope, slope);
-    vec2 d_xy_view = focal * d_mean2d / z + mix(vec2(0.0), d_slope / z, is_free);
-    float d_z = -(focal.x * (d_j0.x - slope.x * d_j0.z) + focal.y * (d_j1.y - slope.y * d_j1.z)) / (z * z)
+    vec2 d_xy_view = camera.focal * d_mean2d / z + mix(vec2(0.0), d_slope / z, is_free);
+    float d_z = -(camera.focal.x * (d_j0.x - slope.x * d_j0.z) + camera.focal.y * (d_j1.y - slope.y * d_j1.z)) / (z * z)
         - dot(d_xy_view, free_slope);
-    vec3 center = -world_from_view * view_from_world[3];
+    vec3 center = -world_from_view * camera.view_from_world[3];
     vec3 d_mean = world_from_view * vec3(d_xy_view, d_z) + sh_backward(i, mean - center, d_color);
 
     STORE_VEC3(MEANS_COLUMN, i, d_mean);
@@ -168,7 +164,7 @@ void main() {
     if (status[0] == 0) {
         float nearness = min(1.0, z / damping_depth);
         float damping = damping_weight * nearness * nearness + 1.0 - damping_weight;
-        grad_norm_sums[i] += damping * length(0.5 * vec2(size) * d_mean2d);
+        grad_norm_sums[i] += damping * length(0.5 * vec2(camera.size) * d_mean2d);
         visit_counts[i] += 1;
     }
 }

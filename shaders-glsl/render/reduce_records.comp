@@ -15,10 +15,8 @@ layout(binding = 0) readonly  buffer Counts  { uint counts[]; };  // [0]: inters
 layout(binding = 1) readonly  buffer Ids     { uint sorted_ids[]; };
 layout(binding = 2) readonly  buffer Ordered { uint ordered_counts[]; };
 layout(binding = 3) readonly  buffer Offsets { uint offsets[]; };
-layout(binding = 4) readonly  buffer Records { float records[]; };   // (slots, 6 + CHANNELS)
-layout(binding = 5) writeonly buffer DSplats { float d_splats[]; };  // (gaussian_count, 6 + CHANNELS)
-
-const uint RECORD = 6 + CHANNELS;
+layout(binding = 4) readonly  buffer Records { float records[]; };   // (slots, RECORD)
+layout(binding = 5) writeonly buffer DSplats { float d_splats[]; };  // (gaussian_count, RECORD)
 
 void main() {
     uint rank = THREAD_INDEX;

@@ -23,20 +23,21 @@ use crate::tone::{CurveChoice, Statistics, ToneSettings};
 use crate::{Error, Result};
 
 /// Apply a tone curve to a photograph, a folder of them or a dataset, and tell what that does.
+#[expect(clippy::doc_markdown, reason = "in help, {setting} stands for its default")]
 #[derive(Clone, Debug, clap::Args)]
 pub struct ToneArgs {
     /// A photograph (PNG, JPEG or EXR), a folder of them, or a dataset; taken as stored, not undistorted
     pub input: PathBuf,
     /// The curve: a name that `nightsplat curves` lists, or a .toml, .csv or .cube file
-    #[arg(long, value_name = "NAME|FILE", default_value = "ap3")]
+    #[arg(long, value_name = "NAME|FILE", default_value_t = ToneSettings::default().curve.into())]
     pub curve: CurveChoice,
     /// The folder to write to, names are kept; made if it does not exist. Without it nothing is written
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
-    /// c: how much a brighter photograph raises the gain [default: 3 for ase, 1 for ap3, else 0]
+    /// c: how much a brighter photograph raises the gain [default: {tone.gain_c of ase} for ase, {tone.gain_c of ap3} for ap3, else {tone.gain_c of linear}]
     #[arg(long, value_name = "C")]
     pub gain: Option<f64>,
-    /// The mean that linear scaling aims at [default: 0.49]
+    /// The mean that linear scaling aims at [default: {tone.theta}]
     #[arg(long, value_name = "T")]
     pub theta: Option<f64>,
     /// One curve for all: percentiles and means are averaged over the training photographs

@@ -37,36 +37,37 @@ pub struct TrainArgs {
 }
 
 /// The options of a run; each wins over the configuration file.
+#[expect(clippy::doc_markdown, reason = "in help, {setting} stands for its default")]
 #[derive(Clone, Debug, Default, clap::Args)]
 pub(crate) struct TrainOptions {
-    /// The tone curve: a name that `nightsplat curves` lists, or a .toml, .csv or .cube file [default: ap3]
+    /// The tone curve: a name that `nightsplat curves` lists, or a .toml, .csv or .cube file [default: {tone.curve}]
     #[arg(long, value_name = "NAME|FILE")]
     curve: Option<CurveChoice>,
-    /// c: how much a brighter photograph raises the curve's gain [default: 3 for ase, 1 for ap3, else 0]
+    /// c: how much a brighter photograph raises the curve's gain [default: {tone.gain_c of ase} for ase, {tone.gain_c of ap3} for ap3, else {tone.gain_c of linear}]
     #[arg(long, value_name = "C")]
     gain: Option<f64>,
-    /// The mean that the linear curve aims at [default: 0.49]
+    /// The mean that the linear curve aims at [default: {tone.theta}]
     #[arg(long, value_name = "T")]
     theta: Option<f64>,
-    /// Training steps, one view each [default: 5000]
+    /// Training steps, one view each [default: {steps}]
     #[arg(long, value_name = "N")]
     pub(super) steps: Option<u64>,
-    /// Shrink the photographs by this factor [default: 1]
+    /// Shrink the photographs by this factor [default: {downscale}]
     #[arg(long, value_name = "F")]
     downscale: Option<f64>,
-    /// Everything random follows from it; the same seed gives the same bits [default: 10]
+    /// Everything random follows from it; the same seed gives the same bits [default: {seed}]
     #[arg(long, value_name = "S")]
     seed: Option<u64>,
-    /// Highest degree of the spherical harmonics, 0 to 3 [default: 3]
+    /// Highest degree of the spherical harmonics, 0 to 3 [default: {sh_degree}]
     #[arg(long, value_name = "D")]
     sh_degree: Option<u32>,
-    /// Weight of 1 - SSIM beside L1, 0 to 1 [default: 0.2]
+    /// Weight of 1 - SSIM beside L1, 0 to 1 [default: {ssim_weight}]
     #[arg(long, value_name = "W")]
     ssim_weight: Option<f64>,
-    /// Never grow beyond this many Gaussians [default: 1000000]
+    /// Never grow beyond this many Gaussians [default: {max_gaussians}]
     #[arg(long, value_name = "N")]
     max_gaussians: Option<usize>,
-    /// black, or random: another colour every step [default: black]
+    /// black, or random: another colour every step [default: {background}]
     #[arg(long)]
     background: Option<Background>,
     /// A folder of reference images by name, for scores only
@@ -83,10 +84,10 @@ pub(crate) struct TrainOptions {
     /// Score the test views every N steps as well as at the end
     #[arg(long, value_name = "N")]
     eval_every: Option<u64>,
-    /// Write what --resume goes on from every N steps; 0: never [default: 1000]
+    /// Write what --resume goes on from every N steps; 0: never [default: {checkpoint_every}]
     #[arg(long, value_name = "N")]
     checkpoint_every: Option<u64>,
-    /// Compare every pass of every Nth step with its CPU reference, and warn of what differs; 0: never [default: 0]
+    /// Compare every pass of every Nth step with its CPU reference, and warn of what differs; 0: never [default: {check.every}]
     #[arg(long, value_name = "N")]
     check_every: Option<u64>,
     /// Stop where a checked step differs
@@ -98,6 +99,7 @@ pub(crate) struct TrainOptions {
 }
 
 /// The options that say what the model has beside colour.
+#[expect(clippy::doc_markdown, reason = "in help, {setting} stands for its default")]
 #[derive(Clone, Debug, Default, clap::Args)]
 #[command(next_help_heading = "Model")]
 pub(crate) struct ModelOptions {
@@ -110,19 +112,19 @@ pub(crate) struct ModelOptions {
     /// The constants that the paper and its code state for a benchmark: lom, realx3d or mip360-varying; other options win
     #[arg(long, value_name = "NAME")]
     preset: Option<Preset>,
-    /// Train the networks on a random crop of at most N x N pixels a step; 0: on the whole view [default: 0]
+    /// Train the networks on a random crop of at most N x N pixels a step; 0: on the whole view [default: {model.denoiser_crop}]
     #[arg(long, value_name = "N")]
     denoiser_crop: Option<u32>,
-    /// Feature maps of the denoiser [default: 64]
+    /// Feature maps of the denoiser [default: {model.network.channels}]
     #[arg(long, value_name = "N")]
     denoiser_channels: Option<u32>,
-    /// Stages of the denoiser [default: 3]
+    /// Stages of the denoiser [default: {model.network.stages}]
     #[arg(long, value_name = "N")]
     denoiser_stages: Option<u32>,
-    /// Repeats of the inner convolution in a stage [default: 6]
+    /// Repeats of the inner convolution in a stage [default: {model.network.repeats}]
     #[arg(long, value_name = "N")]
     denoiser_repeats: Option<u32>,
-    /// single, or half: 16-bit factors in the inner convolution where the device has matrices of them [default: single]
+    /// single, or half: 16-bit factors in the inner convolution where the device has matrices of them [default: {model.network.precision}]
     #[arg(long, value_name = "P")]
     denoiser_precision: Option<Precision>,
     /// A folder of depth maps, `NAME.*` or `depth_NAME.*`, larger is farther [default: `depth/` or `depth_maps/` of the dataset]
@@ -131,7 +133,7 @@ pub(crate) struct ModelOptions {
     /// The depth maps hold disparity: larger is nearer
     #[arg(long)]
     depth_is_disparity: bool,
-    /// Colours are the bare SH sum of LITA-GS instead of max(SH + 0.5, 0) [default: false]
+    /// Colours are the bare SH sum of LITA-GS instead of max(SH + 0.5, 0) [default: {model.raw_colors}]
     #[arg(long, value_name = "BOOL")]
     raw_colors: Option<bool>,
 }

@@ -4,6 +4,7 @@
 //! orientation using unit quaternions", 1987: never a mirror image), scale and translation after Umeyama 1991.
 
 use glam::{DMat3, DQuat, DVec3};
+use nalgebra::{Matrix4, SymmetricEigen};
 
 /// `point -> scale * rotation * point + translation`.
 #[derive(Clone, Copy, Debug)]
@@ -71,45 +72,14 @@ fn horn_rotation(covariance: DMat3) -> DQuat {
     let (xx, yy, zz) = (s(0, 0), s(1, 1), s(2, 2));
     let (yz, zx, xy) = (s(1, 2) - s(2, 1), s(2, 0) - s(0, 2), s(0, 1) - s(1, 0));
     let (xy2, yz2, zx2) = (s(0, 1) + s(1, 0), s(1, 2) + s(2, 1), s(2, 0) + s(0, 2));
-    let [w, x, y, z] = leading_eigenvector([
+    let quaternions = SymmetricEigen::new(Matrix4::from([
         [xx + yy + zz, yz, zx, xy],
         [yz, xx - yy - zz, xy2, zx2],
         [zx, xy2, yy - xx - zz, yz2],
         [xy, zx2, yz2, zz - xx - yy],
-    ]);
-    DQuat::from_xyzw(x, y, z, w).normalize()
-}
-
-/// The eigenvector of the largest eigenvalue of a symmetric matrix, by Jacobi rotations.
-fn leading_eigenvector(mut matrix: [[f64; 4]; 4]) -> [f64; 4] {
-    // Quadratic convergence: a 4x4 needs about six sweeps for full f64 precision.
-    const SWEEPS: usize = 16;
-    let mut vectors: [[f64; 4]; 4] =
-        std::array::from_fn(|row| std::array::from_fn(|column| f64::from(row == column)));
-    for (p, q) in (0..SWEEPS).flat_map(|_| [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]) {
-        if matrix[p][q] == 0.0 {
-            continue;
-        }
-        let theta = (matrix[q][q] - matrix[p][p]) / (2.0 * matrix[p][q]);
-        let tangent = theta.signum() / (theta.abs() + theta.hypot(1.0));
-        let cosine = 1.0 / tangent.hypot(1.0);
-        let sine = tangent * cosine;
-        for row in &mut matrix {
-            (row[p], row[q]) = (cosine * row[p] - sine * row[q], sine * row[p] + cosine * row[q]);
-        }
-        let (above, below) = (matrix[p], matrix[q]);
-        matrix[p] = std::array::from_fn(|column| cosine * above[column] - sine * below[column]);
-        matrix[q] = std::array::from_fn(|column| sine * above[column] + cosine * below[column]);
-        for row in &mut vectors {
-            (row[p], row[q]) = (cosine * row[p] - sine * row[q], sine * row[p] + cosine * row[q]);
-        }
-    }
-    let leading =
-        (1..4).fold(
-            0,
-            |best, index| if matrix[index][index] > matrix[best][best] { index } else { best },
-        );
-    vectors.map(|row| row[leading])
+    ]));
+    let leading = quaternions.eigenvectors.column(quaternions.eigenvalues.imax());
+    DQuat::from_xyzw(leading[1], leading[2], leading[3], leading[0]).normalize()
 }
 
 #[cfg(test)]

@@ -1,6 +1,6 @@
 //! Joint histograms of dark values and reference values: what a fit needs of millions of pixels.
 
-use crate::reference::luminance::measurable;
+use crate::tone::measurable;
 
 /// Reference values are counted by 8-bit code value.
 const LEVELS: usize = 256;

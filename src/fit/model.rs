@@ -1,10 +1,10 @@
 //! A family as a function of the numbers that a fit may change.
 
 use super::{FitOptions, Pair};
-use crate::reference::curves::MAX_CONSTANTS;
-use crate::reference::real::{Dual, Real};
-use crate::reference::tone::{clamped, curve_at};
-use crate::tone::{Constant, Family, Law, Statistics, ToneSettings, White};
+use crate::tone::{
+    Constant, Dual, Family, Law, Numbers, Real, Statistics, ToneSettings, White, clamped, curve_at,
+    law,
+};
 use crate::{Error, Result};
 
 /// Where a number belongs among the [`ToneSettings`].
@@ -33,16 +33,6 @@ pub(super) struct Model {
     places: Vec<Place>,
     /// In the order of every vector of values.
     pub(super) free: Vec<Constant>,
-}
-
-/// All numbers of a curve, in any arithmetic.
-struct Numbers<T> {
-    shape: [T; MAX_CONSTANTS],
-    theta: T,
-    alpha: T,
-    gain_c: T,
-    base_gain: T,
-    beta: f64,
 }
 
 /// What a photograph makes of a curve.
@@ -149,7 +139,7 @@ impl Model {
 
     /// The curve at t = x / p90, before it is clamped.
     pub(super) fn raw_value(&self, values: &[f64], frame: &Frame, t: f64) -> f64 {
-        self.at(&numbers(&self.settings(values)), frame, t)
+        self.at(&Numbers::from(&self.settings(values)), frame, t)
     }
 
     /// The derivatives of the clamped curve by every value; those that are no numbers count as 0.
@@ -171,9 +161,9 @@ impl Model {
     ) -> Vec<f64> {
         let settings = self.settings(values);
         let derivative = |&place: &Place| {
-            let mut numbers: Numbers<Dual> = numbers(&settings);
+            let mut numbers = Numbers::<Dual>::from(&settings);
             let variable = match place {
-                Place::Shape(index) => &mut numbers.shape[index],
+                Place::Shape(index) => &mut numbers.constants[index],
                 Place::Theta => &mut numbers.theta,
                 Place::Alpha => &mut numbers.alpha,
                 Place::GainC => &mut numbers.gain_c,
@@ -186,53 +176,23 @@ impl Model {
         self.places.iter().map(derivative).collect()
     }
 
-    /// As `ToneSettings::parameters` and the kernels have it, for any number.
+    /// The curve at t = x / p90, for any number.
     fn at<T: Real>(&self, numbers: &Numbers<T>, frame: &Frame, t: f64) -> T {
-        let Statistics { p80, p90, mean_luminance, mean, channel_means, .. } = frame.statistics;
-        let number = |x: f32| T::of(x.into());
-        let x = T::of(t) * number(p90);
-        let bounded = |gain: T| gain.at_least(T::of(1.0)).at_most(T::of(6.0));
-        let epsilon = T::of(1e-6);
-        let plain = [T::of(0.0), T::of(1.0)];
-        let (t, law) = match self.family.white {
-            White::One => (x, plain),
-            White::Mean => (x * numbers.theta / number(mean).at_least(T::of(1e-12)), plain),
-            White::P80 => (x * bounded(numbers.theta / number(p80)), plain),
-            White::MeanLuminance => {
-                (x * bounded(numbers.theta / (number(mean_luminance) + epsilon)), plain)
-            }
-            White::ChannelMeans => {
-                (x * numbers.theta / (number(channel_means[frame.channel]) + epsilon), plain)
-            }
-            White::P90 => {
-                let black = T::of((1.0 - frame.statistics.ratio()).powf(numbers.beta));
-                let least = match self.family.law {
-                    Law::Added => T::of(1.0),
-                    Law::Rescaled => numbers.base_gain,
-                };
-                (T::of(t), [numbers.alpha * black, least + numbers.gain_c * number(mean_luminance)])
-            }
+        let family = self.family;
+        let curve = law(family, family.white, numbers, &frame.statistics);
+        let white = match family.white {
+            White::ChannelMeans => curve.constants[frame.channel],
+            _ => curve.white,
         };
-        curve_at(self.family.curve as u32, t, law, &numbers.shape)
-    }
-}
-
-fn numbers<T: Real>(settings: &ToneSettings) -> Numbers<T> {
-    let shape = |index: usize| T::of(settings.constants.get(index).copied().unwrap_or(0.0));
-    Numbers {
-        shape: std::array::from_fn(shape),
-        theta: T::of(settings.theta),
-        alpha: T::of(settings.alpha),
-        gain_c: T::of(settings.gain_c),
-        base_gain: T::of(settings.base_gain),
-        beta: settings.beta,
+        let t = T::of(t * frame.p90()) / white;
+        curve_at(family.curve.constant(), t, [curve.offset, curve.gain], &curve.constants)
     }
 }
 
 /// The PSNR over all pixels and channels of what `settings` makes of the dark photograph, dB.
 pub fn psnr(settings: &ToneSettings, pair: &Pair) -> f64 {
     let model = Model { family: settings.curve.family(), places: vec![], free: vec![] };
-    let numbers = numbers::<f64>(settings);
+    let numbers = Numbers::<f64>::from(settings);
     let [mut count, mut squares] = [0.0; 2];
     for (channel, histogram) in pair.channels.iter().enumerate() {
         let frame = Frame::of(pair.statistics, channel);
@@ -262,11 +222,11 @@ mod tests {
             let settings = ToneSettings::new(family.curve);
             let parameters = settings.parameters(&statistics);
             let model = Model { family, places: vec![], free: vec![] };
+            let numbers = Numbers::<f64>::from(&settings);
             for x in [0.0, 0.004, 0.03, 0.13, 0.3, 0.9] {
                 for channel in 0..3 {
                     let frame = Frame::of(statistics, channel);
-                    let found =
-                        clamped(model.at(&numbers::<f64>(&settings), &frame, x / frame.p90()));
+                    let found = clamped(model.at(&numbers, &frame, x / frame.p90()));
                     let expected = if family.curve == ToneCurve::PerChannel {
                         clamped(x as f32 / parameters.constants[channel])
                     } else {

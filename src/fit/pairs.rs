@@ -7,8 +7,8 @@ use rayon::prelude::*;
 
 use super::Histogram;
 use crate::image::Image;
-use crate::reference::luminance::{luminance, measurable};
 use crate::tone::Statistics;
+use crate::tone::{luminance, measurable};
 use crate::{Error, Result};
 
 /// Folders that hold the dark photographs of a scene.

@@ -2,11 +2,37 @@
 
 use glam::UVec2;
 
-use super::log::{LogSlot, PartialSums, Term};
-use super::{Interior, check_weight, holds, no_scratch, value_count};
+use super::log::{LogSlot, PartialSums};
+use super::{Interior, LossSpec, Term, check_weight, holds, no_scratch, value_count};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::denoising;
+use crate::scene::Feature;
+
+pub(super) const SPEC: LossSpec = LossSpec {
+    feature: Some(Feature::Noise),
+    terms: &[Term::DENOISING, Term::TOTAL_VARIATION],
+    on_render: None,
+};
+
+impl Term {
+    /// Mean squared difference of denoised and rendered image.
+    pub const DENOISING: Self = Self {
+        column: "denoising",
+        name: "denoising",
+        is_likeness: false,
+        weight: |config| config.weights.denoising,
+        setting: "model.weights.denoising",
+    };
+    /// Total variation of the denoised image.
+    pub const TOTAL_VARIATION: Self = Self {
+        column: "total_variation",
+        name: "total variation",
+        weight: |config| config.weights.total_variation,
+        setting: "model.weights.total_variation",
+        ..Self::DENOISING
+    };
+}
 
 /// The weights of the terms.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -136,8 +162,8 @@ impl DenoisingLoss {
         log.record(
             pass,
             [
-                sums(Term::Denoising, &self.mse_partials, mean_scale),
-                sums(Term::TotalVariation, &self.tv_partials, 1.0),
+                sums(Term::DENOISING, &self.mse_partials, mean_scale),
+                sums(Term::TOTAL_VARIATION, &self.tv_partials, 1.0),
             ],
         )
     }

@@ -5,14 +5,75 @@
 
 use glam::UVec2;
 
-use super::log::{LogSlot, PartialSums, Term};
-use super::{check_weight, holds, no_scratch, pixel_count};
+use super::log::{LogSlot, PartialSums};
+use super::{
+    LossSpec, LossTerm, Term, TermInputs, ViewSource, check_weight, holds, no_scratch, pixel_count,
+};
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::{
     DepthGradient, DepthMoments, depth_boxes, depth_correlation, depth_gradient, depth_moments,
 };
 use crate::random::Stream;
+use crate::scene::Feature;
 use crate::{Error, Result};
+
+pub(super) const SPEC: LossSpec = LossSpec {
+    feature: Some(Feature::Depth),
+    terms: &[Term::DEPTH, Term::DEPTH_LOCAL],
+    on_render: Some(|gpu, config| {
+        let settings = DepthSettings { weight: config.weights.depth, box_side: config.depth_box };
+        let loss = DepthLoss::new(gpu, settings)?;
+        Ok(Box::new(DepthTerm { loss, boxes: config.boxes, depths: vec![] }))
+    }),
+};
+
+impl Term {
+    /// 1 - correlation of depths over the view.
+    pub const DEPTH: Self = Self {
+        column: "depth",
+        name: "depth",
+        is_likeness: false,
+        weight: |config| config.weights.depth,
+        setting: "model.weights.depth",
+    };
+    /// Mean 1 - correlation of depths over boxes.
+    pub const DEPTH_LOCAL: Self =
+        Self { column: "depth_local", name: "local depth", ..Self::DEPTH };
+}
+
+/// The term with the depth of every view that has one, (H, W) each.
+#[derive(Debug)]
+struct DepthTerm {
+    loss: DepthLoss,
+    boxes: Stream,
+    depths: Vec<Option<Buffer<f32>>>,
+}
+
+impl LossTerm for DepthTerm {
+    fn prepare(&mut self, views: &[ViewSource<'_>]) -> Result<()> {
+        let gpu = self.loss.gpu.clone();
+        for view in views {
+            self.loss.reserve(view.size)?;
+            let depth = view.depth.map(|depth| gpu.buffer("depth", depth));
+            self.depths.push(depth.transpose()?);
+        }
+        Ok(())
+    }
+
+    fn record_step(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        inputs: &TermInputs<'_>,
+        d_render: &mut Buffer<f32>,
+        log: &mut LogSlot<'_>,
+    ) -> Result<()> {
+        let &TermInputs { size, render, view, step, .. } = inputs;
+        let Some(Some(depth)) = self.depths.get(view) else { return Ok(()) };
+        let plane = inputs.plane(Feature::Depth);
+        let inputs = DepthInputs { size, render, plane, depth, stream: self.boxes, step };
+        self.loss.record(pass, inputs, d_render, log)
+    }
+}
 
 /// What the depth term weighs and where it looks.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -209,8 +270,8 @@ impl DepthLoss {
         log.record(
             pass,
             [
-                sums(Term::Depth, &self.view_value, 1),
-                sums(Term::DepthLocal, &self.box_values, boxes),
+                sums(Term::DEPTH, &self.view_value, 1),
+                sums(Term::DEPTH_LOCAL, &self.box_values, boxes),
             ],
         )
     }

@@ -1,94 +1,28 @@
 //! The log of the loss terms: one row per step, one column per term, filled on the device.
 
+use super::Term;
 use crate::gpu::{Buffer, Download, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::loss_log;
 use crate::{Error, Result};
 
-/// A loss term that the log has a column for.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Term {
-    /// Mean |render - target|.
-    L1,
-    /// Mean SSIM of render and target.
-    Ssim,
-    /// Mean |render - photograph| of the dark reconstruction.
-    LowL1,
-    /// Mean SSIM of the dark reconstruction and the photograph.
-    LowSsim,
-    /// Mean |structure - that of the target|.
-    Structure,
-    /// 1 - correlation of depths over the view.
-    Depth,
-    /// Mean 1 - correlation of depths over boxes.
-    DepthLocal,
-    /// Mean squared difference of denoised and rendered image.
-    Denoising,
-    /// Total variation of the denoised image.
-    TotalVariation,
-}
-
-impl Term {
-    /// Every term, in the order of the columns.
-    pub const ALL: [Self; 9] = [
-        Self::L1,
-        Self::Ssim,
-        Self::LowL1,
-        Self::LowSsim,
-        Self::Structure,
-        Self::Depth,
-        Self::DepthLocal,
-        Self::Denoising,
-        Self::TotalVariation,
-    ];
-
-    /// The term's column in train.csv.
-    pub const fn column(self) -> &'static str {
-        match self {
-            Self::L1 => "l1",
-            Self::Ssim => "ssim",
-            Self::LowL1 => "low_l1",
-            Self::LowSsim => "low_ssim",
-            Self::Structure => "structure",
-            Self::Depth => "depth",
-            Self::DepthLocal => "depth_local",
-            Self::Denoising => "denoising",
-            Self::TotalVariation => "total_variation",
-        }
-    }
-
-    /// What the term is called in messages and tables.
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::L1 => "L1",
-            Self::Ssim => "SSIM",
-            Self::LowL1 => "L1 of the dark reconstruction",
-            Self::LowSsim => "SSIM of the dark reconstruction",
-            Self::Structure => "structure",
-            Self::Depth => "depth",
-            Self::DepthLocal => "local depth",
-            Self::Denoising => "denoising",
-            Self::TotalVariation => "total variation",
-        }
-    }
-}
-
 /// The terms of one step.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct StepLosses {
     /// The status word behind the last term: the step counts only if it is 0.
     pub status: u32,
-    values: [f32; Term::ALL.len()],
+    /// One per term.
+    values: Vec<f32>,
 }
 
 impl StepLosses {
     /// The mean that `term` had; 0 if it was never recorded.
     pub fn get(&self, term: Term) -> f32 {
-        self.values[term as usize]
+        self.values[term.index()]
     }
 
     /// The first term that is NaN or infinite.
     pub fn first_not_finite(&self) -> Option<Term> {
-        Term::ALL.into_iter().find(|&term| !self.get(term).is_finite())
+        Term::all().find(|&term| !self.get(term).is_finite())
     }
 }
 
@@ -116,10 +50,8 @@ pub struct LogSlot<'a> {
     pub log: &'a mut LossLog,
     /// The row that this step fills.
     pub slot: u32,
-    /// The sticky status word; `not_finite_flag` is set in its first element if a term is NaN or infinite.
+    /// The status words; the first gets the bit `STATUS_NOT_FINITE` if a term is NaN or infinite.
     pub status: &'a mut Buffer<u32>,
-    /// The bits to set.
-    pub not_finite_flag: u32,
 }
 
 /// A term and the partial sums that it is the scaled sum of; with none of them its column is left as it is.
@@ -138,7 +70,7 @@ impl LossLog {
     pub fn new(gpu: &Gpu, slots: usize) -> Result<Self> {
         Ok(Self {
             pipeline: gpu.pipeline(&loss_log::Constants::default())?,
-            values: gpu.zeros("loss_log", slots * Term::ALL.len())?,
+            values: gpu.zeros("loss_log", slots * Term::all().count())?,
             statuses: gpu.zeros("step_statuses", slots)?,
         })
     }
@@ -167,8 +99,8 @@ impl LossLogDownload {
     /// The device was lost.
     pub fn wait(self) -> Result<Vec<StepLosses>> {
         let (values, statuses) = (self.values.wait()?, self.statuses.wait()?);
-        let rows = values.as_chunks().0.iter().zip(statuses);
-        Ok(rows.map(|(&values, status)| StepLosses { status, values }).collect())
+        let rows = values.chunks_exact(Term::all().count()).map(<[f32]>::to_vec).zip(statuses);
+        Ok(rows.map(|(values, status)| StepLosses { status, values }).collect())
     }
 }
 
@@ -194,11 +126,10 @@ impl LogSlot<'_> {
             &self.log.pipeline,
             &loss_log::Params {
                 slot: self.slot,
-                term_count: Term::ALL.len() as u32,
-                terms: [first.term as u32, second.term as u32].into(),
+                term_count: Term::all().count() as u32,
+                terms: [first.term.index() as u32, second.term.index() as u32].into(),
                 partial_counts: [first.count, second.count].into(),
                 mean_scales: [first.scale, second.scale].into(),
-                not_finite_flag: self.not_finite_flag,
             },
             loss_log::Buffers {
                 first_partials: first.partials,

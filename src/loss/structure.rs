@@ -2,11 +2,73 @@
 
 use glam::UVec2;
 
-use super::log::{LogSlot, PartialSums, Term};
-use super::{check_weight, holds, no_scratch, pixel_count};
+use super::log::{LogSlot, PartialSums};
+use super::{
+    LossSpec, LossTerm, Term, TermInputs, ViewSource, check_weight, holds, no_scratch, pixel_count,
+};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::structure_l1;
+use crate::scene::Feature;
+use crate::structure::StructureTarget;
+
+pub(super) const SPEC: LossSpec = LossSpec {
+    feature: Some(Feature::Structure),
+    terms: &[Term::STRUCTURE],
+    on_render: Some(|gpu, config| {
+        let loss = StructureLoss::new(gpu, config.weights.structure)?;
+        Ok(Box::new(StructureTerm { loss, structures: vec![] }))
+    }),
+};
+
+impl Term {
+    /// Mean |structure - that of the target|.
+    pub const STRUCTURE: Self = Self {
+        column: "structure",
+        name: "structure",
+        is_likeness: false,
+        weight: |config| config.weights.structure,
+        setting: "model.weights.structure",
+    };
+}
+
+/// The term with the structure of every view's pseudo-GT, (H, W) each.
+#[derive(Debug)]
+struct StructureTerm {
+    loss: StructureLoss,
+    structures: Vec<Buffer<f32>>,
+}
+
+impl LossTerm for StructureTerm {
+    fn prepare(&mut self, views: &[ViewSource<'_>]) -> Result<()> {
+        let gpu = self.loss.gpu.clone();
+        let mut structures = StructureTarget::new(&gpu)?;
+        for view in views {
+            self.loss.reserve(view.size)?;
+            let target = (view.target)()?;
+            let mut structure = gpu.uninit("structure", pixel_count(view.size) as usize)?;
+            gpu.run("structure", |pass| {
+                structures.record(pass, &target, view.size, &mut structure)
+            })?;
+            self.structures.push(structure);
+        }
+        Ok(())
+    }
+
+    fn record_step(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        inputs: &TermInputs<'_>,
+        d_render: &mut Buffer<f32>,
+        log: &mut LogSlot<'_>,
+    ) -> Result<()> {
+        let &TermInputs { size, render, view, .. } = inputs;
+        let Some(structure) = self.structures.get(view) else { return Ok(()) };
+        let plane = inputs.plane(Feature::Structure);
+        let inputs = StructureInputs { size, render, plane, structure };
+        self.loss.record(pass, inputs, d_render, log)
+    }
+}
 
 /// What one step's structure term reads.
 #[derive(Clone, Copy, Debug)]
@@ -92,7 +154,7 @@ impl StructureLoss {
             Threads::Workgroups([workgroups, 1, 1]),
         )?;
         let sums = |count| PartialSums {
-            term: Term::Structure,
+            term: Term::STRUCTURE,
             partials: &self.partials,
             count,
             scale: 1.0 / pixels as f32,

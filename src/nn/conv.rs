@@ -20,10 +20,11 @@ const STRIP_ROWS: u32 = 16;
 
 /// What follows the sum of a convolution.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u32)]
 pub(super) enum Activation {
     None = 0,
-    Relu = 1,
-    Sigmoid = 2,
+    Relu = conv3x3::RELU,
+    Sigmoid = conv3x3::SIGMOID,
 }
 
 /// How precise the factors of a convolution are; its sums are in single precision.

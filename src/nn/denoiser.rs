@@ -130,6 +130,9 @@ struct Memory {
 }
 
 impl Denoiser {
+    /// Adam's learning rate in LITA-GS.
+    pub const LEARNING_RATE: f64 = 5e-5;
+
     /// Draws the weights; memory for a view comes with [`Denoiser::reserve`].
     ///
     /// # Errors
@@ -149,7 +152,11 @@ impl Denoiser {
         Ok(Self {
             gpu: gpu.clone(),
             settings,
-            parameters: layout.upload(gpu, serde_json::json!(settings).to_string())?,
+            parameters: layout.upload(
+                gpu,
+                ("denoiser", Self::LEARNING_RATE),
+                serde_json::json!(settings).to_string(),
+            )?,
             stages,
             kernels: Kernels::new(gpu, settings)?,
             reserved,

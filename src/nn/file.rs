@@ -14,27 +14,32 @@ use crate::{Error, Result};
 /// The key of the metadata that holds the settings of every network, as one JSON object.
 const SETTINGS: &str = "networks";
 
-/// Writes each network's tensors as `prefix.name`.
+/// Writes each network's tensors as `network.tensor`.
 ///
 /// # Errors
 /// The file cannot be written, or the device was lost.
-pub fn save(path: &Path, networks: &[(&str, &Parameters)], gpu: &Gpu) -> Result<()> {
+pub fn save(path: &Path, networks: &[&Parameters], gpu: &Gpu) -> Result<()> {
     let mut settings = BTreeMap::new();
     let mut values = vec![];
-    for (prefix, parameters) in networks {
-        settings
-            .insert(*prefix, serde_json::from_str(parameters.settings()).unwrap_or(Value::Null));
+    for parameters in networks {
+        settings.insert(
+            parameters.name,
+            serde_json::from_str(parameters.settings()).unwrap_or(Value::Null),
+        );
         values.push(gpu.read(&parameters.values)?);
     }
     let failed = |error: &dyn std::fmt::Display| {
         Error::output(path, format!("cannot be written ({error}); check the folder and the disk"))
     };
     let mut views = vec![];
-    for ((prefix, parameters), values) in networks.iter().zip(&values) {
+    for (parameters, values) in networks.iter().zip(&values) {
         for tensor in parameters.tensors() {
             let bytes = bytemuck::cast_slice(&values[tensor.offset..][..tensor.len()]);
             let view = TensorView::new(Dtype::F32, tensor.shape.clone(), bytes);
-            views.push((format!("{prefix}.{}", tensor.name), view.map_err(|e| failed(&e))?));
+            views.push((
+                format!("{}.{}", parameters.name, tensor.name),
+                view.map_err(|e| failed(&e))?,
+            ));
         }
     }
     let settings = serde_json::json!(settings).to_string();
@@ -43,11 +48,11 @@ pub fn save(path: &Path, networks: &[(&str, &Parameters)], gpu: &Gpu) -> Result<
     write_whole(path, &bytes)
 }
 
-/// Reads each network's values from the tensors `prefix.name`; all networks are read, or none is changed.
+/// Reads each network's values from the tensors `network.tensor`; all networks are read, or none is changed.
 ///
 /// # Errors
 /// The file is missing or damaged, a value is not finite, or the file holds a network of another configuration.
-pub fn load(path: &Path, networks: &mut [(&str, &mut Parameters)], gpu: &Gpu) -> Result<()> {
+pub fn load(path: &Path, networks: &mut [&mut Parameters], gpu: &Gpu) -> Result<()> {
     let bytes = std::fs::read(path)
         .map_err(|error| Error::input(path, format!("cannot be read ({error})")))?;
     let damaged = |error| Error::input(path, format!("is no whole safetensors file ({error})"));
@@ -57,8 +62,9 @@ pub fn load(path: &Path, networks: &mut [(&str, &mut Parameters)], gpu: &Gpu) ->
     let settings: Value = settings.and_then(|s| serde_json::from_str(s).ok()).unwrap_or_default();
 
     let mut values = vec![];
-    for (prefix, parameters) in networks.iter() {
-        let remedy = match settings.get(*prefix) {
+    for parameters in networks.iter() {
+        let prefix = parameters.name;
+        let remedy = match settings.get(prefix) {
             Some(made_with) => format!("use the settings it was made with: {made_with}"),
             None => "use the settings it was made with".to_owned(),
         };
@@ -101,5 +107,5 @@ pub fn load(path: &Path, networks: &mut [(&str, &mut Parameters)], gpu: &Gpu) ->
     networks
         .iter_mut()
         .zip(values)
-        .try_for_each(|((_, parameters), values)| gpu.write(&mut parameters.values, &values))
+        .try_for_each(|(parameters, values)| gpu.write(&mut parameters.values, &values))
 }

@@ -2,6 +2,7 @@
 
 use crate::Result;
 use crate::gpu::{Buffer, Gpu};
+use crate::optimizer::{AdamBuffers, Learnable, Moments};
 use crate::random::Stream;
 
 /// Where a tensor lies in the array, under its name in `PyTorch`.
@@ -27,13 +28,18 @@ impl Tensor {
     }
 }
 
-/// All parameters of a network and their gradients.
+/// All parameters of a network, their gradients and what Adam keeps of them.
 #[derive(Debug)]
 pub struct Parameters {
+    /// The network's name in files.
+    pub name: &'static str,
+    /// Adam's learning rate.
+    pub learning_rate: f64,
     /// Every tensor, one behind the other.
     pub values: Buffer<f32>,
     /// dL/d values, as the last backward pass left them.
     pub gradients: Buffer<f32>,
+    moments: Moments,
     tensors: Vec<Tensor>,
     /// What the shapes follow from, as JSON.
     settings: String,
@@ -48,6 +54,21 @@ impl Parameters {
     /// What the shapes follow from, as JSON.
     pub fn settings(&self) -> &str {
         &self.settings
+    }
+}
+
+impl Learnable for Parameters {
+    fn name(&self) -> &'static str {
+        self.name
+    }
+
+    fn learning_rate(&self) -> f64 {
+        self.learning_rate
+    }
+
+    fn buffers(&mut self) -> AdamBuffers<'_> {
+        let Self { values, gradients, moments, .. } = self;
+        AdamBuffers { parameters: values, gradients, moments }
     }
 }
 
@@ -93,10 +114,18 @@ impl Layout {
 
     /// # Errors
     /// The device is out of memory.
-    pub(super) fn upload(self, gpu: &Gpu, settings: String) -> Result<Parameters> {
+    pub(super) fn upload(
+        self,
+        gpu: &Gpu,
+        (name, learning_rate): (&'static str, f64),
+        settings: String,
+    ) -> Result<Parameters> {
         Ok(Parameters {
+            name,
+            learning_rate,
             values: gpu.buffer("network_values", &self.values)?,
             gradients: gpu.zeros("network_gradients", self.values.len())?,
+            moments: Moments::zeros(gpu, self.values.len())?,
             tensors: self.tensors,
             settings,
         })

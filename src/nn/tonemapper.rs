@@ -50,6 +50,9 @@ struct Memory {
 }
 
 impl Tonemapper {
+    /// Adam's learning rate in LITA-GS.
+    pub const LEARNING_RATE: f64 = 1e-4;
+
     /// Draws the weights; memory for a view comes with [`Tonemapper::reserve`].
     ///
     /// # Errors
@@ -63,7 +66,7 @@ impl Tonemapper {
         ];
         Ok(Self {
             gpu: gpu.clone(),
-            parameters: layout.upload(gpu, "{}".to_owned())?,
+            parameters: layout.upload(gpu, ("tonemapper", Self::LEARNING_RATE), "{}".to_owned())?,
             offsets,
             convs: [
                 Conv::new(gpu, [RGB, CHANNELS], Activation::Relu, false, Precision::Single)?,

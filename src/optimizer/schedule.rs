@@ -1,61 +1,68 @@
 //! What changes with the step: learning rates, SH degree, gradient damping, density control.
 
-use crate::scene::Attribute;
+use std::collections::BTreeMap;
+use std::ops::{Index, IndexMut};
 
-/// Adam's learning rate of each attribute.
-#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct LearningRates {
-    /// Positions, in world units.
-    pub means: f64,
-    /// Quaternions.
-    pub quats: f64,
-    /// Logarithms of the scales.
-    pub log_scales: f64,
-    /// Opacities before the sigmoid.
-    pub raw_opacities: f64,
-    /// SH coefficients of degree 0.
-    pub dc: f64,
-    /// What is blended beside colour.
-    pub features: f64,
-    /// SH coefficients above degree 0.
-    pub rest: f64,
-}
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+
+use crate::attributes::{ATTRIBUTES, Attribute};
+
+/// Adam's learning rate of each attribute, by its name in TOML; that of the means in world units.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct LearningRates(pub [f64; ATTRIBUTES.len()]);
 
 impl LearningRates {
     /// One rate for every column.
     pub const fn uniform(rate: f64) -> Self {
-        Self {
-            means: rate,
-            quats: rate,
-            log_scales: rate,
-            raw_opacities: rate,
-            dc: rate,
-            features: rate,
-            rest: rate,
-        }
+        Self([rate; ATTRIBUTES.len()])
     }
 }
 
-/// Those of the attribute table.
+/// Those of the table.
 impl Default for LearningRates {
     fn default() -> Self {
-        let rate = |attribute: Attribute| attribute.spec().learning_rate;
-        Self {
-            means: rate(Attribute::Means),
-            quats: rate(Attribute::Quats),
-            log_scales: rate(Attribute::LogScales),
-            raw_opacities: rate(Attribute::RawOpacities),
-            dc: rate(Attribute::Dc),
-            features: rate(Attribute::Features),
-            rest: rate(Attribute::Rest),
+        Self(ATTRIBUTES.each_ref().map(|spec| spec.learning_rate))
+    }
+}
+
+impl Index<Attribute> for LearningRates {
+    type Output = f64;
+
+    fn index(&self, attribute: Attribute) -> &f64 {
+        &self.0[attribute as usize]
+    }
+}
+
+impl IndexMut<Attribute> for LearningRates {
+    fn index_mut(&mut self, attribute: Attribute) -> &mut f64 {
+        &mut self.0[attribute as usize]
+    }
+}
+
+impl Serialize for LearningRates {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_map(ATTRIBUTES.iter().map(|spec| spec.name).zip(self.0))
+    }
+}
+
+impl<'de> Deserialize<'de> for LearningRates {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let mut rates = Self::default();
+        for (name, rate) in BTreeMap::<String, f64>::deserialize(deserializer)? {
+            let spec = ATTRIBUTES.iter().find(|spec| spec.name == name).ok_or_else(|| {
+                let names = ATTRIBUTES.each_ref().map(|spec| spec.name).join(", ");
+                D::Error::custom(format!("unknown attribute `{name}`, expected one of {names}"))
+            })?;
+            rates[spec.attribute] = rate;
         }
+        Ok(rates)
     }
 }
 
 /// The schedules as functions of the step, counted from 1. The defaults are those of 3DGS (Kerbl et al. 2023) but for
 /// density control, which ends at step 5 000 and acts every 200 steps, as in LITA-GS.
-#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Schedule {
     /// The rates at the start; that of the means for a scene of extent 1.
@@ -95,8 +102,10 @@ impl Schedule {
     /// The rates of `step` in a scene of `extent`: the means' decay log-linearly, the others stay.
     pub fn learning_rates(&self, step: u64, extent: f64) -> LearningRates {
         let done = (step as f64 / self.means_rate_steps.max(1) as f64).min(1.0);
-        let decay = (self.final_means_rate / self.initial_rates.means).powf(done);
-        LearningRates { means: self.initial_rates.means * decay * extent, ..self.initial_rates }
+        let mut rates = self.initial_rates;
+        let decay = (self.final_means_rate / rates[Attribute::Means]).powf(done);
+        rates[Attribute::Means] = rates[Attribute::Means] * decay * extent;
+        rates
     }
 
     /// The SH degree that `step` trains, at most `max`.
@@ -130,12 +139,12 @@ mod tests {
     #[test]
     fn the_means_rate_decays_a_hundredfold_and_stays() {
         let schedule = Schedule::default();
-        let rate = |step| schedule.learning_rates(step, 2.0).means;
+        let rate = |step| schedule.learning_rates(step, 2.0)[Attribute::Means];
         assert!((rate(0) - 3.2e-4).abs() < 1e-12);
         assert!((rate(15_000) - 3.2e-5).abs() < 1e-12);
         assert!((rate(30_000) - 3.2e-6).abs() < 1e-12);
         assert!((rate(90_000) - 3.2e-6).abs() < 1e-12);
-        assert_eq!(schedule.learning_rates(7, 2.0).quats, 0.001);
+        assert_eq!(schedule.learning_rates(7, 2.0)[Attribute::Quats], 0.001);
     }
 
     #[test]
@@ -169,7 +178,7 @@ mod tests {
             densify_interval: 0,
             ..Default::default()
         };
-        assert!(schedule.learning_rates(1, 1.0).means.is_finite());
+        assert!(schedule.learning_rates(1, 1.0)[Attribute::Means].is_finite());
         assert_eq!(schedule.sh_degree(2, 3), 2);
         assert!(schedule.densifies_at(501));
     }

@@ -1,50 +1,34 @@
-use super::real::Real;
 use super::rounding::Rounded;
+use crate::attributes::{Attribute, planes};
 use crate::gpu::{Reference, Tolerance};
-use crate::kernels::adam::{Constants, Kernel, Params, Slices, Tolerances};
+use crate::kernels::adam::{
+    BETA1, BETA2, Constants, EPSILON, GRADIENT_BOUND, Kernel, LOG_SCALE_MAX, LOG_SCALE_MIN, Params,
+    Slices, Tolerances,
+};
+use crate::tone::Real;
 
-// A compiler folds 1 - beta in double precision.
-const BETA1: f64 = 0.9;
-const BETA2: f64 = 0.999;
-const EPSILON: f32 = 1e-15;
-const GRADIENT_BOUND: f32 = 1e18;
-
-/// The bounds of the natural logarithm of a scale.
-pub(super) const LOG_SCALE_BOUNDS: [f32; 2] = [-30.0, 13.0];
-
-fn rate_of(params: &Params, column: usize) -> f32 {
-    match column {
-        0..3 => params.means_rate,
-        3..7 => params.quats_rate,
-        7..10 => params.log_scales_rate,
-        10 => params.raw_opacities_rate,
-        11..14 => params.dc_rate,
-        _ if column < 14 + params.feature_count as usize => params.features_rate,
-        _ => params.rest_rate,
-    }
-}
-
-/// The parameter and both moments after the step.
+/// The parameter and both moments after the step. A compiler folds 1 - beta in double precision.
 fn updated<T: Real>(params: &Params, column: usize, [p, g, m, v]: [f32; 4]) -> [T; 3] {
     let of = |x: f32| T::of(x.into());
-    let g = if g.is_finite() { g.clamp(-GRADIENT_BOUND, GRADIENT_BOUND) } else { 0.0 };
+    let planes = planes(params.feature_count as usize, params.column_count as usize);
+    let plane = planes.iter().rposition(|(first, width)| *width > 0 && column >= *first);
+    let plane = plane.unwrap_or_default();
+    let bound = GRADIENT_BOUND as f32;
+    let g = if g.is_finite() { g.clamp(-bound, bound) } else { 0.0 };
     let [old, new] = [BETA1, 1.0 - BETA1].map(|beta| of(beta as f32));
     let m = old * of(m) + new * of(g);
     let [old, new] = [BETA2, 1.0 - BETA2].map(|beta| of(beta as f32));
     let v = old * of(v) + new * of(g) * of(g);
-    let step =
-        of(rate_of(params, column)) * m / (v.sqrt() * of(params.second_correction) + of(EPSILON));
-    let p = of(p) - step;
-    let [low, high] = LOG_SCALE_BOUNDS.map(of);
-    // Phrased so that a NaN stays one.
-    let bounded = if p < low {
-        low
-    } else if p > high {
-        high
-    } else {
-        p
+    let divisor = v.sqrt() * of(params.second_correction) + of(EPSILON as f32);
+    let p = of(p) - of(params.rates[plane]) * m / divisor;
+    let [low, high] = [LOG_SCALE_MIN, LOG_SCALE_MAX].map(|bound| of(bound as f32));
+    let bounded = match plane == Attribute::LogScales as usize {
+        // Phrased so that a NaN stays one.
+        true if p < low => low,
+        true if p > high => high,
+        _ => p,
     };
-    [if (7..10).contains(&column) { bounded } else { p }, m, v]
+    [bounded, m, v]
 }
 
 impl Reference for Kernel {

@@ -8,8 +8,9 @@ use super::rounding::{UNIT, chain};
 use super::splat::{Splat, fragments};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::blend_backward::{Constants, Kernel, Params, Slices, Tolerances};
+use crate::kernels::splat::RECORD_HEAD;
 
-/// Adds to `records` (splats, 6 + channels) what one pixel with the values `render` and the gradient `d_render` says:
+/// Adds to `records` (splats, record) what one pixel with the values `render` and the gradient `d_render` says:
 /// the gradients of mean2d, conic, opacity and colours.
 pub fn blend_pixel_backward(
     splats: &[Splat],
@@ -20,16 +21,16 @@ pub fn blend_pixel_backward(
     alpha_max: f64,
     records: &mut [f64],
 ) {
-    let channels = render.len();
+    let (channels, head) = (render.len(), RECORD_HEAD as usize);
     let mut light = render.to_vec();
     for fragment in fragments(splats, pixel, alpha_max).0 {
         let Splat { conic, opacity, .. } = splats[fragment.index];
-        let record = &mut records[(6 + channels) * fragment.index..][..6 + channels];
+        let record = &mut records[(head + channels) * fragment.index..][..head + channels];
         let weight = fragment.alpha * fragment.before;
         let mut d_alpha = 0.0;
         for c in 0..channels {
             let color = colors[channels * fragment.index + c];
-            record[6 + c] += weight * d_render[c];
+            record[head + c] += weight * d_render[c];
             d_alpha += (fragment.before * color - light[c]) * d_render[c];
             light[c] -= weight * color;
         }
@@ -64,7 +65,8 @@ fn for_each_tile(
 ) {
     let Slices { tile_ranges, sorted_slots, owners, splats, colors, render, d_render, .. } = slices;
     let (channels, pixels) = (constants.channels as usize, params.size.element_product() as usize);
-    let (record, tile) = (6 + channels, UVec2::new(constants.tile_width, constants.tile_height));
+    let record = RECORD_HEAD as usize + channels;
+    let tile = UVec2::new(constants.tile_width, constants.tile_height);
     for index in 0..params.tile_columns * params.size.y.div_ceil(tile.y) {
         let range = tile_ranges[index as usize];
         let slots = &sorted_slots[range.x as usize..range.y as usize];
@@ -94,11 +96,12 @@ fn add_bounds(constants: &Constants, list: &TileList, pixel: &Pixel, bounds: &mu
     let d_sum: f64 = (0..channels).map(d).sum();
     let light: f64 = (0..channels).map(|c| pixel.render[c].abs() * d(c)).sum();
     let light_error = model.error * list.largest_color(&pixel.render) * d_sum;
+    let head = RECORD_HEAD as usize;
     // Every sum is over the pixels of the tile.
     let own = (chain(tile.element_product() as usize) + 64.0) * UNIT;
     for &(fragment, alpha_error) in &model.fragments {
         let Splat { conic, .. } = list.splats[fragment.index];
-        let bound = &mut bounds[(6 + channels) * fragment.index..][..6 + channels];
+        let bound = &mut bounds[(head + channels) * fragment.index..][..head + channels];
         let color = &list.colors[channels * fragment.index..][..channels];
         let share: f64 = (0..channels).map(|c| fragment.before * color[c].abs() * d(c)).sum();
         let rounded = 2.0 * alpha_error / (1.0 - fragment.alpha) + own;
@@ -114,7 +117,7 @@ fn add_bounds(constants: &Constants, list: &TileList, pixel: &Pixel, bounds: &mu
         bound[4] += d_sigma * 0.5 * offset.y * offset.y;
         bound[5] += d_alpha * fragment.falloff;
         let weight = fragment.alpha * fragment.before;
-        (0..channels).for_each(|c| bound[6 + c] += weight * (relative + model.error) * d(c));
+        (0..channels).for_each(|c| bound[head + c] += weight * (relative + model.error) * d(c));
     }
 }
 

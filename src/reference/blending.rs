@@ -7,7 +7,8 @@
 use glam::{DVec2, UVec2};
 
 use super::rounding::UNIT;
-use super::splat::{ALPHA_MIN, Fragment, Splat, TRANSMITTANCE_MIN};
+use super::splat::{Fragment, Splat};
+use crate::kernels::splat::{ALPHA_MIN, TRANSMITTANCE_MIN};
 
 /// One pixel, and how far a device may be from it.
 pub(super) struct PixelModel {

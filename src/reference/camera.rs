@@ -1,9 +1,9 @@
 //! The pinhole camera of `include/camera.glsl`, in f64.
 
-use glam::{DMat3, DVec2, DVec3, DVec4, UVec2, Vec2};
+use glam::{DMat3, DVec2, DVec3, DVec4};
 
-/// How far outside the image, in widths and heights, the Jacobian of the projection is still taken.
-pub const JACOBIAN_MARGIN: f64 = 0.15;
+use crate::kernels;
+use crate::kernels::camera::JACOBIAN_MARGIN;
 
 /// A view as the parameters of the projecting kernels describe it.
 #[derive(Clone, Debug)]
@@ -20,25 +20,21 @@ pub struct Camera {
     pub size: DVec2,
 }
 
-impl Camera {
-    /// From the parameters of `project` and `project_backward`.
-    pub fn new(
-        view_from_world: [[f32; 3]; 4],
-        focal: Vec2,
-        principal_point: Vec2,
-        size: UVec2,
-    ) -> Self {
+impl From<&kernels::Camera> for Camera {
+    fn from(camera: &kernels::Camera) -> Self {
         let [x, y, z, translation] =
-            view_from_world.map(|column| DVec3::from(column.map(f64::from)));
+            camera.view_from_world.map(|column| DVec3::from(column.map(f64::from)));
         Self {
             rotation: DMat3::from_cols(x, y, z),
             translation,
-            focal: focal.as_dvec2(),
-            principal_point: principal_point.as_dvec2(),
-            size: size.as_dvec2(),
+            focal: camera.focal.as_dvec2(),
+            principal_point: camera.principal_point.as_dvec2(),
+            size: camera.size.as_dvec2(),
         }
     }
+}
 
+impl Camera {
     /// A point of the world in view coordinates.
     pub fn view(&self, point: DVec3) -> DVec3 {
         self.rotation * point + self.translation

@@ -3,12 +3,10 @@
 use glam::{Vec2, Vec3};
 
 use super::ciconv_rows::taps;
-use super::real::Real;
 use super::rounding::{Rounded, chain};
 use crate::gpu::Reference;
-use crate::kernels::ciconv_columns::{Constants, Kernel, Params, Slices, Tolerances};
-
-const EPSILON: f64 = 1e-5;
+use crate::kernels::ciconv_columns::{Constants, EPSILON, Kernel, Params, Slices, Tolerances};
+use crate::tone::Real;
 
 /// ln(W + 1e-5) of every pixel.
 fn log_invariants(params: &Params, smooth_rows: &[Vec3], slope_rows: &[Vec3]) -> Vec<Rounded> {

@@ -1,9 +1,9 @@
 use glam::Vec2;
 
-use super::real::Real;
 use super::rounding::{Rounded, chain};
 use crate::gpu::Reference;
-use crate::kernels::ciconv_moments::{Constants, Kernel, Params, Slices, Tolerances};
+use crate::kernels::ciconv_moments::{Constants, EPSILON, Kernel, Params, Slices, Tolerances};
+use crate::tone::Real;
 
 /// Mean and 1 / standard deviation, from the moments of the workgroups.
 fn norm(params: &Params, moments: &[Vec2]) -> [Rounded; 2] {
@@ -23,7 +23,7 @@ fn norm(params: &Params, moments: &[Vec2]) -> [Rounded; 2] {
         Rounded::exact(of.y) + count * deviation * deviation
     });
     let variance = Rounded::sum(chain, squares) / all;
-    [pivot + shift, Rounded::of(1.0) / (variance + Rounded::of(1e-5)).sqrt()]
+    [pivot + shift, Rounded::of(1.0) / (variance + Rounded::of(EPSILON)).sqrt()]
 }
 
 impl Reference for Kernel {

@@ -3,7 +3,7 @@
 use super::rounding::UNIT;
 use super::ssim_forward::widen;
 use crate::gpu::{Reference, Tolerance};
-use crate::kernels::conv3x3::{Constants, Kernel, Params, Slices, Tolerances};
+use crate::kernels::conv3x3::{Constants, Kernel, Params, RELU, SIGMOID, Slices, Tolerances};
 
 /// Calls `visit(pixel, tap, neighbour)` for each of the nine neighbours of each pixel that lie in the image.
 pub(super) fn for_each_tap(
@@ -68,8 +68,8 @@ pub fn data_gradient(
 pub fn activate(activation: u32, x: f64) -> f64 {
     match activation {
         // A NaN stays one.
-        1 if x < 0.0 => 0.0,
-        2 => 1.0 / (1.0 + (-x).exp()),
+        RELU if x < 0.0 => 0.0,
+        SIGMOID => 1.0 / (1.0 + (-x).exp()),
         _ => x,
     }
 }
@@ -115,7 +115,7 @@ impl Reference for Kernel {
         let magnitudes = sums(params, constants.transposed, values, source, f64::abs);
         let bound = |(magnitude, target): (f64, &f32)| {
             let sigmoid =
-                if constants.activation == 2 { (8.0 + 4.0 * magnitude) * UNIT } else { 0.0 };
+                if constants.activation == SIGMOID { (8.0 + 4.0 * magnitude) * UNIT } else { 0.0 };
             let kept = if constants.accumulate { f64::from(target.abs()) } else { 0.0 };
             sum_error(params, magnitude) + sigmoid + 2.0 * UNIT * (magnitude + kept)
         };

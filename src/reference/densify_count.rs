@@ -1,17 +1,8 @@
 use super::rounding::UNIT;
+use crate::attributes::{Attribute, planes};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::densify_count::{Constants, Kernel, Params, Slices, Tolerances};
-
-pub(super) const PRUNE: u32 = 0;
-pub(super) const KEEP: u32 = 1;
-pub(super) const CLONE: u32 = 2;
-pub(super) const SPLIT: u32 = 3;
-
-/// First column and width of every plane.
-pub(super) fn planes(feature_count: usize, column_count: usize) -> [(usize, usize); 7] {
-    let rest = 14 + feature_count;
-    [(0, 3), (3, 4), (7, 3), (10, 1), (11, 3), (14, feature_count), (rest, column_count - rest)]
-}
+use crate::kernels::fate::{FATE_CLONE, FATE_KEEP, FATE_PRUNE, FATE_SPLIT};
 
 fn mean_gradient(slices: &Slices<'_>, i: usize) -> f32 {
     match slices.visit_counts[i] {
@@ -23,22 +14,24 @@ fn mean_gradient(slices: &Slices<'_>, i: usize) -> f32 {
 impl Reference for Kernel {
     fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
         let n = params.gaussian_count as usize;
+        let first = |attribute: Attribute| attribute.column(0) * n;
+        let (opacities, log_scales) = (first(Attribute::RawOpacities), first(Attribute::LogScales));
         for i in 0..n {
             let [features, columns] =
                 [params.feature_count, params.column_count].map(|n| n as usize);
             let is_finite = planes(features, columns).iter().all(|(column, width)| {
                 (0..*width).all(|k| slices.parameters[column * n + width * i + k].abs() < 3e38)
             });
-            let is_visible = slices.parameters[10 * n + i] >= params.min_raw_opacity;
+            let is_visible = slices.parameters[opacities + i] >= params.min_raw_opacity;
             let largest =
-                (0..3).map(|k| slices.parameters[7 * n + 3 * i + k]).fold(f32::MIN, f32::max);
+                (0..3).map(|k| slices.parameters[log_scales + 3 * i + k]).fold(f32::MIN, f32::max);
             let mean_gradient = mean_gradient(&slices, i);
             let fate = if !is_finite || !is_visible {
-                PRUNE
+                FATE_PRUNE
             } else if mean_gradient > params.gradient_threshold {
-                if largest > params.split_log_scale { SPLIT } else { CLONE }
+                if largest > params.split_log_scale { FATE_SPLIT } else { FATE_CLONE }
             } else {
-                KEEP
+                FATE_KEEP
             };
             slices.mean_gradients[i] = mean_gradient;
             slices.fates[i] = fate;
@@ -51,7 +44,7 @@ impl Reference for Kernel {
         let threshold = f64::from(params.gradient_threshold);
         let either = |i: usize| {
             let distance = (f64::from(mean_gradient(&slices, i)) - threshold).abs();
-            if distance <= ROUNDINGS * UNIT * threshold { f64::from(SPLIT) } else { 0.0 }
+            if distance <= ROUNDINGS * UNIT * threshold { f64::from(FATE_SPLIT) } else { 0.0 }
         };
         let fates: Vec<f64> = (0..params.gaussian_count as usize).map(either).collect();
         Tolerances {

@@ -2,11 +2,11 @@
 
 use glam::Vec2;
 
-use super::real::Real;
 use super::rounding::{Rounded, chain};
 use crate::gpu::Reference;
 use crate::kernels::DepthGradient;
-use crate::kernels::depth_correlation::{Constants, Kernel, Params, Slices, Tolerances};
+use crate::kernels::depth_correlation::{Constants, EPSILON, Kernel, Params, Slices, Tolerances};
+use crate::tone::Real;
 
 /// P, and what multiplies a - mean a and b - mean b in its gradient with respect to a.
 #[derive(Clone, Copy, Debug)]
@@ -27,7 +27,7 @@ pub fn pearson<T: Real>(n: f64, [aa, ab, bb]: [T; 3]) -> Pearson<T> {
     }
     let [all, others] = [T::of(n), T::of(n - 1.0)];
     let [deviation_a, deviation_b] = [aa, bb].map(|sum| (sum / others).sqrt());
-    let [a, b] = [deviation_a, deviation_b].map(|deviation| deviation + T::of(1e-6));
+    let [a, b] = [deviation_a, deviation_b].map(|deviation| deviation + T::of(EPSILON));
     let correlation = ab / all / a / b;
     Pearson {
         value: one - correlation,

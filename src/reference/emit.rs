@@ -4,9 +4,7 @@ use super::rounding::UNIT;
 use super::splat::{extent_error, splat_tile_rows, splat_tiles};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::ProjectedSplat;
-use crate::kernels::emit::{Constants, Kernel, Params, Slices, Tolerances};
-
-const NO_TILE: u32 = u32::MAX;
+use crate::kernels::emit::{Constants, Kernel, NO_TILE, Params, Slices, Tolerances};
 
 /// The tiles that the splat covers, row by row.
 fn covered(params: &Params, constants: &Constants, splat: &ProjectedSplat) -> Vec<u32> {

@@ -1,8 +1,10 @@
-//! One Gaussian's attributes in the planes of `include/gaussian.glsl`.
+//! One Gaussian's attributes in the planes of [`attributes`](crate::attributes).
+
+use std::ops::Range;
 
 use glam::{DVec3, DVec4};
 
-use super::sh::sh_count;
+use crate::attributes::{column_count, planes};
 
 /// A Gaussian, or the gradient of one, in f64.
 #[derive(Clone, Debug, PartialEq)]
@@ -35,7 +37,7 @@ pub struct Planes {
 impl Planes {
     /// Floats of the whole array.
     pub fn len(self) -> usize {
-        self.count * (11 + self.feature_count + 3 * sh_count(self.sh_degree))
+        self.count * column_count(self.feature_count, self.sh_degree)
     }
 
     /// True where there is no Gaussian.
@@ -45,9 +47,8 @@ impl Planes {
 
     /// Where Gaussian `i` has its floats, in the order of [`Gaussian`].
     fn places(self, i: usize) -> impl Iterator<Item = usize> {
-        let (features, rest) = (self.feature_count, 3 * (sh_count(self.sh_degree) - 1));
-        let planes =
-            [(0, 3), (3, 4), (7, 3), (10, 1), (14, features), (11, 3), (14 + features, rest)];
+        let columns = column_count(self.feature_count, self.sh_degree);
+        let planes = planes(self.feature_count, columns);
         planes.into_iter().flat_map(move |(column, width)| {
             let first = column * self.count + width * i;
             first..first + width
@@ -62,19 +63,24 @@ impl Planes {
             quat: DVec4::from_slice(&v[3..7]),
             log_scale: DVec3::from_slice(&v[7..10]),
             raw_opacity: v[10],
-            features: v[11..11 + self.feature_count].to_vec(),
-            sh: v[11 + self.feature_count..].chunks_exact(3).map(DVec3::from_slice).collect(),
+            features: v[14..14 + self.feature_count].to_vec(),
+            sh: [&v[11..14], &v[14 + self.feature_count..]]
+                .into_iter()
+                .flat_map(|sh| sh.chunks_exact(3).map(DVec3::from_slice))
+                .collect(),
         }
     }
 
     /// Writes Gaussian `i` through `set`, which takes the place in the array and the value.
     pub fn store(self, gaussian: &Gaussian, i: usize, mut set: impl FnMut(usize, f64)) {
+        let sh = |range: Range<usize>| gaussian.sh[range].iter().flat_map(DVec3::to_array);
         let values = (gaussian.mean.to_array().into_iter())
             .chain(gaussian.quat.to_array())
             .chain(gaussian.log_scale.to_array())
             .chain([gaussian.raw_opacity])
+            .chain(sh(0..1))
             .chain(gaussian.features.iter().copied())
-            .chain(gaussian.sh.iter().flat_map(|coefficient| coefficient.to_array()));
+            .chain(sh(1..gaussian.sh.len()));
         self.places(i).zip(values).for_each(|(at, value)| set(at, value));
     }
 }

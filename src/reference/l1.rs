@@ -1,6 +1,5 @@
 use super::inside;
-use super::rounding::{Rounded, chain};
-use super::tone::rounded_tone_curve;
+use super::rounding::{Rounded, chain, rounded_tone_curve};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::l1::{Constants, Kernel, Params, Slices, Tolerances};
 

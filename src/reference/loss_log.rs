@@ -1,6 +1,7 @@
 use super::rounding::{Rounded, chain};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::loss_log::{Constants, Kernel, Params, Slices, Tolerances};
+use crate::kernels::status::STATUS_NOT_FINITE;
 
 /// The mean of a term.
 fn mean(params: &Params, partials: &[f32], term: usize) -> Rounded {
@@ -22,7 +23,7 @@ impl Reference for Kernel {
                 log[row + params.terms[term] as usize] = mean;
             }
             if !mean.is_finite() {
-                status[0] |= params.not_finite_flag;
+                status[0] |= STATUS_NOT_FINITE;
             }
         }
         statuses[params.slot as usize] = status[0];

@@ -4,6 +4,8 @@ use super::CompensatedSum;
 use crate::gpu::Reference;
 use crate::kernels::RankSearch;
 use crate::kernels::luminance::{Constants, Kernel, Params, Slices};
+use crate::kernels::rank_search::{FIRST_SHIFT, WORKGROUP};
+use crate::tone::{luminance, measurable};
 
 impl Reference for Kernel {
     fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
@@ -16,28 +18,18 @@ impl Reference for Kernel {
         let thread_count = params.thread_count as usize;
         for thread in 0..thread_count {
             let mut total = CompensatedSum::default();
-            // A workgroup of 256 takes a run of pixels, a thread every 256th of them.
-            let run = pixel_count.div_ceil(256).div_ceil(thread_count / 256) * 256;
-            let (workgroup, local) = (thread / 256, thread % 256);
+            // A workgroup takes a run of pixels, a thread every 256th of them.
+            let size = WORKGROUP as usize;
+            let run = pixel_count.div_ceil(size).div_ceil(thread_count / size) * size;
+            let (workgroup, local) = (thread / size, thread % size);
             let end = pixel_count.min((workgroup + 1) * run);
-            for i in (workgroup * run + local..end).step_by(256) {
+            for i in (workgroup * run + local..end).step_by(size) {
                 let [r, g, b] = [0, 1, 2].map(|plane| measurable(image[plane * pixel_count + i]));
                 luminances[i] = luminance([r, g, b]);
-                histograms[(luminances[i].to_bits() >> 20) as usize] += 1;
+                histograms[(luminances[i].to_bits() >> FIRST_SHIFT) as usize] += 1;
                 total.add(Vec3::new(r, g, b));
             }
             sums[params.first_sum as usize + thread] = total.sum;
         }
     }
-}
-
-/// BT.601 luminance of an RGB value, in the kernel's order of operations.
-pub(crate) fn luminance([r, g, b]: [f32; 3]) -> f32 {
-    0.299 * r + 0.587 * g + 0.114 * b
-}
-
-/// A value the statistics can take: finite, not negative.
-pub(crate) fn measurable(x: f32) -> f32 {
-    // Positive phrasing: a NaN fails it too.
-    if x > 0.0 { x.min(65504.0) } else { 0.0 }
 }

@@ -1,5 +1,6 @@
 use crate::gpu::Reference;
 use crate::kernels::luminance_histogram::{Constants, Kernel, Params, Slices};
+use crate::kernels::rank_search::{BINS, DIGIT_BITS, SEARCHES};
 
 impl Reference for Kernel {
     fn run(
@@ -7,12 +8,13 @@ impl Reference for Kernel {
         _: &Constants,
         Slices { luminances, searches, histograms }: Slices<'_>,
     ) {
-        let searches = &searches[params.first_search as usize..][..4];
+        let searches = &searches[params.first_search as usize..][..SEARCHES as usize];
         for luminance in &luminances[..params.pixel_count as usize] {
             let digits = luminance.to_bits() >> params.shift;
-            let mut matching = searches.iter().filter(|search| search.prefix == digits >> 10);
+            let mut matching =
+                searches.iter().filter(|search| search.prefix == digits >> DIGIT_BITS);
             if let Some(search) = matching.next() {
-                histograms[(search.histogram * 1024 + digits % 1024) as usize] += 1;
+                histograms[(search.histogram * BINS + digits % BINS) as usize] += 1;
             }
         }
     }

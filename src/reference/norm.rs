@@ -1,15 +1,16 @@
 //! The norm of one channel, in any number: statistics of the image itself, biased variance, affine, `ReLU`.
 
-use super::real::Real;
 use super::rounding::{Gated, Rounded};
 use crate::kernels::ChannelStatistics;
+use crate::kernels::norm_merge::EPSILON;
+use crate::tone::Real;
 
 /// Mean and 1 / standard deviation.
 #[derive(Clone, Copy, Debug)]
 pub struct Statistics<T = f64> {
     /// Mean of the channel.
     pub mean: T,
-    /// 1 / sqrt(variance + 1e-5).
+    /// 1 / sqrt(variance + EPSILON).
     pub inverse_deviation: T,
 }
 
@@ -33,7 +34,7 @@ impl Statistics {
 
 impl<T: Real> Statistics<T> {
     pub(super) fn new(mean: T, variance: T) -> Self {
-        Self { mean, inverse_deviation: T::of(1.0) / (variance + T::of(1e-5)).sqrt() }
+        Self { mean, inverse_deviation: T::of(1.0) / (variance + T::of(EPSILON)).sqrt() }
     }
 
     /// (z - mean) / deviation.

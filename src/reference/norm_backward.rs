@@ -1,8 +1,8 @@
 use super::norm::{affine, backward, plane};
-use super::real::Real;
 use super::rounding::{Rounded, values};
 use crate::gpu::Reference;
 use crate::kernels::norm_backward::{Constants, Kernel, Params, Slices, Tolerances};
+use crate::tone::Real;
 
 /// The gradient of every value of every channel.
 fn d_source(params: &Params, slices: &Slices<'_>) -> Vec<Rounded> {

@@ -1,12 +1,13 @@
 use crate::gpu::Reference;
 use crate::kernels::RankSearch;
 use crate::kernels::percentile_select::{Constants, Kernel, Params, Slices};
+use crate::kernels::rank_search::{BINS, SEARCHES};
 
 impl Reference for Kernel {
     fn run(params: &Params, _: &Constants, Slices { searches, histograms }: Slices<'_>) {
-        let searches = &mut searches[params.first_search as usize..][..4];
+        let searches = &mut searches[params.first_search as usize..][..SEARCHES as usize];
         for search in searches.iter_mut() {
-            let first = search.histogram * 1024;
+            let first = search.histogram * BINS;
             let mut digit = 0;
             while digit < (1 << params.digit_bits) - 1
                 && search.rank >= histograms[(first + digit) as usize]

@@ -6,14 +6,11 @@ use super::camera::{Camera, rotation, unit_quat};
 use super::gaussian::{Gaussian, Planes, sigmoid};
 use super::rounding::{UNIT, sensitivity};
 use super::sh::sh_basis;
-use super::splat::{
-    ALPHA_MIN, DILATION, Splat, extent_error, splat_level, splat_tile_rows, splat_tiles,
-};
+use super::splat::{Splat, extent_error, splat_level, splat_tile_rows, splat_tiles};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::ProjectedSplat;
-use crate::kernels::project::{Constants, Kernel, Params, Slices, Tolerances};
-
-const CULLED: u32 = u32::MAX;
+use crate::kernels::project::{CULLED, Constants, Kernel, Params, Slices, Tolerances};
+use crate::kernels::splat::{ALPHA_MIN, DILATION};
 
 /// What one Gaussian is on the image plane.
 #[derive(Clone, Debug)]
@@ -96,9 +93,9 @@ impl Projection {
 /// The tiles of an image that a splat covers.
 fn tile_count(params: &Params, constants: &Constants, splat: &ProjectedSplat) -> u32 {
     let tile = UVec2::new(constants.tile_width, constants.tile_height);
-    let [top, bottom] = splat_tile_rows(splat, params.size.y, tile);
+    let [top, bottom] = splat_tile_rows(splat, params.camera.size.y, tile);
     let row = |row| {
-        let [first, end] = splat_tiles(splat, row, params.size.x, tile);
+        let [first, end] = splat_tiles(splat, row, params.camera.size.x, tile);
         end - first
     };
     (top..bottom).map(row).sum()
@@ -114,11 +111,10 @@ struct Scene<'a> {
 
 impl<'a> Scene<'a> {
     fn new(params: &'a Params, constants: &'a Constants) -> Self {
-        let &Params { view_from_world, focal, principal_point, size, .. } = params;
         let (count, feature_count) =
             (params.gaussian_count as usize, constants.channels as usize - 3);
         let planes = Planes { count, feature_count, sh_degree: constants.sh_degree };
-        let camera = Camera::new(view_from_world, focal, principal_point, size);
+        let camera = Camera::from(&params.camera);
         Self { params, constants, camera, planes }
     }
 

@@ -9,6 +9,7 @@ use super::sh::{sh_basis, sh_basis_gradient};
 use super::splat::Splat;
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::project_backward::{Constants, Kernel, Params, Slices, Tolerances};
+use crate::kernels::splat::RECORD_HEAD;
 
 /// The gradients that arrive at one splat.
 #[derive(Clone, Debug)]
@@ -119,6 +120,9 @@ fn outer_product(column: DVec3, row: DVec3) -> DMat3 {
     DMat3::from_cols(column * row.x, column * row.y, column * row.z)
 }
 
+/// Numbers of a record before its channels.
+const HEAD: usize = RECORD_HEAD as usize;
+
 /// A view, and the Gaussians in it.
 struct Scene<'a> {
     params: &'a Params,
@@ -129,11 +133,10 @@ struct Scene<'a> {
 
 impl<'a> Scene<'a> {
     fn new(params: &'a Params, constants: &'a Constants) -> Self {
-        let &Params { view_from_world, focal, principal_point, size, .. } = params;
         let (count, feature_count) =
             (params.gaussian_count as usize, constants.channels as usize - 3);
         let planes = Planes { count, feature_count, sh_degree: constants.sh_degree };
-        let camera = Camera::new(view_from_world, focal, principal_point, size);
+        let camera = Camera::from(&params.camera);
         Self { params, constants, camera, planes }
     }
 
@@ -141,13 +144,13 @@ impl<'a> Scene<'a> {
     fn d_splat(&self, colors: &[f32], record: &[f64], i: usize) -> DSplat {
         let first = self.constants.channels as usize * i;
         let is_free = |c: usize| self.constants.raw_colors || colors[first + c] > 0.0;
-        let passes = |c: usize| if is_free(c) { record[6 + c] } else { 0.0 };
+        let passes = |c: usize| if is_free(c) { record[HEAD + c] } else { 0.0 };
         DSplat {
             mean2d: DVec2::from_slice(record),
             conic: DVec3::from_slice(&record[2..]),
             opacity: record[5],
             color: DVec3::from_array([0, 1, 2].map(passes)),
-            features: record[9..].to_vec(),
+            features: record[HEAD + 3..].to_vec(),
         }
     }
 
@@ -166,7 +169,7 @@ impl<'a> Scene<'a> {
 
     /// The record of Gaussian `i`.
     fn record(&self, d_splats: &[f32], i: usize) -> Vec<f64> {
-        let len = 6 + self.constants.channels as usize;
+        let len = HEAD + self.constants.channels as usize;
         d_splats[len * i..][..len].iter().map(|&d| d.into()).collect()
     }
 }

@@ -1,10 +1,11 @@
 use crate::gpu::Reference;
 use crate::kernels::reduce_records::{Constants, Kernel, Params, Slices};
+use crate::kernels::splat::RECORD_HEAD;
 
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
         let Slices { counts, sorted_ids, ordered_counts, offsets, records, d_splats } = slices;
-        let record = 6 + constants.channels as usize;
+        let record = (RECORD_HEAD + constants.channels) as usize;
         for rank in 0..params.gaussian_count as usize {
             let d_splat = &mut d_splats[record * sorted_ids[rank] as usize..][..record];
             d_splat.fill(0.0);

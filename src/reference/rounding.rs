@@ -4,8 +4,9 @@
 use std::cmp::Ordering;
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
-use super::real::Real;
 use crate::gpu::Tolerance;
+use crate::kernels::ToneParameters;
+use crate::tone::{Real, curve_at};
 
 /// The relative error of one rounding; half a unit in the last place (ulp).
 pub const UNIT: f64 = f32::EPSILON as f64 / 2.0;
@@ -106,6 +107,13 @@ impl Rounded {
     pub(super) fn bound(self) -> f64 {
         self.error + UNIT * self.value.abs()
     }
+}
+
+/// The pseudo-GT value in [0, 1] of the sRGB-encoded value `x` under the curve `curve` (a `CURVE_*`).
+pub(super) fn rounded_tone_curve(curve: u32, x: f32, tone: &ToneParameters) -> Rounded {
+    let [x, white, offset, gain] = [x, tone.white, tone.offset, tone.gain].map(Rounded::exact);
+    let y = curve_at(curve, x / white, [offset, gain], &tone.constants.map(Rounded::exact));
+    y.at_least(Rounded::of(0.0)).at_most(Rounded::of(1.0))
 }
 
 /// The numbers themselves, as a reference leaves them.
@@ -269,7 +277,7 @@ impl Real for Rounded {
 mod tests {
     use super::{Rounded, UNIT};
     use crate::random::Stream;
-    use crate::reference::real::Real;
+    use crate::tone::Real;
 
     /// A formula with every operation, in any number.
     fn formula<T: Real>(x: T, y: T) -> T {

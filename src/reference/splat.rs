@@ -4,13 +4,7 @@ use glam::{DVec2, DVec3, UVec2};
 
 use super::rounding::UNIT;
 use crate::kernels::ProjectedSplat;
-
-/// Below this alpha a splat leaves no trace on a pixel.
-pub const ALPHA_MIN: f64 = 1.0 / 255.0;
-/// A pixel is done before its transmittance falls to this.
-pub const TRANSMITTANCE_MIN: f64 = 1e-4;
-/// Added to both diagonal entries of cov2d, in pixels^2.
-pub const DILATION: f64 = 0.3;
+use crate::kernels::splat::{ALPHA_MIN, TRANSMITTANCE_MIN};
 
 /// What of a [`ProjectedSplat`] makes its light.
 #[derive(Clone, Copy, Debug)]

@@ -3,11 +3,11 @@
 use glam::UVec2;
 
 use super::inside;
-use super::real::Real;
 use super::rounding::{Rounded, chain, values};
 use super::ssim_forward::{blur, rounded_blur, target};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::ssim_backward::{Constants, Kernel, Params, Slices, Tolerances};
+use crate::tone::Real;
 
 /// The gradient of `l1_scale` sum|a - b| - `ssim_scale` sum SSIM with respect to one channel of the render `a`, sums over
 /// the pixels from `begin` to before `end`; `d_moments` are the derivatives that [`super::ssim_forward::ssim`] finds, 0

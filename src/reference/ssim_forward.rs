@@ -3,15 +3,11 @@
 use glam::Vec3;
 
 use super::inside;
-use super::real::Real;
-use super::rounding::{Rounded, UNIT, chain};
-use super::tone::rounded_tone_curve;
+use super::rounding::{Rounded, UNIT, chain, rounded_tone_curve};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::ToneParameters;
-use crate::kernels::ssim_forward::{Constants, Kernel, Params, Slices, Tolerances};
-
-const C1: f64 = 0.0001;
-const C2: f64 = 0.0009;
+use crate::kernels::ssim_forward::{C1, C2, Constants, Kernel, Params, Slices, Tolerances};
+use crate::tone::Real;
 
 /// SSIM at one pixel of one channel and its derivatives with respect to the blurred moments.
 #[derive(Clone, Copy, Debug)]

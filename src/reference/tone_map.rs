@@ -1,5 +1,4 @@
-use super::rounding::{Rounded, values};
-use super::tone::rounded_tone_curve;
+use super::rounding::{Rounded, rounded_tone_curve, values};
 use crate::gpu::Reference;
 use crate::kernels::tone_map::{Constants, Kernel, Params, Slices, Tolerances};
 

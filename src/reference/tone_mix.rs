@@ -1,7 +1,7 @@
-use super::luminance::{luminance, measurable};
-use super::tone::{CURVE_LUM_PRESERVE, clamped};
 use crate::gpu::{Reference, Tolerance};
+use crate::kernels::curves::CURVE_LUM_PRESERVE;
 use crate::kernels::tone_mix::{Constants, Kernel, Params, Slices, Tolerances};
+use crate::tone::{clamped, luminance, measurable};
 
 impl Reference for Kernel {
     fn run(

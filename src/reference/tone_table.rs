@@ -1,22 +1,7 @@
-use super::real::Real;
 use super::rounding::{Rounded, values};
 use crate::gpu::Reference;
 use crate::kernels::tone_table::{Constants, Kernel, Params, Slices, Tolerances};
-
-/// The cubic Hermite curve through knots (x, y, slope); beyond the ends it is constant.
-pub(crate) fn interpolate<T: Real>(knots: &[[T; 3]], x: T) -> T {
-    let [first, last] = [knots[0], knots[knots.len() - 1]];
-    // Positive phrasing: a NaN counts as the lower end.
-    let x = if x > first[0] { x.at_most(last[0]) } else { first[0] };
-    let upper = knots.partition_point(|knot| knot[0] <= x).min(knots.len() - 1);
-    let ([x0, y0, d0], [x1, y1, d1]) = (knots[upper - 1], knots[upper]);
-    let width = x1 - x0;
-    let s = (x - x0) / width;
-    let rise = y1 - y0;
-    let (a, b) = (width * d0 - rise, rise - width * d1);
-    let left = T::of(1.0) - s;
-    y0 + rise * s + s * left * (a * left + b * s)
-}
+use crate::tone::{Real, interpolate};
 
 /// Every value on its channel's curve.
 fn mapped(params: &Params, slices: &Slices<'_>) -> Vec<Rounded> {

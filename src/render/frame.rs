@@ -5,9 +5,8 @@ use glam::UVec2;
 use crate::Result;
 use crate::gpu::{Buffer, Gpu};
 use crate::kernels::ProjectedSplat;
-
-/// Values of a gradient record before its channels: mean2d 2, conic 3, opacity 1.
-const RECORD_HEAD: usize = 6;
+use crate::kernels::splat::RECORD_HEAD;
+use crate::kernels::status::{STATUS_NOT_FINITE, STATUS_OVERFLOWED, STATUS_WORDS};
 
 /// The first guess of how many tiles a Gaussian meets; a view that needs more makes the memory grow.
 const TILES_PER_GAUSSIAN: u32 = 6;
@@ -24,19 +23,12 @@ pub struct Status {
 }
 
 impl Status {
-    /// The bit that `check_capacity` raises.
-    pub const OVERFLOWED: u32 = 1;
-    /// The bit that the loss raises.
-    pub const NOT_FINITE: u32 = 2;
-    /// The number of status words.
-    pub const WORDS: usize = 2;
-
     /// Reads the words that [`super::Renderer::status`] holds.
     pub fn from_words(words: &[u32]) -> Self {
         let word = |i: usize| words.get(i).copied().unwrap_or_default();
         Self {
-            overflowed: word(0) & Self::OVERFLOWED != 0,
-            not_finite: word(0) & Self::NOT_FINITE != 0,
+            overflowed: word(0) & STATUS_OVERFLOWED != 0,
+            not_finite: word(0) & STATUS_NOT_FINITE != 0,
             intersections: word(1),
         }
     }
@@ -98,7 +90,7 @@ impl Frame {
             tile_ranges: gpu.uninit("tile_ranges", 0)?,
             total: gpu.zeros("total", 1)?,
             counts: gpu.zeros("counts", 1)?,
-            status: gpu.zeros("status", Status::WORDS)?,
+            status: gpu.zeros("status", STATUS_WORDS as usize)?,
         })
     }
 
@@ -118,7 +110,7 @@ impl Frame {
             self.tile_counts = gpu.uninit("tile_counts", count)?;
             self.ordered_counts = gpu.uninit("ordered_counts", count)?;
             self.offsets = gpu.uninit("offsets", count)?;
-            self.d_splats = gpu.uninit("d_splats", (RECORD_HEAD + self.channels) * count)?;
+            self.d_splats = gpu.uninit("d_splats", self.record() * count)?;
             self.gaussian_count = count as u32;
             gpu.write(&mut self.gaussian_counts, &[count as u32])?;
         }
@@ -141,9 +133,14 @@ impl Frame {
             self.tiles = gpu.uninit("tiles", capacity)?;
             self.slots = gpu.uninit("slots", capacity)?;
             self.owners = gpu.uninit("owners", capacity)?;
-            self.records = gpu.uninit("records", (RECORD_HEAD + self.channels) * capacity)?;
+            self.records = gpu.uninit("records", self.record() * capacity)?;
         }
         Ok(())
+    }
+
+    /// Values of a gradient record.
+    fn record(&self) -> usize {
+        RECORD_HEAD as usize + self.channels
     }
 
     pub(super) fn intersection_capacity(&self) -> u32 {

@@ -1,7 +1,7 @@
 //! How a photograph's luminance is distributed: before a curve, after it, and in the reference image.
 
 use super::plot::{Series, plot};
-use crate::reference::luminance::{luminance, measurable};
+use crate::tone::{luminance, measurable};
 
 /// Bins over [0, 1]; what lies beyond counts in the last.
 const BINS: usize = 64;

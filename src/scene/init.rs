@@ -1,12 +1,11 @@
 //! The Gaussians that training begins with.
 
 use std::borrow::Borrow;
-use std::num::NonZero;
 
 use glam::{DVec2, DVec3, Vec3};
-use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rayon::prelude::*;
 
+use super::neighbours::Neighbours;
 use super::{Gaussians, SH_C0, Shape};
 use crate::camera::Camera;
 use crate::dataset::{Point, Split, View};
@@ -58,7 +57,7 @@ pub fn from_points(
         *mean = position.as_vec3();
     }
     gaussians.quats_mut().fill([1.0, 0.0, 0.0, 0.0]);
-    for (log_scale, scale) in gaussians.log_scales_mut().iter_mut().zip(scales(positions)?) {
+    for (log_scale, scale) in gaussians.log_scales_mut().iter_mut().zip(scales(positions)) {
         *log_scale = Vec3::splat(scale.ln() as f32);
     }
     gaussians.raw_opacities_mut().fill((OPACITY / (1.0 - OPACITY)).ln());
@@ -73,32 +72,29 @@ pub fn from_points(
 }
 
 /// The standard deviation of each point's Gaussian, world units.
-fn scales(positions: &[DVec3]) -> Result<Vec<f64>> {
-    const NEIGHBOURS: usize = 3;
+fn scales(positions: &[DVec3]) -> Vec<f64> {
+    // The nearest position is the point itself.
+    const NEAREST: usize = 1 + 3;
     // Adding zero turns -0 into 0, so that equal coordinates have equal bits.
     let key = |position: &DVec3| (*position + 0.0).to_array().map(f64::to_bits);
     let mut distinct: Vec<_> = positions.iter().map(key).collect();
     distinct.sort_unstable();
     distinct.dedup();
-    let distinct: Vec<[f64; 3]> =
-        distinct.into_iter().map(|bits| bits.map(f64::from_bits)).collect();
+    let distinct = distinct.into_iter().map(|bits| bits.map(f64::from_bits).into());
+    let distinct: Vec<DVec3> = distinct.collect();
     if distinct.len() <= 1 {
-        return Ok(vec![LONE_SCALE; positions.len()]);
+        return vec![LONE_SCALE; positions.len()];
     }
 
-    let tree: ImmutableKdTree<f64, 3> = ImmutableKdTree::new_from_slice(&distinct)
-        .map_err(|error| Error::Usage(format!("the points have no neighbours: {error}")))?;
-    // The nearest position is the point itself.
-    let wanted = NonZero::<usize>::MIN.saturating_add(NEIGHBOURS);
+    let found = distinct.len().min(NEAREST);
+    let neighbours = Neighbours::new(distinct);
     let scale = |position: &DVec3| {
-        let nearest =
-            tree.query(&position.to_array()).nearest_n::<SquaredEuclidean<f64>>(wanted).execute();
-        let others = &nearest[1..];
-        let mean =
-            others.iter().map(|neighbour| neighbour.distance).sum::<f64>() / others.len() as f64;
+        let squared = neighbours.nearest::<NEAREST>(*position);
+        let others = &squared[1..found];
+        let mean = others.iter().sum::<f64>() / others.len() as f64;
         mean.max(LEAST_SQUARED_DISTANCE).sqrt()
     };
-    Ok(positions.par_iter().map(scale).collect())
+    positions.par_iter().map(scale).collect()
 }
 
 /// `count` random positions inside what the cameras see, for captures without points; none without cameras.

@@ -10,21 +10,9 @@ use std::fs;
 use std::io::{BufWriter, Write as _};
 use std::path::Path;
 
-use super::{
-    Attribute, FEATURES, Feature, Features, Gaussians, MAX_SH_DEGREE, Shape, rest_coefficients,
-};
+use super::{FEATURES, Feature, Features, Gaussians, MAX_SH_DEGREE, Shape, width};
+use crate::attributes::{ATTRIBUTES, Attribute, AttributeSpec, Ply, planes, rest_coefficients};
 use crate::{Error, Result};
-
-/// The attributes in the order of their properties; the unused normals follow the means.
-const FILE_ORDER: [Attribute; 7] = [
-    Attribute::Means,
-    Attribute::Dc,
-    Attribute::Rest,
-    Attribute::Features,
-    Attribute::RawOpacities,
-    Attribute::LogScales,
-    Attribute::Quats,
-];
 
 /// A property of the file: its name, the attribute and the component of it that it holds.
 struct Property {
@@ -36,28 +24,35 @@ struct Property {
 impl Property {
     /// The property's value is at `begin + stride * gaussian` in [`Gaussians::parameters`].
     fn address(&self, gaussians: &Gaussians) -> (usize, usize) {
-        let stride = (self.attribute.spec().width)(gaussians.shape);
-        (gaussians.plane(self.attribute).start + self.component, stride)
+        let (column, width) = gaussians.columns(self.attribute);
+        (column * gaussians.count + self.component, width)
     }
 }
 
-/// Every property but the normals, in the order of the file.
+/// Every property but the normals, which follow the means, in the order of the file.
 fn properties(shape: Shape) -> Vec<Property> {
-    let of_attribute = |attribute: Attribute| {
-        let spec = attribute.spec();
-        (0..(spec.width)(shape)).map(move |position| {
+    let mut specs: Vec<&AttributeSpec> = ATTRIBUTES.iter().collect();
+    specs.sort_by_key(|spec| spec.ply_place);
+    let planes = planes(shape.features.width(), width(shape));
+    let of_attribute = |spec: &'static AttributeSpec| {
+        (0..planes[spec.attribute as usize].1).map(move |position| {
             // The file is channel-major where the scene is coefficient-major.
-            let component = match attribute {
+            let component = match spec.attribute {
                 Attribute::Rest => {
                     let coefficients = rest_coefficients(shape.sh_degree);
                     3 * (position % coefficients) + position / coefficients
                 }
                 _ => position,
             };
-            Property { name: (spec.ply_property)(shape, position), attribute, component }
+            let name = match spec.ply {
+                Ply::Named(names) => names[position].to_owned(),
+                Ply::Numbered(prefix) => format!("{prefix}{position}"),
+                Ply::Features => shape.features.ply_property(position),
+            };
+            Property { name, attribute: spec.attribute, component }
         })
     };
-    FILE_ORDER.into_iter().flat_map(of_attribute).collect()
+    specs.into_iter().flat_map(of_attribute).collect()
 }
 
 /// Writes `gaussians` to `path`; the file appears under its name only once it is complete.

@@ -3,10 +3,8 @@
 use super::{Count, DispatchArguments, common_len};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
+use crate::kernels::digit::MAX_DIGIT_BITS;
 use crate::kernels::{sort_downsweep, sort_spine, sort_upsweep};
-
-/// The most bits that one pass orders by: `MAX_DIGITS` of the shaders is 2^8.
-const MAX_DIGIT_BITS: u32 = 8;
 
 /// A stable sort of (key, value) pairs of `u32`, ascending by key.
 #[derive(Debug)]

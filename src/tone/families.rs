@@ -1,55 +1,8 @@
 //! What a row of the table of curves holds, and the values, derivatives and gradients it gives.
 
-use crate::kernels::*;
-use crate::reference::curves::{MAX_CONSTANTS, curve_shape};
-use crate::reference::real::{Dual, Real};
-use crate::reference::tone::within;
-
-/// A tone curve, by its number in `include/curves.glsl`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize)]
-#[serde(try_from = "String", into = "String")]
-#[repr(u32)]
-#[expect(missing_docs, reason = "the table below says what each is")]
-pub enum ToneCurve {
-    None = CURVE_NONE,
-    Linear = CURVE_LINEAR,
-    Ase = CURVE_ASE,
-    Ap3 = CURVE_AP3,
-    FittedCubic = CURVE_FITTED_CUBIC,
-    ExpPlateau = CURVE_EXP_PLATEAU,
-    PowerSoftexp = CURVE_POWER_SOFTEXP,
-    LogCurve = CURVE_LOG_CURVE,
-    AcesFilmic = CURVE_ACES_FILMIC,
-    Reinhard = CURVE_REINHARD,
-    SoftexpGamma = CURVE_SOFTEXP_GAMMA,
-    Rational = CURVE_RATIONAL,
-    Poly5Origin = CURVE_POLY5_ORIGIN,
-    DoubleExp = CURVE_DOUBLE_EXP,
-    Gamma = CURVE_GAMMA,
-    SinhRatio = CURVE_SINH_RATIO,
-    Hybrid = CURVE_HYBRID,
-    Poly3Origin = CURVE_POLY3_ORIGIN,
-    SoftexpMod = CURVE_SOFTEXP_MOD,
-    SqrtBlend = CURVE_SQRT_BLEND,
-    Softexp = CURVE_SOFTEXP,
-    TanhCurve = CURVE_TANH_CURVE,
-    ArctanCurve = CURVE_ARCTAN_CURVE,
-    Bezier3 = CURVE_BEZIER3,
-    Piecewise3 = CURVE_PIECEWISE3,
-    Hable = CURVE_HABLE,
-    Richards = CURVE_RICHARDS,
-    ArctanStandard = CURVE_ARCTAN_STANDARD,
-    Bezier3Standard = CURVE_BEZIER3_STANDARD,
-    Piecewise3Standard = CURVE_PIECEWISE3_STANDARD,
-    Hable2010 = CURVE_HABLE_2010,
-    RichardsStandard = CURVE_RICHARDS_STANDARD,
-    Tanh = CURVE_TANH,
-    AseFloor = CURVE_ASE_FLOOR,
-    P80 = CURVE_P80,
-    LumPreserve = CURVE_LUM_PRESERVE,
-    PerChannel = CURVE_PER_CHANNEL,
-    Table = CURVE_TABLE,
-}
+use super::catalogue::{Constants, ToneCurve, curve_shape};
+use super::law::within;
+use super::real::{Dual, Real};
 
 /// How black level and gain join a curve's shape f.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -157,6 +110,6 @@ impl Family {
 }
 
 /// The constants as the kernels hold them.
-pub(super) fn padded(constants: &[f64]) -> [f64; MAX_CONSTANTS] {
+pub(super) fn padded(constants: &[f64]) -> Constants<f64> {
     std::array::from_fn(|index| constants.get(index).copied().unwrap_or(0.0))
 }

@@ -4,21 +4,13 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use super::families::{Law, White};
+use super::families::White;
+use super::law::{Numbers, black_level, law};
 use super::{Statistics, Table, ToneCurve, ToneParameters};
 use crate::{Error, Result};
 
-/// The least value that linear scaling maps to 1: it keeps a black photograph black.
-const LEAST_WHITE: f64 = 1e-12;
-
 /// A shape that passes this near p90 has a pole there.
 const LARGEST_SHAPE: f64 = 1e8;
-
-/// Added to a mean before it divides.
-const EPSILON: f64 = 1e-6;
-
-/// The gains that `p80` and `lum_preserve` may take.
-const GAINS: [f64; 2] = [1.0, 6.0];
 
 /// A curve and its constants; what a photograph adds to them are its [`Statistics`].
 ///
@@ -138,45 +130,18 @@ impl ToneSettings {
 
     /// delta0 = alpha (1 - r)^beta: the black level of a photograph with r = p10 / p90.
     pub fn offset(&self, ratio: f64) -> f64 {
-        self.alpha * (1.0 - ratio).powf(self.beta)
-    }
-
-    /// g0 where black is rescaled, 1 where it is added: the gain of a black photograph.
-    pub(crate) fn least_gain(&self) -> f64 {
-        match self.curve.family().law {
-            Law::Added => 1.0,
-            Law::Rescaled => self.base_gain,
-        }
+        black_level(self.alpha, self.beta, ratio)
     }
 
     /// The curve that these settings give a photograph with these statistics.
     pub fn parameters(&self, statistics: &Statistics) -> ToneParameters {
-        let mean_luminance = f64::from(statistics.mean_luminance);
-        let bounded_gain = |value: f64| (self.theta / value).clamp(GAINS[0], GAINS[1]);
-        let stored = [1.0, 0.0, 1.0];
-        let mut constants = super::families::padded(&self.constants);
-        let [white, offset, gain] = match self.white() {
-            White::One => stored,
-            White::Mean => [(f64::from(statistics.mean) / self.theta).max(LEAST_WHITE), 0.0, 1.0],
-            White::MeanLuminance => [1.0, 0.0, bounded_gain(mean_luminance + EPSILON)],
-            White::ChannelMeans => {
-                for (white, mean) in constants.iter_mut().zip(statistics.channel_means) {
-                    *white = (f64::from(mean) + EPSILON) / self.theta;
-                }
-                stored
-            }
-            White::P80 => [1.0 / bounded_gain(statistics.p80.into()), 0.0, 1.0],
-            White::P90 => [
-                f64::from(statistics.p90),
-                self.offset(statistics.ratio()),
-                self.least_gain() + self.gain_c * mean_luminance,
-            ],
-        };
+        let numbers = Numbers::<f64>::from(self);
+        let curve = law(self.curve.family(), self.white(), &numbers, statistics);
         ToneParameters {
-            white: white as f32,
-            offset: offset as f32,
-            gain: gain as f32,
-            constants: constants.map(|constant| constant as f32),
+            white: curve.white as f32,
+            offset: curve.offset as f32,
+            gain: curve.gain as f32,
+            constants: curve.constants.map(|constant| constant as f32),
         }
     }
 
@@ -191,9 +156,10 @@ impl ToneSettings {
     /// The curve at t = x / p90, in [0, 1], for a photograph with these statistics; of a table of three channels green.
     /// `lum_preserve` and `per_channel` are shown as they map grey.
     pub fn value(&self, t: f64, statistics: &Statistics) -> f64 {
-        let ToneParameters { mut white, offset, gain, .. } = self.parameters(statistics);
+        let grey = Statistics { channel_means: [statistics.mean; 3], ..*statistics };
+        let ToneParameters { mut white, offset, gain, constants } = self.parameters(&grey);
         if self.white() == White::ChannelMeans {
-            white = (f64::from(statistics.mean) + EPSILON) as f32 / self.theta as f32;
+            white = constants[0];
         }
         let t = t * f64::from(statistics.p90) / f64::from(white);
         match &self.table {

@@ -1,7 +1,6 @@
 //! What a curve knows of a photograph: percentiles and means.
 
 use crate::kernels::ToneStatistics;
-use crate::reference::luminance::{luminance, measurable};
 
 /// Added to both percentiles, so that a black photograph divides by something.
 const EPSILON: f32 = 1e-6;
@@ -88,6 +87,17 @@ impl From<ToneStatistics> for Statistics {
         let ToneStatistics { p10, p80, p90, mean_luminance, mean, channel_means } = found;
         Self { p10, p80, p90, mean_luminance, mean, channel_means: channel_means.into() }
     }
+}
+
+/// BT.601 luminance of an RGB value, in the kernels' order of operations.
+pub(crate) fn luminance([r, g, b]: [f32; 3]) -> f32 {
+    0.299 * r + 0.587 * g + 0.114 * b
+}
+
+/// A value the statistics can take: finite, not negative.
+pub(crate) fn measurable(x: f32) -> f32 {
+    // Positive phrasing: a NaN fails it too.
+    if x > 0.0 { x.min(65504.0) } else { 0.0 }
 }
 
 /// Where a quantile lies among sorted values: `weight` of the way from one rank to the next.

@@ -4,7 +4,8 @@ use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
 use super::families::White;
-use crate::reference::tone_table::interpolate;
+use super::law::clamped;
+use super::real::Real;
 
 /// What a table's first column holds.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -142,7 +143,7 @@ impl Table {
 
     /// The table at `x`, in [0, 1], of a channel from 0 to 2.
     pub fn value(&self, x: f64, channel: usize) -> f64 {
-        crate::reference::tone::clamped(interpolate(&self.channel(channel), x))
+        clamped(interpolate(&self.channel(channel), x))
     }
 
     fn channel(&self, channel: usize) -> Vec<[f64; 3]> {
@@ -150,6 +151,21 @@ impl Table {
         let slopes = slopes(&self.x, y);
         (0..y.len()).map(|i| [self.x[i], y[i], slopes[i]]).collect()
     }
+}
+
+/// The cubic Hermite curve through knots (x, y, slope); beyond the ends it is constant.
+pub(crate) fn interpolate<T: Real>(knots: &[[T; 3]], x: T) -> T {
+    let [first, last] = [knots[0], knots[knots.len() - 1]];
+    // Positive phrasing: a NaN counts as the lower end.
+    let x = if x > first[0] { x.at_most(last[0]) } else { first[0] };
+    let upper = knots.partition_point(|knot| knot[0] <= x).min(knots.len() - 1);
+    let ([x0, y0, d0], [x1, y1, d1]) = (knots[upper - 1], knots[upper]);
+    let width = x1 - x0;
+    let s = (x - x0) / width;
+    let rise = y1 - y0;
+    let (a, b) = (width * d0 - rise, rise - width * d1);
+    let left = T::of(1.0) - s;
+    y0 + rise * s + s * left * (a * left + b * s)
 }
 
 /// The lines that say something, with their number from 1.

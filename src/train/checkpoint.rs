@@ -1,7 +1,7 @@
 //! Checkpoints: a run goes on from one as if it had never stopped.
 //!
 //! Random numbers are functions of seed and step, so a checkpoint holds what a step leaves behind and no more: the
-//! Gaussians and the networks with their moments, and the statistics of density control.
+//! Gaussians and what else is learned with their moments, and the statistics of density control.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -10,10 +10,10 @@ use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
 
 use super::model::Model;
-use super::{TrainConfig, Trainer};
+use super::{TrainConfig, Trainer, learnables};
 use crate::densify::DeviceGaussians;
 use crate::gpu::{Buffer, Gpu};
-use crate::optimizer::Moments;
+use crate::optimizer::{AdamBuffers, Moments};
 use crate::output::write_whole_with;
 use crate::{Error, Result};
 
@@ -165,9 +165,11 @@ impl Trainer {
         let name = "density.grad_norm_sums".to_owned();
         let mut state = vec![State { name, shape: vec![count], buffer: grad_norm_sums }];
         state.extend(optimized("gaussians", &[columns, count], parameters, moments));
-        for (name, parameters, moments) in self.parts.trained_networks() {
-            let len = parameters.values.len();
-            state.extend(optimized(name, &[len], &mut parameters.values, moments));
+        for learnable in learnables(&mut self.networks) {
+            let name = learnable.name();
+            let AdamBuffers { parameters, moments, .. } = learnable.buffers();
+            let len = parameters.len();
+            state.extend(optimized(name, &[len], parameters, moments));
         }
         state
     }

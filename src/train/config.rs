@@ -5,9 +5,11 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::parts::ModelConfig;
+use super::streams;
 use crate::dataset::{Dataset, DepthOptions, LoadOptions};
-use crate::loss::Term;
+use crate::loss::LossConfig;
 use crate::optimizer::Schedule;
+use crate::random::Stream;
 use crate::scene::MAX_SH_DEGREE;
 use crate::tone::ToneSettings;
 use crate::{Error, Result};
@@ -193,25 +195,16 @@ impl TrainConfig {
         }
     }
 
-    /// The loss terms of the model with their weights; SSIM terms enter the loss as 1 - SSIM.
-    pub fn terms(&self) -> Vec<(Term, f64)> {
-        let (model, weights) = (&self.model, &self.model.weights);
-        let mut terms = vec![(Term::L1, 1.0 - self.ssim_weight), (Term::Ssim, self.ssim_weight)];
-        if model.tonemapper {
-            terms.push((Term::LowL1, 1.0 - weights.low_ssim));
-            terms.push((Term::LowSsim, weights.low_ssim));
+    /// What the loss terms of the model are built from.
+    pub fn loss(&self) -> LossConfig {
+        LossConfig {
+            tone_curve: self.tone.loss_curve(),
+            ssim_weight: self.ssim_weight,
+            weights: self.model.weights,
+            depth_box: self.model.depth_box,
+            boxes: Stream::new(self.seed, streams::BOXES),
+            features: self.model.features(),
         }
-        if model.structure {
-            terms.push((Term::Structure, weights.structure));
-        }
-        if model.depth {
-            terms.extend([Term::Depth, Term::DepthLocal].map(|term| (term, weights.depth)));
-        }
-        if model.denoiser {
-            terms.push((Term::Denoising, weights.denoising));
-            terms.push((Term::TotalVariation, weights.total_variation));
-        }
-        terms
     }
 
     /// Refuses values that make no sense, naming the option.
@@ -221,17 +214,12 @@ impl TrainConfig {
     pub fn check(&self) -> Result<()> {
         self.tone.check()?;
         self.model.check()?;
+        self.loss().check()?;
         let density = &self.density;
         let rules = [
             ("--steps", self.steps as f64, self.steps >= 1, "at least 1"),
             ("--sh-degree", f64::from(self.sh_degree), self.sh_degree <= MAX_SH_DEGREE, "0 to 3"),
             ("--max-gaussians", self.max_gaussians as f64, self.max_gaussians >= 1, "at least 1"),
-            (
-                "--ssim-weight",
-                self.ssim_weight,
-                (0.0..=1.0).contains(&self.ssim_weight),
-                "from 0 to 1",
-            ),
             ("random_points", self.random_points as f64, self.random_points >= 1, "at least 1"),
             (
                 "density.gradient_threshold",
@@ -279,5 +267,8 @@ mod tests {
         assert!(
             refused(TrainConfig { sh_degree: 4, ..Default::default() }).contains("--sh-degree")
         );
+        let mut config = TrainConfig::default();
+        config.model.weights.low_ssim = 1.5;
+        assert!(refused(config).contains("low_ssim"));
     }
 }

@@ -44,11 +44,18 @@ impl Networks {
         }
         let denoiser = model.denoiser.then(|| Denoiser::new(gpu, model.network, seed));
         let tonemapper = model.tonemapper.then(|| Tonemapper::new(gpu, seed));
+        let (mut denoiser, mut tonemapper) = (denoiser.transpose()?, tonemapper.transpose()?);
+        if let Some(denoiser) = &mut denoiser {
+            denoiser.parameters_mut().learning_rate = model.rates.denoiser;
+        }
+        if let Some(tonemapper) = &mut tonemapper {
+            tonemapper.parameters_mut().learning_rate = model.rates.tonemapper;
+        }
         Ok(Self {
             gpu: gpu.clone(),
             features,
-            denoiser: denoiser.transpose()?,
-            tonemapper: tonemapper.transpose()?,
+            denoiser,
+            tonemapper,
             windows: Windows::new(gpu)?,
             colors: gpu.uninit("window_colors", 0)?,
             noise: gpu.uninit("window_noise", 0)?,
@@ -126,9 +133,9 @@ impl Networks {
     /// # Errors
     /// The file cannot be written, or the device was lost.
     pub fn save(&self, path: &Path) -> Result<()> {
-        let denoiser = self.denoiser.as_ref().map(|n| ("denoiser", n.parameters()));
-        let tonemapper = self.tonemapper.as_ref().map(|n| ("tonemapper", n.parameters()));
-        let networks: Vec<(&str, &Parameters)> = denoiser.into_iter().chain(tonemapper).collect();
+        let denoiser = self.denoiser.as_ref().map(Denoiser::parameters);
+        let tonemapper = self.tonemapper.as_ref().map(Tonemapper::parameters);
+        let networks: Vec<&Parameters> = denoiser.into_iter().chain(tonemapper).collect();
         nn::save(path, &networks, &self.gpu)
     }
 
@@ -138,10 +145,13 @@ impl Networks {
     /// The file is missing or damaged, or holds networks of another configuration.
     pub fn load(&mut self, path: &Path) -> Result<()> {
         let gpu = self.gpu.clone();
-        let denoiser = self.denoiser.as_mut().map(|n| ("denoiser", n.parameters_mut()));
-        let tonemapper = self.tonemapper.as_mut().map(|n| ("tonemapper", n.parameters_mut()));
-        let mut networks: Vec<(&str, &mut Parameters)> =
-            denoiser.into_iter().chain(tonemapper).collect();
+        let mut networks: Vec<&mut Parameters> = self.parameters_mut().collect();
         nn::load(path, &mut networks, &gpu)
+    }
+
+    /// The parameters of every network.
+    pub(super) fn parameters_mut(&mut self) -> impl Iterator<Item = &mut Parameters> {
+        let denoiser = self.denoiser.as_mut().map(Denoiser::parameters_mut);
+        denoiser.into_iter().chain(self.tonemapper.as_mut().map(Tonemapper::parameters_mut))
     }
 }

@@ -5,7 +5,8 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-use crate::nn::DenoiserSettings;
+use crate::loss::Weights;
+use crate::nn::{Denoiser, DenoiserSettings, Tonemapper};
 use crate::scene::Features;
 use crate::{Error, Result};
 
@@ -100,22 +101,6 @@ pub struct ModelConfig {
     pub rates: NetworkRates,
 }
 
-/// The weights of the terms of LITA-GS.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct Weights {
-    /// Of mean `(R_K - R_0)^2`.
-    pub denoising: f64,
-    /// Of the total variation of R_K.
-    pub total_variation: f64,
-    /// The reconstruction of the dark photograph weighs 1: (1 - w) L1 + w (1 - SSIM); this is its w.
-    pub low_ssim: f64,
-    /// Of mean |structure - edges of the target|.
-    pub structure: f64,
-    /// Of 1 minus the correlation with the depth map, over the view and over boxes.
-    pub depth: f64,
-}
-
 /// Adam's learning rates, constant.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -146,16 +131,9 @@ impl Default for ModelConfig {
 }
 
 /// Those of the paper's code.
-impl Default for Weights {
-    fn default() -> Self {
-        Self { denoising: 1.0, total_variation: 1.0, low_ssim: 0.2, structure: 0.01, depth: 0.1 }
-    }
-}
-
-/// Those of the paper's code.
 impl Default for NetworkRates {
     fn default() -> Self {
-        Self { denoiser: 5e-5, tonemapper: 1e-4 }
+        Self { denoiser: Denoiser::LEARNING_RATE, tonemapper: Tonemapper::LEARNING_RATE }
     }
 }
 
@@ -192,19 +170,11 @@ impl ModelConfig {
     /// [`Error::Usage`] names a value that makes no sense.
     pub(super) fn check(&self) -> Result<()> {
         self.network.check()?;
-        let Weights { denoising, total_variation, low_ssim, structure, depth } = self.weights;
-        let rules = [
-            ("model.weights.denoising", denoising, f64::MAX),
-            ("model.weights.total_variation", total_variation, f64::MAX),
-            ("model.weights.low_ssim", low_ssim, 1.0),
-            ("model.weights.structure", structure, f64::MAX),
-            ("model.weights.depth", depth, f64::MAX),
-            ("model.rates.denoiser", self.rates.denoiser, f64::MAX),
-            ("model.rates.tonemapper", self.rates.tonemapper, f64::MAX),
-        ];
-        for (name, value, most) in rules {
-            if !(0.0..=most).contains(&value) {
-                return Err(Error::Usage(format!("{name} is {value}; it must be 0 or more")));
+        let NetworkRates { denoiser, tonemapper } = self.rates;
+        for (name, rate) in [("denoiser", denoiser), ("tonemapper", tonemapper)] {
+            if !(rate.is_finite() && rate >= 0.0) {
+                let problem = format!("model.rates.{name} is {rate}; it must be 0 or more");
+                return Err(Error::Usage(problem));
             }
         }
         if self.depth_box < 2 {
@@ -237,11 +207,8 @@ mod tests {
     }
 
     #[test]
-    fn a_weight_that_makes_no_sense_is_refused_by_name() {
+    fn a_rate_that_makes_no_sense_is_refused_by_name() {
         let mut model = ModelConfig::default();
-        model.weights.low_ssim = 1.5;
-        assert!(model.check().unwrap_err().to_string().contains("low_ssim"));
-        model = ModelConfig::default();
         model.rates.denoiser = f64::NAN;
         assert!(model.check().unwrap_err().to_string().contains("rates.denoiser"));
     }

@@ -3,6 +3,7 @@
 use std::str::FromStr;
 
 use super::TrainConfig;
+use crate::attributes::Attribute;
 use crate::tone::ToneCurve;
 use crate::{Error, Result};
 
@@ -67,7 +68,7 @@ impl Preset {
                 config.ssim_weight = 0.4;
                 config.model.network.stages = 6;
                 schedule.means_rate_steps = 20_000;
-                schedule.initial_rates.means = 2.5e-4;
+                schedule.initial_rates[Attribute::Means] = 2.5e-4;
                 schedule.final_means_rate = 2.5e-6;
             }
             (Self::RealX3d, "bluehawaii") => config.ssim_weight = 0.0,
@@ -117,7 +118,7 @@ mod tests {
     fn a_scene_of_the_code_brings_its_own_constants() {
         let shrub = applied(Preset::Lom, "shrub", ToneCurve::Ap3);
         assert_eq!((shrub.steps, shrub.ssim_weight, shrub.model.network.stages), (5_000, 0.4, 6));
-        assert_eq!(shrub.schedule.initial_rates.means, 2.5e-4);
+        assert_eq!(shrub.schedule.initial_rates[Attribute::Means], 2.5e-4);
         assert_eq!(applied(Preset::Lom, "chair", ToneCurve::Ap3).model.weights.low_ssim, 0.5);
         assert_eq!(applied(Preset::RealX3d, "BlueHawaii", ToneCurve::Ap3).ssim_weight, 0.0);
         let cupcake = applied(Preset::RealX3d, "Cupcake", ToneCurve::Linear);

@@ -1,5 +1,7 @@
 //! The training views on the device: dark photographs, their curves, and the order in which steps take them.
 
+use std::sync::Arc;
+
 use glam::{DVec3, UVec2};
 
 use super::{TrainConfig, streams};
@@ -9,29 +11,27 @@ use crate::dataset::{Dataset, Point};
 use crate::gpu::{Buffer, Gpu};
 use crate::image::Image;
 use crate::kernels::ToneParameters;
+use crate::loss::ViewSource;
 use crate::pseudo_gt::PseudoGt;
 use crate::random::Stream;
-use crate::scene::{Features, Gaussians, Shape, init};
-use crate::structure::StructureTarget;
+use crate::scene::{Gaussians, Shape, init};
 use crate::tone::{Statistics, ToneCurve, ToneSettings};
 
 /// One training view.
 #[derive(Debug)]
 pub(super) struct TrainView {
     pub(super) name: String,
+    /// Its place among the training views.
+    pub(super) number: usize,
     /// Index into the dataset's views.
     index: usize,
     pub(super) camera: Camera,
     /// The dark photograph, planar (3, H, W), sRGB-encoded.
     pub(super) image: Buffer<f32>,
     /// The target, where the loss does not evaluate the curve.
-    baked: Option<Buffer<f32>>,
+    baked: Option<Arc<Buffer<f32>>>,
     /// The curve that its statistics give; one element. Of a baked target none.
     pub(super) tone: Buffer<ToneParameters>,
-    /// The edges of the pseudo-GT, (H, W), where the model has structure.
-    pub(super) structure: Option<Buffer<f32>>,
-    /// Depth from elsewhere, (H, W), larger is farther, where the view has any.
-    pub(super) depth: Option<Buffer<f32>>,
 }
 
 /// All training views, in the dataset's order.
@@ -39,32 +39,25 @@ pub(super) struct TrainView {
 pub(super) struct Views(Vec<TrainView>);
 
 impl Views {
-    /// Uploads every training photograph and takes its statistics once, with what the features are held to.
-    pub(super) fn upload(
-        gpu: &Gpu,
-        pseudo_gt: &mut PseudoGt,
-        dataset: &Dataset,
-        features: Features,
-    ) -> Result<Self> {
-        let (mut views, mut statistics) = (vec![], vec![]);
+    /// Uploads every training photograph and takes its statistics once.
+    pub(super) fn upload(gpu: &Gpu, pseudo_gt: &mut PseudoGt, dataset: &Dataset) -> Result<Self> {
+        let (mut views, mut statistics) = (Vec::<TrainView>::new(), vec![]);
         for (index, view) in dataset.views.iter().enumerate() {
             let Some(image) = view.image.as_ref().filter(|_| view.is_train()) else { continue };
             let pixels = gpu.buffer("low", &image.data)?;
-            let mut tone = gpu.uninit("tone", 1)?;
             gpu.run("statistics", |pass| {
-                pseudo_gt.statistics(pass, &pixels, [image.width, image.height], &mut tone, 0)
+                pseudo_gt.statistics(pass, &pixels, [image.width, image.height])
             })?;
-            let depth = view.depth.as_ref().filter(|_| features.depth);
-            statistics.push(pseudo_gt.measured()?);
+            let measured = pseudo_gt.measured()?;
+            statistics.push(measured);
             views.push(TrainView {
                 name: view.name.clone(),
+                number: views.len(),
                 index,
                 camera: view.camera,
                 image: pixels,
                 baked: None,
-                tone,
-                structure: None,
-                depth: depth.map(|depth| gpu.buffer("depth", depth)).transpose()?,
+                tone: gpu.buffer("tone", &[pseudo_gt.settings().parameters(&measured)])?,
             });
         }
         let settings = pseudo_gt.settings();
@@ -80,13 +73,22 @@ impl Views {
                 view.bake(gpu, pseudo_gt)?;
             }
         }
-        if features.structure {
-            let mut structures = StructureTarget::new(gpu)?;
-            for view in &mut views {
-                view.structure = Some(view.edges(gpu, pseudo_gt, &mut structures)?);
-            }
-        }
         Ok(Self(views))
+    }
+
+    /// What the loss terms may compare the views with.
+    pub(super) fn sources<'a>(
+        &'a self,
+        gpu: &'a Gpu,
+        pseudo_gt: &'a PseudoGt,
+        dataset: &'a Dataset,
+    ) -> Vec<ViewSource<'a>> {
+        let source = |view: &'a TrainView| ViewSource {
+            size: view.size(),
+            depth: dataset.views[view.index].depth.as_deref(),
+            target: Box::new(|| view.target(gpu, pseudo_gt)),
+        };
+        self.0.iter().map(source).collect()
     }
 
     /// The view that a step trains on: every epoch takes each view once, in an order of its own.
@@ -136,7 +138,7 @@ impl Views {
         let kept = &points[..points.len().min(config.max_gaussians)];
         let colors = init::colors_from_views(kept, &dataset.views, |index| {
             let view = self.0.iter().find(|view| view.index == index);
-            view.map(|view| view.target(gpu, pseudo_gt)).transpose()
+            view.map(|view| view.target_image(gpu, pseudo_gt)).transpose()
         })?;
         let positions: Vec<DVec3> = kept.iter().map(|point| point.position).collect();
         let seed = Stream::new(config.seed, streams::FEATURES).bits(0);
@@ -153,50 +155,30 @@ impl TrainView {
 
     /// What the loss applies its curve to.
     pub(super) fn loss_input(&self) -> &Buffer<f32> {
-        self.baked.as_ref().unwrap_or(&self.image)
-    }
-
-    /// The structure of the pseudo-GT.
-    fn edges(
-        &self,
-        gpu: &Gpu,
-        pseudo_gt: &PseudoGt,
-        structures: &mut StructureTarget,
-    ) -> Result<Buffer<f32>> {
-        let mapped;
-        let target = match &self.baked {
-            Some(target) => target,
-            None => {
-                mapped = self.mapped(gpu, pseudo_gt)?;
-                &mapped
-            }
-        };
-        let mut structure = gpu.uninit("structure", self.image.len() / 3)?;
-        gpu.run("structure", |pass| structures.record(pass, target, self.size(), &mut structure))?;
-        Ok(structure)
+        self.baked.as_deref().unwrap_or(&self.image)
     }
 
     /// Makes the target now, in place of the loss kernels.
     fn bake(&mut self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<()> {
-        self.baked = Some(self.mapped(gpu, pseudo_gt)?);
+        self.baked = Some(self.target(gpu, pseudo_gt)?);
         gpu.write(
             &mut self.tone,
             &[ToneSettings::new(ToneCurve::None).parameters(&Statistics::default())],
         )
     }
 
-    fn mapped(&self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<Buffer<f32>> {
+    /// The pseudo-GT of the view, (3, H, W).
+    fn target(&self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<Arc<Buffer<f32>>> {
+        if let Some(baked) = &self.baked {
+            return Ok(Arc::clone(baked));
+        }
         let mut target = gpu.uninit("target", self.image.len())?;
         gpu.run("target", |pass| pseudo_gt.map(pass, &self.image, &self.tone, 0, &mut target))?;
-        Ok(target)
+        Ok(Arc::new(target))
     }
 
-    /// The pseudo-GT of the view.
-    fn target(&self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<Image> {
-        let data = match &self.baked {
-            Some(target) => gpu.read(target)?,
-            None => gpu.read(&self.mapped(gpu, pseudo_gt)?)?,
-        };
+    fn target_image(&self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<Image> {
+        let data = gpu.read(&*self.target(gpu, pseudo_gt)?)?;
         let Camera { width, height, .. } = self.camera;
         Ok(Image { width, height, data })
     }

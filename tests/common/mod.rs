@@ -7,9 +7,10 @@ pub(crate) mod model;
 use glam::{UVec2, Vec2};
 use nightsplat::gpu::Threads;
 use nightsplat::gpu::testing::gpu;
+use nightsplat::kernels::splat::RECORD_HEAD;
 use nightsplat::kernels::{
-    ProjectedSplat, blend_backward, blend_forward, check_capacity, emit, order_counts, project,
-    project_backward, reduce_records, tile_ranges,
+    self, ProjectedSplat, blend_backward, blend_forward, check_capacity, emit, order_counts,
+    project, project_backward, reduce_records, tile_ranges,
 };
 use nightsplat::random::Stream;
 use nightsplat::reference::camera::Camera;
@@ -112,15 +113,14 @@ impl Setup {
         seed: u64,
     ) -> Self {
         let (sin, cos) = 0.3f32.sin_cos();
-        let params = project::Params {
+        let camera = kernels::Camera {
             view_from_world: [[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos], [0.2, -0.1, 0.4]],
             focal: Vec2::new(0.9, 0.8) * size.x as f32,
             principal_point: Vec2::new(0.42, 0.57) * size.as_vec2(),
             size,
-            near: 0.2,
-            gaussian_count: count as u32,
-            sh_degree,
         };
+        let gaussian_count = count as u32;
+        let params = project::Params { camera, near: 0.2, gaussian_count, sh_degree };
         let mut setup = Self {
             params,
             parameters: vec![],
@@ -168,8 +168,7 @@ impl Setup {
     }
 
     pub(crate) fn camera(&self) -> Camera {
-        let p = &self.params;
-        Camera::new(p.view_from_world, p.focal, p.principal_point, p.size)
+        Camera::from(&self.params.camera)
     }
 
     pub(crate) fn get(&self, i: usize) -> Gaussian {
@@ -182,7 +181,7 @@ impl Setup {
     }
 
     pub(crate) fn tiles(&self) -> UVec2 {
-        (self.params.size + self.tile - 1) / self.tile
+        (self.params.camera.size + self.tile - 1) / self.tile
     }
 
     pub(crate) fn tile_count(&self) -> u32 {
@@ -190,11 +189,11 @@ impl Setup {
     }
 
     pub(crate) fn pixels(&self) -> usize {
-        self.params.size.element_product() as usize
+        self.params.camera.size.element_product() as usize
     }
 
     pub(crate) fn record(&self) -> usize {
-        6 + self.channels as usize
+        (RECORD_HEAD + self.channels) as usize
     }
 }
 
@@ -308,7 +307,7 @@ pub(crate) fn forward(setup: &Setup, capacity: Option<u32>) -> Frame {
     let (tiles, slots, owners) = run_kernel!(
         emit,
         constants!(emit, setup),
-        emit::Params { size: params.size, gaussian_count: n, tile_columns: setup.tiles().x },
+        emit::Params { size: params.camera.size, gaussian_count: n, tile_columns: setup.tiles().x },
         exactly,
         [counts, sorted_ids, ordered_counts, offsets, splats],
         [tiles, slots, owners]
@@ -362,7 +361,7 @@ pub(crate) fn forward(setup: &Setup, capacity: Option<u32>) -> Frame {
 
 pub(crate) fn blend_params(setup: &Setup) -> blend_forward::Params {
     blend_forward::Params {
-        size: setup.params.size,
+        size: setup.params.camera.size,
         tile_columns: setup.tiles().x,
         background: setup.background,
     }
@@ -391,13 +390,9 @@ pub(crate) struct Gradients {
 }
 
 pub(crate) fn project_backward_params(setup: &Setup) -> project_backward::Params {
-    let project::Params { view_from_world, focal, principal_point, size, .. } = setup.params;
-    let project::Params { gaussian_count, sh_degree, .. } = setup.params;
+    let project::Params { camera, gaussian_count, sh_degree, .. } = setup.params;
     project_backward::Params {
-        view_from_world,
-        focal,
-        principal_point,
-        size,
+        camera,
         gaussian_count,
         sh_degree,
         damping_weight: 0.7,
@@ -415,7 +410,7 @@ pub(crate) fn backward(setup: &Setup, frame: &Frame, d_render: &[f32]) -> Gradie
     let records = run_kernel!(
         blend_backward,
         constants!(blend_backward, setup),
-        blend_backward::Params { size: setup.params.size, tile_columns: setup.tiles().x },
+        blend_backward::Params { size: setup.params.camera.size, tile_columns: setup.tiles().x },
         Threads::Workgroups([setup.tile_count(), 1, 1]),
         [tile_ranges, sorted_slots, owners, splats, colors, render, d_render],
         [records]

@@ -1,7 +1,8 @@
 //! The rounding model of the blending kernels.
 
 use glam::UVec2;
-use nightsplat::reference::splat::{ALPHA_MIN, Fragment, Splat, TRANSMITTANCE_MIN, fragments};
+use nightsplat::kernels::splat::{ALPHA_MIN, TRANSMITTANCE_MIN};
+use nightsplat::reference::splat::{Fragment, Splat, fragments};
 
 use super::{Frame, Setup};
 
@@ -32,7 +33,7 @@ pub(crate) fn model_tile(setup: &Setup, frame: &Frame, tile: usize) -> Vec<Pixel
         colors.iter().chain(&setup.background.map(f64::from)).fold(1.0, |a: f64, c| a.max(c.abs()));
     let columns = setup.tiles().x;
     let first = UVec2::new(tile as u32 % columns, tile as u32 / columns) * setup.tile;
-    let end = (first + setup.tile).min(setup.params.size);
+    let end = (first + setup.tile).min(setup.params.camera.size);
     let pixels = (first.y..end.y).flat_map(|y| (first.x..end.x).map(move |x| UVec2::new(x, y)));
     pixels.map(|pixel| model_pixel(setup, &splats, colors, pixel)).collect()
 }
@@ -69,7 +70,7 @@ fn model_pixel(setup: &Setup, splats: &[Splat], max_color: f64, pixel: UVec2) ->
             || near(after, TRANSMITTANCE_MIN, after_error)
             || near(last, TRANSMITTANCE_MIN, transmittance_error)
     });
-    let at = (pixel.y * setup.params.size.x + pixel.x) as usize;
+    let at = (pixel.y * setup.params.camera.size.x + pixel.x) as usize;
     PixelModel { at, fragments, alpha_errors, error, is_fragile }
 }
 

@@ -131,8 +131,8 @@ fn the_terms_match_their_reference_and_finite_differences() {
         close("d_denoised", &actual.d_denoised, &d_denoised);
         close("d_render", &actual.d_render, &d_render);
         let losses = actual.logged.losses;
-        close("MSE", &[losses.get(Term::Denoising)], &[mse_partials[0] * params.mean_scale]);
-        close("TV", &[losses.get(Term::TotalVariation)], &tv_partials);
+        close("MSE", &[losses.get(Term::DENOISING)], &[mse_partials[0] * params.mean_scale]);
+        close("TV", &[losses.get(Term::TOTAL_VARIATION)], &tv_partials);
         assert_eq!(actual.logged.status, 0);
     }
     assert_no_validation_messages();
@@ -148,10 +148,10 @@ fn the_terms_are_those_of_pytorch() {
         evaluate(&gpu, weights, (size, Interior::whole(size)), images)
     };
     let (mse, tv) = (evaluate(1.0, 0.0), evaluate(0.0, 1.0));
-    torch.assert_agrees("denoising.mse.value", &[mse.logged.losses.get(Term::Denoising)]);
+    torch.assert_agrees("denoising.mse.value", &[mse.logged.losses.get(Term::DENOISING)]);
     torch.assert_agrees("denoising.mse.d_denoised", &mse.d_denoised);
     torch.assert_agrees("denoising.mse.d_rendered", &mse.d_render);
-    torch.assert_agrees("denoising.tv.value", &[tv.logged.losses.get(Term::TotalVariation)]);
+    torch.assert_agrees("denoising.tv.value", &[tv.logged.losses.get(Term::TOTAL_VARIATION)]);
     torch.assert_agrees("denoising.tv.d_denoised", &tv.d_denoised);
     assert!(tv.d_render.iter().all(|&d| d == 0.0), "the total variation has no business here");
     assert_no_validation_messages();
@@ -162,8 +162,8 @@ fn a_constant_image_that_is_the_render_costs_nothing() {
     let size = UVec2::new(20, 21);
     let image = vec![0.3; 3 * 420];
     let outcome = evaluate(&gpu(), WEIGHTS, (size, Interior::whole(size)), [&image, &image]);
-    assert_eq!(outcome.logged.losses.get(Term::Denoising), 0.0);
-    assert_eq!(outcome.logged.losses.get(Term::TotalVariation), 0.0);
+    assert_eq!(outcome.logged.losses.get(Term::DENOISING), 0.0);
+    assert_eq!(outcome.logged.losses.get(Term::TOTAL_VARIATION), 0.0);
     assert!([outcome.d_denoised, outcome.d_render].concat().iter().all(|&d| d == 0.0));
     assert_no_validation_messages();
 }
@@ -182,7 +182,7 @@ fn a_value_that_is_not_finite_reaches_the_log_if_it_counts() {
     let broken = |images: [&[f32]; 2]| {
         let Logged { losses, status } = evaluate(&gpu, WEIGHTS, (size, interior), images).logged;
         assert_eq!(status, if losses.first_not_finite().is_some() { NOT_FINITE } else { 0 });
-        [Term::Denoising, Term::TotalVariation].map(|term| !losses.get(term).is_finite())
+        [Term::DENOISING, Term::TOTAL_VARIATION].map(|term| !losses.get(term).is_finite())
     };
     assert_eq!(broken([&image, &with_nan(7)]), [true, false]);
     assert_eq!(broken([&with_nan(7), &image]), [true, true]);
@@ -199,7 +199,7 @@ fn the_same_step_leaves_the_same_bits() {
     let (denoised, render) = (noise(1, values, 0.0, 1.0), noise(2, values, 0.0, 1.0));
     let step = || {
         let outcome = evaluate(&gpu, WEIGHTS, (size, Interior::whole(size)), [&denoised, &render]);
-        let terms = [Term::Denoising, Term::TotalVariation];
+        let terms = [Term::DENOISING, Term::TOTAL_VARIATION];
         let values = terms.map(|term| outcome.logged.losses.get(term));
         (bits(&values), bits(&outcome.d_denoised), bits(&outcome.d_render))
     };

@@ -249,8 +249,8 @@ fn the_term_is_the_mean_over_the_view_and_over_its_boxes() {
         let boxes = regions.len() - 1;
         let local = values[1..].iter().sum::<f64>() / boxes.max(1) as f64;
         let close = |actual: f32, expected: f64| (f64::from(actual) - expected).abs() < 2e-5;
-        assert!(close(logged.losses.get(Term::Depth), values[0]), "{size:?}");
-        assert!(close(logged.losses.get(Term::DepthLocal), local), "{size:?}");
+        assert!(close(logged.losses.get(Term::DEPTH), values[0]), "{size:?}");
+        assert!(close(logged.losses.get(Term::DEPTH_LOCAL), local), "{size:?}");
         assert_eq!(logged.status, 0);
         let weights = [0.3, 0.3 / boxes.max(1) as f32];
         let expected = chain!(run_reference, size.into(), regions, weights, images, chunk_size());
@@ -275,8 +275,8 @@ fn a_constant_depth_has_no_correlation_and_no_gradient() {
     ] {
         let settings = DepthSettings { weight: 1.0, box_side: 20 };
         let (logged, d_render) = evaluate(&gpu, settings, size, &images, 0);
-        assert_eq!(logged.losses.get(Term::Depth), 1.0);
-        assert_eq!(logged.losses.get(Term::DepthLocal), 1.0);
+        assert_eq!(logged.losses.get(Term::DEPTH), 1.0);
+        assert_eq!(logged.losses.get(Term::DEPTH_LOCAL), 1.0);
         assert!(d_render.iter().all(|&d| d == 0.0));
     }
     assert_no_validation_messages();
@@ -291,7 +291,7 @@ fn scale_and_offset_of_the_estimate_do_not_matter() {
     let settings = DepthSettings { weight: 1.0, box_side: 20 };
     let [(near, d_near), (far, d_far)] =
         [depth, farther].map(|depth| evaluate(&gpu, settings, size, &[render.clone(), depth], 0));
-    for term in [Term::Depth, Term::DepthLocal] {
+    for term in [Term::DEPTH, Term::DEPTH_LOCAL] {
         assert!((near.losses.get(term) - far.losses.get(term)).abs() < 1e-5);
     }
     assert_close("d_render", &d_far, &d_near, 1e-4 * largest(&d_near));
@@ -306,7 +306,7 @@ fn a_value_that_is_not_finite_reaches_the_log() {
         render[at] = value;
         let images = [render, depth];
         let (logged, _) = evaluate(&gpu, DepthSettings::default(), [77, 50], &images, 0);
-        assert_eq!(logged.losses.first_not_finite(), Some(Term::Depth), "{value} at {at}");
+        assert_eq!(logged.losses.first_not_finite(), Some(Term::DEPTH), "{value} at {at}");
         assert_eq!(logged.status, NOT_FINITE);
     }
     assert_no_validation_messages();
@@ -320,7 +320,7 @@ fn the_same_step_leaves_the_same_bits_and_another_step_other_boxes() {
     let step = |step: u64| {
         let settings = DepthSettings { weight: 1.0, box_side: 24 };
         let (logged, d_render) = evaluate(&gpu, settings, size, &images, step);
-        let values = [Term::Depth, Term::DepthLocal].map(|term| logged.losses.get(term));
+        let values = [Term::DEPTH, Term::DEPTH_LOCAL].map(|term| logged.losses.get(term));
         (bits(&values), bits(&d_render))
     };
     let first = step(3);

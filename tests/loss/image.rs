@@ -3,11 +3,11 @@
 use glam::{UVec2, Vec3};
 use nightsplat::gpu::testing::{assert_no_validation_messages, gpu};
 use nightsplat::gpu::{Gpu, Reference, Threads};
+use nightsplat::kernels::curves::{CURVE_AP3, CURVE_ASE, CURVE_NONE};
 use nightsplat::kernels::{ToneParameters, l1, ssim_backward, ssim_forward};
 use nightsplat::loss::{Interior, Loss, LossInputs, LossSettings, Term};
 use nightsplat::reference::ssim_backward::gradient;
 use nightsplat::reference::ssim_forward::ssim;
-use nightsplat::reference::tone::{CURVE_AP3, CURVE_ASE, CURVE_NONE};
 
 use super::{NOT_FINITE, Torch, assert_close, bits, central_differences, largest, log_step};
 
@@ -39,7 +39,7 @@ struct Outcome {
 }
 
 fn settings(tone_curve: u32, ssim_weight: f64) -> LossSettings {
-    LossSettings { tone_curve, ssim_weight, terms: [Term::L1, Term::Ssim] }
+    LossSettings { tone_curve, ssim_weight, terms: [Term::L1, Term::SSIM] }
 }
 
 fn evaluate(gpu: &Gpu, curve: u32, weight: f64, size: [u32; 2], images: &[Vec<f32>; 2]) -> Outcome {
@@ -67,7 +67,7 @@ fn evaluate_interior(
         loss.record(pass, inputs, &mut d_render, log)
     })
     .unwrap();
-    let [l1, ssim] = [Term::L1, Term::Ssim].map(|term| logged.losses.get(term));
+    let [l1, ssim] = [Term::L1, Term::SSIM].map(|term| logged.losses.get(term));
     Outcome { l1, ssim, d_render: gpu.read(&d_render).unwrap(), status: logged.status }
 }
 

@@ -18,9 +18,8 @@ use std::collections::BTreeMap;
 
 use nightsplat::Result;
 use nightsplat::gpu::{Gpu, Recorder};
+use nightsplat::kernels::status::STATUS_NOT_FINITE as NOT_FINITE;
 use nightsplat::loss::{LogSlot, LossLog, StepLosses, Term};
-
-const NOT_FINITE: u32 = 2;
 
 /// What the terms of one step leave in the log.
 struct Logged {
@@ -37,8 +36,7 @@ fn log_step(
     let mut status = gpu.zeros("status", 1)?;
     let mut download = None;
     gpu.run("losses", |pass| {
-        let mut slot =
-            LogSlot { log: &mut log, slot: 1, status: &mut status, not_finite_flag: NOT_FINITE };
+        let mut slot = LogSlot { log: &mut log, slot: 1, status: &mut status };
         record(pass, &mut slot)?;
         download = Some(log.download(pass)?);
         Ok(())
@@ -46,11 +44,11 @@ fn log_step(
     let steps = download.unwrap().wait()?;
     assert_eq!(steps.len(), 3);
     for other in [&steps[0], &steps[2]] {
-        assert!(Term::ALL.iter().all(|&term| other.get(term) == 0.0) && other.status == 0);
+        assert!(Term::all().all(|term| other.get(term) == 0.0) && other.status == 0);
     }
     let status = gpu.read(&status)?[0];
     assert_eq!(steps[1].status, status);
-    Ok(Logged { losses: steps[1], status })
+    Ok(Logged { losses: steps[1].clone(), status })
 }
 
 /// The first mismatches, so that a failure shows its pattern.

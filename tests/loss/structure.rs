@@ -156,7 +156,7 @@ fn the_term_matches_its_reference_and_finite_differences() {
         let (logged, actual) = evaluate(&gpu, weight, size.into(), &render, &structure);
         assert_close("d_render", &actual, &expected, 1e-6 * largest(&expected));
         let mean = sum[0] / pixels as f32;
-        assert!((logged.losses.get(Term::Structure) - mean).abs() <= 1e-6 + 1e-6 * mean);
+        assert!((logged.losses.get(Term::STRUCTURE) - mean).abs() <= 1e-6 + 1e-6 * mean);
         assert_eq!(logged.status, 0);
     }
     assert_no_validation_messages();
@@ -167,7 +167,7 @@ fn the_term_is_that_of_pytorch() {
     let torch = Torch::read();
     let (prior, target) = (torch.get("structure.prior"), torch.get("structure.target"));
     let (logged, d_prior) = evaluate(&gpu(), 1.0, [31, 24].into(), prior, target);
-    torch.assert_agrees("structure.value", &[logged.losses.get(Term::Structure)]);
+    torch.assert_agrees("structure.value", &[logged.losses.get(Term::STRUCTURE)]);
     torch.assert_agrees("structure.d_prior", &d_prior);
     assert_no_validation_messages();
 }
@@ -185,7 +185,7 @@ fn a_value_that_is_not_finite_reaches_the_log() {
     let mut render = noise(7, 100, 0.0, 1.0);
     render[57] = f32::NAN;
     let (logged, _) = evaluate(&gpu(), 1.0, [10, 10].into(), &render, &noise(8, 100, 0.0, 1.0));
-    assert_eq!(logged.losses.first_not_finite(), Some(Term::Structure));
+    assert_eq!(logged.losses.first_not_finite(), Some(Term::STRUCTURE));
     assert_eq!(logged.status, NOT_FINITE);
     assert_no_validation_messages();
 }

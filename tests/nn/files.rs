@@ -15,7 +15,7 @@ fn networks(settings: DenoiserSettings, seed: u64) -> (Denoiser, Tonemapper) {
 }
 
 fn save_both(path: &Path, (denoiser, tonemapper): &(Denoiser, Tonemapper)) {
-    let all = [("denoiser", denoiser.parameters()), ("tonemapper", tonemapper.parameters())];
+    let all = [denoiser.parameters(), tonemapper.parameters()];
     save(path, &all, &gpu()).unwrap();
 }
 
@@ -23,8 +23,7 @@ fn load_both(
     path: &Path,
     (denoiser, tonemapper): &mut (Denoiser, Tonemapper),
 ) -> nightsplat::Result<()> {
-    let mut all =
-        [("denoiser", denoiser.parameters_mut()), ("tonemapper", tonemapper.parameters_mut())];
+    let mut all = [denoiser.parameters_mut(), tonemapper.parameters_mut()];
     load(path, &mut all, &gpu())
 }
 
@@ -106,6 +105,6 @@ fn damaged_files_are_told_from_whole_ones() {
     std::fs::write(&path, &poisoned).unwrap();
     refused(&mut all, "not finite");
     let nowhere = folder.path().join("missing/networks.safetensors");
-    let error = save(&nowhere, &[("denoiser", all.0.parameters())], &gpu()).unwrap_err();
+    let error = save(&nowhere, &[all.0.parameters()], &gpu()).unwrap_err();
     assert!(error.to_string().contains("cannot be written"), "{error}");
 }

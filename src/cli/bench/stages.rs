@@ -150,7 +150,8 @@ impl Photograph {
         let image = gpu.buffer("low", &scene::dark(1920, 1080).data)?;
         Ok(Self {
             pseudo_gt: PseudoGt::new(gpu, &ToneSettings::default())?,
-            parameters: gpu.zeros("tone", 1)?,
+            parameters: gpu
+                .buffer("tone", &[ToneParameters { white: 1.0, ..Default::default() }])?,
             target: gpu.uninit("target", image.len())?,
             image,
         })
@@ -158,7 +159,7 @@ impl Photograph {
 
     fn record(&mut self, pass: &mut crate::gpu::Recorder<'_>) -> Result<()> {
         let Self { image, pseudo_gt, parameters, target } = self;
-        pseudo_gt.statistics(pass, image, [1920, 1080], parameters, 0)?;
+        pseudo_gt.statistics(pass, image, [1920, 1080])?;
         pseudo_gt.map(pass, image, parameters, 0, target)
     }
 

@@ -38,13 +38,11 @@ impl Mapper {
     pub(in crate::cli) fn statistics(&mut self, planes: &[f32]) -> Result<Statistics> {
         let tiles = self.tiles(planes)?;
         let tiles: Vec<&Buffer<f32>> = tiles.iter().collect();
-        self.gpu.run("tone statistics", |pass| {
-            self.pseudo_gt.statistics_of_tiles(pass, &tiles, &mut self.parameters, 0)
-        })?;
-        if let Some(scene) = self.scene {
-            self.gpu.write(&mut self.parameters, &[scene])?;
-        }
-        self.pseudo_gt.measured()
+        self.gpu.run("tone statistics", |pass| self.pseudo_gt.statistics_of_tiles(pass, &tiles))?;
+        let measured = self.pseudo_gt.measured()?;
+        let own = || self.pseudo_gt.settings().parameters(&measured);
+        self.gpu.write(&mut self.parameters, &[self.scene.unwrap_or_else(own)])?;
+        Ok(measured)
     }
 
     /// The photograph under the curve that the last statistics gave.

@@ -3,7 +3,7 @@
 
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
-/// What the formulas of [`super::curves`] need of a number.
+/// What the formulas of the curves need of a number.
 pub trait Real:
     Copy
     + PartialOrd
@@ -93,16 +93,16 @@ impl Real for f64 {
 
 /// A value with its derivative with respect to one variable.
 #[derive(Clone, Copy, Debug)]
-pub struct Dual {
+pub(crate) struct Dual {
     /// The value.
-    pub value: f64,
+    pub(crate) value: f64,
     /// Its derivative.
-    pub derivative: f64,
+    pub(crate) derivative: f64,
 }
 
 impl Dual {
     /// The variable itself.
-    pub fn variable(value: f64) -> Self {
+    pub(crate) fn variable(value: f64) -> Self {
         Self { value, derivative: 1.0 }
     }
 

@@ -1,0 +1,6 @@
+// The status words: what a step met that the host must know. [0] holds flags that stay raised until the host lowers
+// them, and kernels that change parameters do nothing while one is up; [1] the most intersections of a render.
+
+const uint STATUS_WORDS      = 2;
+const uint STATUS_OVERFLOWED = 1;  // more intersections than memory was reserved for
+const uint STATUS_NOT_FINITE = 2;  // a loss term is NaN or infinite

@@ -1,0 +1,353 @@
+//! A render against an image: L = (1 - w) mean|a - b| + w (1 - mean SSIM), means over all values of the interior.
+//!
+//! `a` is the render, not clamped, and `b` the tone curve of the dark photograph, evaluated inside the kernels. SSIM is
+//! that of 3DGS: 11 x 11 Gaussian window with sigma 1.5, per channel, zero padding. R_0 is held to the pseudo-GT, and
+//! the tonemapper's output to the dark photograph itself.
+
+use glam::{UVec2, Vec3};
+
+use super::log::{LogSlot, PartialSums};
+use super::{
+    Interior, LossSpec, LossTerm, Term, TermInputs, ViewSource, holds, no_scratch, value_count,
+};
+use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
+use crate::kernels::{ToneParameters, l1, ssim_backward, ssim_forward};
+use crate::scene::Feature;
+use crate::{Error, Result};
+
+/// R_0 and the pseudo-GT.
+pub(super) const TARGET: LossSpec = LossSpec {
+    feature: None,
+    terms: &[Term::L1, Term::SSIM],
+    on_render: Some(|gpu, config| {
+        let settings = LossSettings {
+            tone_curve: config.tone_curve,
+            ssim_weight: config.ssim_weight,
+            terms: [Term::L1, Term::SSIM],
+        };
+        Ok(Box::new(Loss::new(gpu, settings)?))
+    }),
+};
+
+/// The dark reconstruction and the photograph.
+pub(super) const DARK: LossSpec = LossSpec {
+    feature: Some(Feature::Illumination),
+    terms: &[Term::LOW_L1, Term::LOW_SSIM],
+    on_render: None,
+};
+
+impl Term {
+    /// Mean |render - target|.
+    pub const L1: Self = Self {
+        column: "l1",
+        name: "L1",
+        is_likeness: false,
+        weight: |config| 1.0 - config.ssim_weight,
+        setting: "ssim_weight",
+    };
+    /// Mean SSIM of render and target.
+    pub const SSIM: Self = Self {
+        column: "ssim",
+        name: "SSIM",
+        is_likeness: true,
+        weight: |config| config.ssim_weight,
+        ..Self::L1
+    };
+    /// Mean |render - photograph| of the dark reconstruction.
+    pub const LOW_L1: Self = Self {
+        column: "low_l1",
+        name: "L1 of the dark reconstruction",
+        is_likeness: false,
+        weight: |config| 1.0 - config.weights.low_ssim,
+        setting: "model.weights.low_ssim",
+    };
+    /// Mean SSIM of the dark reconstruction and the photograph.
+    pub const LOW_SSIM: Self = Self {
+        column: "low_ssim",
+        name: "SSIM of the dark reconstruction",
+        is_likeness: true,
+        weight: |config| config.weights.low_ssim,
+        ..Self::LOW_L1
+    };
+}
+
+/// The columns and rows of a view that one thread of the SSIM kernels takes.
+///
+/// On a processor a load costs the most, so wide strips, which share their borders' loads, win over registers that
+/// spill into the first-level cache; a GPU needs narrow ones that stay in registers.
+const CPU_STRIP: [u32; 2] = [16, 64];
+const GPU_STRIP: [u32; 2] = [2, 32];
+
+/// The strip that suits the device.
+fn strip(gpu: &Gpu) -> [u32; 2] {
+    if gpu.properties().is_cpu { CPU_STRIP } else { GPU_STRIP }
+}
+
+/// What a loss compares and how.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct LossSettings {
+    /// A `CURVE_*` of include/tone.glsl.
+    pub tone_curve: u32,
+    /// w, in [0, 1].
+    pub ssim_weight: f64,
+    /// The columns of the log for mean|a - b| and for mean SSIM.
+    pub terms: [Term; 2],
+}
+
+/// What one step's loss reads.
+#[derive(Clone, Copy, Debug)]
+pub struct LossInputs<'a> {
+    /// Width and height in pixels.
+    pub size: UVec2,
+    /// The pixels that count.
+    pub interior: Interior,
+    /// (3, H, W), not clamped.
+    pub render: &'a Buffer<f32>,
+    /// (3, H, W), sRGB-encoded.
+    pub low: &'a Buffer<f32>,
+    /// The curve of this view, one element.
+    pub tone: &'a Buffer<ToneParameters>,
+}
+
+/// The kernels of L1 and SSIM and their scratch memory.
+#[derive(Debug)]
+pub struct Loss {
+    gpu: Gpu,
+    terms: [Term; 2],
+    kernels: Kernels,
+    max_values: u32,
+    l1_partials: Buffer<f32>,
+    ssim_partials: Buffer<f32>,
+}
+
+#[derive(Debug)]
+enum Kernels {
+    /// The SSIM weight is zero: no SSIM is evaluated.
+    L1 {
+        whole: Pipeline<l1::Kernel>,
+        interior: Pipeline<l1::Kernel>,
+        values_per_workgroup: u32,
+    },
+    Ssim(Ssim),
+}
+
+#[derive(Debug)]
+struct Ssim {
+    weight: f64,
+    strip: [u32; 2],
+    subgroup_size: u32,
+    forward: Pipeline<ssim_forward::Kernel>,
+    backward: Pipeline<ssim_backward::Kernel>,
+    /// (3, H, W), dS/dE\[a\], dS/dE\[aa\], dS/dE\[ab\].
+    d_moments: Buffer<Vec3>,
+}
+
+impl Loss {
+    /// The kernels, without scratch memory: see [`Loss::reserve`].
+    ///
+    /// # Errors
+    /// The weight is outside [0, 1], or the device is out of memory.
+    pub fn new(gpu: &Gpu, settings: LossSettings) -> Result<Self> {
+        let LossSettings { tone_curve, ssim_weight, terms } = settings;
+        if !(0.0..=1.0).contains(&ssim_weight) {
+            return Err(Error::Usage(format!(
+                "the SSIM weight is {ssim_weight}; it must be within 0 and 1"
+            )));
+        }
+        let subgroup_size = gpu.properties().subgroup_size;
+        let kernels = if ssim_weight > 0.0 {
+            let [columns, rows] = strip(gpu);
+            Kernels::Ssim(Ssim {
+                weight: ssim_weight,
+                strip: [columns, rows],
+                subgroup_size,
+                forward: gpu.pipeline(&ssim_forward::Constants { columns, rows, tone_curve })?,
+                backward: gpu.pipeline(&ssim_backward::Constants { columns, rows, tone_curve })?,
+                d_moments: gpu.uninit("d_moments", 0)?,
+            })
+        } else {
+            let constants = l1::Constants { tone_curve, ..Default::default() };
+            Kernels::L1 {
+                whole: gpu.pipeline(&constants)?,
+                interior: gpu.pipeline(&l1::Constants { with_interior: true, ..constants })?,
+                values_per_workgroup: subgroup_size * constants.values_per_thread,
+            }
+        };
+        Ok(Self {
+            gpu: gpu.clone(),
+            terms,
+            kernels,
+            max_values: 0,
+            l1_partials: gpu.uninit("l1_partials", 0)?,
+            ssim_partials: gpu.uninit("ssim_partials", 0)?,
+        })
+    }
+
+    /// Scratch memory for views of `size`, and for those reserved for before.
+    ///
+    /// # Errors
+    /// The device is out of memory.
+    pub fn reserve(&mut self, size: UVec2) -> Result<()> {
+        let (values, workgroups) = (value_count(size), self.kernels.workgroups(size) as usize);
+        if values > self.max_values {
+            if let Kernels::Ssim(ssim) = &mut self.kernels {
+                ssim.d_moments = self.gpu.uninit("d_moments", values as usize)?;
+            }
+            self.max_values = values;
+        }
+        if workgroups > self.l1_partials.len() {
+            self.l1_partials = self.gpu.uninit("l1_partials", workgroups)?;
+            self.ssim_partials = self.gpu.uninit("ssim_partials", workgroups)?;
+        }
+        Ok(())
+    }
+
+    /// Writes dL/d render, (3, H, W), to `d_render`, also outside the interior, and the means of |a - b| and of SSIM to
+    /// the log. Where the SSIM weight is 0, SSIM is neither evaluated nor logged.
+    ///
+    /// # Errors
+    /// The view is empty or larger than those that scratch memory is reserved for, the interior is empty or not inside
+    /// it, a buffer is shorter than the view, or the log has no such slot.
+    pub fn record(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        inputs: LossInputs<'_>,
+        d_render: &mut Buffer<f32>,
+        log: &mut LogSlot<'_>,
+    ) -> Result<()> {
+        self.check(&inputs, d_render, log)?;
+        let workgroups = self.kernels.workgroups(inputs.size);
+        let threads = Threads::Workgroups([workgroups, 1, 1]);
+        let [l1_partials, ssim_partials] = [&mut self.l1_partials, &mut self.ssim_partials];
+        let mut ssim_count = 0;
+        match &mut self.kernels {
+            Kernels::L1 { whole, interior, .. } => {
+                let LossInputs { size, render, low, tone, .. } = inputs;
+                let is_whole = inputs.interior == Interior::whole(size);
+                pass.dispatch(
+                    if is_whole { whole } else { interior },
+                    &l1::Params {
+                        value_count: value_count(size),
+                        l1_scale: 1.0 / inputs.interior.value_count() as f32,
+                        width: size.x,
+                        height: size.y,
+                        interior_begin: inputs.interior.origin,
+                        interior_end: inputs.interior.end(),
+                    },
+                    l1::Buffers { render, low, tone, d_render, partials: l1_partials },
+                    threads,
+                )?;
+            }
+            Kernels::Ssim(ssim) => {
+                ssim_count = workgroups;
+                ssim.record(pass, threads, inputs, d_render, [l1_partials, ssim_partials])?;
+            }
+        }
+        let scale = 1.0 / inputs.interior.value_count() as f32;
+        let [l1, ssim] = self.terms;
+        log.record(
+            pass,
+            [
+                PartialSums { term: l1, partials: &self.l1_partials, count: workgroups, scale },
+                PartialSums { term: ssim, partials: &self.ssim_partials, count: ssim_count, scale },
+            ],
+        )
+    }
+
+    /// A kernel that runs beyond a buffer corrupts its neighbours: refuse before anything is recorded.
+    fn check(
+        &self,
+        inputs: &LossInputs<'_>,
+        d_render: &Buffer<f32>,
+        log: &LogSlot<'_>,
+    ) -> Result<()> {
+        let values = value_count(inputs.size);
+        let fits = (1..=self.max_values).contains(&values)
+            && self.kernels.workgroups(inputs.size) as usize <= self.l1_partials.len();
+        if !fits {
+            return Err(no_scratch("loss", inputs.size));
+        }
+        inputs.interior.check(inputs.size)?;
+        for buffer in [inputs.render, inputs.low, d_render] {
+            holds(buffer, values as usize)?;
+        }
+        if inputs.tone.is_empty() {
+            return Err(Error::Usage("there are no tone parameters".to_owned()));
+        }
+        log.check()
+    }
+}
+
+impl Kernels {
+    /// One subgroup each; as many as there are partial sums.
+    fn workgroups(&self, size: UVec2) -> u32 {
+        match self {
+            Self::L1 { values_per_workgroup, .. } => {
+                value_count(size).div_ceil(*values_per_workgroup)
+            }
+            Self::Ssim(ssim) => {
+                let [columns, rows] = ssim.strip;
+                (3 * size.x.div_ceil(columns) * size.y.div_ceil(rows)).div_ceil(ssim.subgroup_size)
+            }
+        }
+    }
+}
+
+impl Ssim {
+    fn record(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        threads: Threads<'_>,
+        LossInputs { size, interior, render, low, tone }: LossInputs<'_>,
+        d_render: &mut Buffer<f32>,
+        [l1_partials, ssim_partials]: [&mut Buffer<f32>; 2],
+    ) -> Result<()> {
+        let UVec2 { x: width, y: height } = size;
+        let (interior_begin, interior_end) = (interior.origin, interior.end());
+        let d_moments = &mut self.d_moments;
+        pass.dispatch(
+            &self.forward,
+            &ssim_forward::Params { width, height, interior_begin, interior_end },
+            ssim_forward::Buffers { render, low, tone, d_moments, partials: ssim_partials },
+            threads,
+        )?;
+        let mean_scale = 1.0 / f64::from(interior.value_count());
+        pass.dispatch(
+            &self.backward,
+            &ssim_backward::Params {
+                width,
+                height,
+                interior_begin,
+                interior_end,
+                l1_scale: ((1.0 - self.weight) * mean_scale) as f32,
+                ssim_scale: (self.weight * mean_scale) as f32,
+            },
+            ssim_backward::Buffers {
+                render,
+                low,
+                tone,
+                d_moments,
+                d_render,
+                partials: l1_partials,
+            },
+            threads,
+        )
+    }
+}
+
+impl LossTerm for Loss {
+    fn prepare(&mut self, views: &[ViewSource<'_>]) -> Result<()> {
+        views.iter().try_for_each(|view| self.reserve(view.size))
+    }
+
+    fn record_step(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        &TermInputs { size, render, low, tone, .. }: &TermInputs<'_>,
+        d_render: &mut Buffer<f32>,
+        log: &mut LogSlot<'_>,
+    ) -> Result<()> {
+        let inputs = LossInputs { size, interior: Interior::whole(size), render, low, tone };
+        self.record(pass, inputs, d_render, log)
+    }
+}
