@@ -158,6 +158,21 @@ impl<'a> Scene<'a> {
         project_gaussian_backward(&self.camera, self.params.sh_degree, gaussian, splat, d_splat)
     }
 
+    /// What roundings make of the gradient of a quaternion where the terms cancel, as they do for a sphere, which has none:
+    /// its entries are sums of products whose magnitudes these are.
+    fn quat_error(&self, gaussian: &Gaussian, splat: &Splat, d_splat: &DSplat) -> f64 {
+        let ([a, b, c], d) = (splat.conic.abs().to_array(), d_splat.conic.abs());
+        let d_xx = a * a * d.x + a * b * d.y + b * b * d.z;
+        let d_xy = 2.0 * a * b * d.x + (a * c + b * b) * d.y + 2.0 * b * c * d.z;
+        let d_yy = b * b * d.x + b * c * d.y + c * c * d.z;
+        let mean_in_view = self.camera.view(gaussian.mean);
+        let slope = self.camera.clamped_slope(mean_in_view);
+        let t = self.camera.focal / mean_in_view.z * (1.0 + slope * slope).map(f64::sqrt);
+        let scale = gaussian.log_scale.max_element().exp();
+        let d_u = DVec2::new(2.0 * d_xx * t.x + d_xy * t.y, 2.0 * d_yy * t.y + d_xy * t.x);
+        512.0 * UNIT * scale * scale * t.dot(d_u) / gaussian.quat.length().max(1e-12)
+    }
+
     /// What the statistics of density control grow by.
     fn damped_norm(&self, gaussian: &Gaussian, d_splat: &DSplat) -> f64 {
         let Params { damping_weight, damping_depth, .. } = *self.params;
@@ -232,6 +247,7 @@ impl Reference for Kernel {
             // A basis is a polynomial of magnitude 3 and degree 3, which may vanish.
             let basis = 64.0 * UNIT * d_splat.color.abs();
             moved.sh.iter_mut().for_each(|bound| *bound += basis);
+            moved.quat += scene.quat_error(&gaussian, &splat, &d_splat);
             scene.planes.store(&moved, i, |at, bound| gradients[at] += bound);
             let norm = scene.damped_norm(&gaussian, &d_splat);
             let sum = f64::from(slices.grad_norm_sums[i].abs()) + norm;

@@ -38,6 +38,7 @@ macro_rules! run_kernel {
 }
 
 /// The same with the kernel's CPU reference.
+#[allow(unused_macros, reason = "no test binary uses everything")]
 macro_rules! run_reference {
     ($kernel:ident, $constants:expr, $params:expr, [$($input:ident),*], [$($output:ident),+]) => {{
         $(let mut $output = $output.clone();)+
