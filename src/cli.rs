@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use anyhow::Result;
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory, Parser, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::image::Image;
@@ -92,6 +92,28 @@ impl Cli {
     }
 }
 
+/// A message of the library with options in place of what they set: `--steps` for `` `TrainConfig::steps` ``.
+pub fn in_options(message: &str) -> String {
+    let command = Cli::command();
+    let arguments = || command.get_subcommands().flat_map(clap::Command::get_arguments);
+    let option = |quoted: &str| {
+        let long = match quoted.rsplit_once("::")?.1 {
+            "gain_c" => "gain".to_owned(),
+            "Replace" => "overwrite".to_owned(),
+            "Name" => "device".to_owned(),
+            field => field.replace('_', "-"),
+        };
+        arguments().any(|own| own.get_long() == Some(&long)).then(|| format!("--{long}"))
+    };
+    let parts: Vec<&str> = message.split('`').collect();
+    let said = parts.iter().enumerate().map(|(index, part)| match index % 2 {
+        0 => (*part).to_owned(),
+        _ if index + 1 == parts.len() => format!("`{part}"),
+        _ => option(part).unwrap_or_else(|| format!("`{part}`")),
+    });
+    said.collect()
+}
+
 /// The picture files that a command writes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
 pub enum ImageFormat {
@@ -126,4 +148,33 @@ impl ImageFormat {
 fn progress_bar(len: usize) -> ProgressBar {
     let style = ProgressStyle::with_template("{bar:32} {pos}/{len}  {msg}  {eta} left");
     ProgressBar::new(len as u64).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_an_option_sets_is_called_by_the_option() {
+        for (message, said) in [
+            (
+                "`TrainConfig::steps` is 0; it must be at least 1",
+                "--steps is 0; it must be at least 1",
+            ),
+            (
+                "raise `LoadOptions::downscale` or `TrainConfig::max_gaussians`",
+                "raise --downscale or --max-gaussians",
+            ),
+            ("`ToneSettings::gain_c` is -1", "--gain is -1"),
+            ("pass `HeldRun::Replace`", "pass --overwrite"),
+            ("`DeviceChoice::Name` picks another", "--device picks another"),
+            // Neither a setting, nor one that has an option, nor closed.
+            (
+                "buffer `steps` of `Trainer::log` is `odd",
+                "buffer `steps` of `Trainer::log` is `odd",
+            ),
+        ] {
+            assert_eq!(in_options(message), said);
+        }
+    }
 }

@@ -5,7 +5,6 @@
 //! same name is a test view's reference image (`View::reference`), used for scores only and loaded for test views only.
 
 mod colmap;
-mod files;
 mod options;
 mod pixels;
 mod similarity;
@@ -20,8 +19,8 @@ use glam::{DAffine3, DVec3};
 
 use crate::camera::{Camera, Lens};
 use crate::image::Image;
+use crate::image::files::{self, Files};
 use crate::{Error, Result};
-use files::Files;
 pub use options::{DepthOptions, LoadOptions};
 use pixels::Source;
 use similarity::Similarity;
@@ -97,7 +96,7 @@ pub struct Point {
 
 /// One view as a listing describes it, before any pixel is read.
 #[derive(Clone, Debug)]
-struct Frame {
+struct ListedView {
     name: String,
     /// Path as listed, relative to the root.
     listed: String,
@@ -112,7 +111,7 @@ struct Frame {
 
 #[derive(Debug, Default)]
 struct Listing {
-    frames: Vec<Frame>,
+    frames: Vec<ListedView>,
     skipped: Vec<String>,
 }
 
@@ -136,6 +135,15 @@ impl Dataset {
     /// [`Error::Usage`] for a downscale that makes no sense; [`Error::Input`] naming the folder or file where there is
     /// no dataset, no training photograph left, a file cut short, two views of one name, an unsupported camera model,
     /// or a photograph whose size contradicts its camera.
+    ///
+    /// ```no_run
+    /// use nightsplat::dataset::{Dataset, LoadOptions};
+    ///
+    /// let options = LoadOptions { downscale: 4.0, ..LoadOptions::default() };
+    /// let dataset = Dataset::load("photos", &options)?;
+    /// println!("{} to train on, {} points", dataset.train_views().count(), dataset.points.len());
+    /// # Ok::<(), nightsplat::Error>(())
+    /// ```
     pub fn load(root: impl AsRef<Path>, options: &LoadOptions) -> Result<Self> {
         let root = root.as_ref();
         options.check()?;
@@ -261,12 +269,12 @@ fn list_colmap(root: &Path, folder: &Path, files: &Files, listing: &mut Listing)
         let listed = if beside_root.is_some() { name.clone() } else { format!("images/{name}") };
         let file = beside_root.or_else(|| files.find(&root.join("images"), &name));
         let name = files::stem(&name).to_owned();
-        listing.frames.push(Frame { name, listed, split: None, file, lens, view_from_world });
+        listing.frames.push(ListedView { name, listed, split: None, file, lens, view_from_world });
     }
     Ok(())
 }
 
-fn refuse_two_of_one_name(root: &Path, frames: &[Frame]) -> Result<()> {
+fn refuse_two_of_one_name(root: &Path, frames: &[ListedView]) -> Result<()> {
     let mut listed = HashMap::new();
     for frame in frames {
         if let Some(other) = listed.insert(&frame.name, &frame.listed) {
@@ -281,9 +289,9 @@ fn refuse_two_of_one_name(root: &Path, frames: &[Frame]) -> Result<()> {
 }
 
 /// Frames that the listing did not assign: by `test.txt` (a name a line), else every eighth. Sorted by name already.
-fn split(root: &Path, frames: &mut [Frame]) -> Result<()> {
+fn split(root: &Path, frames: &mut [ListedView]) -> Result<()> {
     let path = root.join("test.txt");
-    let mut undecided: Vec<&mut Frame> =
+    let mut undecided: Vec<&mut ListedView> =
         frames.iter_mut().filter(|frame| frame.split.is_none()).collect();
     if undecided.is_empty() || !path.is_file() {
         for (index, frame) in undecided.into_iter().enumerate() {
@@ -312,13 +320,13 @@ fn split(root: &Path, frames: &mut [Frame]) -> Result<()> {
 /// Which files each view reads. A training view without its photograph is left out, a test view stays as a pose.
 fn sources(
     root: &Path,
-    frames: &[Frame],
+    frames: &[ListedView],
     options: &LoadOptions,
     files: &Files,
     skipped: &mut Vec<String>,
 ) -> Vec<Source> {
     let training = frames.iter().filter(|frame| frame.split == Some(Split::Train));
-    let training_folders: BTreeSet<&str> = training.map(Frame::folder).collect();
+    let training_folders: BTreeSet<&str> = training.map(ListedView::folder).collect();
     let mut sources = Vec::new();
     for frame in frames {
         let split = frame.split.unwrap_or(Split::Train);
@@ -339,7 +347,7 @@ fn sources(
             let depth = (options.depth.load && split == Split::Train)
                 .then(|| frame.depth(root, options.depth.folder.as_deref(), files))
                 .flatten();
-            let Frame { name, lens, view_from_world, .. } = frame.clone();
+            let ListedView { name, lens, view_from_world, .. } = frame.clone();
             sources.push(Source { name, split, lens, view_from_world, input, reference, depth });
         }
     }
@@ -354,7 +362,7 @@ fn sources(
     sources
 }
 
-impl Frame {
+impl ListedView {
     /// The folder it is listed in.
     fn folder(&self) -> &str {
         self.listed.rsplit_once('/').map_or("", |(folder, _)| folder)
@@ -455,35 +463,6 @@ fn same_world(folder: &Path, pairs: &[(DVec3, DVec3)]) -> Option<Box<dyn Fn(DVec
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    /// The model's cameras and the views they belong to, of a LOM scene, or `None` with a word on stdout.
-    fn lom_pairs(scene: &str) -> Option<Vec<(DVec3, DVec3)>> {
-        let root =
-            Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../shared/data/lom")).join(scene);
-        if !root.is_dir() {
-            println!("skipped: {} is absent", root.display());
-            return None;
-        }
-        let frames = list(&root, &Files::default()).unwrap().frames;
-        let images = colmap::read_images(&colmap::find(&root, &["images"]).unwrap()).unwrap();
-        let center = |pose: DAffine3| pose.inverse().translation;
-        let pairs = images.iter().map(|image| {
-            let frame = frames.iter().find(|frame| frame.name == files::stem(&image.name)).unwrap();
-            (center(image.view_from_world.unwrap()), center(frame.view_from_world))
-        });
-        Some(pairs.collect())
-    }
-
-    #[test]
-    fn loms_two_worlds_differ_by_an_exact_similarity() {
-        for (scene, count) in [("chair", 48), ("sofa", 33), ("shrub", 35)] {
-            if let Some(pairs) = lom_pairs(scene) {
-                let residual = Similarity::solve(&pairs).unwrap().residual;
-                assert!(residual < 1e-8, "{scene}: {residual}");
-                assert_eq!(pairs.len(), count);
-            }
-        }
-    }
 
     #[test]
     fn a_world_that_is_off_by_more_than_a_hundredth_gives_no_points() {

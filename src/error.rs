@@ -1,4 +1,7 @@
 //! What can go wrong, sorted by what the user can do about it.
+//!
+//! A message names what a caller sets by its place in the library, in backquotes: `` `TrainConfig::steps` ``. The command
+//! line says its option instead.
 
 use std::path::{Path, PathBuf};
 
@@ -25,7 +28,7 @@ pub enum Error {
         /// The fact and the remedy.
         problem: String,
     },
-    /// An option or a combination of options that makes no sense; the exit code is 2.
+    /// A setting, an argument or a combination of them that makes no sense; the exit code is 2.
     #[error("{0}")]
     Usage(String),
     /// There is no Vulkan loader, or no device that the choice names.
@@ -33,7 +36,7 @@ pub enum Error {
     NoDevice(String),
     /// The device lacks something every kernel needs.
     #[error(
-        "{device} lacks {feature}; `nightsplat doctor` lists every device and what it offers, --device picks another"
+        "{device} lacks {feature}; `nightsplat doctor` lists every device and what it offers, `DeviceChoice::Name` picks another"
     )]
     MissingFeature {
         /// The device's name.
@@ -43,17 +46,19 @@ pub enum Error {
     },
     /// A buffer did not fit into device memory.
     #[error(
-        "out of device memory: buffer `{buffer}` needs {bytes} bytes; lower --max-gaussians or raise --downscale"
+        "out of device memory: buffer `{buffer}` needs {bytes} bytes; lower `TrainConfig::max_gaussians` or raise `TrainConfig::downscale`"
     )]
     OutOfMemory {
         /// The buffer's name.
         buffer: String,
         /// Its size in bytes.
         bytes: u64,
+        /// What the driver or the allocator said.
+        source: Box<dyn std::error::Error + Send + Sync>,
     },
     /// A buffer exceeds what one binding may hold on this device.
     #[error(
-        "buffer `{buffer}` needs {bytes} bytes, {device} binds {limit} at most; lower --max-gaussians or raise --downscale"
+        "buffer `{buffer}` needs {bytes} bytes, {device} binds {limit} at most; lower `TrainConfig::max_gaussians` or raise `TrainConfig::downscale`"
     )]
     BufferTooLarge {
         /// The buffer's name.
@@ -66,12 +71,12 @@ pub enum Error {
         limit: u64,
     },
     /// The device stopped answering.
-    #[error("{device} was lost while it ran `{pass}`; lower the load or update the driver")]
+    #[error("{device} was lost while it ran `{submission}`; lower the load or update the driver")]
     DeviceLost {
         /// The device's name.
         device: String,
-        /// The last pass recorded.
-        pass: String,
+        /// The label of the submission, as [`crate::gpu::Gpu::submit`] takes it.
+        submission: String,
     },
     /// A Vulkan call failed for a reason not named above.
     #[error("{call} failed on {device}: {result}")]

@@ -21,8 +21,10 @@ mod submission;
 pub mod testing;
 mod validation;
 
+use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::thread::{self, ThreadId};
 
 use ash::{ext, khr, vk};
 
@@ -76,6 +78,7 @@ struct Shared {
     debug: Option<ext::debug_utils::Device>,
     allocator: Mutex<Option<gpu_allocator::vulkan::Allocator>>,
     queue: Mutex<Queue>,
+    progress: Mutex<Progress>,
     timeline: vk::Semaphore,
     /// The timeline value after which a resource that is dropped now is unused.
     last_use: AtomicU64,
@@ -93,7 +96,25 @@ struct Shared {
 struct Queue {
     raw: vk::Queue,
     family: u32,
+}
+
+/// Where recording and submission are. Unlike the queue, nobody holds it for long.
+#[derive(Default)]
+struct Progress {
+    /// Who records, and under which label.
+    recording: Option<(ThreadId, String)>,
+    /// The timeline value of the last submission.
     submitted: u64,
+    /// The labels of the submissions that were not waited for, and the last that was.
+    labels: BTreeMap<u64, String>,
+}
+
+impl Progress {
+    /// The label under which this thread records.
+    fn recorded_here(&self) -> Option<&str> {
+        let here = thread::current().id();
+        self.recording.as_ref().filter(|(thread, _)| *thread == here).map(|(_, label)| &**label)
+    }
 }
 
 /// A Vulkan object whose owner is gone.
@@ -120,20 +141,6 @@ impl Gpu {
     pub fn properties(&self) -> &Properties {
         &self.shared.properties
     }
-
-    /// Validation messages seen so far (own devices with validation only).
-    pub fn validation_messages(&self) -> Vec<String> {
-        self.shared.owned.as_ref().map(device::Owned::messages).unwrap_or_default()
-    }
-
-    /// Waits until everything submitted so far is done.
-    ///
-    /// # Errors
-    /// The device was lost.
-    pub fn wait_idle(&self) -> Result<()> {
-        let submitted = lock(&self.shared.queue).submitted;
-        self.shared.wait(submitted)
-    }
 }
 
 impl Shared {
@@ -141,19 +148,45 @@ impl Shared {
     fn error(&self, call: &'static str, result: vk::Result) -> Error {
         let device = self.properties.name.clone();
         match result {
-            vk::Result::ERROR_DEVICE_LOST => Error::DeviceLost { device, pass: call.to_owned() },
+            vk::Result::ERROR_DEVICE_LOST => {
+                let submission = self.unfinished().unwrap_or_else(|| call.to_owned());
+                Error::DeviceLost { device, submission }
+            }
             _ => Error::Vulkan { call, device, result },
         }
     }
 
+    /// The label of the submission that the device is at; where it is done with all, of the last.
+    fn unfinished(&self) -> Option<String> {
+        // SAFETY: the semaphore lives as long as `self`. A lost device may not know.
+        let done = unsafe { self.device.get_semaphore_counter_value(self.timeline) }.unwrap_or(0);
+        let progress = lock(&self.progress);
+        let (mut all, later) =
+            (progress.labels.values(), progress.labels.range(done.saturating_add(1)..));
+        later.map(|(_, label)| label).next().or_else(|| all.next_back()).cloned()
+    }
+
     /// Blocks until the timeline reaches `value`, then frees what nobody uses any more.
     fn wait(&self, value: u64) -> Result<()> {
+        let is_coming = {
+            let progress = lock(&self.progress);
+            let is_recorded_elsewhere =
+                progress.recording.is_some() && progress.recorded_here().is_none();
+            value <= progress.submitted || is_recorded_elsewhere
+        };
+        if !is_coming {
+            let problem = "a download that was not submitted cannot be waited for; wait once `Gpu::run` or \
+                           `Gpu::submit` has returned";
+            return Err(Error::Usage(problem.to_owned()));
+        }
         let (semaphores, values) = ([self.timeline], [value]);
         let wait = vk::SemaphoreWaitInfo::default().semaphores(&semaphores).values(&values);
         // SAFETY: the semaphore lives as long as `self`.
         unsafe { self.device.wait_semaphores(&wait, u64::MAX) }
             .map_err(|result| self.error("vkWaitSemaphores", result))?;
         self.collect(value);
+        let mut progress = lock(&self.progress);
+        progress.labels = progress.labels.split_off(&value);
         Ok(())
     }
 
@@ -198,7 +231,7 @@ impl Shared {
 
 impl Drop for Shared {
     fn drop(&mut self) {
-        let submitted = lock(&self.queue).submitted;
+        let submitted = lock(&self.progress).submitted;
         // A lost device still has to be torn down.
         let _ = self.wait(submitted);
         self.collect(u64::MAX);
@@ -216,5 +249,23 @@ impl Drop for Shared {
                 owned.destroy();
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_lost_device_names_what_it_was_at() {
+        let gpu = Gpu::new(&DeviceChoice::Best).unwrap();
+        let lost = || gpu.shared.error("vkQueueSubmit2", vk::Result::ERROR_DEVICE_LOST).to_string();
+        assert!(lost().contains("`vkQueueSubmit2`"), "{}", lost());
+        gpu.run("the first", |_| Ok(())).unwrap();
+        gpu.submit("the second", |_| Ok(())).unwrap();
+        assert!(lost().contains("`the second`"), "{}", lost());
+        gpu.run("the third", |_| Ok(())).unwrap();
+        assert!(lost().contains("`the third`"), "{}", lost());
+        assert_eq!(lock(&gpu.shared.progress).labels.len(), 1);
     }
 }

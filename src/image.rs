@@ -5,6 +5,7 @@
 //! the power law continued above 1).
 
 mod exr_file;
+pub(crate) mod files;
 mod jpeg;
 
 use std::io::Cursor;

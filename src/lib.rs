@@ -4,8 +4,11 @@
 //! photographs on disk -> dataset -> pseudo-GT (tone curve) ┐
 //!                                                          ├-> loss -> backward -> optimizer -> densify -> next step
 //! points -> scene (Gaussians) -> project -> bin -> sort -> blend ┘
-//!                                                          └-> eval, export, render
+//!                                                          └-> run, eval, render
 //! ```
+//!
+//! A program trains with [`run::train`], as `examples/train.rs` does, or lends its own Vulkan device and renders into its
+//! own command buffers, as `examples/embed.rs` does.
 //!
 //! Data flows one way: a module uses only modules above it in this list, which `tests/architecture.rs` reads and asserts.
 //!
@@ -34,7 +37,7 @@
 //! - [`train`]: one step after another
 //! - [`metrics`]: PSNR and SSIM of a render against its reference image
 //! - [`eval`]: scores of the test views
-//! - [`export`]: the run directory
+//! - [`run`]: a training run, its events and its directory
 //! - [`report`]: tables and plots in one self-contained page
 //! - `cli`: one file per subcommand (feature `cli`)
 
@@ -46,7 +49,6 @@ pub mod dataset;
 pub mod densify;
 pub mod error;
 pub mod eval;
-pub mod export;
 pub mod fit;
 #[expect(unsafe_code, reason = "the only module that speaks Vulkan")]
 pub mod gpu;
@@ -62,6 +64,7 @@ pub mod random;
 pub mod reference;
 pub mod render;
 pub mod report;
+pub mod run;
 pub mod scene;
 pub mod sort;
 pub mod structure;

@@ -5,7 +5,7 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use nightsplat::Error;
-use nightsplat::cli::Cli;
+use nightsplat::cli::{Cli, in_options};
 use tracing_subscriber::filter::LevelFilter;
 
 fn main() -> ExitCode {
@@ -30,7 +30,7 @@ fn main() -> ExitCode {
         return ExitCode::SUCCESS;
     }
     // A closed stderr leaves nobody to tell.
-    let _ = writeln!(std::io::stderr(), "error: {error:#}");
+    let _ = writeln!(std::io::stderr(), "error: {}", in_options(&format!("{error:#}")));
     ExitCode::from(error.downcast_ref::<Error>().map_or(1, Error::exit_code))
 }
 

@@ -21,6 +21,7 @@ use crate::{Error, Result};
 
 pub use conv::Precision;
 pub use denoiser::{Denoiser, DenoiserSettings};
+pub(crate) use file::TensorFile;
 pub use file::{load, save};
 pub use parameters::{Parameters, Tensor};
 pub use tonemapper::Tonemapper;

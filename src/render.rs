@@ -24,7 +24,8 @@ use crate::scene::Shape;
 use crate::sort::{Count, DispatchArguments, RadixSort, Scan};
 use crate::{Error, Result};
 
-use frame::Frame;
+#[doc(hidden)]
+pub use frame::Frame;
 pub use frame::Status;
 
 /// What a renderer is specialised for.
@@ -101,6 +102,24 @@ pub struct Gradients<'a> {
 }
 
 /// Renders Gaussians, forward and backward. Holds the memory of one view.
+///
+/// ```no_run
+/// use nightsplat::dataset::{Dataset, LoadOptions};
+/// use nightsplat::gpu::{DeviceChoice, Gpu};
+/// use nightsplat::render::{RenderOptions, RenderSettings, Renderer};
+/// use nightsplat::scene::ply;
+///
+/// let gpu = Gpu::new(&DeviceChoice::Best)?;
+/// let camera = Dataset::load("photos", &LoadOptions::default())?.views[0].camera;
+/// let gaussians = ply::load("run/model.ply")?;
+/// let settings = RenderSettings { shape: gaussians.shape, ..RenderSettings::default() };
+/// let mut renderer = Renderer::new(&gpu, settings)?;
+/// let parameters = gpu.buffer("parameters", &gaussians.parameters)?;
+/// renderer.reserve(gaussians.count, [&camera])?;
+/// let options = RenderOptions { sh_degree: gaussians.shape.sh_degree, background: [0.0; 3] };
+/// renderer.render_image(&parameters, &camera, &options)?.save_png8("view.png")?;
+/// # Ok::<(), nightsplat::Error>(())
+/// ```
 #[derive(Debug)]
 pub struct Renderer {
     gpu: Gpu,
@@ -205,6 +224,17 @@ impl Renderer {
     /// The last render, planar (channels, H, W): RGB, then the features.
     pub fn render(&self) -> &Buffer<f32> {
         &self.frame.render
+    }
+
+    /// How much of the background the last render lets through, (H, W): 1 where no splat is.
+    pub fn transmittances(&self) -> &Buffer<f32> {
+        &self.frame.transmittances
+    }
+
+    /// Everything that the passes of the last render handed each other.
+    #[doc(hidden)]
+    pub fn frame(&self) -> &Frame {
+        &self.frame
     }
 
     /// The status words: see [`Status`]. Kernels that change parameters look at the first and do nothing unless it is 0.

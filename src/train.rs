@@ -117,7 +117,25 @@ impl StepReport {
     }
 }
 
-/// A model in training, and all that its steps need.
+/// A model in training, and all that its steps need; [`crate::run::train`] drives one into a run directory.
+///
+/// ```no_run
+/// use nightsplat::dataset::Dataset;
+/// use nightsplat::gpu::{DeviceChoice, Gpu};
+/// use nightsplat::train::{TrainConfig, Trainer};
+///
+/// let config = TrainConfig { steps: 500, ..TrainConfig::default() };
+/// let gpu = Gpu::new(&DeviceChoice::Best)?;
+/// let dataset = Dataset::load("photos", &config.load_options())?;
+/// let mut trainer = Trainer::new(&gpu, config.clone(), &dataset)?;
+/// while trainer.steps_done() < config.steps {
+///     for report in trainer.advance(config.steps)? {
+///         println!("step {}: loss {:.4}", report.step, report.loss);
+///     }
+/// }
+/// nightsplat::scene::ply::save(&trainer.gaussians()?, "model.ply")?;
+/// # Ok::<(), nightsplat::Error>(())
+/// ```
 #[derive(Debug)]
 pub struct Trainer {
     gpu: Gpu,

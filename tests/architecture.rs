@@ -196,6 +196,17 @@ fn unsafe_code_is_in_the_gpu_layer_alone() {
 }
 
 #[test]
+fn tests_start_the_command_and_look_for_captures_in_one_place() {
+    // There validation is made to fail the command, and what is absent is said.
+    for (what, place) in [("CARGO_BIN_", "common/command.rs"), ("/../shar", "common/mod.rs")] {
+        for (path, text) in files("tests", "rs") {
+            let allowed = path.ends_with(place) || path.ends_with("architecture.rs");
+            assert!(allowed || !text.contains(what), "{}: see tests/{place}", path.display());
+        }
+    }
+}
+
+#[test]
 fn a_file_can_be_read_in_one_sitting() {
     let all = [("src", "rs"), ("tests", "rs"), ("shaders-glsl", "comp"), ("shaders-glsl", "glsl")];
     for (path, text) in all.into_iter().flat_map(|(folder, extension)| files(folder, extension)) {

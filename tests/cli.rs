@@ -4,49 +4,14 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
 use std::sync::OnceLock;
 
 use nightsplat::image::Image;
 use nightsplat::metrics::Scores;
 use serde_json::Value;
 
-/// Runs `nightsplat` with arguments as a shell splits them; paths hold no spaces.
-fn nightsplat(arguments: &str) -> Output {
-    nightsplat_with(arguments, &[])
-}
-
-fn nightsplat_with(arguments: &str, environment: &[(&str, &str)]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_nightsplat"))
-        .args(arguments.split_whitespace())
-        .envs(environment.iter().copied())
-        .output()
-        .unwrap()
-}
-
-/// Standard output of a command that must succeed.
-fn succeed(arguments: &str) -> String {
-    let output = nightsplat(arguments);
-    let stderr = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success(), "{arguments}: {stderr}");
-    String::from_utf8(output.stdout).unwrap()
-}
-
-/// The command must fail with this exit code and one line on standard error that has all of `parts`.
-fn refused(arguments: &str, code: i32, parts: &[&str]) {
-    assert_refused(arguments, &nightsplat(arguments), code, parts);
-}
-
-fn assert_refused(arguments: &str, output: &Output, code: i32, parts: &[&str]) {
-    let stderr = String::from_utf8(output.stderr.clone()).unwrap();
-    assert_eq!(output.status.code(), Some(code), "{arguments}: {stderr}");
-    let mut lines = stderr.lines();
-    let line = lines.next().unwrap_or_default();
-    assert!(line.starts_with("error: ") && lines.next().is_none(), "{arguments}: {stderr}");
-    for part in parts {
-        assert!(line.contains(part), "{arguments}: no `{part}` in: {line}");
-    }
-}
+mod common;
+use common::command::{command, refused, refused_with, run, succeed};
 
 /// Work that the tests share, done once: a small set and a short run on it.
 struct Fixture {
@@ -222,11 +187,9 @@ fn a_set_without_references_trains_and_scores_nothing() {
     let (root, run) = (set.path().display(), set.path().join("run"));
     succeed(&format!("train {root} --out {} --steps 2", run.display()));
     assert_eq!(json(run.join("metrics.json"))["mean"], Value::Null);
-    let output = nightsplat(&format!("eval {} --json", run.display()));
-    assert!(output.status.success());
-    let printed: Value = serde_json::from_slice(&output.stdout).unwrap();
+    let (printed, said) = common::command::run(&format!("eval {} --json", run.display()), 0);
+    let printed: Value = serde_json::from_str(&printed).unwrap();
     assert_eq!((&printed["mean"], keys(&printed["views"]).len()), (&Value::Null, 0));
-    let said = String::from_utf8(output.stderr).unwrap();
     assert!(said.contains("no test view has a reference image"), "{said}");
     assert_eq!(succeed(&format!("eval {}", run.display())).lines().count(), 1);
 }
@@ -380,11 +343,10 @@ fn refuses_to_train(root: &Path, options: &str, code: i32, parts: &[&str]) {
 
 /// Training on `root` must succeed and say all of `parts` on standard error.
 fn trains_and_says(root: &Path, parts: &[&str]) {
-    let run = root.join("run");
-    let arguments = format!("train {} --out {} --steps 1", root.display(), run.display());
-    let output = nightsplat(&arguments);
-    let stderr = String::from_utf8(output.stderr).unwrap();
-    assert!(output.status.success() && run.join("metrics.json").exists(), "{stderr}");
+    let out = root.join("run");
+    let (_, stderr) =
+        run(&format!("train {} --out {} --steps 1", root.display(), out.display()), 0);
+    assert!(out.join("metrics.json").exists(), "{stderr}");
     for part in parts {
         assert!(stderr.contains(part), "no `{part}` in: {stderr}");
     }
@@ -549,9 +511,24 @@ fn no_device_and_an_unknown_one_are_said_with_the_remedy() {
     let nothing =
         [("VK_DRIVER_FILES", "/nonexistent.json"), ("VK_ICD_FILENAMES", "/nonexistent.json")];
     for arguments in ["doctor", "bench", "demo --out /nonexistent/demo"] {
-        let output = nightsplat_with(arguments, &nothing);
-        assert_refused(arguments, &output, 1, &["no Vulkan device", "install"]);
+        refused_with(arguments, &nothing, 1, &["no Vulkan device", "install"]);
     }
+}
+
+#[test]
+fn what_validation_says_fails_the_command() {
+    if !cfg!(debug_assertions) {
+        return common::not_run("commands are validated in debug builds alone");
+    }
+    // Advice on best practices, to which nothing here is held, finds something in every run.
+    let advice = "VK_VALIDATION_FEATURE_ENABLE_BEST_PRACTICES_EXT";
+    let photograph = common::fixture("lom/low/000.png");
+    let out = tempfile::tempdir().unwrap();
+    let arguments = format!("tone {} --out {}", photograph.display(), out.path().display());
+    let output = command(&arguments).env("VK_LAYER_ENABLES", advice).output().unwrap();
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(101), "{stderr}");
+    assert!(stderr.contains("validation failed in\nmain: "), "{stderr}");
 }
 
 #[test]

@@ -3,28 +3,15 @@
 #![expect(clippy::unwrap_used, reason = "what fails here fails the test")]
 
 use nightsplat::dataset::Dataset;
-use nightsplat::dataset::synthetic::{self, SyntheticOptions};
-use nightsplat::gpu::testing::{assert_no_validation_messages, gpu};
 use nightsplat::tone::{Table, ToneCurve, ToneSettings};
-use nightsplat::train::{TrainConfig, Trainer};
+use nightsplat::train::TrainConfig;
 
-/// Five views of 32 x 24 pixels.
-fn dataset() -> Dataset {
-    let folder = tempfile::tempdir().unwrap();
-    let options = SyntheticOptions { views: 5, width: 32, height: 24, seed: 1 };
-    synthetic::write(folder.path(), &options).unwrap();
-    Dataset::load(folder.path(), &TrainConfig::default().load_options()).unwrap()
-}
+mod common;
 
 /// The losses of the first steps, and the parameters after them.
 fn train(config: &TrainConfig, dataset: &Dataset) -> (Vec<f64>, Vec<f32>) {
-    let mut trainer = Trainer::new(&gpu(), config.clone(), dataset).unwrap();
-    let mut losses = vec![];
-    while trainer.steps_done() < config.steps {
-        let reports = trainer.advance(config.steps).unwrap();
-        losses.extend(reports.into_iter().map(|report| report.loss));
-    }
-    (losses, trainer.gaussians().unwrap().parameters)
+    let (reports, gaussians) = common::train::train(config, dataset);
+    (reports.into_iter().map(|report| report.loss).collect(), gaussians.parameters)
 }
 
 fn config(tone: ToneSettings) -> TrainConfig {
@@ -41,7 +28,7 @@ fn dense_table(curve: ToneCurve) -> Table {
 
 #[test]
 fn every_kind_of_curve_trains_and_a_recorded_configuration_repeats_it() {
-    let dataset = dataset();
+    let dataset = common::train::dataset(5, [32, 24]);
     let kinds = [
         ToneSettings::new(ToneCurve::Hybrid),
         ToneSettings { constants: vec![0.9, 0.4], ..ToneSettings::new(ToneCurve::Gamma) },
@@ -58,12 +45,11 @@ fn every_kind_of_curve_trains_and_a_recorded_configuration_repeats_it() {
         let recorded: TrainConfig = toml::from_str(&config.to_toml().unwrap()).unwrap();
         assert_eq!(train(&recorded, &dataset), (losses, parameters), "{}", config.tone.curve);
     }
-    assert_no_validation_messages();
 }
 
 #[test]
 fn a_baked_target_trains_as_the_curve_in_the_loss() {
-    let dataset = dataset();
+    let dataset = common::train::dataset(5, [32, 24]);
     let in_loss = train(&config(ToneSettings::new(ToneCurve::PowerSoftexp)), &dataset).0;
     let table = ToneSettings::of_table(dense_table(ToneCurve::PowerSoftexp));
     let baked = train(&config(table), &dataset).0;
@@ -74,7 +60,7 @@ fn a_baked_target_trains_as_the_curve_in_the_loss() {
 
 #[test]
 fn the_statistics_of_the_scene_are_not_those_of_a_view() {
-    let dataset = dataset();
+    let dataset = common::train::dataset(5, [32, 24]);
     let settings = ToneSettings::new(ToneCurve::Ap3);
     let scene = ToneSettings { scene_statistics: true, ..settings.clone() };
     assert_ne!(train(&config(settings), &dataset).0, train(&config(scene), &dataset).0);

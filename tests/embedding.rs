@@ -118,6 +118,9 @@ fn render_into(host: &Host, gpu: &Gpu, memory: &mut Memory) {
         // SAFETY: the command buffer is recording; what it uses lives until the host has waited for it.
         let recorded = unsafe {
             gpu.record_into(commands.as_raw(), |pass| {
+                // Nothing of ours would know when the copy is there.
+                let message = pass.download(&parameters).unwrap_err().to_string();
+                assert!(message.contains("`parameters`"), "{message}");
                 renderer.forward(pass, &parameters, &camera(), &OPTIONS)
             })
         };

@@ -6,6 +6,9 @@ use std::process::Command;
 use nightsplat::image::Image;
 use nightsplat::metrics::{Scores, psnr, psnr_channel_mean, ssim};
 
+mod common;
+use common::{not_run, shared};
+
 fn pattern(width: u32, height: u32) -> (Image, Image) {
     let render = |x: u32, y: u32, c: u32| f64::from((x * 7 + y * 13 + c * 29) % 32) / 31.0;
     let noise = |x: u32, y: u32, c: u32| f64::from((x * 11 + y * 5 + c * 17) % 29) / 28.0 - 0.5;
@@ -67,11 +70,10 @@ fn the_mean_of_no_scores_is_none() {
 
 #[test]
 fn scores_agree_with_the_scoring_script() {
-    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/tools/score.py");
+    let Some(script) = shared("tools/score.py") else { return };
     let python = Command::new("python3").args(["-c", "import numpy, PIL"]).output();
-    if !script.exists() || !python.is_ok_and(|output| output.status.success()) {
-        println!("skipped: needs {} and python3 with numpy and PIL", script.display());
-        return;
+    if !python.is_ok_and(|output| output.status.success()) {
+        return not_run("there is no python3 with numpy and PIL");
     }
     let dir = tempfile::tempdir().unwrap();
     let (render, reference) = pattern(60, 40);

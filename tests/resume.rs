@@ -4,14 +4,19 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output, Stdio};
+use std::process::Stdio;
 use std::time::Duration;
 
 use nightsplat::dataset::Dataset;
 use nightsplat::dataset::synthetic::{self, SyntheticOptions};
-use nightsplat::gpu::testing::{assert_no_validation_messages, gpu};
+use nightsplat::gpu::testing::gpu;
+use nightsplat::run::{self, Event, HeldRun};
 use nightsplat::train::{Background, Part, StepReport, TrainConfig, Trainer};
 use safetensors::SafeTensors;
+
+mod common;
+use common::command::{command, refused, succeed};
+use common::train::advance;
 
 /// A set of nine small views.
 fn make_set(folder: &Path) {
@@ -32,14 +37,6 @@ fn config(parts: &[Part]) -> TrainConfig {
     config.model.network.repeats = 2;
     config.model.denoiser_crop = 16;
     config
-}
-
-fn advance(trainer: &mut Trainer, until: u64) -> Vec<StepReport> {
-    let mut reports = vec![];
-    while trainer.steps_done() < until {
-        reports.extend(trainer.advance(until).unwrap());
-    }
-    reports
 }
 
 /// The whole state at the end, and what every step said.
@@ -78,7 +75,6 @@ fn a_restored_run_goes_on_bit_for_bit() {
             assert_eq!(same.len() as u64, 30 - step);
         }
     }
-    assert_no_validation_messages();
 }
 
 #[test]
@@ -111,7 +107,11 @@ fn a_checkpoint_that_does_not_fit_is_refused_and_changes_nothing() {
     refuses(&mut trainer, &edited("checkpoint 1", "checkpoint 9"), &["is no `nightsplat"]);
     refuses(&mut trainer, &edited("visit_counts", "visit_c0unts"), &["density.visit_counts"]);
     refuses(&mut trainer, &edited("first_moments", "first_m0ments"), &["gaussians.first_moments"]);
-    refuses(&mut trainer, &edited("seed = 10", "seed = 11"), &["seed = 11, not 10", "--overwrite"]);
+    refuses(
+        &mut trainer,
+        &edited("seed = 10", "seed = 11"),
+        &["seed = 11, not 10", "HeldRun::Replace"],
+    );
     refuses(&mut trainer, &edited("steps = 30", "stepz = 30"), &["another version"]);
     let file = SafeTensors::deserialize(&whole).unwrap();
     let sums = file.tensor("density.grad_norm_sums").unwrap().data();
@@ -123,28 +123,44 @@ fn a_checkpoint_that_does_not_fit_is_refused_and_changes_nothing() {
 
     let shorter = TrainConfig { steps: 5, ..config };
     let mut shorter = Trainer::new(&gpu, shorter, &dataset).unwrap();
-    refuses(&mut shorter, &whole, &["at step 6", "ends at 5", "--steps"]);
-    assert_no_validation_messages();
+    refuses(&mut shorter, &whole, &["at step 6", "ends at 5", "TrainConfig::steps"]);
 }
 
-fn nightsplat(arguments: &str) -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_nightsplat"));
-    command.args(arguments.split_whitespace()).stdout(Stdio::piped()).stderr(Stdio::piped());
-    command
-}
-
-fn succeed(arguments: &str) {
-    let Output { status, stderr, .. } = nightsplat(arguments).output().unwrap();
-    assert!(status.success(), "{arguments}: {}", String::from_utf8_lossy(&stderr));
-}
-
-fn refused(arguments: &str, code: i32, parts: &[&str]) {
-    let Output { status, stderr, .. } = nightsplat(arguments).output().unwrap();
-    let message = String::from_utf8_lossy(&stderr);
-    assert_eq!(status.code(), Some(code), "{arguments}: {message}");
-    for part in parts {
-        assert!(message.contains(part), "`{part}` is not in: {message}");
+#[test]
+fn a_run_tells_its_observer_everything_in_order() {
+    let folder = tempfile::tempdir().unwrap();
+    make_set(&folder.path().join("set"));
+    let config = TrainConfig { eval_every: 12, checkpoint_every: 20, ..config(&[]) };
+    let dataset = Dataset::load(folder.path().join("set"), &config.load_options()).unwrap();
+    let train = |config: &TrainConfig, held| {
+        let mut told = vec![];
+        let out = folder.path().join("run");
+        let trained = run::train(&gpu(), config, &dataset, &out, held, |event| {
+            told.push(match event {
+                Event::Started { step, steps } => format!("started {step} of {steps}"),
+                Event::Step(report) => format!("step {}", report.step),
+                Event::Checkpointed { step } => format!("checkpointed {step}"),
+                Event::Evaluated { step, scored } => format!("evaluated {step}: {}", scored.len()),
+                Event::Finished(trained) => format!("finished {}", trained.scored.len()),
+                _ => String::new(),
+            });
+        });
+        (trained.map(|trained| trained.losses.len()), told)
+    };
+    let mut expected = vec!["started 0 of 30".to_owned()];
+    for step in 1..=30 {
+        expected.push(format!("step {step}"));
+        expected.extend((step == 20).then(|| "checkpointed 20".to_owned()));
+        expected.extend((step % 12 == 0).then(|| format!("evaluated {step}: 2")));
     }
+    expected.extend(["evaluated 30: 2", "finished 2"].map(str::to_owned));
+    let (steps, told) = train(&config, HeldRun::Refuse);
+    assert_eq!((steps.unwrap(), told), (30, expected));
+
+    let (refused, told) = train(&config, HeldRun::Refuse);
+    assert!(refused.unwrap_err().to_string().contains("already holds a run") && told.is_empty());
+    let (steps, told) = train(&TrainConfig { steps: 33, ..config }, HeldRun::Resume);
+    assert_eq!((steps.unwrap(), told[0].as_str()), (13, "started 20 of 33"));
 }
 
 /// The log without the column of times.
@@ -166,7 +182,8 @@ fn a_killed_run_is_resumed_to_the_same_model() {
     succeed(&train(&straight, "--steps 200"));
 
     // Without a checkpoint it begins; killed at some step behind one, it goes on.
-    let mut child = nightsplat(&train(&killed, "--steps 200 --resume")).spawn().unwrap();
+    let mut child = command(&train(&killed, "--steps 200 --resume"));
+    let mut child = child.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
     let checkpoint = killed.join("checkpoint.safetensors");
     while !checkpoint.exists() && child.try_wait().unwrap().is_none() {
         std::thread::sleep(Duration::from_millis(2));

@@ -4,24 +4,12 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output, Stdio};
+use std::process::{Command, Stdio};
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
-/// `nightsplat` with arguments as a shell splits them; paths hold no spaces.
-fn command(arguments: &str) -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_nightsplat"));
-    command.args(arguments.split_whitespace());
-    command
-}
-
-/// Standard output and error of a command that must end with this exit code.
-fn run(arguments: &str, code: i32) -> (String, String) {
-    let Output { status, stdout, stderr } = command(arguments).output().unwrap();
-    let [stdout, stderr] = [stdout, stderr].map(|text| String::from_utf8(text).unwrap());
-    assert_eq!(status.code(), Some(code), "{arguments}: {stderr}");
-    (stdout, stderr)
-}
+mod common;
+use common::command::{command, refused, run};
 
 /// The smallest set with views to score.
 fn set() -> &'static Path {
@@ -206,34 +194,23 @@ fn the_paper_s_tables_and_all_curves_are_grids() {
 fn more_values_may_join_and_another_sweep_may_not() {
     let sweep = Sweep::new("--steps 1 --curves ap3");
     run(&sweep.arguments, 0);
-    let refused = |arguments: String, parts: &[&str]| {
-        let (_, said) = run(&arguments, 1);
-        assert_eq!(said.lines().count(), 1, "{said}");
-        for part in parts {
-            assert!(said.contains(part), "no `{part}` in: {said}");
-        }
-    };
     let wider = Sweep { arguments: sweep.arguments.replace("ap3", "ap3,linear"), ..sweep };
     assert_eq!(wider.left().len(), 1);
     let arguments = &wider.arguments;
     let run_differs = ["curve=ap3", "another run", "steps = 1", "--out"];
-    refused(arguments.replace("--steps 1", "--steps 2"), &run_differs);
+    refused(&arguments.replace("--steps 1", "--steps 2"), 1, &run_differs);
     let sweep_differs = ["another sweep", "lists = [\"curve\"]", "--out"];
-    refused(format!("{arguments} --alpha 0.1"), &sweep_differs);
+    refused(&format!("{arguments} --alpha 0.1"), 1, &sweep_differs);
     // A folder of something else.
     fs::remove_file(wider.path("sweep.toml")).unwrap();
-    refused(arguments.clone(), &["leaderboard.csv", "no sweep wrote", "--out"]);
+    refused(arguments, 1, &["leaderboard.csv", "no sweep wrote", "--out"]);
 }
 
 #[test]
 fn misuse_is_refused_before_anything_is_trained() {
     let refused = |options: &str, code: i32, parts: &[&str]| {
         let sweep = Sweep::new(options);
-        let (_, said) = run(&sweep.arguments, code);
-        assert!(said.starts_with("error: ") && said.lines().count() == 1, "{options}: {said}");
-        for part in parts {
-            assert!(said.contains(part), "{options}: no `{part}` in: {said}");
-        }
+        refused(&sweep.arguments, code, parts);
         assert_eq!(fs::read_dir(sweep.folder.path()).unwrap().count(), 0, "{options}");
     };
     refused("", 2, &["grid is empty", "--curves"]);

@@ -7,7 +7,7 @@ use anyhow::Result;
 
 use super::comparison::{self, Run};
 use super::table;
-use super::train::{HeldRun, TrainOptions, train_into};
+use super::train::{TrainOptions, held_unless, train_with_bar};
 use crate::Error;
 use crate::dataset::Dataset;
 use crate::eval;
@@ -70,9 +70,9 @@ pub fn run(args: &AblateArgs) -> Result<()> {
     for (i, Model { folder, title, config }) in models.iter().enumerate() {
         tracing::info!("{} of {}: {title}", i + 1, models.len());
         let out = args.out.join(folder);
-        let (trained, losses) =
-            train_into(&out, &gpu, config, &dataset, HeldRun::of(args.overwrite))?;
-        runs.push(Run::new(title.clone(), trained, losses));
+        let held = held_unless(args.overwrite);
+        let trained = train_with_bar(&gpu, config, &dataset, &out, held)?;
+        runs.push(Run::new(title.clone(), trained));
     }
     let dark = eval::score(&dataset, |view| {
         // A test view without its dark photograph shows nothing.

@@ -1,11 +1,11 @@
 //! Runs of one dataset side by side: the tables, curves and pictures of `demo` and `ablate`.
 
-use super::train::Trained;
 use crate::dataset::View;
 use crate::eval::{self, ViewScore};
 use crate::image::Image;
 use crate::metrics::Scores;
 use crate::report::{Best, Column, Comparison, Picture, Series, Table};
+use crate::run::Trained;
 
 /// A run and what it made of the test views.
 pub(super) struct Run {
@@ -20,8 +20,8 @@ pub(super) struct Run {
 }
 
 impl Run {
-    pub(super) fn new(title: String, trained: Trained, losses: Vec<f64>) -> Self {
-        let Trained { trainer, scored, seconds, peak_bytes } = trained;
+    pub(super) fn new(title: String, trained: Trained) -> Self {
+        let Trained { trainer, scored, losses, seconds, peak_bytes } = trained;
         Self { title, scored, seconds, gaussians: trainer.gaussian_count(), peak_bytes, losses }
     }
 }

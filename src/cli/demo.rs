@@ -16,6 +16,7 @@ use crate::gpu::{DeviceChoice, Gpu};
 use crate::optimizer::Schedule;
 use crate::output::write_whole;
 use crate::report::{Distribution, Report, distributions, plot};
+use crate::run::HeldRun;
 use crate::tone::{ToneCurve, ToneSettings};
 use crate::train::TrainConfig;
 
@@ -102,9 +103,9 @@ fn config(curve: ToneCurve, dataset: &Dataset, gpu: &Gpu) -> TrainConfig {
 
 fn train_with(curve: ToneCurve, gpu: &Gpu, dataset: &Dataset, out: &Path) -> crate::Result<Run> {
     let config = config(curve, dataset, gpu);
-    let (trained, losses) =
-        train::train_into(&out.join(curve.name()), gpu, &config, dataset, train::HeldRun::Replace)?;
-    Ok(Run::new(title(curve), trained, losses))
+    let folder = out.join(curve.name());
+    let trained = train::train_with_bar(gpu, &config, dataset, &folder, HeldRun::Replace)?;
+    Ok(Run::new(title(curve), trained))
 }
 
 /// What the dark photographs themselves score: the least that a model must beat.

@@ -4,8 +4,8 @@ use std::path::Path;
 
 use crate::dataset::Dataset;
 use crate::eval::Player;
-use crate::export;
 use crate::gpu::{DeviceChoice, Gpu};
+use crate::run;
 use crate::train::TrainConfig;
 use crate::{Error, Result};
 
@@ -22,16 +22,16 @@ impl FinishedRun {
     ///
     /// # Errors
     /// The folder holds no finished run, its dataset is gone, or there is no such device.
-    pub(super) fn open(run: &Path, device: Option<&DeviceChoice>) -> Result<Self> {
-        let config = export::load_config(run)?;
+    pub(super) fn open(folder: &Path, device: Option<&DeviceChoice>) -> Result<Self> {
+        let config = run::load_config(folder)?;
         let raw_colors = config.model.raw_colors;
-        let gaussians = export::load_model(run, raw_colors)?;
+        let gaussians = run::load_model(folder, raw_colors)?;
         if !config.dataset.is_dir() {
             let problem = format!(
                 "names the dataset {}, which is not there; correct `dataset` in this file",
                 config.dataset.display()
             );
-            return Err(Error::input(run.join("config.toml"), problem));
+            return Err(Error::input(folder.join("config.toml"), problem));
         }
         let device = device.map_or_else(|| config.device.parse(), |choice| Ok(choice.clone()))?;
         let gpu = Gpu::new(&device)?;
@@ -42,7 +42,7 @@ impl FinishedRun {
                 &gpu,
                 &gaussians,
                 raw_colors,
-                export::load_networks(&gpu, run, &config.model, gaussians.shape.features)?,
+                run::load_networks(&gpu, folder, &config.model, gaussians.shape.features)?,
             )?,
             config,
         })

@@ -29,9 +29,9 @@ use super::progress_bar;
 use super::train::TrainArgs;
 use crate::Error;
 use crate::dataset::Dataset;
-use crate::export::load_config;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::output::write_whole;
+use crate::run::load_config;
 use crate::tone::Statistics;
 use crate::train::TrainConfig;
 

@@ -2,18 +2,17 @@
 
 use std::io::{IsTerminal, Write};
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
 
 use anyhow::Result;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use crate::dataset::Dataset;
 use crate::eval::{self, ViewScore};
-use crate::export::{self, RunDirectory};
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::nn::Precision;
+use crate::run::{Event, HeldRun, Trained};
 use crate::tone::CurveChoice;
-use crate::train::{Background, ModelName, Part, Preset, TrainConfig, Trainer};
+use crate::train::{Background, ModelName, Part, Preset, TrainConfig};
 
 /// Train a 3D Gaussian Splatting model from dark photographs.
 ///
@@ -223,9 +222,9 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     let config = args.options.config(args.dataset.clone())?;
     let gpu = Gpu::new(&config.device.parse::<DeviceChoice>()?)?;
     let dataset = Dataset::load(&config.dataset, &config.load_options())?;
-    let held = if args.resume { HeldRun::Resume } else { HeldRun::of(args.overwrite) };
-    let (trained, _) = train_into(&args.out, &gpu, &config, &dataset, held)?;
-    let Trained { trainer, scored, seconds, .. } = trained;
+    let held = if args.resume { HeldRun::Resume } else { held_unless(args.overwrite) };
+    let Trained { trainer, scored, seconds, .. } =
+        train_with_bar(&gpu, &config, &dataset, &args.out, held)?;
     let gaussians = trainer.gaussian_count();
     let mut out = std::io::stdout().lock();
     if let Some(line) = summary(&scored) {
@@ -240,119 +239,38 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     Ok(())
 }
 
-/// What a training run made.
-pub(crate) struct Trained {
-    pub(crate) trainer: Trainer,
-    pub(crate) scored: Vec<ViewScore>,
-    /// Of the steps alone, without loading and scoring.
-    pub(crate) seconds: f64,
-    /// The most that buffers took on the device.
-    pub(crate) peak_bytes: u64,
+/// What `--overwrite` says.
+pub(crate) fn held_unless(overwrite: bool) -> HeldRun {
+    if overwrite { HeldRun::Replace } else { HeldRun::Refuse }
 }
 
-/// What becomes of a run that the directory already holds.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum HeldRun {
-    Refuse,
-    Replace,
-    Resume,
-}
-
-impl HeldRun {
-    /// What `--overwrite` says.
-    pub(crate) fn of(overwrite: bool) -> Self {
-        if overwrite { Self::Replace } else { Self::Refuse }
-    }
-}
-
-/// Trains into a run directory; gives the loss of every step as well.
-pub(crate) fn train_into(
-    out: &Path,
+/// Trains behind a progress bar; scores on the way go to the log.
+pub(crate) fn train_with_bar(
     gpu: &Gpu,
     config: &TrainConfig,
     dataset: &Dataset,
-    held: HeldRun,
-) -> crate::Result<(Trained, Vec<f64>)> {
-    gpu.reset_peak_memory();
-    let (mut directory, mut trainer) = begin(out, gpu, config, dataset, held)?;
-    let (losses, seconds) = train_to_the_end(&mut trainer, &mut directory, config, dataset)?;
-    let peak_bytes = gpu.peak_memory();
-    let scored = eval::score(dataset, |view| trainer.render(&view.camera))?;
-    directory.save_model(&trainer.gaussians()?, config.model.raw_colors)?;
-    if let Some(networks) = trainer.networks() {
-        directory.save_networks(networks)?;
-    }
-    let metrics = eval::metrics(&scored, seconds, trainer.gaussian_count(), config.steps);
-    directory.save_metrics(&metrics)?;
-    Ok((Trained { trainer, scored, seconds, peak_bytes }, losses))
-}
-
-/// A new run, or one that is taken up again.
-fn begin(
     out: &Path,
-    gpu: &Gpu,
-    config: &TrainConfig,
-    dataset: &Dataset,
     held: HeldRun,
-) -> crate::Result<(RunDirectory, Trainer)> {
-    let checkpoint = export::checkpoint(out).filter(|_| held == HeldRun::Resume);
-    if let Some(checkpoint) = checkpoint {
-        let mut trainer = Trainer::new(gpu, config.clone(), dataset)?;
-        trainer.restore(&checkpoint)?;
-        let step = trainer.steps_done();
-        tracing::info!("{} goes on after step {step}", out.display());
-        return Ok((RunDirectory::resume(out, config, step)?, trainer));
-    }
-    // Without a checkpoint, an unfinished run is nothing to lose.
-    let replaces = match held {
-        HeldRun::Refuse => false,
-        HeldRun::Replace => true,
-        HeldRun::Resume => !export::is_finished(out),
-    };
-    let directory = RunDirectory::create(out, config, replaces)?;
-    Ok((directory, Trainer::new(gpu, config.clone(), dataset)?))
-}
-
-/// Trains with a progress bar, logs every step, and writes checkpoints; gives the losses and the seconds of all steps.
-fn train_to_the_end(
-    trainer: &mut Trainer,
-    directory: &mut RunDirectory,
-    config: &TrainConfig,
-    dataset: &Dataset,
-) -> crate::Result<(Vec<f64>, f64)> {
-    let bar = progress_bar(config.steps).with_position(trainer.steps_done());
-    let (mut losses, mut spent) = (vec![], Duration::ZERO);
-    while trainer.steps_done() < config.steps {
-        let next = |every| (trainer.steps_done() + 1).checked_next_multiple_of(every);
-        let until = [config.eval_every, config.checkpoint_every].into_iter().filter_map(next);
-        let until = until.min().unwrap_or(config.steps);
-        let begin = Instant::now();
-        let reports = trainer.advance(until)?;
-        spent += begin.elapsed();
-        for report in &reports {
-            losses.push(report.loss);
-            directory.log(report)?;
+) -> crate::Result<Trained> {
+    let mut bar = ProgressBar::hidden();
+    crate::run::train(gpu, config, dataset, out, held, |event| match event {
+        Event::Started { step, steps } => bar = progress_bar(steps).with_position(step),
+        Event::Step(report) => {
+            bar.set_position(report.step);
+            bar.set_message(format!("loss {:.4}  {} Gaussians", report.loss, report.gaussians));
         }
-        let Some(last) = reports.last() else { continue };
-        bar.set_position(last.step);
-        bar.set_message(format!("loss {:.4}  {} Gaussians", last.loss, last.gaussians));
-        let falls_on = |every: u64| every > 0 && last.step.is_multiple_of(every);
-        if falls_on(config.checkpoint_every) {
-            directory.save_checkpoint(trainer)?;
-        }
-        if falls_on(config.eval_every) && last.step < config.steps {
-            let scored = eval::score(dataset, |view| trainer.render(&view.camera))?;
-            if let Some(line) = summary(&scored) {
-                bar.suspend(|| tracing::info!("step {}: {line}", last.step));
+        Event::Evaluated { step, scored } if step < config.steps => {
+            if let Some(line) = summary(scored) {
+                bar.suspend(|| tracing::info!("step {step}: {line}"));
             }
         }
-    }
-    bar.finish_and_clear();
-    Ok((losses, directory.seconds_before() + spent.as_secs_f64()))
+        Event::Evaluated { .. } => bar.finish_and_clear(),
+        _ => {}
+    })
 }
 
 /// The mean scores in a line; none where nothing was scored.
-pub(crate) fn summary(scored: &[ViewScore]) -> Option<String> {
+fn summary(scored: &[ViewScore]) -> Option<String> {
     let (mean, r0) = eval::means(scored);
     let mean = mean?;
     let before = r0.map(|r0| format!("; before the denoiser {:.2} dB, {:.3}", r0.psnr, r0.ssim));

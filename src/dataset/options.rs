@@ -47,9 +47,10 @@ impl LoadOptions {
     pub(super) fn check(&self) -> Result<()> {
         // Positive phrasing: a NaN fails the test too.
         if !(self.downscale >= 1.0 && self.downscale.is_finite()) {
-            let problem =
-                format!("downscale {} makes no image; give a factor of 1 or more", self.downscale);
-            return Err(Error::Usage(problem));
+            let downscale = self.downscale;
+            return Err(Error::Usage(format!(
+                "`LoadOptions::downscale` is {downscale}; it must be 1 or more"
+            )));
         }
         match &self.reference {
             Some(folder) if !folder.is_dir() => {

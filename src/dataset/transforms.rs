@@ -8,10 +8,10 @@ use std::path::{Path, PathBuf};
 use glam::{DAffine3, DMat3, DVec2, DVec3};
 use serde::Deserialize;
 
-use super::files::{Files, stem};
-use super::{Frame, Listing, Split};
+use super::{ListedView, Listing, Split};
 use crate::camera::{Distortion, Lens};
 use crate::image::Image;
+use crate::image::files::{Files, stem};
 use crate::{Error, Result};
 
 #[derive(Deserialize)]
@@ -101,7 +101,7 @@ pub(super) fn read(
             .lens(size)
             .map_err(|problem| Error::input(path, format!("{listed}: {problem}")))?;
         let name = stem(&listed).to_owned();
-        listing.frames.push(Frame { name, listed, split, file, lens, view_from_world });
+        listing.frames.push(ListedView { name, listed, split, file, lens, view_from_world });
     }
     Ok(())
 }

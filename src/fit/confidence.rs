@@ -41,13 +41,13 @@ pub(super) fn of(
     let mut normal = DMatrix::<f64>::zeros(inner.len(), inner.len());
     for group in groups {
         for column in &group.histogram.columns {
-            let y = model.value(values, &group.frame, column.x);
+            let y = model.value(values, &group.exposure, column.x);
             for cell in &column.cells {
                 let size = (cell.y() - y).abs();
                 psi2 += cell.count() * size.min(limit).powi(2);
                 slope += if size <= limit { cell.count() } else { 0.0 };
             }
-            let gradient = model.gradient(values, &group.frame, column.x);
+            let gradient = model.gradient(values, &group.exposure, column.x);
             for (row, &i) in inner.iter().enumerate() {
                 for (at, &j) in inner.iter().enumerate() {
                     normal[(row, at)] += column.count * gradient[i] * gradient[j];

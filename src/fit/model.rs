@@ -35,14 +35,14 @@ pub(super) struct Model {
     pub(super) free: Vec<Constant>,
 }
 
-/// What a photograph makes of a curve.
+/// What the exposure of a photograph makes of a curve.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Frame {
+pub(super) struct Exposure {
     statistics: Statistics,
     channel: usize,
 }
 
-impl Frame {
+impl Exposure {
     /// Of several photographs together: t is all there is.
     pub(super) const POOLED: Self = Self {
         statistics: Statistics {
@@ -133,29 +133,29 @@ impl Model {
     }
 
     /// The curve at t = x / p90, clamped.
-    pub(super) fn value(&self, values: &[f64], frame: &Frame, t: f64) -> f64 {
-        clamped(self.raw_value(values, frame, t))
+    pub(super) fn value(&self, values: &[f64], exposure: &Exposure, t: f64) -> f64 {
+        clamped(self.raw_value(values, exposure, t))
     }
 
     /// The curve at t = x / p90, before it is clamped.
-    pub(super) fn raw_value(&self, values: &[f64], frame: &Frame, t: f64) -> f64 {
-        self.at(&Numbers::from(&self.settings(values)), frame, t)
+    pub(super) fn raw_value(&self, values: &[f64], exposure: &Exposure, t: f64) -> f64 {
+        self.at(&Numbers::from(&self.settings(values)), exposure, t)
     }
 
     /// The derivatives of the clamped curve by every value; those that are no numbers count as 0.
-    pub(super) fn gradient(&self, values: &[f64], frame: &Frame, t: f64) -> Vec<f64> {
-        self.derivatives(values, frame, t, clamped)
+    pub(super) fn gradient(&self, values: &[f64], exposure: &Exposure, t: f64) -> Vec<f64> {
+        self.derivatives(values, exposure, t, clamped)
     }
 
     /// The derivatives of the curve before it is clamped.
-    pub(super) fn raw_gradient(&self, values: &[f64], frame: &Frame, t: f64) -> Vec<f64> {
-        self.derivatives(values, frame, t, |y| y)
+    pub(super) fn raw_gradient(&self, values: &[f64], exposure: &Exposure, t: f64) -> Vec<f64> {
+        self.derivatives(values, exposure, t, |y| y)
     }
 
     fn derivatives(
         &self,
         values: &[f64],
-        frame: &Frame,
+        exposure: &Exposure,
         t: f64,
         of: impl Fn(Dual) -> Dual,
     ) -> Vec<f64> {
@@ -170,21 +170,21 @@ impl Model {
                 Place::BaseGain => &mut numbers.base_gain,
             };
             variable.derivative = 1.0;
-            let derivative = of(self.at(&numbers, frame, t)).derivative;
+            let derivative = of(self.at(&numbers, exposure, t)).derivative;
             if derivative.is_finite() { derivative } else { 0.0 }
         };
         self.places.iter().map(derivative).collect()
     }
 
     /// The curve at t = x / p90, for any number.
-    fn at<T: Real>(&self, numbers: &Numbers<T>, frame: &Frame, t: f64) -> T {
+    fn at<T: Real>(&self, numbers: &Numbers<T>, exposure: &Exposure, t: f64) -> T {
         let family = self.family;
-        let curve = law(family, family.white, numbers, &frame.statistics);
+        let curve = law(family, family.white, numbers, &exposure.statistics);
         let white = match family.white {
-            White::ChannelMeans => curve.constants[frame.channel],
+            White::ChannelMeans => curve.constants[exposure.channel],
             _ => curve.white,
         };
-        let t = T::of(t * frame.p90()) / white;
+        let t = T::of(t * exposure.p90()) / white;
         curve_at(family.curve.constant(), t, [curve.offset, curve.gain], &curve.constants)
     }
 }
@@ -195,8 +195,8 @@ pub fn psnr(settings: &ToneSettings, pair: &Pair) -> f64 {
     let numbers = Numbers::<f64>::from(settings);
     let [mut count, mut squares] = [0.0; 2];
     for (channel, histogram) in pair.channels.iter().enumerate() {
-        let frame = Frame::of(pair.statistics, channel);
-        let value = |x: f64| clamped(model.at(&numbers, &frame, x / frame.p90()));
+        let exposure = Exposure::of(pair.statistics, channel);
+        let value = |x: f64| clamped(model.at(&numbers, &exposure, x / exposure.p90()));
         squares += histogram.residuals(value)[1];
         count += histogram.count();
     }
@@ -225,8 +225,8 @@ mod tests {
             let numbers = Numbers::<f64>::from(&settings);
             for x in [0.0, 0.004, 0.03, 0.13, 0.3, 0.9] {
                 for channel in 0..3 {
-                    let frame = Frame::of(statistics, channel);
-                    let found = clamped(model.at(&numbers, &frame, x / frame.p90()));
+                    let exposure = Exposure::of(statistics, channel);
+                    let found = clamped(model.at(&numbers, &exposure, x / exposure.p90()));
                     let expected = if family.curve == ToneCurve::PerChannel {
                         clamped(x as f32 / parameters.constants[channel])
                     } else {
@@ -249,19 +249,20 @@ mod tests {
             mean: 0.14,
             channel_means: [0.14; 3],
         };
-        let frame = Frame::of(statistics, 1);
+        let exposure = Exposure::of(statistics, 1);
         for family in FAMILIES.iter().filter(|family| family.white != White::One) {
             let model =
                 Model::new(family, &FitOptions { adapt: true, ..FitOptions::default() }).unwrap();
             let values: Vec<f64> = model.free.iter().map(|constant| constant.start).collect();
             for t in [0.05, 0.17, 0.61] {
-                for (index, exact) in model.raw_gradient(&values, &frame, t).into_iter().enumerate()
+                for (index, exact) in
+                    model.raw_gradient(&values, &exposure, t).into_iter().enumerate()
                 {
                     let h = 1e-6 * values[index].abs().max(1e-3);
                     let at = |shift: f64| {
                         let mut values = values.clone();
                         values[index] += shift;
-                        model.raw_value(&values, &frame, t)
+                        model.raw_value(&values, &exposure, t)
                     };
                     let difference = (at(h) - at(-h)) / (2.0 * h);
                     let what = model.free[index].name;

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use rayon::prelude::*;
 
 use super::Histogram;
-use crate::image::Image;
+use crate::image::{Image, files};
 use crate::tone::Statistics;
 use crate::tone::{luminance, measurable};
 use crate::{Error, Result};
@@ -15,7 +15,6 @@ use crate::{Error, Result};
 const DARK_FOLDERS: [&str; 2] = ["low", "images_low"];
 /// Folders that hold those in normal light, of the same names.
 const NORMAL_FOLDERS: [&str; 3] = ["high", "normal", "images"];
-const EXTENSIONS: [&str; 4] = ["png", "jpg", "jpeg", "exr"];
 
 /// Pairs that were taken in one place.
 #[derive(Clone, Debug)]
@@ -141,7 +140,7 @@ fn subfolders(folder: &Path) -> Result<(PathBuf, PathBuf)> {
         |names: &[&str]| names.iter().map(|name| folder.join(name)).find(|path| path.is_dir());
     first(&DARK_FOLDERS).zip(first(&NORMAL_FOLDERS)).ok_or_else(|| {
         let problem = if folder.is_dir() {
-            "holds no pairs: it needs folders `low` and `high` (or `normal`, or `images`), or name the second with --normal"
+            "holds no pairs: it needs folders `low` and `high` (or `normal`, or `images`), or name the folder in normal light as well"
         } else {
             "is not a folder; name the folder of the pairs"
         };
@@ -151,15 +150,8 @@ fn subfolders(folder: &Path) -> Result<(PathBuf, PathBuf)> {
 
 /// The photographs of a folder by name without extension.
 fn photographs(folder: &Path) -> Result<BTreeMap<String, PathBuf>> {
-    let unreadable =
-        |error: std::io::Error| Error::input(folder, format!("cannot be read: {error}"));
     let mut found = BTreeMap::new();
-    for entry in std::fs::read_dir(folder).map_err(unreadable)? {
-        let path = entry.map_err(unreadable)?.path();
-        let extension = path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
-        if !EXTENSIONS.contains(&extension.as_str()) || !path.is_file() {
-            continue;
-        }
+    for path in files::photographs_in(folder)? {
         let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         if let Some(other) = found.insert(name, path.clone()) {
             let problem = format!("has the same name as {}; rename one", other.display());

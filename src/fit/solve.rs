@@ -3,14 +3,14 @@
 use levenberg_marquardt::{LeastSquaresProblem, LevenbergMarquardt};
 use nalgebra::{DMatrix, DVector, Dyn, Owned};
 
-use super::model::{Frame, Model};
+use super::model::{Exposure, Model};
 use super::{Channels, FitOptions, Histogram, Pair, Weighting};
 use crate::random::Stream;
 use crate::tone::Statistics;
 
 /// Values that share a curve of t.
 pub(super) struct Group {
-    pub(super) frame: Frame,
+    pub(super) exposure: Exposure,
     /// Of t = x / p90.
     pub(super) histogram: Histogram,
 }
@@ -18,34 +18,35 @@ pub(super) struct Group {
 /// The pairs with their weights as the model sees them: all in one group where t alone decides.
 fn groups(model: &Model, pairs: &[&Pair], weights: &[f64], options: &FitOptions) -> Vec<Group> {
     let all = pairs.iter().zip(weights).flat_map(|(pair, &weight)| {
-        parts(model, pair, options.channels).into_iter().map(move |(frame, histograms)| {
-            let scaled = |histogram| (histogram, [1.0 / frame.p90(), weight]);
-            (frame, histograms.into_iter().map(scaled).collect::<Vec<_>>())
+        parts(model, pair, options.channels).into_iter().map(move |(exposure, histograms)| {
+            let scaled = |histogram| (histogram, [1.0 / exposure.p90(), weight]);
+            (exposure, histograms.into_iter().map(scaled).collect::<Vec<_>>())
         })
     });
-    let group = |(frame, parts)| Group { frame, histogram: Histogram::pooled(parts, options.bins) };
+    let group =
+        |(exposure, parts)| Group { exposure, histogram: Histogram::pooled(parts, options.bins) };
     if model.differs_by_photograph() {
         all.map(group).collect()
     } else {
-        vec![group((Frame::POOLED, all.flat_map(|(_, parts)| parts).collect()))]
+        vec![group((Exposure::POOLED, all.flat_map(|(_, parts)| parts).collect()))]
     }
 }
 
-/// The histograms of a pair that are fitted, by the frame they share.
+/// The histograms of a pair that are fitted, by the exposure they share.
 pub(super) fn parts<'a>(
     model: &Model,
     pair: &'a Pair,
     channels: Channels,
-) -> Vec<(Frame, Vec<&'a Histogram>)> {
-    let frame = |channel| Frame::of(pair.statistics, channel);
+) -> Vec<(Exposure, Vec<&'a Histogram>)> {
+    let exposure = |channel| Exposure::of(pair.statistics, channel);
     if model.differs_by_channel() {
-        return (0..3).map(|channel| (frame(channel), vec![&pair.channels[channel]])).collect();
+        return (0..3).map(|channel| (exposure(channel), vec![&pair.channels[channel]])).collect();
     }
     let histograms = match channels {
         Channels::Rgb => pair.channels.iter().collect(),
         Channels::Luminance => vec![&pair.luminance],
     };
-    vec![(frame(0), histograms)]
+    vec![(exposure(0), histograms)]
 }
 
 /// How many values of a pair are fitted, and the sums of their residuals and of the squares.
@@ -57,11 +58,12 @@ pub(super) fn pair_residuals(
 ) -> (f64, [f64; 2]) {
     let parts = parts(model, pair, channels).into_iter();
     let mut found = (0.0, [0.0; 2]);
-    for (frame, histogram) in
-        parts.flat_map(|(frame, parts)| parts.into_iter().map(move |part| (frame, part)))
+    for (exposure, histogram) in
+        parts.flat_map(|(exposure, parts)| parts.into_iter().map(move |part| (exposure, part)))
     {
-        let pooled = if model.differs_by_photograph() { frame } else { Frame::POOLED };
-        let [sum, squares] = histogram.residuals(|x| model.value(values, &pooled, x / frame.p90()));
+        let pooled = if model.differs_by_photograph() { exposure } else { Exposure::POOLED };
+        let [sum, squares] =
+            histogram.residuals(|x| model.value(values, &pooled, x / exposure.p90()));
         found.0 += histogram.count();
         found.1 = [found.1[0] + sum, found.1[1] + squares];
     }
@@ -118,17 +120,17 @@ pub(super) struct Solver<'a> {
     pub(super) groups: Vec<Group>,
     /// Where constraints are tested, of a photograph like the mean of all.
     grid: Vec<f64>,
-    frame: Frame,
+    exposure: Exposure,
 }
 
 impl<'a> Solver<'a> {
     pub(super) fn new(model: &'a Model, pairs: &'a [&'a Pair], options: &'a FitOptions) -> Self {
         let groups = groups(model, pairs, &vec![1.0; pairs.len()], options);
-        let frame = if model.differs_by_photograph() {
+        let exposure = if model.differs_by_photograph() {
             let statistics: Vec<Statistics> = pairs.iter().map(|pair| pair.statistics).collect();
-            Frame::of(Statistics::mean_of(&statistics).unwrap_or_default(), 0)
+            Exposure::of(Statistics::mean_of(&statistics).unwrap_or_default(), 0)
         } else {
-            Frame::POOLED
+            Exposure::POOLED
         };
         let last = groups.iter().filter_map(|group| group.histogram.columns.last());
         let end = last.map(|column| column.x).fold(LEAST_END, f64::max);
@@ -138,7 +140,7 @@ impl<'a> Solver<'a> {
             share / (1.0 - share)
         };
         let grid = (0..GRID).map(t).collect();
-        Self { model, pairs, options, groups, grid, frame }
+        Self { model, pairs, options, groups, grid, exposure }
     }
 
     pub(super) fn solve(&mut self) -> Solution {
@@ -196,7 +198,7 @@ impl<'a> Solver<'a> {
         let mut sizes = vec![];
         for group in &self.groups {
             for column in &group.histogram.columns {
-                let y = self.model.value(values, &group.frame, column.x);
+                let y = self.model.value(values, &group.exposure, column.x);
                 sizes.extend(column.cells.iter().map(|cell| ((cell.y() - y).abs(), cell.count())));
             }
         }
@@ -219,7 +221,7 @@ impl<'a> Solver<'a> {
                     });
                     continue;
                 }
-                let model = self.model.value(values, &group.frame, t);
+                let model = self.model.value(values, &group.exposure, t);
                 let weighted = column
                     .cells
                     .iter()
@@ -235,7 +237,7 @@ impl<'a> Solver<'a> {
         for row in &mut rows {
             row.weight /= total;
             if prior > 0.0 {
-                let own = self.model.value(&start, &self.groups[row.group].frame, row.t);
+                let own = self.model.value(&start, &self.groups[row.group].exposure, row.t);
                 row.y = (row.y + prior * own) / (1.0 + prior);
             }
         }
@@ -306,7 +308,7 @@ impl<'a> Solver<'a> {
     /// Of every point of the grid, by how much the clamped curve falls to the next, and passes 1.
     fn broken(&self, values: &[f64]) -> Vec<[f64; 2]> {
         let raw: Vec<f64> =
-            self.grid.iter().map(|&t| self.model.raw_value(values, &self.frame, t)).collect();
+            self.grid.iter().map(|&t| self.model.raw_value(values, &self.exposure, t)).collect();
         let next = raw.iter().skip(1).chain(raw.last());
         let fall = |raw: f64, next: f64| (raw.clamp(0.0, 1.0) - next.clamp(0.0, 1.0)).max(0.0);
         raw.iter().zip(next).map(|(&raw, &next)| [fall(raw, next), (raw - 1.0).max(0.0)]).collect()
@@ -364,7 +366,8 @@ impl Problem<'_> {
     fn all_residuals(&self) -> DVector<f64> {
         let Solver { model, ref groups, options, .. } = *self.solver;
         let residual = |row: &Row| {
-            row.weight.sqrt() * (model.value(&self.values, &groups[row.group].frame, row.t) - row.y)
+            row.weight.sqrt()
+                * (model.value(&self.values, &groups[row.group].exposure, row.t) - row.y)
         };
         let mut residuals: Vec<f64> = self.rows.iter().map(residual).collect();
         if self.is_constrained() {
@@ -398,7 +401,7 @@ impl LeastSquaresProblem<f64, Dyn, Dyn> for Problem<'_> {
     }
 
     fn jacobian(&self) -> Option<DMatrix<f64>> {
-        let Solver { model, ref groups, options, ref grid, ref frame, .. } = *self.solver;
+        let Solver { model, ref groups, options, ref grid, ref exposure, .. } = *self.solver;
         let values = &self.values;
         let constrained = if self.is_constrained() { 2 * grid.len() } else { 0 };
         let mut jacobian = DMatrix::zeros(self.rows.len() + constrained, values.len());
@@ -413,17 +416,21 @@ impl LeastSquaresProblem<f64, Dyn, Dyn> for Problem<'_> {
             }
         };
         for (index, row) in self.rows.iter().enumerate() {
-            set(index, row.weight.sqrt(), model.gradient(values, &groups[row.group].frame, row.t));
+            set(
+                index,
+                row.weight.sqrt(),
+                model.gradient(values, &groups[row.group].exposure, row.t),
+            );
         }
         if constrained > 0 {
             for (index, [fall, excess]) in self.solver.broken(values).into_iter().enumerate() {
                 let row = self.rows.len() + 2 * index;
                 if fall > 0.0 {
-                    set(row, self.strength, model.gradient(values, frame, grid[index]));
-                    set(row, -self.strength, model.gradient(values, frame, grid[index + 1]));
+                    set(row, self.strength, model.gradient(values, exposure, grid[index]));
+                    set(row, -self.strength, model.gradient(values, exposure, grid[index + 1]));
                 }
                 if options.bounded && excess > 0.0 {
-                    set(row + 1, self.strength, model.raw_gradient(values, frame, grid[index]));
+                    set(row + 1, self.strength, model.raw_gradient(values, exposure, grid[index]));
                 }
             }
         }

@@ -71,7 +71,7 @@ fn split(scenes: &[Scene], folds: usize) -> Result<Vec<(String, Vec<&Pair>)>> {
         let count = scene.pairs.len().min(folds);
         if count < 2 {
             return Err(Error::Usage(format!(
-                "{} pairs in {folds} folds leave none to fit to or none to validate on; it takes two pairs and --folds 2",
+                "{} pairs in {folds} folds leave none to fit to or none to validate on; it takes two pairs in two folds",
                 scene.pairs.len()
             )));
         }

@@ -5,9 +5,10 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use ash::vk;
-use gpu_allocator::MemoryLocation;
 use gpu_allocator::vulkan::{Allocation, AllocationCreateDesc, AllocationScheme};
+use gpu_allocator::{AllocationError, MemoryLocation};
 
+use super::recorder::HOST_SUBMITS;
 use super::{Bound, Gpu, Recorder, Retired, Shared, lock};
 use crate::{Error, Result};
 
@@ -158,7 +159,7 @@ impl Recorder<'_> {
     /// Copies `buffer` as it is at this point of the recording to the host.
     ///
     /// # Errors
-    /// The device is out of memory.
+    /// The device is out of memory, or the recording is [`Gpu::record_into`]'s: only the host knows when the copy is there.
     pub fn download<T: bytemuck::Pod>(&mut self, buffer: &Buffer<T>) -> Result<Download<T>> {
         self.download_raw(buffer.name(), buffer.handle(), buffer.len)
     }
@@ -170,6 +171,11 @@ impl Recorder<'_> {
         raw: vk::Buffer,
         len: usize,
     ) -> Result<Download<T>> {
+        if self.value() == HOST_SUBMITS {
+            return Err(Error::Usage(format!(
+                "`{name}` cannot be downloaded where the host submits; once that is done, `Gpu::read` it"
+            )));
+        }
         let bytes = (len * size_of::<T>()) as u64;
         let host = Memory::new(self.shared(), name, bytes, MemoryLocation::GpuToCpu)?;
         if bytes > 0 {
@@ -235,31 +241,38 @@ impl Memory {
         // Vulkan has no empty buffers, an empty array still binds; whole quads, for kernels that read four values at a time.
         let size = bytes.max(1).next_multiple_of(16);
         let info = vk::BufferCreateInfo::default().size(size).usage(usage);
-        let out_of_memory = || Error::OutOfMemory { buffer: name.to_owned(), bytes };
+        fn out_of_memory<E>(name: &str, bytes: u64) -> impl Fn(E) -> Error
+        where
+            E: std::error::Error + Send + Sync + 'static,
+        {
+            move |cause| Error::OutOfMemory { buffer: name.to_owned(), bytes, source: cause.into() }
+        }
         // SAFETY: the device is live; the buffer is bound once to memory that satisfies its requirements.
         unsafe {
-            let raw = shared.device.create_buffer(&info, None).map_err(|_| out_of_memory())?;
+            let raw =
+                shared.device.create_buffer(&info, None).map_err(out_of_memory(name, bytes))?;
             let requirements = shared.device.get_buffer_memory_requirements(raw);
-            let allocation = lock(&shared.allocator).as_mut().and_then(|allocator| {
-                let desc = AllocationCreateDesc {
-                    name,
-                    requirements,
-                    location,
-                    linear: true,
-                    allocation_scheme: AllocationScheme::GpuAllocatorManaged,
-                };
-                allocator.allocate(&desc).ok()
-            });
-            let Some(allocation) = allocation else {
-                shared.device.destroy_buffer(raw, None);
-                return Err(out_of_memory());
+            let desc = AllocationCreateDesc {
+                name,
+                requirements,
+                location,
+                linear: true,
+                allocation_scheme: AllocationScheme::GpuAllocatorManaged,
             };
+            let allocated = match lock(&shared.allocator).as_mut() {
+                Some(allocator) => allocator.allocate(&desc),
+                None => Err(AllocationError::OutOfMemory),
+            };
+            let allocation = allocated.map_err(|error| {
+                shared.device.destroy_buffer(raw, None);
+                out_of_memory(name, bytes)(error)
+            })?;
             let bound =
                 shared.device.bind_buffer_memory(raw, allocation.memory(), allocation.offset());
             shared.usage.add(allocation.size());
             let shared = Arc::clone(shared);
             let memory = Self { shared, raw, allocation: Some(allocation), name: name.to_owned() };
-            bound.map_err(|_| out_of_memory())?;
+            bound.map_err(out_of_memory(&memory.name, bytes))?;
             Ok(memory)
         }
     }
@@ -275,5 +288,22 @@ impl Drop for Memory {
                 self.shared.collect(0);
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::DeviceChoice;
+
+    #[test]
+    fn a_buffer_that_does_not_fit_says_why() {
+        // A device of its own: validation has something to say about a petabyte.
+        let gpu = Gpu::new(&DeviceChoice::Best).unwrap();
+        let refused = Memory::new(&gpu.shared, "staging", 1 << 50, MemoryLocation::CpuToGpu);
+        let error = refused.unwrap_err();
+        assert!(error.to_string().contains("`staging` needs 1125899906842624 bytes"), "{error}");
+        let cause = std::error::Error::source(&error).map(ToString::to_string);
+        assert!(cause.is_some_and(|cause| !cause.is_empty()));
     }
 }

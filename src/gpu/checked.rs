@@ -15,7 +15,7 @@ use super::{
     Binding, Bound, CheckReport, CheckedPass, Difference, Download, Gpu, Kernel, Pipeline, Queue,
     Recorder, Reference, Shared, Threads, lock, testing,
 };
-use crate::{Error, Result};
+use crate::Result;
 
 /// The reports of the threads whose submissions are checked.
 #[derive(Debug, Default)]
@@ -40,7 +40,7 @@ impl Checks {
 /// What a recorder needs to run its passes one by one.
 #[derive(Debug)]
 pub(super) struct Checked<'g> {
-    queue: &'g mut Queue,
+    queue: &'g Queue,
     pool: vk::CommandPool,
     recording: &'g str,
     report: CheckReport,
@@ -71,12 +71,13 @@ impl Shared {
     /// in the report.
     pub(super) fn record_checked(
         self: &Arc<Self>,
-        queue: &mut Queue,
+        queue: &Queue,
         pool: vk::CommandPool,
+        value: u64,
         recording: &str,
         record: impl FnOnce(&mut Recorder<'_>) -> Result<()>,
     ) -> Result<u64> {
-        let mut recorder = Recorder::new(self, self.begin(pool)?, queue.submitted + 1, None);
+        let mut recorder = Recorder::new(self, self.begin(pool)?, value, None);
         let report = self.checks.take().unwrap_or_default();
         let has_wrong_integers = false;
         recorder.checked = Some(Checked { queue, pool, recording, report, has_wrong_integers });
@@ -161,11 +162,9 @@ impl Recorder<'_> {
         let shared = self.shared();
         self.finish();
         let Some(checked) = &mut self.checked else { return Ok(()) };
-        shared.submit(checked.queue, self.commands, self.value)?;
-        shared.wait(self.value).map_err(|error| match error {
-            Error::DeviceLost { device, .. } => Error::DeviceLost { device, pass: pass.to_owned() },
-            other => other,
-        })?;
+        // Under the pass's name: should the device be lost, it is known where.
+        shared.submit(checked.queue, self.commands, self.value, pass)?;
+        shared.wait(self.value)?;
         self.commands = shared.begin(checked.pool)?;
         self.value += 1;
         shared.last_use.store(self.value, Ordering::Release);

@@ -13,7 +13,7 @@ use gpu_allocator::vulkan::{Allocator, AllocatorCreateDesc};
 use super::checked::Checks;
 use super::cooperative::{self, CooperativeMatrix};
 use super::requirements::{EXTENSIONS, Offered, required_device_features};
-use super::{Gpu, Properties, Queue, REQUIREMENTS, Shared, lock, validation};
+use super::{Gpu, Properties, Queue, REQUIREMENTS, Shared, validation};
 use crate::{Error, Result};
 
 /// What to install where there is no Vulkan; the same words for a missing loader and a missing driver.
@@ -106,18 +106,12 @@ pub struct HostDevice {
 pub(super) struct Owned {
     instance: ash::Instance,
     messenger: Option<(ext::debug_utils::Instance, vk::DebugUtilsMessengerEXT)>,
-    /// The messenger points at it: a box does not move.
-    messages: Box<validation::Messages>,
     cache_path: Option<PathBuf>,
     /// Last, because the instance's functions live in the library.
     entry: ash::Entry,
 }
 
 impl Owned {
-    pub(super) fn messages(&self) -> Vec<String> {
-        lock(&self.messages).clone()
-    }
-
     pub(super) fn save_pipeline_cache(&self, device: &ash::Device, cache: vk::PipelineCache) {
         let Some(path) = &self.cache_path else { return };
         // SAFETY: the cache is live. A cache that cannot be kept costs time, never correctness.
@@ -164,6 +158,15 @@ impl Gpu {
     ///
     /// # Errors
     /// No loader, no such device, or one that lacks a requirement.
+    ///
+    /// ```no_run
+    /// use nightsplat::gpu::{DeviceChoice, Gpu};
+    ///
+    /// let gpu = Gpu::new(&DeviceChoice::Best)?;
+    /// let squares = gpu.buffer("squares", &[0u32, 1, 4, 9])?;
+    /// assert_eq!(gpu.read(&squares)?, [0, 1, 4, 9]);
+    /// # Ok::<(), nightsplat::Error>(())
+    /// ```
     pub fn new(choice: &DeviceChoice) -> Result<Self> {
         let validate = cfg!(debug_assertions) && validation_is_installed();
         Self::open(choice, validate)
@@ -236,8 +239,7 @@ impl Gpu {
         };
         let offered = Offered::gather(&instance, physical).map_err(loader_error)?;
         offered.check()?;
-        let queue =
-            Queue { raw: vk::Queue::from_raw(host.queue), family: host.queue_family, submitted: 0 };
+        let queue = Queue { raw: vk::Queue::from_raw(host.queue), family: host.queue_family };
         let properties = properties(&instance, physical, &offered);
         Self::assemble(&instance, physical, properties, device, queue, None)
     }
@@ -287,6 +289,7 @@ impl Gpu {
                 device,
                 allocator: Mutex::new(Some(allocator)),
                 queue: Mutex::new(queue),
+                progress: Mutex::default(),
                 timeline,
                 last_use: AtomicU64::new(0),
                 usage: super::buffer::MemoryUsage::default(),
@@ -332,7 +335,6 @@ fn validation_is_installed() -> bool {
 
 fn instance(validate: bool) -> Result<Owned> {
     let entry = entry()?;
-    let messages = Box::new(Mutex::new(vec![]));
     let app = vk::ApplicationInfo::default()
         .application_name(c"nightsplat")
         .api_version(vk::API_VERSION_1_3);
@@ -340,7 +342,7 @@ fn instance(validate: bool) -> Result<Owned> {
     let extensions = [ext::debug_utils::NAME.as_ptr(), ext::validation_features::NAME.as_ptr()];
     let checks = [vk::ValidationFeatureEnableEXT::SYNCHRONIZATION_VALIDATION];
     let mut features = vk::ValidationFeaturesEXT::default().enabled_validation_features(&checks);
-    let messenger_info = validation::messenger(&messages);
+    let messenger_info = validation::messenger();
     let mut early = messenger_info;
     let mut info = vk::InstanceCreateInfo::default().application_info(&app);
     if validate {
@@ -350,7 +352,7 @@ fn instance(validate: bool) -> Result<Owned> {
             .push_next(&mut features)
             .push_next(&mut early);
     }
-    // SAFETY: `info` points at live locals, `messages` outlives the instance.
+    // SAFETY: `info` points at live locals.
     unsafe {
         let instance = entry.create_instance(&info, None).map_err(loader_error)?;
         let messenger = validate
@@ -361,7 +363,7 @@ fn instance(validate: bool) -> Result<Owned> {
             })
             .transpose()
             .map_err(loader_error)?;
-        Ok(Owned { instance, messenger, messages, cache_path: None, entry })
+        Ok(Owned { instance, messenger, cache_path: None, entry })
     }
 }
 
@@ -529,7 +531,7 @@ fn create_device(
             .create_device(physical, &info, None)
             .map_err(|result| Error::Vulkan { call: "vkCreateDevice", device, result })?;
         let raw = device.get_device_queue(family, 0);
-        Ok((device, Queue { raw, family, submitted: 0 }))
+        Ok((device, Queue { raw, family }))
     }
 }
 

@@ -37,6 +37,9 @@ pub struct Recorder<'g> {
     pub(super) checked: Option<Checked<'g>>,
 }
 
+/// The timeline value of a recording that the host application submits: none of ours.
+pub(super) const HOST_SUBMITS: u64 = 0;
+
 /// Timestamps that fit one recording; passes beyond are not timed.
 pub(super) const MAX_TIMESTAMPS: u32 = 4096;
 
@@ -298,7 +301,7 @@ impl Gpu {
         record: impl FnOnce(&mut Recorder<'_>) -> Result<()>,
     ) -> Result<()> {
         let commands = vk::CommandBuffer::from_raw(commands);
-        let mut recorder = Recorder::new(&self.shared, commands, 0, None);
+        let mut recorder = Recorder::new(&self.shared, commands, HOST_SUBMITS, None);
         record(&mut recorder)?;
         recorder.finish();
         Ok(())

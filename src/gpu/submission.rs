@@ -1,13 +1,14 @@
 //! Hands recorded work to the queue and waits for it.
 
-use std::sync::Arc;
 use std::sync::atomic::Ordering;
+use std::sync::{Arc, MutexGuard};
+use std::thread;
 
 use ash::vk;
 
 use super::recorder::MAX_TIMESTAMPS;
 use super::{Gpu, Queue, Recorder, Retired, Shared, lock};
-use crate::Result;
+use crate::{Error, Result};
 
 /// Work in flight.
 #[derive(Debug)]
@@ -35,11 +36,40 @@ impl Submission {
     }
 }
 
+/// The queue, held by the thread that records.
+struct Recording<'a> {
+    shared: &'a Shared,
+    queue: MutexGuard<'a, Queue>,
+}
+
+impl Shared {
+    /// Takes the queue; refuses where this thread has it, which would wait for itself.
+    fn begin_recording(&self, label: &str) -> Result<Recording<'_>> {
+        if let Some(outer) = lock(&self.progress).recorded_here() {
+            return Err(Error::Usage(format!(
+                "`{label}` cannot be submitted while `{outer}` is recorded; do it before or behind that"
+            )));
+        }
+        let queue = lock(&self.queue);
+        lock(&self.progress).recording = Some((thread::current().id(), label.to_owned()));
+        Ok(Recording { shared: self, queue })
+    }
+}
+
+impl Drop for Recording<'_> {
+    fn drop(&mut self) {
+        lock(&self.shared.progress).recording = None;
+    }
+}
+
 impl Gpu {
     /// Records passes and submits them; does not wait.
     ///
+    /// The queue is held while `record` runs: other threads that submit wait. What submits by itself, such as
+    /// [`Gpu::write`], [`Gpu::zeros`] or [`crate::render::Renderer::reserve`], belongs before or behind the recording.
+    ///
     /// # Errors
-    /// What `record` returns (nothing is submitted then), or the device was lost.
+    /// What `record` returns (nothing is submitted then), this thread is recording already, or the device was lost.
     pub fn submit(
         &self,
         label: &str,
@@ -107,28 +137,28 @@ impl Gpu {
         record: impl FnOnce(&mut Recorder<'_>) -> Result<()>,
     ) -> Result<(Submission, Vec<&'static str>)> {
         let shared = &self.shared;
-        let mut queue = lock(&shared.queue);
+        let recording = shared.begin_recording(label)?;
         let fail = |call| move |result| shared.error(call, result);
         let pool_info = vk::CommandPoolCreateInfo::default()
             .flags(vk::CommandPoolCreateFlags::TRANSIENT)
-            .queue_family_index(queue.family);
+            .queue_family_index(recording.queue.family);
         // SAFETY: the device is live; the pool is retired when this function ends, after its last submission.
         let pool = unsafe { shared.device.create_command_pool(&pool_info, None) }
             .map_err(fail("vkCreateCommandPool"))?;
-        let value = queue.submitted + 1;
+        let value = lock(&shared.progress).submitted + 1;
         // From here on, whatever is dropped may be in this recording.
         shared.last_use.store(value, Ordering::Release);
+        let queue = &recording.queue;
         let submitted = if queries.is_none() && shared.checks.are_on() {
-            let last = shared.record_checked(&mut queue, pool, label, record);
-            last.map(|last| (last, vec![]))
+            shared.record_checked(queue, pool, value, label, record).map(|last| (last, vec![]))
         } else {
             self.record_commands(pool, value, queries, record).and_then(|(commands, labels)| {
-                shared.submit(&mut queue, commands, value)?;
+                shared.submit(queue, commands, value, label)?;
                 tracing::trace!(label, value, "submitted");
                 Ok((value, labels))
             })
         };
-        // After a failure, what was dropped meanwhile waits for the next submission's value.
+        // Where nothing was submitted, what was dropped meanwhile waits for the next submission, of the same value.
         shared.retire(Retired::Commands(pool));
         submitted.map(|(value, labels)| (Submission { shared: Arc::clone(shared), value }, labels))
     }
@@ -172,9 +202,10 @@ impl Shared {
     /// Ends a recording and hands it to the queue; the timeline reaches `value` when it is done.
     pub(super) fn submit(
         &self,
-        queue: &mut Queue,
+        queue: &Queue,
         commands: vk::CommandBuffer,
         value: u64,
+        label: &str,
     ) -> Result<()> {
         let fail = |call| move |result| self.error(call, result);
         // SAFETY: recording.
@@ -190,7 +221,9 @@ impl Shared {
         // SAFETY: the queue is locked, the command buffer recorded and not touched again.
         unsafe { self.device.queue_submit2(queue.raw, &info, vk::Fence::null()) }
             .map_err(fail("vkQueueSubmit2"))?;
-        queue.submitted = value;
+        let mut progress = lock(&self.progress);
+        progress.submitted = value;
+        progress.labels.insert(value, label.to_owned());
         Ok(())
     }
 }

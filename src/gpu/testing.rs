@@ -3,18 +3,21 @@
 use std::cell::Cell;
 use std::sync::OnceLock;
 
+use ash::vk;
+
 use super::{DeviceChoice, Gpu};
 
 static GPU: OnceLock<Gpu> = OnceLock::new();
 
-/// The device that tests share: validation and synchronization validation are on. `NIGHTSPLAT_DEVICE` picks another
-/// device than the default.
+/// The device that tests share: validation and synchronization validation are on, and whatever they say fails the
+/// process as it ends, with the name of the test. `NIGHTSPLAT_DEVICE` picks another device than the default.
 ///
 /// # Panics
 /// There is no device or no validation layer: a test without them proves nothing.
 #[expect(clippy::panic, reason = "a test without a device must fail")]
 pub fn gpu() -> Gpu {
     let open = || {
+        super::validation::fail_at_exit();
         let choice = std::env::var("NIGHTSPLAT_DEVICE").unwrap_or_default();
         let choice: DeviceChoice = choice.parse().unwrap_or_else(|error| panic!("{error}"));
         Gpu::with_validation(&choice).unwrap_or_else(|error| panic!("{error}"))
@@ -22,11 +25,16 @@ pub fn gpu() -> Gpu {
     GPU.get_or_init(open).clone()
 }
 
-/// # Panics
-/// The validation layer has said something since the process began.
-pub fn assert_no_validation_messages() {
-    let messages = gpu().validation_messages();
-    assert!(messages.is_empty(), "validation: {messages:#?}");
+/// Does what the validation layer must object to: creates a buffer of no bytes.
+pub fn misuse(gpu: &Gpu) {
+    let device = &gpu.shared.device;
+    let info = vk::BufferCreateInfo::default().usage(vk::BufferUsageFlags::STORAGE_BUFFER);
+    // SAFETY: the device is live. The size is wrong on purpose; drivers bear it, and nothing uses the buffer.
+    unsafe {
+        if let Ok(buffer) = device.create_buffer(&info, None) {
+            device.destroy_buffer(buffer, None);
+        }
+    }
 }
 
 /// A wrong wiring: of the pass's parameters, `bits` of 32-bit number `word` reach the device flipped.

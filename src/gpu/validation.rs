@@ -1,18 +1,28 @@
-//! The validation layer's messages, collected so that a test can fail on them.
+//! The validation layer's messages: logged as they come, and where tests ask for it the failure of the process.
 
-use std::ffi::{CStr, c_void};
-use std::sync::Mutex;
+use std::ffi::{CStr, c_int, c_void};
+use std::io::Write;
+use std::sync::{Mutex, Once};
 
 use ash::vk;
 
 /// The Khronos layer that checks every call, and here every hazard.
 pub(super) const LAYER: &CStr = c"VK_LAYER_KHRONOS_validation";
 
-/// Messages of one instance; its address is the messenger's user data.
-pub(super) type Messages = Mutex<Vec<String>>;
+/// Set in the environment of the processes that tests start, so that they [`fail_at_exit`].
+const FAIL_VARIABLE: &str = "NIGHTSPLAT_FAIL_ON_VALIDATION";
 
-/// A messenger that pushes warnings and errors to `messages`, which must outlive the instance.
-pub(super) fn messenger(messages: &Messages) -> vk::DebugUtilsMessengerCreateInfoEXT<'static> {
+/// The exit code of a process that validation has failed: that of a test binary in which a test failed.
+const FAILED: c_int = 101;
+
+/// Everything that was said to this process, each with the name of the thread, which for a test is its own.
+static MESSAGES: Mutex<Vec<String>> = Mutex::new(vec![]);
+
+/// A messenger for the layer's warnings and errors.
+pub(super) fn messenger() -> vk::DebugUtilsMessengerCreateInfoEXT<'static> {
+    if std::env::var_os(FAIL_VARIABLE).is_some() {
+        fail_at_exit();
+    }
     vk::DebugUtilsMessengerCreateInfoEXT::default()
         .message_severity(
             vk::DebugUtilsMessageSeverityFlagsEXT::ERROR
@@ -20,20 +30,41 @@ pub(super) fn messenger(messages: &Messages) -> vk::DebugUtilsMessengerCreateInf
         )
         .message_type(vk::DebugUtilsMessageTypeFlagsEXT::VALIDATION)
         .pfn_user_callback(Some(on_message))
-        .user_data(std::ptr::from_ref(messages).cast_mut().cast())
 }
 
 unsafe extern "system" fn on_message(
     _: vk::DebugUtilsMessageSeverityFlagsEXT,
     _: vk::DebugUtilsMessageTypeFlagsEXT,
     data: *const vk::DebugUtilsMessengerCallbackDataEXT<'_>,
-    messages: *mut c_void,
+    _: *mut c_void,
 ) -> vk::Bool32 {
-    // SAFETY: the loader passes valid callback data with a NUL-terminated message, and our own user data.
-    let (message, messages) = unsafe {
-        (CStr::from_ptr((*data).p_message).to_string_lossy(), &*messages.cast::<Messages>())
-    };
+    // SAFETY: the loader passes valid callback data with a NUL-terminated message.
+    let message = unsafe { CStr::from_ptr((*data).p_message) }.to_string_lossy();
     tracing::error!(target: "vulkan", "{message}");
-    super::lock(messages).push(message.into_owned());
+    // The layer calls from the thread whose call it objects to.
+    let thread = std::thread::current();
+    super::lock(&MESSAGES).push(format!("{}: {message}", thread.name().unwrap_or("a thread")));
     vk::FALSE
+}
+
+unsafe extern "C" {
+    fn atexit(function: extern "C" fn()) -> c_int;
+    fn _exit(code: c_int) -> !;
+}
+
+/// From now on a process to which the layer says anything fails as it ends, whatever its tests found, and says what.
+pub(super) fn fail_at_exit() {
+    static ONCE: Once = Once::new();
+    // SAFETY: the function lives as long as the process, and does not unwind.
+    ONCE.call_once(|| assert_eq!(unsafe { atexit(fail_with_messages) }, 0));
+}
+
+extern "C" fn fail_with_messages() {
+    let messages = super::lock(&MESSAGES);
+    if !messages.is_empty() {
+        // A closed stderr leaves the exit code to tell.
+        let _ = writeln!(std::io::stderr(), "validation failed in\n{}", messages.join("\n"));
+        // SAFETY: always sound; `exit` must not be called again while it runs.
+        unsafe { _exit(FAILED) };
+    }
 }

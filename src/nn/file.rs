@@ -3,7 +3,8 @@
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::Path;
 
-use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use safetensors::SafeTensorError;
+use safetensors::tensor::{Dtype, Metadata, SafeTensors, TensorInfo, TensorView};
 use serde_json::Value;
 
 use super::parameters::{Parameters, Tensor};
@@ -13,6 +14,35 @@ use crate::{Error, Result};
 
 /// The key of the metadata that holds the settings of every network, as one JSON object.
 const SETTINGS: &str = "networks";
+
+/// A safetensors file whose header is read once.
+pub(crate) struct TensorFile<'a> {
+    metadata: Metadata,
+    /// Behind the header.
+    data: &'a [u8],
+}
+
+impl<'a> TensorFile<'a> {
+    /// # Errors
+    /// The header is damaged, or says that there is more or less than there is.
+    pub(crate) fn of(bytes: &'a [u8]) -> std::result::Result<Self, SafeTensorError> {
+        let (header_bytes, metadata) = SafeTensors::read_metadata(bytes)?;
+        // The length of the header stands before it.
+        Ok(Self { metadata, data: &bytes[size_of::<u64>() + header_bytes..] })
+    }
+
+    /// What the header says under `key` beside the tensors.
+    pub(crate) fn note(&self, key: &str) -> Option<&str> {
+        self.metadata.metadata().as_ref()?.get(key).map(String::as_str)
+    }
+
+    /// A tensor and its bytes.
+    pub(crate) fn tensor(&self, name: &str) -> Option<(&TensorInfo, &'a [u8])> {
+        let info = self.metadata.info(name)?;
+        let (begin, end) = info.data_offsets;
+        Some((info, &self.data[begin..end]))
+    }
+}
 
 /// Writes each network's tensors as `network.tensor`.
 ///
@@ -56,9 +86,8 @@ pub fn load(path: &Path, networks: &mut [&mut Parameters], gpu: &Gpu) -> Result<
     let bytes = std::fs::read(path)
         .map_err(|error| Error::input(path, format!("cannot be read ({error})")))?;
     let damaged = |error| Error::input(path, format!("is no whole safetensors file ({error})"));
-    let (_, header) = SafeTensors::read_metadata(&bytes).map_err(damaged)?;
-    let file = SafeTensors::deserialize(&bytes).map_err(damaged)?;
-    let settings = header.metadata().as_ref().and_then(|metadata| metadata.get(SETTINGS));
+    let file = TensorFile::of(&bytes).map_err(damaged)?;
+    let settings = file.note(SETTINGS);
     let settings: Value = settings.and_then(|s| serde_json::from_str(s).ok()).unwrap_or_default();
 
     let mut values = vec![];
@@ -75,15 +104,14 @@ pub fn load(path: &Path, networks: &mut [&mut Parameters], gpu: &Gpu) -> Result<
         let read = |tensor: &Tensor| {
             let name = format!("{prefix}.{}", tensor.name);
             let expected = &tensor.shape;
-            let found = file.tensor(&name).map_err(|_| {
+            let (TensorInfo { shape, dtype, .. }, bytes) = file.tensor(&name).ok_or_else(|| {
                 other(format!("has no tensor `{name}`, which must be {expected:?}"))
             })?;
-            if found.shape() != expected || found.dtype() != Dtype::F32 {
-                let (shape, dtype) = (found.shape(), found.dtype());
+            if shape != expected || *dtype != Dtype::F32 {
                 let problem = format!("tensor `{name}` is {shape:?} {dtype}, not {expected:?} F32");
                 return Err(other(problem));
             }
-            let values = found.data().chunks_exact(4);
+            let values = bytes.chunks_exact(4);
             let values: Vec<f32> =
                 values.map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
             if values.iter().all(|value| value.is_finite()) {
@@ -100,7 +128,8 @@ pub fn load(path: &Path, networks: &mut [&mut Parameters], gpu: &Gpu) -> Result<
             is_own && !known.contains(*name)
         };
         values.push(parameters.tensors().iter().map(read).collect::<Result<Vec<_>>>()?.concat());
-        if let Some(stray) = file.names().into_iter().filter(is_stray).min() {
+        let names = file.metadata.tensors();
+        if let Some(stray) = names.keys().map(String::as_str).filter(is_stray).min() {
             return Err(other(format!("holds a tensor `{stray}` that this network lacks")));
         }
     }

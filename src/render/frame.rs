@@ -34,36 +34,37 @@ impl Status {
     }
 }
 
-/// Buffers by what their length follows.
+/// What the passes hand each other; buffers by what their length follows. Public for tests alone.
 #[derive(Debug)]
-pub(super) struct Frame {
+#[expect(missing_docs, reason = "each is declared in the kernels that write and read it")]
+pub struct Frame {
     /// Values per pixel.
     channels: usize,
     // Gaussians
-    pub(super) gaussian_count: u32,
+    pub gaussian_count: u32,
     /// [0]: the count again, where a pass looks for it
-    pub(super) gaussian_counts: Buffer<u32>,
-    pub(super) splats: Buffer<ProjectedSplat>,
-    pub(super) colors: Buffer<f32>,
-    pub(super) depth_keys: Buffer<u32>,
-    pub(super) ids: Buffer<u32>,
-    pub(super) tile_counts: Buffer<u32>,
-    pub(super) ordered_counts: Buffer<u32>,
-    pub(super) offsets: Buffer<u32>,
-    pub(super) d_splats: Buffer<f32>,
+    pub gaussian_counts: Buffer<u32>,
+    pub splats: Buffer<ProjectedSplat>,
+    pub colors: Buffer<f32>,
+    pub depth_keys: Buffer<u32>,
+    pub ids: Buffer<u32>,
+    pub tile_counts: Buffer<u32>,
+    pub ordered_counts: Buffer<u32>,
+    pub offsets: Buffer<u32>,
+    pub d_splats: Buffer<f32>,
     // intersections
-    pub(super) tiles: Buffer<u32>,
-    pub(super) slots: Buffer<u32>,
-    pub(super) owners: Buffer<u32>,
-    pub(super) records: Buffer<f32>,
+    pub tiles: Buffer<u32>,
+    pub slots: Buffer<u32>,
+    pub owners: Buffer<u32>,
+    pub records: Buffer<f32>,
     // pixels and tiles
-    pub(super) render: Buffer<f32>,
-    pub(super) transmittances: Buffer<f32>,
-    pub(super) tile_ranges: Buffer<UVec2>,
+    pub render: Buffer<f32>,
+    pub transmittances: Buffer<f32>,
+    pub tile_ranges: Buffer<UVec2>,
     // single numbers
-    pub(super) total: Buffer<u32>,
-    pub(super) counts: Buffer<u32>,
-    pub(super) status: Buffer<u32>,
+    pub total: Buffer<u32>,
+    pub counts: Buffer<u32>,
+    pub status: Buffer<u32>,
 }
 
 impl Frame {

@@ -77,8 +77,8 @@ impl ToneSettings {
     /// [`Error::Usage`] names the constant.
     pub fn check(&self) -> Result<()> {
         let rules = [
-            ("--gain (c)", self.gain_c, self.gain_c >= 0.0, "at least 0"),
-            ("--theta", self.theta, self.theta > 0.0, "above 0"),
+            ("`ToneSettings::gain_c`", self.gain_c, self.gain_c >= 0.0, "at least 0"),
+            ("`ToneSettings::theta`", self.theta, self.theta > 0.0, "above 0"),
             ("alpha", self.alpha, (0.0..=1.0).contains(&self.alpha), "from 0 to 1"),
             ("beta", self.beta, self.beta >= 0.0, "at least 0"),
             ("base_gain (g0)", self.base_gain, self.base_gain > 0.0, "above 0"),

@@ -6,13 +6,14 @@
 use std::collections::HashMap;
 use std::path::Path;
 
-use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use safetensors::tensor::{Dtype, TensorView};
 use serde::{Deserialize, Serialize};
 
 use super::model::Model;
 use super::{TrainConfig, Trainer, learnables};
 use crate::densify::DeviceGaussians;
 use crate::gpu::{Buffer, Gpu};
+use crate::nn::TensorFile;
 use crate::optimizer::{AdamBuffers, Moments};
 use crate::output::write_whole_with;
 use crate::{Error, Result};
@@ -90,8 +91,8 @@ impl Trainer {
             .map_err(|error| Error::input(path, format!("cannot be read ({error})")))?;
         let damaged =
             |problem: String| Error::input(path, format!("is no whole checkpoint ({problem})"));
-        let file = SafeTensors::deserialize(&bytes).map_err(|error| damaged(error.to_string()))?;
-        let step = self.step_of(path, &bytes)?;
+        let file = TensorFile::of(&bytes).map_err(|error| damaged(error.to_string()))?;
+        let step = self.step_of(path, &file)?;
         let visits: Vec<u32> = values(&file, VISIT_COUNTS, Dtype::U32, None).map_err(damaged)?;
         let gpu = self.gpu.clone();
         let mut restored = Model::zeros(&gpu, visits.len(), self.model.shape())?;
@@ -106,30 +107,25 @@ impl Trainer {
     }
 
     /// The step of a checkpoint that this run can go on from.
-    fn step_of(&self, path: &Path, bytes: &[u8]) -> Result<u64> {
+    fn step_of(&self, path: &Path, file: &TensorFile<'_>) -> Result<u64> {
         let refused = |problem: String| Error::input(path, problem);
-        let (_, metadata) = SafeTensors::read_metadata(bytes)
-            .map_err(|error| refused(format!("is no whole checkpoint ({error})")))?;
-        let header = metadata.metadata().as_ref().and_then(|metadata| metadata.get(HEADER));
-        let header = header.and_then(|header| serde_json::from_str(header).ok());
+        let anew = "begin anew with `HeldRun::Replace`";
+        let header = file.note(HEADER).and_then(|header| serde_json::from_str(header).ok());
         let Some(Header { step, config, .. }) = header.filter(|h: &Header| h.format == FORMAT)
         else {
-            return Err(refused(format!("is no `{FORMAT}`; train the run again with --overwrite")));
+            return Err(refused(format!("is no `{FORMAT}`; {anew}")));
         };
-        let config = TrainConfig::from_toml(&config).map_err(|error| {
-            refused(format!(
-                "was made by another version ({error}); train the run again with --overwrite"
-            ))
-        })?;
+        let config = TrainConfig::from_toml(&config)
+            .map_err(|error| refused(format!("was made by another version ({error}); {anew}")))?;
         if let Some(difference) = config.difference(&self.config) {
             return Err(refused(format!(
-                "was made with {difference}; give the settings that the run began with, or begin anew with --overwrite"
+                "was made with {difference}; give the settings that the run began with, or {anew}"
             )));
         }
         let steps = self.config.steps;
         if step > steps {
             return Err(refused(format!(
-                "is at step {step}, this run ends at {steps}; raise --steps"
+                "is at step {step}, this run ends at {steps}; raise `TrainConfig::steps`"
             )));
         }
         Ok(step)
@@ -139,7 +135,7 @@ impl Trainer {
     fn read_state(
         &mut self,
         gpu: &Gpu,
-        file: &SafeTensors<'_>,
+        file: &TensorFile<'_>,
         damaged: &dyn Fn(String) -> Error,
     ) -> Result<()> {
         let read = |state: State<'_>| {
@@ -189,14 +185,14 @@ fn optimized<'a>(
 
 /// A tensor's elements, or what is wrong with it.
 fn values<T: bytemuck::Pod>(
-    file: &SafeTensors<'_>,
+    file: &TensorFile<'_>,
     name: &str,
     dtype: Dtype,
     shape: Option<&[usize]>,
 ) -> std::result::Result<Vec<T>, String> {
-    let tensor = file.tensor(name).map_err(|_| format!("it has no tensor `{name}`"))?;
-    if tensor.dtype() != dtype || shape.is_some_and(|shape| shape != tensor.shape()) {
-        return Err(format!("tensor `{name}` cannot be {:?} {}", tensor.shape(), tensor.dtype()));
+    let (found, bytes) = file.tensor(name).ok_or_else(|| format!("it has no tensor `{name}`"))?;
+    if found.dtype != dtype || shape.is_some_and(|shape| shape != found.shape) {
+        return Err(format!("tensor `{name}` cannot be {:?} {}", found.shape, found.dtype));
     }
-    Ok(bytemuck::pod_collect_to_vec(tensor.data()))
+    Ok(bytemuck::pod_collect_to_vec(bytes))
 }

@@ -185,7 +185,9 @@ impl TrainConfig {
         }
         let count = dataset.train_views().filter(|view| view.depth.is_some()).count();
         if count == 0 {
-            tracing::warn!("no view has a depth map (depth/NAME.png or --depth): no depth term");
+            tracing::warn!(
+                "no view has a depth map (depth/NAME.png, or in model.depth_folder): no depth term"
+            );
             self.model.depth = false;
         } else {
             tracing::info!(
@@ -207,7 +209,7 @@ impl TrainConfig {
         }
     }
 
-    /// Refuses values that make no sense, naming the option.
+    /// Refuses values that make no sense, naming the field.
     ///
     /// # Errors
     /// [`Error::Usage`].
@@ -217,9 +219,19 @@ impl TrainConfig {
         self.loss().check()?;
         let density = &self.density;
         let rules = [
-            ("--steps", self.steps as f64, self.steps >= 1, "at least 1"),
-            ("--sh-degree", f64::from(self.sh_degree), self.sh_degree <= MAX_SH_DEGREE, "0 to 3"),
-            ("--max-gaussians", self.max_gaussians as f64, self.max_gaussians >= 1, "at least 1"),
+            ("`TrainConfig::steps`", self.steps as f64, self.steps >= 1, "at least 1"),
+            (
+                "`TrainConfig::sh_degree`",
+                f64::from(self.sh_degree),
+                self.sh_degree <= MAX_SH_DEGREE,
+                "0 to 3",
+            ),
+            (
+                "`TrainConfig::max_gaussians`",
+                self.max_gaussians as f64,
+                self.max_gaussians >= 1,
+                "at least 1",
+            ),
             ("random_points", self.random_points as f64, self.random_points >= 1, "at least 1"),
             (
                 "density.gradient_threshold",
@@ -260,12 +272,15 @@ mod tests {
     #[test]
     fn values_that_make_no_sense_are_refused_by_name() {
         let refused = |config: TrainConfig| config.check().unwrap_err().to_string();
-        assert!(refused(TrainConfig { steps: 0, ..Default::default() }).contains("--steps"));
+        assert!(
+            refused(TrainConfig { steps: 0, ..Default::default() })
+                .contains("`TrainConfig::steps` is 0")
+        );
         assert!(
             refused(TrainConfig { ssim_weight: f64::NAN, ..Default::default() }).contains("ssim")
         );
         assert!(
-            refused(TrainConfig { sh_degree: 4, ..Default::default() }).contains("--sh-degree")
+            refused(TrainConfig { sh_degree: 4, ..Default::default() }).contains("::sh_degree`")
         );
         let mut config = TrainConfig::default();
         config.model.weights.low_ssim = 1.5;

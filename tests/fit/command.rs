@@ -1,6 +1,6 @@
 //! `nightsplat fit`, in process.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use nightsplat::cli::fit::{ChannelChoice, FamilyChoice, FitArgs, WeightingChoice, apply};
 use nightsplat::tone::CurveChoice;

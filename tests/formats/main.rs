@@ -1,12 +1,10 @@
 //! Datasets: every layout is recognised and read the same, and bad input is told in one line.
 
-#![allow(
-    clippy::unwrap_used,
-    clippy::print_stdout,
-    reason = "a test may fail, and says what it skips"
-)]
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
 mod bad_input;
+#[path = "../common/mod.rs"]
+mod common;
 mod real;
 mod synthetic;
 

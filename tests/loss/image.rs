@@ -1,7 +1,7 @@
 //! L1 and SSIM of an image.
 
 use glam::{UVec2, Vec3};
-use nightsplat::gpu::testing::{assert_no_validation_messages, gpu};
+use nightsplat::gpu::testing::gpu;
 use nightsplat::gpu::{Gpu, Reference, Threads};
 use nightsplat::kernels::curves::{CURVE_AP3, CURVE_ASE, CURVE_NONE};
 use nightsplat::kernels::{ToneParameters, l1, ssim_backward, ssim_forward};
@@ -114,7 +114,6 @@ fn the_ssim_kernels_match_their_references_at_every_size() {
     for size in SIZES {
         check_ssim_kernels(CURVE_AP3, [16, 64], size, Interior::whole(size.into()));
     }
-    assert_no_validation_messages();
 }
 
 #[test]
@@ -122,7 +121,6 @@ fn the_shape_of_the_strips_does_not_matter() {
     for (shape, curve) in [([2, 32], CURVE_ASE), ([1, 1], CURVE_NONE), ([5, 7], CURVE_AP3)] {
         check_ssim_kernels(curve, shape, [37, 41], Interior::whole([37, 41].into()));
     }
-    assert_no_validation_messages();
 }
 
 #[test]
@@ -154,7 +152,6 @@ fn l1_matches_its_reference() {
         assert!((outcome.l1 - sum[0] / count as f32).abs() < 1e-6);
         assert_eq!(outcome.ssim, 0.0, "SSIM is not modelled at weight 0");
     }
-    assert_no_validation_messages();
 }
 
 /// (1 - w) mean|a - b| + w (1 - mean SSIM) of one channel, means over the interior.
@@ -254,7 +251,6 @@ fn the_kernels_match_their_references_with_an_interior() {
         assert_close("d_render", &outcome.d_render, &expected, 0.0);
         assert!((outcome.l1 - sum[0] * params.l1_scale).abs() < 1e-6);
     }
-    assert_no_validation_messages();
 }
 
 /// The interior's pixels see those around them, so their gradient is not that of the interior alone.
@@ -285,7 +281,6 @@ fn outside_the_interior_the_value_ignores_the_render_but_ssim_does_not() {
         assert_eq!(l1.d_render[i] != 0.0, distance(i) == 0, "{i}");
         assert_eq!(with_ssim.d_render[i] != 0.0, distance(i) <= 5, "{i}");
     }
-    assert_no_validation_messages();
 }
 
 /// A value that counts for nothing must not spoil the mean, unless a window sees it.
@@ -300,7 +295,6 @@ fn a_nan_beyond_every_window_of_the_interior_changes_nothing() {
         let outcome = evaluate_interior(&gpu, CURVE_AP3, weight, size, interior, TONE, &images);
         assert!(outcome.l1.is_finite() && outcome.ssim.is_finite() && outcome.status == 0);
     }
-    assert_no_validation_messages();
 }
 
 #[test]
@@ -318,7 +312,6 @@ fn an_interior_that_is_not_inside_is_refused() {
         let logged = log_step(&gpu, |pass, log| loss.record(pass, inputs, &mut d_render, log));
         assert!(logged.is_err(), "{interior:?}");
     }
-    assert_no_validation_messages();
 }
 
 #[test]
@@ -335,7 +328,6 @@ fn l1_and_ssim_are_those_of_pytorch() {
     torch.assert_agrees("image.l1.d_render", &l1.d_render);
     torch.assert_agrees("image.ssim.value", &[1.0 - ssim.ssim]);
     torch.assert_agrees("image.ssim.d_render", &ssim.d_render);
-    assert_no_validation_messages();
 }
 
 #[test]
@@ -353,7 +345,6 @@ fn an_image_compared_with_itself_costs_nothing() {
     assert!((outcome.ssim - 1.0).abs() < 1e-6, "{}", outcome.ssim);
     assert!(largest(&outcome.d_render) < 1e-6, "{}", largest(&outcome.d_render));
     assert_eq!(outcome.status, 0);
-    assert_no_validation_messages();
 }
 
 #[test]
@@ -372,7 +363,6 @@ fn constant_images_have_the_ssim_of_their_means_inside() {
     assert!((map[24 * 64 + 32].value - inside).abs() < 1e-6);
     let mean = map.iter().map(|ssim| ssim.value).sum::<f64>() / map.len() as f64;
     assert!((f64::from(outcome.ssim) - mean).abs() < 1e-5, "{} {mean}", outcome.ssim);
-    assert_no_validation_messages();
 }
 
 #[test]
@@ -382,7 +372,6 @@ fn black_images_have_a_finite_gradient() {
     let outcome = evaluate(&gpu, CURVE_NONE, 0.5, [20, 20], &[vec![0.0; count], vec![0.0; count]]);
     assert!((outcome.ssim - 1.0).abs() < 1e-6);
     assert!(outcome.d_render.iter().all(|d| d.abs() < 1e-6));
-    assert_no_validation_messages();
 }
 
 /// Squares near 4e4 round by more than C2: without the floor under the variances the denominator turns negative.
@@ -401,7 +390,6 @@ fn a_render_that_is_far_too_bright_keeps_its_ssim_positive() {
         assert!(outcome.ssim > 0.0, "{brightness}: {}", outcome.ssim);
         assert_eq!(outcome.status, 0);
     }
-    assert_no_validation_messages();
 }
 
 #[test]
@@ -416,7 +404,6 @@ fn a_value_that_is_not_finite_reaches_the_log_and_the_status() {
         assert!(!outcome.l1.is_finite(), "{value} at weight {weight}: {}", outcome.l1);
         assert_eq!(outcome.status, NOT_FINITE);
     }
-    assert_no_validation_messages();
 }
 
 #[test]
@@ -431,7 +418,6 @@ fn the_same_step_leaves_the_same_bits() {
     for _ in 0..5 {
         assert!(step() == first);
     }
-    assert_no_validation_messages();
 }
 
 #[test]
@@ -469,5 +455,4 @@ fn a_view_that_does_not_fit_is_refused() {
         });
         assert!(result.is_err(), "{weight} {size:?} {slot}");
     }
-    assert_no_validation_messages();
 }

@@ -5,8 +5,6 @@
 #[macro_use]
 #[path = "../common/mod.rs"]
 mod common;
-#[path = "../common/safetensors.rs"]
-mod safetensors;
 
 mod denoising;
 mod depth;
@@ -16,6 +14,7 @@ mod structure;
 
 use std::collections::BTreeMap;
 
+use common::{largest, widen};
 use nightsplat::Result;
 use nightsplat::gpu::{Gpu, Recorder};
 use nightsplat::kernels::status::STATUS_NOT_FINITE as NOT_FINITE;
@@ -56,10 +55,6 @@ fn assert_close(what: &str, actual: &[f32], expected: &[f32], tolerance: f32) {
     common::assert_close(what, actual, expected, |_, _| tolerance);
 }
 
-fn largest(values: &[f32]) -> f32 {
-    values.iter().fold(0.0, |largest, value| value.abs().max(largest))
-}
-
 fn bits(values: &[f32]) -> Vec<u32> {
     values.iter().map(|value| value.to_bits()).collect()
 }
@@ -87,13 +82,9 @@ fn central_differences(at: &[f64], loss: impl Fn(&[f64]) -> f64) -> Vec<f64> {
         .collect()
 }
 
-fn widen(values: &[f32]) -> Vec<f64> {
-    values.iter().map(|&value| f64::from(value)).collect()
-}
-
 /// The gradient that a reference finds against that of finite differences.
 fn assert_gradient(what: &str, analytic: &[f32], numeric: &[f64]) {
-    let numeric: Vec<f32> = numeric.iter().map(|&d| d as f32).collect();
+    let numeric = common::narrow(numeric);
     assert_close(what, analytic, &numeric, 1e-5 * largest(&numeric) + 1e-9);
 }
 
@@ -102,7 +93,7 @@ struct Torch(BTreeMap<String, Vec<f32>>);
 
 impl Torch {
     fn read() -> Self {
-        Self(safetensors::read("tests/fixtures/torch/losses.safetensors"))
+        Self(common::safetensors::read("tests/fixtures/torch/losses.safetensors"))
     }
 
     fn get(&self, name: &str) -> &[f32] {

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use glam::UVec2;
-use nightsplat::gpu::testing::{assert_no_validation_messages, gpu};
+use nightsplat::gpu::testing::gpu;
 use nightsplat::nn::{Denoiser, DenoiserSettings, Parameters, Tonemapper};
 use safetensors::SafeTensors;
 
@@ -71,7 +71,6 @@ fn a_denoiser_stage_is_pytorch_s() {
     let [noise, render, d] = fixture.images(["noise", "r0", "d_r1"]);
     let outcome = run_denoiser(&mut denoiser, SIZE, [&noise, &render, &d]);
     fixture.check(denoiser.parameters(), &outcome, ["r1", "d_noise", "d_r0"]);
-    assert_no_validation_messages();
 }
 
 #[test]
@@ -83,5 +82,4 @@ fn the_tonemapper_is_pytorch_s() {
     let [illumination, denoised, d] = fixture.images(["illumination", "denoised", "d_low"]);
     let outcome = run_tonemapper(&mut tonemapper, SIZE, [&illumination, &denoised, &d]);
     fixture.check(tonemapper.parameters(), &outcome, ["low", "d_illumination", "d_denoised"]);
-    assert_no_validation_messages();
 }

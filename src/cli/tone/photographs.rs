@@ -1,12 +1,12 @@
 //! Which photographs `tone` reads, and where each goes.
 
 use std::collections::BTreeMap;
-use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 
 use super::{ToneArgs, is_same_file};
 use crate::cli::ImageFormat;
 use crate::dataset::{Dataset, LoadOptions, Photograph, Split};
+use crate::image::files::photographs_in;
 use crate::{Error, Result};
 
 /// A photograph to map.
@@ -20,8 +20,6 @@ pub(super) struct Listed {
     /// The file to write.
     pub(super) target: Option<PathBuf>,
 }
-
-const EXTENSIONS: [&str; 4] = ["png", "jpg", "jpeg", "exr"];
 
 /// The photographs of the input: itself, those of a folder by name, or a dataset's.
 pub(super) fn listed(args: &ToneArgs) -> Result<Vec<Listed>> {
@@ -42,7 +40,7 @@ pub(super) fn listed(args: &ToneArgs) -> Result<Vec<Listed>> {
         };
         Dataset::photographs(input, &options)?.into_iter().map(of_view).collect()
     } else {
-        let files = images_in(input)?;
+        let files = photographs_in(input)?;
         files.iter().map(|file| plain(file, args.reference.as_deref())).collect::<Result<_>>()?
     };
     if photographs.is_empty() {
@@ -59,7 +57,7 @@ fn plain(input: &Path, reference: Option<&Path>) -> Result<Listed> {
     let stem = input.file_stem().unwrap_or_default();
     let reference = match reference {
         Some(folder) if folder.is_dir() => {
-            images_in(folder)?.into_iter().find(|file| file.file_stem() == Some(stem))
+            photographs_in(folder)?.into_iter().find(|file| file.file_stem() == Some(stem))
         }
         Some(file) if file.is_file() => Some(file.to_owned()),
         Some(absent) => return Err(Error::input(absent, "is neither a folder nor a file")),
@@ -67,21 +65,6 @@ fn plain(input: &Path, reference: Option<&Path>) -> Result<Listed> {
     };
     let name = stem.to_string_lossy().into_owned();
     Ok(Listed { name, input: input.to_owned(), reference, split: None, target: None })
-}
-
-/// The images of a folder, by name.
-fn images_in(folder: &Path) -> Result<Vec<PathBuf>> {
-    let unreadable =
-        |error: std::io::Error| Error::input(folder, format!("cannot be read: {error}"));
-    let entries = std::fs::read_dir(folder).map_err(unreadable)?;
-    let paths = entries.map(|entry| entry.map(|entry| entry.path()));
-    let mut paths: Vec<PathBuf> = paths.collect::<std::io::Result<_>>().map_err(unreadable)?;
-    paths.retain(|path| {
-        let extension = path.extension().and_then(OsStr::to_str).unwrap_or_default();
-        EXTENSIONS.contains(&extension.to_ascii_lowercase().as_str()) && path.is_file()
-    });
-    paths.sort();
-    Ok(paths)
 }
 
 /// The file that each is written to, all different and none of them a photograph.

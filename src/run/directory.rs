@@ -1,4 +1,4 @@
-//! The run directory: what a training run leaves behind.
+//! The run directory: what a run leaves behind.
 //!
 //! ```text
 //! RUN/config.toml    everything the run used
@@ -34,8 +34,10 @@ pub struct RunDirectory {
 }
 
 /// The files of a run that a new run replaces; nothing else in the directory is touched.
-const FILES: [&str; 6] =
-    ["metrics.json", "model.ply", NETWORKS, CHECKPOINT, "train.csv", "config.toml"];
+const FILES: [&str; 6] = ["metrics.json", "model.ply", NETWORKS, CHECKPOINT, LOG, "config.toml"];
+
+/// A line per step.
+const LOG: &str = "train.csv";
 
 /// The weights of the networks.
 const NETWORKS: &str = "networks.safetensors";
@@ -51,17 +53,13 @@ impl RunDirectory {
     pub fn create(path: &Path, config: &TrainConfig, overwrite: bool) -> Result<Self> {
         let used = FILES.iter().find(|file| path.join(file).exists());
         if let Some(file) = used.filter(|_| !overwrite) {
-            let problem = format!("already holds a run ({file}); pass --overwrite to replace it");
+            let problem =
+                format!("already holds a run ({file}); pass `HeldRun::Replace` to replace it");
             return Err(Error::output(path, problem));
         }
         std::fs::create_dir_all(path).map_err(|error| unwritable(path, &error))?;
         remove(path, &FILES)?;
-        write_whole(&path.join("config.toml"), config.to_toml()?.as_bytes())?;
-        let log_path = path.join("train.csv");
-        let log = File::create(&log_path).map_err(|error| unwritable(&log_path, &error))?;
-        let terms = config.loss().terms();
-        let log = BufWriter::new(log);
-        let mut run = Self { path: path.to_owned(), log, terms, seconds_before: 0.0 };
+        let mut run = Self::open(path, config, "", 0.0)?;
         let columns: String = run.terms.iter().map(|term| format!("{},", term.column)).collect();
         run.log_line(&format!("step,view,loss,{columns}gaussians,milliseconds"))?;
         Ok(run)
@@ -72,22 +70,29 @@ impl RunDirectory {
     /// # Errors
     /// The directory cannot be written, or its log does not reach `step`.
     pub fn resume(path: &Path, config: &TrainConfig, step: u64) -> Result<Self> {
-        let log_path = path.join("train.csv");
+        let log_path = path.join(LOG);
         let text = std::fs::read_to_string(&log_path)
             .map_err(|error| Error::input(&log_path, format!("cannot be read ({error})")))?;
         // The header and a line per step; the last line may be cut short.
         let lines: Vec<&str> = text.split_inclusive('\n').take(step as usize + 1).collect();
         let last = lines.last().filter(|line| line.starts_with(&format!("{step},")));
         if last.is_none_or(|line| !line.ends_with('\n')) {
-            let problem =
-                format!("ends before step {step} of the checkpoint; begin anew with --overwrite");
+            let problem = format!(
+                "ends before step {step} of the checkpoint; begin anew with `HeldRun::Replace`"
+            );
             return Err(Error::input(&log_path, problem));
         }
         let milliseconds = |line: &&str| line.trim_end().rsplit(',').next()?.parse::<f64>().ok();
         let seconds_before = lines.iter().filter_map(milliseconds).sum::<f64>() / 1e3;
         remove(path, &["metrics.json", "model.ply", NETWORKS])?;
+        Self::open(path, config, &lines.concat(), seconds_before)
+    }
+
+    /// Writes the configuration and what the log begins with.
+    fn open(path: &Path, config: &TrainConfig, log: &str, seconds_before: f64) -> Result<Self> {
         write_whole(&path.join("config.toml"), config.to_toml()?.as_bytes())?;
-        write_whole(&log_path, lines.concat().as_bytes())?;
+        let log_path = path.join(LOG);
+        write_whole(&log_path, log.as_bytes())?;
         let log = File::options().append(true).open(&log_path);
         let log = BufWriter::new(log.map_err(|error| unwritable(&log_path, &error))?);
         let terms = config.loss().terms();
@@ -147,7 +152,7 @@ impl RunDirectory {
     /// # Errors
     /// The disk is full or gone.
     pub fn save_metrics(&self, metrics: &serde_json::Value) -> Result<()> {
-        write_json(&self.path.join("metrics.json"), metrics)
+        write_whole(&self.path.join("metrics.json"), format!("{metrics:#}\n").as_bytes())
     }
 
     fn log_line(&mut self, line: &str) -> Result<()> {
@@ -156,7 +161,7 @@ impl RunDirectory {
 }
 
 /// The checkpoint of a run; none where there is none.
-pub fn checkpoint(run: &Path) -> Option<PathBuf> {
+pub(super) fn checkpoint(run: &Path) -> Option<PathBuf> {
     Some(run.join(CHECKPOINT)).filter(|path| path.is_file())
 }
 
@@ -173,7 +178,7 @@ pub fn load_config(run: &Path) -> Result<TrainConfig> {
     let path = run.join("config.toml");
     if !path.is_file() {
         let problem =
-            "is no run directory: it has no config.toml; name the --out of `nightsplat train`";
+            "is no run directory: it has no config.toml; name what `nightsplat train` wrote";
         return Err(Error::input(run, problem));
     }
     TrainConfig::load(&path)
@@ -214,17 +219,6 @@ pub fn load_networks(
     Ok(Some(networks))
 }
 
-/// Writes a JSON file, pretty-printed, whole or not at all.
-///
-/// # Errors
-/// The folder cannot be written.
-pub fn write_json(path: &Path, value: &serde_json::Value) -> Result<()> {
-    let mut text =
-        serde_json::to_string_pretty(value).map_err(|error| Error::Usage(error.to_string()))?;
-    text.push('\n');
-    write_whole(path, text.as_bytes())
-}
-
 fn remove(run: &Path, files: &[&str]) -> Result<()> {
     for file in files.iter().map(|file| run.join(file)).filter(|file| file.exists()) {
         std::fs::remove_file(&file).map_err(|error| unwritable(&file, &error))?;
@@ -247,7 +241,7 @@ mod tests {
         drop(RunDirectory::create(folder.path(), &config, false).unwrap());
         std::fs::write(folder.path().join("notes.txt"), "mine").unwrap();
         let error = RunDirectory::create(folder.path(), &config, false).unwrap_err();
-        assert!(error.to_string().contains("--overwrite"), "{error}");
+        assert!(error.to_string().contains("HeldRun::Replace"), "{error}");
         drop(RunDirectory::create(folder.path(), &config, true).unwrap());
         assert!(folder.path().join("notes.txt").exists());
         assert_eq!(load_config(folder.path()).unwrap(), config);

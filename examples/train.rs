@@ -1,0 +1,55 @@
+//! Trains a small set from a program: `cargo run --release --example train -- FOLDER`.
+//!
+//! Makes the set in FOLDER/set, trains it into FOLDER/run and says on the way what the run tells its observer.
+
+#![expect(clippy::print_stdout, reason = "what a run tells its observer is what there is to see")]
+
+use std::path::PathBuf;
+
+use nightsplat::dataset::Dataset;
+use nightsplat::dataset::synthetic::{self, SyntheticOptions};
+use nightsplat::eval;
+use nightsplat::gpu::{DeviceChoice, Gpu};
+use nightsplat::run::{self, Event, HeldRun};
+use nightsplat::tone::{ToneCurve, ToneSettings};
+use nightsplat::train::TrainConfig;
+
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    let folder: PathBuf = std::env::args_os().nth(1).ok_or("usage: train FOLDER")?.into();
+    let set = folder.join("set");
+    synthetic::write(&set, &SyntheticOptions { width: 80, height: 60, ..Default::default() })?;
+
+    let config = TrainConfig {
+        dataset: set,
+        steps: 200,
+        eval_every: 100,
+        tone: ToneSettings::new(ToneCurve::Ase),
+        ..TrainConfig::default()
+    };
+    let gpu = Gpu::new(&DeviceChoice::Best)?;
+    let dataset = Dataset::load(&config.dataset, &config.load_options())?;
+    run::train(
+        &gpu,
+        &config,
+        &dataset,
+        &folder.join("run"),
+        HeldRun::Replace,
+        |event| match event {
+            Event::Started { steps, .. } => println!("{steps} steps"),
+            Event::Step(report) if report.step.is_multiple_of(50) => {
+                println!("step {}, view {}: loss {:.4}", report.step, report.view, report.loss);
+            }
+            Event::Evaluated { step, scored } => {
+                if let (Some(mean), _) = eval::means(scored) {
+                    println!("step {step}: {:.2} dB on {} test views", mean.psnr, scored.len());
+                }
+            }
+            Event::Finished(trained) => {
+                let gaussians = trained.trainer.gaussian_count();
+                println!("{gaussians} Gaussians in {:.1} s", trained.seconds);
+            }
+            _ => {}
+        },
+    )?;
+    Ok(())
+}

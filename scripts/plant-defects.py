@@ -1,0 +1,83 @@
+#!/usr/bin/env python3
+"""Plants defects in the kernels and their wiring, one at a time, and shows which test catches each.
+
+    scripts/plant-defects.py [PART OF A NAME]
+
+Each defect is one replacement in one file, which is put back whatever happens. The tests named beside it are built and
+run; one of them has to fail. Exit code 1 if a defect survives, or if its place is no longer there to plant it in.
+"""
+
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+
+# name, file, what is there, what is planted, arguments of `cargo test`
+DEFECTS = [
+    ("the sign of a conic's off-diagonal", "shaders-glsl/render/project.comp",
+     "vec3(cov2d.z, -cov2d.y, cov2d.x)", "vec3(cov2d.z, cov2d.y, cov2d.x)", "--test render golden"),
+    ("colours at the stride of three channels", "shaders-glsl/render/blend_forward.comp",
+     "my_color[c] = colors[CHANNELS * id + c]", "my_color[c] = colors[3 * id + c]", "--test render golden"),
+    ("pixels beyond the right and the lower edge are written", "shaders-glsl/render/blend_forward.comp",
+     "if (all(lessThan(pixel, size)))", "if (all(lessThanEqual(pixel, size)))", "--test render"),
+    ("the last intersection of a tile is lost", "shaders-glsl/render/tile_ranges.comp",
+     "tile_ranges[tile].y = i + 1;", "tile_ranges[tile].y = i;", "--test render"),
+    ("depth without its share of the mean's gradient", "shaders-glsl/render/project_backward.comp",
+     "/ (z * z)\n        - dot(d_xy_view, free_slope);", "/ (z * z);", "--test gradients"),
+    ("sums by Gaussian where they are by depth", "src/render.rs",
+     "ordered_counts: &frame.ordered_counts,\n                offsets: &frame.offsets,\n                records",
+     "ordered_counts: &frame.tile_counts,\n                offsets: &frame.offsets,\n                records",
+     "--test gradients"),
+    ("no barrier before the counts are read", "shaders-glsl/pseudo_gt/percentile_select.comp",
+     "    barrier();\n\n    uint rank = 0;", "    uint rank = 0;", "--test pseudo_gt"),
+    ("ranks that ignore the pairs before", "shaders-glsl/sort/sort_downsweep.comp",
+     "next_place[digit] = place + 1;", "next_place[digit] = place;", "--test sort"),
+    ("weights of the transposed convolution not turned", "shaders-glsl/nn/conv3x3.comp",
+     "(TAPS - 1 - tap)", "tap", "--test nn"),
+    ("SSIM's gradient without that of the product", "shaders-glsl/loss/ssim_backward.comp",
+     " + b * blurred[PRODUCT];", ";", "--test loss"),
+    ("a second moment that forgets too soon", "shaders-glsl/optimizer/adam.comp",
+     "const float BETA2 = 0.999;", "const float BETA2 = 0.99;", "--test optimizer"),
+    ("split Gaussians keep their moments", "shaders-glsl/densify/densify_scatter.comp",
+     "bool is_new = fate == FATE_SPLIT || copy_index > 0;", "bool is_new = copy_index > 0;", "--test densify"),
+]
+
+
+def plant(file, before, after, arguments):
+    """What became of the defect, in words, and whether it was caught."""
+    path = ROOT / file
+    original = path.read_text()
+    if original.count(before) != 1:
+        return f"its place is there {original.count(before)} times", False
+    try:
+        path.write_text(original.replace(before, after))
+        run = subprocess.run(["cargo", "test", "-q", *arguments.split()], cwd=ROOT, text=True, capture_output=True)
+    finally:
+        path.write_text(original)
+    if "test result" not in run.stdout:
+        return "does not build: " + "; ".join(re.findall(r"^error.*", run.stderr, re.M)[:2]), False
+    failed = sorted(set(re.findall(r"^test (\S+) \.\.\. FAILED|^---- (\S+) stdout", run.stdout, re.M)))
+    names = [name for pair in failed for name in pair if name]
+    if run.returncode != 0 and not names:
+        names = ["validation, as the process ended"]
+    return ", ".join(names) or "SURVIVED", bool(names)
+
+
+def main():
+    # Interrupted, Python unwinds as for any other exception, and the file is put back.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(130))
+    wanted = " ".join(sys.argv[1:])
+    survivors = 0
+    for name, file, before, after, arguments in DEFECTS:
+        if wanted in name:
+            said, caught = plant(file, before, after, arguments)
+            survivors += not caught
+            print(f"{'caught' if caught else 'MISSED'}  {name} ({file}): {said}", flush=True)
+    sys.exit(survivors > 0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,77 @@
+//! Finding photographs: all of a folder, or one by the path a listing gives, with or without its extension.
+
+use std::cell::RefCell;
+use std::collections::{BTreeMap, HashMap};
+use std::path::{Path, PathBuf};
+
+use crate::{Error, Result};
+
+/// Endings of the files that [`super::Image::load`] reads.
+const READABLE: [&str; 4] = ["png", "jpg", "jpeg", "exr"];
+/// Endings of other image files: no part of a name either. What follows another dot is.
+const UNREADABLE: [&str; 5] = ["tif", "tiff", "webp", "bmp", "hdr"];
+
+/// A photograph's name: the file name without an image's extension.
+pub(crate) fn stem(listed: &str) -> &str {
+    let name = listed.rsplit('/').next().unwrap_or(listed);
+    match name.rsplit_once('.') {
+        Some((stem, ending)) if is_one_of(&READABLE, ending) || is_one_of(&UNREADABLE, ending) => {
+            stem
+        }
+        _ => name,
+    }
+}
+
+/// The photographs of a folder that can be read, by path.
+///
+/// # Errors
+/// [`Error::Input`] where the folder cannot be read.
+pub(crate) fn photographs_in(folder: &Path) -> Result<Vec<PathBuf>> {
+    let unreadable = |error| Error::input(folder, format!("cannot be read: {error}"));
+    let mut paths = files_in(folder).map_err(unreadable)?;
+    paths.retain(|path| {
+        let ending = path.extension().unwrap_or_default();
+        is_one_of(&READABLE, &ending.to_string_lossy())
+    });
+    Ok(paths)
+}
+
+/// Looks photographs up and remembers what the folders hold.
+#[derive(Debug, Default)]
+pub(crate) struct Files {
+    folders: RefCell<HashMap<PathBuf, BTreeMap<String, PathBuf>>>,
+}
+
+impl Files {
+    /// The file at `folder/listed`; where there is none, the one there that differs by its extension only.
+    pub(crate) fn find(&self, folder: &Path, listed: &str) -> Option<PathBuf> {
+        let exact = folder.join(listed);
+        if exact.is_file() {
+            return Some(exact);
+        }
+        let parent = exact.parent()?.to_owned();
+        let mut folders = self.folders.borrow_mut();
+        let by_stem = folders.entry(parent).or_insert_with_key(|parent| by_stem(parent));
+        by_stem.get(stem(listed)).cloned()
+    }
+}
+
+fn by_stem(folder: &Path) -> BTreeMap<String, PathBuf> {
+    let paths = files_in(folder).unwrap_or_default().into_iter();
+    let named = |path: PathBuf| Some((stem(path.file_name()?.to_str()?).to_owned(), path));
+    // Of two files with one stem the first by name, whatever order the disk lists them in.
+    paths.rev().filter_map(named).collect()
+}
+
+/// Every file of a folder, sorted.
+fn files_in(folder: &Path) -> std::io::Result<Vec<PathBuf>> {
+    let entries = std::fs::read_dir(folder)?.map(|entry| entry.map(|entry| entry.path()));
+    let mut paths = entries.collect::<std::io::Result<Vec<PathBuf>>>()?;
+    paths.retain(|path| path.is_file());
+    paths.sort();
+    Ok(paths)
+}
+
+fn is_one_of(endings: &[&str], ending: &str) -> bool {
+    endings.contains(&ending.to_ascii_lowercase().as_str())
+}

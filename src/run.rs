@@ -1,0 +1,9 @@
+//! A training run from its first step to its last file: what the command does, without its progress bar.
+
+mod directory;
+mod events;
+mod train;
+
+pub use directory::{RunDirectory, is_finished, load_config, load_model, load_networks};
+pub use events::Event;
+pub use train::{HeldRun, Trained, train};

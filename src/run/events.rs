@@ -1,0 +1,34 @@
+//! What a run tells its observer.
+
+use super::Trained;
+use crate::eval::ViewScore;
+use crate::train::StepReport;
+
+/// A moment of a run, in the order in which they come.
+#[derive(Clone, Copy, Debug)]
+#[non_exhaustive]
+pub enum Event<'a> {
+    /// The model is on the device.
+    Started {
+        /// Steps that a resumed run has behind it; otherwise 0.
+        step: u64,
+        /// The step that ends the run.
+        steps: u64,
+    },
+    /// A step is done and in the log. Steps are submitted several at a time and arrive so.
+    Step(&'a StepReport),
+    /// What the run can go on from is on disk.
+    Checkpointed {
+        /// Steps done.
+        step: u64,
+    },
+    /// The test views were scored, on the way or behind the last step.
+    Evaluated {
+        /// Steps done.
+        step: u64,
+        /// The views that have a reference image.
+        scored: &'a [ViewScore],
+    },
+    /// The run directory is whole.
+    Finished(&'a Trained),
+}

@@ -1,0 +1,161 @@
+//! Trains into a run directory and tells an observer.
+
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use super::{Event, RunDirectory, directory};
+use crate::Result;
+use crate::dataset::Dataset;
+use crate::eval::{self, ViewScore};
+use crate::gpu::Gpu;
+use crate::train::{TrainConfig, Trainer};
+
+/// What becomes of a run that the directory already holds.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum HeldRun {
+    /// It stays: nothing is trained.
+    #[default]
+    Refuse,
+    /// It is deleted.
+    Replace,
+    /// It goes on from its checkpoint, to the bits that it would have had in one go; without one it begins anew.
+    Resume,
+}
+
+/// What a run made.
+#[derive(Debug)]
+pub struct Trained {
+    /// The model and its networks, on the device.
+    pub trainer: Trainer,
+    /// The test views that have a reference image.
+    pub scored: Vec<ViewScore>,
+    /// The loss of every step of this call.
+    pub losses: Vec<f64>,
+    /// Of the steps alone, without loading and scoring; those before a resumed run included.
+    pub seconds: f64,
+    /// The most that buffers took on the device while it trained.
+    pub peak_bytes: u64,
+}
+
+/// Trains `config` on `dataset`, scores the test views and writes the run directory `out`.
+///
+/// `observe` is told every [`Event`] on the calling thread. `dataset` is what [`TrainConfig::load_options`] loads.
+///
+/// # Errors
+/// The directory holds a run that `held` keeps, or cannot be written; the configuration makes no sense or is not that of
+/// the run that is to go on; a loss is not finite; the device is out of memory or lost.
+///
+/// ```no_run
+/// use std::path::Path;
+///
+/// use nightsplat::dataset::Dataset;
+/// use nightsplat::gpu::{DeviceChoice, Gpu};
+/// use nightsplat::run::{self, Event, HeldRun};
+/// use nightsplat::train::TrainConfig;
+///
+/// let config = TrainConfig { dataset: "photos".into(), steps: 2000, ..TrainConfig::default() };
+/// let gpu = Gpu::new(&DeviceChoice::Best)?;
+/// let dataset = Dataset::load(&config.dataset, &config.load_options())?;
+/// let trained = run::train(&gpu, &config, &dataset, Path::new("run"), HeldRun::Refuse, |event| {
+///     if let Event::Step(report) = event {
+///         println!("step {}: loss {:.4}", report.step, report.loss);
+///     }
+/// })?;
+/// println!("{} Gaussians in {:.0} s", trained.trainer.gaussian_count(), trained.seconds);
+/// # Ok::<(), nightsplat::Error>(())
+/// ```
+pub fn train(
+    gpu: &Gpu,
+    config: &TrainConfig,
+    dataset: &Dataset,
+    out: &Path,
+    held: HeldRun,
+    mut observe: impl FnMut(Event<'_>),
+) -> Result<Trained> {
+    gpu.reset_peak_memory();
+    let (mut directory, mut trainer) = begin(gpu, config, dataset, out, held)?;
+    observe(Event::Started { step: trainer.steps_done(), steps: config.steps });
+    let (losses, seconds) =
+        train_to_the_end(&mut trainer, &mut directory, config, dataset, &mut observe)?;
+    let peak_bytes = gpu.peak_memory();
+    let scored = evaluate(&mut trainer, dataset, &mut observe)?;
+    directory.save_model(&trainer.gaussians()?, config.model.raw_colors)?;
+    if let Some(networks) = trainer.networks() {
+        directory.save_networks(networks)?;
+    }
+    let metrics = eval::metrics(&scored, seconds, trainer.gaussian_count(), config.steps);
+    directory.save_metrics(&metrics)?;
+    let trained = Trained { trainer, scored, losses, seconds, peak_bytes };
+    observe(Event::Finished(&trained));
+    Ok(trained)
+}
+
+/// A new run, or one that is taken up again.
+fn begin(
+    gpu: &Gpu,
+    config: &TrainConfig,
+    dataset: &Dataset,
+    out: &Path,
+    held: HeldRun,
+) -> Result<(RunDirectory, Trainer)> {
+    let checkpoint = directory::checkpoint(out).filter(|_| held == HeldRun::Resume);
+    if let Some(checkpoint) = checkpoint {
+        let mut trainer = Trainer::new(gpu, config.clone(), dataset)?;
+        trainer.restore(&checkpoint)?;
+        let step = trainer.steps_done();
+        tracing::info!("{} goes on after step {step}", out.display());
+        return Ok((RunDirectory::resume(out, config, step)?, trainer));
+    }
+    // Without a checkpoint, an unfinished run is nothing to lose.
+    let replaces = match held {
+        HeldRun::Refuse => false,
+        HeldRun::Replace => true,
+        HeldRun::Resume => !directory::is_finished(out),
+    };
+    let directory = RunDirectory::create(out, config, replaces)?;
+    Ok((directory, Trainer::new(gpu, config.clone(), dataset)?))
+}
+
+/// Logs every step and writes checkpoints; gives the losses, and the seconds of all steps.
+fn train_to_the_end(
+    trainer: &mut Trainer,
+    directory: &mut RunDirectory,
+    config: &TrainConfig,
+    dataset: &Dataset,
+    observe: &mut impl FnMut(Event<'_>),
+) -> Result<(Vec<f64>, f64)> {
+    let (mut losses, mut spent) = (vec![], Duration::ZERO);
+    while trainer.steps_done() < config.steps {
+        let next = |every| (trainer.steps_done() + 1).checked_next_multiple_of(every);
+        let until = [config.eval_every, config.checkpoint_every].into_iter().filter_map(next);
+        let until = until.min().unwrap_or(config.steps);
+        let begin = Instant::now();
+        let reports = trainer.advance(until)?;
+        spent += begin.elapsed();
+        for report in &reports {
+            losses.push(report.loss);
+            directory.log(report)?;
+            observe(Event::Step(report));
+        }
+        let Some(step) = reports.last().map(|report| report.step) else { continue };
+        let falls_on = |every: u64| every > 0 && step.is_multiple_of(every);
+        if falls_on(config.checkpoint_every) {
+            directory.save_checkpoint(trainer)?;
+            observe(Event::Checkpointed { step });
+        }
+        if falls_on(config.eval_every) && step < config.steps {
+            evaluate(trainer, dataset, observe)?;
+        }
+    }
+    Ok((losses, directory.seconds_before() + spent.as_secs_f64()))
+}
+
+fn evaluate(
+    trainer: &mut Trainer,
+    dataset: &Dataset,
+    observe: &mut impl FnMut(Event<'_>),
+) -> Result<Vec<ViewScore>> {
+    let scored = eval::score(dataset, |view| trainer.render(&view.camera))?;
+    observe(Event::Evaluated { step: trainer.steps_done(), scored: &scored });
+    Ok(scored)
+}

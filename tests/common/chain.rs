@@ -1,0 +1,213 @@
+//! The whole renderer once more in f64 and without tiles: every splat on every pixel, front to back, and its gradients.
+
+use glam::{DVec2, DVec3};
+use nightsplat::kernels::splat::RECORD_HEAD;
+use nightsplat::reference::blend_backward::blend_pixel_backward;
+use nightsplat::reference::blend_forward::blend_pixel;
+use nightsplat::reference::project::{Projection, project_gaussian};
+use nightsplat::reference::project_backward::{DSplat, project_gaussian_backward};
+use nightsplat::reference::splat::Splat;
+
+use super::setup::{Rendered, Setup};
+use super::{Random, assert_close};
+
+/// A setup and the gradient of its render, (channels, H, W): the functional that is differentiated is their product.
+pub(crate) struct Chain<'a> {
+    setup: &'a Setup,
+    d_render: Vec<f64>,
+}
+
+/// The splats of a render, front to back, with the Gaussians they come from.
+struct Projected {
+    ids: Vec<usize>,
+    splats: Vec<Splat>,
+    colors: Vec<f64>,
+    depths: Vec<f64>,
+}
+
+/// What the renderer gives.
+pub(crate) struct Results {
+    /// (channels, H, W)
+    pub(crate) render: Vec<f64>,
+    /// (H, W)
+    pub(crate) transmittances: Vec<f64>,
+    /// In the order of the parameters.
+    pub(crate) gradient: Vec<f64>,
+    /// By Gaussian: what is added to the statistics of density control.
+    grad_norms: Vec<f64>,
+    /// By channel.
+    pub(crate) d_background: Vec<f64>,
+}
+
+impl<'a> Chain<'a> {
+    /// With a random gradient of the render.
+    pub(crate) fn new(setup: &'a Setup) -> Self {
+        let mut random = Random::new(4);
+        let count = setup.channels() * setup.pixels();
+        // Numbers of f32, which is what the device is given.
+        let d_render = (0..count).map(|_| f64::from(random.between(-1.0, 1.0) as f32)).collect();
+        Self { setup, d_render }
+    }
+
+    pub(crate) fn parameters(&self) -> Vec<f64> {
+        self.setup.parameters.iter().map(|&p| p.into()).collect()
+    }
+
+    pub(crate) fn background(&self) -> Vec<f64> {
+        self.setup.background().into_iter().map(f64::from).collect()
+    }
+
+    fn project(&self, parameters: &[f64]) -> Projected {
+        let Setup { settings, options, .. } = self.setup;
+        let camera = self.setup.camera();
+        let one = |i| -> Option<(usize, Projection, Vec<f64>)> {
+            let gaussian = self.setup.planes().load(parameters, i);
+            let (near, degree) = (settings.near.into(), options.sh_degree);
+            let projection =
+                project_gaussian(&camera, near, degree, settings.raw_colors, &gaussian)?;
+            Some((i, projection, gaussian.features))
+        };
+        let mut visible: Vec<_> = (0..self.setup.count).filter_map(one).collect();
+        visible.sort_by(|(_, a, _), (_, b, _)| a.depth.total_cmp(&b.depth));
+        Projected {
+            ids: visible.iter().map(|(i, ..)| *i).collect(),
+            splats: visible.iter().map(|(_, p, _)| p.splat).collect(),
+            colors: visible
+                .iter()
+                .flat_map(|(_, p, features)| [&p.color.to_array()[..], features].concat())
+                .collect(),
+            depths: visible.iter().map(|(_, p, _)| p.depth).collect(),
+        }
+    }
+
+    /// Centre and gradient of each pixel.
+    fn pixels(&self) -> impl Iterator<Item = (DVec2, Vec<f64>)> {
+        let (width, count) = (self.setup.camera.width as usize, self.setup.pixels());
+        (0..count).map(move |at| {
+            let center = DVec2::new((at % width) as f64, (at / width) as f64) + 0.5;
+            (center, self.d_render.iter().skip(at).step_by(count).copied().collect())
+        })
+    }
+
+    fn alpha_max(&self) -> f64 {
+        self.setup.settings.max_alpha.into()
+    }
+
+    /// The functional's value.
+    pub(crate) fn loss(&self, parameters: &[f64], background: &[f64]) -> f64 {
+        let Projected { splats, colors, .. } = self.project(parameters);
+        let pixel = |(center, d): (DVec2, Vec<f64>)| {
+            let (render, _) = blend_pixel(&splats, &colors, background, center, self.alpha_max());
+            render.iter().zip(d).map(|(value, d)| value * d).sum::<f64>()
+        };
+        self.pixels().map(pixel).sum()
+    }
+
+    /// The render, and the gradients that the references' own backward gives.
+    pub(crate) fn run(&self, parameters: &[f64]) -> Results {
+        let Projected { ids, splats, colors, depths } = self.project(parameters);
+        let (channels, pixels, background) =
+            (self.setup.channels(), self.setup.pixels(), self.background());
+        let record = RECORD_HEAD as usize + channels;
+        let mut records = vec![0.0; record * ids.len()];
+        let mut results = Results {
+            render: vec![0.0; channels * pixels],
+            transmittances: vec![],
+            gradient: vec![0.0; parameters.len()],
+            grad_norms: vec![0.0; self.setup.count],
+            d_background: vec![0.0; channels],
+        };
+        let alpha_max = self.alpha_max();
+        for (at, (center, d)) in self.pixels().enumerate() {
+            let (values, transmittance) =
+                blend_pixel(&splats, &colors, &background, center, alpha_max);
+            let list = &mut records;
+            blend_pixel_backward(&splats, &colors, &values, &d, center, alpha_max, list);
+            for c in 0..channels {
+                results.render[c * pixels + at] = values[c];
+                results.d_background[c] += transmittance * d[c];
+            }
+            results.transmittances.push(transmittance);
+        }
+        let (planes, camera) = (self.setup.planes(), self.setup.camera());
+        for (j, &i) in ids.iter().enumerate() {
+            let d_splat = self.d_splat(&records[record * j..][..record], &colors[channels * j..]);
+            let gaussian = planes.load(parameters, i);
+            let degree = self.setup.options.sh_degree;
+            let d = project_gaussian_backward(&camera, degree, &gaussian, &splats[j], &d_splat);
+            planes.store(&d, i, |at, value| results.gradient[at] = value);
+            let damping = Rendered::DAMPING;
+            let nearness = (depths[j] / f64::from(damping.depth)).min(1.0);
+            let undamped = 1.0 - f64::from(damping.weight) * (1.0 - nearness * nearness);
+            results.grad_norms[i] = undamped * (0.5 * camera.size * d_splat.mean2d).length();
+        }
+        results
+    }
+
+    /// What arrives at a splat, where clamped colours pass nothing on.
+    fn d_splat(&self, record: &[f64], color: &[f64]) -> DSplat {
+        let is_free = |c: usize| self.setup.settings.raw_colors || color[c] > 0.0;
+        let passes = |c: usize| if is_free(c) { record[RECORD_HEAD as usize + c] } else { 0.0 };
+        DSplat {
+            mean2d: DVec2::from_slice(record),
+            conic: DVec3::from_slice(&record[2..]),
+            opacity: record[5],
+            color: DVec3::from_array([0, 1, 2].map(passes)),
+            features: record[9..].to_vec(),
+        }
+    }
+
+    /// The parameters, off by some roundings each.
+    pub(crate) fn jitter(&self, seed: u64) -> Vec<f64> {
+        let mut random = Random::new(100 + seed);
+        let mut moved = |p: f64| p + JITTER * (p.abs() + 1.0) * random.between(-1.0, 1.0);
+        self.parameters().into_iter().map(&mut moved).collect()
+    }
+
+    /// Renders the setup on the device, forward and backward, and panics where a result is none of this chain's.
+    ///
+    /// The model of what rounding may change: the device gives what the chain gives for parameters that are off by some
+    /// roundings each. So the parameters jitter, and what that moves a result by is what the device may be off by, some
+    /// times over; a pixel in which a rounding decides whether a splat counts shows itself.
+    pub(crate) fn assert_agrees_with_the_device(&self, name: &str) {
+        let exact = self.run(&self.parameters());
+        let jittered: Vec<Results> =
+            (0..JITTERS).map(|seed| self.run(&self.jitter(seed))).collect();
+        let check = |what: &str, actual: &[f32], values: fn(&Results) -> &[f64], size: f64| {
+            let exact = values(&exact);
+            let expected: Vec<f32> = exact.iter().map(|&e| e as f32).collect();
+            let bound = |i: usize, _| {
+                let moved = |results: &Results| (values(results)[i] - exact[i]).abs();
+                let most = jittered.iter().map(moved).fold(0.0, f64::max);
+                (TIMES * most + JITTER * (exact[i].abs() + size)) as f32
+            };
+            assert_close(&format!("{name}: {what}"), actual, &expected, bound);
+        };
+        let mut rendered = self.setup.render();
+        check("render", &rendered.render, |results| &results.render, 1.0);
+        check("transmittance", &rendered.transmittances, |results| &results.transmittances, 1.0);
+        let d_render: Vec<f32> = self.d_render.iter().map(|&d| d as f32).collect();
+        let gradients = rendered.backward(&d_render);
+        check("gradient", &gradients.parameters, |results| &results.gradient, 1.0);
+        let norms: Vec<f32> =
+            gradients.grad_norm_sums.iter().map(|sum| sum - Rendered::NORM_BEFORE).collect();
+        check("gradient norm", &norms, |results| &results.grad_norms, 1.0);
+        for (i, &visits) in gradients.visit_counts.iter().enumerate() {
+            let visits = visits - Rendered::VISITS_BEFORE;
+            let leaves_a_trace = exact.grad_norms[i] > 0.0;
+            assert!(
+                visits == 1 || visits == 0 && !leaves_a_trace,
+                "{name}: {visits} visits of {i}"
+            );
+        }
+    }
+}
+
+/// Half a unit in the last place of 1.0: the relative error of one rounding.
+const ROUNDING: f64 = f32::EPSILON as f64 / 2.0;
+/// How far the parameters jitter, relative to their magnitude and one, which is that of the terms they meet in sums and
+/// exponentials: some dozens of roundings lie between a parameter and a pixel.
+const JITTER: f64 = 32.0 * ROUNDING;
+const JITTERS: u64 = 6;
+/// How many times what the jitter moved a result by.
+const TIMES: f64 = 4.0;

@@ -1,0 +1,49 @@
+//! The built binary, as a shell runs it.
+
+use std::process::{Command, Output};
+
+/// `nightsplat` with arguments as a shell splits them; paths hold no spaces. Whatever validation says fails it.
+pub(crate) fn command(arguments: &str) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_nightsplat"));
+    command.args(arguments.split_whitespace()).env("NIGHTSPLAT_FAIL_ON_VALIDATION", "1");
+    command
+}
+
+/// Standard output and error of a command that must end with this exit code.
+pub(crate) fn run(arguments: &str, code: i32) -> (String, String) {
+    outcome(arguments, command(arguments).output().unwrap(), code)
+}
+
+fn outcome(arguments: &str, output: Output, code: i32) -> (String, String) {
+    let [stdout, stderr] =
+        [output.stdout, output.stderr].map(|text| String::from_utf8(text).unwrap());
+    assert_eq!(output.status.code(), Some(code), "{arguments}: {stderr}");
+    (stdout, stderr)
+}
+
+/// Standard output of a command that must succeed.
+pub(crate) fn succeed(arguments: &str) -> String {
+    run(arguments, 0).0
+}
+
+/// The command must fail with this exit code and one line on standard error that has all of `parts`.
+pub(crate) fn refused(arguments: &str, code: i32, parts: &[&str]) {
+    refused_with(arguments, &[], code, parts);
+}
+
+/// The same under other variables.
+pub(crate) fn refused_with(
+    arguments: &str,
+    environment: &[(&str, &str)],
+    code: i32,
+    parts: &[&str],
+) {
+    let output = command(arguments).envs(environment.iter().copied()).output().unwrap();
+    let (_, stderr) = outcome(arguments, output, code);
+    let mut lines = stderr.lines();
+    let line = lines.next().unwrap_or_default();
+    assert!(line.starts_with("error: ") && lines.next().is_none(), "{arguments}: {stderr}");
+    for part in parts {
+        assert!(line.contains(part), "{arguments}: no `{part}` in: {line}");
+    }
+}

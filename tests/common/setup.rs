@@ -1,0 +1,240 @@
+//! Gaussians and a view of them, through the renderer that ships.
+
+use glam::{DAffine3, DMat3, DVec2, DVec3, UVec2, Vec2};
+use nightsplat::camera;
+use nightsplat::gpu::Buffer;
+use nightsplat::gpu::testing::gpu;
+use nightsplat::reference::camera::Camera;
+use nightsplat::reference::gaussian::{Gaussian, Planes};
+use nightsplat::reference::sh::sh_count;
+use nightsplat::render::{self, Damping, RenderOptions, RenderSettings, Renderer, Status};
+use nightsplat::scene::{Features, Shape};
+
+use super::Random;
+
+/// Gaussians, a view of them, and what the renderer is specialised for.
+#[derive(Clone)]
+pub(crate) struct Setup {
+    pub(crate) count: usize,
+    pub(crate) parameters: Vec<f32>,
+    pub(crate) camera: camera::Camera,
+    pub(crate) settings: RenderSettings,
+    pub(crate) options: RenderOptions,
+}
+
+impl Setup {
+    /// `count` Gaussians inside the view of a turned camera with an off-centre principal point.
+    pub(crate) fn new(count: usize, size: [u32; 2], shape: impl Into<Shape>, seed: u64) -> Self {
+        let shape = shape.into();
+        let (sin, cos) = 0.3f32.sin_cos();
+        // Every number is one of f32, which is what the kernels are given.
+        let wide = |column: [f32; 3]| DVec3::from(column.map(f64::from));
+        let [x, y, z] = [[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]].map(wide);
+        let [width, height] = size;
+        let camera = camera::Camera {
+            width,
+            height,
+            focal: (Vec2::new(0.9, 0.8) * width as f32).as_dvec2(),
+            principal_point: (Vec2::new(0.42, 0.57) * UVec2::from(size).as_vec2()).as_dvec2(),
+            view_from_world: DAffine3 {
+                matrix3: DMat3::from_cols(x, y, z),
+                translation: wide([0.2, -0.1, 0.4]),
+            },
+        };
+        let settings = RenderSettings { shape, ..RenderSettings::default() };
+        let options = RenderOptions { sh_degree: shape.sh_degree, background: [0.0, 0.1, 0.2] };
+        let mut setup = Self { count, parameters: vec![], camera, settings, options };
+        setup.parameters = vec![0.0; setup.planes().len()];
+        let mut random = Random::new(seed);
+        for i in 0..count {
+            let gaussian = setup.random_gaussian(&mut random);
+            setup.set(i, &gaussian);
+        }
+        setup
+    }
+
+    /// One that projects into the image or beside it, also where slopes are clamped, some pixels wide.
+    fn random_gaussian(&self, random: &mut Random) -> Gaussian {
+        let camera = self.camera();
+        let depth = random.between(1.0, 5.0);
+        let pixel = camera.size * DVec2::from_array([0; 2].map(|_| random.between(-0.25, 1.25)));
+        let pixel_size = depth / camera.focal.x;
+        Gaussian {
+            mean: self.at_pixel(pixel, depth),
+            quat: random.normals().into(),
+            log_scale: [0; 3].map(|_| (pixel_size * random.between(0.3, 8.0)).ln()).into(),
+            raw_opacity: random.between(-3.0, 6.0),
+            features: (3..self.channels()).map(|_| random.between(-1.0, 2.0)).collect(),
+            sh: (0..sh_count(self.settings.shape.sh_degree))
+                .map(|k| (random.normals().map(|c: f64| c / (1.0 + k as f64))).into())
+                .collect(),
+        }
+    }
+
+    /// The point of the world that is seen at `pixel`, so deep in the view.
+    pub(crate) fn at_pixel(&self, pixel: DVec2, depth: f64) -> DVec3 {
+        let camera = self.camera();
+        let in_view = ((pixel - camera.principal_point) / camera.focal * depth).extend(depth);
+        camera.rotation.transpose() * (in_view - camera.translation)
+    }
+
+    pub(crate) fn planes(&self) -> Planes {
+        let feature_count = self.channels() - 3;
+        Planes { count: self.count, feature_count, sh_degree: self.settings.shape.sh_degree }
+    }
+
+    /// The camera as the references know it.
+    pub(crate) fn camera(&self) -> Camera {
+        let camera::Camera { width, height, focal, principal_point, view_from_world } = self.camera;
+        let size = UVec2::new(width, height).as_dvec2();
+        let DAffine3 { matrix3: rotation, translation } = view_from_world;
+        Camera { rotation, translation, focal, principal_point, size }
+    }
+
+    pub(crate) fn get(&self, i: usize) -> Gaussian {
+        self.planes().load(&self.parameters, i)
+    }
+
+    pub(crate) fn set(&mut self, i: usize, gaussian: &Gaussian) {
+        let planes = self.planes();
+        planes.store(gaussian, i, |at, value| self.parameters[at] = value as f32);
+    }
+
+    pub(crate) fn channels(&self) -> usize {
+        self.settings.channels()
+    }
+
+    pub(crate) fn pixels(&self) -> usize {
+        self.camera.width as usize * self.camera.height as usize
+    }
+
+    /// What is seen where no splat is.
+    pub(crate) fn background(&self) -> Vec<f32> {
+        let mut background = self.options.background.to_vec();
+        background.resize(self.channels(), 0.0);
+        background
+    }
+
+    /// The render, with as much memory as it takes.
+    pub(crate) fn render(&self) -> Rendered<'_> {
+        let mut rendered = Rendered::new(self);
+        let Rendered { renderer, gaussians, .. } = &mut rendered;
+        renderer.render_channels(gaussians, &self.camera, &self.options).unwrap();
+        rendered.download()
+    }
+
+    /// The render with memory for so many intersections, whether they suffice or not, and the status.
+    pub(crate) fn render_within(&self, capacity: u32) -> (Rendered<'_>, Status) {
+        let mut rendered = Rendered::new(self);
+        rendered.renderer.set_intersection_capacity(capacity).unwrap();
+        rendered.forward();
+        let status = Status::from_words(&gpu().read(rendered.renderer.status()).unwrap());
+        (rendered.download(), status)
+    }
+}
+
+/// A setup, rendered.
+pub(crate) struct Rendered<'a> {
+    setup: &'a Setup,
+    gaussians: Buffer<f32>,
+    pub(crate) renderer: Renderer,
+    /// (channels, H, W)
+    pub(crate) render: Vec<f32>,
+    /// (H, W)
+    pub(crate) transmittances: Vec<f32>,
+}
+
+/// What the backward pass leaves behind.
+#[derive(Clone, PartialEq, Debug)]
+pub(crate) struct Gradients {
+    pub(crate) parameters: Vec<f32>,
+    pub(crate) grad_norm_sums: Vec<f32>,
+    pub(crate) visit_counts: Vec<u32>,
+}
+
+impl<'a> Rendered<'a> {
+    pub(crate) const DAMPING: Damping = Damping { weight: 0.7, depth: 3.0 };
+    /// The statistics before the backward pass, which adds to them.
+    pub(crate) const NORM_BEFORE: f32 = 0.5;
+    pub(crate) const VISITS_BEFORE: u32 = 3;
+
+    fn new(setup: &'a Setup) -> Self {
+        let gaussians = gpu().buffer("parameters", &setup.parameters).unwrap();
+        let mut renderer = Renderer::new(&gpu(), setup.settings).unwrap();
+        renderer.reserve(setup.count, [&setup.camera]).unwrap();
+        Self { setup, gaussians, renderer, render: vec![], transmittances: vec![] }
+    }
+
+    /// The forward pass alone: the flags of the status stay.
+    pub(crate) fn forward(&mut self) {
+        let Self { setup, gaussians, renderer, .. } = self;
+        gpu()
+            .run("forward", |pass| renderer.forward(pass, gaussians, &setup.camera, &setup.options))
+            .unwrap();
+    }
+
+    fn download(mut self) -> Self {
+        self.render = gpu().read(self.renderer.render()).unwrap();
+        self.transmittances = gpu().read(self.renderer.transmittances()).unwrap();
+        self
+    }
+
+    /// The gradients from that of the render, (channels, H, W).
+    pub(crate) fn backward(&mut self, d_render: &[f32]) -> Gradients {
+        let (gpu, Self { setup, gaussians, renderer, .. }) = (gpu(), self);
+        let d_render = gpu.buffer("d_render", d_render).unwrap();
+        let unwritten = vec![f32::NAN; setup.parameters.len()];
+        let mut parameters = gpu.buffer("gradients", &unwritten).unwrap();
+        let norms = vec![Self::NORM_BEFORE; setup.count];
+        let mut grad_norm_sums = gpu.buffer("grad_norm_sums", &norms).unwrap();
+        let visits = vec![Self::VISITS_BEFORE; setup.count];
+        let mut visit_counts = gpu.buffer("visit_counts", &visits).unwrap();
+        gpu.run("backward", |pass| {
+            let gradients = render::Gradients {
+                parameters: &mut parameters,
+                grad_norm_sums: &mut grad_norm_sums,
+                visit_counts: &mut visit_counts,
+            };
+            let Setup { camera, options, .. } = setup;
+            renderer.backward(pass, gaussians, camera, options, Self::DAMPING, &d_render, gradients)
+        })
+        .unwrap();
+        Gradients {
+            parameters: gpu.read(&parameters).unwrap(),
+            grad_norm_sums: gpu.read(&grad_norm_sums).unwrap(),
+            visit_counts: gpu.read(&visit_counts).unwrap(),
+        }
+    }
+}
+
+/// Features of so many channels, with the three of colour.
+pub(crate) fn features(channels: usize) -> Features {
+    let features = Features { depth: channels > 3, structure: channels > 4, ..Features::NONE };
+    let features = if channels > 5 { Features::ALL } else { features };
+    assert_eq!(features.channels(), channels);
+    features
+}
+
+/// Every size, channel count, tile and SH degree (stored, in use) that a kernel may trip over; colours are raw in those
+/// with many channels.
+pub(crate) fn variants() -> Vec<Setup> {
+    type Row = (usize, [u32; 2], [u32; 2], usize, [u32; 2]);
+    let rows: [Row; 7] = [
+        (0, [33, 17], [0, 0], 3, [16, 8]),
+        (1, [16, 16], [0, 0], 3, [16, 16]),
+        (63, [50, 37], [1, 1], 4, [16, 8]),
+        (64, [64, 48], [2, 1], 11, [16, 4]),
+        (65, [65, 31], [3, 0], 3, [8, 8]),
+        (65, [40, 41], [3, 2], 11, [8, 8]),
+        (300, [131, 77], [3, 3], 3, [16, 8]),
+    ];
+    let build = |(count, size, [stored, used], channels, tile): Row| {
+        let shape = Shape { sh_degree: stored, features: features(channels) };
+        let mut setup = Setup::new(count, size, shape, count as u64);
+        setup.options.sh_degree = used;
+        setup.settings.raw_colors = channels > 4;
+        setup.settings.tile = Some(tile);
+        setup
+    };
+    rows.map(build).to_vec()
+}

@@ -1,0 +1,29 @@
+//! Small sets, and training on them.
+
+use nightsplat::dataset::Dataset;
+use nightsplat::dataset::synthetic::{self, SyntheticOptions};
+use nightsplat::gpu::testing::gpu;
+use nightsplat::scene::Gaussians;
+use nightsplat::train::{StepReport, TrainConfig, Trainer};
+
+/// So many synthetic views of a size, loaded as by default.
+pub(crate) fn dataset(views: usize, [width, height]: [u32; 2]) -> Dataset {
+    let folder = tempfile::tempdir().unwrap();
+    synthetic::write(folder.path(), &SyntheticOptions { views, width, height, seed: 1 }).unwrap();
+    Dataset::load(folder.path(), &TrainConfig::default().load_options()).unwrap()
+}
+
+/// Trains until a step; what the steps said.
+pub(crate) fn advance(trainer: &mut Trainer, until: u64) -> Vec<StepReport> {
+    let mut reports = vec![];
+    while trainer.steps_done() < until {
+        reports.extend(trainer.advance(until).unwrap());
+    }
+    reports
+}
+
+/// A whole training: what the steps said, and what came of it.
+pub(crate) fn train(config: &TrainConfig, dataset: &Dataset) -> (Vec<StepReport>, Gaussians) {
+    let mut trainer = Trainer::new(&gpu(), config.clone(), dataset).unwrap();
+    (advance(&mut trainer, config.steps), trainer.gaussians().unwrap())
+}
