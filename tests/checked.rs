@@ -18,8 +18,8 @@ use nightsplat::sort::{Count, RadixSort, Scan};
 use nightsplat::tone::{Statistics, ToneCurve, ToneSettings};
 use nightsplat::train::{Background, Part, TrainConfig, Trainer};
 
-/// Six views of 40 x 30 pixels with depth maps.
-fn dataset() -> Dataset {
+/// Six views of 40 x 30 pixels with depth maps, as the model wants them.
+fn dataset(config: &TrainConfig) -> Dataset {
     let folder = tempfile::tempdir().unwrap();
     let options = SyntheticOptions { views: 6, width: 40, height: 30, seed: 1 };
     synthetic::write(folder.path(), &options).unwrap();
@@ -30,7 +30,7 @@ fn dataset() -> Dataset {
         let name = file.unwrap().path().file_stem().unwrap().to_str().unwrap().to_owned();
         map.save_png16(depth.join(format!("depth_{name}.png"))).unwrap();
     }
-    Dataset::load(folder.path(), &TrainConfig::default().load_options()).unwrap()
+    Dataset::load(folder.path(), &config.load_options()).unwrap()
 }
 
 /// Density control acts after the second step.
@@ -74,7 +74,7 @@ fn assert_agrees(what: &str, report: &CheckReport) {
 
 /// Three checked steps, density control included; the kernels that took part.
 fn assert_steps_agree(name: &str, config: &TrainConfig) -> BTreeSet<String> {
-    let (gpu, dataset) = (gpu(), dataset());
+    let (gpu, dataset) = (gpu(), dataset(config));
     let (trainer, mut all) = gpu.checked(|| Trainer::new(&gpu, config.clone(), &dataset));
     let mut trainer = trainer.unwrap();
     while trainer.steps_done() < 3 {
@@ -118,8 +118,8 @@ fn every_pass_of_the_whole_model_agrees_with_its_reference_on_a_crop() {
 
 #[test]
 fn a_checked_step_leaves_the_bits_that_an_unchecked_one_leaves() {
-    let (gpu, dataset) = (gpu(), dataset());
-    let config = config(&Part::ALL);
+    let (gpu, config) = (gpu(), config(&Part::ALL));
+    let dataset = dataset(&config);
     let [mut checked, mut unchecked] =
         [(); 2].map(|()| Trainer::new(&gpu, config.clone(), &dataset).unwrap());
     while checked.steps_done() < 4 {
@@ -201,7 +201,7 @@ fn every_pass_of_scan_and_sort_agrees_with_its_reference_at_every_size() {
 
 /// A step of `plain` on a device whose `kernel` gets one parameter with its lowest bits flipped.
 fn with_wrong_param(gpu: &Gpu, kernel: &'static str, word: usize, bits: u32) -> CheckReport {
-    let mut trainer = Trainer::new(gpu, config(&[]), &dataset()).unwrap();
+    let mut trainer = Trainer::new(gpu, config(&[]), &dataset(&config(&[]))).unwrap();
     let (step, report) = with_defect(Defect { kernel, word, bits }, || trainer.check_step());
     assert!(step.is_ok() || matches!(step, Err(Error::NotFinite { .. })), "{step:?}");
     report
@@ -234,7 +234,7 @@ fn a_wrong_wiring_is_named_where_it_arises() {
 #[test]
 fn data_that_is_not_finite_is_no_difference_and_no_panic() {
     let gpu = gpu();
-    let mut dataset = dataset();
+    let mut dataset = dataset(&config(&[]));
     for view in &mut dataset.views {
         if let Some(image) = &mut view.image {
             for (i, value) in image.data.iter_mut().enumerate() {
