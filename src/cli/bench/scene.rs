@@ -7,7 +7,7 @@ use glam::{DAffine3, DVec2, Vec3};
 use crate::Result;
 use crate::camera::Camera;
 use crate::dataset::{Dataset, Point, Split, View};
-use crate::gpu::Gpu;
+use crate::gpu::{CheckReport, Gpu};
 use crate::image::Image;
 use crate::random::Stream;
 use crate::render::{RenderOptions, RenderSettings, Renderer, Status};
@@ -67,6 +67,8 @@ pub(super) struct Trainers {
     pub(super) plain: Trainer,
     /// Every part, small enough for the references.
     pub(super) lita: Trainer,
+    /// The passes behind its first Gaussians and its targets, checked.
+    pub(super) lita_begins: CheckReport,
     /// Splats times tiles of the plain scene.
     pub(super) intersections: u32,
 }
@@ -75,7 +77,8 @@ pub(super) struct Trainers {
 /// The device is out of memory or lost.
 pub(super) fn trainers(gpu: &Gpu, scene: &Scene) -> Result<Trainers> {
     let plain = plain(gpu, scene, ToneCurve::Ap3)?;
-    Ok(Trainers { plain, lita: lita(gpu)?, intersections: intersections(gpu, scene)? })
+    let (lita, lita_begins) = gpu.checked(|| lita(gpu));
+    Ok(Trainers { plain, lita: lita?, lita_begins, intersections: intersections(gpu, scene)? })
 }
 
 /// A configuration whose steps all do the same work, behind those that the SH take to come into use.
