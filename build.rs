@@ -52,7 +52,9 @@ fn main() {
         kernel.write(&says, &mut kernels);
         text.add_comments(says);
     }
-    let kernels = structs.write(&text) + &glsl::include_modules() + &kernels;
+    let names: Vec<&String> = names.iter().collect();
+    let all = format!("/// Every kernel, by name.\npub const NAMES: &[&str] = &{names:?};\n");
+    let kernels = structs.write(&text) + &glsl::include_modules() + &all + &kernels;
     fs::write(out_dir.join("kernels.rs"), kernels).expect("OUT_DIR is ours");
 }
 

@@ -37,6 +37,8 @@ pub(crate) struct Buffer {
     pub(crate) binding: u32,
     pub(crate) element: String,
     pub(crate) writable: bool,
+    /// Its elements are made of floats; else of integers.
+    pub(crate) is_float: bool,
 }
 
 #[derive(PartialEq)]
@@ -130,6 +132,7 @@ impl Kernel {
                     binding: desc_bind.bind(),
                     element,
                     writable: access != AccessType::ReadOnly,
+                    is_float: is_float(&array.element_ty),
                 });
             }
             other => panic!("{kernel}: {other:?} has no Rust counterpart"),
@@ -158,6 +161,23 @@ fn spec_constant_defaults(spirv: &[u32]) -> BTreeMap<u32, u32> {
         at += words;
     }
     ids.into_iter().filter_map(|(target, id)| Some((id, *values.get(&target)?))).collect()
+}
+
+/// Whether an element is made of 32-bit floats; one of integers otherwise. A mixture could not be compared as numbers.
+fn is_float(ty: &Type) -> bool {
+    match ty {
+        Type::Scalar(ScalarType::Float { bits: 32 }) => true,
+        Type::Scalar(ScalarType::Integer { bits: 32, .. }) => false,
+        Type::Vector(vector) => is_float(&Type::Scalar(vector.scalar_ty.clone())),
+        Type::Matrix(_) => true,
+        Type::Array(array) => is_float(&array.element_ty),
+        Type::Struct(ty) => {
+            let floats = ty.members.iter().filter(|member| is_float(&member.ty)).count();
+            assert!([0, ty.members.len()].contains(&floats), "{:?} mixes numbers", ty.name);
+            floats > 0
+        }
+        other => panic!("{other:?} is no element of a buffer"),
+    }
 }
 
 fn workgroup_size(entry: &EntryPoint) -> [u32; 3] {

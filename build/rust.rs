@@ -90,11 +90,21 @@ impl Kernel {
         let host = list(&|b, m| binding(text, b, &format!("&'a {m}[{}]", b.element)));
         let bindings = list(&|b, _| {
             format!(
-                "gpu::Binding {{ name: {:?}, index: {}, writable: {} }}, ",
-                b.name, b.binding, b.writable
+                "gpu::Binding {{ name: {:?}, index: {}, writable: {}, is_float: {} }}, ",
+                b.name, b.binding, b.writable, b.is_float
             )
         });
-        let handles = list(&|b, _| format!("buffers.{}.handle(), ", b.name));
+        let bound = list(&|b, _| format!("buffers.{}.bound(), ", b.name));
+        let slices = list(&|b, _| {
+            let cast = if b.writable { "cast_slice_mut" } else { "cast_slice" };
+            format!("{}: bytemuck::{cast}(words.next().unwrap_or_default()), ", b.name)
+        });
+        let written = |line: &dyn Fn(&str) -> String| -> String {
+            buffers.iter().filter(|b| b.writable).map(|b| line(&b.name)).collect()
+        };
+        let tolerances =
+            written(&|name| format!("    /// Of `{name}`.\n    pub {name}: gpu::Tolerance,\n"));
+        let listed = written(&|name| format!("tolerances.{name}, "));
         let fields: String = constants.iter().map(|constant| constant.field(text)).collect();
         let params = params.write(text);
         let own_constants = text.own_constants();
@@ -133,6 +143,15 @@ pub struct Buffers<'a> {{
 pub struct Slices<'a> {{
 {host}}}
 
+/// How far each buffer that it writes may be from the reference's.
+#[derive(Clone, Debug, Default)]
+pub struct Tolerances {{
+{tolerances}}}
+
+impl From<Tolerances> for Vec<gpu::Tolerance> {{
+    fn from(tolerances: Tolerances) -> Self {{ vec![{listed}] }}
+}}
+
 impl gpu::Kernel for Kernel {{
     const NAME: &'static str = {name:?};
     const SPIRV: &'static [u8] = include_bytes!(concat!(env!("OUT_DIR"), "/{name}.spv"));
@@ -144,7 +163,12 @@ impl gpu::Kernel for Kernel {{
     type Buffers<'a> = Buffers<'a>;
     type Slices<'a> = Slices<'a>;
     fn constants(constants: &Constants) -> Vec<(u32, u32)> {{ let _ = constants; vec![{values}] }}
-    fn handles(buffers: &Buffers<'_>) -> Vec<ash::vk::Buffer> {{ vec![{handles}] }}
+    type Tolerances = Tolerances;
+    fn bound(buffers: &Buffers<'_>) -> Vec<gpu::Bound> {{ vec![{bound}] }}
+    fn slices(words: &mut [Vec<u32>]) -> Slices<'_> {{
+        let mut words = words.iter_mut().map(Vec::as_mut_slice);
+        Slices {{ {slices}}}
+    }}
 }}
 }}
 

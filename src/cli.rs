@@ -10,6 +10,7 @@ use crate::image::Image;
 
 pub mod ablate;
 pub mod bench;
+pub mod check;
 mod comparison;
 pub mod curves;
 mod defaults;
@@ -64,6 +65,7 @@ enum Command {
     Demo(demo::DemoArgs),
     Doctor(doctor::DoctorArgs),
     Bench(bench::BenchArgs),
+    Check(Box<check::CheckArgs>),
 }
 
 /// Whatever is given to a subcommand that this build lacks.
@@ -104,6 +106,7 @@ impl Cli {
             Command::Demo(args) => demo::run(&args),
             Command::Doctor(args) => doctor::run(&args),
             Command::Bench(args) => bench::run(&args),
+            Command::Check(args) => check::run(&args),
         }
     }
 }

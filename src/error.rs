@@ -100,6 +100,15 @@ pub enum Error {
         /// The loss term or buffer that is not finite.
         what: String,
     },
+    /// A checked pass left other numbers than its CPU reference.
+    #[error(
+        "the device disagrees with the CPU references: {what}; update the driver, or report this with the output of \
+         `nightsplat doctor`"
+    )]
+    Disagrees {
+        /// The first difference: pass, buffer, index, both values and the bound.
+        what: String,
+    },
 }
 
 impl Error {

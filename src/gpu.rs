@@ -8,6 +8,8 @@
 //! - a borrowed device ([`Gpu::from_host`]) keeps everything that it had: we destroy what we created and nothing else.
 
 mod buffer;
+mod check;
+mod checked;
 mod cooperative;
 mod device;
 mod kernel;
@@ -27,9 +29,10 @@ use std::thread::{self, ThreadId};
 use ash::{ext, khr, vk};
 
 pub use buffer::{Buffer, Download};
+pub use check::{CheckReport, CheckedPass, Difference, Tolerance};
 pub use cooperative::CooperativeMatrix;
 pub use device::{DeviceChoice, DeviceReport, HostDevice, RequirementReport, devices};
-pub use kernel::{Binding, Kernel, Reference};
+pub use kernel::{Binding, Bound, Kernel, Reference};
 pub use pipeline::Pipeline;
 pub use recorder::{Recorder, Threads};
 pub use requirements::{REQUIREMENTS, Requirement, required_device_features};
@@ -81,12 +84,15 @@ struct Shared {
     last_use: AtomicU64,
     usage: buffer::MemoryUsage,
     retired: Mutex<Vec<(u64, Retired)>>,
+    /// The threads whose submissions are checked.
+    checks: checked::Checks,
     pipeline_cache: vk::PipelineCache,
     /// What we created around the device and destroy with it; nothing for a borrowed device.
     owned: Option<device::Owned>,
 }
 
 /// The queue is held while a submission is recorded, so that timeline values are known in advance.
+#[derive(Debug)]
 struct Queue {
     raw: vk::Queue,
     family: u32,

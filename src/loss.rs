@@ -23,7 +23,6 @@ use crate::{Error, Result};
 
 pub use denoising::{DenoisingGradients, DenoisingInputs, DenoisingLoss, DenoisingWeights};
 pub use depth::{DepthBoxes, DepthInputs, DepthLoss, DepthSettings};
-pub(crate) use image::strip;
 pub use image::{Loss, LossInputs, LossSettings};
 pub use log::{LogSlot, LossLog, LossLogDownload, StepLosses};
 pub use structure::{StructureInputs, StructureLoss};

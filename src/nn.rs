@@ -12,6 +12,7 @@ mod denoiser;
 mod file;
 mod norm;
 mod parameters;
+mod relu;
 mod tonemapper;
 
 use glam::UVec2;

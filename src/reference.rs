@@ -9,6 +9,7 @@
 mod adam;
 pub mod blend_backward;
 pub mod blend_forward;
+mod blending;
 pub mod camera;
 mod check_capacity;
 mod ciconv_columns;
@@ -52,6 +53,7 @@ mod reduce_strips;
 mod relu_backward;
 pub mod residual;
 pub mod residual_backward;
+pub mod rounding;
 mod scan_downsweep;
 mod scan_spine;
 mod scan_upsweep;

@@ -35,8 +35,8 @@ pub use self::file::CurveChoice;
 #[cfg(feature = "fit")]
 pub(crate) use self::law::{Numbers, law};
 pub(crate) use self::law::{clamped, curve_at, tone_curve};
-#[cfg(feature = "fit")]
-pub(crate) use self::real::{Dual, Real};
+pub(crate) use self::real::Dual;
+pub use self::real::Real;
 pub use self::settings::ToneSettings;
 pub(crate) use self::statistics::{Rank, luminance, measurable};
 pub use self::statistics::{Statistics, percentile};

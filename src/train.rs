@@ -17,17 +17,17 @@ use glam::UVec2;
 use crate::camera::Camera;
 use crate::dataset::Dataset;
 use crate::densify::{Densifier, DensifySettings};
-use crate::gpu::{Buffer, Gpu, PassTime, Recorder};
+use crate::gpu::{Buffer, CheckReport, Gpu, PassTime, Recorder};
 use crate::image::Image;
 use crate::loss::{DepthBoxes, LogSlot, LossLog, Losses, StepLosses, Term, TermInputs};
 use crate::optimizer::{Adam, AdamBuffers, Learnable};
 use crate::pseudo_gt::PseudoGt;
 use crate::random::Stream;
 use crate::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer, Status};
-use crate::scene::{Gaussians, width};
+use crate::scene::{Gaussians, Shape, width};
 use crate::{Error, Result};
 
-pub use config::{Background, DensityConfig, TrainConfig};
+pub use config::{Background, CheckConfig, DensityConfig, TrainConfig};
 use model::Model;
 pub use networks::Networks;
 pub use parts::{ModelConfig, ModelName, NetworkRates, Part};
@@ -159,14 +159,44 @@ impl Trainer {
     ///
     /// # Errors
     /// The configuration makes no sense, or the device is out of memory or lost.
-    pub fn new(gpu: &Gpu, mut config: TrainConfig, dataset: &Dataset) -> Result<Self> {
+    pub fn new(gpu: &Gpu, config: TrainConfig, dataset: &Dataset) -> Result<Self> {
+        Self::begin(gpu, config, dataset, None)
+    }
+
+    /// The same from Gaussians that there are already.
+    ///
+    /// # Errors
+    /// As [`Trainer::new`], or the Gaussians are not made of what the configuration's model is.
+    pub fn from_gaussians(
+        gpu: &Gpu,
+        config: TrainConfig,
+        dataset: &Dataset,
+        gaussians: &Gaussians,
+    ) -> Result<Self> {
+        Self::begin(gpu, config, dataset, Some(gaussians))
+    }
+
+    fn begin(
+        gpu: &Gpu,
+        mut config: TrainConfig,
+        dataset: &Dataset,
+        gaussians: Option<&Gaussians>,
+    ) -> Result<Self> {
         config.check()?;
         config.leave_out_what_is_missing(dataset);
         let mut pseudo_gt = PseudoGt::new(gpu, &config.tone)?;
         let views = Views::upload(gpu, &mut pseudo_gt, dataset)?;
         let sizes = views.sizes();
         say_what_parts_see(&config.model, &sizes);
-        let gaussians = views.initial_gaussians(gpu, &pseudo_gt, dataset, &config)?;
+        let shape = Shape { sh_degree: config.sh_degree, features: config.model.features() };
+        let gaussians = match gaussians {
+            Some(gaussians) if gaussians.shape == shape => gaussians.clone(),
+            Some(Gaussians { shape: own, .. }) => {
+                let problem = format!("Gaussians of {own:?} make no model of {shape:?}");
+                return Err(Error::Usage(problem));
+            }
+            None => views.initial_gaussians(gpu, &pseudo_gt, dataset, &config)?,
+        };
         let settings = RenderSettings {
             shape: gaussians.shape,
             raw_colors: config.model.raw_colors,
@@ -222,11 +252,31 @@ impl Trainer {
         self.renderer.set_intersection_capacity(intersections)
     }
 
-    /// Trains up to `until`, one submission's worth at most, and reports every step done.
+    /// Trains up to `until`, one submission's worth at most, and reports every step done. Steps that the configuration
+    /// wants checked are, each on its own.
     ///
     /// # Errors
-    /// [`Error::NotFinite`] where a loss term is NaN, or the device is out of memory or lost.
+    /// [`Error::NotFinite`] where a loss term is NaN, [`Error::Disagrees`] where a checked step is to stop at a difference
+    /// and has one, or the device is out of memory or lost.
     pub fn advance(&mut self, until: u64) -> Result<Vec<StepReport>> {
+        match (self.step + 1).checked_next_multiple_of(self.config.check.every) {
+            Some(checked) if checked > until => self.submit_steps(until),
+            Some(checked) if checked > self.step + 1 => self.submit_steps(checked - 1),
+            Some(_) if self.step < until.min(self.config.steps) => {
+                let (reports, checks) = self.check_step();
+                let stops = self.config.check.stops;
+                match checks.agree() {
+                    Err(difference) if stops => return Err(difference),
+                    Err(difference) => tracing::warn!("step {}: {difference}", self.step),
+                    Ok(()) => {}
+                }
+                reports
+            }
+            _ => self.submit_steps(until),
+        }
+    }
+
+    fn submit_steps(&mut self, until: u64) -> Result<Vec<StepReport>> {
         let first = self.step + 1;
         let until = until.min(self.config.steps).min(self.step + STEPS_PER_SUBMISSION);
         // A submission ends where density control changes the number of Gaussians.
@@ -275,6 +325,14 @@ impl Trainer {
             return Err(Error::NotFinite { step, view, what });
         }
         Ok(reports)
+    }
+
+    /// Trains one step with every pass checked ([`Gpu::checked`]), density control included, and reports on them. The
+    /// model is what [`Trainer::advance`] would have made of it, bit for bit; no step is reported where it has to be done
+    /// again with more memory.
+    pub fn check_step(&mut self) -> (Result<Vec<StepReport>>, CheckReport) {
+        let next = self.step + 1;
+        self.gpu.clone().checked(|| self.submit_steps(next))
     }
 
     /// Trains one step and reports how long each of its passes took on the device.

@@ -144,6 +144,43 @@ fn every_kernel_is_named_in_a_test() {
     }
 }
 
+/// How often the text wires the kernel by hand: names its `Buffers`, or the test macro that does.
+fn wirings(text: &str, kernel: &str) -> usize {
+    let code: String = text.lines().map(code).flat_map(|line| [line.trim(), " "]).collect();
+    let words = |pattern: String| {
+        let begins = |at: usize| !code[..at].ends_with(|c: char| c.is_alphanumeric() || c == '_');
+        code.match_indices(&pattern).filter(|&(at, _)| begins(at)).count()
+    };
+    let [buffers, run] = [format!("{kernel}::Buffers {{"), format!("run_kernel!( {kernel},")];
+    words(buffers) + words(run) + words(format!("run_kernel!({kernel},"))
+}
+
+#[test]
+fn the_library_wires_each_kernel_in_one_place_and_no_command_wires_any() {
+    let sources = files("src", "rs");
+    for (shader, _) in files("shaders-glsl", "comp") {
+        let count = |(_, text): &(PathBuf, String)| wirings(text, stem(&shader));
+        let wired = sources.iter().filter(|(path, _)| module(path) != "reference");
+        let places: usize = wired.map(count).sum();
+        assert_eq!(places, 1, "{} is wired in {places} places", stem(&shader));
+        let commands = sources.iter().filter(|(path, _)| module(path) == "cli");
+        assert_eq!(commands.map(count).sum::<usize>(), 0, "a command wires {}", stem(&shader));
+    }
+}
+
+#[test]
+fn a_test_wires_a_kernel_by_hand_only_where_it_tests_that_kernel() {
+    // What the recorder does is shown with kernels of the rasteriser, and each curve with the kernel that maps images.
+    const EXEMPT: [&str; 2] = ["tests/gpu.rs", "tests/curves.rs"];
+    let mut tests = files("tests", "rs");
+    tests.retain(|(path, _)| !EXEMPT.iter().any(|exempt| path == Path::new(exempt)));
+    for (shader, _) in files("shaders-glsl", "comp") {
+        let wiring = tests.iter().filter(|(_, text)| wirings(text, stem(&shader)) > 0);
+        let places: Vec<_> = wiring.map(|(path, _)| path.display().to_string()).collect();
+        assert!(places.len() <= 1, "{} is wired by hand in {places:?}", stem(&shader));
+    }
+}
+
 #[test]
 fn unsafe_code_is_in_the_gpu_layer_alone() {
     for (path, text) in files("src", "rs") {

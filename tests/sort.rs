@@ -381,7 +381,7 @@ fn compare_sort_kernels(rank_by_ballot: bool) {
         gpu.run("upsweep", |pass| pass.dispatch(&upsweep, &params, buffers, groups)).unwrap();
         assert_same(&format!("upsweep {what}"), &gpu.read(&gpu_table).unwrap(), &table);
 
-        let params = sort_spine::Params { count_index, capacity };
+        let params = sort_spine::Params { count_index, capacity, digit_bits };
         let slices = sort_spine::Slices {
             counts: &counts,
             table: &mut table,

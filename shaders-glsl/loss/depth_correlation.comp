@@ -17,6 +17,7 @@ layout(push_constant) uniform Params {
     uint  first;        // the plane's first value in render
     uint  view_chunks;  // of region 0
     uint  box_chunks;   // of each other region
+    uint  region_count;
     uint  chunk_size;   // pixels, but for the last chunk of a region, which has what is left
     float view_weight;  // of region 0's P
     float box_weight;   // of each other P: weight / number of boxes
@@ -34,6 +35,7 @@ const float EPSILON = 1e-6;
 
 void main() {
     uint region_index = WORKGROUP_INDEX;
+    if (region_index >= region_count) return;
     bool is_view = region_index == 0;
     uvec4 region = regions[region_index];
     uint pixels = region.z * region.w;

@@ -14,6 +14,7 @@ layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 layout(push_constant) uniform Params {
     uint count_index;  // where in `counts` the number of keys lives
     uint capacity;     // keys
+    uint digit_bits;   // as many digits as they make
 };
 
 layout(binding = 0) readonly  buffer Counts { uint counts[]; };
@@ -22,6 +23,7 @@ layout(binding = 2) writeonly buffer Totals { uint digit_totals[]; };  // (digit
 
 void main() {
     uint digit = WORKGROUP_INDEX;
+    if (digit >> digit_bits != 0) return;
     uint partition_count = partitions_of(min(counts[count_index], capacity));
     uint running = 0;
     for (uint first = 0; first < partition_count; first += SUBGROUP_SIZE) {

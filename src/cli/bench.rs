@@ -1,10 +1,9 @@
-//! `nightsplat bench`: check every kernel against its CPU reference, then time it.
+//! `nightsplat bench`: check a step against the CPU references pass by pass, then time its kernels and stages.
 
-mod check;
-mod kernels;
 mod scene;
 mod stages;
 
+use std::collections::BTreeMap;
 use std::io::Write;
 
 use anyhow::Result;
@@ -12,15 +11,16 @@ use serde_json::{Map, Value, json};
 
 use super::table;
 use crate::Error;
-use crate::gpu::{DeviceChoice, Gpu, PassTime};
+use crate::gpu::{CheckReport, DeviceChoice, Gpu, PassTime};
+use crate::kernels;
 use scene::Scene;
 
-/// Check every kernel against its CPU reference, then time it, and the stages of a training step.
+/// Check a training step against the CPU references, pass by pass, then time its kernels and its stages.
 ///
 /// The scene is the same every time. Bounds are those of two processor cores at the default size.
 #[derive(Clone, Debug, clap::Args)]
 pub struct BenchArgs {
-    /// Print JSON instead of tables: device, driver, kernels, groups and the step
+    /// Print JSON instead of tables: device, driver, largest errors, kernels, groups and the step
     #[arg(long)]
     pub json: bool,
     /// The device: a part of its name or its index in `nightsplat doctor` [default: the best]
@@ -59,6 +59,14 @@ struct Bench {
     repeats: usize,
 }
 
+/// What it found.
+struct Findings {
+    checked: CheckReport,
+    /// Milliseconds of every kernel of a step.
+    kernels: BTreeMap<&'static str, f64>,
+    stages: stages::Stages,
+}
+
 /// Checks, times and prints.
 ///
 /// # Errors
@@ -76,76 +84,94 @@ pub fn run(args: &BenchArgs) -> Result<()> {
     let gpu = Gpu::new(&args.device.clone().unwrap_or_default())?;
     let bench = Bench { gpu, repeats: args.repeats };
     let scene = Scene::new(args.width, args.height, args.gaussians);
-    let kernels = kernels::check_and_time(&bench, &scene)?;
-    let stages = stages::time(&bench, &scene)?;
+    let mut trainers = scene::trainers(&bench.gpu, &scene)?;
+    let checked = stages::check(&bench, &mut trainers)?;
+    checked.agree()?;
+    let kernels = stages::time_kernels(&bench, &mut trainers)?;
+    let stages = stages::time(&bench, &scene, &mut trainers)?;
+    let findings = Findings { checked, kernels, stages };
     let mut out = std::io::stdout().lock();
     if args.json {
-        writeln!(out, "{:#}", as_json(&bench, &kernels, &stages))?;
+        writeln!(out, "{:#}", findings.as_json(&bench))?;
     } else {
         let has_bounds = (args.width, args.height, args.gaussians) == (WIDTH, HEIGHT, GAUSSIANS);
-        write!(out, "{}", as_text(&bench, &scene, &kernels, &stages, has_bounds))?;
+        write!(out, "{}", findings.as_text(&bench, &scene, has_bounds))?;
     }
     Ok(())
 }
 
-fn as_json(bench: &Bench, kernels: &[Timing], stages: &stages::Stages) -> Value {
-    let map = |timings: &[Timing]| {
-        let entry = |timing: &Timing| (timing.name.to_owned(), json!(timing.milliseconds));
-        timings.iter().map(entry).collect::<Map<String, Value>>()
-    };
-    let properties = bench.gpu.properties();
-    json!({
-        "device": properties.name,
-        "driver": properties.driver,
-        "intersections": stages.intersections,
-        "kernels": map(kernels),
-        "groups": map(&stages.groups),
-        "step_ms": stages.step.milliseconds,
-    })
-}
+impl Findings {
+    /// The kernels that no checked pass was of.
+    fn not_covered(&self) -> Vec<&'static str> {
+        let covered = self.checked.kernels();
+        let is_covered = |name: &str| covered.iter().any(|(covered, ..)| *covered == name);
+        kernels::NAMES.iter().copied().filter(|name| !is_covered(name)).collect()
+    }
 
-fn as_text(
-    bench: &Bench,
-    scene: &Scene,
-    kernels: &[Timing],
-    stages: &stages::Stages,
-    has_bounds: bool,
-) -> String {
-    let properties = bench.gpu.properties();
-    let head = format!(
-        "{}, {}\n{}x{} pixels, {} Gaussians, {} intersections; medians of {} runs",
-        properties.name,
-        properties.driver,
-        scene.camera.width,
-        scene.camera.height,
-        scene.gaussians.count,
-        stages.intersections,
-        bench.repeats
-    );
-    let header = |names: &[&str]| names.iter().map(|&name| name.to_owned()).collect::<Vec<_>>();
-    let mut rows = vec![header(&["kernel (agrees with its reference)", "ms"])];
-    rows.extend(kernels.iter().map(|k| vec![k.name.to_owned(), format!("{:.2}", k.milliseconds)]));
-    let kernel_table = table::aligned(&rows);
-    let mut rows = vec![header(&["stage", "ms", "bound", "within"])];
-    rows.extend(stages.groups.iter().chain([&stages.step]).map(|stage| {
-        let mut row = vec![stage.name.to_owned(), format!("{:.2}", stage.milliseconds)];
-        if let Some(bound) = stage.bound.filter(|_| has_bounds) {
-            let within = if stage.milliseconds <= bound { "yes" } else { "no" };
-            row.extend([format!("{bound:.0}"), within.to_owned()]);
-        }
-        row
-    }));
-    format!("{head}\n\n{kernel_table}\n{}", table::aligned(&rows))
+    fn as_json(&self, bench: &Bench) -> Value {
+        let entry = |timing: &Timing| (timing.name.to_owned(), json!(timing.milliseconds));
+        let properties = bench.gpu.properties();
+        let Self { stages, .. } = self;
+        let errors = self.checked.kernels();
+        json!({
+            "device": properties.name,
+            "driver": properties.driver,
+            "intersections": stages.intersections,
+            "errors": errors.into_iter().map(|(name, _, error)| (name.to_owned(), json!(error))).collect::<Map<_, _>>(),
+            "not_covered": self.not_covered(),
+            "kernels": self.kernels,
+            "groups": stages.groups.iter().map(entry).collect::<Map<String, Value>>(),
+            "step_ms": stages.step.milliseconds,
+        })
+    }
+
+    fn as_text(&self, bench: &Bench, scene: &Scene, has_bounds: bool) -> String {
+        let (properties, stages) = (bench.gpu.properties(), &self.stages);
+        let head = format!(
+            "{}, {}\n{}x{} pixels, {} Gaussians, {} intersections; medians of {} runs",
+            properties.name,
+            properties.driver,
+            scene.camera.width,
+            scene.camera.height,
+            scene.gaussians.count,
+            stages.intersections,
+            bench.repeats
+        );
+        let header = |names: &[&str]| names.iter().map(|&name| name.to_owned()).collect::<Vec<_>>();
+        let mut rows = vec![header(&["kernel", "largest error / bound", "ms"])];
+        rows.extend(self.checked.kernels().into_iter().map(|(name, _, error)| {
+            let milliseconds = self.kernels.get(name);
+            let milliseconds = milliseconds.map_or_else(|| "-".to_owned(), |ms| format!("{ms:.2}"));
+            vec![name.to_owned(), format!("{error:.3}"), milliseconds]
+        }));
+        let kernel_table = table::aligned(&rows);
+        let mut rows = vec![header(&["stage", "ms", "bound", "within"])];
+        rows.extend(stages.groups.iter().chain([&stages.step]).map(|stage| {
+            let mut row = vec![stage.name.to_owned(), format!("{:.2}", stage.milliseconds)];
+            if let Some(bound) = stage.bound.filter(|_| has_bounds) {
+                let within = if stage.milliseconds <= bound { "yes" } else { "no" };
+                row.extend([format!("{bound:.0}"), within.to_owned()]);
+            }
+            row
+        }));
+        let not_covered = self.not_covered().join(", ");
+        let stage_table = table::aligned(&rows);
+        format!("{head}\n\n{kernel_table}not covered: {not_covered}\n\n{stage_table}")
+    }
 }
 
 impl Bench {
     /// The median of the milliseconds that `once` reports, after a run that does not count.
     fn median(&self, mut once: impl FnMut() -> crate::Result<f64>) -> crate::Result<f64> {
         once()?;
-        let mut times = (0..self.repeats).map(|_| once()).collect::<crate::Result<Vec<_>>>()?;
-        times.sort_by(f64::total_cmp);
-        Ok(times[times.len() / 2])
+        let times = (0..self.repeats).map(|_| once()).collect::<crate::Result<Vec<_>>>()?;
+        Ok(median(times))
     }
+}
+
+fn median(mut times: Vec<f64>) -> f64 {
+    times.sort_by(f64::total_cmp);
+    times[times.len() / 2]
 }
 
 /// Milliseconds of all passes together.

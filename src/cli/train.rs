@@ -50,7 +50,7 @@ pub(crate) struct TrainOptions {
     theta: Option<f64>,
     /// Training steps, one view each [default: {steps}]
     #[arg(long, value_name = "N")]
-    steps: Option<u64>,
+    pub(super) steps: Option<u64>,
     /// Shrink the photographs by this factor [default: {downscale}]
     #[arg(long, value_name = "F")]
     downscale: Option<f64>,
@@ -86,6 +86,12 @@ pub(crate) struct TrainOptions {
     /// Write what --resume goes on from every N steps; 0: never [default: {checkpoint_every}]
     #[arg(long, value_name = "N")]
     checkpoint_every: Option<u64>,
+    /// Compare every pass of every Nth step with its CPU reference, and warn of what differs; 0: never [default: {check.every}]
+    #[arg(long, value_name = "N")]
+    check_every: Option<u64>,
+    /// Stop where a checked step differs
+    #[arg(long)]
+    check_stops: bool,
     /// Any other setting by its place in config.toml, such as tone.alpha=0.1; may be repeated, wins over all else
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
@@ -197,6 +203,8 @@ impl TrainOptions {
         set(&mut config.device, &self.device);
         set(&mut config.eval_every, &self.eval_every);
         set(&mut config.checkpoint_every, &self.checkpoint_every);
+        set(&mut config.check.every, &self.check_every);
+        config.check.stops |= self.check_stops;
         if self.reference.is_some() {
             config.reference.clone_from(&self.reference);
         }

@@ -9,7 +9,7 @@ use gpu_allocator::vulkan::{Allocation, AllocationCreateDesc, AllocationScheme};
 use gpu_allocator::{AllocationError, MemoryLocation};
 
 use super::recorder::HOST_SUBMITS;
-use super::{Gpu, Recorder, Retired, Shared, lock};
+use super::{Bound, Gpu, Recorder, Retired, Shared, lock};
 use crate::{Error, Result};
 
 /// An array of `T` in device memory. Dropping it frees the memory once no submission uses it.
@@ -63,6 +63,11 @@ impl<T: bytemuck::Pod> Buffer<T> {
     /// The size of the elements, in bytes.
     pub(super) fn size(&self) -> u64 {
         (self.len * size_of::<T>()) as u64
+    }
+
+    /// What a dispatch binds.
+    pub(crate) fn bound(&self) -> Bound {
+        Bound { raw: self.handle(), size: self.size() }
     }
 }
 
@@ -156,18 +161,27 @@ impl Recorder<'_> {
     /// # Errors
     /// The device is out of memory, or the recording is [`Gpu::record_into`]'s: only the host knows when the copy is there.
     pub fn download<T: bytemuck::Pod>(&mut self, buffer: &Buffer<T>) -> Result<Download<T>> {
-        let bytes = buffer.size();
+        self.download_raw(buffer.name(), buffer.handle(), buffer.len)
+    }
+
+    /// The same for a buffer of which only the handle is at hand.
+    pub(super) fn download_raw<T: bytemuck::Pod>(
+        &mut self,
+        name: &str,
+        raw: vk::Buffer,
+        len: usize,
+    ) -> Result<Download<T>> {
         if self.value() == HOST_SUBMITS {
             return Err(Error::Usage(format!(
-                "`{}` cannot be downloaded where the host submits; once that is done, `Gpu::read` it",
-                buffer.name()
+                "`{name}` cannot be downloaded where the host submits; once that is done, `Gpu::read` it"
             )));
         }
-        let host = Memory::new(self.shared(), buffer.name(), bytes, MemoryLocation::GpuToCpu)?;
+        let bytes = (len * size_of::<T>()) as u64;
+        let host = Memory::new(self.shared(), name, bytes, MemoryLocation::GpuToCpu)?;
         if bytes > 0 {
-            self.copy_raw(buffer.handle(), host.raw, bytes);
+            self.copy_raw(raw, host.raw, bytes);
         }
-        Ok(Download { host, len: buffer.len, value: self.value(), element: PhantomData })
+        Ok(Download { host, len, value: self.value(), element: PhantomData })
     }
 }
 

@@ -10,6 +10,7 @@ use ash::vk::Handle as _;
 use ash::{ext, khr, vk};
 use gpu_allocator::vulkan::{Allocator, AllocatorCreateDesc};
 
+use super::checked::Checks;
 use super::cooperative::{self, CooperativeMatrix};
 use super::requirements::{EXTENSIONS, Offered, required_device_features};
 use super::{Gpu, Properties, Queue, REQUIREMENTS, Shared, validation};
@@ -293,6 +294,7 @@ impl Gpu {
                 last_use: AtomicU64::new(0),
                 usage: super::buffer::MemoryUsage::default(),
                 retired: Mutex::new(vec![]),
+                checks: Checks::default(),
                 pipeline_cache,
                 owned,
             }),

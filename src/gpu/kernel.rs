@@ -1,6 +1,10 @@
 //! What a compute shader tells the host about itself.
 
+use std::fmt::Debug;
+
 use ash::vk;
+
+use super::Tolerance;
 
 /// One storage buffer of a kernel.
 #[derive(Clone, Copy, Debug)]
@@ -11,6 +15,17 @@ pub struct Binding {
     pub index: u32,
     /// False where the shader says `readonly`.
     pub writable: bool,
+    /// Its 32-bit numbers are floats; else they are integers.
+    pub is_float: bool,
+}
+
+/// A buffer that a dispatch binds.
+#[derive(Clone, Copy, Debug)]
+pub struct Bound {
+    /// The Vulkan buffer.
+    pub raw: vk::Buffer,
+    /// Bytes of its elements.
+    pub size: u64,
 }
 
 /// A compute shader and everything the host must know to launch it.
@@ -30,19 +45,37 @@ pub trait Kernel: 'static {
     /// The push constants.
     type Params: bytemuck::Pod;
     /// The specialization constants.
-    type Constants;
+    type Constants: Copy + Debug;
     /// The buffers of a dispatch.
     type Buffers<'a>;
     /// The buffers in host memory, for the reference.
     type Slices<'a>;
+    /// How far each buffer that it writes may be from the reference's.
+    type Tolerances: Default + Into<Vec<Tolerance>>;
     /// The Vulkan buffers in binding order.
-    fn handles(buffers: &Self::Buffers<'_>) -> Vec<vk::Buffer>;
+    fn bound(buffers: &Self::Buffers<'_>) -> Vec<Bound>;
+    /// The slices whose 32-bit numbers these are, in binding order.
+    fn slices(words: &mut [Vec<u32>]) -> Self::Slices<'_>;
     /// Specialization ids and the bits of their values.
     fn constants(constants: &Self::Constants) -> Vec<(u32, u32)>;
 }
 
 /// The CPU reference of a kernel: same parameters, same buffers, plain loops.
+///
+/// It takes from a slice what parameters and counts say and nothing else: a buffer may be longer than a view needs, and
+/// what lies beyond is anything.
 pub trait Reference: Kernel {
     /// Does to the slices what the kernel does to the buffers.
     fn run(params: &Self::Params, constants: &Self::Constants, slices: Self::Slices<'_>);
+
+    /// How far the kernel's results may be from those of [`Reference::run`] on the same slices: the rounding of single
+    /// precision, and either side of a cutoff where that decides. Exact where a reference does not say otherwise.
+    fn tolerances(
+        params: &Self::Params,
+        constants: &Self::Constants,
+        slices: Self::Slices<'_>,
+    ) -> Self::Tolerances {
+        let _ = (params, constants, slices);
+        Self::Tolerances::default()
+    }
 }

@@ -1,7 +1,6 @@
 //! A kernel specialised for its constants and the device.
 
 use std::io::Cursor;
-use std::marker::PhantomData;
 use std::sync::Arc;
 
 use ash::vk;
@@ -11,12 +10,13 @@ use crate::Result;
 
 /// A kernel ready to be dispatched.
 #[derive(Debug)]
-pub struct Pipeline<K> {
+pub struct Pipeline<K: Kernel> {
     pub(super) raw: vk::Pipeline,
     pub(super) layout: vk::PipelineLayout,
+    /// What it is specialised for.
+    pub(super) constants: K::Constants,
     set_layout: vk::DescriptorSetLayout,
     shared: Arc<Shared>,
-    kernel: PhantomData<K>,
 }
 
 impl Gpu {
@@ -46,7 +46,7 @@ impl Gpu {
                 Ok(raw) => {
                     shared.name(raw, K::NAME);
                     let shared = Arc::clone(shared);
-                    Ok(Pipeline { raw, layout, set_layout, shared, kernel: PhantomData })
+                    Ok(Pipeline { raw, layout, constants: *constants, set_layout, shared })
                 }
                 Err(result) => {
                     shared.device.destroy_pipeline_layout(layout, None);
@@ -156,7 +156,7 @@ impl Shared {
     }
 }
 
-impl<K> Drop for Pipeline<K> {
+impl<K: Kernel> Drop for Pipeline<K> {
     fn drop(&mut self) {
         self.shared.retire(Retired::Pipeline(self.raw, self.layout, self.set_layout));
     }

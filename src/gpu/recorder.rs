@@ -7,7 +7,8 @@ use std::sync::Arc;
 use ash::vk;
 use ash::vk::Handle as _;
 
-use super::{Buffer, Gpu, Kernel, Pipeline, Shared};
+use super::checked::Checked;
+use super::{Bound, Buffer, Gpu, Kernel, Pipeline, Reference, Shared};
 use crate::{Error, Result};
 
 /// How many invocations a dispatch needs; the kernel knows its workgroup size.
@@ -25,13 +26,15 @@ pub enum Threads<'a> {
 #[derive(Debug)]
 pub struct Recorder<'g> {
     shared: &'g Arc<Shared>,
-    commands: vk::CommandBuffer,
+    pub(super) commands: vk::CommandBuffer,
     /// The timeline value that signals the end of this recording.
-    value: u64,
+    pub(super) value: u64,
     queries: Option<vk::QueryPool>,
     pub(super) labels: Vec<&'static str>,
     /// Buffers touched since the last barrier; true when written.
     pending: HashMap<vk::Buffer, bool>,
+    /// Where every pass is run alone and compared with its reference.
+    pub(super) checked: Option<Checked<'g>>,
 }
 
 /// The timeline value of a recording that the host application submits: none of ours.
@@ -48,8 +51,15 @@ impl<'g> Recorder<'g> {
         value: u64,
         queries: Option<vk::QueryPool>,
     ) -> Self {
-        let mut recorder =
-            Self { shared, commands, value, queries, labels: vec![], pending: HashMap::new() };
+        let mut recorder = Self {
+            shared,
+            commands,
+            value,
+            queries,
+            labels: vec![],
+            pending: HashMap::new(),
+            checked: None,
+        };
         recorder.barrier();
         recorder.timestamp();
         recorder
@@ -67,33 +77,39 @@ impl<'g> Recorder<'g> {
     ///
     /// # Errors
     /// The extent exceeds what the device can launch.
-    pub fn dispatch<K: Kernel>(
+    pub fn dispatch<K: Reference>(
         &mut self,
         pipeline: &Pipeline<K>,
         params: &K::Params,
         buffers: K::Buffers<'_>,
         threads: Threads<'_>,
     ) -> Result<()> {
-        let raw = K::handles(&buffers);
-        let bound = K::BINDINGS.iter().zip(&raw).map(|(b, &raw)| (raw, b.writable));
+        let bound = K::bound(&buffers);
+        if self.checked.is_some() {
+            return self.dispatch_checked(pipeline, params, &bound, threads);
+        }
+        self.record_dispatch(pipeline, params, &bound, threads)
+    }
+
+    pub(super) fn record_dispatch<K: Kernel>(
+        &mut self,
+        pipeline: &Pipeline<K>,
+        params: &K::Params,
+        bound: &[Bound],
+        threads: Threads<'_>,
+    ) -> Result<()> {
+        let uses = K::BINDINGS.iter().zip(bound).map(|(b, bound)| (bound.raw, b.writable));
         let indirect = match threads {
             Threads::Indirect(arguments) => Some((arguments.handle(), false)),
             _ => None,
         };
-        self.synchronize(bound.chain(indirect));
+        self.synchronize(uses.chain(indirect));
         let groups = match threads {
-            Threads::Exactly(n) => {
-                let mut size = K::WORKGROUP_SIZE;
-                if size[0] == 0 {
-                    size[0] = self.shared.properties.subgroup_size;
-                }
-                self.fold(K::NAME, std::array::from_fn(|i| n[i].div_ceil(size[i])))?
-            }
-            Threads::Workgroups(n) => self.fold(K::NAME, n)?,
             Threads::Indirect(_) => [0; 3],
+            _ => self.fold(K::NAME, self.workgroups::<K>(threads))?,
         };
         self.begin_label(K::NAME);
-        self.bind(pipeline, params, &raw);
+        self.bind(pipeline, params, bound);
         let device = &self.shared.device;
         // SAFETY: recording; a retired buffer outlives this submission.
         unsafe {
@@ -162,7 +178,7 @@ impl<'g> Recorder<'g> {
         }
     }
 
-    fn barrier(&mut self) {
+    pub(super) fn barrier(&mut self) {
         let stages =
             vk::PipelineStageFlags2::COMPUTE_SHADER | vk::PipelineStageFlags2::ALL_TRANSFER;
         let barrier = [vk::MemoryBarrier2::default()
@@ -182,10 +198,10 @@ impl<'g> Recorder<'g> {
         self.pending.clear();
     }
 
-    fn bind<K: Kernel>(&self, pipeline: &Pipeline<K>, params: &K::Params, raw: &[vk::Buffer]) {
-        let infos: Vec<_> = raw
+    fn bind<K: Kernel>(&self, pipeline: &Pipeline<K>, params: &K::Params, bound: &[Bound]) {
+        let infos: Vec<_> = bound
             .iter()
-            .map(|&raw| [vk::DescriptorBufferInfo::default().buffer(raw).range(vk::WHOLE_SIZE)])
+            .map(|b| [vk::DescriptorBufferInfo::default().buffer(b.raw).range(vk::WHOLE_SIZE)])
             .collect();
         let writes: Vec<_> = K::BINDINGS
             .iter()
@@ -213,6 +229,21 @@ impl<'g> Recorder<'g> {
                 let stage = vk::ShaderStageFlags::COMPUTE;
                 self.shared.device.cmd_push_constants(commands, pipeline.layout, stage, 0, bytes);
             }
+        }
+    }
+
+    /// The workgroups of a dispatch; none where the device alone knows.
+    pub(super) fn workgroups<K: Kernel>(&self, threads: Threads<'_>) -> [u32; 3] {
+        match threads {
+            Threads::Exactly(n) => {
+                let mut size = K::WORKGROUP_SIZE;
+                if size[0] == 0 {
+                    size[0] = self.shared.properties.subgroup_size;
+                }
+                std::array::from_fn(|i| n[i].div_ceil(size[i]))
+            }
+            Threads::Workgroups(n) => n,
+            Threads::Indirect(_) => [0; 3],
         }
     }
 

@@ -148,29 +148,19 @@ impl Gpu {
         let value = lock(&shared.progress).submitted + 1;
         // From here on, whatever is dropped may be in this recording.
         shared.last_use.store(value, Ordering::Release);
-        let recorded = self.record_commands(pool, value, queries, record);
-        let submitted = recorded.and_then(|(commands, labels)| {
-            let commands = [vk::CommandBufferSubmitInfo::default().command_buffer(commands)];
-            let signal = [vk::SemaphoreSubmitInfo::default()
-                .semaphore(shared.timeline)
-                .value(value)
-                .stage_mask(vk::PipelineStageFlags2::ALL_COMMANDS)];
-            let info = [vk::SubmitInfo2::default()
-                .command_buffer_infos(&commands)
-                .signal_semaphore_infos(&signal)];
-            // SAFETY: the queue is locked, the command buffer recorded and not touched again.
-            unsafe { shared.device.queue_submit2(recording.queue.raw, &info, vk::Fence::null()) }
-                .map_err(fail("vkQueueSubmit2"))?;
-            tracing::trace!(label, value, "submitted");
-            Ok(labels)
-        });
-        shared.retire(Retired::Commands(pool));
+        let queue = &recording.queue;
+        let submitted = if queries.is_none() && shared.checks.are_on() {
+            shared.record_checked(queue, pool, value, label, record).map(|last| (last, vec![]))
+        } else {
+            self.record_commands(pool, value, queries, record).and_then(|(commands, labels)| {
+                shared.submit(queue, commands, value, label)?;
+                tracing::trace!(label, value, "submitted");
+                Ok((value, labels))
+            })
+        };
         // Where nothing was submitted, what was dropped meanwhile waits for the next submission, of the same value.
-        let labels = submitted?;
-        let mut progress = lock(&shared.progress);
-        progress.submitted = value;
-        progress.labels.insert(value, label.to_owned());
-        Ok((Submission { shared: Arc::clone(shared), value }, labels))
+        shared.retire(Retired::Commands(pool));
+        submitted.map(|(value, labels)| (Submission { shared: Arc::clone(shared), value }, labels))
     }
 
     fn record_commands(
@@ -181,30 +171,59 @@ impl Gpu {
         record: impl FnOnce(&mut Recorder<'_>) -> Result<()>,
     ) -> Result<(vk::CommandBuffer, Vec<&'static str>)> {
         let shared = &self.shared;
-        let fail = |call| move |result| shared.error(call, result);
+        let mut recorder = Recorder::new(shared, shared.begin(pool)?, value, queries);
+        record(&mut recorder)?;
+        recorder.finish();
+        Ok((recorder.commands, recorder.labels))
+    }
+}
+
+impl Shared {
+    /// A command buffer that is being recorded.
+    pub(super) fn begin(&self, pool: vk::CommandPool) -> Result<vk::CommandBuffer> {
+        let fail = |call| move |result| self.error(call, result);
         let allocate =
             vk::CommandBufferAllocateInfo::default().command_pool(pool).command_buffer_count(1);
         let begin = vk::CommandBufferBeginInfo::default()
             .flags(vk::CommandBufferUsageFlags::ONE_TIME_SUBMIT);
         // SAFETY: pool and command buffer are live and used by this thread alone.
-        let commands = unsafe {
-            let commands = shared
+        unsafe {
+            let commands = self
                 .device
                 .allocate_command_buffers(&allocate)
                 .map_err(fail("vkAllocateCommandBuffers"))?[0];
-            shared
-                .device
+            self.device
                 .begin_command_buffer(commands, &begin)
                 .map_err(fail("vkBeginCommandBuffer"))?;
-            commands
-        };
-        let mut recorder = Recorder::new(shared, commands, value, queries);
-        record(&mut recorder)?;
-        recorder.finish();
-        let labels = recorder.labels;
+            Ok(commands)
+        }
+    }
+
+    /// Ends a recording and hands it to the queue; the timeline reaches `value` when it is done.
+    pub(super) fn submit(
+        &self,
+        queue: &Queue,
+        commands: vk::CommandBuffer,
+        value: u64,
+        label: &str,
+    ) -> Result<()> {
+        let fail = |call| move |result| self.error(call, result);
         // SAFETY: recording.
-        unsafe { shared.device.end_command_buffer(commands) }
-            .map_err(fail("vkEndCommandBuffer"))?;
-        Ok((commands, labels))
+        unsafe { self.device.end_command_buffer(commands) }.map_err(fail("vkEndCommandBuffer"))?;
+        let commands = [vk::CommandBufferSubmitInfo::default().command_buffer(commands)];
+        let signal = [vk::SemaphoreSubmitInfo::default()
+            .semaphore(self.timeline)
+            .value(value)
+            .stage_mask(vk::PipelineStageFlags2::ALL_COMMANDS)];
+        let info = [vk::SubmitInfo2::default()
+            .command_buffer_infos(&commands)
+            .signal_semaphore_infos(&signal)];
+        // SAFETY: the queue is locked, the command buffer recorded and not touched again.
+        unsafe { self.device.queue_submit2(queue.raw, &info, vk::Fence::null()) }
+            .map_err(fail("vkQueueSubmit2"))?;
+        let mut progress = lock(&self.progress);
+        progress.submitted = value;
+        progress.labels.insert(value, label.to_owned());
+        Ok(())
     }
 }

@@ -1,5 +1,6 @@
 //! One validated device for all tests of a process.
 
+use std::cell::Cell;
 use std::sync::OnceLock;
 
 use ash::vk;
@@ -34,4 +35,34 @@ pub fn misuse(gpu: &Gpu) {
             device.destroy_buffer(buffer, None);
         }
     }
+}
+
+/// A wrong wiring: of the pass's parameters, `bits` of 32-bit number `word` reach the device flipped.
+#[derive(Clone, Copy, Debug)]
+pub struct Defect {
+    /// The kernel.
+    pub kernel: &'static str,
+    /// Which number of its parameters.
+    pub word: usize,
+    /// Which bits of it.
+    pub bits: u32,
+}
+
+thread_local! {
+    static DEFECT: Cell<Option<Defect>> = const { Cell::new(None) };
+}
+
+/// Does `work` on a device that has the defect, as far as it is checked.
+pub fn with_defect<R>(defect: Defect, work: impl FnOnce() -> R) -> R {
+    DEFECT.set(Some(defect));
+    let result = work();
+    DEFECT.set(None);
+    result
+}
+
+/// Alters the parameters of the defective kernel.
+pub(super) fn plant_defect(kernel: &str, params: &mut [u8]) {
+    let Some(defect) = DEFECT.get().filter(|defect| defect.kernel == kernel) else { return };
+    let bytes = params.iter_mut().skip(4 * defect.word);
+    bytes.zip(defect.bits.to_le_bytes()).for_each(|(byte, bits)| *byte ^= bits);
 }

@@ -311,6 +311,7 @@ impl DepthLoss {
                 first,
                 view_chunks,
                 box_chunks,
+                region_count: boxes + 1,
                 chunk_size: self.chunk_size,
                 view_weight: weight as f32,
                 box_weight: (weight / f64::from(boxes.max(1))) as f32,

@@ -79,7 +79,7 @@ const CPU_STRIP: [u32; 2] = [16, 64];
 const GPU_STRIP: [u32; 2] = [2, 32];
 
 /// The strip that suits the device.
-pub(crate) fn strip(gpu: &Gpu) -> [u32; 2] {
+fn strip(gpu: &Gpu) -> [u32; 2] {
     if gpu.properties().is_cpu { CPU_STRIP } else { GPU_STRIP }
 }
 

@@ -15,9 +15,10 @@ use serde::{Deserialize, Serialize};
 use super::conv::{Activation, Conv, Precision, Seen, partial_count};
 use super::norm::{Backward, Forward, Norm, NormMemory, Use};
 use super::parameters::{Layout, Parameters};
+use super::relu::ReluBackward;
 use super::{RGB, check_binding, check_images, float_bytes, out_of_turn, pixel_count};
 use crate::gpu::{Buffer, Gpu, Pipeline, Properties, Recorder, Threads};
-use crate::kernels::{relu_backward, residual, residual_backward};
+use crate::kernels::{residual, residual_backward};
 use crate::random::Stream;
 use crate::{Error, Result};
 
@@ -96,7 +97,7 @@ struct Kernels {
     conv: Conv,
     conv_out: Conv,
     norm: Norm,
-    relu_backward: Pipeline<relu_backward::Kernel>,
+    relu_backward: ReluBackward,
     residual: Pipeline<residual::Kernel>,
     residual_backward: Pipeline<residual_backward::Kernel>,
 }
@@ -356,7 +357,7 @@ impl Kernels {
             conv: Conv::new(gpu, [channels, channels], Activation::None, true, precision)?,
             conv_out: Conv::new(gpu, [channels, RGB], Activation::Sigmoid, false, ends)?,
             norm: Norm::new(gpu, channels)?,
-            relu_backward: gpu.pipeline(&relu_backward::Constants::default())?,
+            relu_backward: ReluBackward::new(gpu)?,
             residual: gpu.pipeline(&residual::Constants::default())?,
             residual_backward: gpu.pipeline(&residual_backward::Constants::default())?,
         })
@@ -421,12 +422,7 @@ impl Kernels {
             self.conv.data_gradient(pass, size, stage.conv, values, d_convolved, d_features)?;
         }
         let value_count = self.channels * size.element_product();
-        pass.dispatch(
-            &self.relu_backward,
-            &relu_backward::Params { value_count },
-            relu_backward::Buffers { activations: &features[0], gradient: &mut *d_features },
-            Threads::Exactly([value_count, 1, 1]),
-        )?;
+        self.relu_backward.record(pass, value_count, &features[0], d_features)?;
         let seen = Seen { source: ends.stage_input, d_target: &*d_features };
         self.conv_in.weight_gradient(pass, size, stage.conv_in, seen, partials, gradients)?;
         let d_input = ends.d_stage_input;

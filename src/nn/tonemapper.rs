@@ -4,10 +4,11 @@ use glam::UVec2;
 
 use super::conv::{Activation, Conv, Precision, Seen, partial_count};
 use super::parameters::{Layout, Parameters};
+use super::relu::ReluBackward;
 use super::{RGB, check_binding, check_images, out_of_turn, pixel_count};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
-use crate::kernels::{product, product_backward, relu_backward};
+use crate::kernels::{product, product_backward};
 use crate::random::Stream;
 
 /// The stream of random numbers that the weights are drawn from.
@@ -26,7 +27,7 @@ pub struct Tonemapper {
     convs: [Conv; 3],
     product: Pipeline<product::Kernel>,
     product_backward: Pipeline<product_backward::Kernel>,
-    relu_backward: Pipeline<relu_backward::Kernel>,
+    relu_backward: ReluBackward,
     reserved: [usize; 2],
     memory: Memory,
     /// The size of the forward pass that the memory holds.
@@ -74,7 +75,7 @@ impl Tonemapper {
             ],
             product: gpu.pipeline(&product::Constants::default())?,
             product_backward: gpu.pipeline(&product_backward::Constants::default())?,
-            relu_backward: gpu.pipeline(&relu_backward::Constants::default())?,
+            relu_backward: ReluBackward::new(gpu)?,
             reserved: [0; 2],
             memory: Memory::new(gpu, [0; 2])?,
             recorded: None,
@@ -192,21 +193,11 @@ impl Tonemapper {
         conv_out.weight_gradient(pass, size, at_out, seen, partials, gradients)?;
         conv_out.data_gradient(pass, size, at_out, values, d_output, d_second)?;
         let value_count = CHANNELS * pixels as u32;
-        pass.dispatch(
-            &self.relu_backward,
-            &relu_backward::Params { value_count },
-            relu_backward::Buffers { activations: second, gradient: &mut *d_second },
-            threads(value_count),
-        )?;
+        self.relu_backward.record(pass, value_count, second, d_second)?;
         let seen = Seen { source: first, d_target: d_second };
         conv.weight_gradient(pass, size, at, seen, partials, gradients)?;
         conv.data_gradient(pass, size, at, values, d_second, d_first)?;
-        pass.dispatch(
-            &self.relu_backward,
-            &relu_backward::Params { value_count },
-            relu_backward::Buffers { activations: first, gradient: &mut *d_first },
-            threads(value_count),
-        )?;
+        self.relu_backward.record(pass, value_count, first, d_first)?;
         let seen = Seen { source: product, d_target: d_first };
         conv_in.weight_gradient(pass, size, at_in, seen, partials, gradients)?;
         conv_in.data_gradient(pass, size, at_in, values, d_first, d_product)?;

@@ -2,10 +2,12 @@
 
 use glam::{DVec2, UVec2};
 
-use super::blend_forward::tile_pixels;
+use super::blend_forward::{TileList, tile_pixels};
+use super::blending::PixelModel;
+use super::rounding::{UNIT, chain};
 use super::splat::{Splat, fragments};
-use crate::gpu::Reference;
-use crate::kernels::blend_backward::{Constants, Kernel, Params, Slices};
+use crate::gpu::{Reference, Tolerance};
+use crate::kernels::blend_backward::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::splat::RECORD_HEAD;
 
 /// Adds to `records` (splats, record) what one pixel with the values `render` and the gradient `d_render` says:
@@ -46,43 +48,104 @@ pub fn blend_pixel_backward(
     }
 }
 
-impl Reference for Kernel {
-    fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
-        let Slices { tile_ranges, sorted_slots, owners, splats, colors, render, d_render, records } =
-            slices;
-        let channels = constants.channels as usize;
-        let record = RECORD_HEAD as usize + channels;
-        let [width, height] = params.size.as_usizevec2().to_array();
-        let tile = UVec2::new(constants.tile_width, constants.tile_height);
-        for (index, range) in tile_ranges.iter().enumerate() {
-            let slots = &sorted_slots[range.x as usize..range.y as usize];
-            let ids = || slots.iter().map(|&slot| owners[slot as usize] as usize);
-            let list: Vec<Splat> = ids().map(|id| Splat::from(&splats[id])).collect();
-            let list_colors: Vec<f64> = ids()
-                .flat_map(|id| &colors[channels * id..][..channels])
-                .map(|&c| c.into())
-                .collect();
-            let mut sums = vec![0.0; record * list.len()];
-            for pixel in tile_pixels(index as u32, params.tile_columns, tile, params.size) {
-                let at = pixel.y as usize * width + pixel.x as usize;
-                let values = |image: &[f32]| -> Vec<f64> {
-                    (0..channels).map(|c| image[c * width * height + at].into()).collect()
-                };
-                blend_pixel_backward(
-                    &list,
-                    &list_colors,
-                    &values(render),
-                    &values(d_render),
-                    pixel.as_dvec2() + 0.5,
-                    constants.alpha_max.into(),
-                    &mut sums,
-                );
-            }
-            for (j, &slot) in slots.iter().enumerate() {
-                for k in 0..record {
-                    records[record * slot as usize + k] = sums[record * j + k] as f32;
-                }
-            }
+/// A pixel of a tile: its centre, its render, and the gradient of that.
+struct Pixel {
+    center: DVec2,
+    render: Vec<f64>,
+    d_render: Vec<f64>,
+}
+
+/// Adds up what `visit` adds for every pixel to the records of its tile's list, and writes each to its slot.
+fn for_each_tile(
+    params: &Params,
+    constants: &Constants,
+    slices: &Slices<'_>,
+    mut write: impl FnMut(usize, f64),
+    visit: impl Fn(&TileList, &Pixel, &mut [f64]),
+) {
+    let Slices { tile_ranges, sorted_slots, owners, splats, colors, render, d_render, .. } = slices;
+    let (channels, pixels) = (constants.channels as usize, params.size.element_product() as usize);
+    let record = RECORD_HEAD as usize + channels;
+    let tile = UVec2::new(constants.tile_width, constants.tile_height);
+    for index in 0..params.tile_columns * params.size.y.div_ceil(tile.y) {
+        let range = tile_ranges[index as usize];
+        let slots = &sorted_slots[range.x as usize..range.y as usize];
+        let list = TileList::new(constants.channels, slots, owners, splats, colors);
+        let mut sums = vec![0.0; record * list.slots.len()];
+        for pixel in tile_pixels(index, params.tile_columns, tile, params.size) {
+            let at = (pixel.y * params.size.x + pixel.x) as usize;
+            let values =
+                |image: &[f32]| (0..channels).map(|c| image[c * pixels + at].into()).collect();
+            let (render, d_render) = (values(render), values(d_render));
+            visit(&list, &Pixel { center: pixel.as_dvec2() + 0.5, render, d_render }, &mut sums);
         }
+        for (sums, &slot) in sums.chunks(record).zip(&list.slots) {
+            (0..record).for_each(|k| write(record * slot as usize + k, sums[k]));
+        }
+    }
+}
+
+/// Adds to `bounds` how far the shares of one pixel in the records may be off: the light still to come is off by what
+/// the render may be off, which 1 / (1 - alpha) magnifies; the rest is relative to the magnitude of the share, which
+/// counts whole where a rounding decides about it.
+fn add_bounds(constants: &Constants, list: &TileList, pixel: &Pixel, bounds: &mut [f64]) {
+    let (channels, tile) =
+        (constants.channels as usize, UVec2::new(constants.tile_width, constants.tile_height));
+    let model = PixelModel::new(&list.splats, pixel.center, constants.alpha_max.into(), tile);
+    let d = |c: usize| pixel.d_render[c].abs();
+    let d_sum: f64 = (0..channels).map(d).sum();
+    let light: f64 = (0..channels).map(|c| pixel.render[c].abs() * d(c)).sum();
+    let light_error = model.error * list.largest_color(&pixel.render) * d_sum;
+    let head = RECORD_HEAD as usize;
+    // Every sum is over the pixels of the tile.
+    let own = (chain(tile.element_product() as usize) + 64.0) * UNIT;
+    for &(fragment, alpha_error) in &model.fragments {
+        let Splat { conic, .. } = list.splats[fragment.index];
+        let bound = &mut bounds[(head + channels) * fragment.index..][..head + channels];
+        let color = &list.colors[channels * fragment.index..][..channels];
+        let share: f64 = (0..channels).map(|c| fragment.before * color[c].abs() * d(c)).sum();
+        let rounded = 2.0 * alpha_error / (1.0 - fragment.alpha) + own;
+        let relative = if model.is_fragile { 1.0 } else { rounded };
+        let d_alpha = (2.0 * light_error + relative * (light + share)) / (1.0 - fragment.alpha);
+        let d_sigma = fragment.alpha * d_alpha;
+        // An offset may be off by the rounding of a tile's extent.
+        let offset = fragment.d.abs() + 1.0;
+        bound[0] += d_sigma * (conic.x * offset.x + conic.y.abs() * offset.y);
+        bound[1] += d_sigma * (conic.y.abs() * offset.x + conic.z * offset.y);
+        bound[2] += d_sigma * 0.5 * offset.x * offset.x;
+        bound[3] += d_sigma * offset.x * offset.y;
+        bound[4] += d_sigma * 0.5 * offset.y * offset.y;
+        bound[5] += d_alpha * fragment.falloff;
+        let weight = fragment.alpha * fragment.before;
+        (0..channels).for_each(|c| bound[head + c] += weight * (relative + model.error) * d(c));
+    }
+}
+
+impl Reference for Kernel {
+    fn run(params: &Params, constants: &Constants, mut slices: Slices<'_>) {
+        let alpha_max = constants.alpha_max.into();
+        let records = std::mem::take(&mut slices.records);
+        let write = |at: usize, sum: f64| records[at] = sum as f32;
+        for_each_tile(params, constants, &slices, write, |list, pixel, sums| {
+            let Pixel { center, render, d_render } = pixel;
+            blend_pixel_backward(
+                &list.splats,
+                &list.colors,
+                render,
+                d_render,
+                *center,
+                alpha_max,
+                sums,
+            );
+        });
+    }
+
+    fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
+        let mut bounds = vec![0.0; slices.records.len()];
+        let write = |at: usize, bound: f64| bounds[at] = bound;
+        for_each_tile(params, constants, &slices, write, |list, pixel, bounds| {
+            add_bounds(constants, list, pixel, bounds);
+        });
+        Tolerances { records: Tolerance::Each(bounds) }
     }
 }

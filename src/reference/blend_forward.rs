@@ -2,9 +2,11 @@
 
 use glam::{DVec2, UVec2};
 
+use super::blending::PixelModel;
 use super::splat::{Splat, fragments};
-use crate::gpu::Reference;
-use crate::kernels::blend_forward::{Constants, Kernel, Params, Slices};
+use crate::gpu::{Reference, Tolerance};
+use crate::kernels::ProjectedSplat;
+use crate::kernels::blend_forward::{Constants, Kernel, Params, Slices, Tolerances};
 
 /// One pixel's channels and transmittance, from splats front to back with colours (splats, channels).
 pub fn blend_pixel(
@@ -26,40 +28,98 @@ pub fn blend_pixel(
     (render, transmittance)
 }
 
-impl Reference for Kernel {
-    fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
-        let Slices { tile_ranges, sorted_slots, owners, splats, colors, render, transmittances } =
-            slices;
-        let channels = constants.channels as usize;
-        let background: Vec<f64> =
-            params.background[..channels].iter().copied().map(f64::from).collect();
-        let [width, height] = params.size.as_usizevec2().to_array();
-        let tile = UVec2::new(constants.tile_width, constants.tile_height);
-        for (index, range) in tile_ranges.iter().enumerate() {
-            let slots = &sorted_slots[range.x as usize..range.y as usize];
-            let ids = || slots.iter().map(|&slot| owners[slot as usize] as usize);
-            let list: Vec<Splat> = ids().map(|id| Splat::from(&splats[id])).collect();
-            let list_colors: Vec<f64> = ids()
-                .flat_map(|id| &colors[channels * id..][..channels])
-                .map(|&c| c.into())
-                .collect();
-            for pixel in tile_pixels(index as u32, params.tile_columns, tile, params.size) {
-                let center = pixel.as_dvec2() + 0.5;
-                let (values, transmittance) = blend_pixel(
-                    &list,
-                    &list_colors,
-                    &background,
-                    center,
-                    constants.alpha_max.into(),
-                );
-                let at = pixel.y as usize * width + pixel.x as usize;
-                transmittances[at] = transmittance as f32;
-                for c in 0..channels {
-                    render[c * width * height + at] = values[c] as f32;
-                }
-            }
+/// What a tile blends, front to back.
+pub(super) struct TileList {
+    pub(super) slots: Vec<u32>,
+    pub(super) splats: Vec<Splat>,
+    /// (splats, channels)
+    pub(super) colors: Vec<f64>,
+}
+
+impl TileList {
+    pub(super) fn new(
+        channels: u32,
+        slots: &[u32],
+        owners: &[u32],
+        splats: &[ProjectedSplat],
+        colors: &[f32],
+    ) -> Self {
+        let (channels, ids) =
+            (channels as usize, || slots.iter().map(|&slot| owners[slot as usize] as usize));
+        let color = |id| colors[channels * id..][..channels].iter().map(|&c| f64::from(c));
+        Self {
+            slots: slots.to_vec(),
+            splats: ids().map(|id| Splat::from(&splats[id])).collect(),
+            colors: ids().flat_map(color).collect(),
         }
     }
+
+    /// The largest magnitude of a colour, at least 1.
+    pub(super) fn largest_color(&self, background: &[f64]) -> f64 {
+        self.colors.iter().chain(background).fold(1.0, |largest: f64, c| largest.max(c.abs()))
+    }
+}
+
+/// Calls `visit` with the list of every tile of the image and its pixels.
+fn for_each_tile(
+    params: &Params,
+    constants: &Constants,
+    slices: &Slices<'_>,
+    mut visit: impl FnMut(&TileList, &mut dyn Iterator<Item = UVec2>),
+) {
+    let Slices { tile_ranges, sorted_slots, owners, splats, colors, .. } = slices;
+    let tile = UVec2::new(constants.tile_width, constants.tile_height);
+    for index in 0..params.tile_columns * params.size.y.div_ceil(tile.y) {
+        let range = tile_ranges[index as usize];
+        let slots = &sorted_slots[range.x as usize..range.y as usize];
+        let list = TileList::new(constants.channels, slots, owners, splats, colors);
+        visit(&list, &mut tile_pixels(index, params.tile_columns, tile, params.size));
+    }
+}
+
+impl Reference for Kernel {
+    fn run(params: &Params, constants: &Constants, mut slices: Slices<'_>) {
+        let background = background(params, constants);
+        let pixels = params.size.element_product() as usize;
+        let (render, transmittances) =
+            (std::mem::take(&mut slices.render), std::mem::take(&mut slices.transmittances));
+        for_each_tile(params, constants, &slices, |list, tile| {
+            for pixel in tile {
+                let (center, alpha_max) = (pixel.as_dvec2() + 0.5, constants.alpha_max.into());
+                let (values, transmittance) =
+                    blend_pixel(&list.splats, &list.colors, &background, center, alpha_max);
+                let at = (pixel.y * params.size.x + pixel.x) as usize;
+                transmittances[at] = transmittance as f32;
+                for (c, value) in values.into_iter().enumerate() {
+                    render[c * pixels + at] = value as f32;
+                }
+            }
+        });
+    }
+
+    fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
+        let background = background(params, constants);
+        let pixels = params.size.element_product() as usize;
+        let mut errors = vec![0.0; pixels];
+        let mut largest_colors = vec![0.0; pixels];
+        let tile_size = UVec2::new(constants.tile_width, constants.tile_height);
+        for_each_tile(params, constants, &slices, |list, tile| {
+            let largest = list.largest_color(&background);
+            for pixel in tile {
+                let (center, alpha_max) = (pixel.as_dvec2() + 0.5, constants.alpha_max.into());
+                let at = (pixel.y * params.size.x + pixel.x) as usize;
+                errors[at] = PixelModel::new(&list.splats, center, alpha_max, tile_size).error;
+                largest_colors[at] = largest;
+            }
+        });
+        let of_channel = errors.iter().zip(largest_colors).map(|(error, color)| error * color);
+        let render = of_channel.cycle().take(constants.channels as usize * pixels).collect();
+        Tolerances { render: Tolerance::Each(render), transmittances: Tolerance::Each(errors) }
+    }
+}
+
+fn background(params: &Params, constants: &Constants) -> Vec<f64> {
+    params.background[..constants.channels as usize].iter().map(|&c| c.into()).collect()
 }
 
 /// The pixels of a tile that lie in the image, row by row.

@@ -1,36 +1,63 @@
-//! `CIConv` in double precision: the columns pass and the invariant.
+//! `CIConv`: the columns pass and the invariant.
 
 use glam::{Vec2, Vec3};
 
-use super::ciconv_rows::{correlate, taps};
+use super::ciconv_rows::taps;
+use super::rounding::{Rounded, chain};
 use crate::gpu::Reference;
-use crate::kernels::ciconv_columns::{Constants, EPSILON, Kernel, Params, Slices};
+use crate::kernels::ciconv_columns::{Constants, EPSILON, Kernel, Params, Slices, Tolerances};
+use crate::tone::Real;
+
+/// ln(W + 1e-5) of every pixel.
+fn log_invariants(params: &Params, smooth_rows: &[Vec3], slope_rows: &[Vec3]) -> Vec<Rounded> {
+    let (width, height) = (params.width as usize, params.height as usize);
+    let [smooth, slope] = taps();
+    let log_invariant = |i: usize| {
+        let along = |rows: &[Vec3], channel: usize, taps: &[f64; 13]| {
+            let neighbours = (0..13).filter_map(|k| Some((k, (i / width + k).checked_sub(6)?)));
+            let inside = neighbours.filter(|&(_, y)| y < height);
+            let term = |(k, y): (usize, usize)| {
+                Rounded::of(taps[k]) * Rounded::exact(rows[y * width + i % width][channel])
+            };
+            Rounded::sum(13.0, inside.map(term))
+        };
+        let e = along(smooth_rows, 0, &smooth) + Rounded::of(EPSILON);
+        let squares = (0..3).map(|channel| {
+            let x = along(slope_rows, channel, &smooth) / e;
+            let y = along(smooth_rows, channel, &slope) / e;
+            // The kernel multiplies by the inverse.
+            (x * x + y * y).rounded(2.0)
+        });
+        (Rounded::sum(4.0, squares) + Rounded::of(EPSILON)).ln()
+    };
+    (0..width * height).map(log_invariant).collect()
+}
+
+/// Mean and sum of squares about it of every workgroup's pixels.
+fn moments(params: &Params, logs: &[Rounded]) -> impl Iterator<Item = [Rounded; 2]> {
+    logs.chunks(params.pixels_per_moment as usize).map(|logs| {
+        let (count, chain) = (logs.len() as f64, chain(logs.len()));
+        let mean = Rounded::sum(chain, logs.iter().copied()) / Rounded::of(count);
+        let squares = logs.iter().map(|&log| (log - mean) * (log - mean));
+        [mean, Rounded::sum(chain, squares)]
+    })
+}
 
 impl Reference for Kernel {
     fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
-        let (width, height) = (params.width as usize, params.height as usize);
-        let [smooth, slope] = taps();
-        let mut logs = vec![0.0; width * height];
-        for i in 0..logs.len() {
-            let at = |rows: &[Vec3], channel: usize, u: isize| {
-                let y = (i / width).checked_add_signed(u).filter(|&y| y < height)?;
-                Some(f64::from(rows[y * width + i % width][channel]))
-            };
-            let along = |rows, channel, taps| correlate(taps, |u| at(rows, channel, u));
-            let e = along(slices.smooth_rows, 0, &smooth);
-            let squares = (0..3).map(|channel| {
-                let x = along(slices.slope_rows, channel, &smooth) / (e + EPSILON);
-                let y = along(slices.smooth_rows, channel, &slope) / (e + EPSILON);
-                x * x + y * y
-            });
-            logs[i] = (squares.sum::<f64>() + EPSILON).ln();
-            slices.logs[i] = logs[i] as f32;
+        let logs = log_invariants(params, slices.smooth_rows, slices.slope_rows);
+        slices.logs.iter_mut().zip(&logs).for_each(|(log, of)| *log = of.value as f32);
+        for (moment, of) in slices.moments.iter_mut().zip(moments(params, &logs)) {
+            *moment = Vec2::from_array(of.map(|of| of.value as f32));
         }
-        let chunks = logs.chunks(params.pixels_per_moment as usize);
-        for (logs, moments) in chunks.zip(slices.moments) {
-            let mean = logs.iter().sum::<f64>() / logs.len() as f64;
-            let squares: f64 = logs.iter().map(|log| (log - mean).powi(2)).sum();
-            *moments = Vec2::new(mean as f32, squares as f32);
+    }
+
+    /// A derivative that almost vanishes has lost its digits to cancellation; W is floored at 1e-5.
+    fn tolerances(params: &Params, _: &Constants, slices: Slices<'_>) -> Tolerances {
+        let logs = log_invariants(params, slices.smooth_rows, slices.slope_rows);
+        Tolerances {
+            moments: moments(params, &logs).flatten().collect(),
+            logs: logs.into_iter().collect(),
         }
     }
 }

@@ -1,18 +1,37 @@
 use glam::Vec2;
 
+use super::rounding::{Rounded, chain};
 use crate::gpu::Reference;
-use crate::kernels::ciconv_moments::{Constants, EPSILON, Kernel, Params, Slices};
+use crate::kernels::ciconv_moments::{Constants, EPSILON, Kernel, Params, Slices, Tolerances};
+use crate::tone::Real;
+
+/// Mean and 1 / standard deviation, from the moments of the workgroups.
+fn norm(params: &Params, moments: &[Vec2]) -> [Rounded; 2] {
+    let (pixels, size) = (params.pixel_count as usize, params.pixels_per_moment as usize);
+    let workgroups = pixels.div_ceil(size);
+    let chain = chain(workgroups);
+    let parts = || {
+        let all = moments.iter().take(workgroups).enumerate();
+        all.map(|(i, of)| (Rounded::of(size.min(pixels - i * size) as f64), of))
+    };
+    let pivot = Rounded::exact(moments[0].x);
+    let from_pivot = |of: &Vec2| Rounded::exact(of.x) - pivot;
+    let all = Rounded::of(pixels as f64);
+    let shift = Rounded::sum(chain, parts().map(|(count, of)| count * from_pivot(of))) / all;
+    let squares = parts().map(|(count, of)| {
+        let deviation = from_pivot(of) - shift;
+        Rounded::exact(of.y) + count * deviation * deviation
+    });
+    let variance = Rounded::sum(chain, squares) / all;
+    [pivot + shift, Rounded::of(1.0) / (variance + Rounded::of(EPSILON)).sqrt()]
+}
 
 impl Reference for Kernel {
-    fn run(params: &Params, _: &Constants, Slices { moments, norm }: Slices<'_>) {
-        let (pixels, size) = (params.pixel_count as usize, params.pixels_per_moment as usize);
-        let chunks = || {
-            let all = moments.iter().take(pixels.div_ceil(size)).enumerate();
-            all.map(|(i, of)| (size.min(pixels - i * size) as f64, of.as_dvec2()))
-        };
-        let mean = chunks().map(|(count, of)| count * of.x).sum::<f64>() / pixels as f64;
-        let squares: f64 = chunks().map(|(count, of)| of.y + count * (of.x - mean).powi(2)).sum();
-        let deviation = (squares / pixels as f64 + EPSILON).sqrt();
-        norm[0] = Vec2::new(mean as f32, (1.0 / deviation) as f32);
+    fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
+        slices.norm[0] = Vec2::from_array(norm(params, slices.moments).map(|of| of.value as f32));
+    }
+
+    fn tolerances(params: &Params, _: &Constants, slices: Slices<'_>) -> Tolerances {
+        Tolerances { norm: norm(params, slices.moments).into_iter().collect() }
     }
 }

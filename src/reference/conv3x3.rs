@@ -1,8 +1,9 @@
 //! The 3x3 convolution in double precision; the kernel's reference rounds what it returns.
 
+use super::rounding::UNIT;
 use super::ssim_forward::widen;
-use crate::gpu::Reference;
-use crate::kernels::conv3x3::{Constants, Kernel, Params, RELU, SIGMOID, Slices};
+use crate::gpu::{Reference, Tolerance};
+use crate::kernels::conv3x3::{Constants, Kernel, Params, RELU, SIGMOID, Slices, Tolerances};
 
 /// Calls `visit(pixel, tap, neighbour)` for each of the nine neighbours of each pixel that lie in the image.
 pub(super) fn for_each_tap(
@@ -73,20 +74,53 @@ pub fn activate(activation: u32, x: f64) -> f64 {
     }
 }
 
+/// The sums before activation; of the terms' magnitudes, where `term` makes those of the factors.
+pub(super) fn sums(
+    params: &Params,
+    is_transposed: bool,
+    values: &[f32],
+    source: &[f32],
+    term: impl Fn(f64) -> f64,
+) -> Vec<f64> {
+    let size = params.size.to_array().map(|n| n as usize);
+    let [from, to] = [params.in_channels, params.out_channels].map(|n| n as usize);
+    let factors = |values: &[f32]| widen(values).into_iter().map(&term).collect::<Vec<_>>();
+    let layer = &values[params.offset as usize..];
+    let source = factors(&source[..from * size[0] * size[1]]);
+    let weights = factors(&layer[..9 * from * to]);
+    if is_transposed {
+        data_gradient(size, [to, from], &weights, &source)
+    } else {
+        conv3x3(size, [from, to], &weights, &factors(&layer[9 * from * to..][..to]), &source)
+    }
+}
+
+/// What a sum of products rounds by, in whatever order: a rounding for each of its terms' magnitudes.
+pub(super) fn sum_error(params: &Params, magnitude: f64) -> f64 {
+    f64::from(9 * params.in_channels + 2) * UNIT * magnitude
+}
+
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, Slices { values, source, target }: Slices<'_>) {
-        let size = params.size.to_array().map(|n| n as usize);
-        let [from, to] = [params.in_channels, params.out_channels].map(|n| n as usize);
-        let (layer, source) = (widen(&values[params.offset as usize..]), widen(source));
-        let output = if constants.transposed {
-            data_gradient(size, [to, from], &layer, &source)
-        } else {
-            let (weights, biases) = layer.split_at(9 * from * to);
-            conv3x3(size, [from, to], weights, biases, &source)
-        };
-        for (target, output) in target.iter_mut().zip(output) {
+        let sums = sums(params, constants.transposed, values, source, |x| x);
+        for (target, sum) in target.iter_mut().zip(sums) {
             let kept = if constants.accumulate { f64::from(*target) } else { 0.0 };
-            *target = (kept + activate(constants.activation, output)) as f32;
+            *target = (kept + activate(constants.activation, sum)) as f32;
+        }
+    }
+
+    /// No activation magnifies an error; the sigmoid adds those of an exponential, an addition and a division.
+    fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
+        let Slices { values, source, target } = slices;
+        let magnitudes = sums(params, constants.transposed, values, source, f64::abs);
+        let bound = |(magnitude, target): (f64, &f32)| {
+            let sigmoid =
+                if constants.activation == SIGMOID { (8.0 + 4.0 * magnitude) * UNIT } else { 0.0 };
+            let kept = if constants.accumulate { f64::from(target.abs()) } else { 0.0 };
+            sum_error(params, magnitude) + sigmoid + 2.0 * UNIT * (magnitude + kept)
+        };
+        Tolerances {
+            target: Tolerance::Each(magnitudes.into_iter().zip(target.iter()).map(bound).collect()),
         }
     }
 }

@@ -1,9 +1,10 @@
 //! The gradient of the weights and biases of a 3x3 convolution in double precision.
 
 use super::conv3x3::for_each_tap;
+use super::rounding::UNIT;
 use super::ssim_forward::widen;
-use crate::gpu::Reference;
-use crate::kernels::conv3x3_weight_gradient::{Constants, Kernel, Params, Slices};
+use crate::gpu::{Reference, Tolerance};
+use crate::kernels::conv3x3_weight_gradient::{Constants, Kernel, Params, Slices, Tolerances};
 
 /// The gradients of the weights (out, in, 3, 3), then of the biases (out), that the pixels for which `counts` make.
 pub fn weight_gradient(
@@ -32,23 +33,40 @@ pub fn weight_gradient(
     d_layer
 }
 
+/// The gradients of every strip; sums of magnitudes, where `term` makes those of the factors.
+fn strips(
+    params: &Params,
+    constants: &Constants,
+    source: &[f32],
+    d_target: &[f32],
+    term: impl Fn(f64) -> f64,
+) -> Vec<f64> {
+    let size = params.size.to_array().map(|n| n as usize);
+    let channels = [params.in_channels, params.out_channels].map(|n| n as usize);
+    let [source, d_target] =
+        [(source, channels[0]), (d_target, channels[1])].map(|(values, of)| {
+            let values = widen(&values[..of * size[0] * size[1]]);
+            values.into_iter().map(&term).collect::<Vec<_>>()
+        });
+    let rows = constants.rows as usize;
+    let strip = |strip| {
+        let counts = |pixel| pixel / size[0] / rows == strip;
+        weight_gradient(size, channels, &source, &d_target, counts)
+    };
+    (0..size[1].div_ceil(rows)).flat_map(strip).collect()
+}
+
 impl Reference for Kernel {
-    fn run(
-        params: &Params,
-        constants: &Constants,
-        Slices { source, d_target, partials }: Slices<'_>,
-    ) {
-        let size = params.size.to_array().map(|n| n as usize);
-        let channels = [params.in_channels, params.out_channels].map(|n| n as usize);
-        let (source, d_target) = (widen(source), widen(d_target));
-        let rows = constants.rows as usize;
-        let count = channels[1] * (9 * channels[0] + 1);
-        for strip in 0..size[1].div_ceil(rows) {
-            let counts = |pixel| pixel / size[0] / rows == strip;
-            let d_layer = weight_gradient(size, channels, &source, &d_target, counts);
-            for i in 0..count {
-                partials[strip * count + i] = d_layer[i] as f32;
-            }
-        }
+    fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
+        let Slices { source, d_target, partials } = slices;
+        let strips = strips(params, constants, source, d_target, |x| x);
+        partials.iter_mut().zip(strips).for_each(|(partial, sum)| *partial = sum as f32);
+    }
+
+    /// A rounding for each pixel of the strip.
+    fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
+        let magnitudes = strips(params, constants, slices.source, slices.d_target, f64::abs);
+        let error = f64::from(constants.rows * params.size.x + 2) * UNIT;
+        Tolerances { partials: Tolerance::Each(magnitudes.iter().map(|m| error * m).collect()) }
     }
 }

@@ -1,11 +1,20 @@
 use super::inside;
-use crate::gpu::Reference;
-use crate::kernels::denoising::{Constants, Kernel, Params, Slices};
+use super::rounding::{UNIT, chain};
+use crate::gpu::{Reference, Tolerance};
+use crate::kernels::denoising::{Constants, Kernel, Params, Slices, Tolerances};
 
-impl Reference for Kernel {
-    /// The whole sums go into the first partials: how many there are is the device's choice.
-    fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
-        let Slices { denoised, render, d_denoised, d_render, mse_partials, tv_partials } = slices;
+/// Gradients and sums, in double precision.
+struct Terms {
+    d_denoised: Vec<f64>,
+    d_render: Vec<f64>,
+    squares: f64,
+    tv: f64,
+}
+
+impl Terms {
+    /// With sums of magnitudes for the gradients, where `term` makes those of their terms.
+    fn new(params: &Params, slices: &Slices<'_>, term: impl Fn(f64) -> f64) -> Self {
+        let Slices { denoised, render, .. } = slices;
         let (width, values) = (params.width as usize, 3 * (params.width * params.height) as usize);
         let counts = |i: usize| {
             inside(i, [params.width, params.height], [params.interior_begin, params.interior_end])
@@ -15,11 +24,9 @@ impl Reference for Kernel {
         for i in (0..values).filter(|&i| counts(i)) {
             let difference = f64::from(denoised[i]) - f64::from(render[i]);
             squares += difference * difference;
-            d[i] += 2.0 * u * f64::from(params.mean_scale) * difference;
+            d[i] += term(2.0 * u * f64::from(params.mean_scale) * difference);
         }
-        for i in 0..values {
-            d_render[i] = -d[i] as f32;
-        }
+        let d_render = d.iter().map(|d| -d).collect();
         for i in (0..values).filter(|&i| counts(i)) {
             let (row, height) = (i / width, params.height as usize);
             let right = (i % width + 1 < width).then_some((i + 1, params.x_scale));
@@ -28,15 +35,37 @@ impl Reference for Kernel {
                 let (scale, step) =
                     (f64::from(scale), f64::from(denoised[j]) - f64::from(denoised[i]));
                 tv += scale * step * step;
-                d[j] += 2.0 * v * scale * step;
-                d[i] -= 2.0 * v * scale * step;
+                d[j] += term(2.0 * v * scale * step);
+                d[i] += term(-2.0 * v * scale * step);
             }
         }
-        for i in 0..values {
-            d_denoised[i] = d[i] as f32;
-        }
+        Self { d_denoised: d, d_render, squares, tv }
+    }
+}
+
+impl Reference for Kernel {
+    /// The whole sums go into the first partials: how many there are is the device's choice.
+    fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
+        let terms = Terms::new(params, &slices, |x| x);
+        let Slices { d_denoised, d_render, mse_partials, tv_partials, .. } = slices;
+        d_denoised.iter_mut().zip(terms.d_denoised).for_each(|(to, d)| *to = d as f32);
+        d_render.iter_mut().zip(terms.d_render).for_each(|(to, d)| *to = d as f32);
         mse_partials.fill(0.0);
         tv_partials.fill(0.0);
-        (mse_partials[0], tv_partials[0]) = (squares as f32, tv as f32);
+        (mse_partials[0], tv_partials[0]) = (terms.squares as f32, terms.tv as f32);
+    }
+
+    /// Each term is a product of five factors, and there are five of them.
+    fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
+        let terms = Terms::new(params, &slices, f64::abs);
+        let bounds =
+            |sums: Vec<f64>| Tolerance::Each(sums.iter().map(|m| 10.0 * UNIT * m.abs()).collect());
+        let sum_error = (chain(0) + f64::from(constants.rows) + 6.0) * UNIT;
+        Tolerances {
+            d_denoised: bounds(terms.d_denoised),
+            d_render: bounds(terms.d_render),
+            mse_partials: Tolerance::Sum(sum_error * terms.squares),
+            tv_partials: Tolerance::Sum(sum_error * terms.tv),
+        }
     }
 }

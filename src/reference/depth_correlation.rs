@@ -1,78 +1,100 @@
-//! The Pearson loss in double precision.
+//! The Pearson loss, in any number.
 
-use glam::{DVec2, DVec3};
+use glam::Vec2;
 
+use super::rounding::{Rounded, chain};
 use crate::gpu::Reference;
 use crate::kernels::DepthGradient;
-use crate::kernels::depth_correlation::{Constants, EPSILON, Kernel, Params, Slices};
+use crate::kernels::depth_correlation::{Constants, EPSILON, Kernel, Params, Slices, Tolerances};
+use crate::tone::Real;
 
 /// P, and what multiplies a - mean a and b - mean b in its gradient with respect to a.
 #[derive(Clone, Copy, Debug)]
-pub struct Pearson {
+pub struct Pearson<T> {
     /// 1 - correlation.
-    pub value: f64,
+    pub value: T,
     /// Of a - mean a.
-    pub a_scale: f64,
+    pub a_scale: T,
     /// Of b - mean b.
-    pub b_scale: f64,
+    pub b_scale: T,
 }
 
 /// P from the sums of aa, ab and bb about the means of `n` values.
-pub fn pearson(n: f64, products: DVec3) -> Pearson {
-    if products.x == 0.0 || products.z == 0.0 {
-        return Pearson { value: 1.0, a_scale: 0.0, b_scale: 0.0 };
+pub fn pearson<T: Real>(n: f64, [aa, ab, bb]: [T; 3]) -> Pearson<T> {
+    let (zero, one) = (T::of(0.0), T::of(1.0));
+    if aa == zero || bb == zero {
+        return Pearson { value: one, a_scale: zero, b_scale: zero };
     }
-    let [deviation_a, deviation_b] = [products.x, products.z].map(|sum| (sum / (n - 1.0)).sqrt());
-    let [a, b] = [deviation_a, deviation_b].map(|deviation| deviation + EPSILON);
-    let correlation = products.y / (n * a * b);
+    let [all, others] = [T::of(n), T::of(n - 1.0)];
+    let [deviation_a, deviation_b] = [aa, bb].map(|sum| (sum / others).sqrt());
+    let [a, b] = [deviation_a, deviation_b].map(|deviation| deviation + T::of(EPSILON));
+    let correlation = ab / all / a / b;
     Pearson {
-        value: 1.0 - correlation,
-        a_scale: correlation / (a * (n - 1.0) * deviation_a),
-        b_scale: -1.0 / (n * a * b),
+        value: one - correlation,
+        a_scale: correlation / a / (others * deviation_a),
+        b_scale: -one / all / a / b,
     }
+}
+
+/// Mean of a and of b, scales of a and of b, then P, of one region.
+fn correlation(params: &Params, slices: &Slices<'_>, region: usize) -> [Rounded; 5] {
+    let [left, top, width, height] = slices.regions[region];
+    let pixels = width * height;
+    let (first, count, weight) = match region as u32 {
+        0 => (0, params.view_chunks, params.view_weight),
+        region => {
+            let first = params.view_chunks + (region - 1) * params.box_chunks;
+            (first, params.box_chunks, params.box_weight)
+        }
+    };
+    let (chain, n) = (chain(count as usize), Rounded::of(pixels.into()));
+    let chunks = || {
+        let of = &slices.moments[first as usize..][..count as usize];
+        (0..).zip(of).map(|(i, of)| {
+            let values = params.chunk_size.min(pixels - i * params.chunk_size);
+            (Rounded::of(values.into()), of.mean.to_array().map(Rounded::exact), of.products)
+        })
+    };
+    let mean =
+        [0, 1].map(|c| Rounded::sum(chain, chunks().map(|(count, mean, _)| count * mean[c])) / n);
+    let products = [(0, 0), (0, 1), (1, 1)].map(|(c, d)| {
+        let term = |(count, of, products): (Rounded, [Rounded; 2], glam::Vec3)| {
+            let about = count * ((of[c] - mean[c]) * (of[d] - mean[d]));
+            Rounded::exact(products[c + d]) + about
+        };
+        Rounded::sum(chain, chunks().map(term))
+    });
+    let corner = (top * params.width + left) as usize;
+    let pivot = [slices.render[params.first as usize + corner], slices.depth[corner]];
+    let Pearson { value, a_scale, b_scale } = pearson(pixels.into(), products);
+    let weight = Rounded::exact(weight);
+    let mean = [0, 1].map(|c| mean[c] + Rounded::exact(pivot[c]));
+    [mean[0], mean[1], weight * a_scale, weight * b_scale, value]
+}
+
+/// The correlations of all regions, the view first.
+fn correlations(params: &Params, slices: &Slices<'_>) -> Vec<[Rounded; 5]> {
+    (0..params.region_count as usize).map(|region| correlation(params, slices, region)).collect()
 }
 
 impl Reference for Kernel {
     fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
-        for (region, &[left, top, width, height]) in slices.regions.iter().enumerate() {
-            let (pixels, is_view) = (width * height, region == 0);
-            let chunks = match region {
-                0 => 0..params.view_chunks,
-                _ => {
-                    let first = params.view_chunks + (region as u32 - 1) * params.box_chunks;
-                    first..first + params.box_chunks
-                }
-            };
-            let counted = || {
-                let of = &slices.moments[chunks.start as usize..chunks.end as usize];
-                (0..).zip(of).map(|(i, of)| {
-                    (f64::from(params.chunk_size.min(pixels - i * params.chunk_size)), of)
-                })
-            };
-            let n = f64::from(pixels);
-            let sum: DVec2 = counted().map(|(count, of)| count * of.mean.as_dvec2()).sum();
-            let products: DVec3 = counted()
-                .map(|(count, of)| {
-                    let d = of.mean.as_dvec2() - sum / n;
-                    of.products.as_dvec3() + count * DVec3::new(d.x * d.x, d.x * d.y, d.y * d.y)
-                })
-                .sum();
-            let Pearson { value, a_scale, b_scale } = pearson(n, products);
-            let weight = f64::from(if is_view { params.view_weight } else { params.box_weight });
-            let corner = (top * params.width + left) as usize;
-            let pivot = DVec2::new(
-                slices.render[params.first as usize + corner].into(),
-                slices.depth[corner].into(),
-            );
-            slices.gradients[region] = DepthGradient {
-                mean: (pivot + sum / n).as_vec2(),
-                a_scale: (weight * a_scale) as f32,
-                b_scale: (weight * b_scale) as f32,
-            };
+        for (region, of) in correlations(params, &slices).into_iter().enumerate() {
+            let [a, b, a_scale, b_scale, value] = of.map(|of| of.value as f32);
+            slices.gradients[region] = DepthGradient { mean: Vec2::new(a, b), a_scale, b_scale };
             match region {
-                0 => slices.view_values[0] = value as f32,
-                _ => slices.box_values[region - 1] = value as f32,
+                0 => slices.view_values[0] = value,
+                _ => slices.box_values[region - 1] = value,
             }
+        }
+    }
+
+    fn tolerances(params: &Params, _: &Constants, slices: Slices<'_>) -> Tolerances {
+        let regions = correlations(params, &slices);
+        Tolerances {
+            gradients: regions.iter().flat_map(|of| of[..4].iter().copied()).collect(),
+            view_values: regions[..1].iter().map(|of| of[4]).collect(),
+            box_values: regions[1..].iter().map(|of| of[4]).collect(),
         }
     }
 }

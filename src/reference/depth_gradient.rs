@@ -1,25 +1,36 @@
-use crate::gpu::Reference;
-use crate::kernels::depth_gradient::{Constants, Kernel, Params, Slices};
+use super::rounding::{Rounded, values};
+use crate::gpu::{Reference, Tolerance};
+use crate::kernels::depth_gradient::{Constants, Kernel, Params, Slices, Tolerances};
+
+/// The gradient of every pixel: what each region around it gives.
+fn d_depths(params: &Params, slices: &Slices<'_>) -> Vec<Rounded> {
+    let (size, count) = (params.size, params.region_count as usize);
+    let regions = || slices.regions.iter().zip(slices.gradients).take(count);
+    let pixel = |i: usize| {
+        let (x, y) = (i as u32 % size.x, i as u32 / size.x);
+        let around = |&(&[left, top, width, height], _): &(&[u32; 4], _)| {
+            (left..left + width).contains(&x) && (top..top + height).contains(&y)
+        };
+        let at = [slices.render[params.first as usize + i], slices.depth[i]].map(Rounded::exact);
+        let terms = regions().filter(around).map(|(_, of)| {
+            let [a, b] = [0, 1].map(|c| at[c] - Rounded::exact(of.mean[c]));
+            Rounded::exact(of.a_scale) * a + Rounded::exact(of.b_scale) * b
+        });
+        Rounded::sum(count as f64, terms)
+    };
+    (0..size.element_product() as usize).map(pixel).collect()
+}
 
 impl Reference for Kernel {
     fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
-        let (size, first) = (params.size, params.first as usize);
-        for i in 0..(size.x * size.y) as usize {
-            let (x, y) = (i as u32 % size.x, i as u32 / size.x);
-            let [a, b] = [slices.render[first + i], slices.depth[i]].map(f64::from);
-            let regions = slices.regions.iter().zip(slices.gradients);
-            let around = |&(&[left, top, width, height], _): &(&[u32; 4], _)| {
-                (left..left + width).contains(&x) && (top..top + height).contains(&y)
-            };
-            let d: f64 = regions
-                .take(params.region_count as usize)
-                .filter(around)
-                .map(|(_, gradient)| {
-                    f64::from(gradient.a_scale) * (a - f64::from(gradient.mean.x))
-                        + f64::from(gradient.b_scale) * (b - f64::from(gradient.mean.y))
-                })
-                .sum();
-            slices.d_render[first + i] = d as f32;
-        }
+        let gradients = values(d_depths(params, &slices));
+        let plane = &mut slices.d_render[params.first as usize..];
+        plane.iter_mut().zip(gradients).for_each(|(to, d)| *to = d);
+    }
+
+    fn tolerances(params: &Params, _: &Constants, slices: Slices<'_>) -> Tolerances {
+        let mut bounds = vec![0.0; params.first as usize];
+        bounds.extend(d_depths(params, &slices).into_iter().map(Rounded::bound));
+        Tolerances { d_render: Tolerance::Each(bounds) }
     }
 }

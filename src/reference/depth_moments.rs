@@ -1,32 +1,49 @@
-use glam::{DVec2, Vec3};
+use glam::{Vec2, Vec3};
 
+use super::rounding::{Rounded, chain};
 use crate::gpu::Reference;
 use crate::kernels::DepthMoments;
-use crate::kernels::depth_moments::{Constants, Kernel, Params, Slices};
+use crate::kernels::depth_moments::{Constants, Kernel, Params, Slices, Tolerances};
+use crate::tone::Real;
+
+/// Means of a and b, then the sums of aa, ab and bb about them, of every chunk.
+fn moments(params: &Params, slices: &Slices<'_>) -> impl Iterator<Item = [Rounded; 5]> {
+    (0..params.chunk_count).map(|workgroup| {
+        let (mut region, mut chunk) = (0, workgroup);
+        if workgroup >= params.view_chunks {
+            let beyond = workgroup - params.view_chunks;
+            (region, chunk) = (1 + beyond / params.box_chunks, beyond % params.box_chunks);
+        }
+        let [left, top, width, height] = slices.regions[region as usize].map(|x| x as usize);
+        let value = |i: usize| {
+            let at = (top + i / width) * params.width as usize + left + i % width;
+            [slices.render[params.first as usize + at], slices.depth[at]].map(Rounded::exact)
+        };
+        let [pivot_a, pivot_b] = value(0);
+        let first = (chunk * params.chunk_size) as usize;
+        let end = (width * height).min(first + params.chunk_size as usize);
+        let values: Vec<[Rounded; 2]> =
+            (first..end).map(|i| value(i)).map(|[a, b]| [a - pivot_a, b - pivot_b]).collect();
+        let (chain, count) = (chain(values.len()), Rounded::of(values.len() as f64));
+        let mean = [0, 1].map(|c| Rounded::sum(chain, values.iter().map(|v| v[c])) / count);
+        let [aa, ab, bb] = [(0, 0), (0, 1), (1, 1)].map(|(c, d)| {
+            let products = values.iter().map(|v| (v[c] - mean[c]) * (v[d] - mean[d]));
+            Rounded::sum(chain, products)
+        });
+        [mean[0], mean[1], aa, ab, bb]
+    })
+}
 
 impl Reference for Kernel {
-    fn run(params: &Params, _: &Constants, Slices { render, depth, regions, moments }: Slices<'_>) {
-        for workgroup in 0..params.chunk_count {
-            let (mut region, mut chunk) = (0, workgroup);
-            if workgroup >= params.view_chunks {
-                let beyond = workgroup - params.view_chunks;
-                (region, chunk) = (1 + beyond / params.box_chunks, beyond % params.box_chunks);
-            }
-            let [left, top, width, height] = regions[region as usize].map(|x| x as usize);
-            let value = |i: usize| {
-                let at = (top + i / width) * params.width as usize + left + i % width;
-                DVec2::new(render[params.first as usize + at].into(), depth[at].into())
-            };
-            let first = (chunk * params.chunk_size) as usize;
-            let end = (width * height).min(first + params.chunk_size as usize);
-            let values: Vec<DVec2> = (first..end).map(|i| value(i) - value(0)).collect();
-            let mean = values.iter().sum::<DVec2>() / values.len() as f64;
-            let sum = |of: fn(DVec2) -> f64| values.iter().map(|&v| of(v - mean)).sum::<f64>();
-            let products = [sum(|d| d.x * d.x), sum(|d| d.x * d.y), sum(|d| d.y * d.y)];
-            moments[workgroup as usize] = DepthMoments {
-                mean: mean.as_vec2(),
-                products: Vec3::from_array(products.map(|p| p as f32)),
-            };
+    fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
+        let all: Vec<_> = moments(params, &slices).collect();
+        for (moments, of) in slices.moments.iter_mut().zip(all) {
+            let [a, b, aa, ab, bb] = of.map(|of| of.value as f32);
+            *moments = DepthMoments { mean: Vec2::new(a, b), products: Vec3::new(aa, ab, bb) };
         }
+    }
+
+    fn tolerances(params: &Params, _: &Constants, slices: Slices<'_>) -> Tolerances {
+        Tolerances { moments: moments(params, &slices).flatten().collect() }
     }
 }

@@ -1,6 +1,14 @@
-use crate::gpu::Reference;
-use crate::kernels::loss_log::{Constants, Kernel, Params, Slices};
+use super::rounding::{Rounded, chain};
+use crate::gpu::{Reference, Tolerance};
+use crate::kernels::loss_log::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::status::STATUS_NOT_FINITE;
+
+/// The mean of a term.
+fn mean(params: &Params, partials: &[f32], term: usize) -> Rounded {
+    let count = params.partial_counts[term] as usize;
+    let terms = partials[..count].iter().copied().map(Rounded::exact);
+    Rounded::sum(chain(count), terms) * Rounded::exact(params.mean_scales[term])
+}
 
 impl Reference for Kernel {
     fn run(
@@ -10,10 +18,8 @@ impl Reference for Kernel {
     ) {
         let row = (params.slot * params.term_count) as usize;
         for (term, partials) in [first_partials, second_partials].into_iter().enumerate() {
-            let count = params.partial_counts[term] as usize;
-            let sum: f64 = partials[..count].iter().map(|&x| f64::from(x)).sum();
-            let mean = (sum * f64::from(params.mean_scales[term])) as f32;
-            if count > 0 {
+            let mean = mean(params, partials, term).value as f32;
+            if params.partial_counts[term] > 0 {
                 log[row + params.terms[term] as usize] = mean;
             }
             if !mean.is_finite() {
@@ -21,5 +27,17 @@ impl Reference for Kernel {
             }
         }
         statuses[params.slot as usize] = status[0];
+    }
+
+    fn tolerances(params: &Params, _: &Constants, slices: Slices<'_>) -> Tolerances {
+        let mut log = vec![0.0; slices.log.len()];
+        let partials = [slices.first_partials, slices.second_partials];
+        for (term, partials) in partials.into_iter().enumerate() {
+            if params.partial_counts[term] > 0 {
+                let at = params.slot * params.term_count + params.terms[term];
+                log[at as usize] = mean(params, partials, term).bound();
+            }
+        }
+        Tolerances { log: Tolerance::Each(log), ..Tolerances::default() }
     }
 }

@@ -1,59 +1,73 @@
-//! The norm of one channel in double precision: statistics of the image itself, biased variance, affine, `ReLU`.
+//! The norm of one channel, in any number: statistics of the image itself, biased variance, affine, `ReLU`.
 
-use super::conv3x3::activate;
+use super::rounding::{Gated, Rounded};
+use crate::kernels::ChannelStatistics;
 use crate::kernels::norm_merge::EPSILON;
+use crate::tone::Real;
 
 /// Mean and 1 / standard deviation.
 #[derive(Clone, Copy, Debug)]
-pub struct Statistics {
+pub struct Statistics<T = f64> {
     /// Mean of the channel.
-    pub mean: f64,
+    pub mean: T,
     /// 1 / sqrt(variance + EPSILON).
-    pub inverse_deviation: f64,
+    pub inverse_deviation: T,
 }
 
 /// gamma and beta of a channel.
 #[derive(Clone, Copy, Debug)]
-pub struct Affine {
+pub struct Affine<T = f64> {
     /// The scale.
-    pub gamma: f64,
+    pub gamma: T,
     /// The shift.
-    pub beta: f64,
+    pub beta: T,
 }
 
 impl Statistics {
     /// Those of a channel's values.
     pub fn of(values: &[f64]) -> Self {
-        let [mean, squares] = moments(values);
-        Self::new(mean, squares / values.len() as f64)
+        let n = values.len() as f64;
+        let mean = values.iter().sum::<f64>() / n;
+        Self::new(mean, values.iter().map(|z| (z - mean).powi(2)).sum::<f64>() / n)
     }
+}
 
-    pub(super) fn new(mean: f64, variance: f64) -> Self {
-        Self { mean, inverse_deviation: 1.0 / (variance + EPSILON).sqrt() }
+impl<T: Real> Statistics<T> {
+    pub(super) fn new(mean: T, variance: T) -> Self {
+        Self { mean, inverse_deviation: T::of(1.0) / (variance + T::of(EPSILON)).sqrt() }
     }
 
     /// (z - mean) / deviation.
-    pub fn normalised(&self, z: f64) -> f64 {
+    pub fn normalised(&self, z: T) -> T {
         (z - self.mean) * self.inverse_deviation
     }
 }
 
-impl Affine {
+impl<T: Real> Affine<T> {
     /// gamma n + beta: what the `ReLU` sees.
-    pub fn apply(&self, normalised: f64) -> f64 {
+    pub fn apply(&self, normalised: T) -> T {
         self.gamma * normalised + self.beta
     }
 }
 
-/// The mean and the sum of squared deviations.
-pub(super) fn moments(values: &[f64]) -> [f64; 2] {
-    let mean = values.iter().sum::<f64>() / values.len() as f64;
-    [mean, values.iter().map(|z| (z - mean).powi(2)).sum()]
+/// relu(gamma n + beta) of every value of a channel; a NaN stays one.
+pub fn forward<T: Real>(statistics: Statistics<T>, affine: Affine<T>, z: &[T]) -> Vec<T> {
+    let relu = |y: T| if y.partial_cmp(&y).is_none() { y } else { y.at_least(T::of(0.0)) };
+    z.iter().map(|&z| relu(affine.apply(statistics.normalised(z)))).collect()
 }
 
-/// relu(gamma n + beta) of every value of a channel.
-pub fn forward(statistics: Statistics, affine: Affine, z: &[f64]) -> Vec<f64> {
-    z.iter().map(|&z| activate(1, affine.apply(statistics.normalised(z)))).collect()
+/// `d_y` and `d_y` n of every value.
+pub fn backward_terms<T: Gated>(
+    statistics: Statistics<T>,
+    affine: Affine<T>,
+    z: &[T],
+    d_output: &[T],
+) -> impl Iterator<Item = [T; 2]> {
+    z.iter().zip(d_output).map(move |(&z, &d)| {
+        let normalised = statistics.normalised(z);
+        let d_y = d.where_positive(affine.apply(normalised));
+        [d_y, d_y * normalised]
+    })
 }
 
 /// The sums over the values of `d_y` and of `d_y` n: the gradients of beta and of gamma.
@@ -63,45 +77,50 @@ pub fn backward_sums(
     z: &[f64],
     d_output: &[f64],
 ) -> [f64; 2] {
-    let mut sums = [0.0; 2];
-    for (&z, &d) in z.iter().zip(d_output) {
-        let normalised = statistics.normalised(z);
-        if affine.apply(normalised) > 0.0 {
-            sums[0] += d;
-            sums[1] += d * normalised;
-        }
-    }
-    sums
+    let terms = backward_terms(statistics, affine, z, d_output);
+    terms.fold([0.0; 2], |sums, terms| [sums[0] + terms[0], sums[1] + terms[1]])
 }
 
 /// The gradient of every value, given the sums of [`backward_sums`] divided by the number of values.
-pub fn backward(
-    statistics: Statistics,
-    affine: Affine,
-    means: [f64; 2],
-    z: &[f64],
-    d_output: &[f64],
-) -> Vec<f64> {
-    let one = |(&z, &d): (&f64, &f64)| {
+pub fn backward<T: Gated>(
+    statistics: Statistics<T>,
+    affine: Affine<T>,
+    means: [T; 2],
+    z: &[T],
+    d_output: &[T],
+) -> Vec<T> {
+    let one = |(&z, &d): (&T, &T)| {
         let normalised = statistics.normalised(z);
-        let d_y = if affine.apply(normalised) > 0.0 { d } else { 0.0 };
+        let d_y = d.where_positive(affine.apply(normalised));
         let centred = d_y - means[0] - normalised * means[1];
         affine.gamma * statistics.inverse_deviation * centred
     };
     z.iter().zip(d_output).map(one).collect()
 }
 
-impl From<crate::kernels::ChannelStatistics> for Statistics {
-    fn from(statistics: crate::kernels::ChannelStatistics) -> Self {
+impl From<ChannelStatistics> for Statistics<Rounded> {
+    fn from(statistics: ChannelStatistics) -> Self {
         Self {
-            mean: statistics.mean.into(),
-            inverse_deviation: statistics.inverse_deviation.into(),
+            mean: Rounded::exact(statistics.mean),
+            inverse_deviation: Rounded::exact(statistics.inverse_deviation),
         }
     }
 }
 
 /// gamma and beta of channel `channel` of a layer at `offset`.
-pub(super) fn affine(values: &[f32], offset: u32, channels: usize, channel: usize) -> Affine {
+pub(super) fn affine(
+    values: &[f32],
+    offset: u32,
+    channels: u32,
+    channel: usize,
+) -> Affine<Rounded> {
     let at = offset as usize + channel;
-    Affine { gamma: values[at].into(), beta: values[at + channels].into() }
+    let [gamma, beta] = [at, at + channels as usize].map(|at| Rounded::exact(values[at]));
+    Affine { gamma, beta }
+}
+
+/// Channel `channel` of an image.
+pub(super) fn plane(image: &[f32], pixels: u32, channel: usize) -> Vec<Rounded> {
+    let pixels = pixels as usize;
+    image[channel * pixels..][..pixels].iter().copied().map(Rounded::exact).collect()
 }

@@ -1,25 +1,31 @@
-use super::norm::{affine, backward};
-use super::ssim_forward::widen;
+use super::norm::{affine, backward, plane};
+use super::rounding::{Rounded, values};
 use crate::gpu::Reference;
-use crate::kernels::norm_backward::{Constants, Kernel, Params, Slices};
+use crate::kernels::norm_backward::{Constants, Kernel, Params, Slices, Tolerances};
+use crate::tone::Real;
+
+/// The gradient of every value of every channel.
+fn d_source(params: &Params, slices: &Slices<'_>) -> Vec<Rounded> {
+    let &Params { pixel_count, channel_count, offset, slot } = params;
+    let channel = |channel| {
+        let affine = affine(slices.values, offset, channel_count, channel);
+        let statistics = slices.statistics[slot as usize + channel].into();
+        let sums = slices.sums[channel].to_array().map(Rounded::exact);
+        let means = sums.map(|sum| sum / Rounded::of(pixel_count.into()));
+        let [z, d] =
+            [slices.source, slices.d_target].map(|image| plane(image, pixel_count, channel));
+        backward(statistics, affine, means, &z, &d)
+    };
+    (0..channel_count as usize).flat_map(channel).collect()
+}
 
 impl Reference for Kernel {
-    fn run(
-        params: &Params,
-        _: &Constants,
-        Slices { values, statistics, sums, source, d_target, d_source }: Slices<'_>,
-    ) {
-        let (pixels, channels) = (params.pixel_count as usize, params.channel_count as usize);
-        for channel in 0..channels {
-            let affine = affine(values, params.offset, channels, channel);
-            let statistics = statistics[params.slot as usize + channel].into();
-            let means = (sums[channel].as_dvec2() / pixels as f64).to_array();
-            let plane = channel * pixels;
-            let [z, d] = [source, d_target].map(|image| widen(&image[plane..][..pixels]));
-            let d_z = backward(statistics, affine, means, &z, &d);
-            for i in 0..pixels {
-                d_source[plane + i] = d_z[i] as f32;
-            }
-        }
+    fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
+        let d_source = values(d_source(params, &slices));
+        slices.d_source.iter_mut().zip(d_source).for_each(|(to, value)| *to = value);
+    }
+
+    fn tolerances(params: &Params, _: &Constants, slices: Slices<'_>) -> Tolerances {
+        Tolerances { d_source: d_source(params, &slices).into_iter().collect() }
     }
 }

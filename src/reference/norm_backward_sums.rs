@@ -1,28 +1,38 @@
 use glam::Vec2;
 
-use super::norm::{affine, backward_sums};
-use super::ssim_forward::widen;
+use super::norm::{affine, backward_terms, plane};
+use super::rounding::{Rounded, chain};
 use crate::gpu::Reference;
-use crate::kernels::norm_backward_sums::{Constants, Kernel, Params, Slices};
+use crate::kernels::norm_backward_sums::{Constants, Kernel, Params, Slices, Tolerances};
+
+/// Both sums of every chunk of every channel.
+fn partials(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Vec<[Rounded; 2]> {
+    let &Params { pixel_count, channel_count, offset, slot } = params;
+    let chunk = constants.chunk as usize;
+    let channel = |channel| {
+        let affine = affine(slices.values, offset, channel_count, channel);
+        let statistics = slices.statistics[slot as usize + channel].into();
+        let [z, d] =
+            [slices.source, slices.d_target].map(|image| plane(image, pixel_count, channel));
+        let sums = z.chunks(chunk).zip(d.chunks(chunk)).map(|(z, d)| {
+            let terms: Vec<_> = backward_terms(statistics, affine, z, d).collect();
+            [0, 1].map(|which| Rounded::sum(chain(chunk), terms.iter().map(|of| of[which])))
+        });
+        sums.collect::<Vec<_>>()
+    };
+    (0..channel_count as usize).flat_map(channel).collect()
+}
 
 impl Reference for Kernel {
-    fn run(
-        params: &Params,
-        constants: &Constants,
-        Slices { values, statistics, source, d_target, partials }: Slices<'_>,
-    ) {
-        let (pixels, channels) = (params.pixel_count as usize, params.channel_count as usize);
-        let chunk = constants.chunk as usize;
-        let chunks = pixels.div_ceil(chunk);
-        for channel in 0..channels {
-            let affine = affine(values, params.offset, channels, channel);
-            let statistics = statistics[params.slot as usize + channel].into();
-            let [z, d] =
-                [source, d_target].map(|image| widen(&image[channel * pixels..][..pixels]));
-            for (k, (z, d)) in z.chunks(chunk).zip(d.chunks(chunk)).enumerate() {
-                let sums = backward_sums(statistics, affine, z, d);
-                partials[channel * chunks + k] = Vec2::from_array(sums.map(|sum| sum as f32));
-            }
+    fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
+        let partials = partials(params, constants, &slices);
+        for (partial, sums) in slices.partials.iter_mut().zip(partials) {
+            *partial = Vec2::from_array(sums.map(|sum| sum.value as f32));
         }
+    }
+
+    fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
+        let partials = partials(params, constants, &slices);
+        Tolerances { partials: partials.into_iter().flatten().collect() }
     }
 }

@@ -1,23 +1,28 @@
-use super::norm::{affine, forward};
-use super::ssim_forward::widen;
+use super::norm::{affine, forward, plane};
+use super::rounding::{Rounded, values};
 use crate::gpu::Reference;
-use crate::kernels::norm_forward::{Constants, Kernel, Params, Slices};
+use crate::kernels::norm_forward::{Constants, Kernel, Params, Slices, Tolerances};
+
+/// Every value of every channel.
+fn target(params: &Params, slices: &Slices<'_>) -> Vec<Rounded> {
+    let &Params { pixel_count, channel_count, offset, slot } = params;
+    let channel = |channel| {
+        let affine = affine(slices.values, offset, channel_count, channel);
+        let statistics = slices.statistics[slot as usize + channel].into();
+        let added = forward(statistics, affine, &plane(slices.source, pixel_count, channel));
+        let shortcut = plane(slices.shortcut, pixel_count, channel);
+        shortcut.into_iter().zip(added).map(|(shortcut, added)| shortcut + added)
+    };
+    (0..channel_count as usize).flat_map(channel).collect()
+}
 
 impl Reference for Kernel {
-    fn run(
-        params: &Params,
-        _: &Constants,
-        Slices { values, statistics, source, shortcut, target }: Slices<'_>,
-    ) {
-        let (pixels, channels) = (params.pixel_count as usize, params.channel_count as usize);
-        for channel in 0..channels {
-            let affine = affine(values, params.offset, channels, channel);
-            let statistics = statistics[params.slot as usize + channel].into();
-            let plane = channel * pixels;
-            let added = forward(statistics, affine, &widen(&source[plane..][..pixels]));
-            for i in 0..pixels {
-                target[plane + i] = (f64::from(shortcut[plane + i]) + added[i]) as f32;
-            }
-        }
+    fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
+        let target = values(target(params, &slices));
+        slices.target.iter_mut().zip(target).for_each(|(to, value)| *to = value);
+    }
+
+    fn tolerances(params: &Params, _: &Constants, slices: Slices<'_>) -> Tolerances {
+        Tolerances { target: target(params, &slices).into_iter().collect() }
     }
 }

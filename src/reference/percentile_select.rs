@@ -22,6 +22,6 @@ impl Reference for Kernel {
             let first = searches.iter().position(|search| search.prefix == prefix);
             searches[thread].histogram = first.unwrap_or(thread) as u32;
         }
-        histograms.fill(0);
+        histograms[..4096].fill(0);
     }
 }

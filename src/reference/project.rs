@@ -1,14 +1,15 @@
 //! One Gaussian from world space to the image plane, in f64.
 
-use glam::{DMat3, DVec2, DVec3, UVec2};
+use glam::{DMat3, DVec2, DVec3, DVec4, UVec2};
 
 use super::camera::{Camera, rotation, unit_quat};
 use super::gaussian::{Gaussian, Planes, sigmoid};
+use super::rounding::{UNIT, sensitivity};
 use super::sh::sh_basis;
-use super::splat::{Splat, splat_tile_rows, splat_tiles};
-use crate::gpu::Reference;
+use super::splat::{Splat, extent_error, splat_level, splat_tile_rows, splat_tiles};
+use crate::gpu::{Reference, Tolerance};
 use crate::kernels::ProjectedSplat;
-use crate::kernels::project::{CULLED, Constants, Kernel, Params, Slices};
+use crate::kernels::project::{CULLED, Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::splat::{ALPHA_MIN, DILATION};
 
 /// What one Gaussian is on the image plane.
@@ -69,44 +70,209 @@ pub fn project_gaussian(
     })
 }
 
+impl Projection {
+    /// As the kernel stores it.
+    fn stored(&self) -> ProjectedSplat {
+        ProjectedSplat {
+            mean2d: self.splat.mean2d.as_vec2(),
+            conic: self.splat.conic.as_vec3(),
+            opacity: self.splat.opacity as f32,
+            half_extent: self.half_extent.as_vec2(),
+        }
+    }
+
+    /// mean2d, conic, opacity, half extent, colour, depth.
+    fn numbers(&self) -> [f64; 12] {
+        let Splat { mean2d, conic, opacity } = self.splat;
+        let ([x, y], [a, b, c]) = (mean2d.to_array(), conic.to_array());
+        let ([w, h], [r, g, blue]) = (self.half_extent.to_array(), self.color.to_array());
+        [x, y, a, b, c, opacity, w, h, r, g, blue, self.depth]
+    }
+}
+
+/// The tiles of an image that a splat covers.
+fn tile_count(params: &Params, constants: &Constants, splat: &ProjectedSplat) -> u32 {
+    let tile = UVec2::new(constants.tile_width, constants.tile_height);
+    let [top, bottom] = splat_tile_rows(splat, params.camera.size.y, tile);
+    let row = |row| {
+        let [first, end] = splat_tiles(splat, row, params.camera.size.x, tile);
+        end - first
+    };
+    (top..bottom).map(row).sum()
+}
+
+/// A view, and the Gaussians in it.
+struct Scene<'a> {
+    params: &'a Params,
+    constants: &'a Constants,
+    camera: Camera,
+    planes: Planes,
+}
+
+impl<'a> Scene<'a> {
+    fn new(params: &'a Params, constants: &'a Constants) -> Self {
+        let (count, feature_count) =
+            (params.gaussian_count as usize, constants.channels as usize - 3);
+        let planes = Planes { count, feature_count, sh_degree: constants.sh_degree };
+        let camera = Camera::from(&params.camera);
+        Self { params, constants, camera, planes }
+    }
+
+    fn project(&self, gaussian: &Gaussian) -> Option<Projection> {
+        let Params { near, sh_degree, .. } = *self.params;
+        let raw_colors = self.constants.raw_colors;
+        project_gaussian(&self.camera, near.into(), sh_degree, raw_colors, gaussian)
+    }
+
+    /// How far each of [`Projection::numbers`] may be off: the kernel gives them for a Gaussian that is off by a few
+    /// roundings, exponentials included, and rounds them a few times. None where that decides whether it is culled.
+    fn errors(&self, gaussian: &Gaussian) -> Option<[f64; 12]> {
+        let Gaussian { mean, quat, log_scale, raw_opacity, .. } = gaussian;
+        let far = mean.length() + self.camera.center().length();
+        let mut inputs = mean.to_array().to_vec();
+        inputs.extend(quat.to_array());
+        inputs.extend(log_scale.to_array());
+        inputs.push(*raw_opacity);
+        let errors: Vec<f64> = (0..inputs.len())
+            .map(|at| match at {
+                0..3 => 16.0 * UNIT * far,
+                3..7 => 16.0 * UNIT * quat.length(),
+                _ => (16.0 + 8.0 * inputs[at].abs()) * UNIT,
+            })
+            .collect();
+        let project = |inputs: &[f64]| {
+            self.project(&Gaussian {
+                mean: DVec3::from_slice(inputs),
+                quat: DVec4::from_slice(&inputs[3..]),
+                log_scale: DVec3::from_slice(&inputs[7..]),
+                raw_opacity: inputs[10],
+                ..gaussian.clone()
+            })
+        };
+        let is_culled = |inputs: &[f64]| project(inputs).is_none();
+        let is_fragile = (0..inputs.len()).any(|at| {
+            let mut moved = inputs.clone();
+            [errors[at], -errors[at]].into_iter().any(|error| {
+                moved[at] = inputs[at] + error;
+                is_culled(&moved) != is_culled(&inputs)
+            })
+        });
+        if is_fragile {
+            return None;
+        }
+        let Some(projection) = project(&inputs) else { return Some([0.0; 12]) };
+        let moved = sensitivity(&inputs, &errors, |inputs| {
+            project(inputs).map_or_else(|| vec![f64::NAN; 12], |p| p.numbers().to_vec())
+        });
+        let Splat { mean2d, conic, opacity } = projection.splat;
+        let size = self.camera.size.max_element();
+        let center = mean2d.abs() + size;
+        let widest = 64.0 * conic.x.max(conic.z);
+        // Sixteen terms, whose basis is a polynomial of magnitude 3 and degree 3.
+        let color = 128.0 * (1.0 + gaussian.sh.iter().map(|c| c.abs().max_element()).sum::<f64>());
+        let extent = projection.half_extent * extent_error(opacity as f32) / UNIT;
+        let own = [
+            16.0 * center.x,
+            16.0 * center.y,
+            widest,
+            widest,
+            widest,
+            8.0 * opacity,
+            extent.x,
+            extent.y,
+            color,
+            color,
+            color,
+            16.0 * far,
+        ];
+        Some(std::array::from_fn(|k| moved[k] + UNIT * own[k]))
+    }
+
+    /// The fewest and the most tiles of a splat whose numbers are off by `errors`.
+    fn tile_counts(&self, splat: &ProjectedSplat, errors: &[f64; 12]) -> [u32; 2] {
+        let extent = splat.half_extent.as_dvec2();
+        let conic = splat.conic.as_dvec3();
+        let shift = errors[0].max(errors[1]) * (conic.x + conic.z).sqrt();
+        let grown = [
+            errors[2] / conic.x,
+            errors[4] / conic.z,
+            errors[6] / extent.x,
+            errors[7] / extent.y,
+            extent_error(splat.opacity),
+        ];
+        let radius = f64::from(splat_level(splat.opacity)).sqrt();
+        let grown = (grown.into_iter().fold(0.0, f64::max) + shift / radius) as f32;
+        [1.0 - grown, 1.0 + grown].map(|factor| {
+            let (conic, half_extent) =
+                (splat.conic / (factor * factor), splat.half_extent * factor);
+            tile_count(
+                self.params,
+                self.constants,
+                &ProjectedSplat { conic, half_extent, ..*splat },
+            )
+        })
+    }
+}
+
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
         let Slices { parameters, splats, colors, depth_keys, ids, tile_counts } = slices;
-        let camera = Camera::from(&params.camera);
-        let (size, near) = (params.camera.size, params.near);
-        let (channels, sh_degree) = (constants.channels as usize, constants.sh_degree);
-        let feature_count = channels - 3;
-        let planes = Planes { count: params.gaussian_count as usize, feature_count, sh_degree };
-        let raw_colors = constants.raw_colors;
-        let tile = UVec2::new(constants.tile_width, constants.tile_height);
-        for i in 0..planes.count {
+        let scene = Scene::new(params, constants);
+        let channels = constants.channels as usize;
+        for i in 0..scene.planes.count {
             ids[i] = i as u32;
             depth_keys[i] = CULLED;
             tile_counts[i] = 0;
-            let gaussian = planes.load(parameters, i);
-            let Some(projection) =
-                project_gaussian(&camera, near.into(), params.sh_degree, raw_colors, &gaussian)
-            else {
-                continue;
-            };
-            splats[i] = ProjectedSplat {
-                mean2d: projection.splat.mean2d.as_vec2(),
-                conic: projection.splat.conic.as_vec3(),
-                opacity: projection.splat.opacity as f32,
-                half_extent: projection.half_extent.as_vec2(),
-            };
+            let gaussian = scene.planes.load(parameters, i);
+            let Some(projection) = scene.project(&gaussian) else { continue };
+            splats[i] = projection.stored();
             let values = projection.color.to_array().into_iter().chain(gaussian.features);
             for (color, value) in colors[channels * i..].iter_mut().zip(values) {
                 *color = value as f32;
             }
-            let [top, bottom] = splat_tile_rows(&splats[i], size.y, tile);
-            for row in top..bottom {
-                let [first, end] = splat_tiles(&splats[i], row, size.x, tile);
-                tile_counts[i] += end - first;
-            }
+            tile_counts[i] = tile_count(params, constants, &splats[i]);
             if tile_counts[i] > 0 {
                 depth_keys[i] = (projection.depth as f32).to_bits();
             }
+        }
+    }
+
+    /// A Gaussian at the border of being culled may be; one whose ellipse borders on a tile may cover it.
+    fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
+        let scene = Scene::new(params, constants);
+        let (n, channels) = (scene.planes.count, constants.channels as usize);
+        let [mut splats, mut colors, mut depth_keys, mut tile_counts] =
+            [8 * n, channels * n, n, n].map(|len| vec![0.0; len]);
+        for i in 0..n {
+            let gaussian = scene.planes.load(slices.parameters, i);
+            let Some(errors) = scene.errors(&gaussian) else {
+                splats[8 * i..][..8].fill(f64::INFINITY);
+                colors[channels * i..][..channels].fill(f64::INFINITY);
+                (depth_keys[i], tile_counts[i]) = (f64::INFINITY, f64::INFINITY);
+                continue;
+            };
+            let Some(projection) = scene.project(&gaussian) else { continue };
+            splats[8 * i..][..8].copy_from_slice(&errors[..8]);
+            colors[channels * i..][..3].copy_from_slice(&errors[8..11]);
+            let stored = projection.stored();
+            let count = tile_count(params, constants, &stored);
+            let [fewest, most] = scene.tile_counts(&stored, &errors);
+            tile_counts[i] = (count - count.min(fewest)).max(most.max(count) - count).into();
+            // The keys of positive numbers are as far apart as these in units of the last place.
+            let depth = projection.depth as f32;
+            let last_place = f64::from(depth.next_up()) - f64::from(depth);
+            depth_keys[i] = match (fewest, most) {
+                (_, 0) => 0.0,
+                (0, _) => f64::INFINITY,
+                _ => 1.0 + errors[11] / last_place,
+            };
+        }
+        Tolerances {
+            splats: Tolerance::Each(splats),
+            colors: Tolerance::Each(colors),
+            depth_keys: Tolerance::Each(depth_keys),
+            tile_counts: Tolerance::Each(tile_counts),
+            ..Tolerances::default()
         }
     }
 }

@@ -4,10 +4,11 @@ use glam::{DMat3, DVec2, DVec3, DVec4};
 
 use super::camera::{Camera, rotation, unit_quat};
 use super::gaussian::{Gaussian, Planes, sigmoid};
+use super::rounding::{UNIT, sensitivity};
 use super::sh::{sh_basis, sh_basis_gradient};
 use super::splat::Splat;
-use crate::gpu::Reference;
-use crate::kernels::project_backward::{Constants, Kernel, Params, Slices};
+use crate::gpu::{Reference, Tolerance};
+use crate::kernels::project_backward::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::splat::RECORD_HEAD;
 
 /// The gradients that arrive at one splat.
@@ -119,47 +120,143 @@ fn outer_product(column: DVec3, row: DVec3) -> DMat3 {
     DMat3::from_cols(column * row.x, column * row.y, column * row.z)
 }
 
+/// Numbers of a record before its channels.
+const HEAD: usize = RECORD_HEAD as usize;
+
+/// A view, and the Gaussians in it.
+struct Scene<'a> {
+    params: &'a Params,
+    constants: &'a Constants,
+    camera: Camera,
+    planes: Planes,
+}
+
+impl<'a> Scene<'a> {
+    fn new(params: &'a Params, constants: &'a Constants) -> Self {
+        let (count, feature_count) =
+            (params.gaussian_count as usize, constants.channels as usize - 3);
+        let planes = Planes { count, feature_count, sh_degree: constants.sh_degree };
+        let camera = Camera::from(&params.camera);
+        Self { params, constants, camera, planes }
+    }
+
+    /// What arrives at the splat of Gaussian `i` as `record` says, where clamped colours pass nothing on.
+    fn d_splat(&self, colors: &[f32], record: &[f64], i: usize) -> DSplat {
+        let first = self.constants.channels as usize * i;
+        let is_free = |c: usize| self.constants.raw_colors || colors[first + c] > 0.0;
+        let passes = |c: usize| if is_free(c) { record[HEAD + c] } else { 0.0 };
+        DSplat {
+            mean2d: DVec2::from_slice(record),
+            conic: DVec3::from_slice(&record[2..]),
+            opacity: record[5],
+            color: DVec3::from_array([0, 1, 2].map(passes)),
+            features: record[HEAD + 3..].to_vec(),
+        }
+    }
+
+    fn backward(&self, gaussian: &Gaussian, splat: &Splat, d_splat: &DSplat) -> Gaussian {
+        project_gaussian_backward(&self.camera, self.params.sh_degree, gaussian, splat, d_splat)
+    }
+
+    /// What roundings make of the gradient of a quaternion where the terms cancel, as they do for a sphere, which has none:
+    /// its entries are sums of products whose magnitudes these are.
+    fn quat_error(&self, gaussian: &Gaussian, splat: &Splat, d_splat: &DSplat) -> f64 {
+        let ([a, b, c], d) = (splat.conic.abs().to_array(), d_splat.conic.abs());
+        let d_xx = a * a * d.x + a * b * d.y + b * b * d.z;
+        let d_xy = 2.0 * a * b * d.x + (a * c + b * b) * d.y + 2.0 * b * c * d.z;
+        let d_yy = b * b * d.x + b * c * d.y + c * c * d.z;
+        let mean_in_view = self.camera.view(gaussian.mean);
+        let slope = self.camera.clamped_slope(mean_in_view);
+        let t = self.camera.focal / mean_in_view.z * (1.0 + slope * slope).map(f64::sqrt);
+        let scale = gaussian.log_scale.max_element().exp();
+        let d_u = DVec2::new(2.0 * d_xx * t.x + d_xy * t.y, 2.0 * d_yy * t.y + d_xy * t.x);
+        512.0 * UNIT * scale * scale * t.dot(d_u) / gaussian.quat.length().max(1e-12)
+    }
+
+    /// What the statistics of density control grow by.
+    fn damped_norm(&self, gaussian: &Gaussian, d_splat: &DSplat) -> f64 {
+        let Params { damping_weight, damping_depth, .. } = *self.params;
+        let (weight, depth) = (f64::from(damping_weight), self.camera.view(gaussian.mean).z);
+        let nearness = (depth / f64::from(damping_depth)).min(1.0);
+        let damping = weight * nearness * nearness + 1.0 - weight;
+        damping * (0.5 * self.camera.size * d_splat.mean2d).length()
+    }
+
+    /// The record of Gaussian `i`.
+    fn record(&self, d_splats: &[f32], i: usize) -> Vec<f64> {
+        let len = HEAD + self.constants.channels as usize;
+        d_splats[len * i..][..len].iter().map(|&d| d.into()).collect()
+    }
+}
+
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
         let Slices { parameters, splats, colors, tile_counts, d_splats, status, .. } = slices;
         let Slices { gradients, grad_norm_sums, visit_counts, .. } = slices;
-        let camera = Camera::from(&params.camera);
-        let (channels, sh_degree) = (constants.channels as usize, constants.sh_degree);
-        let feature_count = channels - 3;
-        let planes = Planes { count: params.gaussian_count as usize, feature_count, sh_degree };
-        let raw_colors = constants.raw_colors;
-        let head = RECORD_HEAD as usize;
-        let record = head + channels;
-        gradients[..planes.len()].fill(0.0);
-        for i in 0..planes.count {
-            if tile_counts[i] == 0 {
-                continue;
-            }
-            let d: Vec<f64> = d_splats[record * i..][..record].iter().map(|&d| d.into()).collect();
-            let is_free = |c: usize| raw_colors || colors[channels * i + c] > 0.0;
-            let passes = |c: usize| if is_free(c) { d[head + c] } else { 0.0 };
-            let d_splat = DSplat {
-                mean2d: DVec2::from_slice(&d[0..2]),
-                conic: DVec3::from_slice(&d[2..5]),
-                opacity: d[5],
-                color: DVec3::from_array([0, 1, 2].map(passes)),
-                features: d[head + 3..].to_vec(),
-            };
-            let gaussian = planes.load(parameters, i);
-            let splat = Splat::from(&splats[i]);
-            let gradient =
-                project_gaussian_backward(&camera, params.sh_degree, &gaussian, &splat, &d_splat);
-            planes.store(&gradient, i, |at, value| gradients[at] = value as f32);
-
+        let scene = Scene::new(params, constants);
+        gradients[..scene.planes.len()].fill(0.0);
+        for i in (0..scene.planes.count).filter(|&i| tile_counts[i] > 0) {
+            let d_splat = scene.d_splat(colors, &scene.record(d_splats, i), i);
+            let gaussian = scene.planes.load(parameters, i);
+            let gradient = scene.backward(&gaussian, &Splat::from(&splats[i]), &d_splat);
+            scene.planes.store(&gradient, i, |at, value| gradients[at] = value as f32);
             if status[0] == 0 {
-                let depth = camera.view(gaussian.mean).z;
-                let weight = f64::from(params.damping_weight);
-                let nearness = (depth / f64::from(params.damping_depth)).min(1.0);
-                let damping = weight * nearness * nearness + 1.0 - weight;
-                let norm = (0.5 * camera.size * d_splat.mean2d).length();
-                grad_norm_sums[i] += (damping * norm) as f32;
+                grad_norm_sums[i] += scene.damped_norm(&gaussian, &d_splat) as f32;
                 visit_counts[i] += 1;
             }
+        }
+    }
+
+    /// Backward stability: the kernel gives what the reference gives for inputs that are off by some roundings each.
+    /// Attributes also pass through sums and exponentials with terms of order one, means through the view.
+    fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
+        const OFF: f64 = 256.0 * UNIT;
+        let scene = Scene::new(params, constants);
+        let one = Planes { count: 1, ..scene.planes };
+        let far = scene.camera.center().length();
+        let [mut gradients, mut grad_norm_sums] =
+            [scene.planes.len(), scene.planes.count].map(|len| vec![0.0; len]);
+        for i in (0..scene.planes.count).filter(|&i| slices.tile_counts[i] > 0) {
+            let gaussian = scene.planes.load(slices.parameters, i);
+            let splat = Splat::from(&slices.splats[i]);
+            let mut inputs = vec![0.0; one.len()];
+            one.store(&gaussian, 0, |at, value| inputs[at] = value);
+            inputs.extend(splat.conic.to_array());
+            inputs.extend(scene.record(slices.d_splats, i));
+            let errors: Vec<f64> = (0..inputs.len())
+                .map(|at| {
+                    let beside = if at < 3 { far } else { 0.0 };
+                    OFF * (inputs[at].abs() + beside + if at < one.len() { 1.0 } else { 0.0 })
+                })
+                .collect();
+            let bounds = sensitivity(&inputs, &errors, |inputs| {
+                let (own, rest) = inputs.split_at(one.len());
+                let splat = Splat { conic: DVec3::from_slice(rest), ..splat };
+                let (gaussian, d_splat) =
+                    (one.load(own, 0), scene.d_splat(slices.colors, &rest[3..], i));
+                let gradient = scene.backward(&gaussian, &splat, &d_splat);
+                let mut numbers = vec![0.0; one.len() + 1];
+                one.store(&gradient, 0, |at, value| numbers[at] = value);
+                numbers[one.len()] = scene.damped_norm(&gaussian, &d_splat);
+                numbers
+            });
+            let d_splat = scene.d_splat(slices.colors, &scene.record(slices.d_splats, i), i);
+            let gradient = scene.backward(&gaussian, &splat, &d_splat);
+            scene.planes.store(&gradient, i, |at, value| gradients[at] = OFF * value.abs());
+            let mut moved = one.load(&bounds, 0);
+            // A basis is a polynomial of magnitude 3 and degree 3, which may vanish.
+            let basis = 64.0 * UNIT * d_splat.color.abs();
+            moved.sh.iter_mut().for_each(|bound| *bound += basis);
+            moved.quat += scene.quat_error(&gaussian, &splat, &d_splat);
+            scene.planes.store(&moved, i, |at, bound| gradients[at] += bound);
+            let norm = scene.damped_norm(&gaussian, &d_splat);
+            let sum = f64::from(slices.grad_norm_sums[i].abs()) + norm;
+            grad_norm_sums[i] = bounds[one.len()] + 16.0 * UNIT * norm + 2.0 * UNIT * sum;
+        }
+        Tolerances {
+            gradients: Tolerance::Each(gradients),
+            grad_norm_sums: Tolerance::Each(grad_norm_sums),
+            ..Tolerances::default()
         }
     }
 }

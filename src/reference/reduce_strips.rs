@@ -1,14 +1,29 @@
+use super::rounding::{Rounded, values};
 use crate::gpu::Reference;
-use crate::kernels::reduce_strips::{Constants, Kernel, Params, Slices};
+use crate::kernels::reduce_strips::{Constants, Kernel, Params, Slices, Tolerances};
+
+/// Every gradient of the buffer up to the layer's last.
+fn gradients(params: &Params, slices: &Slices<'_>) -> Vec<Rounded> {
+    let (count, offset) = (params.parameter_count as usize, params.offset as usize);
+    let before = slices.gradients[..offset + count].iter().copied().map(Rounded::exact);
+    let after = before.enumerate().map(|(i, gradient)| match i.checked_sub(offset) {
+        None => gradient,
+        Some(i) => {
+            let strips = (0..params.strip_count as usize).map(|strip| strip * count + i);
+            let terms = strips.map(|at| Rounded::exact(slices.partials[at]));
+            gradient + Rounded::sum(params.strip_count.into(), terms)
+        }
+    });
+    after.collect()
+}
 
 impl Reference for Kernel {
-    fn run(params: &Params, _: &Constants, Slices { partials, gradients }: Slices<'_>) {
-        let count = params.parameter_count as usize;
-        for i in 0..count {
-            let of_strip = |strip| f64::from(partials[strip * count + i]);
-            let sum: f64 = (0..params.strip_count as usize).map(of_strip).sum();
-            let gradient = &mut gradients[params.offset as usize + i];
-            *gradient = (f64::from(*gradient) + sum) as f32;
-        }
+    fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
+        let after = values(gradients(params, &slices));
+        slices.gradients.iter_mut().zip(after).for_each(|(gradient, after)| *gradient = after);
+    }
+
+    fn tolerances(params: &Params, _: &Constants, slices: Slices<'_>) -> Tolerances {
+        Tolerances { gradients: gradients(params, &slices).into_iter().collect() }
     }
 }

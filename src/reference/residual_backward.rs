@@ -1,7 +1,7 @@
 //! The gradient of the end of a denoiser stage in double precision.
 
-use crate::gpu::Reference;
-use crate::kernels::residual_backward::{Constants, Kernel, Params, Slices};
+use crate::gpu::{Reference, Tolerance};
+use crate::kernels::residual_backward::{Constants, Kernel, Params, Slices, Tolerances};
 
 /// What the gradient `d` of the result of [`super::residual::residual`] becomes behind the clamp, which lets it pass
 /// within 0 and 1, bounds included: the gradient of `R_0`, and the negative of those of I and u.
@@ -23,5 +23,10 @@ impl Reference for Kernel {
             d_stage_input[i] = -d as f32;
             d_render[i] = (f64::from(d_render[i]) + d) as f32;
         }
+    }
+
+    /// A difference and two products; what else there is rounds alike everywhere.
+    fn tolerances(_: &Params, _: &Constants, _: Slices<'_>) -> Tolerances {
+        Tolerances { d_update: Tolerance::Roundings(4.0), ..Tolerances::default() }
     }
 }

@@ -2,6 +2,7 @@
 
 use glam::{DVec2, DVec3, UVec2};
 
+use super::rounding::UNIT;
 use crate::kernels::ProjectedSplat;
 use crate::kernels::splat::{ALPHA_MIN, TRANSMITTANCE_MIN};
 
@@ -69,6 +70,12 @@ pub fn fragments(splats: &[Splat], pixel: DVec2, alpha_max: f64) -> (Vec<Fragmen
         before = after;
     }
     (fragments, before)
+}
+
+/// The relative error of an ellipse's extent: of the square root of [`splat_level`], whose logarithm is good to 2^-21
+/// where it is small, and of the quotients and roots around it.
+pub(super) fn extent_error(opacity: f32) -> f64 {
+    48.0 * UNIT + 1.1 / 2_097_152.0 / f64::from(splat_level(opacity))
 }
 
 /// Twice the sigma at which alpha falls to 1/255, a hair high.

@@ -1,11 +1,13 @@
-//! The gradient of L1 + SSIM in double precision.
+//! The gradient of L1 + SSIM.
 
-use glam::{UVec2, Vec3};
+use glam::UVec2;
 
 use super::inside;
-use super::ssim_forward::{blur, target, widen};
-use crate::gpu::Reference;
-use crate::kernels::ssim_backward::{Constants, Kernel, Params, Slices};
+use super::rounding::{Rounded, chain, values};
+use super::ssim_forward::{blur, rounded_blur, target};
+use crate::gpu::{Reference, Tolerance};
+use crate::kernels::ssim_backward::{Constants, Kernel, Params, Slices, Tolerances};
+use crate::tone::Real;
 
 /// The gradient of `l1_scale` sum|a - b| - `ssim_scale` sum SSIM with respect to one channel of the render `a`, sums over
 /// the pixels from `begin` to before `end`; `d_moments` are the derivatives that [`super::ssim_forward::ssim`] finds, 0
@@ -22,39 +24,70 @@ pub fn gradient(
         let plane: Vec<f64> = d_moments.iter().map(|d| d[m]).collect();
         blur(width, height, &plane)
     });
-    let sign = |x: f64| if x == 0.0 { 0.0 } else { x.signum() };
     let at = |i: usize| {
-        let d_ssim = blurred[0][i] + 2.0 * a[i] * blurred[1][i] + b[i] * blurred[2][i];
         let counts = inside(i, [width as u32, height as u32], interior);
         let difference = if counts { a[i] - b[i] } else { 0.0 };
-        l1_scale * sign(difference) - ssim_scale * d_ssim
+        let sign = if difference == 0.0 { 0.0 } else { difference.signum() };
+        l1_scale * sign - ssim_scale * d_ssim(a[i], b[i], [0, 1, 2].map(|m| blurred[m][i]))
     };
     (0..a.len()).map(at).collect()
 }
 
+/// dSSIM/da at one pixel, from the blurred derivatives.
+fn d_ssim<T: Real>(a: T, b: T, [mean, square, product]: [T; 3]) -> T {
+    mean + T::of(2.0) * a * square + b * product
+}
+
+/// The gradient and a - b of every value of the three channels.
+fn gradients(
+    params: &Params,
+    constants: &Constants,
+    slices: &Slices<'_>,
+) -> impl Iterator<Item = [Rounded; 2]> {
+    let size = [params.width as usize, params.height as usize];
+    let interior = [params.interior_begin, params.interior_end];
+    let pixels = size[0] * size[1];
+    (0..3).flat_map(move |channel: usize| {
+        let plane = channel * pixels..(channel + 1) * pixels;
+        let b = target(&slices.low[plane.clone()], &slices.tone[0], constants.tone_curve);
+        let blurred = [0, 1, 2].map(|m| {
+            let derivatives = slices.d_moments[plane.clone()].iter();
+            rounded_blur(size, &derivatives.map(|d| Rounded::exact(d[m])).collect::<Vec<_>>())
+        });
+        let [l1_scale, ssim_scale] = [params.l1_scale, params.ssim_scale].map(Rounded::exact);
+        (0..pixels).map(move |i| {
+            let a = Rounded::exact(slices.render[plane.start + i]);
+            let counts = inside(i, [params.width, params.height], interior);
+            let difference = if counts { a - b[i] } else { Rounded::default() };
+            let own = difference.value;
+            let sign = Rounded {
+                value: if own == 0.0 { 0.0 } else { own.signum() },
+                // Either one where a rounding of the curve decides.
+                error: if difference.error > 0.0 && difference.may_cross(0.0) { 2.0 } else { 0.0 },
+            };
+            let d_ssim = d_ssim(a, b[i], [0, 1, 2].map(|m| blurred[m][i]));
+            [l1_scale * sign - ssim_scale * d_ssim, difference]
+        })
+    })
+}
+
 impl Reference for Kernel {
     /// The whole sum goes into the first partial: how many there are is the device's choice.
-    fn run(
-        params: &Params,
-        constants: &Constants,
-        Slices { render, low, tone, d_moments, d_render, partials }: Slices<'_>,
-    ) {
-        let size = [params.width as usize, params.height as usize];
-        let interior = [params.interior_begin, params.interior_end];
-        let scales = [f64::from(params.l1_scale), f64::from(params.ssim_scale)];
-        let (a, b) = (widen(render), target(low, &tone[0], constants.tone_curve));
-        let d_moments: Vec<_> = d_moments.iter().map(Vec3::as_dvec3).map(Into::into).collect();
-        for channel in 0..3 {
-            let plane = channel * size[0] * size[1]..(channel + 1) * size[0] * size[1];
-            let [a, b] = [&a, &b].map(|image| &image[plane.clone()]);
-            let d = gradient(size, interior, scales, a, b, &d_moments[plane.clone()]);
-            for (i, d) in plane.zip(d) {
-                d_render[i] = d as f32;
-            }
+    fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
+        let gradients: Vec<_> = gradients(params, constants, &slices).collect();
+        let d_render = values(gradients.iter().map(|of| of[0]));
+        slices.d_render.iter_mut().zip(d_render).for_each(|(to, d)| *to = d);
+        slices.partials.fill(0.0);
+        slices.partials[0] = gradients.iter().map(|of| of[1].value.abs()).sum::<f64>() as f32;
+    }
+
+    fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
+        let gradients: Vec<_> = gradients(params, constants, &slices).collect();
+        let chain = chain(0) + f64::from(constants.columns * constants.rows);
+        let sum = Rounded::sum(chain, gradients.iter().map(|of| of[1].abs()));
+        Tolerances {
+            d_render: gradients.iter().map(|of| of[0]).collect(),
+            partials: Tolerance::Sum(sum.bound()),
         }
-        partials.fill(0.0);
-        let counts = |&i: &usize| inside(i, [params.width, params.height], interior);
-        let sum: f64 = (0..a.len()).filter(counts).map(|i| (a[i] - b[i]).abs()).sum();
-        partials[0] = sum as f32;
     }
 }

@@ -1,5 +1,6 @@
-use crate::gpu::Reference;
-use crate::kernels::structure_l1::{Constants, Kernel, Params, Slices};
+use super::rounding::{UNIT, chain};
+use crate::gpu::{Reference, Tolerance};
+use crate::kernels::structure_l1::{Constants, Kernel, Params, Slices, Tolerances};
 
 impl Reference for Kernel {
     /// The whole sum goes into the first partial: how many there are is the device's choice.
@@ -19,5 +20,15 @@ impl Reference for Kernel {
         }
         partials.fill(0.0);
         partials[0] = sum as f32;
+    }
+
+    /// The gradient is a sign; each difference rounds once, then in the sum.
+    fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
+        let plane = &slices.render[params.first as usize..][..params.pixel_count as usize];
+        let differences =
+            plane.iter().zip(slices.structure).map(|(p, s)| (p.clamp(0.0, 1.0) - s).abs());
+        let sum: f64 = differences.map(f64::from).sum();
+        let chain = chain(0) + f64::from(constants.values_per_thread) + 2.0;
+        Tolerances { partials: Tolerance::Sum(chain * UNIT * sum), ..Tolerances::default() }
     }
 }

@@ -1,6 +1,6 @@
-use crate::gpu::Reference;
+use crate::gpu::{Reference, Tolerance};
 use crate::kernels::curves::CURVE_LUM_PRESERVE;
-use crate::kernels::tone_mix::{Constants, Kernel, Params, Slices};
+use crate::kernels::tone_mix::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::tone::{clamped, luminance, measurable};
 
 impl Reference for Kernel {
@@ -22,5 +22,10 @@ impl Reference for Kernel {
                 target[channel * n + i] = clamped(rgb[channel] * scale);
             }
         }
+    }
+
+    /// Luminance five roundings, the scale a product, a sum and a division of five, then a product; the reference as many.
+    fn tolerances(_: &Params, _: &Constants, _: Slices<'_>) -> Tolerances {
+        Tolerances { target: Tolerance::Roundings(30.0) }
     }
 }

@@ -1,7 +1,7 @@
 use super::CompensatedSum;
-use crate::gpu::Reference;
+use crate::gpu::{Reference, Tolerance};
 use crate::kernels::ToneStatistics;
-use crate::kernels::tone_statistics::{Constants, Kernel, Params, Slices};
+use crate::kernels::tone_statistics::{Constants, Kernel, Params, Slices, Tolerances};
 
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
@@ -28,5 +28,10 @@ impl Reference for Kernel {
             mean: (means.x + means.y + means.z) / 3.0,
             channel_means: means,
         };
+    }
+
+    /// The sums are the same bits; each statistic is a division of five and six more roundings, as in the reference.
+    fn tolerances(_: &Params, _: &Constants, _: Slices<'_>) -> Tolerances {
+        Tolerances { statistics: Tolerance::Roundings(22.0) }
     }
 }

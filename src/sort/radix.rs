@@ -99,7 +99,7 @@ impl RadixSort {
         )?;
         pass.dispatch(
             &self.spine,
-            &sort_spine::Params { count_index, capacity },
+            &sort_spine::Params { count_index, capacity, digit_bits },
             sort_spine::Buffers { counts, table, digit_totals },
             Threads::Workgroups([1 << digit_bits, 1, 1]),
         )?;

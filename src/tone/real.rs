@@ -4,7 +4,7 @@
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
 /// What the formulas of the curves need of a number.
-pub(crate) trait Real:
+pub trait Real:
     Copy
     + PartialOrd
     + Add<Output = Self>

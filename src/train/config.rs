@@ -64,6 +64,8 @@ pub struct TrainConfig {
     pub eval_every: u64,
     /// Writes a checkpoint every so many steps; 0: never.
     pub checkpoint_every: u64,
+    /// Steps whose every pass is compared with its CPU reference.
+    pub check: CheckConfig,
     /// The device: a part of its name or its index; empty: the best.
     pub device: String,
     /// Random points to begin with where the dataset has none.
@@ -76,6 +78,16 @@ pub struct TrainConfig {
     pub density: DensityConfig,
     /// What the model has beside colour.
     pub model: ModelConfig,
+}
+
+/// Steps whose every pass is compared with its CPU reference.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct CheckConfig {
+    /// Every so many; 0: none.
+    pub every: u64,
+    /// A difference ends the run; else it is a warning.
+    pub stops: bool,
 }
 
 /// Which Gaussians multiply and which go; [`Schedule`] says when.
@@ -104,6 +116,7 @@ impl Default for TrainConfig {
             background: Background::Black,
             eval_every: 0,
             checkpoint_every: 1000,
+            check: CheckConfig::default(),
             device: String::new(),
             random_points: 20_000,
             tone: ToneSettings::default(),

@@ -30,8 +30,16 @@ impl TrainConfig {
     /// The first setting in which a run of `self` differs from one of `other`, with both values: `tone.alpha = 0.1, not
     /// 0.12`. Left out is what changes no step: how long the run is, where the photographs lie, when it is scored and saved.
     pub fn difference(&self, other: &Self) -> Option<String> {
-        const FREE: [&str; 6] =
-            ["steps", "dataset", "reference", "device", "eval_every", "checkpoint_every"];
+        const FREE: [&str; 8] = [
+            "steps",
+            "dataset",
+            "reference",
+            "device",
+            "eval_every",
+            "checkpoint_every",
+            "check.every",
+            "check.stops",
+        ];
         let [own, others] =
             [self, other].map(|config| settings("", &Table::try_from(config).unwrap_or_default()));
         let value = |settings: &BTreeMap<String, Value>, key: &str| {

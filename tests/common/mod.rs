@@ -16,7 +16,8 @@ use std::path::PathBuf;
 
 use nightsplat::random::Stream;
 
-/// Runs a kernel on the device over host vectors named like its buffers; gives back those that it writes.
+/// Runs a kernel on the device over host vectors named like its buffers, checks what it leaves against its reference, and
+/// gives back what it writes.
 macro_rules! run_kernel {
     ($kernel:ident, $constants:expr, $params:expr, $threads:expr, [$($input:ident),*], [$($output:ident),+]) => {{
         // Before the buffers take the vectors' names.
@@ -25,16 +26,19 @@ macro_rules! run_kernel {
         let pipeline = gpu.pipeline::<$kernel::Kernel>(&$constants).unwrap();
         $(let $input = gpu.buffer(stringify!($input), &$input).unwrap();)*
         $(let mut $output = gpu.buffer(stringify!($output), &$output).unwrap();)+
-        gpu.run(stringify!($kernel), |pass| {
-            let buffers = $kernel::Buffers { $($input: &$input,)* $($output: &mut $output,)+ };
-            pass.dispatch(&pipeline, params, buffers, threads)
-        })
-        .unwrap();
+        let (done, report) = gpu.checked(|| {
+            gpu.run(stringify!($kernel), |pass| {
+                let buffers = $kernel::Buffers { $($input: &$input,)* $($output: &mut $output,)+ };
+                pass.dispatch(&pipeline, params, buffers, threads)
+            })
+        });
+        done.and_then(|()| report.agree()).unwrap_or_else(|error| panic!("{params:?}: {error}"));
         ($(gpu.read(&$output).unwrap()),+)
     }};
 }
 
 /// The same with the kernel's CPU reference.
+#[allow(unused_macros, reason = "no test binary uses everything")]
 macro_rules! run_reference {
     ($kernel:ident, $constants:expr, $params:expr, [$($input:ident),*], [$($output:ident),+]) => {{
         $(let mut $output = $output.clone();)+

@@ -2,7 +2,7 @@
 
 use glam::{UVec2, Vec3};
 use nightsplat::gpu::testing::gpu;
-use nightsplat::gpu::{Buffer, Gpu, Reference, Threads};
+use nightsplat::gpu::{Gpu, Reference, Threads};
 use nightsplat::kernels::curves::{CURVE_AP3, CURVE_ASE, CURVE_NONE};
 use nightsplat::kernels::{ToneParameters, l1, ssim_backward, ssim_forward};
 use nightsplat::loss::{Interior, Loss, LossInputs, LossSettings, Term};
@@ -71,10 +71,9 @@ fn evaluate_interior(
     Outcome { l1, ssim, d_render: gpu.read(&d_render).unwrap(), status: logged.status }
 }
 
-/// Runs both SSIM kernels with their references beside them, with strips of `shape` columns and rows.
+/// Runs both SSIM kernels, the second on what the first leaves, with strips of `shape` columns and rows.
 fn check_ssim_kernels(
-    gpu: &Gpu,
-    curve: u32,
+    tone_curve: u32,
     [columns, rows]: [u32; 2],
     size: [u32; 2],
     interior: Interior,
@@ -82,108 +81,45 @@ fn check_ssim_kernels(
     let [width, height] = size;
     let (interior_begin, interior_end) = (interior.origin, interior.origin + interior.size);
     let [render, low] = images(size);
-    let count = render.len();
-    let threads = 3 * width.div_ceil(columns) * height.div_ceil(rows);
-    let forward_constants = ssim_forward::Constants { columns, rows, tone_curve: curve };
-    let backward_constants = ssim_backward::Constants { columns, rows, tone_curve: curve };
-    let forward_params = ssim_forward::Params { width, height, interior_begin, interior_end };
-    let scale = 1.0 / count as f32;
-    let backward_params = ssim_backward::Params {
-        width,
-        height,
-        interior_begin,
-        interior_end,
-        l1_scale: 0.8 * scale,
-        ssim_scale: 0.2 * scale,
+    let scale = 1.0 / render.len() as f32;
+    let count = 3 * width.div_ceil(columns) * height.div_ceil(rows);
+    let threads = Threads::Exactly([count, 1, 1]);
+    let (tone, d_moments) = (vec![TONE], vec![Vec3::NAN; render.len()]);
+    let (d_render, partials) = (vec![f32::NAN; render.len()], vec![0.0_f32; count as usize]);
+    let (d_moments, _) = {
+        let [render, low] = [render.clone(), low.clone()];
+        let (tone, partials) = (tone.clone(), partials.clone());
+        run_kernel!(
+            ssim_forward,
+            ssim_forward::Constants { columns, rows, tone_curve },
+            ssim_forward::Params { width, height, interior_begin, interior_end },
+            threads,
+            [render, low, tone],
+            [d_moments, partials]
+        )
     };
-
-    let (mut d_moments, mut d_render) = (vec![Vec3::ZERO; count], vec![0.0; count]);
-    let (mut ssim_sum, mut l1_sum) = (vec![0.0], vec![0.0]);
-    let tone = [TONE];
-    let slices = ssim_forward::Slices {
-        render: &render,
-        low: &low,
-        tone: &tone,
-        d_moments: &mut d_moments,
-        partials: &mut ssim_sum,
-    };
-    ssim_forward::Kernel::run(&forward_params, &forward_constants, slices);
-    let slices = ssim_backward::Slices {
-        render: &render,
-        low: &low,
-        tone: &tone,
-        d_moments: &d_moments,
-        d_render: &mut d_render,
-        partials: &mut l1_sum,
-    };
-    ssim_backward::Kernel::run(&backward_params, &backward_constants, slices);
-
-    let [render, low] =
-        [("render", &render), ("low", &low)].map(|(name, data)| gpu.buffer(name, data).unwrap());
-    let tone = gpu.buffer("tone", &tone).unwrap();
-    let mut gpu_d_moments = gpu.zeros("d_moments", count).unwrap();
-    let mut gpu_d_render = gpu.zeros("d_render", count).unwrap();
-    let mut ssim_partials = gpu.zeros("ssim_partials", threads as usize).unwrap();
-    let mut l1_partials = gpu.zeros("l1_partials", threads as usize).unwrap();
-    let forward = gpu.pipeline::<ssim_forward::Kernel>(&forward_constants).unwrap();
-    let backward = gpu.pipeline::<ssim_backward::Kernel>(&backward_constants).unwrap();
-    gpu.run("ssim", |pass| {
-        let buffers = ssim_forward::Buffers {
-            render: &render,
-            low: &low,
-            tone: &tone,
-            d_moments: &mut gpu_d_moments,
-            partials: &mut ssim_partials,
-        };
-        pass.dispatch(&forward, &forward_params, buffers, Threads::Exactly([threads, 1, 1]))?;
-        let buffers = ssim_backward::Buffers {
-            render: &render,
-            low: &low,
-            tone: &tone,
-            d_moments: &gpu_d_moments,
-            d_render: &mut gpu_d_render,
-            partials: &mut l1_partials,
-        };
-        pass.dispatch(&backward, &backward_params, buffers, Threads::Exactly([threads, 1, 1]))
-    })
-    .unwrap();
-
-    let sum = |partials: &Buffer<f32>| gpu.read(partials).unwrap().iter().sum::<f32>();
-    let near = |actual: f32, expected: f32| (actual - expected).abs() <= 1e-5 * count as f32;
-    let context = format!("{width} x {height} in strips of {columns} x {rows}");
-    assert!(
-        near(sum(&ssim_partials), ssim_sum[0]),
-        "{context}: SSIM {} {}",
-        sum(&ssim_partials),
-        ssim_sum[0]
+    let (l1_scale, ssim_scale) = (0.8 * scale, 0.2 * scale);
+    run_kernel!(
+        ssim_backward,
+        ssim_backward::Constants { columns, rows, tone_curve },
+        ssim_backward::Params { width, height, interior_begin, interior_end, l1_scale, ssim_scale },
+        threads,
+        [render, low, tone, d_moments],
+        [d_render, partials]
     );
-    assert!(
-        near(sum(&l1_partials), l1_sum[0]),
-        "{context}: L1 {} {}",
-        sum(&l1_partials),
-        l1_sum[0]
-    );
-    // The variances lose about 1e-7 of a squared mean near 1 to cancellation, against a floor of C2 = 9e-4.
-    let actual: Vec<f32> =
-        gpu.read(&gpu_d_moments).unwrap().iter().flat_map(|d| d.to_array()).collect();
-    let expected: Vec<f32> = d_moments.iter().flat_map(|d| d.to_array()).collect();
-    assert_close(&context, &actual, &expected, 1e-3 * largest(&expected));
-    assert_close(&context, &gpu.read(&gpu_d_render).unwrap(), &d_render, 1e-3 * largest(&d_render));
 }
 
 #[test]
 fn the_ssim_kernels_match_their_references_at_every_size() {
-    let gpu = gpu();
     for size in SIZES {
-        check_ssim_kernels(&gpu, CURVE_AP3, [16, 64], size, Interior::whole(size.into()));
+        check_ssim_kernels(CURVE_AP3, [16, 64], size, Interior::whole(size.into()));
     }
 }
 
 #[test]
 fn the_shape_of_the_strips_does_not_matter() {
-    let gpu = gpu();
     for (shape, curve) in [([2, 32], CURVE_ASE), ([1, 1], CURVE_NONE), ([5, 7], CURVE_AP3)] {
-        check_ssim_kernels(&gpu, curve, shape, [37, 41], Interior::whole([37, 41].into()));
+        check_ssim_kernels(curve, shape, [37, 41], Interior::whole([37, 41].into()));
     }
 }
 
@@ -295,8 +231,8 @@ fn the_reference_gradient_is_that_of_finite_differences() {
 fn the_kernels_match_their_references_with_an_interior() {
     let gpu = gpu();
     for (size, interior) in interiors() {
-        check_ssim_kernels(&gpu, CURVE_AP3, [16, 64], size, interior);
-        check_ssim_kernels(&gpu, CURVE_ASE, [2, 32], size, interior);
+        check_ssim_kernels(CURVE_AP3, [16, 64], size, interior);
+        check_ssim_kernels(CURVE_ASE, [2, 32], size, interior);
         let [render, low] = images(size);
         let constants =
             l1::Constants { tone_curve: CURVE_AP3, with_interior: true, ..Default::default() };

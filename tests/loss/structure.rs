@@ -1,11 +1,9 @@
 //! The structure of a pseudo-GT, and the term that compares a plane of the render with it.
 
-use glam::{UVec2, Vec2, Vec3};
+use glam::UVec2;
+use nightsplat::gpu::Gpu;
 use nightsplat::gpu::testing::gpu;
-use nightsplat::gpu::{Gpu, Threads};
-use nightsplat::kernels::{
-    ciconv_columns, ciconv_moments, ciconv_normalize, ciconv_rows, structure_l1,
-};
+use nightsplat::kernels::structure_l1;
 use nightsplat::loss::{StructureInputs, StructureLoss, Term};
 use nightsplat::structure::StructureTarget;
 
@@ -37,74 +35,14 @@ fn structure_of(gpu: &Gpu, image: &[f32], size: [u32; 2]) -> Vec<f32> {
 
 #[test]
 fn the_kernels_match_their_references() {
-    let pixels_per_moment = gpu().properties().subgroup_size;
+    let gpu = gpu();
     for size in SIZES {
-        let [width, height] = size;
-        let (pixel_count, image) = (width * height, photograph(size));
-        let per_pixel = Threads::Exactly([pixel_count, 1, 1]);
-        let [smooth_rows, slope_rows] = [0; 2].map(|_| vec![Vec3::NAN; pixel_count as usize]);
-        let (constants, params) =
-            (ciconv_rows::Constants {}, ciconv_rows::Params { width, height });
-        let expected =
-            run_reference!(ciconv_rows, constants, params, [image], [smooth_rows, slope_rows]);
-        let (smooth_rows, slope_rows) = run_kernel!(
-            ciconv_rows,
-            constants,
-            params,
-            per_pixel,
-            [image],
-            [smooth_rows, slope_rows]
-        );
-        let flat = |rows: &[Vec3]| rows.iter().flat_map(Vec3::to_array).collect::<Vec<f32>>();
-        // Thirteen products of values below 1.
-        assert_close("smooth_rows", &flat(&smooth_rows), &flat(&expected.0), 2e-6);
-        assert_close("slope_rows", &flat(&slope_rows), &flat(&expected.1), 2e-6);
-
-        let (constants, params) = (
-            ciconv_columns::Constants::default(),
-            ciconv_columns::Params { width, height, pixels_per_moment },
-        );
-        let logs = vec![f32::NAN; pixel_count as usize];
-        let moments = vec![Vec2::NAN; pixel_count.div_ceil(pixels_per_moment) as usize];
-        let expected = run_reference!(
-            ciconv_columns,
-            constants,
-            params,
-            [smooth_rows, slope_rows],
-            [logs, moments]
-        );
-        let (logs, moments) = run_kernel!(
-            ciconv_columns,
-            constants,
-            params,
-            per_pixel,
-            [smooth_rows, slope_rows],
-            [logs, moments]
-        );
-        // A derivative that almost vanishes has lost its digits to cancellation; W is floored at 1e-5.
-        assert_close("logs", &logs, &expected.0, 1e-3);
-        let flat = |moments: &[Vec2]| moments.iter().flat_map(Vec2::to_array).collect::<Vec<_>>();
-        assert_close("moments", &flat(&moments), &flat(&expected.1), 5e-3);
-
-        let (constants, params) = (
-            ciconv_moments::Constants {},
-            ciconv_moments::Params { pixel_count, pixels_per_moment },
-        );
-        let norm = vec![Vec2::NAN];
-        let expected = run_reference!(ciconv_moments, constants, params, [moments], [norm]);
-        let one = Threads::Workgroups([1, 1, 1]);
-        let norm = run_kernel!(ciconv_moments, constants, params, one, [moments], [norm]);
-        assert!((norm[0].x - expected[0].x).abs() <= 1e-5 * expected[0].x.abs() + 1e-6);
-        assert!((norm[0].y - expected[0].y).abs() <= 1e-4 * expected[0].y, "{norm:?} {expected:?}");
-
-        let (constants, params) =
-            (ciconv_normalize::Constants {}, ciconv_normalize::Params { pixel_count });
-        let structure = vec![f32::NAN; pixel_count as usize];
-        let expected =
-            run_reference!(ciconv_normalize, constants, params, [logs, norm], [structure]);
-        let structure =
-            run_kernel!(ciconv_normalize, constants, params, per_pixel, [logs, norm], [structure]);
-        assert_close("structure", &structure, &expected, 1e-5);
+        let (structure, report) = gpu.checked(|| structure_of(&gpu, &photograph(size), size));
+        report.agree().unwrap();
+        assert_eq!(structure.len(), (size[0] * size[1]) as usize);
+        let kernels: Vec<&str> = report.passes.iter().map(|pass| pass.kernel).collect();
+        let chain = ["ciconv_rows", "ciconv_columns", "ciconv_moments", "ciconv_normalize"];
+        assert_eq!(kernels, chain);
     }
 }
 

@@ -14,6 +14,3 @@ mod networks;
 mod torch;
 
 use common::{largest, narrow, widen};
-
-/// The relative rounding of one operation in single precision.
-const UNIT: f32 = 1.0 / (1 << 24) as f32;

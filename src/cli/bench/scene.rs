@@ -1,11 +1,19 @@
 //! The scene of the bench: deterministic, and as hard as a trained one.
 
+use std::path::PathBuf;
+
 use glam::{DAffine3, DVec2, Vec3};
 
+use crate::Result;
 use crate::camera::Camera;
+use crate::dataset::{Dataset, Point, Split, View};
+use crate::gpu::{CheckReport, Gpu};
 use crate::image::Image;
 use crate::random::Stream;
+use crate::render::{RenderOptions, RenderSettings, Renderer, Status};
 use crate::scene::{Gaussians, SH_C0};
+use crate::tone::{ToneCurve, ToneSettings};
+use crate::train::{Part, TrainConfig, Trainer};
 
 /// Gaussians before a camera that looks along z from the origin.
 pub(super) struct Scene {
@@ -34,6 +42,87 @@ impl Scene {
         let gaussians = gaussians(&camera, count);
         Self { low: dark(width, height), gaussians, camera }
     }
+
+    /// One view, with a depth map and the Gaussians' means for points.
+    fn dataset(&self) -> Dataset {
+        let Camera { width, height, .. } = self.camera;
+        let depth = (0..width * height).map(|i| (i / width) as f32 / height as f32);
+        let view = View {
+            name: "view".to_owned(),
+            split: Split::Train,
+            camera: self.camera,
+            image: Some(self.low.clone()),
+            reference: None,
+            depth: Some(depth.collect()),
+        };
+        let point = |mean: &Vec3| Point { position: mean.as_dvec3(), views: vec![0] };
+        let points = self.gaussians.means().iter().map(point).collect();
+        Dataset { root: PathBuf::new(), views: vec![view], points, skipped: vec![] }
+    }
+}
+
+/// The scene in training.
+pub(super) struct Trainers {
+    /// Colour alone, with SH of degree 3.
+    pub(super) plain: Trainer,
+    /// Every part, small enough for the references.
+    pub(super) lita: Trainer,
+    /// The passes behind its first Gaussians and its targets, checked.
+    pub(super) lita_begins: CheckReport,
+    /// Splats times tiles of the plain scene.
+    pub(super) intersections: u32,
+}
+
+/// # Errors
+/// The device is out of memory or lost.
+pub(super) fn trainers(gpu: &Gpu, scene: &Scene) -> Result<Trainers> {
+    let plain = plain(gpu, scene, ToneCurve::Ap3)?;
+    let (lita, lita_begins) = gpu.checked(|| lita(gpu));
+    Ok(Trainers { plain, lita: lita?, lita_begins, intersections: intersections(gpu, scene)? })
+}
+
+/// A configuration whose steps all do the same work, behind those that the SH take to come into use.
+fn config(curve: ToneCurve) -> TrainConfig {
+    let mut config = TrainConfig { tone: ToneSettings::new(curve), ..TrainConfig::default() };
+    config.schedule.sh_degree_interval = 1;
+    config.schedule.densify_after = u64::MAX;
+    config
+}
+
+/// The plain model after the steps that bring all its coefficients into use.
+///
+/// # Errors
+/// The device is out of memory or lost.
+pub(super) fn plain(gpu: &Gpu, scene: &Scene, curve: ToneCurve) -> Result<Trainer> {
+    let dataset = scene.dataset();
+    let mut trainer = Trainer::from_gaussians(gpu, config(curve), &dataset, &scene.gaussians)?;
+    while trainer.steps_done() < 3 {
+        trainer.advance(3)?;
+    }
+    Ok(trainer)
+}
+
+/// Every part on a small scene, density control in every step.
+fn lita(gpu: &Gpu) -> Result<Trainer> {
+    let mut config = config(ToneCurve::Ap3);
+    config.model.set_parts(&Part::ALL);
+    config.ssim_weight = 0.0;
+    config.model.denoiser_crop = 24;
+    config.model.network.channels = 8;
+    config.model.network.stages = 2;
+    config.model.network.repeats = 2;
+    (config.schedule.densify_after, config.schedule.densify_interval) = (0, 1);
+    Trainer::new(gpu, config, &Scene::new(96, 72, 500).dataset())
+}
+
+/// How often a splat meets a tile.
+fn intersections(gpu: &Gpu, Scene { camera, gaussians, .. }: &Scene) -> Result<u32> {
+    let mut renderer = Renderer::new(gpu, RenderSettings::default())?;
+    renderer.reserve(gaussians.count, [camera])?;
+    let parameters = gpu.buffer("parameters", &gaussians.parameters)?;
+    let options = RenderOptions { sh_degree: 0, background: [0.0; 3] };
+    gpu.run("render", |pass| renderer.forward(pass, &parameters, camera, &options))?;
+    Ok(Status::from_words(&gpu.read(renderer.status())?).intersections)
 }
 
 fn gaussians(camera: &Camera, count: usize) -> Gaussians {

@@ -1,0 +1,260 @@
+//! What the device made of a pass against what the CPU reference makes of it.
+
+use std::fmt;
+
+use crate::{Error, Result};
+
+/// The relative error of one rounding to single precision.
+const ROUNDING: f64 = f32::EPSILON as f64 / 2.0;
+
+/// How far the 32-bit numbers of a buffer may be from the reference's.
+///
+/// Two NaNs agree, as do two zeros; a NaN on one side only differs. Vulkan lets a device flush numbers below the smallest
+/// normal one to zero, so wherever floats need not be exact that much is allowed beside.
+#[derive(Clone, Debug, Default)]
+pub enum Tolerance {
+    /// Not at all: integers, copies, and what IEEE 754 rounds alike everywhere.
+    #[default]
+    Exact,
+    /// So many roundings of the expected number.
+    Roundings(f64),
+    /// A bound for each number; the numbers beyond the list are exact.
+    Each(Vec<f64>),
+    /// One partial sum per workgroup, of which only the sum counts: how it is parted is the device's choice.
+    Sum(f64),
+}
+
+/// What one pass of a checked recording did.
+#[derive(Clone, Debug)]
+pub struct CheckedPass {
+    /// What was recorded: the label of the submission.
+    pub recording: String,
+    /// The kernel.
+    pub kernel: &'static str,
+    /// The largest error, in units of what is allowed: at most 1 where the pass agrees. None where the pass was not
+    /// compared, because it works on counts or indices that differ already.
+    pub error: Option<f64>,
+    /// The first number that differs.
+    pub difference: Option<Difference>,
+}
+
+/// A number of which device and reference differ by more than roundings explain.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Difference {
+    /// The pass, counted from 0 in its report.
+    pub pass: usize,
+    /// The kernel.
+    pub kernel: &'static str,
+    /// The buffer, as the shader calls it.
+    pub buffer: &'static str,
+    /// The place among the buffer's 32-bit numbers; of the sum of partial sums 0.
+    pub index: usize,
+    /// What the device left there.
+    pub device: f64,
+    /// What the reference left there.
+    pub reference: f64,
+    /// How far they may be apart.
+    pub bound: f64,
+    /// How many numbers of the buffer differ.
+    pub count: usize,
+}
+
+impl fmt::Display for Difference {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { pass, kernel, buffer, index, device, reference, bound, count } = self;
+        write!(
+            f,
+            "pass {pass}, `{kernel}`: {buffer}[{index}] is {device} on the device and {reference} in the "
+        )?;
+        write!(f, "reference, which may differ by {bound:.3e} ({count} of its numbers differ)")
+    }
+}
+
+/// Every pass of the recordings that were checked, in order.
+#[derive(Clone, Debug, Default)]
+pub struct CheckReport {
+    /// In the order in which they ran.
+    pub passes: Vec<CheckedPass>,
+}
+
+impl CheckReport {
+    /// Where device and reference first differ; nowhere on a sound device.
+    pub fn first_difference(&self) -> Option<&Difference> {
+        self.passes.iter().find_map(|pass| pass.difference.as_ref())
+    }
+
+    /// Takes over the passes of a later report.
+    pub fn extend(&mut self, later: Self) {
+        let before = self.passes.len();
+        self.passes.extend(later.passes.into_iter().map(|mut pass| {
+            pass.difference =
+                pass.difference.map(|own| Difference { pass: before + own.pass, ..own });
+            pass
+        }));
+    }
+
+    /// # Errors
+    /// [`Error::Disagrees`] with the first difference, if there is one.
+    pub fn agree(&self) -> Result<()> {
+        match self.first_difference() {
+            Some(difference) => Err(Error::Disagrees { what: difference.to_string() }),
+            None => Ok(()),
+        }
+    }
+
+    /// Each kernel once, in the order of its first pass, with how often it ran and its largest error.
+    pub fn kernels(&self) -> Vec<(&'static str, usize, f64)> {
+        let mut kernels: Vec<(&'static str, usize, f64)> = vec![];
+        for pass in &self.passes {
+            let error = pass.error.unwrap_or_default();
+            match kernels.iter_mut().find(|(name, ..)| *name == pass.kernel) {
+                Some((_, passes, largest)) => {
+                    (*passes, *largest) = (*passes + 1, largest.max(error))
+                }
+                None => kernels.push((pass.kernel, 1, error)),
+            }
+        }
+        kernels
+    }
+}
+
+/// A buffer before the pass, as the device left it, and as the reference did.
+pub(super) struct Versions<'a> {
+    pub(super) before: &'a [u32],
+    pub(super) device: &'a [u32],
+    pub(super) reference: &'a [u32],
+    pub(super) is_float: bool,
+}
+
+/// How the numbers of a buffer compare: the largest error in units of its bound, and the first that exceeds it.
+#[derive(Debug, Default, PartialEq)]
+pub(super) struct Comparison {
+    pub(super) error: f64,
+    /// Index, device, reference, bound.
+    pub(super) first: Option<(usize, [f64; 3])>,
+    pub(super) count: usize,
+}
+
+impl Versions<'_> {
+    /// `workgroups` says how many partial sums there are.
+    pub(super) fn compare(&self, tolerance: &Tolerance, workgroups: usize) -> Comparison {
+        let number = |word: u32| {
+            if self.is_float { f64::from(f32::from_bits(word)) } else { f64::from(word) }
+        };
+        let mut comparison = Comparison::default();
+        let mut from = 0;
+        if let Tolerance::Sum(bound) = *tolerance {
+            from = workgroups.min(self.device.len());
+            let sum = |words: &[u32]| words[..from].iter().map(|&word| number(word)).sum();
+            comparison.add(0, sum(self.device), sum(self.reference), bound + flushed(from));
+        }
+        for i in from..self.device.len() {
+            let expected = match tolerance {
+                // Beyond the partial sums nothing is written; the reference writes one and zeros.
+                Tolerance::Sum(_) => self.before[i],
+                _ => self.reference[i],
+            };
+            if self.device[i] == expected {
+                continue;
+            }
+            let (device, reference) = (number(self.device[i]), number(expected));
+            let bound = match tolerance {
+                Tolerance::Exact | Tolerance::Sum(_) => 0.0,
+                Tolerance::Roundings(n) => n * ROUNDING * reference.abs() + flushed(1),
+                Tolerance::Each(bounds) => bounds
+                    .get(i)
+                    .map_or(0.0, |bound| bound + if self.is_float { flushed(1) } else { 0.0 }),
+            };
+            comparison.add(i, device, reference, bound);
+        }
+        comparison
+    }
+}
+
+/// What `count` numbers can lose where the device flushes subnormal ones.
+fn flushed(count: usize) -> f64 {
+    count as f64 * f64::from(f32::MIN_POSITIVE)
+}
+
+impl Comparison {
+    fn add(&mut self, index: usize, device: f64, reference: f64, bound: f64) {
+        let is_same = device == reference || (device.is_nan() && reference.is_nan());
+        let distance = (device - reference).abs();
+        let error = if is_same { 0.0 } else { distance / bound };
+        // Positive phrasing: a NaN on one side differs.
+        if is_same || distance <= bound {
+            self.error = self.error.max(error);
+            return;
+        }
+        self.error = self.error.max(if error > 1.0 { error } else { f64::INFINITY });
+        self.count += 1;
+        self.first.get_or_insert((index, [device, reference, bound]));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Comparison, Tolerance, Versions};
+
+    fn compare(device: &[f32], reference: &[f32], tolerance: &Tolerance) -> Comparison {
+        let bits = |values: &[f32]| values.iter().map(|value| value.to_bits()).collect::<Vec<_>>();
+        let (device, reference) = (bits(device), bits(reference));
+        let before = &vec![0; device.len()];
+        let (device, reference) = (&device, &reference);
+        Versions { before, device, reference, is_float: true }.compare(tolerance, 2)
+    }
+
+    #[test]
+    fn a_number_may_be_off_by_its_bound_and_no_more() {
+        let each = Tolerance::Each(vec![0.25, 0.25]);
+        let agreed = compare(&[1.25, 2.125], &[1.0, 2.0], &each);
+        assert!(agreed.first.is_none() && (agreed.error - 1.0).abs() < 1e-6);
+        let off = compare(&[1.0, 2.5, 9.0], &[1.0, 2.0, 9.0], &each);
+        assert_eq!(
+            off.first.map(|(i, [device, reference, _])| (i, device, reference)),
+            Some((1, 2.5, 2.0))
+        );
+        assert_eq!(off.count, 1);
+        assert!(
+            compare(&[1.0, 2.0, 9.0], &[1.0, 2.0, 9.5], &each).first.is_some(),
+            "beyond the list"
+        );
+        let one = f32::EPSILON;
+        assert!(compare(&[1.0 + one], &[1.0], &Tolerance::Roundings(2.0)).first.is_none());
+        assert!(compare(&[1.0 + one], &[1.0], &Tolerance::Roundings(1.0)).first.is_some());
+        assert!(compare(&[1.0 + one], &[1.0], &Tolerance::Exact).first.is_some());
+        assert_eq!(compare(&[0.0], &[-0.0], &Tolerance::Exact), Comparison::default());
+    }
+
+    #[test]
+    fn two_nans_agree_and_one_differs() {
+        for tolerance in [
+            Tolerance::Exact,
+            Tolerance::Roundings(9.0),
+            Tolerance::Each(vec![f64::INFINITY; 2]),
+            Tolerance::Each(vec![f64::NAN; 2]),
+            Tolerance::Sum(9.0),
+        ] {
+            let nans = [f32::NAN, -f32::NAN];
+            assert_eq!(compare(&nans, &[f32::NAN; 2], &tolerance), Comparison::default());
+            let off = compare(&nans, &[1.0, f32::NAN], &tolerance);
+            let sums = matches!(tolerance, Tolerance::Sum(_));
+            assert_eq!((off.count, off.error), if sums { (0, 0.0) } else { (1, f64::INFINITY) });
+            assert_eq!(compare(&[0.0, 1.0], &[1.0, f32::NAN], &tolerance).error, f64::INFINITY);
+        }
+    }
+
+    #[test]
+    fn partial_sums_compare_as_one_and_nothing_is_written_behind_them() {
+        let sum = Tolerance::Sum(0.1);
+        assert!(compare(&[1.0, 2.0, 0.0], &[3.05, 0.0, 0.0], &sum).first.is_none());
+        assert_eq!(
+            compare(&[1.0, 2.0, 0.0], &[3.5, 0.0, 0.0], &sum).first,
+            Some((0, [3.0, 3.5, 0.1 + 2.0 * f64::from(f32::MIN_POSITIVE)]))
+        );
+        assert_eq!(
+            compare(&[1.0, 2.0, 7.0], &[3.0, 0.0, 0.0], &sum).first,
+            Some((2, [7.0, 0.0, 0.0]))
+        );
+    }
+}

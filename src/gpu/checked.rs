@@ -1,0 +1,178 @@
+//! Checked recordings: every pass alone, and what it leaves against what its CPU reference makes of the same buffers.
+//!
+//! A pass works on what the device made of the passes before it, so a difference is named where it arises. Slow, and
+//! meant to be: it is for tests, `nightsplat check` and drivers.
+
+use std::collections::HashMap;
+use std::sync::atomic::Ordering;
+use std::sync::{Arc, Mutex};
+use std::thread::{self, ThreadId};
+
+use ash::vk;
+
+use super::check::Versions;
+use super::{
+    Binding, Bound, CheckReport, CheckedPass, Difference, Download, Gpu, Kernel, Pipeline, Queue,
+    Recorder, Reference, Shared, Threads, lock, testing,
+};
+use crate::Result;
+
+/// The reports of the threads whose submissions are checked.
+#[derive(Debug, Default)]
+pub(super) struct Checks(Mutex<HashMap<ThreadId, CheckReport>>);
+
+impl Checks {
+    /// This thread's report, while one of its submissions adds to it.
+    fn take(&self) -> Option<CheckReport> {
+        lock(&self.0).remove(&thread::current().id())
+    }
+
+    /// Whether this thread's submissions are checked.
+    pub(super) fn are_on(&self) -> bool {
+        lock(&self.0).contains_key(&thread::current().id())
+    }
+
+    fn put(&self, report: CheckReport) {
+        lock(&self.0).insert(thread::current().id(), report);
+    }
+}
+
+/// What a recorder needs to run its passes one by one.
+#[derive(Debug)]
+pub(super) struct Checked<'g> {
+    queue: &'g Queue,
+    pool: vk::CommandPool,
+    recording: &'g str,
+    report: CheckReport,
+    /// An integer differs: whoever takes it for an index may leave its buffers.
+    has_wrong_integers: bool,
+}
+
+impl Gpu {
+    /// Does `work`, and checks every pass that it submits to this device from this thread: runs it alone and compares
+    /// all that it writes with what its reference makes of the same buffers. The device's results stay, so whatever is
+    /// done comes out as it would unchecked, bit for bit. What a host records itself ([`Gpu::record_into`]) and what is
+    /// profiled is not checked.
+    pub fn checked<R>(&self, work: impl FnOnce() -> R) -> (R, CheckReport) {
+        let outer = self.shared.checks.take();
+        self.shared.checks.put(CheckReport::default());
+        let result = work();
+        let report = self.shared.checks.take().unwrap_or_default();
+        if let Some(mut outer) = outer {
+            outer.extend(report.clone());
+            self.shared.checks.put(outer);
+        }
+        (result, report)
+    }
+}
+
+impl Shared {
+    /// Records and runs every pass on its own; gives the timeline value of the last. Whatever comes of it, what ran is
+    /// in the report.
+    pub(super) fn record_checked(
+        self: &Arc<Self>,
+        queue: &Queue,
+        pool: vk::CommandPool,
+        value: u64,
+        recording: &str,
+        record: impl FnOnce(&mut Recorder<'_>) -> Result<()>,
+    ) -> Result<u64> {
+        let mut recorder = Recorder::new(self, self.begin(pool)?, value, None);
+        let report = self.checks.take().unwrap_or_default();
+        let has_wrong_integers = false;
+        recorder.checked = Some(Checked { queue, pool, recording, report, has_wrong_integers });
+        let done = record(&mut recorder).and_then(|()| recorder.run_what_is_recorded("copies"));
+        let value = recorder.value - 1;
+        if let Some(checked) = recorder.checked {
+            self.checks.put(checked.report);
+        }
+        done.map(|()| value)
+    }
+}
+
+impl Recorder<'_> {
+    /// Runs what was recorded before, then the pass alone, then its reference, and compares.
+    pub(super) fn dispatch_checked<K: Reference>(
+        &mut self,
+        pipeline: &Pipeline<K>,
+        params: &K::Params,
+        bound: &[Bound],
+        threads: Threads<'_>,
+    ) -> Result<()> {
+        let before = self.copies::<K>(bound, |_| true)?;
+        let mut on_device = *params;
+        testing::plant_defect(K::NAME, bytemuck::bytes_of_mut(&mut on_device));
+        self.record_dispatch(pipeline, &on_device, bound, threads)?;
+        let device = self.copies::<K>(bound, |binding| binding.writable)?;
+        self.run_what_is_recorded(K::NAME)?;
+
+        let workgroups = self.workgroups::<K>(threads).iter().map(|&n| n as usize).product();
+        let Some(checked) = &mut self.checked else { return Ok(()) };
+        let (recording, kernel) = (checked.recording.to_owned(), K::NAME);
+        let mut pass = CheckedPass { recording, kernel, error: None, difference: None };
+        if !checked.has_wrong_integers {
+            let mut before = wait(before)?;
+            let mut reference = before.clone();
+            K::run(params, &pipeline.constants, K::slices(&mut reference));
+            let tolerances = K::tolerances(params, &pipeline.constants, K::slices(&mut before));
+            let written = K::BINDINGS.iter().zip(&before).zip(&reference);
+            let written = written.filter(|((binding, _), _)| binding.writable);
+            pass.error = Some(0.0);
+            for ((((binding, before), reference), device), tolerance) in
+                written.zip(wait(device)?).zip(tolerances.into())
+            {
+                let versions =
+                    Versions { before, device: &device, reference, is_float: binding.is_float };
+                let comparison = versions.compare(&tolerance, workgroups);
+                pass.error = pass.error.map(|error: f64| error.max(comparison.error));
+                let Some((index, [device, reference, bound])) = comparison.first else { continue };
+                checked.has_wrong_integers |= !binding.is_float;
+                pass.difference.get_or_insert(Difference {
+                    pass: checked.report.passes.len(),
+                    kernel,
+                    buffer: binding.name,
+                    index,
+                    device,
+                    reference,
+                    bound,
+                    count: comparison.count,
+                });
+            }
+        }
+        checked.report.passes.push(pass);
+        Ok(())
+    }
+
+    /// Records copies of what the pass binds.
+    fn copies<K: Kernel>(
+        &mut self,
+        bound: &[Bound],
+        wanted: impl Fn(&Binding) -> bool,
+    ) -> Result<Vec<Download<u32>>> {
+        let wanted = K::BINDINGS.iter().zip(bound).filter(|(binding, _)| wanted(binding));
+        wanted
+            .map(|(binding, bound)| {
+                self.download_raw(binding.name, bound.raw, bound.size as usize / size_of::<u32>())
+            })
+            .collect()
+    }
+
+    /// Submits what is recorded, waits for it, and begins anew.
+    fn run_what_is_recorded(&mut self, pass: &str) -> Result<()> {
+        let shared = self.shared();
+        self.finish();
+        let Some(checked) = &mut self.checked else { return Ok(()) };
+        // Under the pass's name: should the device be lost, it is known where.
+        shared.submit(checked.queue, self.commands, self.value, pass)?;
+        shared.wait(self.value)?;
+        self.commands = shared.begin(checked.pool)?;
+        self.value += 1;
+        shared.last_use.store(self.value, Ordering::Release);
+        self.barrier();
+        Ok(())
+    }
+}
+
+fn wait(downloads: Vec<Download<u32>>) -> Result<Vec<Vec<u32>>> {
+    downloads.into_iter().map(Download::wait).collect()
+}

@@ -1,0 +1,302 @@
+//! What single precision may make of a formula: numbers with a bound of their error, as the Vulkan specification
+//! ("Precision of core SPIR-V instructions") bounds each operation. Fused multiply-adds round once less.
+
+use std::cmp::Ordering;
+use std::ops::{Add, Div, Mul, Neg, Sub};
+
+use crate::gpu::Tolerance;
+use crate::kernels::ToneParameters;
+use crate::tone::{Real, curve_at};
+
+/// The relative error of one rounding; half a unit in the last place (ulp).
+pub const UNIT: f64 = f32::EPSILON as f64 / 2.0;
+
+/// The largest absolute error of a sine or cosine.
+pub(super) const TRIGONOMETRIC: f64 = 1.0 / 2048.0;
+
+/// Roundings that one number takes part in while a subgroup adds up `count`: a lane's run of them, then the lanes, of
+/// which there are 4 to 128.
+pub(super) fn chain(count: usize) -> f64 {
+    count as f64 / 4.0 + 128.0
+}
+
+/// Backward stability: how far the numbers of `f` may be off where each of its inputs is off by its error, to first order.
+pub(super) fn sensitivity(
+    inputs: &[f64],
+    errors: &[f64],
+    f: impl Fn(&[f64]) -> Vec<f64>,
+) -> Vec<f64> {
+    let (exact, mut moved) = (f(inputs), inputs.to_vec());
+    let mut bounds = vec![0.0; exact.len()];
+    for at in 0..inputs.len() {
+        moved[at] += errors[at];
+        let changes = f(&moved).into_iter().zip(&exact).map(|(moved, exact)| (moved - exact).abs());
+        bounds.iter_mut().zip(changes).for_each(|(bound, change)| *bound += change);
+        moved[at] = inputs[at];
+    }
+    bounds
+}
+
+/// A number, and how far single precision may be from it: running error analysis (Higham 2002, section 3.3).
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Rounded {
+    /// The number itself.
+    pub value: f64,
+    /// The bound of the error.
+    pub error: f64,
+}
+
+impl Rounded {
+    /// A number in single precision.
+    pub fn exact(value: f32) -> Self {
+        Self { value: value.into(), error: 0.0 }
+    }
+
+    /// After `count` roundings more.
+    pub(super) fn rounded(self, count: f64) -> Self {
+        Self { error: self.error + count * UNIT * (self.value.abs() + self.error), ..self }
+    }
+
+    /// As it is, but for an error of the argument that it grows with `slope`.
+    fn from_argument(value: f64, argument: f64, slope: f64) -> Self {
+        let error = if argument == 0.0 { 0.0 } else { argument * slope };
+        Self { value, error }
+    }
+
+    /// A sum in any order in which a term takes part in at most `chain` additions.
+    pub(super) fn sum(chain: f64, terms: impl IntoIterator<Item = Self>) -> Self {
+        let (mut sum, mut magnitude) = (Self::default(), 0.0);
+        for term in terms {
+            sum.value += term.value;
+            sum.error += term.error;
+            magnitude += term.value.abs() + term.error;
+        }
+        Self { error: sum.error + chain * UNIT * magnitude, ..sum }
+    }
+
+    pub(super) fn abs(self) -> Self {
+        Self { value: self.value.abs(), ..self }
+    }
+
+    /// The greater or the lesser of both, which `choose` gives.
+    fn between(self, choose: impl Fn(f64, f64) -> f64, other: Self) -> Self {
+        let value = choose(self.value, other.value);
+        let high = choose(self.value + self.error, other.value + other.error);
+        let low = choose(self.value - self.error, other.value - other.error);
+        Self { value, error: (high - value).max(value - low) }
+    }
+
+    /// The other side of `limit` is within a rounding.
+    pub(super) fn may_cross(self, limit: f64) -> bool {
+        (self.value - limit).abs() <= self.error
+    }
+
+    /// ln x: three ulp, or 2^-21 between a half and two.
+    pub(super) fn ln(self) -> Self {
+        let (low, value) = (self.value - self.error, self.value.ln());
+        let own = if (0.5..=2.0).contains(&self.value) {
+            1.0 / 2_097_152.0
+        } else {
+            6.0 * UNIT * value.abs()
+        };
+        let argument = if self.error == 0.0 { 0.0 } else { (self.value / low.max(0.0)).ln() };
+        Self { value, error: own + argument }
+    }
+
+    /// What a reference in double precision, rounded at its end, may be off by.
+    pub(super) fn bound(self) -> f64 {
+        self.error + UNIT * self.value.abs()
+    }
+}
+
+/// The pseudo-GT value in [0, 1] of the sRGB-encoded value `x` under the curve `curve` (a `CURVE_*`).
+pub(super) fn rounded_tone_curve(curve: u32, x: f32, tone: &ToneParameters) -> Rounded {
+    let [x, white, offset, gain] = [x, tone.white, tone.offset, tone.gain].map(Rounded::exact);
+    let y = curve_at(curve, x / white, [offset, gain], &tone.constants.map(Rounded::exact));
+    y.at_least(Rounded::of(0.0)).at_most(Rounded::of(1.0))
+}
+
+/// The numbers themselves, as a reference leaves them.
+pub(super) fn values(numbers: impl IntoIterator<Item = Rounded>) -> impl Iterator<Item = f32> {
+    numbers.into_iter().map(|number| number.value as f32)
+}
+
+/// A bound for each number of a buffer, from what a reference in double precision makes of it.
+impl FromIterator<Rounded> for Tolerance {
+    fn from_iter<I: IntoIterator<Item = Rounded>>(numbers: I) -> Self {
+        Self::Each(numbers.into_iter().map(Rounded::bound).collect())
+    }
+}
+
+impl PartialEq for Rounded {
+    fn eq(&self, other: &Self) -> bool {
+        self.value == other.value
+    }
+}
+
+impl PartialOrd for Rounded {
+    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
+        self.value.partial_cmp(&other.value)
+    }
+}
+
+impl Add for Rounded {
+    type Output = Self;
+    fn add(self, other: Self) -> Self {
+        Self { value: self.value + other.value, error: self.error + other.error }.rounded(1.0)
+    }
+}
+
+impl Sub for Rounded {
+    type Output = Self;
+    fn sub(self, other: Self) -> Self {
+        self + -other
+    }
+}
+
+impl Mul for Rounded {
+    type Output = Self;
+    fn mul(self, other: Self) -> Self {
+        let error = self.value.abs() * other.error + (other.value.abs() + other.error) * self.error;
+        Self { value: self.value * other.value, error }.rounded(1.0)
+    }
+}
+
+impl Div for Rounded {
+    type Output = Self;
+    /// 2.5 ulp.
+    fn div(self, other: Self) -> Self {
+        let value = self.value / other.value;
+        let least = other.value.abs() - other.error;
+        let error = match self.error + value.abs() * other.error {
+            0.0 => 0.0,
+            error if least > 0.0 => error / least,
+            _ => f64::INFINITY,
+        };
+        Self { value, error }.rounded(5.0)
+    }
+}
+
+impl Neg for Rounded {
+    type Output = Self;
+    fn neg(self) -> Self {
+        Self { value: -self.value, ..self }
+    }
+}
+
+/// A number that can wait behind a condition.
+pub trait Gated: Real {
+    /// Itself where `y` is above 0, else 0.
+    fn where_positive(self, y: Self) -> Self;
+}
+
+impl Gated for f64 {
+    fn where_positive(self, y: Self) -> Self {
+        if y > 0.0 { self } else { 0.0 }
+    }
+}
+
+impl Gated for Rounded {
+    fn where_positive(self, y: Self) -> Self {
+        let passed = if y.value > 0.0 { self.value } else { 0.0 };
+        let either = if y.may_cross(0.0) { self.value.abs() } else { 0.0 };
+        Self { value: passed, error: self.error + either }
+    }
+}
+
+impl Real for Rounded {
+    fn of(x: f64) -> Self {
+        Self { value: x, error: (f64::from(x as f32) - x).abs() }
+    }
+
+    /// 3 + 2 |x| ulp.
+    fn exp(self) -> Self {
+        let value = self.value.exp();
+        let argument = Self::from_argument(value, self.error.exp_m1(), value);
+        argument.rounded(6.0 + 4.0 * (self.value.abs() + self.error))
+    }
+
+    /// A series where x is small, else 1 - exp(-x).
+    fn one_minus_exp(self) -> Self {
+        let value = -(-self.value).exp_m1();
+        let slope = (self.error - self.value).exp();
+        let argument = Self::from_argument(value, self.error, slope);
+        if self.value < 0.01 {
+            return argument.rounded(6.0);
+        }
+        let own = UNIT * (6.0 + 4.0 * self.value.abs()) * (-self.value).exp();
+        Self { error: argument.error + own, ..argument }.rounded(1.0)
+    }
+
+    /// A series where x is small, else ln(1 + x).
+    fn ln_1p(self) -> Self {
+        if self.value < 0.01 {
+            let argument = Self::from_argument(self.value.ln_1p(), self.error, 1.0);
+            return argument.rounded(8.0);
+        }
+        (Self::of(1.0) + self).ln()
+    }
+
+    /// exp2(p log2(x)).
+    fn power(self, p: Self) -> Self {
+        if self.value > 0.0 {
+            let exponent = p * self.ln();
+            let value = exponent.value.exp();
+            let argument = Self::from_argument(value, exponent.error.exp_m1(), value);
+            argument.rounded(6.0 + 6.0 * (exponent.value.abs() + exponent.error))
+        } else {
+            Self::default()
+        }
+    }
+
+    /// The inverse of an inverse square root of two ulp.
+    fn sqrt(self) -> Self {
+        let value = self.value.sqrt();
+        let argument = match self.error {
+            0.0 => 0.0,
+            error => error / (value + (self.value - error).max(0.0).sqrt()),
+        };
+        Self { value, error: argument }.rounded(9.0)
+    }
+
+    fn at_least(self, low: Self) -> Self {
+        self.between(|x, low| if x > low { x } else { low }, low)
+    }
+
+    fn at_most(self, high: Self) -> Self {
+        self.between(|x, high| if x < high { x } else { high }, high)
+    }
+
+    /// Three halvings of the angle, each a square root and a division, then a series.
+    fn atan(self) -> Self {
+        Self::from_argument(self.value.atan(), self.error, 1.0).rounded(60.0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Rounded, UNIT};
+    use crate::random::Stream;
+    use crate::tone::Real;
+
+    /// A formula with every operation, in any number.
+    fn formula<T: Real>(x: T, y: T) -> T {
+        let root = (x * x + y * y).sqrt();
+        (x - y) / (T::of(0.3) + root) + (-root).exp() * root.one_minus_exp() - x.power(y).ln_1p()
+    }
+
+    #[test]
+    fn single_precision_stays_within_the_bound_and_the_bound_near_it() {
+        let stream = Stream::new(1, 2);
+        let (mut largest, mut loosest) = (0.0_f64, 0.0_f64);
+        for i in 0..10_000 {
+            let [x, y] = [2 * i, 2 * i + 1].map(|at| 3.0 * stream.uniform(at) as f32);
+            let bound = formula(Rounded::exact(x), Rounded::exact(y));
+            let error = (f64::from(formula(x, y)) - bound.value).abs();
+            assert!(error <= bound.error, "{x} {y}: {error} {bound:?}");
+            largest = largest.max(error / bound.error);
+            loosest = loosest.max(bound.error / UNIT);
+        }
+        assert!(largest > 0.02 && loosest < 1e3, "{largest} {loosest}");
+    }
+}
