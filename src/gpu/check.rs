@@ -109,7 +109,8 @@ impl CheckReport {
             let error = pass.error.unwrap_or_default();
             match kernels.iter_mut().find(|(name, ..)| *name == pass.kernel) {
                 Some((_, passes, largest)) => {
-                    (*passes, *largest) = (*passes + 1, largest.max(error))
+                    *passes += 1;
+                    *largest = largest.max(error);
                 }
                 None => kernels.push((pass.kernel, 1, error)),
             }
