@@ -129,11 +129,16 @@ fn area_weights(input: u32, output: u32) -> Vec<Area> {
 mod tests {
     use super::*;
 
-    fn gradient(width: u32, height: u32) -> Image {
+    pub(super) fn gradient(width: u32, height: u32) -> Image {
         Image::from_fn(width, height, |x, y| {
             let (x, y) = (x as f32 / width as f32, y as f32 / height as f32);
             [x, y, (0.3 + x * y) % 1.0]
         })
+    }
+
+    pub(super) fn worst(a: &Image, b: &Image) -> f32 {
+        assert_eq!((a.width, a.height), (b.width, b.height));
+        a.data.iter().zip(&b.data).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
     }
 
     #[test]

@@ -35,6 +35,7 @@ pub use self::file::CurveChoice;
 #[cfg(feature = "fit")]
 pub(crate) use self::law::{Numbers, law};
 pub(crate) use self::law::{clamped, curve_at, tone_curve};
+#[cfg(feature = "fit")]
 pub(crate) use self::real::Dual;
 pub use self::real::Real;
 pub use self::settings::ToneSettings;

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 
 use nightsplat::Error;
 use nightsplat::cli::ImageFormat;
+use nightsplat::cli::in_options;
 use nightsplat::cli::tone::{ToneArgs, ToneReport, apply};
 use nightsplat::image::Image;
 use nightsplat::tone::{Statistics, ToneCurve, ToneSettings};
@@ -108,7 +109,7 @@ fn bad_input_is_named_in_one_line() {
     let out = path("out");
     let fails = |args: ToneArgs, part: &str, code: u8| {
         let error = apply(&args).unwrap_err();
-        let message = error.to_string();
+        let message = in_options(&error.to_string());
         assert!(message.contains(part) && !message.contains('\n'), "{message}");
         assert_eq!(error.exit_code(), code, "{message}");
     };

@@ -107,12 +107,10 @@ impl CheckReport {
         let mut kernels: Vec<(&'static str, usize, f64)> = vec![];
         for pass in &self.passes {
             let error = pass.error.unwrap_or_default();
-            match kernels.iter_mut().find(|(name, ..)| *name == pass.kernel) {
-                Some((_, passes, largest)) => {
-                    *passes += 1;
-                    *largest = largest.max(error);
-                }
-                None => kernels.push((pass.kernel, 1, error)),
+            if let Some(own) = kernels.iter_mut().find(|(name, ..)| *name == pass.kernel) {
+                *own = (own.0, own.1 + 1, own.2.max(error));
+            } else {
+                kernels.push((pass.kernel, 1, error));
             }
         }
         kernels

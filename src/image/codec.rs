@@ -169,24 +169,13 @@ fn from_interleaved(width: u32, height: u32, values: &[f32]) -> Image {
 mod tests {
     use ::image::{ImageBuffer, Luma, LumaA, Rgb, Rgba};
 
+    use super::super::tests::{gradient, worst};
     use super::*;
 
     /// A path in a folder that goes when the second is dropped.
     fn file(name: &str) -> (std::path::PathBuf, tempfile::TempDir) {
         let folder = tempfile::tempdir().unwrap();
         (folder.path().join(name), folder)
-    }
-
-    fn gradient(width: u32, height: u32) -> Image {
-        Image::from_fn(width, height, |x, y| {
-            let (x, y) = (x as f32 / width as f32, y as f32 / height as f32);
-            [x, y, (0.3 + x * y) % 1.0]
-        })
-    }
-
-    fn worst(a: &Image, b: &Image) -> f32 {
-        assert_eq!((a.width, a.height), (b.width, b.height));
-        a.data.iter().zip(&b.data).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
     }
 
     #[test]

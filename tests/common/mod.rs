@@ -1,6 +1,7 @@
 //! What tests share: random numbers, comparisons, kernels run by hand, the command, and what is said of tests not run.
 
 #![allow(dead_code, unused_macros, reason = "no test binary uses everything")]
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
 pub(crate) mod chain;
 #[cfg(feature = "cli")]
@@ -103,6 +104,7 @@ pub(crate) fn widen(values: &[f32]) -> Vec<f64> {
 /// The harness swallows what `println!` and `eprintln!` print in a test that passes, but not what is written to the
 /// handle of standard error: this line is seen in every `cargo test`.
 #[track_caller]
+#[allow(clippy::explicit_write, reason = "`eprintln!` is what the harness swallows")]
 pub(crate) fn not_run(why: impl Display) {
     let (thread, place) = (std::thread::current(), Location::caller());
     let test = thread.name().unwrap_or("a test");
