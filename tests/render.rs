@@ -320,7 +320,6 @@ fn assert_golden(name: &str, setup: &Setup, golden: &[f32], tolerance: f32) {
     let (pixel, width) = (at % setup.pixels(), setup.camera.width as usize);
     let (x, y, channel) = (pixel % width, pixel / width, at / setup.pixels());
     let (largest, actual, golden) = (difference(&at), actual[at], golden[at]);
-    println!("{name}: off by {largest:e}");
     assert!(
         largest <= tolerance,
         "{name}: off by {largest:e} at most, at pixel ({x}, {y}) of channel {channel}: {actual}, golden {golden}"
