@@ -1,6 +1,6 @@
 //! Curves from files: TOML settings, CSV and .cube tables, and what is wrong with them.
 
-#![expect(clippy::unwrap_used, reason = "what fails here fails the test")]
+#![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
 
 use std::path::PathBuf;
 

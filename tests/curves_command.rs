@@ -1,6 +1,6 @@
 //! `nightsplat curves`, in process.
 #![cfg(feature = "cli")]
-#![expect(clippy::unwrap_used, reason = "what fails here fails the test")]
+#![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
 
 use clap::Parser;
 use nightsplat::cli::curves::{CurvesArgs, text};

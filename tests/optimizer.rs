@@ -1,6 +1,6 @@
 //! Adam: the kernel against its reference, its guards, and a problem it has to solve.
 
-#![expect(clippy::unwrap_used, reason = "what fails here fails the test")]
+#![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
 
 use nightsplat::attributes::Attribute;
 use nightsplat::gpu::testing::gpu;

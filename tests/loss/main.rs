@@ -1,6 +1,6 @@
 //! The loss terms: kernels against their references, gradients against finite differences and `PyTorch`, edge cases.
 
-#![expect(clippy::unwrap_used, reason = "what fails here fails the test")]
+#![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
 
 #[macro_use]
 #[path = "../common/mod.rs"]

@@ -1,6 +1,6 @@
 //! The networks: their kernels, their gradients, `PyTorch`'s view of them, their files.
 
-#![expect(clippy::unwrap_used, reason = "what fails here fails the test")]
+#![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
 
 #[macro_use]
 #[path = "../common/mod.rs"]
