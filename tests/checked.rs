@@ -18,6 +18,10 @@ use nightsplat::sort::{Count, RadixSort, Scan};
 use nightsplat::tone::{Statistics, ToneCurve, ToneSettings};
 use nightsplat::train::{Background, Part, TrainConfig, Trainer};
 
+mod common;
+use common::Random;
+use common::setup::variants;
+
 /// Six views of 40 x 30 pixels with depth maps, as the model wants them.
 fn dataset(config: &TrainConfig) -> Dataset {
     let folder = tempfile::tempdir().unwrap();
@@ -172,6 +176,21 @@ fn every_pass_of_the_pseudo_gt_agrees_with_its_reference_for_every_curve() {
         done.unwrap();
         assert!(report.passes.len() >= 6, "{curve}: {:?}", kernels(&report));
         assert_agrees(&curve.to_string(), &report);
+    }
+}
+
+#[test]
+fn every_pass_of_the_rasteriser_agrees_with_its_reference_whatever_its_sizes() {
+    for setup in variants() {
+        let mut random = Random::new(3);
+        let (_, report) = gpu().checked(|| {
+            let mut rendered = setup.render();
+            let d_render: Vec<f32> =
+                rendered.render.iter().map(|_| random.between(-1.0, 1.0) as f32).collect();
+            rendered.backward(&d_render)
+        });
+        assert_agrees(&format!("{} Gaussians, {:?}", setup.count, setup.settings), &report);
+        assert!(kernels(&report).is_superset(&BTreeSet::from(["project", "project_backward"])));
     }
 }
 
