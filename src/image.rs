@@ -28,6 +28,13 @@ pub struct Image {
     pub data: Vec<f32>,
 }
 
+/// Planes from pixels of red, green and blue.
+#[cfg(feature = "io")]
+fn from_interleaved(width: u32, height: u32, values: &[f32]) -> Image {
+    let data = (0..3).flat_map(|plane| values.iter().skip(plane).step_by(3).copied()).collect();
+    Image { width, height, data }
+}
+
 /// The sRGB encoding of a linear-light value; inverse of [`linear_from_srgb`].
 pub fn srgb_from_linear(linear: f32) -> f32 {
     if linear <= 0.003_130_8 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }

@@ -8,7 +8,7 @@ use ::image::{
     codecs::png::PngEncoder,
 };
 
-use super::{Image, exr_file, jpeg, linear_from_srgb, srgb_from_linear};
+use super::{Image, exr_file, from_interleaved, jpeg, linear_from_srgb, srgb_from_linear};
 use crate::output::write_whole;
 use crate::{Error, Result};
 
@@ -157,12 +157,6 @@ fn from_decoded(decoded: DynamicImage) -> Image {
         decoded.into_rgb8().into_raw().into_iter().map(|value| f32::from(value) / 255.0).collect()
     };
     from_interleaved(width, height, &interleaved)
-}
-
-/// Planes from pixels of red, green and blue.
-fn from_interleaved(width: u32, height: u32, values: &[f32]) -> Image {
-    let data = (0..3).flat_map(|plane| values.iter().skip(plane).step_by(3).copied()).collect();
-    Image { width, height, data }
 }
 
 #[cfg(test)]
