@@ -42,7 +42,7 @@ pub struct Frame {
     channels: usize,
     // Gaussians
     pub gaussian_count: u32,
-    /// [0]: the count again, where a pass looks for it
+    /// `[0]`: the count again, where a pass looks for it
     pub gaussian_counts: Buffer<u32>,
     pub splats: Buffer<ProjectedSplat>,
     pub colors: Buffer<f32>,
