@@ -133,18 +133,6 @@ pub fn in_options(message: &str) -> String {
     said.collect()
 }
 
-#[cfg(all(test, not(feature = "fit")))]
-mod without_fit {
-    use super::*;
-
-    #[test]
-    fn fit_says_which_feature_has_it() {
-        let cli = Cli::try_parse_from(["nightsplat", "fit", "pairs", "--family", "ase"]).unwrap();
-        let message = cli.run().unwrap_err().to_string();
-        assert!(message.contains("feature `fit`"), "{message}");
-    }
-}
-
 /// The picture files that a command writes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
 pub enum ImageFormat {
@@ -207,5 +195,17 @@ mod tests {
         ] {
             assert_eq!(in_options(message), said);
         }
+    }
+}
+
+#[cfg(all(test, not(feature = "fit")))]
+mod without_fit {
+    use super::*;
+
+    #[test]
+    fn fit_says_which_feature_has_it() {
+        let cli = Cli::try_parse_from(["nightsplat", "fit", "pairs", "--family", "ase"]).unwrap();
+        let message = cli.run().unwrap_err().to_string();
+        assert!(message.contains("feature `fit`"), "{message}");
     }
 }

@@ -6,7 +6,8 @@
 //!
 //! Percentiles are exact: luminance is not negative, so its bits sort as integers, and a radix select finds both
 //! neighbours of both ranks in three digits of 11, 10 and 10 bits; the same photograph gives the same bits every time. What
-//! curve the statistics give is said once, on the host ([`ToneSettings::parameters`]). A photograph beyond the device's limits comes in tiles, whose counts and sums add up.
+//! curve the statistics give is said once, on the host ([`ToneSettings::parameters`]). A photograph beyond the device's
+//! limits comes in tiles, whose counts and sums add up.
 
 use glam::Vec3;
 
