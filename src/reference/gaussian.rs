@@ -35,6 +35,12 @@ pub struct Planes {
 }
 
 impl Planes {
+    /// Those of so many Gaussians whose splats have so many channels: colour, and the features behind it.
+    pub(super) fn of(gaussian_count: u32, channels: u32, sh_degree: u32) -> Self {
+        let feature_count = channels as usize - 3;
+        Self { count: gaussian_count as usize, feature_count, sh_degree }
+    }
+
     /// Floats of the whole array.
     pub fn len(self) -> usize {
         self.count * column_count(self.feature_count, self.sh_degree)

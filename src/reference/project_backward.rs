@@ -133,9 +133,8 @@ struct Scene<'a> {
 
 impl<'a> Scene<'a> {
     fn new(params: &'a Params, constants: &'a Constants) -> Self {
-        let (count, feature_count) =
-            (params.gaussian_count as usize, constants.channels as usize - 3);
-        let planes = Planes { count, feature_count, sh_degree: constants.sh_degree };
+        let Constants { channels, sh_degree, .. } = *constants;
+        let planes = Planes::of(params.gaussian_count, channels, sh_degree);
         let camera = Camera::from(&params.camera);
         Self { params, constants, camera, planes }
     }
