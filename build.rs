@@ -42,7 +42,7 @@ fn main() {
     let mut names = BTreeSet::new();
     for path in kernel_paths(Path::new(SHADERS)) {
         let source = fs::read_to_string(&path).expect("a listed file can be read");
-        let compiled = compiler::compile(&path, &source);
+        let compiled = compiler::compile(&path, &restricted(&source));
         let kernel = Kernel::reflect(&path, &source, &compiled.reflected, &mut structs);
         assert!(names.insert(kernel.name.clone()), "two kernels are called {}", kernel.name);
         let bytes: Vec<u8> = compiled.shipped.iter().flat_map(|word| word.to_le_bytes()).collect();
@@ -56,6 +56,16 @@ fn main() {
     let all = format!("/// Every kernel, by name.\npub const NAMES: &[&str] = &{names:?};\n");
     let kernels = structs.write(&text) + &glsl::include_modules() + &all + &kernels;
     fs::write(out_dir.join("kernels.rs"), kernels).expect("OUT_DIR is ours");
+}
+
+/// The source with `restrict` on every buffer: Rust's `&` and `&mut` have proved that no two that a pass binds share what
+/// it writes, so drivers may move loads across stores.
+fn restricted(source: &str) -> String {
+    let line = |line: &str| match line.starts_with("layout(binding") {
+        true => line.replacen(" buffer ", " restrict buffer ", 1) + "\n",
+        false => line.to_owned() + "\n",
+    };
+    source.lines().map(line).collect()
 }
 
 /// Every `.comp` below `dir`, in a stable order.

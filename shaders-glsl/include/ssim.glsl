@@ -12,6 +12,7 @@ layout(constant_id = 1) const uint ROWS = 32;    // rows per thread, beside 2 RA
 const int RADIUS = 5;               // of the window, pixels
 const uint PENDING = 2 * RADIUS;    // rows of outputs in reach beside the one that completes
 const uint REACH = COLUMNS + PENDING;  // inputs along x
+const uint QUADS = (REACH + 6) / 4;    // aligned vectors of four that hold them, wherever they begin
 
 // exp(-d^2 / (2 sigma^2)) / sum for d = 0..RADIUS.
 const float TAPS[RADIUS + 1] =
@@ -23,6 +24,13 @@ float blur(float row[REACH], uint x) {
     float sum = TAPS[0] * row[centre];
     [[unroll]] for (int d = 1; d <= RADIUS; ++d) sum += TAPS[d] * (row[centre - d] + row[centre + d]);
     return sum;
+}
+
+// Input `k` along x, the first of which is `shift` floats into the quads.
+float unpack(vec4 quads[QUADS], uint k, uint shift) {
+    float at[4];
+    [[unroll]] for (uint s = 0; s < 4; ++s) at[s] = quads[(k + s) / 4][(k + s) % 4];
+    return shift < 2 ? (shift == 0 ? at[0] : at[1]) : (shift == 2 ? at[2] : at[3]);
 }
 
 // The rectangle whose pixels count: all of them, or the interior of a view with a margin.

@@ -23,8 +23,8 @@ layout(push_constant) uniform Params {
     uvec2 interior_end;    // one past the last
 };
 
-layout(binding = 0) readonly  buffer Render   { float render[]; };          // (3, H, W), not clamped
-layout(binding = 1) readonly  buffer Low      { float low[]; };             // (3, H, W), sRGB-encoded
+layout(binding = 0) readonly  buffer Render   { vec4 render[]; };           // (3, H, W), not clamped
+layout(binding = 1) readonly  buffer Low      { vec4 low[]; };              // (3, H, W), sRGB-encoded
 layout(binding = 2) readonly  buffer Tone     { ToneParameters tone[]; };   // (1,)
 layout(binding = 3) writeonly buffer DMoments { vec3 d_moments[]; };        // (3, H, W, 3), dS/dE[a], dS/dE[aa], dS/dE[ab]
 layout(binding = 4) writeonly buffer Partials { float partials[]; };        // one per workgroup
@@ -60,18 +60,24 @@ void main() {
 
     ToneParameters curve = tone[0];
     float sum = 0.0;
+    int last_quad = int(3 * width * height - 1) / 4;
     // A workgroup's last threads can be beyond the image: no rows, yet they take part in the sum.
     int end = strip.channel < 3 ? strip.end + RADIUS : strip.y - RADIUS;
     for (int y = strip.y - RADIUS; y < end; ++y) {
+        int from = (int(strip.channel * height) + y) * int(width) + strip.x - RADIUS;
+        vec4 render_quads[QUADS], low_quads[QUADS];
+        [[unroll]] for (int q = 0; q < QUADS; ++q) {
+            // Beyond the image a window sees zeros, whatever is loaded.
+            int quad = clamp((from >> 2) + q, 0, last_quad);
+            render_quads[q] = render[quad];
+            low_quads[q] = low[quad];
+        }
         float row[MOMENTS][REACH];
         [[unroll]] for (int k = 0; k < REACH; ++k) {
             int x = strip.x + k - RADIUS;
             bool inside = x >= 0 && x < int(width) && y >= 0 && y < int(height);
-            uint i = inside ? plane + uint(y) * width + uint(x) : 0;
-            float a = render[i];
-            float b = tone_curve(low[i], curve);
-            a = inside ? a : 0.0;
-            b = inside ? b : 0.0;
+            float a = inside ? unpack(render_quads, k, from & 3) : 0.0;
+            float b = inside ? tone_curve(unpack(low_quads, k, from & 3), curve) : 0.0;
             row[A][k] = a;
             row[B][k] = b;
             row[AA][k] = a * a;
