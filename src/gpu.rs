@@ -61,6 +61,8 @@ pub struct Properties {
     pub max_storage_buffer_range: u64,
     /// Workgroups of a dispatch along one dimension.
     pub max_workgroups: u32,
+    /// After how many turns, of all its loops together, a kernel's invocation leaves them, silently.
+    pub max_loop_iterations: u32,
     /// Nanoseconds of one timestamp tick.
     pub timestamp_period: f32,
     /// The device is a processor (lavapipe and the like).

@@ -11,7 +11,7 @@ use nightsplat::gpu::Threads;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::splat::ALPHA_MIN;
 use nightsplat::kernels::status::{STATUS_NOT_FINITE, STATUS_OVERFLOWED};
-use nightsplat::kernels::{ProjectedSplat, check_capacity, emit, tile_ranges};
+use nightsplat::kernels::{ProjectedSplat, emit, order_counts, tile_ranges};
 use nightsplat::reference::gaussian::Gaussian;
 use nightsplat::reference::splat::{Splat, splat_columns};
 use nightsplat::render::Status;
@@ -51,23 +51,37 @@ fn an_overflow_renders_nothing_and_keeps_its_flag() {
     gpu().write(rendered.renderer.render_and_status().1, &[flags, 7]).unwrap();
     rendered.renderer.set_intersection_capacity(total).unwrap();
     rendered.forward();
-    assert_eq!(gpu().read(rendered.renderer.status()).unwrap(), [flags, total]);
+    assert_eq!(gpu().read(rendered.renderer.status()).unwrap(), [flags, total, 0]);
 }
 
 #[test]
 fn the_most_intersections_that_can_be_counted_are_an_overflow() {
-    for (total, before, flag) in [(5, [0, 9], 0), (6, [2, 1], 1), (u32::MAX, [0, 0], 1)] {
-        let (total, counts, status) = (vec![total], vec![7], before.to_vec());
-        let (counts, after) = run_kernel!(
-            check_capacity,
-            check_capacity::Constants::default(),
-            check_capacity::Params { capacity: 5 },
-            Threads::Exactly([1, 1, 1]),
-            [total],
-            [counts, status]
+    // The last wraps around.
+    for (tile_counts, before, flag) in [
+        (vec![], [0, 9], 0),
+        (vec![2, 3], [0, 9], 0),
+        (vec![6], [2, 1], 1),
+        (vec![u32::MAX], [0, 0], 1),
+        (vec![1 << 31, 0, 1 << 31, 3], [0, 0], 1),
+    ] {
+        let total: u64 = tile_counts.iter().map(|&count| u64::from(count)).sum();
+        let total = u32::try_from(total).unwrap_or(u32::MAX);
+        let gaussian_count = tile_counts.len() as u32;
+        let constants = order_counts::Constants { partition_size: 2 };
+        let sorted_ids: Vec<u32> = (0..gaussian_count).rev().collect();
+        let (ordered_counts, sums, arrivals) = (vec![7; 5], vec![7; 3], vec![0]);
+        let (counts, status) = (vec![7], vec![before[0], before[1], 0]);
+        let (_, _, counts, after, arrivals) = run_kernel!(
+            order_counts,
+            constants,
+            order_counts::Params { gaussian_count, capacity: 5 },
+            Threads::Workgroups([3, 1, 1]),
+            [sorted_ids, tile_counts],
+            [ordered_counts, sums, counts, status, arrivals]
         );
-        assert_eq!(counts[0], if flag == 0 { total[0] } else { 0 });
-        assert_eq!(after, [before[0] | flag, before[1].max(total[0])]);
+        assert_eq!(counts[0], if flag == 0 { total } else { 0 });
+        assert_eq!(after, [before[0] | flag, before[1].max(total), 0]);
+        assert_eq!(arrivals, [0]);
     }
 }
 
@@ -75,17 +89,18 @@ fn the_most_intersections_that_can_be_counted_are_an_overflow() {
 fn padding_belongs_to_no_tile() {
     let tile_count = 120;
     let (counts, sorted_tiles) = (vec![5], vec![0, 0, 2, tile_count, u32::MAX]);
-    let tile_ranges = vec![UVec2::ZERO; tile_count as usize];
-    let ranges = run_kernel!(
+    let (tile_ranges, status) = (vec![UVec2::ONE; tile_count as usize], vec![0; 3]);
+    let (ranges, status) = run_kernel!(
         tile_ranges,
         tile_ranges::Constants::default(),
-        tile_ranges::Params { tile_count },
-        Threads::Exactly([5, 1, 1]),
+        tile_ranges::Params { tile_count, longest_run: 2 },
+        Threads::Exactly([tile_count, 1, 1]),
         [counts, sorted_tiles],
-        [tile_ranges]
+        [tile_ranges, status]
     );
-    assert_eq!(ranges[..3], [UVec2::new(0, 2), UVec2::ZERO, UVec2::new(2, 3)]);
-    assert!(ranges[3..].iter().all(|&range| range == UVec2::ZERO));
+    assert_eq!(ranges[..3], [UVec2::new(0, 2), UVec2::splat(2), UVec2::new(2, 3)]);
+    assert!(ranges[3..].iter().all(|range| range.x == range.y));
+    assert_eq!(status, [0; 3]);
 }
 
 #[test]
@@ -93,19 +108,21 @@ fn a_count_that_wrapped_around_writes_no_slot_beyond_the_counted() {
     let setup = Setup::new(3, [32, 32], 0, 1);
     let splats = gpu().read(&setup.render().renderer.frame().splats).unwrap();
     // As if the offsets of later ranks had run past the total.
-    let (counts, sorted_ids, ordered_counts) = (vec![2], vec![0, 1, 2], vec![4, 4, 4]);
-    let offsets = vec![0, 4, u32::MAX - 1];
+    let (counts, sorted_ids, ordered_counts) = (vec![2], vec![0, 1, 2], vec![4, 4, u32::MAX - 5]);
+    let sums = vec![0];
     let [tiles, slots, owners] = [0; 3].map(|_| vec![7u32; 16]);
-    let (tiles, slots, owners) = run_kernel!(
+    let emitted = vec![UVec2::splat(7); 3];
+    let (tiles, slots, owners, emitted) = run_kernel!(
         emit,
-        emit::Constants::default(),
+        emit::Constants { partition_size: 256, ..Default::default() },
         emit::Params { size: UVec2::new(32, 32), gaussian_count: 3, tile_columns: 2 },
         Threads::Exactly([3, 1, 1]),
-        [counts, sorted_ids, ordered_counts, offsets, splats],
-        [tiles, slots, owners]
+        [counts, sorted_ids, ordered_counts, sums, splats],
+        [tiles, slots, owners, emitted]
     );
     let untouched = |slots: &[u32]| slots[2..].iter().all(|&slot| slot == 7);
     assert!(untouched(&tiles) && untouched(&slots) && untouched(&owners));
+    assert!(emitted.iter().all(|range| range.x == range.y));
 }
 
 /// A Gaussian in the middle of the view of [`Setup::new`], a few pixels wide.
@@ -152,7 +169,7 @@ fn gaussians_out_of_range_leave_no_trace() {
     }
     let mut rendered = setup.render();
     assert_shows_nothing(&rendered, &setup);
-    assert_eq!(gpu().read(&rendered.renderer.frame().total).unwrap(), [0]);
+    assert_eq!(gpu().read(&rendered.renderer.frame().counts).unwrap(), [0]);
     let gradients = rendered.backward(&vec![1.0; rendered.render.len()]);
     assert!(gradients.parameters.iter().all(|&g| g == 0.0));
     assert_eq!(gradients.visit_counts, [Rendered::VISITS_BEFORE; 16]);
@@ -280,10 +297,14 @@ fn no_visible_pixel_is_missed() {
 
 #[test]
 fn neither_tiles_nor_the_order_of_gaussians_change_a_bit() {
-    // Faint, so that nothing hides what another tile may have missed.
+    // Faint, so that nothing hides what another tile may have missed; no two at one depth, which their order decides.
     let mut setup = needles(1000);
+    let camera = setup.camera();
     for i in 0..setup.count {
-        setup.set(i, &Gaussian { raw_opacity: -4.0, ..setup.get(i) });
+        let gaussian = setup.get(i);
+        let nearer = (1.0 + 0.004 * i as f64) / camera.view(gaussian.mean).z;
+        let mean = camera.center() + (gaussian.mean - camera.center()) * nearer;
+        setup.set(i, &Gaussian { mean, raw_opacity: -4.0, ..gaussian });
     }
     let mut reversed = setup.clone();
     (0..setup.count).for_each(|i| reversed.set(i, &setup.get(setup.count - 1 - i)));
