@@ -10,11 +10,11 @@ use nightsplat::camera::Camera;
 use nightsplat::gpu::Threads;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::splat::ALPHA_MIN;
-use nightsplat::kernels::status::{STATUS_NOT_FINITE, STATUS_OVERFLOWED};
-use nightsplat::kernels::{ProjectedSplat, emit, order_counts, tile_ranges};
+use nightsplat::kernels::status::{STATUS_CROWDED, STATUS_NOT_FINITE, STATUS_OVERFLOWED};
+use nightsplat::kernels::{ProjectedSplat, emit, order_counts, reduce_records, tile_ranges};
 use nightsplat::reference::gaussian::Gaussian;
 use nightsplat::reference::splat::{Splat, splat_columns};
-use nightsplat::render::Status;
+use nightsplat::render::{Renderer, Status};
 use nightsplat::scene::{Features, Shape};
 
 #[macro_use]
@@ -123,6 +123,140 @@ fn a_count_that_wrapped_around_writes_no_slot_beyond_the_counted() {
     let untouched = |slots: &[u32]| slots[2..].iter().all(|&slot| slot == 7);
     assert!(untouched(&tiles) && untouched(&slots) && untouched(&owners));
     assert!(emitted.iter().all(|range| range.x == range.y));
+}
+
+/// Splats that cover an image whole, `extra` slots more reserved than they need, and what `emit` makes of them.
+fn emit_wide(count: u32, size: UVec2, extra: u32) -> (Vec<u32>, Vec<UVec2>, u32) {
+    let constants = emit::Constants { partition_size: 256, ..Default::default() };
+    let tile = UVec2::new(constants.tile_width, constants.tile_height);
+    let tiles = (size + tile - 1) / tile;
+    let splat = ProjectedSplat {
+        mean2d: size.as_vec2() / 2.0,
+        conic: Vec3::new(1e-9, 0.0, 1e-9),
+        opacity: 0.5,
+        half_extent: Vec2::splat(1e5),
+    };
+    let per_splat = tiles.element_product() + extra;
+    let (splats, sorted_ids) = (vec![splat; count as usize], (0..count).rev().collect::<Vec<_>>());
+    let (counts, sums) = (vec![count * per_splat], vec![0; 1 + count as usize / 256]);
+    let ordered_counts = vec![per_splat; count as usize];
+    let [tiles_, slots, owners] = [0; 3].map(|_| vec![7u32; counts[0] as usize]);
+    let (tiles, emitted) = (tiles_, vec![UVec2::ZERO; count as usize]);
+    let (tiles, _, _, emitted) = run_kernel!(
+        emit,
+        constants,
+        emit::Params { size, gaussian_count: count, tile_columns: size.x.div_ceil(tile.x) },
+        Threads::Exactly([count, 1, 1]),
+        [counts, sorted_ids, ordered_counts, sums, splats],
+        [tiles, slots, owners, emitted]
+    );
+    (tiles, emitted, per_splat)
+}
+
+#[test]
+fn gaussians_that_cover_the_whole_of_a_large_image_fill_their_slots_and_are_summed() {
+    // More tiles than a loop of some devices has turns, for every lane of a subgroup.
+    let size = UVec2::new(4096, 2176);
+    let (tiles, emitted, per_splat) = emit_wide(9, size, 0);
+    assert!(per_splat > 32_000 && tiles.len() == 9 * per_splat as usize);
+    assert!(tiles.chunks(per_splat as usize).all(|own| (0..per_splat).eq(own.iter().copied())));
+    let record = 9;
+    let mut random = Random::new(3);
+    let records: Vec<f32> =
+        (0..tiles.len() * record).map(|_| random.between(-1.0, 1.0) as f32).collect();
+    let d_splats = vec![f32::NAN; 9 * record];
+    run_kernel!(
+        reduce_records,
+        reduce_records::Constants::default(),
+        reduce_records::Params { gaussian_count: 9 },
+        Threads::Exactly([9, 1, 1]),
+        [emitted, records],
+        [d_splats]
+    );
+}
+
+#[test]
+fn slots_that_no_tile_fills_are_padding_and_leave_no_trace_in_the_sums() {
+    // Few slots, which their lane walks alone, and many, which all lanes share.
+    for size in [UVec2::new(40, 20), UVec2::new(400, 200)] {
+        let (tiles, emitted, per_splat) = emit_wide(11, size, 5);
+        let is_padding = |slot: usize| slot as u32 % per_splat >= per_splat - 5;
+        assert!((0..tiles.len()).all(|slot| (tiles[slot] == emit::NO_TILE) == is_padding(slot)));
+        // No tile has written the records of padding.
+        let record = |slot: usize| [if is_padding(slot) { f32::NAN } else { 1.0 }; 9];
+        let records: Vec<f32> = (0..tiles.len()).flat_map(record).collect();
+        let d_splats = vec![f32::NAN; 11 * 9];
+        let sums = run_kernel!(
+            reduce_records,
+            reduce_records::Constants::default(),
+            reduce_records::Params { gaussian_count: 11 },
+            Threads::Exactly([11, 1, 1]),
+            [emitted, records],
+            [d_splats]
+        );
+        assert!(sums.iter().all(|&sum| sum == (per_splat - 5) as f32), "{sums:?}");
+    }
+}
+
+/// So many faint splats, one behind the other, on one pixel.
+fn crowd(count: usize) -> Setup {
+    let mut setup = Setup::new(count, [20, 11], 0, 5);
+    let size = setup.camera().size;
+    for i in 0..count {
+        let depth = 1.0 + 4.0 * i as f64 / count as f64;
+        let gaussian = Gaussian {
+            mean: setup.at_pixel((size / 2.0).floor() + 0.5, depth),
+            log_scale: DVec3::splat((0.1 * depth / setup.camera().focal.x).ln()),
+            raw_opacity: -4.5,
+            ..setup.get(i)
+        };
+        setup.set(i, &gaussian);
+    }
+    setup
+}
+
+#[test]
+fn a_hundred_thousand_splats_on_one_pixel_are_blended_as_the_references_say() {
+    let setup = crowd(100_000);
+    let (_, report) = gpu().checked(|| {
+        let mut rendered = setup.render();
+        rendered.backward(&vec![1.0; 3 * setup.pixels()])
+    });
+    report.agree().unwrap();
+    let passed: HashSet<_> = report.passes.iter().map(|pass| pass.kernel).collect();
+    assert!(
+        ["emit", "blend_forward", "blend_backward", "reduce_records"].map(|k| passed.contains(k))
+            == [true; 4]
+    );
+}
+
+#[test]
+fn more_splats_on_a_tile_than_the_device_follows_are_an_error_that_says_so() {
+    let tile_count = 3;
+    let (counts, sorted_tiles) = (vec![7], vec![0, 0, 0, 0, 2, 2, 2]);
+    let (tile_ranges, status) = (vec![UVec2::ONE; 3], vec![0; 3]);
+    let (ranges, status) = run_kernel!(
+        tile_ranges,
+        tile_ranges::Constants::default(),
+        tile_ranges::Params { tile_count, longest_run: 3 },
+        Threads::Exactly([tile_count, 1, 1]),
+        [counts, sorted_tiles],
+        [tile_ranges, status]
+    );
+    assert_eq!(ranges, [UVec2::ZERO, UVec2::splat(4), UVec2::new(4, 7)]);
+    assert_eq!(status, [STATUS_CROWDED, 0, 4]);
+    assert_eq!(Status::from_words(&status).crowd, 4);
+    if gpu().properties().max_loop_iterations == u32::MAX {
+        return;
+    }
+    let setup = crowd(300_000);
+    let gaussians = gpu().buffer("parameters", &setup.parameters).unwrap();
+    let mut renderer = Renderer::new(&gpu(), setup.settings).unwrap();
+    renderer.reserve(setup.count, [&setup.camera]).unwrap();
+    let refused = renderer.render_image(&gaussians, &setup.camera, &setup.options);
+    let message = refused.unwrap_err().to_string();
+    assert!(message.starts_with("a 20x11 render: 300000 splats on one tile of 16x8"), "{message}");
+    assert!(!message.contains('\n'), "{message}");
 }
 
 /// A Gaussian in the middle of the view of [`Setup::new`], a few pixels wide.

@@ -87,23 +87,44 @@ fn references_change_no_trained_bit() {
 fn steps_that_outgrow_their_memory_are_redone_and_nothing_is_lost() {
     let dataset = dataset();
     let config = TrainConfig { steps: 20, ..config() };
-    let run = |reserved: u32| {
+    let run = |reserved: u32, in_flight: usize| {
         let mut trainer = Trainer::new(&gpu(), config.clone(), &dataset).unwrap();
         trainer.set_intersection_capacity(reserved).unwrap();
+        trainer.set_pace(in_flight, Some(3));
         let mut reports = vec![];
-        let mut submissions = 0;
+        let mut interruptions = 0;
         while trainer.steps_done() < config.steps {
-            reports.extend(trainer.advance(config.steps).unwrap());
-            submissions += 1;
+            let more = trainer.advance(config.steps).unwrap();
+            interruptions += u32::from(more.is_empty());
+            reports.extend(more);
         }
         let steps: Vec<u64> = reports.iter().map(|report| report.step).collect();
         assert_eq!(steps, (1..=20).collect::<Vec<_>>());
-        (submissions, trainer.gaussians().unwrap())
+        (interruptions, trainer.gaussians().unwrap())
     };
-    let (few, roomy) = run(100_000);
-    let (more, tight) = run(16);
-    assert!(more > few, "{more} submissions, {few} without an overflow");
-    assert_eq!(roomy, tight);
+    let (none, roomy) = run(100_000, 2);
+    assert_eq!(none, 0);
+    for in_flight in [1, 2, 3] {
+        let (some, tight) = run(16, in_flight);
+        assert!(some > 0, "no overflow with {in_flight} in flight");
+        assert_eq!(roomy, tight, "{in_flight} in flight");
+    }
+}
+
+#[test]
+fn how_steps_are_submitted_changes_no_bit() {
+    let dataset = dataset();
+    let run = |in_flight: usize, steps: Option<u64>| {
+        let mut trainer = Trainer::new(&gpu(), config(), &dataset).unwrap();
+        trainer.set_pace(in_flight, steps);
+        let losses: Vec<f64> = advance(&mut trainer, 60).iter().map(|report| report.loss).collect();
+        (losses, trainer.gaussians().unwrap())
+    };
+    let one_by_one = run(1, Some(1));
+    assert_eq!(one_by_one.0.len(), 60);
+    for (in_flight, steps) in [(2, Some(1)), (1, Some(64)), (2, Some(7)), (2, None)] {
+        assert_eq!(run(in_flight, steps), one_by_one, "{in_flight} in flight, {steps:?} steps");
+    }
 }
 
 #[test]
