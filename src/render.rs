@@ -160,6 +160,7 @@ impl Renderer {
         let channels = settings.channels() as u32;
         let (alpha_max, sh_degree) = (settings.max_alpha, settings.shape.sh_degree);
         let (raw_colors, partition_size) = (settings.raw_colors, RANKS_PER_PARTITION);
+        let splats_per_turn = splats_per_turn(gpu);
         // What every kernel that includes `splat.glsl` is specialised with, and what some are beside it.
         macro_rules! constants {
             ($kernel:ident $(, $own:ident)*) => {
@@ -175,8 +176,8 @@ impl Renderer {
             order_counts: gpu.pipeline(&order_counts::Constants { partition_size })?,
             emit: gpu.pipeline(&constants!(emit, partition_size))?,
             tile_ranges: gpu.pipeline(&tile_ranges::Constants::default())?,
-            blend_forward: gpu.pipeline(&constants!(blend_forward))?,
-            blend_backward: gpu.pipeline(&constants!(blend_backward))?,
+            blend_forward: gpu.pipeline(&constants!(blend_forward, splats_per_turn))?,
+            blend_backward: gpu.pipeline(&constants!(blend_backward, splats_per_turn))?,
             reduce_records: gpu.pipeline(&constants!(reduce_records))?,
             project_backward: gpu.pipeline(&constants!(project_backward, sh_degree, raw_colors))?,
             depth_sort: RadixSort::new(gpu, 0)?,
@@ -516,12 +517,19 @@ impl Renderer {
     }
 }
 
-/// How many splats of a tile the blending kernels get through on this device: of every SUBGROUP_SIZE splats they make
-/// one turn of the outer loop and one of the inner loop per splat, and processors may run each inner loop once in vain.
+/// How many splats the blending kernels take in one turn of their inner loop. More cost a device nothing that ends loops
+/// after so many turns, a processor, and let it follow more; others have the shorter code.
+fn splats_per_turn(gpu: &Gpu) -> u32 {
+    if gpu.properties().max_loop_iterations < u32::MAX { 4 } else { 1 }
+}
+
+/// How many splats of a tile the blending kernels get through: of every SUBGROUP_SIZE splats they make one turn of the
+/// outer loop and the turns of the inner one, and at their end the outer loop and that over what is hidden one more.
 fn longest_run(gpu: &Gpu) -> u32 {
     let properties = gpu.properties();
     let lanes = properties.subgroup_size;
-    properties.max_loop_iterations / (lanes + 2) * lanes
+    let turns_per_batch = 1 + lanes.div_ceil(splats_per_turn(gpu));
+    (properties.max_loop_iterations / turns_per_batch - 1).saturating_mul(lanes)
 }
 
 /// A camera as the kernels take it, and the columns and rows of tiles of its image.

@@ -46,37 +46,41 @@ void main() {
         if (!subgroupAny(alive)) break;
 
         uint batch = min(SUBGROUP_SIZE, range.y - first);
-        // Lanes beyond the batch load its last splat and are never broadcast.
+        // Lanes beyond the batch load its last splat, which meets no pixel of theirs.
         uint id = owners[sorted_slots[first + min(lane, batch - 1)]];
         ProjectedSplat mine = splats[id];
         float my_color[CHANNELS];
         [[unroll]] for (uint c = 0; c < CHANNELS; c++) my_color[c] = colors[CHANNELS * id + c];
-        uint my_groups = splat_groups(mine, origin);
+        uint my_groups = lane < batch ? splat_groups(mine, origin) : 0;
 
         // Tested at its end: a processor's driver runs a loop tested at its head once more, with every lane off.
-        for (uint j = 0; true;) {
-            uint groups = subgroupShuffle(my_groups, j);
-            vec2 d = subgroupShuffle(mine.mean2d, j) - (vec2(first_pixel) + 0.5);
-            vec3 conic = subgroupShuffle(mine.conic, j);
-            float opacity = subgroupShuffle(mine.opacity, j);
-            float splat_color[CHANNELS];
-            [[unroll]] for (uint c = 0; c < CHANNELS; c++) splat_color[c] = subgroupShuffle(my_color[c], j);
+        for (uint turn = 0; true;) {
+            [[unroll]] for (uint k = 0; k < SPLATS_PER_TURN; k++) {
+                uint j = turn + k;
+                uint groups = subgroupShuffle(my_groups, j);
+                vec2 d = subgroupShuffle(mine.mean2d, j) - (vec2(first_pixel) + 0.5);
+                vec3 conic = subgroupShuffle(mine.conic, j);
+                float opacity = subgroupShuffle(mine.opacity, j);
+                float splat_color[CHANNELS];
+                [[unroll]] for (uint c = 0; c < CHANNELS; c++) splat_color[c] = subgroupShuffle(my_color[c], j);
 
-            [[unroll]] for (uint g = 0; g < GROUPS; g++) {
-                if ((groups >> g & 1) == 0) continue;
-                float sigma = splat_sigma(conic, d - vec2(group_offset(g)));
-                float alpha = min(ALPHA_MAX, opacity * exp(-sigma));
-                float before = transmittance[g];
-                bool counts = sigma >= 0.0 && alpha >= ALPHA_MIN && before > 0.0;
-                // What does not count is composited with alpha 0: the lanes never part.
-                alpha = counts ? alpha : 0.0;
-                float after = before * (1.0 - alpha);
-                bool is_done = after < TRANSMITTANCE_MIN;
-                transmittance[g] = is_done ? -abs(before) : after;
-                float weight = is_done ? 0.0 : alpha * before;
-                [[unroll]] for (uint c = 0; c < CHANNELS; c++) color[g][c] += weight * splat_color[c];
+                [[unroll]] for (uint g = 0; g < GROUPS; g++) {
+                    if ((groups >> g & 1) == 0) continue;
+                    float sigma = splat_sigma(conic, d - vec2(group_offset(g)));
+                    float alpha = min(ALPHA_MAX, opacity * exp(-sigma));
+                    float before = transmittance[g];
+                    bool counts = sigma >= 0.0 && alpha >= ALPHA_MIN && before > 0.0;
+                    // What does not count is composited with alpha 0: the lanes never part.
+                    alpha = counts ? alpha : 0.0;
+                    float after = before * (1.0 - alpha);
+                    bool is_done = after < TRANSMITTANCE_MIN;
+                    transmittance[g] = is_done ? -abs(before) : after;
+                    float weight = is_done ? 0.0 : alpha * before;
+                    [[unroll]] for (uint c = 0; c < CHANNELS; c++) color[g][c] += weight * splat_color[c];
+                }
             }
-            if (++j >= batch) break;
+            turn += SPLATS_PER_TURN;
+            if (turn >= batch) break;
         }
     }
 
