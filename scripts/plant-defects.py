@@ -23,7 +23,7 @@ DEFECTS = [
      "my_color[c] = colors[CHANNELS * id + c]", "my_color[c] = colors[3 * id + c]", "--test render golden"),
     ("pixels beyond the right and the lower edge are written", "shaders-glsl/render/blend_forward.comp",
      "if (all(lessThan(pixel, size)))", "if (all(lessThanEqual(pixel, size)))", "--test render"),
-    ("the last intersection of a tile is lost", "shaders-glsl/render/tile_ranges.comp",
+    ("the last intersection of a tile is lost", "shaders-glsl/include/tile_run.glsl",
      "intersections_before(tile + 1));", "intersections_before(tile + 1) - 1);", "--test render"),
     ("depth without its share of the mean's gradient", "shaders-glsl/render/project_backward.comp",
      "/ (z * z)\n        - dot(d_xy_view, free_slope);", "/ (z * z);", "--test gradients"),

@@ -62,7 +62,6 @@ pub mod splat;
 pub mod ssim_backward;
 pub mod ssim_forward;
 mod structure_l1;
-mod tile_ranges;
 mod tone_map;
 mod tone_mix;
 mod tone_statistics;

@@ -1,7 +1,7 @@
 //! The differentiable rasteriser: Gaussians and a camera in, a render out; its gradient in, theirs out.
 //!
 //! ```text
-//! project -> sort by depth -> order_counts -> emit -> sort by tile -> tile_ranges -> blend_forward
+//! project -> sort by depth -> order_counts -> emit -> sort by tile -> blend_forward
 //!     -> [loss] -> blend_backward -> reduce_records -> project_backward
 //! ```
 //!
@@ -19,7 +19,7 @@ use crate::kernels::project::DEPTH_BITS;
 use crate::kernels::splat::MAX_CHANNELS;
 use crate::kernels::{
     self, blend_backward, blend_forward, emit, order_counts, project, project_backward,
-    reduce_records, tile_ranges,
+    reduce_records,
 };
 use crate::scene::Shape;
 use crate::sort::{Count, RadixSort};
@@ -132,7 +132,6 @@ pub struct Renderer {
     project: Pipeline<project::Kernel>,
     order_counts: Pipeline<order_counts::Kernel>,
     emit: Pipeline<emit::Kernel>,
-    tile_ranges: Pipeline<tile_ranges::Kernel>,
     blend_forward: Pipeline<blend_forward::Kernel>,
     blend_backward: Pipeline<blend_backward::Kernel>,
     reduce_records: Pipeline<reduce_records::Kernel>,
@@ -150,11 +149,11 @@ impl Renderer {
     pub fn new(gpu: &Gpu, settings: RenderSettings) -> Result<Self> {
         let [tile_width, tile_height] = settings.tile_on(gpu);
         let lanes = gpu.properties().subgroup_size;
-        let pixels = tile_width * tile_height;
+        let pixels = tile_width.saturating_mul(tile_height);
         if pixels == 0 || pixels % lanes != 0 || pixels / lanes > 32 {
             let what = format!("{tile_width}x{tile_height} tiles do not suit {lanes} lanes");
             return Err(Error::Usage(format!(
-                "{what}; take a tile of 8 to 32 times as many pixels"
+                "{what}; take a tile of as many pixels, or of up to 32 times as many"
             )));
         }
         let channels = settings.channels() as u32;
@@ -175,7 +174,6 @@ impl Renderer {
             project: gpu.pipeline(&constants!(project, sh_degree, raw_colors))?,
             order_counts: gpu.pipeline(&order_counts::Constants { partition_size })?,
             emit: gpu.pipeline(&constants!(emit, partition_size))?,
-            tile_ranges: gpu.pipeline(&tile_ranges::Constants::default())?,
             blend_forward: gpu.pipeline(&constants!(blend_forward, splats_per_turn))?,
             blend_backward: gpu.pipeline(&constants!(blend_backward, splats_per_turn))?,
             reduce_records: gpu.pipeline(&constants!(reduce_records))?,
@@ -333,16 +331,20 @@ impl Renderer {
             &blend_forward::Params {
                 size: view.camera.size,
                 tile_columns: view.tiles.x,
+                longest_run: self.longest_run,
                 background,
             },
             blend_forward::Buffers {
-                tile_ranges: &frame.tile_ranges,
+                counts: &frame.counts,
                 sorted_slots: &frame.slots,
                 owners: &frame.owners,
                 splats: &frame.splats,
                 colors: &frame.colors,
                 render: &mut frame.render,
                 transmittances: &mut frame.transmittances,
+                sorted_tiles: &frame.tiles,
+                tile_ranges: &mut frame.tile_ranges,
+                status: &mut frame.status,
             },
             Threads::Workgroups([view.tile_count(), 1, 1]),
         )
@@ -483,18 +485,7 @@ impl Renderer {
         let emitted = Count { counts: &frame.counts, index: 0 };
         // One value more than there are tiles: padding sorts behind them all.
         let bits = u32::BITS - view.tile_count().leading_zeros();
-        self.tile_sort.record(pass, emitted, &mut frame.tiles, &mut frame.slots, bits)?;
-        pass.dispatch(
-            &self.tile_ranges,
-            &tile_ranges::Params { tile_count: view.tile_count(), longest_run: self.longest_run },
-            tile_ranges::Buffers {
-                counts: &frame.counts,
-                sorted_tiles: &frame.tiles,
-                tile_ranges: &mut frame.tile_ranges,
-                status: &mut frame.status,
-            },
-            Threads::Exactly([view.tile_count(), 1, 1]),
-        )
+        self.tile_sort.record(pass, emitted, &mut frame.tiles, &mut frame.slots, bits)
     }
 
     /// Columns and rows of tiles.
@@ -524,12 +515,13 @@ fn splats_per_turn(gpu: &Gpu) -> u32 {
 }
 
 /// How many splats of a tile the blending kernels get through: of every SUBGROUP_SIZE splats they make one turn of the
-/// outer loop and the turns of the inner one, and at their end the outer loop and that over what is hidden one more.
+/// outer loop and the turns of the inner one; some more find the run, and end a loop.
 fn longest_run(gpu: &Gpu) -> u32 {
     let properties = gpu.properties();
     let lanes = properties.subgroup_size;
+    const SOME_TURNS: u32 = 64;
     let turns_per_batch = 1 + lanes.div_ceil(splats_per_turn(gpu));
-    (properties.max_loop_iterations / turns_per_batch - 1).saturating_mul(lanes)
+    ((properties.max_loop_iterations - SOME_TURNS) / turns_per_batch).saturating_mul(lanes)
 }
 
 /// A camera as the kernels take it, and the columns and rows of tiles of its image.

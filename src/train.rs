@@ -11,6 +11,9 @@ mod submission;
 mod terms;
 mod views;
 
+use std::panic::resume_unwind;
+use std::thread;
+
 use glam::UVec2;
 
 use crate::camera::Camera;
@@ -182,11 +185,21 @@ impl Trainer {
     ) -> Result<Self> {
         config.check()?;
         config.leave_out_what_is_missing(dataset);
+        let shape = Shape { sh_degree: config.sh_degree, features: config.model.features() };
+        let settings = RenderSettings {
+            shape,
+            raw_colors: config.model.raw_colors,
+            ..RenderSettings::default()
+        };
+        // The driver compiles on another thread while the views are uploaded and looked at.
+        let kernels = {
+            let (gpu, density) = (gpu.clone(), density(&config, dataset.extent()));
+            thread::spawn(move || Kernels::new(&gpu, settings, density))
+        };
         let mut pseudo_gt = PseudoGt::new(gpu, &config.tone)?;
         let views = Views::upload(gpu, &mut pseudo_gt, dataset)?;
         let sizes = views.sizes();
         say_what_parts_see(&config.model, &sizes);
-        let shape = Shape { sh_degree: config.sh_degree, features: config.model.features() };
         let gaussians = match gaussians {
             Some(gaussians) if gaussians.shape == shape => gaussians.clone(),
             Some(Gaussians { shape: own, .. }) => {
@@ -195,27 +208,24 @@ impl Trainer {
             }
             None => views.initial_gaussians(gpu, &pseudo_gt, dataset, &config)?,
         };
-        let settings = RenderSettings {
-            shape: gaussians.shape,
-            raw_colors: config.model.raw_colors,
-            ..RenderSettings::default()
-        };
         let pixels = sizes.iter().map(|size| size.x as usize * size.y as usize).max();
         let values = settings.channels() * pixels.unwrap_or_default();
         let sources = views.sources(gpu, &pseudo_gt, dataset);
         let losses = Losses::new(gpu, &config.loss(), &sources)?;
         drop(sources);
+        let Kernels { renderer, adam, densifier } =
+            kernels.join().unwrap_or_else(|panic| resume_unwind(panic))?;
         let mut trainer = Self {
             gpu: gpu.clone(),
             extent: dataset.extent(),
             step: 0,
             views,
             model: Model::upload(gpu, &gaussians)?,
-            renderer: Renderer::new(gpu, settings)?,
+            renderer,
             losses,
             networks: NetworkTerms::new(gpu, &config, &sizes)?,
-            adam: Adam::new(gpu)?,
-            densifier: Densifier::new(gpu, density(&config, dataset.extent()))?,
+            adam,
+            densifier,
             d_render: gpu.uninit("d_render", values)?,
             log: LossLog::new(gpu, MOST_STEPS as usize)?,
             pace: Pace::default(),
@@ -407,6 +417,23 @@ impl Trainer {
             gaussians: self.model.count(),
             milliseconds,
         }
+    }
+}
+
+/// What needs nothing but the device and settings.
+struct Kernels {
+    renderer: Renderer,
+    adam: Adam,
+    densifier: Densifier,
+}
+
+impl Kernels {
+    fn new(gpu: &Gpu, settings: RenderSettings, density: DensifySettings) -> Result<Self> {
+        Ok(Self {
+            renderer: Renderer::new(gpu, settings)?,
+            adam: Adam::new(gpu)?,
+            densifier: Densifier::new(gpu, density)?,
+        })
     }
 }
 

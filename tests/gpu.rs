@@ -271,9 +271,13 @@ fn more_workgroups_than_fit_along_x_are_folded_and_none_is_lost() {
     let pipeline = gpu.pipeline::<blend_forward::Kernel>(&constants).unwrap();
     let mut background = [0.0; 11];
     background[..3].copy_from_slice(&[0.25, 0.5, 0.75]);
-    let params = blend_forward::Params { size, tile_columns: COLUMNS, background };
+    let params =
+        blend_forward::Params { size, tile_columns: COLUMNS, longest_run: u32::MAX, background };
     let pixels = size.element_product() as usize;
-    let tile_ranges = gpu.zeros("tile_ranges", (rows * COLUMNS) as usize).unwrap();
+    let mut tile_ranges = gpu.zeros("tile_ranges", (rows * COLUMNS) as usize).unwrap();
+    let (counts, sorted_tiles) =
+        (gpu.zeros("counts", 1).unwrap(), gpu.zeros("sorted_tiles", 0).unwrap());
+    let mut status = gpu.zeros("status", 3).unwrap();
     let (sorted_slots, owners) =
         (gpu.zeros("sorted_slots", 0).unwrap(), gpu.zeros("owners", 0).unwrap());
     let (splats, colors) = (gpu.zeros("splats", 0).unwrap(), gpu.zeros("colors", 0).unwrap());
@@ -281,7 +285,10 @@ fn more_workgroups_than_fit_along_x_are_folded_and_none_is_lost() {
     let mut transmittances = gpu.zeros("transmittances", pixels).unwrap();
     gpu.run("fold", |pass| {
         let buffers = blend_forward::Buffers {
-            tile_ranges: &tile_ranges,
+            counts: &counts,
+            sorted_tiles: &sorted_tiles,
+            tile_ranges: &mut tile_ranges,
+            status: &mut status,
             sorted_slots: &sorted_slots,
             owners: &owners,
             splats: &splats,

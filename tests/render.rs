@@ -11,7 +11,7 @@ use nightsplat::gpu::Threads;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::splat::ALPHA_MIN;
 use nightsplat::kernels::status::{STATUS_CROWDED, STATUS_NOT_FINITE, STATUS_OVERFLOWED};
-use nightsplat::kernels::{ProjectedSplat, emit, order_counts, reduce_records, tile_ranges};
+use nightsplat::kernels::{ProjectedSplat, blend_forward, emit, order_counts, reduce_records};
 use nightsplat::reference::gaussian::Gaussian;
 use nightsplat::reference::splat::{Splat, splat_columns};
 use nightsplat::render::{Renderer, Status};
@@ -85,22 +85,50 @@ fn the_most_intersections_that_can_be_counted_are_an_overflow() {
     }
 }
 
+/// What `blend_forward` finds of the runs of `sorted_tiles` in a view of 5 x 24 tiles, and the status.
+fn tile_runs(sorted_tiles: Vec<u32>, longest_run: u32) -> (Vec<UVec2>, Vec<u32>) {
+    let setup = Setup::new(1, [32, 32], 0, 1);
+    let splats = gpu().read(&setup.render().renderer.frame().splats).unwrap();
+    let (count, size) = (sorted_tiles.len() as u32, UVec2::new(5 * 16, 24 * 16));
+    let (counts, sorted_slots, owners) =
+        (vec![count], (0..count).collect::<Vec<_>>(), vec![0; count as usize]);
+    let (colors, pixels) = (vec![0.5; 3], size.element_product() as usize);
+    let (render, transmittances) = (vec![0.0; 3 * pixels], vec![0.0; pixels]);
+    let (tile_ranges, status) = (vec![UVec2::ONE; 120], vec![0; 3]);
+    let params =
+        blend_forward::Params { size, tile_columns: 5, longest_run, background: [0.0; 11] };
+    let (_, _, ranges, status) = run_kernel!(
+        blend_forward,
+        blend_forward::Constants::default(),
+        params,
+        Threads::Workgroups([120, 1, 1]),
+        [counts, sorted_slots, owners, splats, colors, sorted_tiles],
+        [render, transmittances, tile_ranges, status]
+    );
+    (ranges, status)
+}
+
 #[test]
 fn padding_belongs_to_no_tile() {
-    let tile_count = 120;
-    let (counts, sorted_tiles) = (vec![5], vec![0, 0, 2, tile_count, u32::MAX]);
-    let (tile_ranges, status) = (vec![UVec2::ONE; tile_count as usize], vec![0; 3]);
-    let (ranges, status) = run_kernel!(
-        tile_ranges,
-        tile_ranges::Constants::default(),
-        tile_ranges::Params { tile_count, longest_run: 2 },
-        Threads::Exactly([tile_count, 1, 1]),
-        [counts, sorted_tiles],
-        [tile_ranges, status]
-    );
+    let (ranges, status) = tile_runs(vec![0, 0, 2, 120, u32::MAX], 2);
     assert_eq!(ranges[..3], [UVec2::new(0, 2), UVec2::splat(2), UVec2::new(2, 3)]);
     assert!(ranges[3..].iter().all(|range| range.x == range.y));
     assert_eq!(status, [0; 3]);
+}
+
+#[test]
+fn every_tile_finds_its_run_among_any_number_of_intersections() {
+    let mut random = Random::new(8);
+    for count in [0, 1, 7, 8, 9, 63, 64, 65, 513, 5000] {
+        let mut tiles: Vec<u32> = (0..count).map(|_| random.between(0.0, 122.0) as u32).collect();
+        tiles.sort_unstable();
+        let (ranges, _) = tile_runs(tiles.clone(), u32::MAX);
+        for (tile, range) in (0..120).zip(ranges) {
+            let own = &tiles[range.x as usize..range.y as usize];
+            let all = tiles.iter().filter(|&&other| other == tile).count();
+            assert!(own.len() == all && own.iter().all(|&other| other == tile), "{count}: {tile}");
+        }
+    }
 }
 
 #[test]
@@ -232,18 +260,8 @@ fn a_hundred_thousand_splats_on_one_pixel_are_blended_as_the_references_say() {
 
 #[test]
 fn more_splats_on_a_tile_than_the_device_follows_are_an_error_that_says_so() {
-    let tile_count = 3;
-    let (counts, sorted_tiles) = (vec![7], vec![0, 0, 0, 0, 2, 2, 2]);
-    let (tile_ranges, status) = (vec![UVec2::ONE; 3], vec![0; 3]);
-    let (ranges, status) = run_kernel!(
-        tile_ranges,
-        tile_ranges::Constants::default(),
-        tile_ranges::Params { tile_count, longest_run: 3 },
-        Threads::Exactly([tile_count, 1, 1]),
-        [counts, sorted_tiles],
-        [tile_ranges, status]
-    );
-    assert_eq!(ranges, [UVec2::ZERO, UVec2::splat(4), UVec2::new(4, 7)]);
+    let (ranges, status) = tile_runs(vec![0, 0, 0, 0, 2, 2, 2], 3);
+    assert_eq!(ranges[..3], [UVec2::ZERO, UVec2::splat(4), UVec2::new(4, 7)]);
     assert_eq!(status, [STATUS_CROWDED, 0, 4]);
     assert_eq!(Status::from_words(&status).crowd, 4);
     if gpu().properties().max_loop_iterations == u32::MAX {
@@ -452,6 +470,23 @@ fn neither_tiles_nor_the_order_of_gaussians_change_a_bit() {
             assert!(render == *first_render, "{tile:?}");
             assert!(transmittances == *first_transmittances, "{tile:?}");
         }
+    }
+}
+
+#[test]
+fn a_tile_that_does_not_suit_the_device_is_refused_in_one_line_and_others_render() {
+    let lanes = gpu().properties().subgroup_size;
+    let mut setup = Setup::new(5, SIZE, 1, 5);
+    for tile in [[0, 8], [1, 1], [lanes + 1, 1], [lanes, 33], [64 * lanes, 1], [1 << 20, 1 << 20]] {
+        setup.settings.tile = Some(tile);
+        let message = Renderer::new(&gpu(), setup.settings).unwrap_err().to_string();
+        let [width, height] = tile;
+        assert!(message.starts_with(&format!("{width}x{height} tiles do not suit")), "{message}");
+        assert!(message.contains("take a tile") && !message.contains('\n'), "{message}");
+    }
+    for tile in [[lanes, 1], [1, lanes], [lanes, 32]] {
+        setup.settings.tile = Some(tile);
+        setup.render();
     }
 }
 

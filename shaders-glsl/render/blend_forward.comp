@@ -4,8 +4,9 @@
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 #include "splat.glsl"
 #include "tile.glsl"
+#include "status.glsl"
 
-//! Blend forward: one subgroup owns a tile and composites its splats front to back.
+//! Blend forward: one subgroup owns a tile, finds its run of the sorted intersections and composites it front to back.
 //!
 //! C = sum_i c_i alpha_i T_i + T background, T_i = prod_{j < i} (1 - alpha_j). Each lane loads one splat of a batch and
 //! finds the groups of pixels that its ellipse meets; the batch is then broadcast splat by splat. The tile's state stays
@@ -13,15 +14,25 @@ layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 
 layout(local_size_x_id = 100) in;
 
-layout(push_constant, scalar) uniform Params { uvec2 size; uint tile_columns; float background[MAX_CHANNELS]; };
+layout(push_constant, scalar) uniform Params {
+    uvec2 size;
+    uint tile_columns;
+    uint longest_run;  // splats of a tile that this device follows
+    float background[MAX_CHANNELS];
+};
 
-layout(binding = 0) readonly  buffer Ranges     { uvec2 tile_ranges[]; };
+layout(binding = 0) readonly  buffer Counts     { uint counts[]; };        // [0]: intersections
 layout(binding = 1) readonly  buffer Slots      { uint sorted_slots[]; };
 layout(binding = 2) readonly  buffer Owners     { uint owners[]; };
 layout(binding = 3) readonly  buffer Splats     { ProjectedSplat splats[]; };
 layout(binding = 4) readonly  buffer Colors     { float colors[]; };
 layout(binding = 5) writeonly buffer Render     { float render[]; };  // (CHANNELS, H, W)
 layout(binding = 6) writeonly buffer Transmittances { float transmittances[]; };  // (H, W)
+layout(binding = 7) readonly  buffer Tiles      { uint sorted_tiles[]; };
+layout(binding = 8) writeonly buffer Ranges     { uvec2 tile_ranges[]; };  // (tiles) first intersection, one past the last
+layout(binding = 9)           buffer Status     { uint status[]; };
+
+#include "tile_run.glsl"
 
 void main() {
     uint tile = WORKGROUP_INDEX;
@@ -39,7 +50,8 @@ void main() {
         [[unroll]] for (uint c = 0; c < CHANNELS; c++) color[g][c] = 0.0;
     }
 
-    uvec2 range = tile_ranges[tile];
+    uvec2 range = tile_run(tile, longest_run);
+    if (subgroupElect()) tile_ranges[tile] = range;
     for (uint first = range.x; first < range.y; first += SUBGROUP_SIZE) {
         bool alive = false;
         [[unroll]] for (uint g = 0; g < GROUPS; g++) alive = alive || transmittance[g] > 0.0;
