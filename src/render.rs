@@ -159,7 +159,7 @@ impl Renderer {
         let channels = settings.channels() as u32;
         let (alpha_max, sh_degree) = (settings.max_alpha, settings.shape.sh_degree);
         let (raw_colors, partition_size) = (settings.raw_colors, RANKS_PER_PARTITION);
-        let splats_per_turn = splats_per_turn(gpu);
+        let (skips_groups, splats_per_turn) = (!gpu.properties().is_cpu, splats_per_turn(gpu));
         // What every kernel that includes `splat.glsl` is specialised with, and what some are beside it.
         macro_rules! constants {
             ($kernel:ident $(, $own:ident)*) => {
@@ -174,8 +174,16 @@ impl Renderer {
             project: gpu.pipeline(&constants!(project, sh_degree, raw_colors))?,
             order_counts: gpu.pipeline(&order_counts::Constants { partition_size })?,
             emit: gpu.pipeline(&constants!(emit, partition_size))?,
-            blend_forward: gpu.pipeline(&constants!(blend_forward, splats_per_turn))?,
-            blend_backward: gpu.pipeline(&constants!(blend_backward, splats_per_turn))?,
+            blend_forward: gpu.pipeline(&constants!(
+                blend_forward,
+                skips_groups,
+                splats_per_turn
+            ))?,
+            blend_backward: gpu.pipeline(&constants!(
+                blend_backward,
+                skips_groups,
+                splats_per_turn
+            ))?,
             reduce_records: gpu.pipeline(&constants!(reduce_records))?,
             project_backward: gpu.pipeline(&constants!(project_backward, sh_degree, raw_colors))?,
             depth_sort: RadixSort::new(gpu, 0)?,

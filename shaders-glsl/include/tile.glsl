@@ -3,10 +3,14 @@
 // A tile's state lives in registers, one array element per group. Loops over groups are therefore unrolled: every
 // index is a constant.
 
+// Whether the groups that a splat misses are jumped over. A GPU jumps where its whole subgroup agrees; a software device
+// may only mask its lanes, does the work all the same, and is faster without the test.
+layout(constant_id = 6) const bool SKIPS_GROUPS = true;
+
 const uint GROUPS = TILE_WIDTH * TILE_HEIGHT / SUBGROUP_SIZE;
 
 // How many splats of a batch one turn of the loop over it blends: some devices give an invocation but so many turns.
-layout(constant_id = 6) const uint SPLATS_PER_TURN = 1;
+layout(constant_id = 7) const uint SPLATS_PER_TURN = 1;
 
 // The lane's pixel of group 0, relative to the tile.
 uvec2 lane_pixel() {
@@ -33,7 +37,7 @@ uint splat_groups(ProjectedSplat splat, uvec2 origin) {
             groups |= (2u << last) - (1u << first);
         }
     }
-    return groups;
+    return SKIPS_GROUPS ? groups : ~0u;
 }
 
 // The sum of `x` over the subgroup, in every lane: a butterfly, which a processor does faster than subgroupAdd.

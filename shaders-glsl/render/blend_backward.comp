@@ -61,7 +61,8 @@ void main() {
         ProjectedSplat mine = splats[id];
         float my_color[CHANNELS];
         [[unroll]] for (uint c = 0; c < CHANNELS; c++) my_color[c] = colors[CHANNELS * id + c];
-        uint my_groups = lane < batch ? splat_groups(mine, origin) : 0;
+        uint my_groups = splat_groups(mine, origin);
+        if (lane >= batch) mine.opacity = 0.0;
         vec2 my_d_mean2d = vec2(0.0);
         vec3 my_d_conic = vec3(0.0);
         float my_d_opacity = 0.0;

@@ -58,12 +58,13 @@ void main() {
         if (!subgroupAny(alive)) break;
 
         uint batch = min(SUBGROUP_SIZE, range.y - first);
-        // Lanes beyond the batch load its last splat, which meets no pixel of theirs.
+        // Lanes beyond the batch load its last splat, which counts on no pixel without opacity.
         uint id = owners[sorted_slots[first + min(lane, batch - 1)]];
         ProjectedSplat mine = splats[id];
         float my_color[CHANNELS];
         [[unroll]] for (uint c = 0; c < CHANNELS; c++) my_color[c] = colors[CHANNELS * id + c];
-        uint my_groups = lane < batch ? splat_groups(mine, origin) : 0;
+        uint my_groups = splat_groups(mine, origin);
+        if (lane >= batch) mine.opacity = 0.0;
 
         // Tested at its end: a processor's driver runs a loop tested at its head once more, with every lane off.
         for (uint turn = 0; true;) {
