@@ -522,7 +522,7 @@ fn splats_per_turn(gpu: &Gpu) -> u32 {
     if gpu.properties().max_loop_iterations < u32::MAX { 4 } else { 1 }
 }
 
-/// How many splats of a tile the blending kernels get through: of every SUBGROUP_SIZE splats they make one turn of the
+/// How many splats of a tile the blending kernels get through: of a subgroup of splats they make one turn of the
 /// outer loop and the turns of the inner one; some more find the run, and end a loop.
 fn longest_run(gpu: &Gpu) -> u32 {
     let properties = gpu.properties();

@@ -12,7 +12,7 @@ mod terms;
 mod views;
 
 use std::panic::resume_unwind;
-use std::thread;
+use std::thread::{self, ScopedJoinHandle};
 
 use glam::UVec2;
 
@@ -191,19 +191,30 @@ impl Trainer {
             raw_colors: config.model.raw_colors,
             ..RenderSettings::default()
         };
-        // The driver compiles on another thread while the views are uploaded and looked at.
-        let kernels = {
-            let (gpu, density) = (gpu.clone(), density(&config, dataset.extent()));
-            thread::spawn(move || Kernels::new(&gpu, settings, density))
-        };
+        let density = density(&config, dataset.extent());
+        thread::scope(|scope| {
+            // The driver compiles on another thread while the views are uploaded and looked at.
+            let kernels = scope.spawn(move || Kernels::new(gpu, settings, density));
+            Self::assemble(gpu, config, dataset, gaussians, settings, kernels)
+        })
+    }
+
+    fn assemble(
+        gpu: &Gpu,
+        config: TrainConfig,
+        dataset: &Dataset,
+        gaussians: Option<&Gaussians>,
+        settings: RenderSettings,
+        kernels: ScopedJoinHandle<'_, Result<Kernels>>,
+    ) -> Result<Self> {
         let mut pseudo_gt = PseudoGt::new(gpu, &config.tone)?;
         let views = Views::upload(gpu, &mut pseudo_gt, dataset)?;
         let sizes = views.sizes();
         say_what_parts_see(&config.model, &sizes);
         let gaussians = match gaussians {
-            Some(gaussians) if gaussians.shape == shape => gaussians.clone(),
+            Some(gaussians) if gaussians.shape == settings.shape => gaussians.clone(),
             Some(Gaussians { shape: own, .. }) => {
-                let problem = format!("Gaussians of {own:?} make no model of {shape:?}");
+                let problem = format!("Gaussians of {own:?} make no model of {:?}", settings.shape);
                 return Err(Error::Usage(problem));
             }
             None => views.initial_gaussians(gpu, &pseudo_gt, dataset, &config)?,

@@ -5,7 +5,7 @@
 use std::collections::HashSet;
 use std::path::Path;
 
-use glam::{DAffine3, DMat3, DVec2, DVec3, DVec4, UVec2, Vec2, Vec3};
+use glam::{DAffine3, DMat3, DVec2, DVec3, DVec4, Vec2, Vec3};
 use nightsplat::camera::Camera;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::ProjectedSplat;

@@ -503,7 +503,7 @@ fn properties(
     }
 }
 
-/// Mesa's software device ends all loops of an invocation after so many turns in total (LP_MAX_TGSI_LOOP_ITERATIONS).
+/// Mesa's software device ends all loops of an invocation after so many turns in total (`LP_MAX_TGSI_LOOP_ITERATIONS`).
 const LLVMPIPE_LOOP_ITERATIONS: u32 = 65_535;
 
 fn create_device(
