@@ -16,7 +16,7 @@ use glam::UVec2;
 
 use crate::camera::Camera;
 use crate::dataset::Dataset;
-use crate::densify::{Densifier, DensifySettings};
+use crate::densify::{Densifier, DensifySettings, DensityControl, Round};
 use crate::gpu::{Buffer, CheckReport, Gpu, PassTime, Recorder};
 use crate::image::Image;
 use crate::loss::{DepthBoxes, LogSlot, LossLog, Losses, StepLosses, Term, TermInputs};
@@ -307,7 +307,12 @@ impl Trainer {
             .collect();
         self.step += done as u64;
         if done > 0 && self.densifies_at(self.step) {
-            let changed = self.model.densify(&gpu, &mut self.densifier, self.step)?;
+            let rounds_left = match self.config.density.control {
+                DensityControl::Conserving => self.config.schedule.rounds_left(self.step),
+                DensityControl::Paper => 1,
+            };
+            let round = Round { step: self.step, rounds_left };
+            let changed = self.model.densify(&gpu, &mut self.densifier, round)?;
             tracing::debug!("step {}: {changed:?}", self.step);
             self.reserve()?;
         }
@@ -436,7 +441,8 @@ impl Trainer {
     }
 
     fn reserve(&mut self) -> Result<()> {
-        self.renderer.reserve(self.model.count(), self.views.cameras())
+        let Self { model, views, renderer, .. } = self;
+        renderer.reserve_with_headroom([model.count(), model.capacity()], views.cameras())
     }
 
     fn report(&self, step: u64, losses: &StepLosses, milliseconds: f64) -> StepReport {
@@ -479,6 +485,7 @@ fn say_what_parts_see(model: &ModelConfig, sizes: &[UVec2]) {
 /// Density control in world units.
 fn density(config: &TrainConfig, extent: f64) -> DensifySettings {
     DensifySettings {
+        control: config.density.control,
         gradient_threshold: config.density.gradient_threshold,
         split_scale: config.density.split_scale * extent,
         min_opacity: config.density.min_opacity,

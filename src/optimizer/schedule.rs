@@ -121,6 +121,12 @@ impl Schedule {
             && step.is_multiple_of(self.densify_interval.max(1))
     }
 
+    /// How many rounds of density control there are from the end of `step` on, one there included.
+    pub fn rounds_left(&self, step: u64) -> u64 {
+        let interval = self.densify_interval.max(1);
+        self.densify_before.saturating_sub(1).saturating_sub(step) / interval + 1
+    }
+
     /// The weight w of the near-camera damping of the screen gradients that density control reads: they are
     /// multiplied by w min(1, (z / extent)^2) + 1 - w (Pixel-GS).
     pub fn damping_weight(&self, step: u64) -> f32 {

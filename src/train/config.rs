@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::parts::ModelConfig;
 use super::streams;
+use crate::densify::DensityControl;
 use crate::dataset::{Dataset, DepthOptions, LoadOptions};
 use crate::loss::LossConfig;
 use crate::optimizer::Schedule;
@@ -94,6 +95,8 @@ pub struct CheckConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DensityConfig {
+    /// What comes of those that multiply.
+    pub control: DensityControl,
     /// Mean norm of the screen-space gradient, in normalised device units, from which a Gaussian multiplies.
     pub gradient_threshold: f64,
     /// Larger than this fraction of the extent: split; smaller: cloned.
@@ -129,7 +132,7 @@ impl Default for TrainConfig {
 
 impl Default for DensityConfig {
     fn default() -> Self {
-        Self { gradient_threshold: 2e-4, split_scale: 0.01, min_opacity: 0.005 }
+        Self { control: DensityControl::Conserving, gradient_threshold: 2e-4, split_scale: 0.01, min_opacity: 0.005 }
     }
 }
 
