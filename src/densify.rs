@@ -25,8 +25,7 @@ use crate::{Error, Result};
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum DensityControl {
-    /// Two halves along its longest axis that together cover what it covered, with their share of its moments: the render
-    /// stays nearly as it was.
+    /// Two halves along its longest axis that together cover what it covered: the render stays nearly as it was.
     #[default]
     Conserving,
     /// LITA-GS's: a small one gets a copy at a position drawn from it, a large one is replaced by two smaller ones at
@@ -312,10 +311,11 @@ impl Densifier {
             seed: (seed ^ (seed >> 32)) as u32,
             step: step as u32,
         };
-        // Two halves share the gradient, so the first moment halves and the second, of squares, falls to a quarter.
-        let share = match self.settings.control {
-            DensityControl::Conserving => 0.5,
-            DensityControl::Paper => 0.0,
+        let moments_params = densify_moments::Params {
+            gaussian_count: count,
+            new_gaussian_count,
+            column_count,
+            feature_count,
         };
         let Scratch { fates, offsets, .. } = &self.scratch;
         let Moments { first, second } = &mut gaussians.moments;
@@ -327,18 +327,11 @@ impl Densifier {
                 densify_scatter::Buffers { parameters, fates, offsets, new_parameters: spare };
             pass.dispatch(&self.scatter, &params, buffers, threads)?;
             std::mem::swap(parameters, spare);
-            for (moments, inherited) in [(first, share), (second, share * share)] {
+            for moments in [first, second] {
                 self.make_room(spare, len, capacity)?;
-                let params = densify_moments::Params {
-                    gaussian_count: count,
-                    new_gaussian_count,
-                    column_count,
-                    feature_count,
-                    inherited,
-                };
                 let buffers =
                     densify_moments::Buffers { moments, fates, offsets, new_moments: spare };
-                pass.dispatch(&self.moments, &params, buffers, threads)?;
+                pass.dispatch(&self.moments, &moments_params, buffers, threads)?;
                 std::mem::swap(moments, spare);
             }
             self.make_room(spare, len, capacity)

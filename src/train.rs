@@ -33,7 +33,7 @@ pub use networks::Networks;
 pub use parts::{ModelConfig, ModelName, NetworkRates, Part};
 pub use preset::Preset;
 use terms::NetworkTerms;
-use views::Views;
+use views::{TrainView, Views};
 
 /// Steps that one submission holds at most: recording and reading back cost once for all of them.
 const STEPS_PER_SUBMISSION: u64 = 8;
@@ -185,7 +185,7 @@ impl Trainer {
         config.check()?;
         config.leave_out_what_is_missing(dataset);
         let mut pseudo_gt = PseudoGt::new(gpu, &config.tone)?;
-        let views = Views::upload(gpu, &mut pseudo_gt, dataset)?;
+        let views = Views::upload(gpu, &mut pseudo_gt, dataset, config.schedule.resolution_levels())?;
         let sizes = views.sizes();
         say_what_parts_see(&config.model, &sizes);
         let shape = Shape { sh_degree: config.sh_degree, features: config.model.features() };
@@ -326,7 +326,7 @@ impl Trainer {
         } else if status.not_finite {
             let step = self.step + 1;
             let what = log[done].first_not_finite().map_or("the loss", |term| term.name).to_owned();
-            let view = self.views.of_step(self.config.seed, step).name.clone();
+            let view = self.view_of(step).name.clone();
             return Err(Error::NotFinite { step, view, what });
         }
         Ok(reports)
@@ -356,7 +356,11 @@ impl Trainer {
     /// The algorithm: render a view, compare it with its pseudo-GT, go back, update.
     fn record_step(&mut self, pass: &mut Recorder<'_>, step: u64, slot: u32) -> Result<()> {
         let schedule = &self.config.schedule;
-        let view = self.views.of_step(self.config.seed, step);
+        let view = self.views.of_step(
+            self.config.seed,
+            step,
+            schedule.resolution_level(step),
+        );
         let options = RenderOptions {
             sh_degree: schedule.sh_degree(step, self.config.sh_degree),
             background: background(&self.config, step),
@@ -440,6 +444,10 @@ impl Trainer {
         schedule.densifies_at(step) && step + schedule.densify_interval <= self.config.steps
     }
 
+    fn view_of(&self, step: u64) -> &TrainView {
+        self.views.of_step(self.config.seed, step, self.config.schedule.resolution_level(step))
+    }
+
     fn reserve(&mut self) -> Result<()> {
         let Self { model, views, renderer, .. } = self;
         renderer.reserve_with_headroom([model.count(), model.capacity()], views.cameras())
@@ -450,7 +458,7 @@ impl Trainer {
         let value = |term| (term, f64::from(losses.get(term)));
         StepReport {
             step,
-            view: self.views.of_step(self.config.seed, step).name.clone(),
+            view: self.view_of(step).name.clone(),
             loss: config.total(losses),
             terms: config.terms().into_iter().map(value).collect(),
             gaussians: self.model.count(),

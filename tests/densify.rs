@@ -209,14 +209,13 @@ impl Host {
             new_parameters: &mut new_parameters,
         };
         densify_scatter::Kernel::run(&params, &densify_scatter::Constants { conserving }, slices);
-        let inherit = |moments: &[f32], inherited: f32| {
+        let carry = |moments: &[f32]| {
             let mut new_moments = vec![0.0; count * COLUMNS];
             let params = densify_moments::Params {
                 gaussian_count,
                 new_gaussian_count,
                 column_count,
                 feature_count,
-                inherited,
             };
             let slices = densify_moments::Slices {
                 moments,
@@ -227,12 +226,11 @@ impl Host {
             densify_moments::Kernel::run(&params, &densify_moments::Constants::default(), slices);
             new_moments
         };
-        let share = if conserving { 0.5 } else { 0.0 };
         Self {
             count,
             parameters: new_parameters,
-            first: inherit(&self.first, share),
-            second: inherit(&self.second, share * share),
+            first: carry(&self.first),
+            second: carry(&self.second),
             grad_norm_sums: vec![0.0; count],
             visit_counts: vec![0; count],
         }

@@ -79,6 +79,8 @@ pub struct Schedule {
     pub densify_before: u64,
     /// and every so many steps.
     pub densify_interval: u64,
+    /// Views are a quarter of their width and height before the first of these steps, half before the second.
+    pub resolution_steps: [u64; 2],
     /// The weight of the near-camera damping is 1 before the first of these steps, 1/2 before the second, then 0.
     pub damping_steps: [u64; 2],
 }
@@ -93,6 +95,7 @@ impl Default for Schedule {
             densify_after: 500,
             densify_before: 5_000,
             densify_interval: 200,
+            resolution_steps: [0, 0],
             damping_steps: [4_000, 7_000],
         }
     }
@@ -119,6 +122,20 @@ impl Schedule {
         step > self.densify_after
             && step < self.densify_before
             && step.is_multiple_of(self.densify_interval.max(1))
+    }
+
+    /// How often the views of `step` are halved.
+    pub fn resolution_level(&self, step: u64) -> usize {
+        match self.resolution_steps {
+            [quarter, _] if step < quarter => 2,
+            [_, half] if step < half => 1,
+            _ => 0,
+        }
+    }
+
+    /// How many levels of resolution the steps use.
+    pub fn resolution_levels(&self) -> usize {
+        1 + self.resolution_level(1)
     }
 
     /// How many rounds of density control there are from the end of `step` on, one there included.
