@@ -185,7 +185,8 @@ impl Trainer {
         config.check()?;
         config.leave_out_what_is_missing(dataset);
         let mut pseudo_gt = PseudoGt::new(gpu, &config.tone)?;
-        let views = Views::upload(gpu, &mut pseudo_gt, dataset, config.schedule.resolution_levels())?;
+        let views =
+            Views::upload(gpu, &mut pseudo_gt, dataset, config.schedule.resolution_levels())?;
         let sizes = views.sizes();
         say_what_parts_see(&config.model, &sizes);
         let shape = Shape { sh_degree: config.sh_degree, features: config.model.features() };
@@ -356,11 +357,7 @@ impl Trainer {
     /// The algorithm: render a view, compare it with its pseudo-GT, go back, update.
     fn record_step(&mut self, pass: &mut Recorder<'_>, step: u64, slot: u32) -> Result<()> {
         let schedule = &self.config.schedule;
-        let view = self.views.of_step(
-            self.config.seed,
-            step,
-            schedule.resolution_level(step),
-        );
+        let view = self.views.of_step(self.config.seed, step, schedule.resolution_level(step));
         let options = RenderOptions {
             sh_degree: schedule.sh_degree(step, self.config.sh_degree),
             background: background(&self.config, step),

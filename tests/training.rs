@@ -77,7 +77,10 @@ fn a_round_of_density_control_leaves_the_scores_nearly_as_they_were() {
     };
     let (conserving, paper) = (drop(DensityControl::Conserving), drop(DensityControl::Paper));
     assert!(conserving <= 0.3, "{conserving} dB were lost");
-    assert!(paper > conserving + 0.3, "the paper's control loses {paper} dB, not more than {conserving}");
+    assert!(
+        paper > conserving + 0.3,
+        "the paper's control loses {paper} dB, not more than {conserving}"
+    );
 }
 
 #[test]

@@ -6,8 +6,8 @@ use serde::{Deserialize, Serialize};
 
 use super::parts::ModelConfig;
 use super::streams;
-use crate::densify::DensityControl;
 use crate::dataset::{Dataset, DepthOptions, LoadOptions};
+use crate::densify::DensityControl;
 use crate::loss::LossConfig;
 use crate::optimizer::Schedule;
 use crate::random::Stream;
@@ -100,7 +100,7 @@ pub struct DensityConfig {
     pub control: DensityControl,
     /// Mean norm of the screen-space gradient, in normalised device units, from which a Gaussian multiplies.
     pub gradient_threshold: f64,
-    /// Larger than this fraction of the extent: split; smaller: cloned.
+    /// Larger than this fraction of the extent: split; smaller: cloned. Of the paper's control alone.
     pub split_scale: f64,
     /// Fainter Gaussians are removed.
     pub min_opacity: f64,
@@ -133,7 +133,12 @@ impl Default for TrainConfig {
 
 impl Default for DensityConfig {
     fn default() -> Self {
-        Self { control: DensityControl::Conserving, gradient_threshold: 2e-4, split_scale: 0.01, min_opacity: 0.005 }
+        Self {
+            control: DensityControl::Conserving,
+            gradient_threshold: 4e-4,
+            split_scale: 0.01,
+            min_opacity: 0.005,
+        }
     }
 }
 

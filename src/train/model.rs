@@ -1,9 +1,7 @@
 //! The Gaussians in training, on the device.
 
 use crate::Result;
-use crate::densify::{
-    Densifier, DensifyInputs, DensifyReport, DeviceGaussians, Round,
-};
+use crate::densify::{Densifier, DensifyInputs, DensifyReport, DeviceGaussians, Round};
 use crate::gpu::{Buffer, Gpu};
 use crate::optimizer::Moments;
 use crate::scene::{Gaussians, Shape, width};

@@ -146,8 +146,7 @@ mod tests {
 
     #[test]
     fn c_follows_benchmark_and_curve() {
-        for (preset, [ase, ap3]) in
-            BENCHMARKS.into_iter().zip([[3.0, 1.0], [4.0, 2.0], [0.0, 0.0]])
+        for (preset, [ase, ap3]) in BENCHMARKS.into_iter().zip([[3.0, 1.0], [4.0, 2.0], [0.0, 0.0]])
         {
             assert_eq!(applied(preset, "x", ToneCurve::Ase).tone.gain_c, ase);
             assert_eq!(applied(preset, "x", ToneCurve::Ap3).tone.gain_c, ap3);
