@@ -6,7 +6,7 @@ mod schedule;
 pub use learnable::Learnable;
 pub use schedule::{LearningRates, Schedule};
 
-use crate::gpu::{Buffer, Gpu, Kernel, Pipeline, Recorder, Threads};
+use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::adam;
 use crate::{Error, Result};
 
@@ -47,7 +47,6 @@ pub struct AdamBuffers<'a> {
 #[derive(Debug)]
 pub struct Adam {
     pipeline: Pipeline<adam::Kernel>,
-    floats_per_workgroup: u32,
 }
 
 impl Adam {
@@ -56,9 +55,7 @@ impl Adam {
     /// # Errors
     /// The device refuses the pipeline.
     pub fn new(gpu: &Gpu) -> Result<Self> {
-        let constants = adam::Constants::default();
-        let floats_per_workgroup = adam::Kernel::WORKGROUP_SIZE[0] * constants.floats_per_thread;
-        Ok(Self { pipeline: gpu.pipeline(&constants)?, floats_per_workgroup })
+        Ok(Self { pipeline: gpu.pipeline(&adam::Constants::default())? })
     }
 
     /// Records step number `step`, from 1, over the first `column_count` columns of `gaussian_count` Gaussians, of which
@@ -99,11 +96,7 @@ impl Adam {
                 second_moments: second,
                 status,
             },
-            Threads::Workgroups([
-                gaussian_count.div_ceil(self.floats_per_workgroup),
-                column_count,
-                1,
-            ]),
+            Threads::Exactly([(len as u32).div_ceil(4), 1, 1]),
         )
     }
 }

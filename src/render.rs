@@ -159,6 +159,7 @@ impl Renderer {
         let channels = settings.channels() as u32;
         let (alpha_max, sh_degree) = (settings.max_alpha, settings.shape.sh_degree);
         let raw_colors = settings.raw_colors;
+        let skips_groups = !gpu.properties().is_cpu;
         // What every kernel that includes `splat.glsl` is specialised with, and what some are beside it.
         macro_rules! constants {
             ($kernel:ident $(, $own:ident)*) => {
@@ -174,8 +175,8 @@ impl Renderer {
             check_capacity: gpu.pipeline(&check_capacity::Constants::default())?,
             emit: gpu.pipeline(&constants!(emit))?,
             tile_ranges: gpu.pipeline(&tile_ranges::Constants::default())?,
-            blend_forward: gpu.pipeline(&constants!(blend_forward))?,
-            blend_backward: gpu.pipeline(&constants!(blend_backward))?,
+            blend_forward: gpu.pipeline(&constants!(blend_forward, skips_groups))?,
+            blend_backward: gpu.pipeline(&constants!(blend_backward, skips_groups))?,
             reduce_records: gpu.pipeline(&constants!(reduce_records))?,
             project_backward: gpu.pipeline(&constants!(project_backward, sh_degree, raw_colors))?,
             depth_sort: RadixSort::new(gpu, 0)?,

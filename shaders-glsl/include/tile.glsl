@@ -3,6 +3,10 @@
 // A tile's state lives in registers, one array element per group. Loops over groups are therefore unrolled: every
 // index is a constant.
 
+// Whether the groups that a splat misses are jumped over. A GPU jumps where its whole subgroup agrees; a software device
+// may only mask its lanes, does the work all the same, and is faster without the test.
+layout(constant_id = 6) const bool SKIPS_GROUPS = true;
+
 const uint GROUPS = TILE_WIDTH * TILE_HEIGHT / SUBGROUP_SIZE;
 
 // The lane's pixel of group 0, relative to the tile.
@@ -30,5 +34,13 @@ uint splat_groups(ProjectedSplat splat, uvec2 origin) {
             groups |= (2u << last) - (1u << first);
         }
     }
-    return groups;
+    return SKIPS_GROUPS ? groups : ~0u;
+}
+
+// The sum of `x` over the subgroup, in every lane: a butterfly, which a processor does faster than subgroupAdd.
+float subgroup_sum(float x) {
+    // Counted, so that drivers unroll it: subgroups have at most 128 lanes.
+    [[unroll]] for (uint bit = 0; bit < 7; bit++)
+        if ((1u << bit) < SUBGROUP_SIZE) x += subgroupShuffle(x, gl_SubgroupInvocationID ^ (1u << bit));
+    return x;
 }

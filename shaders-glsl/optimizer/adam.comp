@@ -6,26 +6,24 @@
 //! Adam over the planes of include/gaussian.glsl: beta 0.9 and 0.999, epsilon 1e-15.
 //!
 //! m = b1 m + (1 - b1) g, v = b2 v + (1 - b2) g^2, p -= rate / (1 - b1^t) m / (sqrt(v) / sqrt(1 - b2^t) + epsilon).
-//! A workgroup's row is the column, along it each thread takes `FLOATS_PER_THREAD` floats. A gradient that is not finite
-//! counts as zero, so that it poisons neither moment; log scales stay within bounds whose exp is finite.
-//! Nothing changes while status[0] is set. Kingma and Ba 2015. Reference: `src/reference/adam.rs`.
+//! A thread takes four floats in a row, of one plane or of two. A gradient that is not finite counts as zero, so that it
+//! poisons neither moment; log scales stay within bounds whose exp is finite. Nothing changes while status[0] is set.
+//! Kingma and Ba 2015. Reference: `src/reference/adam.rs`.
 
 layout(local_size_x = 256) in;
 
-layout(constant_id = 0) const uint FLOATS_PER_THREAD = 4;
-
 layout(push_constant) uniform Params {
     uint  gaussian_count;
-    uint  column_count;         // columns that take part, from the first: rows of the dispatch
+    uint  column_count;         // columns that take part, from the first
     uint  feature_count;        // of these, from FEATURES_COLUMN on
     float second_correction;    // 1 / sqrt(1 - b2^t)
     float rates[PLANE_COUNT];   // learning rates / (1 - b1^t), one per plane
 };
 
-layout(binding = 0)           buffer Parameters    { float parameters[]; };      // planes
-layout(binding = 1) readonly  buffer Gradients     { float gradients[]; };       // planes
-layout(binding = 2)           buffer FirstMoments  { float first_moments[]; };   // planes
-layout(binding = 3)           buffer SecondMoments { float second_moments[]; };  // planes
+layout(binding = 0)           buffer Parameters    { vec4 parameters[]; };      // planes
+layout(binding = 1) readonly  buffer Gradients     { vec4 gradients[]; };       // planes
+layout(binding = 2)           buffer FirstMoments  { vec4 first_moments[]; };   // planes
+layout(binding = 3)           buffer SecondMoments { vec4 second_moments[]; };  // planes
 layout(binding = 4) readonly  buffer Status        { uint status[]; };
 
 const float BETA1 = 0.9;
@@ -37,33 +35,37 @@ const float GRADIENT_BOUND = 1e18;
 const float LOG_SCALE_MIN = -30.0;
 const float LOG_SCALE_MAX = 13.0;
 
-float rate_of(uint column) {
-    uint plane = 0;
-    while (plane + 1 < PLANE_COUNT && column >= plane_column(plane + 1, feature_count, column_count)) ++plane;
-    return rates[plane];
+// The learning rates of the floats at `i`.
+vec4 rates_at(uvec4 i) {
+    vec4 rate = vec4(rates[0]);
+    [[unroll]] for (uint plane = 1; plane < PLANE_COUNT; ++plane) {
+        uint begin = plane_column(plane, feature_count, column_count) * gaussian_count;
+        rate = mix(rate, vec4(rates[plane]), greaterThanEqual(i, uvec4(begin)));
+    }
+    return rate;
 }
 
 // Positive phrasing: an infinite or NaN gradient fails the test.
-float tame(float gradient) {
-    return abs(gradient) < 3e38 ? clamp(gradient, -GRADIENT_BOUND, GRADIENT_BOUND) : 0.0;
+vec4 tame(vec4 gradient) {
+    vec4 bounded = clamp(gradient, -GRADIENT_BOUND, GRADIENT_BOUND);
+    return mix(vec4(0.0), bounded, lessThan(abs(gradient), vec4(3e38)));
 }
 
 void main() {
-    uint column = gl_WorkGroupID.y;
-    if (column >= column_count || status[0] != 0) return;
-    float rate = rate_of(column);
-    bool is_log_scale = column >= LOG_SCALES_COLUMN && column < LOG_SCALES_COLUMN + 3;
-    uint first = gl_WorkGroupID.x * gl_WorkGroupSize.x * FLOATS_PER_THREAD + gl_LocalInvocationID.x;
-    for (uint k = 0; k < FLOATS_PER_THREAD; ++k) {
-        uint row = first + k * gl_WorkGroupSize.x;
-        if (row >= gaussian_count) return;
-        uint i = column * gaussian_count + row;
-        float gradient = tame(gradients[i]);
-        float m = BETA1 * first_moments[i] + (1.0 - BETA1) * gradient;
-        float v = BETA2 * second_moments[i] + (1.0 - BETA2) * gradient * gradient;
-        float value = parameters[i] - rate * m / (sqrt(v) * second_correction + EPSILON);
-        first_moments[i] = m;
-        second_moments[i] = v;
-        parameters[i] = is_log_scale ? clamp(value, LOG_SCALE_MIN, LOG_SCALE_MAX) : value;
-    }
+    uint quad = THREAD_INDEX;
+    uint end = column_count * gaussian_count;
+    if (4 * quad >= end || status[0] != 0) return;
+    uvec4 i = 4 * quad + uvec4(0, 1, 2, 3);
+    // The last quad can reach into a column that takes no part.
+    bvec4 takes_part = lessThan(i, uvec4(end));
+    vec4 gradient = tame(gradients[quad]);
+    vec4 m = BETA1 * first_moments[quad] + (1.0 - BETA1) * gradient;
+    vec4 v = BETA2 * second_moments[quad] + (1.0 - BETA2) * gradient * gradient;
+    vec4 value = parameters[quad] - rates_at(i) * m / (sqrt(v) * second_correction + EPSILON);
+    // Unsigned: what lies before the plane wraps beyond its end.
+    bvec4 is_log_scale = lessThan(i - LOG_SCALES_COLUMN * gaussian_count, uvec4(3 * gaussian_count));
+    value = mix(value, clamp(value, LOG_SCALE_MIN, LOG_SCALE_MAX), is_log_scale);
+    first_moments[quad] = mix(first_moments[quad], m, takes_part);
+    second_moments[quad] = mix(second_moments[quad], v, takes_part);
+    parameters[quad] = mix(parameters[quad], value, takes_part);
 }

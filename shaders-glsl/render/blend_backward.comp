@@ -8,8 +8,9 @@ layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 //! Blend backward: one subgroup owns a tile and records the gradient of every intersection in its slot.
 //!
 //! Walks front to back again, as the forward pass did, with the light still to come, L_i = sum_{k >= i} c_k alpha_k T_k +
-//! T background, which starts as the render itself: dC / dalpha_i = (c_i T_i - L_i) / (1 - alpha_i). No atomics: a slot
-//! is written by the one tile it belongs to, and the sum over a Gaussian's slots comes in a fixed order.
+//! T background, which starts as the render itself: dC / dalpha_i = (c_i T_i - L_i) / (1 - alpha_i). Of both, the product
+//! with dL/dC is all that is needed: one number a pixel, however many channels. No atomics: a slot is written by the one
+//! tile it belongs to, and the sum over a Gaussian's slots comes in a fixed order.
 
 layout(local_size_x_id = 100) in;
 
@@ -25,7 +26,6 @@ layout(binding = 6) readonly  buffer DRender { float d_render[]; };  // (CHANNEL
 // (slots, RECORD): mean2d 2, conic 3, opacity 1, colour CHANNELS
 layout(binding = 7) writeonly buffer Records { float records[]; };
 
-
 void main() {
     uint tile = WORKGROUP_INDEX;
     uint lane = gl_SubgroupInvocationID;
@@ -34,16 +34,17 @@ void main() {
     uvec2 first_pixel = origin + lane_pixel();
 
     float transmittance[GROUPS];    // zero once the pixel is done
-    float light[GROUPS][CHANNELS];  // still to come
+    float light[GROUPS];            // still to come, times d_pixel
     float d_pixel[GROUPS][CHANNELS];
     [[unroll]] for (uint g = 0; g < GROUPS; g++) {
         uvec2 pixel = first_pixel + group_offset(g);
         bool inside = all(lessThan(pixel, size));
         uint at = inside ? pixel.y * size.x + pixel.x : 0;
         transmittance[g] = inside ? 1.0 : 0.0;
+        light[g] = 0.0;
         [[unroll]] for (uint c = 0; c < CHANNELS; c++) {
-            light[g][c] = render[c * size.x * size.y + at];
             d_pixel[g][c] = d_render[c * size.x * size.y + at];
+            light[g] += render[c * size.x * size.y + at] * d_pixel[g][c];
         }
     }
 
@@ -67,13 +68,14 @@ void main() {
         float my_d_color[CHANNELS];
         [[unroll]] for (uint c = 0; c < CHANNELS; c++) my_d_color[c] = 0.0;
 
-        for (uint j = 0; j < batch; j++) {
-            uint groups = subgroupBroadcast(my_groups, j);
-            vec2 offset = subgroupBroadcast(mine.mean2d, j) - (vec2(first_pixel) + 0.5);
-            vec3 conic = subgroupBroadcast(mine.conic, j);
-            float opacity = subgroupBroadcast(mine.opacity, j);
+        // Tested at its end: a processor's driver runs a loop tested at its head once more, with every lane off.
+        for (uint j = 0; true;) {
+            uint groups = subgroupShuffle(my_groups, j);
+            vec2 offset = subgroupShuffle(mine.mean2d, j) - (vec2(first_pixel) + 0.5);
+            vec3 conic = subgroupShuffle(mine.conic, j);
+            float opacity = subgroupShuffle(mine.opacity, j);
             float splat_color[CHANNELS];
-            [[unroll]] for (uint c = 0; c < CHANNELS; c++) splat_color[c] = subgroupBroadcast(my_color[c], j);
+            [[unroll]] for (uint c = 0; c < CHANNELS; c++) splat_color[c] = subgroupShuffle(my_color[c], j);
             // Moments of dL/dsigma over the pixels: what every gradient of the ellipse is made of.
             float moment = 0.0;
             vec2 moment_x_y = vec2(0.0);
@@ -88,30 +90,32 @@ void main() {
                 float falloff = exp(-sigma);
                 float alpha = min(ALPHA_MAX, opacity * falloff);
                 float before = transmittance[g];
-                if (sigma >= 0.0 && alpha >= ALPHA_MIN && before > 0.0) {
-                    float after = before * (1.0 - alpha);
-                    bool is_done = after < TRANSMITTANCE_MIN;
-                    transmittance[g] = is_done ? 0.0 : after;
-                    float weight = is_done ? 0.0 : alpha * before;
-                    float d_alpha = 0.0;
-                    [[unroll]] for (uint c = 0; c < CHANNELS; c++) {
-                        d_color[c] += weight * d_pixel[g][c];
-                        d_alpha += (before * splat_color[c] - light[g][c]) * d_pixel[g][c];
-                        light[g][c] -= weight * splat_color[c];
-                    }
-                    // At the cap alpha no longer depends on the splat.
-                    bool is_free = !is_done && opacity * falloff <= ALPHA_MAX;
-                    d_alpha = is_free ? d_alpha / (1.0 - alpha) : 0.0;
-                    float d_sigma = -alpha * d_alpha;
-                    vec2 first_moment = d_sigma * d;
-                    moment += d_sigma;
-                    moment_x_y += first_moment;
-                    moment_xx_xy_yy += first_moment.xxy * d.xyy;
+                bool counts = sigma >= 0.0 && alpha >= ALPHA_MIN && before > 0.0;
+                // What does not count has alpha 0: the lanes never part.
+                alpha = counts ? alpha : 0.0;
+                float after = before * (1.0 - alpha);
+                bool is_done = after < TRANSMITTANCE_MIN;
+                transmittance[g] = is_done ? 0.0 : after;
+                float weight = is_done ? 0.0 : alpha * before;
+                float shade = 0.0;
+                [[unroll]] for (uint c = 0; c < CHANNELS; c++) {
+                    d_color[c] += weight * d_pixel[g][c];
+                    shade += splat_color[c] * d_pixel[g][c];
                 }
+                float d_alpha = before * shade - light[g];
+                light[g] -= weight * shade;
+                // At the cap alpha no longer depends on the splat.
+                bool is_free = !is_done && opacity * falloff <= ALPHA_MAX;
+                d_alpha = is_free ? d_alpha / (1.0 - alpha) : 0.0;
+                float d_sigma = -alpha * d_alpha;
+                vec2 first_moment = d_sigma * d;
+                moment += d_sigma;
+                moment_x_y += first_moment;
+                moment_xx_xy_yy += first_moment.xxy * d.xyy;
             }
-            moment = subgroupAdd(moment);
-            moment_x_y = subgroupAdd(moment_x_y);
-            moment_xx_xy_yy = subgroupAdd(moment_xx_xy_yy);
+            moment = subgroup_sum(moment);
+            moment_x_y = vec2(subgroup_sum(moment_x_y.x), subgroup_sum(moment_x_y.y));
+            [[unroll]] for (uint k = 0; k < 3; k++) moment_xx_xy_yy[k] = subgroup_sum(moment_xx_xy_yy[k]);
             if (lane == j) {
                 my_d_mean2d = vec2(dot(conic.xy, moment_x_y), dot(conic.yz, moment_x_y));
                 my_d_conic = vec3(0.5, 1.0, 0.5) * moment_xx_xy_yy;
@@ -119,9 +123,10 @@ void main() {
                 my_d_opacity = -moment / opacity;
             }
             [[unroll]] for (uint c = 0; c < CHANNELS; c++) {
-                float sum = subgroupAdd(d_color[c]);
+                float sum = subgroup_sum(d_color[c]);
                 if (lane == j) my_d_color[c] = sum;
             }
+            if (++j >= batch) break;
         }
         if (lane < batch) {
             uint at = RECORD * slot;

@@ -53,27 +53,30 @@ void main() {
         [[unroll]] for (uint c = 0; c < CHANNELS; c++) my_color[c] = colors[CHANNELS * id + c];
         uint my_groups = splat_groups(mine, origin);
 
-        for (uint j = 0; j < batch; j++) {
-            uint groups = subgroupBroadcast(my_groups, j);
-            vec2 d = subgroupBroadcast(mine.mean2d, j) - (vec2(first_pixel) + 0.5);
-            vec3 conic = subgroupBroadcast(mine.conic, j);
-            float opacity = subgroupBroadcast(mine.opacity, j);
+        // Tested at its end: a processor's driver runs a loop tested at its head once more, with every lane off.
+        for (uint j = 0; true;) {
+            uint groups = subgroupShuffle(my_groups, j);
+            vec2 d = subgroupShuffle(mine.mean2d, j) - (vec2(first_pixel) + 0.5);
+            vec3 conic = subgroupShuffle(mine.conic, j);
+            float opacity = subgroupShuffle(mine.opacity, j);
             float splat_color[CHANNELS];
-            [[unroll]] for (uint c = 0; c < CHANNELS; c++) splat_color[c] = subgroupBroadcast(my_color[c], j);
+            [[unroll]] for (uint c = 0; c < CHANNELS; c++) splat_color[c] = subgroupShuffle(my_color[c], j);
 
             [[unroll]] for (uint g = 0; g < GROUPS; g++) {
                 if ((groups >> g & 1) == 0) continue;
                 float sigma = splat_sigma(conic, d - vec2(group_offset(g)));
                 float alpha = min(ALPHA_MAX, opacity * exp(-sigma));
                 float before = transmittance[g];
-                if (sigma >= 0.0 && alpha >= ALPHA_MIN && before > 0.0) {
-                    float after = before * (1.0 - alpha);
-                    bool is_done = after < TRANSMITTANCE_MIN;
-                    transmittance[g] = is_done ? -before : after;
-                    float weight = is_done ? 0.0 : alpha * before;
-                    [[unroll]] for (uint c = 0; c < CHANNELS; c++) color[g][c] += weight * splat_color[c];
-                }
+                bool counts = sigma >= 0.0 && alpha >= ALPHA_MIN && before > 0.0;
+                // What does not count is composited with alpha 0: the lanes never part.
+                alpha = counts ? alpha : 0.0;
+                float after = before * (1.0 - alpha);
+                bool is_done = after < TRANSMITTANCE_MIN;
+                transmittance[g] = is_done ? -abs(before) : after;
+                float weight = is_done ? 0.0 : alpha * before;
+                [[unroll]] for (uint c = 0; c < CHANNELS; c++) color[g][c] += weight * splat_color[c];
             }
+            if (++j >= batch) break;
         }
     }
 
