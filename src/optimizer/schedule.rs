@@ -96,12 +96,12 @@ impl Default for Schedule {
             final_means_rate: 1.6e-6,
             means_rate_steps: 30_000,
             boost: 4.0,
-            boost_steps: 1_000,
+            boost_steps: 600,
             sh_degree_interval: 1_000,
-            densify_after: 150,
+            densify_after: 50,
             densify_before: 3_000,
             densify_interval: 100,
-            resolution_steps: [0, 300],
+            resolution_steps: [0, 200],
             damping_steps: [4_000, 7_000],
         }
     }
@@ -121,9 +121,9 @@ impl Schedule {
         }
     }
 
-    /// For some hundred steps.
+    /// For 700 steps: the budget is shared among the rounds of so short a run.
     pub fn fast() -> Self {
-        Self { densify_after: 50, ..Self::default() }
+        Self { densify_before: 700, ..Self::default() }
     }
 
     /// The rates of `step` in a scene of `extent`: the means' decay log-linearly, the others stay.

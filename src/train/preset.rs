@@ -101,7 +101,7 @@ impl Preset {
 }
 
 /// The steps of [`Preset::Fast`].
-const FAST_STEPS: u64 = 1_000;
+const FAST_STEPS: u64 = 700;
 
 impl FromStr for Preset {
     type Err = Error;
