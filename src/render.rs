@@ -201,13 +201,25 @@ impl Renderer {
         gaussian_count: usize,
         cameras: impl IntoIterator<Item = &'a Camera>,
     ) -> Result<()> {
+        self.reserve_with_headroom([gaussian_count; 2], cameras)
+    }
+
+    /// The same for a number of Gaussians, and where that needs more memory, for another number that may follow.
+    ///
+    /// # Errors
+    /// The device is out of memory.
+    pub fn reserve_with_headroom<'a>(
+        &mut self,
+        [gaussian_count, capacity]: [usize; 2],
+        cameras: impl IntoIterator<Item = &'a Camera>,
+    ) -> Result<()> {
         let (mut pixels, mut tiles) = (0, 0);
         for camera in cameras {
             let UVec2 { x, y } = self.tiles(camera);
             pixels = pixels.max(camera.width as usize * camera.height as usize);
             tiles = tiles.max(x as usize * y as usize);
         }
-        self.frame.reserve(&self.gpu, gaussian_count, pixels, tiles)
+        self.frame.reserve(&self.gpu, [gaussian_count, capacity], pixels, tiles)
     }
 
     /// Makes room for `intersections`, and half as many again; what room there is stays.

@@ -18,7 +18,7 @@ use glam::UVec2;
 
 use crate::camera::Camera;
 use crate::dataset::Dataset;
-use crate::densify::{Densifier, DensifySettings};
+use crate::densify::{Densifier, DensifySettings, DensityControl, Round};
 use crate::gpu::{Buffer, CheckReport, Gpu, PassTime, Recorder};
 use crate::image::Image;
 use crate::loss::{DepthBoxes, LogSlot, LossLog, Losses, StepLosses, Term, TermInputs};
@@ -36,7 +36,7 @@ pub use parts::{ModelConfig, ModelName, NetworkRates, Part};
 pub use preset::Preset;
 use submission::{MOST_STEPS, Pace};
 use terms::NetworkTerms;
-use views::Views;
+use views::{TrainView, Views};
 
 /// The streams of random numbers that training draws from, one per purpose.
 mod streams {
@@ -208,7 +208,8 @@ impl Trainer {
         kernels: ScopedJoinHandle<'_, Result<Kernels>>,
     ) -> Result<Self> {
         let mut pseudo_gt = PseudoGt::new(gpu, &config.tone)?;
-        let views = Views::upload(gpu, &mut pseudo_gt, dataset)?;
+        let views =
+            Views::upload(gpu, &mut pseudo_gt, dataset, config.schedule.resolution_levels())?;
         let sizes = views.sizes();
         say_what_parts_see(&config.model, &sizes);
         let gaussians = match gaussians {
@@ -300,7 +301,12 @@ impl Trainer {
     /// Density control, behind the last step that was submitted.
     fn control_density(&mut self) -> Result<()> {
         let gpu = self.gpu.clone();
-        let changed = self.model.densify(&gpu, &mut self.densifier, self.step)?;
+        let rounds_left = match self.config.density.control {
+            DensityControl::Conserving => self.config.schedule.rounds_left(self.step),
+            DensityControl::Paper => 1,
+        };
+        let round = Round { step: self.step, rounds_left };
+        let changed = self.model.densify(&gpu, &mut self.densifier, round)?;
         tracing::debug!("step {}: {changed:?}", self.step);
         self.reserve()
     }
@@ -329,7 +335,7 @@ impl Trainer {
     /// The algorithm: render a view, compare it with its pseudo-GT, go back, update.
     fn record_step(&mut self, pass: &mut Recorder<'_>, step: u64, slot: u32) -> Result<()> {
         let schedule = &self.config.schedule;
-        let view = self.views.of_step(self.config.seed, step);
+        let view = self.views.of_step(self.config.seed, step, schedule.resolution_level(step));
         let options = RenderOptions {
             sh_degree: schedule.sh_degree(step, self.config.sh_degree),
             background: background(&self.config, step),
@@ -413,8 +419,13 @@ impl Trainer {
         schedule.densifies_at(step) && step + schedule.densify_interval <= self.config.steps
     }
 
+    fn view_of(&self, step: u64) -> &TrainView {
+        self.views.of_step(self.config.seed, step, self.config.schedule.resolution_level(step))
+    }
+
     fn reserve(&mut self) -> Result<()> {
-        self.renderer.reserve(self.model.count(), self.views.cameras())
+        let Self { model, views, renderer, .. } = self;
+        renderer.reserve_with_headroom([model.count(), model.capacity()], views.cameras())
     }
 
     fn report(&self, step: u64, losses: &StepLosses, milliseconds: f64) -> StepReport {
@@ -422,7 +433,7 @@ impl Trainer {
         let value = |term| (term, f64::from(losses.get(term)));
         StepReport {
             step,
-            view: self.views.of_step(self.config.seed, step).name.clone(),
+            view: self.view_of(step).name.clone(),
             loss: config.total(losses),
             terms: config.terms().into_iter().map(value).collect(),
             gaussians: self.model.count(),
@@ -474,6 +485,7 @@ fn say_what_parts_see(model: &ModelConfig, sizes: &[UVec2]) {
 /// Density control in world units.
 fn density(config: &TrainConfig, extent: f64) -> DensifySettings {
     DensifySettings {
+        control: config.density.control,
         gradient_threshold: config.density.gradient_threshold,
         split_scale: config.density.split_scale * extent,
         min_opacity: config.density.min_opacity,

@@ -6,6 +6,7 @@ use glam::{DVec2, UVec2};
 use nightsplat::Error;
 use nightsplat::attributes::Attribute;
 use nightsplat::dataset::{Dataset, Split};
+use nightsplat::densify::DensityControl;
 use nightsplat::eval::{self, Player};
 
 use nightsplat::gpu::testing::{gpu, recorded};
@@ -59,6 +60,42 @@ fn a_model_learns_to_show_the_scene_by_normal_light() {
         .collect();
     let (dark, lit) = (Scores::mean(&dark).unwrap().psnr, mean_psnr(&dataset, &gaussians));
     assert!(lit > dark + 8.0, "the photographs score {dark} dB, the renders {lit} dB");
+}
+
+#[test]
+fn a_round_of_density_control_leaves_the_scores_nearly_as_they_were() {
+    let dataset = dataset();
+    let drop = |control: DensityControl| {
+        let mut config = TrainConfig { steps: 400, ..config() };
+        config.density.control = control;
+        (config.schedule.densify_after, config.schedule.densify_interval) = (100, 160);
+        config.density.gradient_threshold = 1e-4;
+        let mut trainer = Trainer::new(&gpu(), config, &dataset).unwrap();
+        advance(&mut trainer, 159);
+        let before = (trainer.gaussian_count(), mean_psnr(&dataset, &trainer.gaussians().unwrap()));
+        advance(&mut trainer, 160);
+        let after = (trainer.gaussian_count(), mean_psnr(&dataset, &trainer.gaussians().unwrap()));
+        assert!(4 * after.0 > 5 * before.0, "{before:?} {after:?}: hardly anything multiplied");
+        before.1 - after.1
+    };
+    let (conserving, paper) = (drop(DensityControl::Conserving), drop(DensityControl::Paper));
+    assert!(conserving <= 0.3, "{conserving} dB were lost");
+    assert!(
+        paper > conserving + 0.3,
+        "the paper's control loses {paper} dB, not more than {conserving}"
+    );
+}
+
+#[test]
+fn coarse_steps_come_first_and_repeat_bit_for_bit() {
+    let dataset = common::train::dataset(6, [128, 128]);
+    let mut config = TrainConfig { steps: 30, ..config() };
+    let (_, full) = train(&config, &dataset);
+    config.schedule.resolution_steps = [8, 20];
+    let (reports, coarse) = train(&config, &dataset);
+    assert_eq!(coarse, train(&config, &dataset).1);
+    assert_ne!(coarse.parameters, full.parameters);
+    assert!(reports.iter().all(|report| report.loss.is_finite()));
 }
 
 #[test]
@@ -221,6 +258,8 @@ fn growth_stops_at_the_limit() {
     let limit = dataset.points.len() + 5;
     let mut config = TrainConfig { max_gaussians: limit, ..config() };
     config.density.gradient_threshold = 1e-9;
+    // The last round may take all the room that is left.
+    config.schedule.densify_before = 60;
     let (_, gaussians) = train(&config, &dataset);
     assert_eq!(gaussians.count, limit);
 }

@@ -105,15 +105,21 @@ impl Frame {
         })
     }
 
-    /// Lengths follow the number of Gaussians exactly; pixels only grow; intersections begin with a guess.
+    /// Lengths only grow: to `capacity` where they do not suffice for `count` Gaussians, which render from now on;
+    /// intersections begin with a guess.
     pub(super) fn reserve(
         &mut self,
         gpu: &Gpu,
-        count: usize,
+        [count, capacity]: [usize; 2],
         pixels: usize,
         tiles: usize,
     ) -> Result<()> {
-        if self.gaussian_count as usize != count || self.splats.len() != count {
+        if self.gaussian_count as usize != count {
+            self.gaussian_count = count as u32;
+            gpu.write(&mut self.gaussian_counts, &[count as u32])?;
+        }
+        if self.splats.len() < count {
+            let count = capacity.max(count);
             self.splats = gpu.uninit("splats", count)?;
             self.colors = gpu.uninit("colors", self.channels * count)?;
             self.depth_keys = gpu.uninit("depth_keys", count)?;
@@ -124,8 +130,6 @@ impl Frame {
             self.sums = gpu.uninit("sums", partitions as usize)?;
             self.emitted = gpu.uninit("emitted", count)?;
             self.d_splats = gpu.uninit("d_splats", self.record() * count)?;
-            self.gaussian_count = count as u32;
-            gpu.write(&mut self.gaussian_counts, &[count as u32])?;
         }
         if self.render.len() < self.channels * pixels {
             self.render = gpu.uninit("render", self.channels * pixels)?;

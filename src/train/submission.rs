@@ -139,7 +139,7 @@ impl Trainer {
     /// Does what a raised flag asks for, before the next step is done again.
     fn answer(&mut self, status: Status, losses: &StepLosses) -> Result<()> {
         let step = self.step + 1;
-        let view = || self.views.of_step(self.config.seed, step).name.clone();
+        let view = || self.view_of(step).name.clone();
         if status.overflowed {
             self.renderer.grow(status.intersections)?;
             let renderer = &mut self.renderer;
