@@ -531,7 +531,7 @@ impl Renderer {
 /// How many splats the blending kernels take in one turn of their inner loop. More cost a device nothing that ends loops
 /// after so many turns, a processor, and let it follow more; others have the shorter code.
 fn splats_per_turn(gpu: &Gpu) -> u32 {
-    if gpu.properties().max_loop_iterations < u32::MAX { 4 } else { 1 }
+    if gpu.properties().max_loop_iterations < u32::MAX { 2 } else { 1 }
 }
 
 /// How many splats of a tile the blending kernels get through: of a subgroup of splats they make one turn of the
