@@ -23,8 +23,8 @@ use crate::loss::{DepthBoxes, LogSlot, LossLog, Losses, StepLosses, Term, TermIn
 use crate::optimizer::{Adam, AdamBuffers, Learnable};
 use crate::pseudo_gt::PseudoGt;
 use crate::random::Stream;
-use crate::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer, Status};
-use crate::scene::{Gaussians, Shape, width};
+use crate::render::{Damping, Gradients, RenderOptions, Renderer, Status};
+use crate::scene::{Gaussians, width};
 use crate::{Error, Result};
 
 pub use config::{Background, CheckConfig, DensityConfig, TrainConfig};
@@ -188,7 +188,8 @@ impl Trainer {
         let views = Views::upload(gpu, &mut pseudo_gt, dataset)?;
         let sizes = views.sizes();
         say_what_parts_see(&config.model, &sizes);
-        let shape = Shape { sh_degree: config.sh_degree, features: config.model.features() };
+        let settings = config.render_settings();
+        let shape = settings.shape;
         let gaussians = match gaussians {
             Some(gaussians) if gaussians.shape == shape => gaussians.clone(),
             Some(Gaussians { shape: own, .. }) => {
@@ -196,11 +197,6 @@ impl Trainer {
                 return Err(Error::Usage(problem));
             }
             None => views.initial_gaussians(gpu, &pseudo_gt, dataset, &config)?,
-        };
-        let settings = RenderSettings {
-            shape: gaussians.shape,
-            raw_colors: config.model.raw_colors,
-            ..RenderSettings::default()
         };
         let pixels = sizes.iter().map(|size| size.x as usize * size.y as usize).max();
         let values = settings.channels() * pixels.unwrap_or_default();
