@@ -17,11 +17,12 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         return Err("usage: profile DATASET DOWNSCALE STEPS".into());
     };
     let steps: u64 = steps.parse()?;
-    let config = TrainConfig {
+    let mut config = TrainConfig {
         downscale: downscale.parse()?,
         steps: steps + REPEATS,
         ..TrainConfig::default()
     };
+    config.schedule.resolution_steps = [0, 0];
     let gpu = Gpu::new(&DeviceChoice::Best)?;
     let dataset = Dataset::load(path, &config.load_options())?;
     let mut trainer = Trainer::new(&gpu, config, &dataset)?;

@@ -1,21 +1,61 @@
 //! Density control: Gaussians that the views pull at multiply, faint ones go (Kerbl et al. 2023, section 5.2).
 //!
-//! As in LITA-GS, a clone's position is drawn from its parent, opacities are never reset and large Gaussians are not
-//! pruned. A pass makes new buffers of the exact new size; nothing of the old ones is changed.
+//! ```text
+//! score -> sort by need -> decide -> scan of the offspring -> counts to the host -> scatter
+//! ```
+//!
+//! The device decides; the host reads four counts and makes room. What comes of the Gaussians is written plane set by
+//! plane set into the buffer that is free, which the gradients of the last step leave: no memory beyond what training
+//! holds, and buffers grow with headroom, so most rounds allocate nothing.
+
+use std::str::FromStr;
+
+use serde::{Deserialize, Serialize};
 
 use crate::gpu::{Buffer, Gpu, Pipeline, Threads};
-use crate::kernels::fate::{FATE_CLONE, FATE_PRUNE, FATE_SPLIT};
-use crate::kernels::{densify_count, densify_scatter};
+use crate::kernels::fate::{
+    TALLY_CANDIDATES, TALLY_CLONED, TALLY_PRUNED, TALLY_SPLIT, TALLY_WORDS,
+};
+use crate::kernels::{densify_decide, densify_moments, densify_scatter, densify_score};
 use crate::optimizer::Moments;
-use crate::sort::{Count, Scan};
+use crate::sort::{Count, RadixSort, Scan};
 use crate::{Error, Result};
+
+/// What comes of a Gaussian that multiplies.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum DensityControl {
+    /// Two halves along its longest axis that together cover what it covered: the render stays nearly as it was.
+    #[default]
+    Conserving,
+    /// LITA-GS's: a small one gets a copy at a position drawn from it, a large one is replaced by two smaller ones at
+    /// drawn positions. Opacities are never reset and large Gaussians are not pruned.
+    Paper,
+}
+
+impl FromStr for DensityControl {
+    type Err = Error;
+
+    fn from_str(name: &str) -> Result<Self> {
+        match name {
+            "conserving" => Ok(Self::Conserving),
+            "paper" => Ok(Self::Paper),
+            _ => {
+                let problem = format!("unknown density control `{name}`; conserving or paper");
+                Err(Error::Usage(problem))
+            }
+        }
+    }
+}
 
 /// Which Gaussians multiply and which go.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DensifySettings {
+    /// What comes of those that multiply.
+    pub control: DensityControl,
     /// Mean norm of the screen-space gradient, in normalised device units, above which a Gaussian multiplies.
     pub gradient_threshold: f64,
-    /// The largest standard deviation, in world units, up to which it is cloned; beyond, it is split.
+    /// The largest standard deviation, in world units, up to which the paper's control clones; beyond, it splits.
     pub split_scale: f64,
     /// Fainter Gaussians go, in (0, 1).
     pub min_opacity: f64,
@@ -34,22 +74,33 @@ pub struct DeviceGaussians {
     pub column_count: u32,
     /// How many of these are features.
     pub feature_count: u32,
-    /// `count * column_count` floats.
+    /// `count * column_count` floats, and room behind them.
     pub parameters: Buffer<f32>,
     /// As many each.
     pub moments: Moments,
 }
 
-/// What the steps since the last pass have gathered, per Gaussian.
-#[derive(Clone, Copy, Debug)]
-pub struct GradientStatistics<'a> {
+/// What the steps since the last round have gathered, per Gaussian, and a buffer to work with.
+#[derive(Debug)]
+pub struct DensifyInputs<'a> {
     /// Sums of the norms of the screen-space gradients, in normalised device units.
     pub grad_norm_sums: &'a Buffer<f32>,
     /// In how many steps the Gaussian was seen.
     pub visit_counts: &'a Buffer<u32>,
+    /// The gradients, as planes; what they hold is lost.
+    pub gradients: &'a mut Buffer<f32>,
 }
 
-/// What one pass did.
+/// When a round takes place.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Round {
+    /// The step it follows.
+    pub step: u64,
+    /// How many rounds are left, this one included. Each takes its share of the room below the limit; 1 takes it all.
+    pub rounds_left: u64,
+}
+
+/// What one round did.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct DensifyReport {
     /// Gaussians that got a copy.
@@ -60,6 +111,8 @@ pub struct DensifyReport {
     pub pruned: usize,
     /// Gaussians there are now.
     pub count: usize,
+    /// Gaussians that would have multiplied had there been room.
+    pub refused: usize,
 }
 
 /// The kernels of density control.
@@ -67,17 +120,43 @@ pub struct DensifyReport {
 pub struct Densifier {
     gpu: Gpu,
     settings: DensifySettings,
-    count: Pipeline<densify_count::Kernel>,
+    score: Pipeline<densify_score::Kernel>,
+    decide: Pipeline<densify_decide::Kernel>,
     scatter: Pipeline<densify_scatter::Kernel>,
+    moments: Pipeline<densify_moments::Kernel>,
+    sort: RadixSort,
     scan: Scan,
+    scratch: Scratch,
+    /// The device's limit was the reason that a round refused to grow, and the user knows.
+    has_warned: bool,
 }
 
-/// The decision for every Gaussian, on the device and on the host.
-struct Decision {
-    mean_gradients: Buffer<f32>,
-    device_fates: Buffer<u32>,
+/// The decision for every Gaussian.
+#[derive(Debug)]
+struct Scratch {
+    keys: Buffer<u32>,
+    ids: Buffer<u32>,
+    fates: Buffer<u32>,
     offspring_counts: Buffer<u32>,
-    fates: Vec<u32>,
+    offsets: Buffer<u32>,
+    tally: Buffer<u32>,
+    total: Buffer<u32>,
+    count: Buffer<u32>,
+}
+
+impl Scratch {
+    fn new(gpu: &Gpu, capacity: usize) -> Result<Self> {
+        Ok(Self {
+            keys: gpu.uninit("densify_keys", capacity)?,
+            ids: gpu.uninit("densify_ids", capacity)?,
+            fates: gpu.uninit("fates", capacity)?,
+            offspring_counts: gpu.uninit("offspring_counts", capacity)?,
+            offsets: gpu.uninit("offspring_offsets", capacity)?,
+            tally: gpu.uninit("densify_tally", TALLY_WORDS as usize)?,
+            total: gpu.uninit("offspring_total", 1)?,
+            count: gpu.uninit("gaussian_count", 1)?,
+        })
+    }
 }
 
 impl Densifier {
@@ -99,151 +178,199 @@ impl Densifier {
                 return Err(Error::Usage(problem));
             }
         }
+        let conserving = settings.control == DensityControl::Conserving;
         Ok(Self {
             gpu: gpu.clone(),
             settings,
-            count: gpu.pipeline(&densify_count::Constants::default())?,
-            scatter: gpu.pipeline(&densify_scatter::Constants::default())?,
+            score: gpu.pipeline(&densify_score::Constants::default())?,
+            decide: gpu.pipeline(&densify_decide::Constants { conserving })?,
+            scatter: gpu.pipeline(&densify_scatter::Constants { conserving })?,
+            moments: gpu.pipeline(&densify_moments::Constants::default())?,
+            sort: RadixSort::new(gpu, 0)?,
             scan: Scan::new(gpu, 0)?,
+            scratch: Scratch::new(gpu, 0)?,
+            has_warned: false,
         })
     }
 
-    /// One pass of density control after `step`: the Gaussians that come of `gaussians`, and what happened. New ones
-    /// begin with zero moments, the statistics are to be zeroed for the new count.
+    /// One round of density control: `gaussians` become what comes of them. The statistics are to be zeroed for the new
+    /// count; buffers that were too short for it are longer.
     ///
     /// # Errors
-    /// A buffer is shorter than the Gaussians need, or the device is out of memory.
+    /// A buffer is shorter than the Gaussians need, or the device is out of memory or lost.
     pub fn densify(
         &mut self,
-        gaussians: &DeviceGaussians,
-        statistics: GradientStatistics<'_>,
-        step: u64,
-    ) -> Result<(DeviceGaussians, DensifyReport)> {
-        check(gaussians, statistics)?;
-        let threshold = self.settings.gradient_threshold as f32;
-        let mut decision = self.decide(gaussians, statistics, threshold)?;
-        if let Some(threshold) = self.raised_threshold(&decision)? {
-            decision = self.decide(gaussians, statistics, threshold)?;
+        gaussians: &mut DeviceGaussians,
+        inputs: DensifyInputs<'_>,
+        round: Round,
+    ) -> Result<DensifyReport> {
+        check(gaussians, &inputs)?;
+        let limit = self.limit(gaussians.column_count);
+        let tally = self.decide(gaussians, &inputs, limit, round)?;
+        let report = report(gaussians.count, &tally);
+        if report.refused > 0 && limit < self.settings.max_gaussians && !self.has_warned {
+            self.has_warned = true;
+            tracing::warn!(
+                "growth stops at {limit} Gaussians, all that the device can bind at once"
+            );
         }
-        let report = report(&decision.fates);
-        let successors = self.scatter(gaussians, &decision, report.count, step)?;
-        Ok((successors, report))
+        self.scatter(gaussians, inputs.gradients, &report, limit, round.step)?;
+        Ok(report)
     }
 
+    /// The most Gaussians there may be: the setting, or what one binding holds where that is less.
+    fn limit(&self, column_count: u32) -> usize {
+        let floats = self.gpu.properties().max_storage_buffer_range / size_of::<f32>() as u64;
+        let bindable = floats.min(u64::from(u32::MAX)) as usize / column_count.max(1) as usize;
+        self.settings.max_gaussians.min(bindable)
+    }
+
+    /// Leaves every fate and every place on the device, and returns the counts.
     fn decide(
-        &self,
-        gaussians: &DeviceGaussians,
-        GradientStatistics { grad_norm_sums, visit_counts }: GradientStatistics<'_>,
-        gradient_threshold: f32,
-    ) -> Result<Decision> {
-        let len = gaussians.count as usize;
-        let mut mean_gradients = self.gpu.uninit("mean_gradients", len)?;
-        let mut device_fates = self.gpu.uninit("fates", len)?;
-        let mut offspring_counts = self.gpu.uninit("offspring_counts", len)?;
-        let min_opacity = self.settings.min_opacity;
-        let params = densify_count::Params {
-            gaussian_count: gaussians.count,
-            column_count: gaussians.column_count,
-            feature_count: gaussians.feature_count,
-            gradient_threshold,
-            split_log_scale: self.settings.split_scale.ln() as f32,
-            min_raw_opacity: (min_opacity / (1.0 - min_opacity)).ln() as f32,
-        };
-        self.gpu.run("densify_count", |pass| {
-            let buffers = densify_count::Buffers {
-                parameters: &gaussians.parameters,
-                grad_norm_sums,
-                visit_counts,
-                mean_gradients: &mut mean_gradients,
-                fates: &mut device_fates,
-                offspring_counts: &mut offspring_counts,
-            };
-            pass.dispatch(&self.count, &params, buffers, Threads::Exactly([gaussians.count, 1, 1]))
-        })?;
-        let fates = self.gpu.read(&device_fates)?;
-        Ok(Decision { mean_gradients, device_fates, offspring_counts, fates })
-    }
-
-    /// The gradient threshold that keeps the successors of a decision within the limit, if it exceeds that.
-    fn raised_threshold(&self, decision: &Decision) -> Result<Option<f32>> {
-        let DensifyReport { cloned, split, pruned, .. } = report(&decision.fates);
-        let room = self.settings.max_gaussians.saturating_sub(decision.fates.len() - pruned);
-        if cloned + split <= room {
-            return Ok(None);
-        }
-        let mean_gradients = self.gpu.read(&decision.mean_gradients)?;
-        let mut candidates: Vec<f32> = mean_gradients
-            .into_iter()
-            .zip(&decision.fates)
-            .filter_map(|(gradient, &fate)| (fate >= FATE_CLONE).then_some(gradient))
-            .collect();
-        // Each adds one Gaussian. Only those above the largest that finds no room may multiply.
-        let (_, &mut threshold, _) = candidates.select_nth_unstable_by(room, |a, b| b.total_cmp(a));
-        Ok(Some(threshold))
-    }
-
-    fn scatter(
         &mut self,
         gaussians: &DeviceGaussians,
-        decision: &Decision,
-        new_count: usize,
-        step: u64,
-    ) -> Result<DeviceGaussians> {
-        let len = gaussians.count as usize;
-        let new_len = new_count * gaussians.column_count as usize;
-        let counts = self.gpu.buffer("gaussian_count", &[gaussians.count])?;
-        let mut offsets = self.gpu.uninit("offspring_offsets", len)?;
-        let mut total = self.gpu.uninit("offspring_total", 1)?;
-        let mut successors = DeviceGaussians {
-            count: new_count as u32,
-            column_count: gaussians.column_count,
-            feature_count: gaussians.feature_count,
-            parameters: self.gpu.uninit("parameters", new_len)?,
-            moments: Moments {
-                first: self.gpu.uninit("first_moments", new_len)?,
-                second: self.gpu.uninit("second_moments", new_len)?,
-            },
+        DensifyInputs { grad_norm_sums, visit_counts, .. }: &DensifyInputs<'_>,
+        limit: usize,
+        round: Round,
+    ) -> Result<Vec<u32>> {
+        let DeviceGaussians { count, column_count, feature_count, ref parameters, .. } = *gaussians;
+        if self.scratch.keys.len() < count as usize {
+            self.scratch = Scratch::new(&self.gpu, grad_norm_sums.len())?;
+        }
+        let DensifySettings { gradient_threshold, split_scale, min_opacity, .. } = self.settings;
+        let score = densify_score::Params {
+            gaussian_count: count,
+            column_count,
+            feature_count,
+            gradient_threshold: gradient_threshold as f32,
+            min_raw_opacity: (min_opacity / (1.0 - min_opacity)).ln() as f32,
         };
+        let decide = densify_decide::Params {
+            gaussian_count: count,
+            max_gaussians: limit.min(u32::MAX as usize) as u32,
+            rounds_left: round.rounds_left.clamp(1, u64::from(u32::MAX)) as u32,
+            split_log_scale: split_scale.ln() as f32,
+        };
+        let Self { scratch, sort, scan, .. } = self;
+        let threads = Threads::Exactly([count, 1, 1]);
+        self.gpu.write(&mut scratch.count, &[count])?;
+        let mut download = None;
+        self.gpu.run("densify_decide", |pass| {
+            pass.fill(&mut scratch.tally, 0);
+            let buffers = densify_score::Buffers {
+                parameters,
+                grad_norm_sums,
+                visit_counts,
+                keys: &mut scratch.keys,
+                ids: &mut scratch.ids,
+                tally: &mut scratch.tally,
+            };
+            pass.dispatch(&self.score, &score, buffers, threads)?;
+            let counted = Count { counts: &scratch.count, index: 0 };
+            sort.record(pass, counted, &mut scratch.keys, &mut scratch.ids, u32::BITS)?;
+            let buffers = densify_decide::Buffers {
+                parameters,
+                sorted_keys: &scratch.keys,
+                sorted_ids: &scratch.ids,
+                tally: &mut scratch.tally,
+                fates: &mut scratch.fates,
+                offspring_counts: &mut scratch.offspring_counts,
+            };
+            pass.dispatch(&self.decide, &decide, buffers, threads)?;
+            let Scratch { offspring_counts, offsets, total, .. } = scratch;
+            scan.record(pass, counted, offspring_counts, offsets, total)?;
+            download = Some(pass.download(&scratch.tally)?);
+            Ok(())
+        })?;
+        download.map_or_else(|| Ok(vec![]), |tally| tally.wait())
+    }
+
+    /// Writes the successors into the spare buffer, one plane set after the other: each leaves its own as the next one's
+    /// spare.
+    fn scatter(
+        &self,
+        gaussians: &mut DeviceGaussians,
+        spare: &mut Buffer<f32>,
+        report: &DensifyReport,
+        limit: usize,
+        step: u64,
+    ) -> Result<()> {
+        if report.split + report.cloned + report.pruned == 0 {
+            return Ok(());
+        }
+        let DeviceGaussians { count, column_count, feature_count, .. } = *gaussians;
+        let columns = column_count as usize;
+        let (len, capacity) = (report.count * columns, capacity(report.count, limit) * columns);
+        let new_gaussian_count = report.count as u32;
         let seed = self.settings.seed;
         let params = densify_scatter::Params {
-            gaussian_count: gaussians.count,
-            new_gaussian_count: successors.count,
-            column_count: gaussians.column_count,
-            feature_count: gaussians.feature_count,
+            gaussian_count: count,
+            new_gaussian_count,
+            column_count,
+            feature_count,
             seed: (seed ^ (seed >> 32)) as u32,
             step: step as u32,
         };
-        let (scan, scatter) = (&mut self.scan, &self.scatter);
+        let moments_params = densify_moments::Params {
+            gaussian_count: count,
+            new_gaussian_count,
+            column_count,
+            feature_count,
+        };
+        let Scratch { fates, offsets, .. } = &self.scratch;
+        let Moments { first, second } = &mut gaussians.moments;
+        let threads = Threads::Exactly([count, 1, 1]);
         self.gpu.run("densify_scatter", |pass| {
-            let count = Count { counts: &counts, index: 0 };
-            scan.record(pass, count, &decision.offspring_counts, &mut offsets, &mut total)?;
-            let buffers = densify_scatter::Buffers {
-                parameters: &gaussians.parameters,
-                first_moments: &gaussians.moments.first,
-                second_moments: &gaussians.moments.second,
-                fates: &decision.device_fates,
-                offsets: &offsets,
-                new_parameters: &mut successors.parameters,
-                new_first_moments: &mut successors.moments.first,
-                new_second_moments: &mut successors.moments.second,
-            };
-            pass.dispatch(scatter, &params, buffers, Threads::Exactly([gaussians.count, 1, 1]))
+            self.make_room(spare, len, capacity)?;
+            let parameters = &mut gaussians.parameters;
+            let buffers =
+                densify_scatter::Buffers { parameters, fates, offsets, new_parameters: spare };
+            pass.dispatch(&self.scatter, &params, buffers, threads)?;
+            std::mem::swap(parameters, spare);
+            for moments in [first, second] {
+                self.make_room(spare, len, capacity)?;
+                let buffers =
+                    densify_moments::Buffers { moments, fates, offsets, new_moments: spare };
+                pass.dispatch(&self.moments, &moments_params, buffers, threads)?;
+                std::mem::swap(moments, spare);
+            }
+            self.make_room(spare, len, capacity)
         })?;
-        Ok(successors)
+        gaussians.count = new_gaussian_count;
+        Ok(())
+    }
+
+    /// A buffer that is too short goes once the device is done with it, and a longer one takes its place.
+    fn make_room(&self, buffer: &mut Buffer<f32>, len: usize, capacity: usize) -> Result<()> {
+        if buffer.len() < len {
+            *buffer = self.gpu.uninit("planes", capacity)?;
+        }
+        Ok(())
     }
 }
 
-fn report(fates: &[u32]) -> DensifyReport {
-    let with = |fate: u32| fates.iter().filter(|&&other| other == fate).count();
-    let (cloned, split, pruned) = (with(FATE_CLONE), with(FATE_SPLIT), with(FATE_PRUNE));
-    DensifyReport { cloned, split, pruned, count: fates.len() - pruned + cloned + split }
+/// How many Gaussians to make room for where there are to be `count`: half as many again, within the limit.
+pub(crate) fn capacity(count: usize, limit: usize) -> usize {
+    (count + count / 2).min(limit).max(count)
+}
+
+fn report(count: u32, tally: &[u32]) -> DensifyReport {
+    let tally = |place: u32| tally.get(place as usize).map_or(0, |&count| count as usize);
+    let (cloned, split, pruned) = (tally(TALLY_CLONED), tally(TALLY_SPLIT), tally(TALLY_PRUNED));
+    DensifyReport {
+        cloned,
+        split,
+        pruned,
+        count: count as usize - pruned + cloned + split,
+        refused: tally(TALLY_CANDIDATES) - cloned - split,
+    }
 }
 
 /// A kernel that runs beyond a buffer reads its neighbours: refuse before anything is recorded.
-fn check(gaussians: &DeviceGaussians, statistics: GradientStatistics<'_>) -> Result<()> {
+fn check(gaussians: &DeviceGaussians, inputs: &DensifyInputs<'_>) -> Result<()> {
     let DeviceGaussians { count, column_count, feature_count, parameters, moments } = gaussians;
     let (count, columns) = (*count as usize, *column_count as usize);
-    let GradientStatistics { grad_norm_sums, visit_counts } = statistics;
+    let DensifyInputs { grad_norm_sums, visit_counts, .. } = inputs;
     let planes =
         [parameters, &moments.first, &moments.second].map(|b| (b.name(), b.len(), count * columns));
     let per_gaussian = [

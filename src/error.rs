@@ -100,6 +100,23 @@ pub enum Error {
         /// The loss term or buffer that is not finite.
         what: String,
     },
+    /// More splats lie on one tile than a kernel gets through on this device.
+    #[error(
+        "{view}: {splats} splats on one tile of {tile} pixels, {device} follows {limit}; lower \
+         `TrainConfig::max_gaussians` or take another device"
+    )]
+    Crowded {
+        /// The render, or the training step and its view.
+        view: String,
+        /// The most splats of one tile.
+        splats: u32,
+        /// Its width and height in pixels.
+        tile: String,
+        /// The device's name.
+        device: String,
+        /// How many it follows.
+        limit: u32,
+    },
     /// A checked pass left other numbers than its CPU reference.
     #[error(
         "the device disagrees with the CPU references: {what}; update the driver, or report this with the output of \

@@ -65,6 +65,10 @@ pub struct Properties {
     pub max_storage_buffer_range: u64,
     /// Workgroups of a dispatch along one dimension.
     pub max_workgroups: u32,
+    /// After how many turns, of all its loops together, a kernel's invocation leaves them, silently.
+    pub max_loop_iterations: u32,
+    /// Bits of a timestamp on our queue that count; 0 where the queue has none, and passes cannot be timed.
+    pub timestamp_bits: u32,
     /// Nanoseconds of one timestamp tick.
     pub timestamp_period: f32,
     /// The device is a processor (lavapipe and the like).
@@ -92,6 +96,7 @@ struct Shared {
     last_use: AtomicU64,
     usage: buffer::MemoryUsage,
     retired: Mutex<Vec<(u64, Retired)>>,
+    recorded: recorder::Recorded,
     /// The threads whose submissions are checked.
     checks: checked::Checks,
     pipeline_cache: vk::PipelineCache,

@@ -1,8 +1,8 @@
 //! The differentiable rasteriser: Gaussians and a camera in, a render out; its gradient in, theirs out.
 //!
 //! ```text
-//! project -> sort by depth -> order_counts -> scan -> check_capacity -> emit -> sort by tile -> tile_ranges
-//!     -> blend_forward -> [loss] -> blend_backward -> reduce_records -> project_backward
+//! project -> sort by depth -> order_counts -> emit -> sort by tile -> blend_forward
+//!     -> [loss] -> blend_backward -> reduce_records -> project_backward
 //! ```
 //!
 //! Counts stay on the device. Where the intersections of a view exceed the memory reserved for them, a status flag is
@@ -13,19 +13,21 @@ mod frame;
 use glam::UVec2;
 
 use crate::camera::Camera;
-use crate::gpu::{Buffer, Gpu, Kernel as _, Pipeline, Recorder, Statistic, Threads};
+use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Statistic, Threads};
 use crate::image::Image;
+use crate::kernels::project::DEPTH_BITS;
 use crate::kernels::splat::MAX_CHANNELS;
 use crate::kernels::{
-    self, blend_backward, blend_forward, check_capacity, emit, order_counts, project,
-    project_backward, reduce_records, tile_ranges,
+    self, blend_backward, blend_forward, emit, order_counts, project, project_backward,
+    reduce_records,
 };
 use crate::scene::Shape;
-use crate::sort::{Count, DispatchArguments, RadixSort, Scan};
+use crate::sort::{Count, RadixSort};
 use crate::{Error, Result};
 
 #[doc(hidden)]
 pub use frame::Frame;
+use frame::RANKS_PER_PARTITION;
 pub use frame::Status;
 
 /// What a renderer is specialised for.
@@ -137,19 +139,17 @@ pub struct Renderer {
     gpu: Gpu,
     settings: RenderSettings,
     tile: [u32; 2],
+    /// The most splats of one tile that the blending kernels follow.
+    longest_run: u32,
     project: Pipeline<project::Kernel>,
     order_counts: Pipeline<order_counts::Kernel>,
-    check_capacity: Pipeline<check_capacity::Kernel>,
     emit: Pipeline<emit::Kernel>,
-    tile_ranges: Pipeline<tile_ranges::Kernel>,
     blend_forward: Pipeline<blend_forward::Kernel>,
     blend_backward: Pipeline<blend_backward::Kernel>,
     reduce_records: Pipeline<reduce_records::Kernel>,
     project_backward: Pipeline<project_backward::Kernel>,
     depth_sort: RadixSort,
     tile_sort: RadixSort,
-    scan: Scan,
-    intersections: DispatchArguments,
     frame: Frame,
 }
 
@@ -162,8 +162,8 @@ impl Renderer {
         let [tile_width, tile_height] = settings.tile_on(gpu)?;
         let channels = settings.channels() as u32;
         let (alpha_max, sh_degree) = (settings.max_alpha, settings.shape.sh_degree);
-        let raw_colors = settings.raw_colors;
-        let skips_groups = !gpu.properties().is_cpu;
+        let (raw_colors, partition_size) = (settings.raw_colors, RANKS_PER_PARTITION);
+        let (skips_groups, splats_per_turn) = (!gpu.properties().is_cpu, splats_per_turn(gpu));
         // What every kernel that includes `splat.glsl` is specialised with, and what some are beside it.
         macro_rules! constants {
             ($kernel:ident $(, $own:ident)*) => {
@@ -174,19 +174,24 @@ impl Renderer {
             gpu: gpu.clone(),
             settings,
             tile: [tile_width, tile_height],
+            longest_run: longest_run(gpu),
             project: gpu.pipeline(&constants!(project, sh_degree, raw_colors))?,
-            order_counts: gpu.pipeline(&order_counts::Constants::default())?,
-            check_capacity: gpu.pipeline(&check_capacity::Constants::default())?,
-            emit: gpu.pipeline(&constants!(emit))?,
-            tile_ranges: gpu.pipeline(&tile_ranges::Constants::default())?,
-            blend_forward: gpu.pipeline(&constants!(blend_forward, skips_groups))?,
-            blend_backward: gpu.pipeline(&constants!(blend_backward, skips_groups))?,
+            order_counts: gpu.pipeline(&order_counts::Constants { partition_size })?,
+            emit: gpu.pipeline(&constants!(emit, partition_size))?,
+            blend_forward: gpu.pipeline(&constants!(
+                blend_forward,
+                skips_groups,
+                splats_per_turn
+            ))?,
+            blend_backward: gpu.pipeline(&constants!(
+                blend_backward,
+                skips_groups,
+                splats_per_turn
+            ))?,
             reduce_records: gpu.pipeline(&constants!(reduce_records))?,
             project_backward: gpu.pipeline(&constants!(project_backward, sh_degree, raw_colors))?,
             depth_sort: RadixSort::new(gpu, 0)?,
             tile_sort: RadixSort::new(gpu, 0)?,
-            scan: Scan::new(gpu, 0)?,
-            intersections: DispatchArguments::new(gpu)?,
             frame: Frame::new(gpu, settings.channels())?,
         })
     }
@@ -200,13 +205,25 @@ impl Renderer {
         gaussian_count: usize,
         cameras: impl IntoIterator<Item = &'a Camera>,
     ) -> Result<()> {
+        self.reserve_with_headroom([gaussian_count; 2], cameras)
+    }
+
+    /// The same for a number of Gaussians, and where that needs more memory, for another number that may follow.
+    ///
+    /// # Errors
+    /// The device is out of memory.
+    pub fn reserve_with_headroom<'a>(
+        &mut self,
+        [gaussian_count, capacity]: [usize; 2],
+        cameras: impl IntoIterator<Item = &'a Camera>,
+    ) -> Result<()> {
         let (mut pixels, mut tiles) = (0, 0);
         for camera in cameras {
             let UVec2 { x, y } = self.tiles(camera);
             pixels = pixels.max(camera.width as usize * camera.height as usize);
             tiles = tiles.max(x as usize * y as usize);
         }
-        self.frame.reserve(&self.gpu, gaussian_count, pixels, tiles)
+        self.frame.reserve(&self.gpu, [gaussian_count, capacity], pixels, tiles)
     }
 
     /// Makes room for `intersections`, and half as many again; what room there is stays.
@@ -298,6 +315,10 @@ impl Renderer {
             })?;
             let words = status.map_or_else(|| Ok(vec![]), |status| status.wait())?;
             let status = Status::from_words(&words);
+            if status.crowd > 0 {
+                let Camera { width, height, .. } = camera;
+                return Err(self.too_crowded(format!("a {width}x{height} render"), status.crowd));
+            }
             if !status.overflowed {
                 break;
             }
@@ -307,6 +328,13 @@ impl Renderer {
         let pixels = camera.width as usize * camera.height as usize;
         data.truncate(self.settings.channels() * pixels);
         Ok(data)
+    }
+
+    /// What to say of a view whose [`Status::crowd`] is too large for this device.
+    pub fn too_crowded(&self, view: String, splats: u32) -> Error {
+        let ([width, height], device) = (self.tile, self.gpu.properties().name.clone());
+        let (tile, limit) = (format!("{width}x{height}"), self.longest_run);
+        Error::Crowded { view, splats, tile, device, limit }
     }
 
     /// Lowers every flag of the status.
@@ -336,16 +364,20 @@ impl Renderer {
             &blend_forward::Params {
                 size: view.camera.size,
                 tile_columns: view.tiles.x,
+                longest_run: self.longest_run,
                 background,
             },
             blend_forward::Buffers {
-                tile_ranges: &frame.tile_ranges,
+                counts: &frame.counts,
                 sorted_slots: &frame.slots,
                 owners: &frame.owners,
                 splats: &frame.splats,
                 colors: &frame.colors,
                 render: &mut frame.render,
                 transmittances: &mut frame.transmittances,
+                sorted_tiles: &frame.tiles,
+                tile_ranges: &mut frame.tile_ranges,
+                status: &mut frame.status,
             },
             Threads::Workgroups([view.tile_count(), 1, 1]),
         )
@@ -388,10 +420,7 @@ impl Renderer {
             &self.reduce_records,
             &reduce_records::Params { gaussian_count },
             reduce_records::Buffers {
-                counts: &frame.counts,
-                sorted_ids: &frame.ids,
-                ordered_counts: &frame.ordered_counts,
-                offsets: &frame.offsets,
+                emitted: &frame.emitted,
                 records: &frame.records,
                 d_splats: &mut frame.d_splats,
             },
@@ -455,28 +484,20 @@ impl Renderer {
         let frame = &mut self.frame;
         let gaussian_count = frame.gaussian_count;
         let all = Count { counts: &frame.gaussian_counts, index: 0 };
-        self.depth_sort.record(pass, all, &mut frame.depth_keys, &mut frame.ids, u32::BITS)?;
+        self.depth_sort.record(pass, all, &mut frame.depth_keys, &mut frame.ids, DEPTH_BITS)?;
         pass.dispatch(
             &self.order_counts,
-            &order_counts::Params { gaussian_count },
+            &order_counts::Params { gaussian_count, capacity: frame.intersection_capacity() },
             order_counts::Buffers {
                 sorted_ids: &frame.ids,
                 tile_counts: &frame.tile_counts,
                 ordered_counts: &mut frame.ordered_counts,
-            },
-            Threads::Exactly([gaussian_count, 1, 1]),
-        )?;
-        self.scan.record(pass, all, &frame.ordered_counts, &mut frame.offsets, &mut frame.total)?;
-        let capacity = frame.intersection_capacity();
-        pass.dispatch(
-            &self.check_capacity,
-            &check_capacity::Params { capacity },
-            check_capacity::Buffers {
-                total: &frame.total,
+                sums: &mut frame.sums,
                 counts: &mut frame.counts,
                 status: &mut frame.status,
+                arrivals: &mut frame.arrivals,
             },
-            Threads::Exactly([1, 1, 1]),
+            Threads::Workgroups([gaussian_count.div_ceil(RANKS_PER_PARTITION).max(1), 1, 1]),
         )?;
         pass.dispatch(
             &self.emit,
@@ -485,31 +506,19 @@ impl Renderer {
                 counts: &frame.counts,
                 sorted_ids: &frame.ids,
                 ordered_counts: &frame.ordered_counts,
-                offsets: &frame.offsets,
+                sums: &frame.sums,
                 splats: &frame.splats,
                 tiles: &mut frame.tiles,
                 slots: &mut frame.slots,
                 owners: &mut frame.owners,
+                emitted: &mut frame.emitted,
             },
             Threads::Exactly([gaussian_count, 1, 1]),
         )?;
         let emitted = Count { counts: &frame.counts, index: 0 };
         // One value more than there are tiles: padding sorts behind them all.
         let bits = u32::BITS - view.tile_count().leading_zeros();
-        self.tile_sort.record(pass, emitted, &mut frame.tiles, &mut frame.slots, bits)?;
-        pass.fill(&mut frame.tile_ranges, 0);
-        let per_workgroup = tile_ranges::Kernel::WORKGROUP_SIZE[0];
-        self.intersections.record(pass, emitted, per_workgroup, capacity)?;
-        pass.dispatch(
-            &self.tile_ranges,
-            &tile_ranges::Params { tile_count: view.tile_count() },
-            tile_ranges::Buffers {
-                counts: &frame.counts,
-                sorted_tiles: &frame.tiles,
-                tile_ranges: &mut frame.tile_ranges,
-            },
-            self.intersections.threads(),
-        )
+        self.tile_sort.record(pass, emitted, &mut frame.tiles, &mut frame.slots, bits)
     }
 
     /// Columns and rows of tiles.
@@ -530,6 +539,22 @@ impl Renderer {
         }
         Ok(View { camera: camera.into(), tiles })
     }
+}
+
+/// How many splats the blending kernels take in one turn of their inner loop. More cost a device nothing that ends loops
+/// after so many turns, a processor, and let it follow more; others have the shorter code.
+fn splats_per_turn(gpu: &Gpu) -> u32 {
+    if gpu.properties().max_loop_iterations < u32::MAX { 4 } else { 1 }
+}
+
+/// How many splats of a tile the blending kernels get through: of a subgroup of splats they make one turn of the
+/// outer loop and the turns of the inner one; some more find the run, and end a loop.
+fn longest_run(gpu: &Gpu) -> u32 {
+    let properties = gpu.properties();
+    let lanes = properties.subgroup_size;
+    const SOME_TURNS: u32 = 64;
+    let turns_per_batch = 1 + lanes.div_ceil(splats_per_turn(gpu));
+    ((properties.max_loop_iterations - SOME_TURNS) / turns_per_batch).saturating_mul(lanes)
 }
 
 /// A camera as the kernels take it, and the columns and rows of tiles of its image.

@@ -7,23 +7,25 @@ mod networks;
 mod overrides;
 mod parts;
 mod preset;
+mod submission;
 mod terms;
 mod views;
 
-use std::time::Instant;
+use std::panic::resume_unwind;
+use std::thread::{self, ScopedJoinHandle};
 
 use glam::UVec2;
 
 use crate::camera::Camera;
 use crate::dataset::Dataset;
-use crate::densify::{Densifier, DensifySettings};
+use crate::densify::{Densifier, DensifySettings, DensityControl, Round};
 use crate::gpu::{Buffer, CheckReport, Gpu, PassTime, Recorder};
 use crate::image::Image;
 use crate::loss::{DepthBoxes, LogSlot, LossLog, Losses, StepLosses, Term, TermInputs};
 use crate::optimizer::{Adam, AdamBuffers, Learnable};
 use crate::pseudo_gt::PseudoGt;
 use crate::random::Stream;
-use crate::render::{Damping, Gradients, RenderOptions, Renderer, Status};
+use crate::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer};
 use crate::scene::{Gaussians, width};
 use crate::{Error, Result};
 
@@ -32,11 +34,9 @@ use model::Model;
 pub use networks::Networks;
 pub use parts::{ModelConfig, ModelName, NetworkRates, Part};
 pub use preset::Preset;
+use submission::{MOST_STEPS, Pace};
 use terms::NetworkTerms;
-use views::Views;
-
-/// Steps that one submission holds at most: recording and reading back cost once for all of them.
-const STEPS_PER_SUBMISSION: u64 = 8;
+use views::{TrainView, Views};
 
 /// The streams of random numbers that training draws from, one per purpose.
 mod streams {
@@ -152,6 +152,7 @@ pub struct Trainer {
     densifier: Densifier,
     d_render: Buffer<f32>,
     log: LossLog,
+    pace: Pace,
 }
 
 impl Trainer {
@@ -184,16 +185,32 @@ impl Trainer {
     ) -> Result<Self> {
         config.check()?;
         config.leave_out_what_is_missing(dataset);
+        let settings = config.render_settings();
+        let density = density(&config, dataset.extent());
+        thread::scope(|scope| {
+            // The driver compiles on another thread while the views are uploaded and looked at.
+            let kernels = scope.spawn(move || Kernels::new(gpu, settings, density));
+            Self::assemble(gpu, config, dataset, gaussians, settings, kernels)
+        })
+    }
+
+    fn assemble(
+        gpu: &Gpu,
+        config: TrainConfig,
+        dataset: &Dataset,
+        gaussians: Option<&Gaussians>,
+        settings: RenderSettings,
+        kernels: ScopedJoinHandle<'_, Result<Kernels>>,
+    ) -> Result<Self> {
         let mut pseudo_gt = PseudoGt::new(gpu, &config.tone)?;
-        let views = Views::upload(gpu, &mut pseudo_gt, dataset)?;
+        let views =
+            Views::upload(gpu, &mut pseudo_gt, dataset, config.schedule.resolution_levels())?;
         let sizes = views.sizes();
         say_what_parts_see(&config.model, &sizes);
-        let settings = config.render_settings();
-        let shape = settings.shape;
         let gaussians = match gaussians {
-            Some(gaussians) if gaussians.shape == shape => gaussians.clone(),
+            Some(gaussians) if gaussians.shape == settings.shape => gaussians.clone(),
             Some(Gaussians { shape: own, .. }) => {
-                let problem = format!("Gaussians of {own:?} make no model of {shape:?}");
+                let problem = format!("Gaussians of {own:?} make no model of {:?}", settings.shape);
                 return Err(Error::Usage(problem));
             }
             None => views.initial_gaussians(gpu, &pseudo_gt, dataset, &config)?,
@@ -203,19 +220,22 @@ impl Trainer {
         let sources = views.sources(gpu, &pseudo_gt, dataset);
         let losses = Losses::new(gpu, &config.loss(), &sources)?;
         drop(sources);
+        let Kernels { renderer, adam, densifier } =
+            kernels.join().unwrap_or_else(|panic| resume_unwind(panic))?;
         let mut trainer = Self {
             gpu: gpu.clone(),
             extent: dataset.extent(),
             step: 0,
             views,
             model: Model::upload(gpu, &gaussians)?,
-            renderer: Renderer::new(gpu, settings)?,
+            renderer,
             losses,
             networks: NetworkTerms::new(gpu, &config, &sizes)?,
-            adam: Adam::new(gpu)?,
-            densifier: Densifier::new(gpu, density(&config, dataset.extent()))?,
+            adam,
+            densifier,
             d_render: gpu.uninit("d_render", values)?,
-            log: LossLog::new(gpu, STEPS_PER_SUBMISSION as usize)?,
+            log: LossLog::new(gpu, MOST_STEPS as usize)?,
+            pace: Pace::default(),
             config,
         };
         trainer.reserve()?;
@@ -248,11 +268,12 @@ impl Trainer {
         self.renderer.set_intersection_capacity(intersections)
     }
 
-    /// Trains up to `until`, one submission's worth at most, and reports every step done. Steps that the configuration
-    /// wants checked are, each on its own.
+    /// Trains up to `until`, or for about half a second, and reports every step done; nothing is under way afterwards.
+    /// Steps that the configuration wants checked are, each on its own.
     ///
     /// # Errors
-    /// [`Error::NotFinite`] where a loss term is NaN, [`Error::Disagrees`] where a checked step is to stop at a difference
+    /// [`Error::NotFinite`] where a loss term is NaN, [`Error::Crowded`] where the device cannot follow as many splats as
+    /// lie on one tile, [`Error::Disagrees`] where a checked step is to stop at a difference
     /// and has one, or the device is out of memory or lost.
     pub fn advance(&mut self, until: u64) -> Result<Vec<StepReport>> {
         match (self.step + 1).checked_next_multiple_of(self.config.check.every) {
@@ -272,55 +293,17 @@ impl Trainer {
         }
     }
 
-    fn submit_steps(&mut self, until: u64) -> Result<Vec<StepReport>> {
-        let first = self.step + 1;
-        let until = until.min(self.config.steps).min(self.step + STEPS_PER_SUBMISSION);
-        // A submission ends where density control changes the number of Gaussians.
-        let last = (first..until).find(|&step| self.densifies_at(step)).unwrap_or(until);
-        if last < first {
-            return Ok(vec![]);
-        }
-        let begin = Instant::now();
+    /// Density control, behind the last step that was submitted.
+    fn control_density(&mut self) -> Result<()> {
         let gpu = self.gpu.clone();
-        let mut downloads = None;
-        gpu.run("steps", |pass| {
-            self.log.clear(pass);
-            for step in first..=last {
-                self.record_step(pass, step, (step - first) as u32)?;
-            }
-            downloads = Some((self.log.download(pass)?, pass.download(self.renderer.status())?));
-            Ok(())
-        })?;
-        let Some((log, status)) = downloads else { return Ok(vec![]) };
-        let (log, status) = (log.wait()?, Status::from_words(&status.wait()?));
-        // The steps from the first failed one on have changed nothing.
-        let done =
-            log.iter().take((last - first + 1) as usize).take_while(|l| l.status == 0).count();
-        let milliseconds = begin.elapsed().as_secs_f64() * 1e3 / done.max(1) as f64;
-        let reports = (first..)
-            .zip(&log[..done])
-            .map(|(step, loss)| self.report(step, loss, milliseconds))
-            .collect();
-        self.step += done as u64;
-        if done > 0 && self.densifies_at(self.step) {
-            let changed = self.model.densify(&gpu, &mut self.densifier, self.step)?;
-            tracing::debug!("step {}: {changed:?}", self.step);
-            self.reserve()?;
-        }
-        if status.overflowed {
-            self.renderer.grow(status.intersections)?;
-            let renderer = &mut self.renderer;
-            gpu.run("clear_status", |pass| {
-                renderer.clear_status(pass);
-                Ok(())
-            })?;
-        } else if status.not_finite {
-            let step = self.step + 1;
-            let what = log[done].first_not_finite().map_or("the loss", |term| term.name).to_owned();
-            let view = self.views.of_step(self.config.seed, step).name.clone();
-            return Err(Error::NotFinite { step, view, what });
-        }
-        Ok(reports)
+        let rounds_left = match self.config.density.control {
+            DensityControl::Conserving => self.config.schedule.rounds_left(self.step),
+            DensityControl::Paper => 1,
+        };
+        let round = Round { step: self.step, rounds_left };
+        let changed = self.model.densify(&gpu, &mut self.densifier, round)?;
+        tracing::debug!("step {}: {changed:?}", self.step);
+        self.reserve()
     }
 
     /// Trains one step with every pass checked ([`Gpu::checked`]), density control included, and reports on them. The
@@ -347,7 +330,7 @@ impl Trainer {
     /// The algorithm: render a view, compare it with its pseudo-GT, go back, update.
     fn record_step(&mut self, pass: &mut Recorder<'_>, step: u64, slot: u32) -> Result<()> {
         let schedule = &self.config.schedule;
-        let view = self.views.of_step(self.config.seed, step);
+        let view = self.views.of_step(self.config.seed, step, schedule.resolution_level(step));
         let options = RenderOptions {
             sh_degree: schedule.sh_degree(step, self.config.sh_degree),
             background: background(&self.config, step),
@@ -431,8 +414,13 @@ impl Trainer {
         schedule.densifies_at(step) && step + schedule.densify_interval <= self.config.steps
     }
 
+    fn view_of(&self, step: u64) -> &TrainView {
+        self.views.of_step(self.config.seed, step, self.config.schedule.resolution_level(step))
+    }
+
     fn reserve(&mut self) -> Result<()> {
-        self.renderer.reserve(self.model.count(), self.views.cameras())
+        let Self { model, views, renderer, .. } = self;
+        renderer.reserve_with_headroom([model.count(), model.capacity()], views.cameras())
     }
 
     fn report(&self, step: u64, losses: &StepLosses, milliseconds: f64) -> StepReport {
@@ -440,12 +428,29 @@ impl Trainer {
         let value = |term| (term, f64::from(losses.get(term)));
         StepReport {
             step,
-            view: self.views.of_step(self.config.seed, step).name.clone(),
+            view: self.view_of(step).name.clone(),
             loss: config.total(losses),
             terms: config.terms().into_iter().map(value).collect(),
             gaussians: self.model.count(),
             milliseconds,
         }
+    }
+}
+
+/// What needs nothing but the device and settings.
+struct Kernels {
+    renderer: Renderer,
+    adam: Adam,
+    densifier: Densifier,
+}
+
+impl Kernels {
+    fn new(gpu: &Gpu, settings: RenderSettings, density: DensifySettings) -> Result<Self> {
+        Ok(Self {
+            renderer: Renderer::new(gpu, settings)?,
+            adam: Adam::new(gpu)?,
+            densifier: Densifier::new(gpu, density)?,
+        })
     }
 }
 
@@ -475,6 +480,7 @@ fn say_what_parts_see(model: &ModelConfig, sizes: &[UVec2]) {
 /// Density control in world units.
 fn density(config: &TrainConfig, extent: f64) -> DensifySettings {
     DensifySettings {
+        control: config.density.control,
         gradient_threshold: config.density.gradient_threshold,
         split_scale: config.density.split_scale * extent,
         min_opacity: config.density.min_opacity,

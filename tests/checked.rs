@@ -245,7 +245,7 @@ fn a_wrong_wiring_is_named_where_it_arises() {
         let message = first.to_string();
         assert!(message.contains(kernel) && message.contains(buffer), "{message}");
         // What works on wrong counts or indices is not compared: a reference could not follow it.
-        let is_index = matches!(kernel, "project" | "sort_upsweep");
+        let is_index = matches!(kernel, "project" | "blend_forward" | "sort_upsweep");
         assert_eq!(report.passes.iter().any(|pass| pass.error.is_none()), is_index, "{kernel}");
     }
 }

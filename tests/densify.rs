@@ -4,11 +4,13 @@
 
 use glam::{Quat, Vec3};
 use nightsplat::densify::{
-    Densifier, DensifyReport, DensifySettings, DeviceGaussians, GradientStatistics,
+    Densifier, DensifyInputs, DensifyReport, DensifySettings, DensityControl, DeviceGaussians,
+    Round,
 };
 use nightsplat::gpu::testing::gpu;
 use nightsplat::gpu::{Gpu, Reference};
-use nightsplat::kernels::{densify_count, densify_scatter};
+use nightsplat::kernels::fate::{KEY_KEEP, KEY_PRUNE};
+use nightsplat::kernels::{densify_decide, densify_moments, densify_scatter, densify_score};
 use nightsplat::optimizer::Moments;
 
 /// Four features and SH of degree 1.
@@ -16,13 +18,17 @@ const COLUMNS: usize = 27;
 const FEATURES: usize = 4;
 const REST: usize = 14 + FEATURES;
 const SETTINGS: DensifySettings = DensifySettings {
+    control: DensityControl::Paper,
     gradient_threshold: 2e-4,
     split_scale: 0.05,
     min_opacity: 0.005,
     max_gaussians: usize::MAX,
     seed: 10,
 };
+const CONSERVING: DensifySettings =
+    DensifySettings { control: DensityControl::Conserving, ..SETTINGS };
 const STEP: u64 = 600;
+const LAST: Round = Round { step: STEP, rounds_left: 1 };
 
 /// Gaussians, their moments and their statistics in host memory.
 #[derive(Clone, Debug, PartialEq)]
@@ -97,9 +103,9 @@ impl Host {
             .collect()
     }
 
-    fn densify(&self, gpu: &Gpu, settings: DensifySettings, step: u64) -> (Self, DensifyReport) {
+    fn densify(&self, gpu: &Gpu, settings: DensifySettings, round: Round) -> (Self, DensifyReport) {
         let upload = |name: &str, data: &[f32]| gpu.buffer(name, data).unwrap();
-        let gaussians = DeviceGaussians {
+        let mut gaussians = DeviceGaussians {
             count: self.count as u32,
             column_count: COLUMNS as u32,
             feature_count: FEATURES as u32,
@@ -109,47 +115,74 @@ impl Host {
                 second: upload("second", &self.second),
             },
         };
-        let grad_norm_sums = upload("grad_norm_sums", &self.grad_norm_sums);
-        let visit_counts = gpu.buffer("visit_counts", &self.visit_counts).unwrap();
-        let statistics =
-            GradientStatistics { grad_norm_sums: &grad_norm_sums, visit_counts: &visit_counts };
+        let inputs = DensifyInputs {
+            grad_norm_sums: &upload("grad_norm_sums", &self.grad_norm_sums),
+            visit_counts: &gpu.buffer("visit_counts", &self.visit_counts).unwrap(),
+            gradients: &mut upload("gradients", &vec![f32::NAN; self.count * COLUMNS]),
+        };
         let mut densifier = Densifier::new(gpu, settings).unwrap();
-        let (after, report) = densifier.densify(&gaussians, statistics, step).unwrap();
-        assert_eq!(report.count, after.count as usize);
-        assert_eq!(after.parameters.len(), report.count * COLUMNS);
+        let report = densifier.densify(&mut gaussians, inputs, round).unwrap();
+        assert_eq!(report.count, gaussians.count as usize);
+        let read = |buffer| {
+            let mut planes = gpu.read(buffer).unwrap();
+            planes.truncate(report.count * COLUMNS);
+            assert_eq!(planes.len(), report.count * COLUMNS);
+            planes
+        };
         let host = Self {
             count: report.count,
-            parameters: gpu.read(&after.parameters).unwrap(),
-            first: gpu.read(&after.moments.first).unwrap(),
-            second: gpu.read(&after.moments.second).unwrap(),
+            parameters: read(&gaussians.parameters),
+            first: read(&gaussians.moments.first),
+            second: read(&gaussians.moments.second),
             grad_norm_sums: vec![0.0; report.count],
             visit_counts: vec![0; report.count],
         };
         (host, report)
     }
 
-    /// The same by the references, with prefix sums on the host.
-    fn reference(&self, settings: DensifySettings, step: u64) -> Self {
+    /// The same by the references, with sort and prefix sums on the host.
+    fn reference(&self, settings: DensifySettings, round: Round) -> Self {
         let n = self.count;
-        let (mut mean_gradients, mut fates, mut offspring_counts) =
-            (vec![0.0; n], vec![0; n], vec![0; n]);
-        let params = densify_count::Params {
-            gaussian_count: n as u32,
-            column_count: COLUMNS as u32,
-            feature_count: FEATURES as u32,
+        let (gaussian_count, column_count, feature_count) =
+            (n as u32, COLUMNS as u32, FEATURES as u32);
+        let (mut keys, mut ids, mut tally) = (vec![0; n], vec![0; n], vec![0; 4]);
+        let params = densify_score::Params {
+            gaussian_count,
+            column_count,
+            feature_count,
             gradient_threshold: settings.gradient_threshold as f32,
-            split_log_scale: settings.split_scale.ln() as f32,
             min_raw_opacity: (settings.min_opacity / (1.0 - settings.min_opacity)).ln() as f32,
         };
-        let slices = densify_count::Slices {
+        let slices = densify_score::Slices {
             parameters: &self.parameters,
             grad_norm_sums: &self.grad_norm_sums,
             visit_counts: &self.visit_counts,
-            mean_gradients: &mut mean_gradients,
+            keys: &mut keys,
+            ids: &mut ids,
+            tally: &mut tally,
+        };
+        densify_score::Kernel::run(&params, &densify_score::Constants::default(), slices);
+        assert_eq!(tally[0] as usize, keys.iter().filter(|&&key| key < KEY_KEEP).count());
+        assert_eq!(tally[1] as usize, keys.iter().filter(|&&key| key == KEY_PRUNE).count());
+        ids.sort_by_key(|&id| keys[id as usize]);
+        keys.sort_unstable();
+        let (mut fates, mut offspring_counts) = (vec![0; n], vec![0; n]);
+        let params = densify_decide::Params {
+            gaussian_count,
+            max_gaussians: settings.max_gaussians.min(u32::MAX as usize) as u32,
+            rounds_left: round.rounds_left as u32,
+            split_log_scale: settings.split_scale.ln() as f32,
+        };
+        let slices = densify_decide::Slices {
+            parameters: &self.parameters,
+            sorted_keys: &keys,
+            sorted_ids: &ids,
+            tally: &mut tally,
             fates: &mut fates,
             offspring_counts: &mut offspring_counts,
         };
-        densify_count::Kernel::run(&params, &densify_count::Constants::default(), slices);
+        let conserving = settings.control == DensityControl::Conserving;
+        densify_decide::Kernel::run(&params, &densify_decide::Constants { conserving }, slices);
         let mut count = 0;
         let offsets: Vec<u32> = offspring_counts
             .iter()
@@ -158,53 +191,71 @@ impl Host {
                 count - offspring
             })
             .collect();
+        let new_gaussian_count = count;
         let count = count as usize;
-        let mut after = Self {
-            count,
-            parameters: vec![0.0; count * COLUMNS],
-            first: vec![0.0; count * COLUMNS],
-            second: vec![0.0; count * COLUMNS],
-            grad_norm_sums: vec![0.0; count],
-            visit_counts: vec![0; count],
-        };
+        let mut new_parameters = vec![0.0; count * COLUMNS];
         let params = densify_scatter::Params {
-            gaussian_count: n as u32,
-            new_gaussian_count: count as u32,
-            column_count: COLUMNS as u32,
-            feature_count: FEATURES as u32,
+            gaussian_count,
+            new_gaussian_count,
+            column_count,
+            feature_count,
             seed: settings.seed as u32,
-            step: step as u32,
+            step: round.step as u32,
         };
         let slices = densify_scatter::Slices {
             parameters: &self.parameters,
-            first_moments: &self.first,
-            second_moments: &self.second,
             fates: &fates,
             offsets: &offsets,
-            new_parameters: &mut after.parameters,
-            new_first_moments: &mut after.first,
-            new_second_moments: &mut after.second,
+            new_parameters: &mut new_parameters,
         };
-        densify_scatter::Kernel::run(&params, &densify_scatter::Constants::default(), slices);
-        after
+        densify_scatter::Kernel::run(&params, &densify_scatter::Constants { conserving }, slices);
+        let carry = |moments: &[f32]| {
+            let mut new_moments = vec![0.0; count * COLUMNS];
+            let params = densify_moments::Params {
+                gaussian_count,
+                new_gaussian_count,
+                column_count,
+                feature_count,
+            };
+            let slices = densify_moments::Slices {
+                moments,
+                fates: &fates,
+                offsets: &offsets,
+                new_moments: &mut new_moments,
+            };
+            densify_moments::Kernel::run(&params, &densify_moments::Constants::default(), slices);
+            new_moments
+        };
+        Self {
+            count,
+            parameters: new_parameters,
+            first: carry(&self.first),
+            second: carry(&self.second),
+            grad_norm_sums: vec![0.0; count],
+            visit_counts: vec![0; count],
+        }
     }
 }
 
 #[test]
 fn density_control_matches_its_references() {
     let gpu = gpu();
-    for count in [0, 1, 2, 63, 64, 65, 1000] {
+    let limited = DensifySettings { max_gaussians: 1100, ..CONSERVING };
+    let sizes = [0, 1, 2, 63, 64, 65, 1000];
+    let cases = [SETTINGS, CONSERVING, limited].into_iter().flat_map(|s| sizes.map(|n| (s, n)));
+    for (settings, count) in cases {
         let before = Host::mixed(count);
-        let (actual, report) = before.densify(&gpu, SETTINGS, STEP);
-        let expected = before.reference(SETTINGS, STEP);
+        let round = Round { rounds_left: 3, ..LAST };
+        let (actual, report) = before.densify(&gpu, settings, round);
+        let expected = before.reference(settings, round);
         assert_eq!(actual.count, expected.count, "{report:?}");
         assert_eq!((&actual.first, &actual.second), (&expected.first, &expected.second));
         for (i, (a, b)) in actual.parameters.iter().zip(&expected.parameters).enumerate() {
-            // Only drawn means and split scales are computed; exp, log and cos are good to about 1e-5 here.
-            let tolerance = if i < 10 * actual.count { 2e-5 } else { 0.0 };
+            // Only means, scales and opacities are computed; exp, log and cos are good to about 1e-5 here.
+            let tolerance = if i < 11 * actual.count { 2e-5 } else { 0.0 };
             assert!((a - b).abs() <= tolerance, "{count} Gaussians, float {i}: {a} {b}");
         }
-        if count == 1000 {
+        if settings == SETTINGS && count == 1000 {
             assert!(report.cloned > 100 && report.split > 50 && report.pruned > 100, "{report:?}");
         }
     }
@@ -215,8 +266,8 @@ fn a_small_gaussian_under_a_large_gradient_stays_and_gets_a_copy() {
     let gpu = gpu();
     let mut before = Host::calm(3);
     before.pull_at(1);
-    let (after, report) = before.densify(&gpu, SETTINGS, STEP);
-    assert_eq!(report, DensifyReport { cloned: 1, split: 0, pruned: 0, count: 4 });
+    let (after, report) = before.densify(&gpu, SETTINGS, LAST);
+    assert_eq!(report, DensifyReport { cloned: 1, count: 4, ..Default::default() });
     for (old, new) in [(0, 0), (1, 1), (2, 3)] {
         for (planes, new_planes) in [
             (&before.parameters, &after.parameters),
@@ -241,8 +292,8 @@ fn a_large_gaussian_under_a_large_gradient_is_replaced_by_two_smaller_ones() {
     let mut before = Host::calm(2);
     before.pull_at(0);
     before.log_scales_mut(0).copy_from_slice(&[0.2f32.ln(), 0.1f32.ln(), 0.01f32.ln()]);
-    let (after, report) = before.densify(&gpu, SETTINGS, STEP);
-    assert_eq!(report, DensifyReport { cloned: 0, split: 1, pruned: 0, count: 3 });
+    let (after, report) = before.densify(&gpu, SETTINGS, LAST);
+    assert_eq!(report, DensifyReport { split: 1, count: 3, ..Default::default() });
     for i in 0..2 {
         let row = after.row(&after.parameters, i);
         let parent = before.row(&before.parameters, 0);
@@ -270,7 +321,7 @@ fn drawn_positions_have_the_covariance_of_their_parent() {
         before.quat_mut(i).copy_from_slice(&[w, x, y, z]);
         before.log_scales_mut(i).copy_from_slice(&scales.to_array().map(f32::ln));
     }
-    let (after, report) = before.densify(&gpu, SETTINGS, STEP);
+    let (after, report) = before.densify(&gpu, SETTINGS, LAST);
     assert_eq!(report.cloned, count);
     let draws: Vec<Vec3> = (0..count)
         .map(|i| rotation.inverse() * (after.mean(2 * i + 1) - before.mean(i)) / scales)
@@ -292,8 +343,8 @@ fn a_faint_gaussian_goes_even_where_views_pull_at_it() {
     let mut before = Host::calm(3);
     before.parameters[10 * 3 + 1] = -5.4;
     before.pull_at(1);
-    let (after, report) = before.densify(&gpu, SETTINGS, STEP);
-    assert_eq!(report, DensifyReport { cloned: 0, split: 0, pruned: 1, count: 2 });
+    let (after, report) = before.densify(&gpu, SETTINGS, LAST);
+    assert_eq!(report, DensifyReport { pruned: 1, count: 2, ..Default::default() });
     assert_eq!(after.row(&after.first, 1), before.row(&before.first, 2));
 }
 
@@ -302,7 +353,7 @@ fn all_can_go() {
     let gpu = gpu();
     let mut before = Host::calm(70);
     before.parameters[10 * 70..11 * 70].fill(-9.0);
-    let (after, report) = before.densify(&gpu, SETTINGS, STEP);
+    let (after, report) = before.densify(&gpu, SETTINGS, LAST);
     assert_eq!(report, DensifyReport { pruned: 70, ..Default::default() });
     assert_eq!(after.count, 0);
 }
@@ -321,7 +372,7 @@ fn a_gaussian_that_is_not_finite_goes() {
         let mut before = Host::calm(5);
         before.pull_at(2);
         before.parameters[column * 5 + 2] = value;
-        let (after, report) = before.densify(&gpu, SETTINGS, STEP);
+        let (after, report) = before.densify(&gpu, SETTINGS, LAST);
         assert_eq!(
             (report.pruned, report.count - report.cloned),
             (1, 4),
@@ -338,7 +389,7 @@ fn a_quaternion_of_zero_length_draws_along_the_axes() {
     before.pull_at(0);
     before.quat_mut(0).fill(0.0);
     before.log_scales_mut(0).copy_from_slice(&[0.04f32.ln(), -30.0, -30.0]);
-    let (after, _) = before.densify(&gpu, SETTINGS, STEP);
+    let (after, _) = before.densify(&gpu, SETTINGS, LAST);
     let offset = after.mean(1) - before.mean(0);
     assert!(offset.x != 0.0 && offset.y == 0.0 && offset.z == 0.0, "{offset}");
 }
@@ -349,7 +400,7 @@ fn the_rarest_draw_is_finite() {
     let gpu = gpu();
     let mut before = Host::calm(1);
     before.pull_at(0);
-    let (after, report) = before.densify(&gpu, SETTINGS, 14_117_035);
+    let (after, report) = before.densify(&gpu, SETTINGS, Round { step: 14_117_035, ..LAST });
     assert_eq!(report.cloned, 1);
     // 5.8 standard deviations: sqrt(2 ln 2^24).
     let distance = after.mean(1).distance(before.mean(0));
@@ -362,7 +413,7 @@ fn a_gradient_that_is_nan_or_was_never_seen_multiplies_nothing() {
     let mut before = Host::calm(3);
     before.grad_norm_sums = vec![f32::NAN, 1.0, 7e-4];
     before.visit_counts = vec![1, 0, 4];
-    let (_, report) = before.densify(&gpu, SETTINGS, STEP);
+    let (_, report) = before.densify(&gpu, SETTINGS, LAST);
     assert_eq!(report, DensifyReport { count: 3, ..Default::default() });
 }
 
@@ -376,8 +427,11 @@ fn growth_beyond_the_limit_goes_to_the_neediest() {
     }
     // Nine stay; their gradients but one's rank as 3, 7, 1, 4, 8, 2, 5, 9, 6 times 0.1 + 0.1.
     let (after, report) =
-        before.densify(&gpu, DensifySettings { max_gaussians: 11, ..SETTINGS }, STEP);
-    assert_eq!(report, DensifyReport { cloned: 2, split: 0, pruned: 1, count: 11 });
+        before.densify(&gpu, DensifySettings { max_gaussians: 11, ..SETTINGS }, LAST);
+    assert_eq!(
+        report,
+        DensifyReport { cloned: 2, pruned: 1, count: 11, refused: 7, ..Default::default() }
+    );
     // Gaussians 3 (rank 9) and 6 (rank 8) have their copies behind them.
     let rows: Vec<_> = (0..11).map(|i| after.row(&after.parameters, i)[3..].to_vec()).collect();
     let twins: Vec<usize> = (0..10).filter(|&i| rows[i] == rows[i + 1]).collect();
@@ -391,7 +445,7 @@ fn the_limit_holds_where_all_gradients_are_equal_and_where_it_is_passed_already(
     before.grad_norm_sums.fill(0.3);
     for (limit, most) in [(150, 150), (100, 100), (60, 100), (0, 100), (200, 200)] {
         let settings = DensifySettings { max_gaussians: limit, ..SETTINGS };
-        let (_, report) = before.densify(&gpu, settings, STEP);
+        let (_, report) = before.densify(&gpu, settings, LAST);
         assert!((100..=most).contains(&report.count), "limit {limit}: {report:?}");
     }
 }
@@ -401,7 +455,8 @@ fn the_same_pass_leaves_the_same_bits_and_another_step_or_seed_other_ones() {
     let gpu = gpu();
     let before = Host::mixed(500);
     let bits = |seed: u64, step: u64| -> Vec<u32> {
-        let (after, _) = before.densify(&gpu, DensifySettings { seed, ..SETTINGS }, step);
+        let (after, _) =
+            before.densify(&gpu, DensifySettings { seed, ..SETTINGS }, Round { step, ..LAST });
         after.parameters.iter().map(|p| p.to_bits()).collect()
     };
     let first = bits(10, 600);
@@ -432,7 +487,7 @@ fn a_buffer_that_is_too_short_is_refused() {
     let mut densifier = Densifier::new(&gpu, SETTINGS).unwrap();
     for (short, columns) in [(0, 14), (1, 14), (2, 14), (3, 14), (4, 14), (5, 13)] {
         let len = |index: usize, len: usize| if index == short { len - 1 } else { len };
-        let gaussians = DeviceGaussians {
+        let mut gaussians = DeviceGaussians {
             count: 2,
             column_count: columns,
             feature_count: 0,
@@ -442,10 +497,90 @@ fn a_buffer_that_is_too_short_is_refused() {
                 second: gpu.zeros("second", len(2, 28)).unwrap(),
             },
         };
-        let grad_norm_sums = gpu.zeros("grad_norm_sums", len(3, 2)).unwrap();
-        let visit_counts = gpu.zeros("visit_counts", len(4, 2)).unwrap();
-        let statistics =
-            GradientStatistics { grad_norm_sums: &grad_norm_sums, visit_counts: &visit_counts };
-        assert!(densifier.densify(&gaussians, statistics, 1).is_err(), "{short}");
+        let inputs = DensifyInputs {
+            grad_norm_sums: &gpu.zeros("grad_norm_sums", len(3, 2)).unwrap(),
+            visit_counts: &gpu.zeros("visit_counts", len(4, 2)).unwrap(),
+            gradients: &mut gpu.zeros("gradients", 28).unwrap(),
+        };
+        assert!(densifier.densify(&mut gaussians, inputs, LAST).is_err(), "{short}");
+    }
+}
+
+#[test]
+fn a_gaussian_under_a_large_gradient_is_halved_along_its_longest_axis_whatever_its_size() {
+    let gpu = gpu();
+    for scale in [0.2_f32, 0.001] {
+        let mut before = Host::calm(3);
+        before.pull_at(1);
+        before.quat_mut(1).fill(0.0);
+        before.log_scales_mut(1).copy_from_slice(&[
+            (0.5 * scale).ln(),
+            scale.ln(),
+            (0.1 * scale).ln(),
+        ]);
+        let (after, report) = before.densify(&gpu, CONSERVING, LAST);
+        assert_eq!(report, DensifyReport { split: 1, count: 4, ..Default::default() });
+        let offsets = [1, 2].map(|i| after.mean(i) - before.mean(1));
+        for offset in offsets {
+            assert!((offset.y.abs() - 0.5 * scale).abs() < 1e-3 * scale, "{offset}");
+            assert!(offset.x.abs().max(offset.z.abs()) < 1e-6);
+        }
+        assert!(offsets[0].y * offsets[1].y < 0.0);
+        for i in [1, 2] {
+            assert!(after.row(&after.first, i).iter().all(|moment| *moment == 0.0));
+            let (row, parent) =
+                (after.row(&after.parameters, i), before.row(&before.parameters, 1));
+            assert_eq!((&row[3..7], &row[11..]), (&parent[3..7], &parent[11..]));
+        }
+        assert_eq!(before.row(&before.second, 2), after.row(&after.second, 3));
+    }
+}
+
+#[test]
+fn a_round_takes_its_share_of_the_room_and_the_last_one_the_rest() {
+    let gpu = gpu();
+    let mut before = Host::calm(100);
+    for (i, sum) in before.grad_norm_sums.iter_mut().enumerate() {
+        *sum = 0.1 + i as f32;
+    }
+    for (rounds_left, count) in [(1, 130), (2, 115), (4, 108), (30, 101), (1000, 101)] {
+        let settings = DensifySettings { max_gaussians: 130, ..CONSERVING };
+        let (_, report) = before.densify(&gpu, settings, Round { rounds_left, ..LAST });
+        assert_eq!(report.count, count, "{rounds_left} rounds left");
+        assert_eq!(report.refused, 200 - count);
+    }
+}
+
+#[test]
+fn buffers_that_suffice_are_kept_and_others_grow_with_headroom() {
+    let gpu = gpu();
+    let mut host = Host::calm(100);
+    (0..10).for_each(|i| host.pull_at(i));
+    let plane = |name: &str| gpu.zeros(name, 200 * COLUMNS).unwrap();
+    let mut gaussians = DeviceGaussians {
+        count: 100,
+        column_count: COLUMNS as u32,
+        feature_count: FEATURES as u32,
+        parameters: plane("parameters"),
+        moments: Moments { first: plane("first"), second: plane("second") },
+    };
+    gpu.write(&mut gaussians.parameters, &host.parameters).unwrap();
+    let mut gradients = plane("gradients");
+    let visit_counts = gpu.buffer("visit_counts", &[1; 300]).unwrap();
+    let mut densifier = Densifier::new(&gpu, CONSERVING).unwrap();
+    for (pulled, count, capacity) in [(10, 110, 200), (110, 220, 330)] {
+        let mut sums = vec![0.0; 300];
+        sums[..pulled].fill(1.0);
+        let inputs = DensifyInputs {
+            grad_norm_sums: &gpu.buffer("grad_norm_sums", &sums).unwrap(),
+            visit_counts: &visit_counts,
+            gradients: &mut gradients,
+        };
+        let report = densifier.densify(&mut gaussians, inputs, LAST).unwrap();
+        assert_eq!(report.count, count);
+        let DeviceGaussians { parameters, moments, .. } = &gaussians;
+        for buffer in [parameters, &moments.first, &moments.second, &gradients] {
+            assert_eq!(buffer.len(), capacity * COLUMNS);
+        }
     }
 }

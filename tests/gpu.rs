@@ -8,34 +8,28 @@ use glam::UVec2;
 use nightsplat::Error;
 use nightsplat::gpu::testing::{gpu, misuse};
 use nightsplat::gpu::{Buffer, DeviceChoice, Gpu, Pipeline, Threads, devices};
-use nightsplat::kernels::{blend_forward, order_counts};
+use nightsplat::kernels::{blend_forward, relu_backward};
 use nightsplat::render::{RenderSettings, Renderer};
 
-/// Threads of a workgroup of `order_counts`.
+/// Threads of a workgroup of `relu_backward`.
 const WORKGROUP: usize = 256;
 
-fn order_counts_pipeline() -> Pipeline<order_counts::Kernel> {
-    gpu().pipeline(&order_counts::Constants::default()).unwrap()
+fn relu_pipeline() -> Pipeline<relu_backward::Kernel> {
+    gpu().pipeline(&relu_backward::Constants::default()).unwrap()
 }
 
-/// Copies `tile_counts` to a buffer of zeros by way of `order_counts`, in reverse, with so many threads.
-fn reverse(tile_counts: &[u32], threads: Threads<'_>) -> Vec<u32> {
-    let (gpu, pipeline) = (gpu(), order_counts_pipeline());
-    let gaussian_count = tile_counts.len() as u32;
-    let sorted_ids: Vec<u32> = (0..gaussian_count).rev().collect();
-    let sorted_ids = gpu.buffer("sorted_ids", &sorted_ids).unwrap();
-    let tile_counts = gpu.buffer("tile_counts", tile_counts).unwrap();
-    let mut ordered_counts = gpu.zeros("ordered_counts", tile_counts.len()).unwrap();
-    gpu.run("reverse", |pass| {
-        let buffers = order_counts::Buffers {
-            sorted_ids: &sorted_ids,
-            tile_counts: &tile_counts,
-            ordered_counts: &mut ordered_counts,
-        };
-        pass.dispatch(&pipeline, &order_counts::Params { gaussian_count }, buffers, threads)
+/// `count` ones, of which so many threads of `relu_backward` make zeros.
+fn ones_and_zeros(count: usize, threads: Threads<'_>) -> Vec<f32> {
+    let (gpu, pipeline) = (gpu(), relu_pipeline());
+    let activations = gpu.zeros("activations", count).unwrap();
+    let mut gradient = gpu.buffer("gradient", &vec![1.0; count]).unwrap();
+    gpu.run("ones and zeros", |pass| {
+        let params = relu_backward::Params { value_count: count as u32 };
+        let buffers = relu_backward::Buffers { activations: &activations, gradient: &mut gradient };
+        pass.dispatch(&pipeline, &params, buffers, threads)
     })
     .unwrap();
-    gpu.read(&ordered_counts).unwrap()
+    gpu.read(&gradient).unwrap()
 }
 
 // ---------------------------------------------------------------------------
@@ -101,8 +95,8 @@ fn a_buffer_of_no_elements_can_be_used_like_any_other() {
     })
     .unwrap();
     assert!(gpu.read(&other).unwrap().is_empty());
-    assert!(reverse(&[], Threads::Exactly([0, 1, 1])).is_empty());
-    assert!(reverse(&[], Threads::Exactly([1, 1, 1])).is_empty());
+    assert!(ones_and_zeros(0, Threads::Exactly([0, 1, 1])).is_empty());
+    assert!(ones_and_zeros(0, Threads::Exactly([1, 1, 1])).is_empty());
 }
 
 #[test]
@@ -241,23 +235,21 @@ fn a_download_that_was_not_submitted_is_not_waited_for() {
 // Launching
 
 #[test]
-fn order_counts_runs_on_as_many_threads_as_the_extent_asks_for() {
+fn a_dispatch_runs_on_as_many_threads_as_the_extent_asks_for() {
     for count in [1, WORKGROUP - 1, WORKGROUP, WORKGROUP + 1, 10_007] {
-        let tile_counts: Vec<u32> = (1..=count as u32).collect();
-        let reversed: Vec<u32> = tile_counts.iter().copied().rev().collect();
-        assert_eq!(reverse(&tile_counts, Threads::Exactly([count as u32, 1, 1])), reversed);
+        let left = ones_and_zeros(count, Threads::Exactly([count as u32, 1, 1]));
+        assert_eq!(left, vec![0.0; count]);
     }
 }
 
 #[test]
 fn an_indirect_dispatch_runs_the_workgroups_that_the_buffer_says() {
     let gpu = gpu();
-    let tile_counts: Vec<u32> = (1..=1000).collect();
     for (groups, threads) in [([2, 1, 1], 2 * WORKGROUP), ([1, 3, 1], 3 * WORKGROUP), ([0; 3], 0)] {
         let arguments = gpu.buffer("arguments", &[groups, [1000; 3]]).unwrap();
-        let mut expected: Vec<u32> = tile_counts.iter().copied().rev().collect();
-        expected[threads..].fill(0);
-        assert_eq!(reverse(&tile_counts, Threads::Indirect(&arguments)), expected);
+        let mut expected = vec![1.0; 1000];
+        expected[..threads].fill(0.0);
+        assert_eq!(ones_and_zeros(1000, Threads::Indirect(&arguments)), expected);
     }
 }
 
@@ -279,9 +271,13 @@ fn more_workgroups_than_fit_along_x_are_folded_and_none_is_lost() {
     let pipeline = gpu.pipeline::<blend_forward::Kernel>(&constants).unwrap();
     let mut background = [0.0; 11];
     background[..3].copy_from_slice(&[0.25, 0.5, 0.75]);
-    let params = blend_forward::Params { size, tile_columns: COLUMNS, background };
+    let params =
+        blend_forward::Params { size, tile_columns: COLUMNS, longest_run: u32::MAX, background };
     let pixels = size.element_product() as usize;
-    let tile_ranges = gpu.zeros("tile_ranges", (rows * COLUMNS) as usize).unwrap();
+    let mut tile_ranges = gpu.zeros("tile_ranges", (rows * COLUMNS) as usize).unwrap();
+    let (counts, sorted_tiles) =
+        (gpu.zeros("counts", 1).unwrap(), gpu.zeros("sorted_tiles", 0).unwrap());
+    let mut status = gpu.zeros("status", 3).unwrap();
     let (sorted_slots, owners) =
         (gpu.zeros("sorted_slots", 0).unwrap(), gpu.zeros("owners", 0).unwrap());
     let (splats, colors) = (gpu.zeros("splats", 0).unwrap(), gpu.zeros("colors", 0).unwrap());
@@ -289,7 +285,10 @@ fn more_workgroups_than_fit_along_x_are_folded_and_none_is_lost() {
     let mut transmittances = gpu.zeros("transmittances", pixels).unwrap();
     gpu.run("fold", |pass| {
         let buffers = blend_forward::Buffers {
-            tile_ranges: &tile_ranges,
+            counts: &counts,
+            sorted_tiles: &sorted_tiles,
+            tile_ranges: &mut tile_ranges,
+            status: &mut status,
             sorted_slots: &sorted_slots,
             owners: &owners,
             splats: &splats,
@@ -310,42 +309,35 @@ fn more_workgroups_than_fit_along_x_are_folded_and_none_is_lost() {
 fn workgroups_that_cannot_be_folded_are_refused_by_the_name_of_the_pass() {
     let gpu = gpu();
     let too_many = gpu.properties().max_workgroups + 1;
-    let mut buffer = gpu.zeros("buffer", 1).unwrap();
-    let (ids, counts) = (gpu.zeros("ids", 1).unwrap(), gpu.zeros("counts", 1).unwrap());
-    let pipeline = order_counts_pipeline();
+    let mut gradient = gpu.zeros("gradient", 1).unwrap();
+    let activations = gpu.zeros("activations", 1).unwrap();
+    let pipeline = relu_pipeline();
     let refused = gpu.run("refused", |pass| {
-        let buffers = order_counts::Buffers {
-            sorted_ids: &ids,
-            tile_counts: &counts,
-            ordered_counts: &mut buffer,
-        };
-        let params = order_counts::Params { gaussian_count: 1 };
+        let buffers = relu_backward::Buffers { activations: &activations, gradient: &mut gradient };
+        let params = relu_backward::Params { value_count: 1 };
         pass.dispatch(&pipeline, &params, buffers, Threads::Workgroups([too_many, 2, 1]))
     });
     let message = refused.unwrap_err().to_string();
-    assert!(message.contains("order_counts") && message.contains("workgroups"), "{message}");
+    assert!(message.contains("relu_backward") && message.contains("workgroups"), "{message}");
 }
 
 #[test]
 fn a_profile_names_each_pass_and_its_time_in_order() {
     let gpu = gpu();
     let (mut a, mut b) = (gpu.zeros("a", 5000).unwrap(), gpu.zeros("b", 5000).unwrap());
-    let ids = gpu.zeros("ids", 5000).unwrap();
-    let pipeline = order_counts_pipeline();
-    let params = order_counts::Params { gaussian_count: 5000 };
+    let pipeline = relu_pipeline();
+    let params = relu_backward::Params { value_count: 5000 };
     let threads = Threads::Exactly([5000, 1, 1]);
     let times = gpu
         .profile("two passes", |pass| {
-            let buffers =
-                order_counts::Buffers { sorted_ids: &ids, tile_counts: &a, ordered_counts: &mut b };
+            let buffers = relu_backward::Buffers { activations: &a, gradient: &mut b };
             pass.dispatch(&pipeline, &params, buffers, threads)?;
-            let buffers =
-                order_counts::Buffers { sorted_ids: &ids, tile_counts: &b, ordered_counts: &mut a };
+            let buffers = relu_backward::Buffers { activations: &b, gradient: &mut a };
             pass.dispatch(&pipeline, &params, buffers, threads)
         })
         .unwrap();
     let names: Vec<_> = times.iter().map(|time| time.name).collect();
-    assert_eq!(names, ["order_counts", "order_counts"]);
+    assert_eq!(names, ["relu_backward", "relu_backward"]);
     let total: f64 = times.iter().map(|time| time.milliseconds).sum();
     assert!(times.iter().all(|time| time.milliseconds >= 0.0) && total > 0.0 && total < 10_000.0);
 }

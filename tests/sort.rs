@@ -3,12 +3,12 @@
 #![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
 
 use nightsplat::gpu::testing::gpu;
-use nightsplat::gpu::{Buffer, Gpu, Reference, Threads};
-use nightsplat::kernels::{
-    dispatch_arguments, scan_downsweep, scan_spine, scan_upsweep, sort_downsweep, sort_spine,
-    sort_upsweep,
-};
-use nightsplat::sort::{Count, DispatchArguments, RadixSort, Scan};
+use nightsplat::gpu::{Buffer, Gpu, Threads};
+use nightsplat::kernels::{scan_downsweep, scan_upsweep, sort_downsweep, sort_spine, sort_upsweep};
+use nightsplat::sort::{Count, RadixSort, Scan};
+
+#[macro_use]
+mod common;
 
 const PARTITION: u32 = 1024;
 const SIZES: [u32; 8] =
@@ -209,133 +209,45 @@ fn buffers_that_do_not_fit_together_are_an_error() {
 }
 
 #[test]
-fn dispatch_arguments_cover_the_items_and_match_the_reference() {
-    let gpu = gpu();
-    let pipeline = gpu.pipeline::<dispatch_arguments::Kernel>(&Default::default()).unwrap();
-    let most = 65_535 * 64;
-    for (count, items_per_workgroup, capacity) in [
-        (0, 64, 100),
-        (1, 64, 100),
-        (64, 64, 100),
-        (65, 64, 100),
-        (1000, 64, 100),
-        (most, 64, u32::MAX),
-        (most + 1, 64, u32::MAX),
-        (3 * most - 5, 64, u32::MAX),
-        (u32::MAX, 2, u32::MAX),
-    ] {
-        let params = dispatch_arguments::Params { items_per_workgroup, count_index: 1, capacity };
-        let counts = [12_345, count];
-        let mut expected = [[9; 3]];
-        let slices = dispatch_arguments::Slices { counts: &counts, arguments: &mut expected };
-        dispatch_arguments::Kernel::run(&params, &Default::default(), slices);
-        let counts = gpu.buffer("counts", &counts).unwrap();
-        let mut arguments = gpu.zeros("arguments", 1).unwrap();
-        gpu.run("dispatch_arguments", |pass| {
-            let buffers =
-                dispatch_arguments::Buffers { counts: &counts, arguments: &mut arguments };
-            pass.dispatch(&pipeline, &params, buffers, Threads::Workgroups([1, 1, 1]))
-        })
-        .unwrap();
-        let actual = gpu.read(&arguments).unwrap();
-        assert_eq!(actual, expected, "{params:?}");
-        let [x, y, z] = actual[0];
-        let covered = u64::from(x) * u64::from(y) * u64::from(items_per_workgroup);
-        assert!(covered >= u64::from(count.min(capacity)) && x <= 65_535 && y <= 65_535 && z == 1);
-    }
-}
-
-#[test]
-fn no_items_per_workgroup_count_as_one() {
-    let gpu = gpu();
-    let counts = gpu.buffer("counts", &[3]).unwrap();
-    let mut arguments = DispatchArguments::new(&gpu).unwrap();
-    gpu.run("arguments", |pass| arguments.record(pass, first(&counts), 0, 100)).unwrap();
-    let Threads::Indirect(arguments) = arguments.threads() else { panic!("not indirect") };
-    assert_eq!(gpu.read(arguments).unwrap(), [[3, 1, 1]]);
-}
-
-#[test]
 fn more_workgroups_than_fit_along_x_are_folded() {
-    let gpu = gpu();
-    // Two values a partition make 70 001 workgroups, in two rows of 35 001: the last is idle.
-    let constants = scan_upsweep::Constants { partition_size: 2 };
-    let (values, capacity) = (noise(140_001), 140_001);
-    let params = scan_upsweep::Params { count_index: 0, capacity };
-    let mut expected = vec![9; 70_002];
-    let slices = scan_upsweep::Slices { counts: &[capacity], values: &values, sums: &mut expected };
-    scan_upsweep::Kernel::run(&params, &constants, slices);
-    let pipeline = gpu.pipeline::<scan_upsweep::Kernel>(&constants).unwrap();
-    let mut arguments = DispatchArguments::new(&gpu).unwrap();
-    let counts = gpu.buffer("counts", &[capacity]).unwrap();
-    let values = gpu.buffer("values", &values).unwrap();
-    let mut sums = gpu.buffer("sums", &vec![9; expected.len()]).unwrap();
-    gpu.run("folded", |pass| {
-        arguments.record(pass, first(&counts), constants.partition_size, capacity)?;
-        let buffers = scan_upsweep::Buffers { counts: &counts, values: &values, sums: &mut sums };
-        pass.dispatch(&pipeline, &params, buffers, arguments.threads())
-    })
-    .unwrap();
-    assert_same("sums", &gpu.read(&sums).unwrap(), &expected);
+    // Two values a partition make 70 001 workgroups, in two rows: the last is idle in part.
+    compare_scan_kernels(140_001, 2);
 }
 
 #[test]
 fn scan_kernels_match_their_references() {
-    let gpu = gpu();
-    let upsweep = gpu.pipeline::<scan_upsweep::Kernel>(&Default::default()).unwrap();
-    let spine = gpu.pipeline::<scan_spine::Kernel>(&Default::default()).unwrap();
-    let downsweep = gpu.pipeline::<scan_downsweep::Kernel>(&Default::default()).unwrap();
     for size in SIZES {
-        let partitions = size.div_ceil(PARTITION);
-        // One workgroup more than there are partitions: it must leave no trace.
-        let groups = Threads::Workgroups([partitions + 1, 1, 1]);
-        let (capacity, count_index) = (size, 0);
-        // A count beyond the capacity is clamped to it.
-        let (counts, values) = ([size + 5], noise(size));
-        let (mut sums, mut total) = (vec![9; partitions as usize + 1], [0]);
-        let gpu_counts = gpu.buffer("counts", &counts).unwrap();
-        let gpu_values = gpu.buffer("values", &values).unwrap();
-        let mut gpu_sums = gpu.buffer("sums", &sums).unwrap();
-        let mut gpu_total = gpu.zeros("total", 1).unwrap();
-        let mut offsets = vec![7; values.len() + PARTITION as usize];
-        let mut gpu_offsets = gpu.buffer("offsets", &offsets).unwrap();
-
-        let params = scan_upsweep::Params { count_index, capacity };
-        let slices = scan_upsweep::Slices { counts: &counts, values: &values, sums: &mut sums };
-        scan_upsweep::Kernel::run(&params, &Default::default(), slices);
-        let (counts_, values_) = (&gpu_counts, &gpu_values);
-        let buffers =
-            scan_upsweep::Buffers { counts: counts_, values: values_, sums: &mut gpu_sums };
-        gpu.run("upsweep", |pass| pass.dispatch(&upsweep, &params, buffers, groups)).unwrap();
-        assert_same(&format!("upsweep of {size}"), &gpu.read(&gpu_sums).unwrap(), &sums);
-
-        let params = scan_spine::Params { count_index, capacity };
-        let slices = scan_spine::Slices { counts: &counts, sums: &mut sums, total: &mut total };
-        scan_spine::Kernel::run(&params, &Default::default(), slices);
-        let buffers =
-            scan_spine::Buffers { counts: counts_, sums: &mut gpu_sums, total: &mut gpu_total };
-        let one = Threads::Workgroups([1, 1, 1]);
-        gpu.run("spine", |pass| pass.dispatch(&spine, &params, buffers, one)).unwrap();
-        assert_same(&format!("spine of {size}"), &gpu.read(&gpu_sums).unwrap(), &sums);
-        assert_eq!(gpu.read(&gpu_total).unwrap(), total, "total of {size}");
-
-        let params = scan_downsweep::Params { count_index, capacity };
-        let slices = scan_downsweep::Slices {
-            counts: &counts,
-            values: &values,
-            sums: &sums,
-            offsets: &mut offsets,
-        };
-        scan_downsweep::Kernel::run(&params, &Default::default(), slices);
-        let buffers = scan_downsweep::Buffers {
-            counts: counts_,
-            values: values_,
-            sums: &gpu_sums,
-            offsets: &mut gpu_offsets,
-        };
-        gpu.run("downsweep", |pass| pass.dispatch(&downsweep, &params, buffers, groups)).unwrap();
-        assert_same(&format!("downsweep of {size}"), &gpu.read(&gpu_offsets).unwrap(), &offsets);
+        compare_scan_kernels(size, PARTITION);
     }
+}
+
+fn compare_scan_kernels(size: u32, partition_size: u32) {
+    let partitions = size.div_ceil(partition_size).max(1);
+    // One workgroup more than there are partitions: it must leave no trace.
+    let groups = Threads::Workgroups([partitions + 1, 1, 1]);
+    // A count beyond the capacity is clamped to it.
+    let (counts, values, capacity) = (vec![size + 5], noise(size), size);
+    let (sums, total) = (vec![9; partitions as usize + 1], vec![7]);
+    let arrivals = vec![0];
+    let (sums, total, arrivals) = run_kernel!(
+        scan_upsweep,
+        scan_upsweep::Constants { partition_size },
+        scan_upsweep::Params { count_index: 0, capacity },
+        groups,
+        [counts, values],
+        [sums, total, arrivals]
+    );
+    assert_eq!((sums[0], sums[partitions as usize], &arrivals[..]), (0, 9, &[0][..]));
+    assert_eq!(total, [values.iter().fold(0u32, |sum, &value| sum.wrapping_add(value))]);
+    let offsets = vec![7; values.len() + PARTITION as usize];
+    run_kernel!(
+        scan_downsweep,
+        scan_downsweep::Constants { partition_size },
+        scan_downsweep::Params { count_index: 0, capacity },
+        groups,
+        [counts, values, sums],
+        [offsets]
+    );
 }
 
 #[test]
@@ -348,11 +260,7 @@ fn sort_kernels_match_their_references() {
 }
 
 fn compare_sort_kernels(rank_by_ballot: bool) {
-    let gpu = gpu();
-    let upsweep = gpu.pipeline::<sort_upsweep::Kernel>(&Default::default()).unwrap();
-    let spine = gpu.pipeline::<sort_spine::Kernel>(&Default::default()).unwrap();
     let ranked = sort_downsweep::Constants { rank_by_ballot, ..Default::default() };
-    let downsweep = gpu.pipeline::<sort_downsweep::Kernel>(&ranked).unwrap();
     // A digit narrower than any subgroup, and the widest.
     for (size, (shift, digit_bits)) in SIZES.into_iter().flat_map(|s| [(s, (31, 1)), (s, (5, 8))]) {
         let (capacity, count_index, digits) = (size, 0, 1_u32 << digit_bits);
@@ -360,71 +268,40 @@ fn compare_sort_kernels(rank_by_ballot: bool) {
         // One workgroup more than there are partitions: it must leave no trace.
         let groups = Threads::Workgroups([partitions + 1, 1, 1]);
         // A count beyond the capacity is clamped to it.
-        let (counts, keys) = ([size + 5], noise(size));
+        let (counts, keys) = (vec![size + 5], noise(size));
         let values: Vec<u32> = (0..size).map(|i| 3 * i).collect();
-        let mut table = vec![0; (digits * partitions) as usize];
-        let mut digit_totals = vec![0; digits as usize];
-        let gpu_counts = gpu.buffer("counts", &counts).unwrap();
-        let gpu_keys = gpu.buffer("keys", &keys).unwrap();
-        let gpu_values = gpu.buffer("values", &values).unwrap();
-        let mut gpu_table = gpu.zeros("table", table.len()).unwrap();
-        let mut gpu_totals = gpu.zeros("digit_totals", digit_totals.len()).unwrap();
-        let mut gpu_sorted_keys = gpu.zeros("sorted_keys", keys.len()).unwrap();
-        let mut gpu_sorted_values = gpu.zeros("sorted_values", keys.len()).unwrap();
-        let what = format!("of {size}, {digit_bits} bits at {shift}, {ranked:?}");
-
-        let params = sort_upsweep::Params { count_index, capacity, shift, digit_bits };
-        let slices = sort_upsweep::Slices { counts: &counts, keys: &keys, table: &mut table };
-        sort_upsweep::Kernel::run(&params, &Default::default(), slices);
-        let (counts_, keys_, values_) = (&gpu_counts, &gpu_keys, &gpu_values);
-        let buffers = sort_upsweep::Buffers { counts: counts_, keys: keys_, table: &mut gpu_table };
-        gpu.run("upsweep", |pass| pass.dispatch(&upsweep, &params, buffers, groups)).unwrap();
-        assert_same(&format!("upsweep {what}"), &gpu.read(&gpu_table).unwrap(), &table);
-
-        let params = sort_spine::Params { count_index, capacity, digit_bits };
-        let slices = sort_spine::Slices {
-            counts: &counts,
-            table: &mut table,
-            digit_totals: &mut digit_totals,
+        let empty_table = vec![0; (digits * partitions) as usize];
+        let no_totals = vec![0; digits as usize];
+        let upsweep = |folds_spine: u32| {
+            let (table, digit_totals, arrivals) = (empty_table.clone(), no_totals.clone(), vec![0]);
+            run_kernel!(
+                sort_upsweep,
+                sort_upsweep::Constants::default(),
+                sort_upsweep::Params { count_index, capacity, shift, digit_bits, folds_spine },
+                groups,
+                [counts, keys],
+                [table, digit_totals, arrivals]
+            )
         };
-        sort_spine::Kernel::run(&params, &Default::default(), slices);
-        let buffers = sort_spine::Buffers {
-            counts: counts_,
-            table: &mut gpu_table,
-            digit_totals: &mut gpu_totals,
-        };
-        let rows = Threads::Workgroups([digits, 1, 1]);
-        gpu.run("spine", |pass| pass.dispatch(&spine, &params, buffers, rows)).unwrap();
-        assert_same(&format!("spine {what}"), &gpu.read(&gpu_table).unwrap(), &table);
-        assert_same(&format!("totals {what}"), &gpu.read(&gpu_totals).unwrap(), &digit_totals);
-
-        let params = sort_downsweep::Params { count_index, capacity, shift, digit_bits };
-        let (mut sorted_keys, mut sorted_values) = (vec![0; keys.len()], vec![0; keys.len()]);
-        let slices = sort_downsweep::Slices {
-            counts: &counts,
-            table: &table,
-            digit_totals: &digit_totals,
-            keys: &keys,
-            values: &values,
-            sorted_keys: &mut sorted_keys,
-            sorted_values: &mut sorted_values,
-        };
-        sort_downsweep::Kernel::run(&params, &ranked, slices);
-        let buffers = sort_downsweep::Buffers {
-            counts: counts_,
-            table: &gpu_table,
-            digit_totals: &gpu_totals,
-            keys: keys_,
-            values: values_,
-            sorted_keys: &mut gpu_sorted_keys,
-            sorted_values: &mut gpu_sorted_values,
-        };
-        gpu.run("downsweep", |pass| pass.dispatch(&downsweep, &params, buffers, groups)).unwrap();
-        assert_same(&format!("keys {what}"), &gpu.read(&gpu_sorted_keys).unwrap(), &sorted_keys);
-        assert_same(
-            &format!("values {what}"),
-            &gpu.read(&gpu_sorted_values).unwrap(),
-            &sorted_values,
+        let (table, digit_totals, _) = upsweep(0);
+        let (table, digit_totals) = run_kernel!(
+            sort_spine,
+            sort_spine::Constants::default(),
+            sort_spine::Params { count_index, capacity, digit_bits },
+            Threads::Workgroups([digits, 1, 1]),
+            [counts],
+            [table, digit_totals]
+        );
+        let folded = upsweep(1);
+        assert_eq!((&folded.0, &folded.1, folded.2), (&table, &digit_totals, vec![0]));
+        let (sorted_keys, sorted_values) = (vec![0; keys.len()], vec![0; keys.len()]);
+        run_kernel!(
+            sort_downsweep,
+            ranked,
+            sort_downsweep::Params { count_index, capacity, shift, digit_bits },
+            groups,
+            [counts, table, digit_totals, keys, values],
+            [sorted_keys, sorted_values]
         );
     }
 }

@@ -2,14 +2,18 @@
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
+use glam::{DVec2, UVec2};
 use nightsplat::Error;
 use nightsplat::attributes::Attribute;
 use nightsplat::dataset::{Dataset, Split};
+use nightsplat::densify::DensityControl;
 use nightsplat::eval::{self, Player};
-use nightsplat::gpu::testing::gpu;
+
+use nightsplat::gpu::testing::{gpu, recorded};
+use nightsplat::gpu::{DeviceChoice, Gpu};
 use nightsplat::image::Image;
 use nightsplat::metrics::Scores;
-use nightsplat::scene::Gaussians;
+use nightsplat::scene::{Gaussians, Shape};
 use nightsplat::train::{Background, StepReport, TrainConfig, Trainer};
 
 mod common;
@@ -59,6 +63,42 @@ fn a_model_learns_to_show_the_scene_by_normal_light() {
 }
 
 #[test]
+fn a_round_of_density_control_leaves_the_scores_nearly_as_they_were() {
+    let dataset = dataset();
+    let drop = |control: DensityControl| {
+        let mut config = TrainConfig { steps: 400, ..config() };
+        config.density.control = control;
+        (config.schedule.densify_after, config.schedule.densify_interval) = (100, 160);
+        config.density.gradient_threshold = 1e-4;
+        let mut trainer = Trainer::new(&gpu(), config, &dataset).unwrap();
+        advance(&mut trainer, 159);
+        let before = (trainer.gaussian_count(), mean_psnr(&dataset, &trainer.gaussians().unwrap()));
+        advance(&mut trainer, 160);
+        let after = (trainer.gaussian_count(), mean_psnr(&dataset, &trainer.gaussians().unwrap()));
+        assert!(4 * after.0 > 5 * before.0, "{before:?} {after:?}: hardly anything multiplied");
+        before.1 - after.1
+    };
+    let (conserving, paper) = (drop(DensityControl::Conserving), drop(DensityControl::Paper));
+    assert!(conserving <= 0.3, "{conserving} dB were lost");
+    assert!(
+        paper > conserving + 0.3,
+        "the paper's control loses {paper} dB, not more than {conserving}"
+    );
+}
+
+#[test]
+fn coarse_steps_come_first_and_repeat_bit_for_bit() {
+    let dataset = common::train::dataset(6, [128, 128]);
+    let mut config = TrainConfig { steps: 30, ..config() };
+    let (_, full) = train(&config, &dataset);
+    config.schedule.resolution_steps = [8, 20];
+    let (reports, coarse) = train(&config, &dataset);
+    assert_eq!(coarse, train(&config, &dataset).1);
+    assert_ne!(coarse.parameters, full.parameters);
+    assert!(reports.iter().all(|report| report.loss.is_finite()));
+}
+
+#[test]
 fn the_same_seed_gives_the_same_bits_and_another_seed_others() {
     let dataset = dataset();
     let config = TrainConfig { background: Background::Random, ..config() };
@@ -87,23 +127,104 @@ fn references_change_no_trained_bit() {
 fn steps_that_outgrow_their_memory_are_redone_and_nothing_is_lost() {
     let dataset = dataset();
     let config = TrainConfig { steps: 20, ..config() };
-    let run = |reserved: u32| {
+    let run = |reserved: u32, in_flight: usize| {
         let mut trainer = Trainer::new(&gpu(), config.clone(), &dataset).unwrap();
         trainer.set_intersection_capacity(reserved).unwrap();
+        trainer.set_pace(in_flight, Some(3));
         let mut reports = vec![];
-        let mut submissions = 0;
+        let mut interruptions = 0;
         while trainer.steps_done() < config.steps {
-            reports.extend(trainer.advance(config.steps).unwrap());
-            submissions += 1;
+            let more = trainer.advance(config.steps).unwrap();
+            interruptions += u32::from(more.is_empty());
+            reports.extend(more);
         }
         let steps: Vec<u64> = reports.iter().map(|report| report.step).collect();
         assert_eq!(steps, (1..=20).collect::<Vec<_>>());
-        (submissions, trainer.gaussians().unwrap())
+        (interruptions, trainer.gaussians().unwrap())
     };
-    let (few, roomy) = run(100_000);
-    let (more, tight) = run(16);
-    assert!(more > few, "{more} submissions, {few} without an overflow");
-    assert_eq!(roomy, tight);
+    let (none, roomy) = run(100_000, 2);
+    assert_eq!(none, 0);
+    for in_flight in [1, 2, 3] {
+        let (some, tight) = run(16, in_flight);
+        assert!(some > 0, "no overflow with {in_flight} in flight");
+        assert_eq!(roomy, tight, "{in_flight} in flight");
+    }
+}
+
+#[test]
+fn how_steps_are_submitted_changes_no_bit() {
+    let dataset = dataset();
+    let run = |in_flight: usize, steps: Option<u64>| {
+        let mut trainer = Trainer::new(&gpu(), config(), &dataset).unwrap();
+        trainer.set_pace(in_flight, steps);
+        let losses: Vec<f64> = advance(&mut trainer, 60).iter().map(|report| report.loss).collect();
+        (losses, trainer.gaussians().unwrap())
+    };
+    let one_by_one = run(1, Some(1));
+    assert_eq!(one_by_one.0.len(), 60);
+    for (in_flight, steps) in [(2, Some(1)), (1, Some(64)), (2, Some(7)), (2, None)] {
+        assert_eq!(run(in_flight, steps), one_by_one, "{in_flight} in flight, {steps:?} steps");
+    }
+}
+
+#[test]
+fn a_plain_step_is_at_most_24_dispatches_and_20_barriers() {
+    // A device of its own: others would count with it.
+    let (gpu, dataset) = (Gpu::new(&DeviceChoice::Best).unwrap(), dataset());
+    let mut trainer = Trainer::new(&gpu, config(), &dataset).unwrap();
+    trainer.set_intersection_capacity(100_000).unwrap();
+    trainer.set_pace(1, Some(64));
+    let mut recorded_in = |until: u64| {
+        let before = recorded(&gpu);
+        assert_eq!(trainer.advance(until).unwrap().last().unwrap().step, until);
+        [0, 1].map(|i| recorded(&gpu)[i] - before[i])
+    };
+    let (two, eight) = (recorded_in(2), recorded_in(10));
+    // What a submission costs is the same for both.
+    let [dispatches, barriers] = [0, 1].map(|i| (eight[i] - two[i]).div_ceil(6));
+    assert!(dispatches <= 24 && barriers <= 20, "{dispatches} dispatches, {barriers} barriers");
+}
+
+/// Trains a few steps on views of one size, from the points there are.
+fn train_on(size: [u32; 2], points: usize) -> (Vec<StepReport>, Gaussians) {
+    let mut dataset = common::train::dataset(3, [64, 48]);
+    dataset.points.truncate(points);
+    for view in &mut dataset.views {
+        let [width, height] = size;
+        view.camera.principal_point *= UVec2::from(size).as_dvec2() / DVec2::new(64.0, 48.0);
+        (view.camera.width, view.camera.height) = (width, height);
+        view.image = Some(Image::filled(width, height, [0.1, 0.2, 0.05]));
+        view.reference = None;
+    }
+    let mut config = TrainConfig { steps: 6, random_points: 50, ..config() };
+    config.schedule.densify_after = 1;
+    config.schedule.densify_interval = 2;
+    train(&config, &dataset)
+}
+
+#[test]
+fn views_of_one_pixel_and_of_a_long_strip_are_trained_on() {
+    for size in [[1, 1], [1, 33], [8192, 16]] {
+        let (reports, gaussians) = train_on(size, usize::MAX);
+        assert_eq!(reports.len(), 6, "{size:?}");
+        assert!(reports.iter().all(|report| report.loss.is_finite()), "{size:?}");
+        assert!(gaussians.parameters.iter().all(|value| value.is_finite()), "{size:?}");
+    }
+}
+
+#[test]
+fn one_gaussian_and_none_are_trained_and_rendered() {
+    let (reports, gaussians) = train_on([64, 48], 1);
+    assert!(reports.len() == 6 && gaussians.count <= 64);
+    assert!(gaussians.parameters.iter().all(|value| value.is_finite()));
+    let dataset = common::train::dataset(3, [64, 48]);
+    let none = Gaussians::zeros(0, Shape::from(3));
+    let config = TrainConfig { steps: 6, ..config() };
+    let mut trainer = Trainer::from_gaussians(&gpu(), config, &dataset, &none).unwrap();
+    let reports = advance(&mut trainer, 6);
+    assert!(reports.iter().all(|report| report.loss.is_finite() && report.gaussians == 0));
+    let render = trainer.render(&dataset.views[0].camera).unwrap();
+    assert!(render.colors.data.iter().all(|&value| value == 0.0));
 }
 
 #[test]
@@ -137,6 +258,8 @@ fn growth_stops_at_the_limit() {
     let limit = dataset.points.len() + 5;
     let mut config = TrainConfig { max_gaussians: limit, ..config() };
     config.density.gradient_threshold = 1e-9;
+    // The last round may take all the room that is left.
+    config.schedule.densify_before = 60;
     let (_, gaussians) = train(&config, &dataset);
     assert_eq!(gaussians.count, limit);
 }

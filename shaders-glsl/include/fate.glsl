@@ -1,9 +1,38 @@
-// What density control does with a Gaussian.
+// What density control does with a Gaussian, and how it gets there.
 
 const uint FATE_PRUNE = 0;  // it goes
 const uint FATE_KEEP  = 1;  // it stays as it is
 const uint FATE_CLONE = 2;  // it stays, and a copy appears at a position drawn from it
-const uint FATE_SPLIT = 3;  // two smaller ones at positions drawn from it take its place
+const uint FATE_SPLIT = 3;  // two smaller ones take its place
 
 // How many Gaussians come of one.
 uint offspring(uint fate) { return min(fate, 2u); }
+
+// Whether a copy is another Gaussian than the one it comes of.
+bool is_new(uint fate, uint copy_index) { return fate == FATE_SPLIT || copy_index > 0; }
+
+// Keys sort candidates by falling gradient, then those that stay, then those that go.
+const uint KEY_TOP   = 0x7f800000;  // the bits of an infinite gradient: a candidate's key is this less its own bits
+const uint KEY_KEEP  = 0x80000000;
+const uint KEY_PRUNE = 0x80000001;
+
+// Places of the counts of a round.
+const uint TALLY_CANDIDATES = 0;
+const uint TALLY_PRUNED     = 1;
+const uint TALLY_CLONED     = 2;
+const uint TALLY_SPLIT      = 3;
+const uint TALLY_WORDS      = 4;
+
+// The paper's split: 1 / 1.6 of the scale (Kerbl et al. 2023).
+const float PAPER_LOG_SPLIT_FACTOR = 0.47000362924573558;  // ln 1.6
+
+// The conserving split along the longest axis, for opacity o and in standard deviations of the parent: centres at
+// +-OFFSET; scales and opacity are constants + slopes times o, the opacity as a fraction of o. Fitted to the least squared
+// difference of the composited alpha over all directions of view (docs/benchmarks.md).
+const float SPLIT_OFFSET        = 0.5;
+const float SPLIT_ALONG         = 0.866;  // sqrt(1 - OFFSET^2): the pair keeps the parent's variance where o is small
+const float SPLIT_ALONG_SLOPE   = -0.105;
+const float SPLIT_ACROSS        = 0.993;
+const float SPLIT_ACROSS_SLOPE  = -0.063;
+const float SPLIT_OPACITY       = 0.565;
+const float SPLIT_OPACITY_SLOPE = 0.2;

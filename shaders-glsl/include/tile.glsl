@@ -9,6 +9,9 @@ layout(constant_id = 6) const bool SKIPS_GROUPS = true;
 
 const uint GROUPS = TILE_WIDTH * TILE_HEIGHT / SUBGROUP_SIZE;
 
+// How many splats of a batch one turn of the loop over it blends: some devices give an invocation but so many turns.
+layout(constant_id = 7) const uint SPLATS_PER_TURN = 1;
+
 // The lane's pixel of group 0, relative to the tile.
 uvec2 lane_pixel() {
     return uvec2(gl_SubgroupInvocationID % TILE_WIDTH, gl_SubgroupInvocationID / TILE_WIDTH);

@@ -62,6 +62,7 @@ void main() {
         float my_color[CHANNELS];
         [[unroll]] for (uint c = 0; c < CHANNELS; c++) my_color[c] = colors[CHANNELS * id + c];
         uint my_groups = splat_groups(mine, origin);
+        if (lane >= batch) mine.opacity = 0.0;
         vec2 my_d_mean2d = vec2(0.0);
         vec3 my_d_conic = vec3(0.0);
         float my_d_opacity = 0.0;
@@ -69,64 +70,68 @@ void main() {
         [[unroll]] for (uint c = 0; c < CHANNELS; c++) my_d_color[c] = 0.0;
 
         // Tested at its end: a processor's driver runs a loop tested at its head once more, with every lane off.
-        for (uint j = 0; true;) {
-            uint groups = subgroupShuffle(my_groups, j);
-            vec2 offset = subgroupShuffle(mine.mean2d, j) - (vec2(first_pixel) + 0.5);
-            vec3 conic = subgroupShuffle(mine.conic, j);
-            float opacity = subgroupShuffle(mine.opacity, j);
-            float splat_color[CHANNELS];
-            [[unroll]] for (uint c = 0; c < CHANNELS; c++) splat_color[c] = subgroupShuffle(my_color[c], j);
-            // Moments of dL/dsigma over the pixels: what every gradient of the ellipse is made of.
-            float moment = 0.0;
-            vec2 moment_x_y = vec2(0.0);
-            vec3 moment_xx_xy_yy = vec3(0.0);
-            float d_color[CHANNELS];
-            [[unroll]] for (uint c = 0; c < CHANNELS; c++) d_color[c] = 0.0;
+        for (uint turn = 0; true;) {
+            [[unroll]] for (uint k = 0; k < SPLATS_PER_TURN; k++) {
+                uint j = turn + k;
+                uint groups = subgroupShuffle(my_groups, j);
+                vec2 offset = subgroupShuffle(mine.mean2d, j) - (vec2(first_pixel) + 0.5);
+                vec3 conic = subgroupShuffle(mine.conic, j);
+                float opacity = subgroupShuffle(mine.opacity, j);
+                float splat_color[CHANNELS];
+                [[unroll]] for (uint c = 0; c < CHANNELS; c++) splat_color[c] = subgroupShuffle(my_color[c], j);
+                // Moments of dL/dsigma over the pixels: what every gradient of the ellipse is made of.
+                float moment = 0.0;
+                vec2 moment_x_y = vec2(0.0);
+                vec3 moment_xx_xy_yy = vec3(0.0);
+                float d_color[CHANNELS];
+                [[unroll]] for (uint c = 0; c < CHANNELS; c++) d_color[c] = 0.0;
 
-            [[unroll]] for (uint g = 0; g < GROUPS; g++) {
-                if ((groups >> g & 1) == 0) continue;
-                vec2 d = offset - vec2(group_offset(g));
-                float sigma = splat_sigma(conic, d);
-                float falloff = exp(-sigma);
-                float alpha = min(ALPHA_MAX, opacity * falloff);
-                float before = transmittance[g];
-                bool counts = sigma >= 0.0 && alpha >= ALPHA_MIN && before > 0.0;
-                // What does not count has alpha 0: the lanes never part.
-                alpha = counts ? alpha : 0.0;
-                float after = before * (1.0 - alpha);
-                bool is_done = after < TRANSMITTANCE_MIN;
-                transmittance[g] = is_done ? 0.0 : after;
-                float weight = is_done ? 0.0 : alpha * before;
-                float shade = 0.0;
-                [[unroll]] for (uint c = 0; c < CHANNELS; c++) {
-                    d_color[c] += weight * d_pixel[g][c];
-                    shade += splat_color[c] * d_pixel[g][c];
+                [[unroll]] for (uint g = 0; g < GROUPS; g++) {
+                    if ((groups >> g & 1) == 0) continue;
+                    vec2 d = offset - vec2(group_offset(g));
+                    float sigma = splat_sigma(conic, d);
+                    float falloff = exp(-sigma);
+                    float alpha = min(ALPHA_MAX, opacity * falloff);
+                    float before = transmittance[g];
+                    bool counts = sigma >= 0.0 && alpha >= ALPHA_MIN && before > 0.0;
+                    // What does not count has alpha 0: the lanes never part.
+                    alpha = counts ? alpha : 0.0;
+                    float after = before * (1.0 - alpha);
+                    bool is_done = after < TRANSMITTANCE_MIN;
+                    transmittance[g] = is_done ? 0.0 : after;
+                    float weight = is_done ? 0.0 : alpha * before;
+                    float shade = 0.0;
+                    [[unroll]] for (uint c = 0; c < CHANNELS; c++) {
+                        d_color[c] += weight * d_pixel[g][c];
+                        shade += splat_color[c] * d_pixel[g][c];
+                    }
+                    float d_alpha = before * shade - light[g];
+                    light[g] -= weight * shade;
+                    // At the cap alpha no longer depends on the splat.
+                    bool is_free = !is_done && opacity * falloff <= ALPHA_MAX;
+                    d_alpha = is_free ? d_alpha / (1.0 - alpha) : 0.0;
+                    float d_sigma = -alpha * d_alpha;
+                    vec2 first_moment = d_sigma * d;
+                    moment += d_sigma;
+                    moment_x_y += first_moment;
+                    moment_xx_xy_yy += first_moment.xxy * d.xyy;
                 }
-                float d_alpha = before * shade - light[g];
-                light[g] -= weight * shade;
-                // At the cap alpha no longer depends on the splat.
-                bool is_free = !is_done && opacity * falloff <= ALPHA_MAX;
-                d_alpha = is_free ? d_alpha / (1.0 - alpha) : 0.0;
-                float d_sigma = -alpha * d_alpha;
-                vec2 first_moment = d_sigma * d;
-                moment += d_sigma;
-                moment_x_y += first_moment;
-                moment_xx_xy_yy += first_moment.xxy * d.xyy;
+                moment = subgroup_sum(moment);
+                moment_x_y = vec2(subgroup_sum(moment_x_y.x), subgroup_sum(moment_x_y.y));
+                [[unroll]] for (uint i = 0; i < 3; i++) moment_xx_xy_yy[i] = subgroup_sum(moment_xx_xy_yy[i]);
+                if (lane == j) {
+                    my_d_mean2d = vec2(dot(conic.xy, moment_x_y), dot(conic.yz, moment_x_y));
+                    my_d_conic = vec3(0.5, 1.0, 0.5) * moment_xx_xy_yy;
+                    // dL/dsigma = -opacity falloff dL/dalpha below the cap.
+                    my_d_opacity = -moment / opacity;
+                }
+                [[unroll]] for (uint c = 0; c < CHANNELS; c++) {
+                    float sum = subgroup_sum(d_color[c]);
+                    if (lane == j) my_d_color[c] = sum;
+                }
             }
-            moment = subgroup_sum(moment);
-            moment_x_y = vec2(subgroup_sum(moment_x_y.x), subgroup_sum(moment_x_y.y));
-            [[unroll]] for (uint k = 0; k < 3; k++) moment_xx_xy_yy[k] = subgroup_sum(moment_xx_xy_yy[k]);
-            if (lane == j) {
-                my_d_mean2d = vec2(dot(conic.xy, moment_x_y), dot(conic.yz, moment_x_y));
-                my_d_conic = vec3(0.5, 1.0, 0.5) * moment_xx_xy_yy;
-                // dL/dsigma = -opacity falloff dL/dalpha below the cap.
-                my_d_opacity = -moment / opacity;
-            }
-            [[unroll]] for (uint c = 0; c < CHANNELS; c++) {
-                float sum = subgroup_sum(d_color[c]);
-                if (lane == j) my_d_color[c] = sum;
-            }
-            if (++j >= batch) break;
+            turn += SPLATS_PER_TURN;
+            if (turn >= batch) break;
         }
         if (lane < batch) {
             uint at = RECORD * slot;

@@ -4,8 +4,9 @@
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 #include "splat.glsl"
 #include "tile.glsl"
+#include "status.glsl"
 
-//! Blend forward: one subgroup owns a tile and composites its splats front to back.
+//! Blend forward: one subgroup owns a tile, finds its run of the sorted intersections and composites it front to back.
 //!
 //! C = sum_i c_i alpha_i T_i + T background, T_i = prod_{j < i} (1 - alpha_j). Each lane loads one splat of a batch and
 //! finds the groups of pixels that its ellipse meets; the batch is then broadcast splat by splat. The tile's state stays
@@ -13,15 +14,25 @@ layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 
 layout(local_size_x_id = 100) in;
 
-layout(push_constant, scalar) uniform Params { uvec2 size; uint tile_columns; float background[MAX_CHANNELS]; };
+layout(push_constant, scalar) uniform Params {
+    uvec2 size;
+    uint tile_columns;
+    uint longest_run;  // splats of a tile that this device follows
+    float background[MAX_CHANNELS];
+};
 
-layout(binding = 0) readonly  buffer Ranges     { uvec2 tile_ranges[]; };
+layout(binding = 0) readonly  buffer Counts     { uint counts[]; };        // [0]: intersections
 layout(binding = 1) readonly  buffer Slots      { uint sorted_slots[]; };
 layout(binding = 2) readonly  buffer Owners     { uint owners[]; };
 layout(binding = 3) readonly  buffer Splats     { ProjectedSplat splats[]; };
 layout(binding = 4) readonly  buffer Colors     { float colors[]; };
 layout(binding = 5) writeonly buffer Render     { float render[]; };  // (CHANNELS, H, W)
 layout(binding = 6) writeonly buffer Transmittances { float transmittances[]; };  // (H, W)
+layout(binding = 7) readonly  buffer Tiles      { uint sorted_tiles[]; };
+layout(binding = 8) writeonly buffer Ranges     { uvec2 tile_ranges[]; };  // (tiles) first intersection, one past the last
+layout(binding = 9)           buffer Status     { uint status[]; };
+
+#include "tile_run.glsl"
 
 void main() {
     uint tile = WORKGROUP_INDEX;
@@ -39,44 +50,50 @@ void main() {
         [[unroll]] for (uint c = 0; c < CHANNELS; c++) color[g][c] = 0.0;
     }
 
-    uvec2 range = tile_ranges[tile];
+    uvec2 range = tile_run(tile, longest_run);
+    if (subgroupElect()) tile_ranges[tile] = range;
     for (uint first = range.x; first < range.y; first += SUBGROUP_SIZE) {
         bool alive = false;
         [[unroll]] for (uint g = 0; g < GROUPS; g++) alive = alive || transmittance[g] > 0.0;
         if (!subgroupAny(alive)) break;
 
         uint batch = min(SUBGROUP_SIZE, range.y - first);
-        // Lanes beyond the batch load its last splat and are never broadcast.
+        // Lanes beyond the batch load its last splat, which counts on no pixel without opacity.
         uint id = owners[sorted_slots[first + min(lane, batch - 1)]];
         ProjectedSplat mine = splats[id];
         float my_color[CHANNELS];
         [[unroll]] for (uint c = 0; c < CHANNELS; c++) my_color[c] = colors[CHANNELS * id + c];
         uint my_groups = splat_groups(mine, origin);
+        if (lane >= batch) mine.opacity = 0.0;
 
         // Tested at its end: a processor's driver runs a loop tested at its head once more, with every lane off.
-        for (uint j = 0; true;) {
-            uint groups = subgroupShuffle(my_groups, j);
-            vec2 d = subgroupShuffle(mine.mean2d, j) - (vec2(first_pixel) + 0.5);
-            vec3 conic = subgroupShuffle(mine.conic, j);
-            float opacity = subgroupShuffle(mine.opacity, j);
-            float splat_color[CHANNELS];
-            [[unroll]] for (uint c = 0; c < CHANNELS; c++) splat_color[c] = subgroupShuffle(my_color[c], j);
+        for (uint turn = 0; true;) {
+            [[unroll]] for (uint k = 0; k < SPLATS_PER_TURN; k++) {
+                uint j = turn + k;
+                uint groups = subgroupShuffle(my_groups, j);
+                vec2 d = subgroupShuffle(mine.mean2d, j) - (vec2(first_pixel) + 0.5);
+                vec3 conic = subgroupShuffle(mine.conic, j);
+                float opacity = subgroupShuffle(mine.opacity, j);
+                float splat_color[CHANNELS];
+                [[unroll]] for (uint c = 0; c < CHANNELS; c++) splat_color[c] = subgroupShuffle(my_color[c], j);
 
-            [[unroll]] for (uint g = 0; g < GROUPS; g++) {
-                if ((groups >> g & 1) == 0) continue;
-                float sigma = splat_sigma(conic, d - vec2(group_offset(g)));
-                float alpha = min(ALPHA_MAX, opacity * exp(-sigma));
-                float before = transmittance[g];
-                bool counts = sigma >= 0.0 && alpha >= ALPHA_MIN && before > 0.0;
-                // What does not count is composited with alpha 0: the lanes never part.
-                alpha = counts ? alpha : 0.0;
-                float after = before * (1.0 - alpha);
-                bool is_done = after < TRANSMITTANCE_MIN;
-                transmittance[g] = is_done ? -abs(before) : after;
-                float weight = is_done ? 0.0 : alpha * before;
-                [[unroll]] for (uint c = 0; c < CHANNELS; c++) color[g][c] += weight * splat_color[c];
+                [[unroll]] for (uint g = 0; g < GROUPS; g++) {
+                    if ((groups >> g & 1) == 0) continue;
+                    float sigma = splat_sigma(conic, d - vec2(group_offset(g)));
+                    float alpha = min(ALPHA_MAX, opacity * exp(-sigma));
+                    float before = transmittance[g];
+                    bool counts = sigma >= 0.0 && alpha >= ALPHA_MIN && before > 0.0;
+                    // What does not count is composited with alpha 0: the lanes never part.
+                    alpha = counts ? alpha : 0.0;
+                    float after = before * (1.0 - alpha);
+                    bool is_done = after < TRANSMITTANCE_MIN;
+                    transmittance[g] = is_done ? -abs(before) : after;
+                    float weight = is_done ? 0.0 : alpha * before;
+                    [[unroll]] for (uint c = 0; c < CHANNELS; c++) color[g][c] += weight * splat_color[c];
+                }
             }
-            if (++j >= batch) break;
+            turn += SPLATS_PER_TURN;
+            if (turn >= batch) break;
         }
     }
 

@@ -1,18 +1,67 @@
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
+#include "partition.glsl"
+#include "status.glsl"
 
-//! Order counts: one thread per depth rank fetches how many tiles its Gaussian covers.
+//! Order counts: how many tiles the Gaussian of each depth rank covers, and what precedes each partition of ranks.
+//!
+//! One subgroup per partition; the last of them to be done makes prefix sums of the partitions' sums and knows the total.
+//! More intersections than the buffers hold raise a flag that stays: the step then renders nothing and updates nothing;
+//! the host grows the buffers, lowers the flag and redoes it.
 
-layout(local_size_x = 256) in;
+layout(local_size_x_id = 100) in;
+layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 
-layout(push_constant) uniform Params { uint gaussian_count; };
+layout(push_constant) uniform Params {
+    uint gaussian_count;
+    uint capacity;  // intersections
+};
 
 layout(binding = 0) readonly  buffer Ids        { uint sorted_ids[]; };   // by depth
 layout(binding = 1) readonly  buffer TileCounts { uint tile_counts[]; };  // by Gaussian
 layout(binding = 2) writeonly buffer Ordered    { uint ordered_counts[]; };
+layout(binding = 3) coherent  buffer Sums       { uint sums[]; };    // (partitions), exclusive prefix sums
+layout(binding = 4) writeonly buffer Counts     { uint counts[]; };  // [0]: intersections to blend
+layout(binding = 5)           buffer Status     { uint status[]; };
+layout(binding = 6) coherent  buffer Arrivals   { uint arrivals[]; };
+
+#include "last_workgroup.glsl"
 
 void main() {
-    uint rank = THREAD_INDEX;
-    if (rank < gaussian_count) ordered_counts[rank] = tile_counts[sorted_ids[rank]];
+    uint part = WORKGROUP_INDEX;
+    uint lane = gl_SubgroupInvocationID;
+    // Even no Gaussians have a total.
+    uint partition_count = max(partitions_of(gaussian_count), 1);
+    if (part >= partition_count) return;
+
+    uint sum = 0;
+    uint end = gaussian_count == 0 ? 0 : partition_end(part, gaussian_count);
+    for (uint rank = partition_begin(part) + lane; rank < end; rank += SUBGROUP_SIZE) {
+        uint count = tile_counts[sorted_ids[rank]];
+        ordered_counts[rank] = count;
+        sum += count;
+    }
+    sum = subgroupAdd(sum);
+    if (subgroupElect()) sums[part] = sum;
+
+    if (!is_last_workgroup(partition_count)) return;
+    uint total = 0;
+    bool wraps = false;
+    for (uint first = 0; first < partition_count; first += SUBGROUP_SIZE) {
+        uint i = first + lane;
+        uint sum_of_part = i < partition_count ? sums[i] : 0;
+        uint inclusive = subgroupInclusiveAdd(sum_of_part);
+        if (i < partition_count) sums[i] = total + inclusive - sum_of_part;
+        uint sum_of_lanes = subgroupShuffle(inclusive, SUBGROUP_SIZE - 1);
+        total += sum_of_lanes;
+        wraps = wraps || subgroupAny(inclusive < sum_of_part) || total < sum_of_lanes;
+    }
+    if (wraps) total = 0xffffffffu;
+    if (subgroupElect()) {
+        bool fits = total <= capacity;
+        counts[0] = fits ? total : 0;
+        if (!fits) status[0] |= STATUS_OVERFLOWED;
+        status[1] = max(status[1], total);
+    }
 }

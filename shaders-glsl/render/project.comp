@@ -32,8 +32,19 @@ layout(binding = 3) writeonly buffer DepthKeys  { uint depth_keys[]; };
 layout(binding = 4) writeonly buffer Ids        { uint ids[]; };
 layout(binding = 5) writeonly buffer TileCounts { uint tile_counts[]; };
 
-const uint CULLED = 0xffffffffu;  // the depth key of what is not seen: it sorts last
+// A depth key is how many sixteenfold roundings the depth is beyond `near`: 2e-6 of the depth each, over 32 octaves.
+const uint DEPTH_BITS = 24;
+const uint CULLED = (1u << DEPTH_BITS) - 1;  // the depth key of what is not seen: it sorts last
+// A renderer without a near plane counts from here, in world units.
+const float NEAREST = 1e-4;
 const uint FEATURE_COUNT = CHANNELS - 3;
+
+// Depth is positive, so its bits sort like its value.
+uint depth_key(float depth) {
+    float nearest = max(near, NEAREST);
+    uint beyond = floatBitsToUint(max(depth, nearest)) - floatBitsToUint(nearest);
+    return min(beyond >> 4, CULLED - 1);
+}
 
 vec3 sh_color(uint i, vec3 direction) {
     float basis[16];
@@ -97,6 +108,5 @@ void main() {
         count += columns.y - columns.x;
     }
     tile_counts[i] = count;
-    // Depth is positive, so its bits sort like its value.
-    if (count > 0) depth_keys[i] = floatBitsToUint(mean_in_view.z);
+    if (count > 0) depth_keys[i] = depth_key(mean_in_view.z);
 }

@@ -3,7 +3,7 @@
 #include "kernel.glsl"
 #include "partition.glsl"
 
-//! Scan, last of three kernels: the exclusive prefix sums within each partition, on top of what precedes it.
+//! Scan, last of two kernels: the exclusive prefix sums within each partition, on top of what precedes it.
 //!
 //! One subgroup per partition: SUBGROUP_SIZE values at a time, the running total carried along.
 

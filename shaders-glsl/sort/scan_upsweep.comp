@@ -3,9 +3,10 @@
 #include "kernel.glsl"
 #include "partition.glsl"
 
-//! Scan, first of three kernels: the sum of each partition of consecutive values.
+//! Scan, first of two kernels: what precedes each partition of consecutive values, and the total.
 //!
-//! One subgroup per partition. Sums are modulo 2^32.
+//! One subgroup sums up each partition; the last of them to be done turns the sums into exclusive prefix sums. Sums are
+//! modulo 2^32.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
@@ -15,20 +16,37 @@ layout(push_constant) uniform Params {
     uint capacity;     // values
 };
 
-layout(binding = 0) readonly  buffer Counts { uint counts[]; };
-layout(binding = 1) readonly  buffer Values { uint values[]; };
-layout(binding = 2) writeonly buffer Sums   { uint sums[]; };  // (partitions)
+layout(binding = 0) readonly  buffer Counts   { uint counts[]; };
+layout(binding = 1) readonly  buffer Values   { uint values[]; };
+layout(binding = 2) coherent  buffer Sums     { uint sums[]; };   // (partitions)
+layout(binding = 3) writeonly buffer Total    { uint total[]; };  // (1)
+layout(binding = 4) coherent  buffer Arrivals { uint arrivals[]; };
+
+#include "last_workgroup.glsl"
 
 void main() {
     uint part = WORKGROUP_INDEX;
     uint count = min(counts[count_index], capacity);
-    if (part >= partitions_of(count)) return;
+    // Even no values have a total.
+    uint partition_count = max(partitions_of(count), 1);
+    if (part >= partition_count) return;
 
     uint sum = 0;
-    uint end = partition_end(part, count);
+    uint end = count == 0 ? 0 : partition_end(part, count);
     for (uint i = partition_begin(part) + gl_SubgroupInvocationID; i < end; i += SUBGROUP_SIZE) {
         sum += values[i];
     }
     sum = subgroupAdd(sum);
     if (subgroupElect()) sums[part] = sum;
+
+    if (!is_last_workgroup(partition_count)) return;
+    uint running = 0;
+    for (uint first = 0; first < partition_count; first += SUBGROUP_SIZE) {
+        uint i = first + gl_SubgroupInvocationID;
+        uint sum_of_part = i < partition_count ? sums[i] : 0;
+        uint inclusive = subgroupInclusiveAdd(sum_of_part);
+        if (i < partition_count) sums[i] = running + inclusive - sum_of_part;
+        running += subgroupShuffle(inclusive, SUBGROUP_SIZE - 1);
+    }
+    if (subgroupElect()) total[0] = running;
 }

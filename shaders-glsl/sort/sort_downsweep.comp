@@ -4,7 +4,7 @@
 #include "partition.glsl"
 #include "digit.glsl"
 
-//! Radix sort, last of three kernels a pass: every pair to its place, pairs of one digit in their old order.
+//! Radix sort, last kernel of a pass: every pair to its place, pairs of one digit in their old order.
 //!
 //! One subgroup per partition of consecutive keys; shared memory holds, per digit, where the partition's
 //! next key goes. SUBGROUP_SIZE pairs are placed at a time; a pair's rank among them is the number of lower
@@ -24,7 +24,7 @@ layout(push_constant) uniform Params {
 };
 
 layout(binding = 0) readonly  buffer Counts       { uint counts[]; };
-layout(binding = 1) readonly  buffer Table        { uint table[]; };         // (digits, partitions), prefix sums
+layout(binding = 1) readonly  buffer Table        { uint table[]; };         // (partitions, digits), prefix sums
 layout(binding = 2) readonly  buffer Totals       { uint digit_totals[]; };  // (digits)
 layout(binding = 3) readonly  buffer Keys         { uint keys[]; };
 layout(binding = 4) readonly  buffer Values       { uint values[]; };
@@ -33,7 +33,7 @@ layout(binding = 6) writeonly buffer SortedValues { uint sorted_values[]; };
 
 shared uint next_place[MAX_DIGITS];
 
-void find_first_places(uint part, uint partition_count) {
+void find_first_places(uint part) {
     uint digit_count = 1u << digit_bits;
     uint running = 0;
     for (uint first = 0; first < digit_count; first += SUBGROUP_SIZE) {
@@ -41,7 +41,7 @@ void find_first_places(uint part, uint partition_count) {
         uint keys = digit < digit_count ? digit_totals[digit] : 0;
         uint inclusive = subgroupInclusiveAdd(keys);
         if (digit < digit_count) {
-            next_place[digit] = running + inclusive - keys + table[digit * partition_count + part];
+            next_place[digit] = running + inclusive - keys + table[part * digit_count + digit];
         }
         running += subgroupShuffle(inclusive, SUBGROUP_SIZE - 1);
     }
@@ -69,10 +69,9 @@ uvec4 lanes_of_digit(uint digit, bool holds_pair) {
 void main() {
     uint part = WORKGROUP_INDEX;
     uint count = min(counts[count_index], capacity);
-    uint partition_count = partitions_of(count);
-    if (part >= partition_count) return;
+    if (part >= partitions_of(count)) return;
 
-    find_first_places(part, partition_count);
+    find_first_places(part);
     subgroupBarrier();
 
     uint end = partition_end(part, count);

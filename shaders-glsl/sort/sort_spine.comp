@@ -3,10 +3,10 @@
 #include "kernel.glsl"
 #include "partition.glsl"
 
-//! Radix sort, second of three kernels a pass: where each partition begins among the keys of one digit.
+//! Radix sort, between the two kernels of a pass over many partitions: where each begins among the keys of one digit.
 //!
-//! One subgroup per digit turns the digit's row of the table into exclusive prefix sums and leaves the
-//! row's total, which the downsweep adds up over the smaller digits.
+//! One subgroup per digit turns the digit's column of the table into exclusive prefix sums and leaves the
+//! column's total, which the downsweep adds up over the smaller digits.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
@@ -18,7 +18,7 @@ layout(push_constant) uniform Params {
 };
 
 layout(binding = 0) readonly  buffer Counts { uint counts[]; };
-layout(binding = 1)           buffer Table  { uint table[]; };         // (digits, partitions)
+layout(binding = 1)           buffer Table  { uint table[]; };         // (partitions, digits)
 layout(binding = 2) writeonly buffer Totals { uint digit_totals[]; };  // (digits)
 
 void main() {
@@ -28,7 +28,7 @@ void main() {
     uint running = 0;
     for (uint first = 0; first < partition_count; first += SUBGROUP_SIZE) {
         uint part = first + gl_SubgroupInvocationID;
-        uint i = digit * partition_count + part;
+        uint i = (part << digit_bits) + digit;
         uint keys = part < partition_count ? table[i] : 0;
         uint inclusive = subgroupInclusiveAdd(keys);
         if (part < partition_count) table[i] = running + inclusive - keys;

@@ -4,9 +4,11 @@
 #include "partition.glsl"
 #include "digit.glsl"
 
-//! Radix sort, first of three kernels a pass: how many keys of each partition have each digit.
+//! Radix sort, first kernel of a pass: where each partition's keys begin among those of their digit.
 //!
-//! One subgroup per partition of consecutive keys, counters in shared memory.
+//! One subgroup per partition of consecutive keys counts them by digit, in shared memory. The last of them to be done
+//! turns each digit's counts into exclusive prefix sums; where there are so many partitions that one subgroup would take
+//! long for that, `sort_spine` does, a subgroup for every digit.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
@@ -16,13 +18,42 @@ layout(push_constant) uniform Params {
     uint capacity;     // keys
     uint shift;        // the digit's lowest bit
     uint digit_bits;   // 1 to 8
+    uint folds_spine;  // not 0: the table becomes prefix sums here
 };
 
-layout(binding = 0) readonly  buffer Counts { uint counts[]; };
-layout(binding = 1) readonly  buffer Keys   { uint keys[]; };
-layout(binding = 2) writeonly buffer Table  { uint table[]; };  // (digits, partitions)
+layout(binding = 0) readonly  buffer Counts   { uint counts[]; };
+layout(binding = 1) readonly  buffer Keys     { uint keys[]; };
+layout(binding = 2) coherent  buffer Table    { uint table[]; };         // (partitions, digits)
+layout(binding = 3) writeonly buffer Totals   { uint digit_totals[]; };  // (digits)
+layout(binding = 4) coherent  buffer Arrivals { uint arrivals[]; };
+
+#include "last_workgroup.glsl"
 
 shared uint keys_with_digit[MAX_DIGITS];
+
+// Loads of this many partitions are under way at a time.
+const uint BATCH = 4;
+
+void make_prefix_sums(uint partition_count) {
+    uint digit_count = 1u << digit_bits;
+    for (uint digit = gl_SubgroupInvocationID; digit < digit_count; digit += SUBGROUP_SIZE) {
+        uint running = 0;
+        for (uint first = 0; first < partition_count; first += BATCH) {
+            uint key_counts[BATCH];
+            [[unroll]] for (uint k = 0; k < BATCH; k++) {
+                uint part = min(first + k, partition_count - 1);
+                key_counts[k] = table[part * digit_count + digit];
+            }
+            [[unroll]] for (uint k = 0; k < BATCH; k++) {
+                if (first + k < partition_count) {
+                    table[(first + k) * digit_count + digit] = running;
+                    running += key_counts[k];
+                }
+            }
+        }
+        digit_totals[digit] = running;
+    }
+}
 
 void main() {
     uint part = WORKGROUP_INDEX;
@@ -42,6 +73,8 @@ void main() {
     subgroupBarrier();
 
     for (uint digit = lane; digit < digit_count; digit += SUBGROUP_SIZE) {
-        table[digit * partition_count + part] = keys_with_digit[digit];
+        table[part * digit_count + digit] = keys_with_digit[digit];
     }
+    if (folds_spine == 0) return;
+    if (is_last_workgroup(partition_count)) make_prefix_sums(partition_count);
 }

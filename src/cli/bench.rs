@@ -21,7 +21,7 @@ use scene::Scene;
 ///
 /// The scene is the same every time. Bounds are those of two processor cores at the default size. With --tune, it times
 /// the rasteriser with every tile that suits the device instead, and keeps the fastest in the user's cache folder;
-/// training takes them from there unless NIGHTSPLAT_TUNE=off.
+/// training takes them from there unless `NIGHTSPLAT_TUNE=off`.
 #[derive(Clone, Debug, clap::Args)]
 pub struct BenchArgs {
     /// Print JSON instead of tables: device, driver, largest errors, kernels, groups and the step

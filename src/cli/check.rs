@@ -34,7 +34,9 @@ pub fn run(args: &CheckArgs) -> Result<()> {
     // The schedule is that of a whole run; so many of its steps are checked.
     let mut options = args.options.clone();
     let steps = options.steps.take().unwrap_or(1);
-    let config = options.config(args.dataset.clone())?;
+    let mut config = options.config(args.dataset.clone())?;
+    // Sizes that training comes to, from the first step on.
+    config.schedule.resolution_steps = [0, 0];
     let steps = steps.min(config.steps);
     let gpu = Gpu::new(&config.device.parse::<DeviceChoice>()?)?;
     let dataset = Dataset::load(&config.dataset, &config.load_options())?;

@@ -95,7 +95,7 @@ fn config(curve: ToneCurve, dataset: &Dataset, gpu: &Gpu) -> TrainConfig {
             densify_after: STEPS / 5,
             densify_before: 3 * STEPS / 5,
             densify_interval: STEPS / 10,
-            ..Schedule::default()
+            ..Schedule::paper()
         },
         ..TrainConfig::default()
     }

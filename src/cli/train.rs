@@ -7,6 +7,7 @@ use anyhow::Result;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use crate::dataset::Dataset;
+use crate::densify::DensityControl;
 use crate::eval::{self, ViewScore};
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::nn::Precision;
@@ -66,6 +67,9 @@ pub(crate) struct TrainOptions {
     /// Never grow beyond this many Gaussians [default: {max_gaussians}]
     #[arg(long, value_name = "N")]
     max_gaussians: Option<usize>,
+    /// What comes of a Gaussian that multiplies: conserving, two halves that cover what it covered, or paper, LITA-GS's [default: {density.control}]
+    #[arg(long, value_name = "NAME")]
+    density: Option<DensityControl>,
     /// black, or random: another colour every step [default: {background}]
     #[arg(long)]
     background: Option<Background>,
@@ -108,7 +112,7 @@ pub(crate) struct ModelOptions {
     /// Exactly these parts, parted by commas: denoiser, tonemapper, structure, depth
     #[arg(long, value_name = "LIST", value_delimiter = ',')]
     parts: Option<Vec<Part>>,
-    /// The constants that the paper and its code state for a benchmark: lom, realx3d or mip360-varying; other options win
+    /// balanced: the defaults; fast: a good score in few steps; or the constants that the paper and its code state for a benchmark: lom, realx3d or mip360-varying; other options win
     #[arg(long, value_name = "NAME")]
     preset: Option<Preset>,
     /// Train the networks on a random crop of at most N x N pixels a step; 0: on the whole view [default: {model.denoiser_crop}]
@@ -199,6 +203,7 @@ impl TrainOptions {
         set(&mut config.sh_degree, &self.sh_degree);
         set(&mut config.ssim_weight, &self.ssim_weight);
         set(&mut config.max_gaussians, &self.max_gaussians);
+        set(&mut config.density.control, &self.density);
         set(&mut config.background, &self.background);
         set(&mut config.device, &self.device);
         set(&mut config.eval_every, &self.eval_every);

@@ -306,6 +306,7 @@ impl Gpu {
                 last_use: AtomicU64::new(0),
                 usage: super::buffer::MemoryUsage::default(),
                 retired: Mutex::new(vec![]),
+                recorded: super::recorder::Recorded::default(),
                 checks: Checks::default(),
                 pipeline_cache,
                 owned,
@@ -503,12 +504,20 @@ fn properties(
         max_storage_buffer_range: u64::from(limits.max_storage_buffer_range),
         max_workgroups: limits.max_compute_work_group_count[0]
             .min(limits.max_compute_work_group_count[1]),
+        max_loop_iterations: match driver.driver_id {
+            vk::DriverId::MESA_LLVMPIPE => LLVMPIPE_LOOP_ITERATIONS,
+            _ => u32::MAX,
+        },
+        timestamp_bits: offered.timestamp_bits,
         timestamp_period: limits.timestamp_period,
         is_cpu: offered.properties.device_type == vk::PhysicalDeviceType::CPU,
         cooperative_matrix: None,
         tells_statistics: false,
     }
 }
+
+/// Mesa's software device ends all loops of an invocation after so many turns in total (`LP_MAX_TGSI_LOOP_ITERATIONS`).
+const LLVMPIPE_LOOP_ITERATIONS: u32 = 65_535;
 
 fn create_device(
     instance: &ash::Instance,

@@ -3,6 +3,7 @@
 use std::collections::HashMap;
 use std::ffi::CString;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use ash::vk;
 use ash::vk::Handle as _;
@@ -35,6 +36,13 @@ pub struct Recorder<'g> {
     pending: HashMap<vk::Buffer, bool>,
     /// Where every pass is run alone and compared with its reference.
     pub(super) checked: Option<Checked<'g>>,
+}
+
+/// What was recorded since the device was opened.
+#[derive(Debug, Default)]
+pub(super) struct Recorded {
+    pub(super) dispatches: AtomicU64,
+    pub(super) barriers: AtomicU64,
 }
 
 /// The timeline value of a recording that the host application submits: none of ours.
@@ -179,6 +187,7 @@ impl<'g> Recorder<'g> {
     }
 
     pub(super) fn barrier(&mut self) {
+        self.shared.recorded.barriers.fetch_add(1, Ordering::Relaxed);
         let stages =
             vk::PipelineStageFlags2::COMPUTE_SHADER | vk::PipelineStageFlags2::ALL_TRANSFER;
         let barrier = [vk::MemoryBarrier2::default()
@@ -270,6 +279,7 @@ impl<'g> Recorder<'g> {
             // SAFETY: recording; every label that is ended was begun.
             unsafe { debug.cmd_end_debug_utils_label(self.commands) };
         }
+        self.shared.recorded.dispatches.fetch_add(1, Ordering::Relaxed);
         self.labels.push(name);
         self.timestamp();
     }

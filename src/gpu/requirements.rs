@@ -31,6 +31,8 @@ pub(super) struct Offered {
     pub(super) vulkan12: vk::PhysicalDeviceVulkan12Features<'static>,
     pub(super) vulkan13: vk::PhysicalDeviceVulkan13Features<'static>,
     pub(super) compute_family: Option<u32>,
+    /// Of that family.
+    pub(super) timestamp_bits: u32,
 }
 
 /// One thing that every device must offer.
@@ -177,6 +179,8 @@ impl Offered {
         let name = |e: &vk::ExtensionProperties| {
             e.extension_name_as_c_str().ok().map(|name| name.to_string_lossy().into_owned())
         };
+        let compute =
+            families.iter().position(|family| family.queue_flags.contains(vk::QueueFlags::COMPUTE));
         Ok(Self {
             properties,
             subgroup_size: vulkan11.subgroup_size,
@@ -194,10 +198,8 @@ impl Offered {
                 p_next: std::ptr::null_mut(),
                 ..vulkan13
             },
-            compute_family: families
-                .iter()
-                .position(|family| family.queue_flags.contains(vk::QueueFlags::COMPUTE))
-                .and_then(|index| u32::try_from(index).ok()),
+            compute_family: compute.and_then(|index| u32::try_from(index).ok()),
+            timestamp_bits: compute.map_or(0, |index| families[index].timestamp_valid_bits),
         })
     }
 
@@ -247,6 +249,7 @@ mod tests {
             vulkan12,
             vulkan13,
             compute_family: Some(0),
+            timestamp_bits: 64,
         }
     }
 

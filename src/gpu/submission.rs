@@ -93,13 +93,18 @@ impl Gpu {
     /// As [`Gpu::run`], and measures how long each pass took.
     ///
     /// # Errors
-    /// As [`Gpu::submit`].
+    /// As [`Gpu::submit`]; [`Error::MissingFeature`] where the device's queue has no timestamps.
     pub fn profile(
         &self,
         label: &str,
         record: impl FnOnce(&mut Recorder<'_>) -> Result<()>,
     ) -> Result<Vec<PassTime>> {
         let shared = &self.shared;
+        if shared.properties.timestamp_bits == 0 {
+            let (device, feature) =
+                (shared.properties.name.clone(), "timestampValidBits > 0".to_owned());
+            return Err(Error::MissingFeature { device, feature });
+        }
         let info = vk::QueryPoolCreateInfo::default()
             .query_type(vk::QueryType::TIMESTAMP)
             .query_count(MAX_TIMESTAMPS);
@@ -125,7 +130,10 @@ impl Gpu {
         unsafe { self.shared.device.get_query_pool_results(queries, 0, &mut ticks, flags) }
             .map_err(|result| self.shared.error("vkGetQueryPoolResults", result))?;
         let period = f64::from(self.shared.properties.timestamp_period) * 1e-6;
-        let milliseconds = |pair: &[u64]| pair[1].saturating_sub(pair[0]) as f64 * period;
+        // The bits beyond are undefined, and those that count wrap around.
+        let counting = u64::MAX >> (64 - self.shared.properties.timestamp_bits.clamp(1, 64));
+        let milliseconds =
+            |pair: &[u64]| (pair[1].wrapping_sub(pair[0]) & counting) as f64 * period;
         let times = labels.iter().zip(ticks.windows(2));
         Ok(times.map(|(&name, pair)| PassTime { name, milliseconds: milliseconds(pair) }).collect())
     }
@@ -225,5 +233,21 @@ impl Shared {
         progress.submitted = value;
         progress.labels.insert(value, label.to_owned());
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::DeviceChoice;
+
+    #[test]
+    fn a_device_without_timestamps_runs_and_says_that_it_cannot_be_timed() {
+        let mut gpu = Gpu::new(&DeviceChoice::Best).unwrap();
+        Arc::get_mut(&mut gpu.shared).unwrap().properties.timestamp_bits = 0;
+        gpu.run("a pass", |_| Ok(())).unwrap();
+        let message = gpu.profile("a pass", |_| Ok(())).unwrap_err().to_string();
+        assert!(message.contains("lacks timestampValidBits > 0"), "{message}");
+        assert!(!message.contains('\n'), "{message}");
     }
 }

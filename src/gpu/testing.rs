@@ -2,6 +2,7 @@
 
 use std::cell::Cell;
 use std::sync::OnceLock;
+use std::sync::atomic::Ordering;
 
 use ash::vk;
 
@@ -35,6 +36,12 @@ pub fn misuse(gpu: &Gpu) {
             device.destroy_buffer(buffer, None);
         }
     }
+}
+
+/// How many dispatches and barriers were recorded for the device since it was opened.
+pub fn recorded(gpu: &Gpu) -> [u64; 2] {
+    let super::recorder::Recorded { dispatches, barriers } = &gpu.shared.recorded;
+    [dispatches, barriers].map(|count| count.load(Ordering::Relaxed))
 }
 
 /// A wrong wiring: of the pass's parameters, `bits` of 32-bit number `word` reach the device flipped.

@@ -118,6 +118,8 @@ mod tests {
             subgroup_size_is_selectable: true,
             max_storage_buffer_range: 1 << 27,
             max_workgroups: 65_535,
+            max_loop_iterations: u32::MAX,
+            timestamp_bits: 64,
             timestamp_period: 1.0,
             is_cpu: false,
             cooperative_matrix: None,

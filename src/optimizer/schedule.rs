@@ -61,7 +61,7 @@ impl<'de> Deserialize<'de> for LearningRates {
 }
 
 /// The schedules as functions of the step, counted from 1. The defaults are those of 3DGS (Kerbl et al. 2023) but for
-/// density control, which ends at step 5 000 and acts every 200 steps, as in LITA-GS.
+/// density control, which begins early, and for the first steps, which see small views.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Schedule {
@@ -71,6 +71,10 @@ pub struct Schedule {
     pub final_means_rate: f64,
     /// The steps over which the rate of the means decays exponentially.
     pub means_rate_steps: u64,
+    /// All rates but the opacity's begin at this many times themselves
+    pub boost: f64,
+    /// and fall to themselves, exponentially, over so many steps.
+    pub boost_steps: u64,
     /// The SH degree in use grows by one every so many steps, from 0.
     pub sh_degree_interval: u64,
     /// Density control acts after this step,
@@ -79,6 +83,8 @@ pub struct Schedule {
     pub densify_before: u64,
     /// and every so many steps.
     pub densify_interval: u64,
+    /// Views are a quarter of their width and height before the first of these steps, half before the second.
+    pub resolution_steps: [u64; 2],
     /// The weight of the near-camera damping is 1 before the first of these steps, 1/2 before the second, then 0.
     pub damping_steps: [u64; 2],
 }
@@ -89,22 +95,50 @@ impl Default for Schedule {
             initial_rates: LearningRates::default(),
             final_means_rate: 1.6e-6,
             means_rate_steps: 30_000,
+            boost: 4.0,
+            boost_steps: 600,
             sh_degree_interval: 1_000,
-            densify_after: 500,
-            densify_before: 5_000,
-            densify_interval: 200,
+            densify_after: 50,
+            densify_before: 3_000,
+            densify_interval: 100,
+            resolution_steps: [0, 200],
             damping_steps: [4_000, 7_000],
         }
     }
 }
 
 impl Schedule {
+    /// Density control acts between steps 500 and 5 000, every 200 steps, and every step sees whole views (LITA-GS).
+    pub fn paper() -> Self {
+        Self {
+            boost: 1.0,
+            boost_steps: 0,
+            densify_after: 500,
+            densify_before: 5_000,
+            densify_interval: 200,
+            resolution_steps: [0, 0],
+            ..Self::default()
+        }
+    }
+
+    /// For 700 steps: the budget is shared among the rounds of so short a run.
+    pub fn fast() -> Self {
+        Self { densify_before: 700, ..Self::default() }
+    }
+
     /// The rates of `step` in a scene of `extent`: the means' decay log-linearly, the others stay.
     pub fn learning_rates(&self, step: u64, extent: f64) -> LearningRates {
         let done = (step as f64 / self.means_rate_steps.max(1) as f64).min(1.0);
         let mut rates = self.initial_rates;
         let decay = (self.final_means_rate / rates[Attribute::Means]).powf(done);
         rates[Attribute::Means] = rates[Attribute::Means] * decay * extent;
+        let left = 1.0 - (step as f64 / self.boost_steps.max(1) as f64).min(1.0);
+        if left > 0.0 {
+            let boost = self.boost.powf(left);
+            let opacity = rates[Attribute::RawOpacities];
+            rates.0.iter_mut().for_each(|rate| *rate *= boost);
+            rates[Attribute::RawOpacities] = opacity;
+        }
         rates
     }
 
@@ -119,6 +153,26 @@ impl Schedule {
         step > self.densify_after
             && step < self.densify_before
             && step.is_multiple_of(self.densify_interval.max(1))
+    }
+
+    /// How often the views of `step` are halved.
+    pub fn resolution_level(&self, step: u64) -> usize {
+        match self.resolution_steps {
+            [quarter, _] if step < quarter => 2,
+            [_, half] if step < half => 1,
+            _ => 0,
+        }
+    }
+
+    /// How many levels of resolution the steps use.
+    pub fn resolution_levels(&self) -> usize {
+        1 + self.resolution_level(1)
+    }
+
+    /// How many rounds of density control there are from the end of `step` on, one there included.
+    pub fn rounds_left(&self, step: u64) -> u64 {
+        let interval = self.densify_interval.max(1);
+        self.densify_before.saturating_sub(1).saturating_sub(step) / interval + 1
     }
 
     /// The weight w of the near-camera damping of the screen gradients that density control reads: they are
@@ -138,7 +192,7 @@ mod tests {
 
     #[test]
     fn the_means_rate_decays_a_hundredfold_and_stays() {
-        let schedule = Schedule::default();
+        let schedule = Schedule::paper();
         let rate = |step| schedule.learning_rates(step, 2.0)[Attribute::Means];
         assert!((rate(0) - 3.2e-4).abs() < 1e-12);
         assert!((rate(15_000) - 3.2e-5).abs() < 1e-12);
@@ -158,9 +212,36 @@ mod tests {
 
     #[test]
     fn density_control_acts_strictly_inside_its_window() {
-        let schedule = Schedule::default();
+        let schedule = Schedule::paper();
         let steps: Vec<u64> = (0..=6_000).filter(|&step| schedule.densifies_at(step)).collect();
         assert_eq!((steps[0], steps[1], *steps.last().unwrap()), (600, 800, 4_800));
+    }
+
+    #[test]
+    fn the_rounds_left_fall_to_one() {
+        let schedule = Schedule::paper();
+        assert_eq!([600, 800, 4_600, 4_800].map(|step| schedule.rounds_left(step)), [22, 21, 2, 1]);
+    }
+
+    #[test]
+    fn a_boost_fades_and_leaves_the_rates_as_they_are() {
+        let schedule = Schedule { boost: 4.0, boost_steps: 100, ..Schedule::paper() };
+        let rate = |step| schedule.learning_rates(step, 1.0)[Attribute::Quats];
+        assert_eq!(schedule.learning_rates(0, 1.0)[Attribute::RawOpacities], 0.05);
+        assert!((rate(0) - 0.004).abs() < 1e-12 && (rate(50) - 0.002).abs() < 1e-12);
+        for step in [100, 5_000] {
+            assert_eq!(
+                schedule.learning_rates(step, 1.0),
+                Schedule::paper().learning_rates(step, 1.0)
+            );
+        }
+    }
+
+    #[test]
+    fn views_grow_to_their_size() {
+        let schedule = Schedule { resolution_steps: [10, 20], ..Schedule::paper() };
+        assert_eq!([1, 9, 10, 19, 20].map(|step| schedule.resolution_level(step)), [2, 2, 1, 1, 0]);
+        assert_eq!((schedule.resolution_levels(), Schedule::paper().resolution_levels()), (3, 1));
     }
 
     #[test]
@@ -181,5 +262,6 @@ mod tests {
         assert!(schedule.learning_rates(1, 1.0)[Attribute::Means].is_finite());
         assert_eq!(schedule.sh_degree(2, 3), 2);
         assert!(schedule.densifies_at(501));
+        assert!(schedule.rounds_left(1) > 0);
     }
 }

@@ -7,6 +7,7 @@ use super::splat::{Splat, fragments};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::ProjectedSplat;
 use crate::kernels::blend_forward::{Constants, Kernel, Params, Slices, Tolerances};
+use crate::kernels::status::STATUS_CROWDED;
 
 /// One pixel's channels and transmittance, from splats front to back with colours (splats, channels).
 pub fn blend_pixel(
@@ -60,6 +61,20 @@ impl TileList {
     }
 }
 
+/// Where the run of every tile lies among the sorted intersections, and how long it is.
+fn tile_runs(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Vec<(UVec2, u32)> {
+    let mut first = 0;
+    let tiles = 0..params.tile_columns * params.size.y.div_ceil(constants.tile_height);
+    let run = |tile| {
+        let rest = &slices.sorted_tiles[first..slices.counts[0] as usize];
+        let count = rest.iter().take_while(|&&other| other == tile).count();
+        let run = UVec2::new(first as u32, (first + count) as u32);
+        first += count;
+        (run, count as u32)
+    };
+    tiles.map(run).collect()
+}
+
 /// Calls `visit` with the list of every tile of the image and its pixels.
 fn for_each_tile(
     params: &Params,
@@ -67,11 +82,11 @@ fn for_each_tile(
     slices: &Slices<'_>,
     mut visit: impl FnMut(&TileList, &mut dyn Iterator<Item = UVec2>),
 ) {
-    let Slices { tile_ranges, sorted_slots, owners, splats, colors, .. } = slices;
+    let Slices { sorted_slots, owners, splats, colors, .. } = slices;
     let tile = UVec2::new(constants.tile_width, constants.tile_height);
-    for index in 0..params.tile_columns * params.size.y.div_ceil(tile.y) {
-        let range = tile_ranges[index as usize];
-        let slots = &sorted_slots[range.x as usize..range.y as usize];
+    for (index, (range, count)) in (0..).zip(tile_runs(params, constants, slices)) {
+        let shown = if count > params.longest_run { 0 } else { count };
+        let slots = &sorted_slots[range.x as usize..][..shown as usize];
         let list = TileList::new(constants.channels, slots, owners, splats, colors);
         visit(&list, &mut tile_pixels(index, params.tile_columns, tile, params.size));
     }
@@ -81,6 +96,14 @@ impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, mut slices: Slices<'_>) {
         let background = background(params, constants);
         let pixels = params.size.element_product() as usize;
+        for (tile, (run, count)) in tile_runs(params, constants, &slices).into_iter().enumerate() {
+            slices.tile_ranges[tile] = run;
+            if count > params.longest_run {
+                slices.tile_ranges[tile].y = run.x;
+                slices.status[0] |= STATUS_CROWDED;
+                slices.status[2] = slices.status[2].max(count);
+            }
+        }
         let (render, transmittances) =
             (std::mem::take(&mut slices.render), std::mem::take(&mut slices.transmittances));
         for_each_tile(params, constants, &slices, |list, tile| {
@@ -114,7 +137,11 @@ impl Reference for Kernel {
         });
         let of_channel = errors.iter().zip(largest_colors).map(|(error, color)| error * color);
         let render = of_channel.cycle().take(constants.channels as usize * pixels).collect();
-        Tolerances { render: Tolerance::Each(render), transmittances: Tolerance::Each(errors) }
+        Tolerances {
+            render: Tolerance::Each(render),
+            transmittances: Tolerance::Each(errors),
+            ..Tolerances::default()
+        }
     }
 }
 

@@ -1,13 +1,19 @@
+//! What comes of a Gaussian that multiplies.
+
 use std::f32::consts::TAU;
 
 use glam::{Quat, Vec3};
 
+use super::gaussian::sigmoid;
 use super::random::random_bits;
 use super::rounding::{TRIGONOMETRIC, UNIT};
 use crate::attributes::{Attribute, planes};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::densify_scatter::{Constants, Kernel, Params, Slices, Tolerances};
-use crate::kernels::fate::{FATE_CLONE, FATE_KEEP, FATE_SPLIT};
+use crate::kernels::fate::{
+    FATE_CLONE, FATE_KEEP, FATE_SPLIT, PAPER_LOG_SPLIT_FACTOR, SPLIT_ACROSS, SPLIT_ACROSS_SLOPE,
+    SPLIT_ALONG, SPLIT_ALONG_SLOPE, SPLIT_OFFSET, SPLIT_OPACITY, SPLIT_OPACITY_SLOPE,
+};
 
 fn random_uniform(key: u32) -> f32 {
     ((random_bits(key) >> 8) + 1) as f32 / 16_777_216.0
@@ -20,92 +26,148 @@ fn random_normal3(key: u32) -> Vec3 {
     Vec3::new(radius[0] * angle[0].cos(), radius[0] * angle[0].sin(), radius[1] * angle[1].cos())
 }
 
-/// The copies of every Gaussian: whose, which, where they go, and whether each is new.
-fn copies<'a>(
-    params: &Params,
-    slices: &'a Slices<'_>,
-) -> impl Iterator<Item = (usize, u32, usize, bool)> + use<'a> {
-    (0..params.gaussian_count as usize).flat_map(move |i| {
-        let fate = slices.fates[i];
+/// One of what comes of a Gaussian.
+pub(super) struct Copy {
+    pub(super) of: usize,
+    /// The first or the second.
+    index: u32,
+    pub(super) to: usize,
+    pub(super) is_new: bool,
+}
+
+/// The copies of all `count` Gaussians.
+pub(super) fn copies<'a>(
+    count: usize,
+    fates: &'a [u32],
+    offsets: &'a [u32],
+) -> impl Iterator<Item = Copy> + use<'a> {
+    (0..count).flat_map(move |of| {
+        let fate = fates[of];
         let count = match fate {
             FATE_CLONE | FATE_SPLIT => 2,
             FATE_KEEP => 1,
             _ => 0,
         };
-        (0..count).map(move |copy| {
-            let to = slices.offsets[i] as usize + copy as usize;
-            (i, copy, to, fate == FATE_SPLIT || copy > 0)
+        (0..count).map(move |index| {
+            let to = offsets[of] as usize + index as usize;
+            Copy { of, index, to, is_new: fate == FATE_SPLIT || index > 0 }
         })
     })
 }
 
-/// A draw from the normal distribution that Gaussian `i` is.
-fn draw_mean(params: &Params, parameters: &[f32], i: usize, copy: u32) -> Vec3 {
-    let n = params.gaussian_count as usize;
-    let first = |attribute: Attribute| attribute.column(0) * n;
-    let mean = Vec3::from_slice(&parameters[first(Attribute::Means) + 3 * i..]);
-    let quat = &parameters[first(Attribute::Quats) + 4 * i..];
-    let quat = Quat::from_xyzw(quat[1], quat[2], quat[3], quat[0]);
-    let rotation = if quat.length() > 1e-12 { quat.normalize() } else { Quat::IDENTITY };
-    let scales = Vec3::from_slice(&parameters[first(Attribute::LogScales) + 3 * i..]).exp();
-    let step_key = random_bits(random_bits(params.seed).wrapping_add(params.step));
-    let key = random_bits(step_key.wrapping_add(2 * i as u32 + copy));
-    mean + rotation * (scales * random_normal3(key))
+/// What density control changes of a Gaussian.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Shape {
+    /// World units.
+    pub mean: Vec3,
+    /// ln of the standard deviations, in world units.
+    pub log_scales: Vec3,
+    /// Before the sigmoid.
+    pub raw_opacity: f32,
 }
 
-/// Where the planes of means and log scales of `count` Gaussians begin.
-fn drawn(count: usize) -> [usize; 2] {
-    [Attribute::Means, Attribute::LogScales].map(|attribute| attribute.column(0) * count)
+/// One half of a Gaussian, which `rotation` turns, along its longest axis: the first or the second.
+pub fn half_of(parent: &Shape, rotation: Quat, copy: u32) -> Shape {
+    let log_scales = parent.log_scales;
+    let (axis, longest) = (log_scales.max_position(), log_scales.max_element());
+    let opacity = sigmoid(f64::from(parent.raw_opacity));
+    let new_opacity = opacity * (SPLIT_OPACITY + SPLIT_OPACITY_SLOPE * opacity);
+    let mut factors = Vec3::splat((SPLIT_ACROSS + SPLIT_ACROSS_SLOPE * opacity) as f32);
+    factors[axis] = (SPLIT_ALONG + SPLIT_ALONG_SLOPE * opacity) as f32;
+    let offset = (if copy == 0 { SPLIT_OFFSET } else { -SPLIT_OFFSET }) as f32 * longest.exp();
+    Shape {
+        mean: parent.mean + rotation * (Vec3::AXES[axis] * offset),
+        log_scales: log_scales + factors.ln(),
+        raw_opacity: (new_opacity / (1.0 - new_opacity)).ln() as f32,
+    }
+}
+
+/// A Gaussian whose position is drawn from the normal distribution that `parent` is.
+fn drawn(parent: &Shape, rotation: Quat, is_split: bool, key: u32) -> Shape {
+    let shrink = if is_split { PAPER_LOG_SPLIT_FACTOR as f32 } else { 0.0 };
+    Shape {
+        mean: parent.mean + rotation * (parent.log_scales.exp() * random_normal3(key)),
+        log_scales: parent.log_scales - shrink,
+        ..*parent
+    }
+}
+
+/// Where the planes of what density control changes begin, of `count` Gaussians.
+fn changed(count: usize) -> [usize; 3] {
+    [Attribute::Means, Attribute::LogScales, Attribute::RawOpacities]
+        .map(|attribute| attribute.column(0) * count)
+}
+
+fn shape(parameters: &[f32], count: usize, i: usize) -> Shape {
+    let [means, log_scales, raw_opacities] = changed(count);
+    Shape {
+        mean: Vec3::from_slice(&parameters[means + 3 * i..]),
+        log_scales: Vec3::from_slice(&parameters[log_scales + 3 * i..]),
+        raw_opacity: parameters[raw_opacities + i],
+    }
+}
+
+fn rotation(parameters: &[f32], count: usize, i: usize) -> Quat {
+    let quat = &parameters[Attribute::Quats.column(0) * count + 4 * i..];
+    let quat = Quat::from_xyzw(quat[1], quat[2], quat[3], quat[0]);
+    if quat.length() > 1e-12 { quat.normalize() } else { Quat::IDENTITY }
 }
 
 impl Reference for Kernel {
-    fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
+    fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
         let (n, new_n) = (params.gaussian_count as usize, params.new_gaussian_count as usize);
         let [features, columns] = [params.feature_count, params.column_count].map(|n| n as usize);
-        let all: Vec<_> = copies(params, &slices).collect();
-        for (i, copy, to, is_new) in all {
+        let step_key = random_bits(random_bits(params.seed).wrapping_add(params.step));
+        for Copy { of: i, index, to, is_new } in copies(n, slices.fates, slices.offsets) {
             for (column, width) in planes(features, columns) {
                 for k in 0..width {
-                    let source = column * n + width * i + k;
-                    let target = column * new_n + width * to + k;
-                    let kept = |moments: &[f32]| if is_new { 0.0 } else { moments[source] };
-                    slices.new_parameters[target] = slices.parameters[source];
-                    slices.new_first_moments[target] = kept(slices.first_moments);
-                    slices.new_second_moments[target] = kept(slices.second_moments);
+                    slices.new_parameters[column * new_n + width * to + k] =
+                        slices.parameters[column * n + width * i + k];
                 }
             }
             if !is_new {
                 continue;
             }
-            let mean = draw_mean(params, slices.parameters, i, copy);
-            let [means, log_scales] = drawn(new_n);
+            let parent = shape(slices.parameters, n, i);
+            let rotation = rotation(slices.parameters, n, i);
+            let child = if constants.conserving {
+                half_of(&parent, rotation, index)
+            } else {
+                let key = random_bits(step_key.wrapping_add(2 * i as u32 + index));
+                drawn(&parent, rotation, slices.fates[i] == FATE_SPLIT, key)
+            };
+            let [means, log_scales, raw_opacities] = changed(new_n);
             for k in 0..3 {
-                slices.new_parameters[means + 3 * to + k] = mean[k];
-                if slices.fates[i] == FATE_SPLIT {
-                    slices.new_parameters[log_scales + 3 * to + k] -= 1.6f32.ln();
-                }
+                slices.new_parameters[means + 3 * to + k] = child.mean[k];
+                slices.new_parameters[log_scales + 3 * to + k] = child.log_scales[k];
             }
+            slices.new_parameters[raw_opacities + to] = child.raw_opacity;
         }
     }
 
-    /// Drawn positions are off by a cosine's error, which scales and the radius of the draw, 5.8 at most, magnify; what
+    /// Drawn positions are off by a cosine's error, which scales and the radius of the draw, 5.8 at most, magnify; those
+    /// of a half by what an exponential and the axes are off by, its opacity by what the logarithm of a quotient is. What
     /// else there is is copied.
-    fn tolerances(params: &Params, _: &Constants, slices: Slices<'_>) -> Tolerances {
+    fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let (n, new_n) = (params.gaussian_count as usize, params.new_gaussian_count as usize);
         let mut bounds = vec![0.0; slices.new_parameters.len()];
-        for (i, _, to, _) in copies(params, &slices).filter(|&(.., is_new)| is_new) {
-            let ([means, log_scales], [new_means, new_log_scales]) = (drawn(n), drawn(new_n));
-            let log_scales = &slices.parameters[log_scales + 3 * i..][..3];
-            let scale: f64 = log_scales.iter().map(|&log| f64::from(log).exp()).sum();
+        for Copy { of: i, to, .. } in copies(n, slices.fates, slices.offsets).filter(|c| c.is_new) {
+            let parent = shape(slices.parameters, n, i);
+            let [means, log_scales, raw_opacities] = changed(new_n);
+            let scale: f64 =
+                parent.log_scales.to_array().map(|log| f64::from(log).exp()).iter().sum();
             for k in 0..3 {
-                let mean = f64::from(slices.parameters[means + 3 * i + k].abs());
-                let roundings = (64.0 + 8.0 * f64::from(log_scales[k].abs())) * UNIT;
-                bounds[new_means + 3 * to + k] =
-                    5.8 * scale * (TRIGONOMETRIC + roundings) + 2.0 * UNIT * mean;
-                bounds[new_log_scales + 3 * to + k] =
-                    4.0 * UNIT * f64::from(log_scales[k].abs() + 1.0);
+                let log_scale = f64::from(parent.log_scales[k].abs());
+                let roundings = (64.0 + 8.0 * log_scale) * UNIT;
+                bounds[means + 3 * to + k] = 5.8 * scale * (TRIGONOMETRIC + roundings)
+                    + 2.0 * UNIT * f64::from(parent.mean[k].abs());
+                bounds[log_scales + 3 * to + k] = 16.0 * UNIT * (log_scale + 1.0);
+            }
+            if constants.conserving {
+                let raw_opacity = f64::from(parent.raw_opacity.abs());
+                bounds[raw_opacities + to] = 64.0 * UNIT * (raw_opacity + 1.0);
             }
         }
-        Tolerances { new_parameters: Tolerance::Each(bounds), ..Tolerances::default() }
+        Tolerances { new_parameters: Tolerance::Each(bounds) }
     }
 }

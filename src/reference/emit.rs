@@ -17,45 +17,65 @@ fn covered(params: &Params, constants: &Constants, splat: &ProjectedSplat) -> Ve
     (top..bottom).flat_map(row).collect()
 }
 
-/// The rank of every Gaussian that has slots, with these.
-fn ranks<'a>(
+/// The Gaussian of every rank, with its slots.
+fn reserved(
     params: &Params,
-    slices: &'a Slices<'_>,
-) -> impl Iterator<Item = (usize, std::ops::Range<usize>)> + use<'a> {
-    (0..params.gaussian_count as usize).filter_map(|rank| {
-        let first = slices.offsets[rank];
-        let end = first.wrapping_add(slices.ordered_counts[rank]);
-        let has_slots = end != first && end <= slices.counts[0];
-        has_slots.then_some((rank, first as usize..end as usize))
-    })
+    constants: &Constants,
+    slices: &Slices<'_>,
+) -> Vec<(u32, std::ops::Range<u32>)> {
+    let mut next = 0u32;
+    let ranks = 0..params.gaussian_count as usize;
+    let one = |rank| {
+        if rank % constants.partition_size as usize == 0 {
+            next = slices.sums[rank / constants.partition_size as usize];
+        }
+        let first = next;
+        next = next.wrapping_add(slices.ordered_counts[rank]);
+        let is_counted = first <= next && next <= slices.counts[0];
+        (slices.sorted_ids[rank], first..if is_counted { next } else { first })
+    };
+    ranks.map(one).collect()
 }
 
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
-        let all: Vec<_> = ranks(params, &slices).collect();
-        for (rank, reserved) in all {
-            let id = slices.sorted_ids[rank];
-            let covered = covered(params, constants, &slices.splats[id as usize]);
+        for (id, reserved) in reserved(params, constants, &slices) {
+            let first = reserved.start;
+            let covered = match reserved.is_empty() {
+                true => vec![],
+                false => covered(params, constants, &slices.splats[id as usize]),
+            };
+            let count = reserved.len().min(covered.len()) as u32;
+            slices.emitted[id as usize] = UVec2::new(first, first + count);
             let padding = std::iter::repeat(NO_TILE);
             for (slot, tile) in reserved.zip(covered.into_iter().chain(padding)) {
-                slices.tiles[slot] = tile;
-                slices.slots[slot] = slot as u32;
-                slices.owners[slot] = id;
+                slices.tiles[slot as usize] = tile;
+                slices.slots[slot as usize] = slot;
+                slices.owners[slot as usize] = id;
             }
         }
     }
 
     /// Where a border of the ellipse lies within rounding of that of a tile, its Gaussian may or may not cover the tile.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
-        let mut bounds = vec![0.0; slices.tiles.len()];
-        for (rank, reserved) in ranks(params, &slices) {
-            let splat = &slices.splats[slices.sorted_ids[rank] as usize];
+        let mut tiles = vec![0.0; slices.tiles.len()];
+        let mut emitted = vec![0.0; 2 * slices.emitted.len()];
+        for (id, reserved) in reserved(params, constants, &slices) {
+            if reserved.is_empty() {
+                continue;
+            }
+            let splat = &slices.splats[id as usize];
             let exact = covered(params, constants, splat);
             if moved(splat).iter().any(|splat| covered(params, constants, splat) != exact) {
-                bounds[reserved].fill(f64::INFINITY);
+                tiles[reserved.start as usize..reserved.end as usize].fill(f64::INFINITY);
+                emitted[2 * id as usize + 1] = reserved.len() as f64;
             }
         }
-        Tolerances { tiles: Tolerance::Each(bounds), ..Tolerances::default() }
+        Tolerances {
+            tiles: Tolerance::Each(tiles),
+            emitted: Tolerance::Each(emitted),
+            ..Tolerances::default()
+        }
     }
 }
 

@@ -1,14 +1,27 @@
 use crate::gpu::Reference;
 use crate::kernels::order_counts::{Constants, Kernel, Params, Slices};
+use crate::kernels::status::STATUS_OVERFLOWED;
 
 impl Reference for Kernel {
-    fn run(
-        params: &Params,
-        _: &Constants,
-        Slices { sorted_ids, tile_counts, ordered_counts }: Slices<'_>,
-    ) {
-        for rank in 0..params.gaussian_count as usize {
+    fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
+        let Slices { sorted_ids, tile_counts, ordered_counts, sums, counts, status, .. } = slices;
+        let (count, partition_size) =
+            (params.gaussian_count as usize, constants.partition_size as usize);
+        sums[0] = 0;
+        let mut total = 0u64;
+        for rank in 0..count {
+            if rank % partition_size == 0 {
+                sums[rank / partition_size] = total as u32;
+            }
             ordered_counts[rank] = tile_counts[sorted_ids[rank] as usize];
+            total += u64::from(ordered_counts[rank]);
         }
+        let total = u32::try_from(total).unwrap_or(u32::MAX);
+        let fits = total <= params.capacity;
+        counts[0] = if fits { total } else { 0 };
+        if !fits {
+            status[0] |= STATUS_OVERFLOWED;
+        }
+        status[1] = status[1].max(total);
     }
 }

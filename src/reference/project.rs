@@ -9,7 +9,7 @@ use super::sh::sh_basis;
 use super::splat::{Splat, extent_error, splat_level, splat_tile_rows, splat_tiles};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::ProjectedSplat;
-use crate::kernels::project::{CULLED, Constants, Kernel, Params, Slices, Tolerances};
+use crate::kernels::project::{CULLED, Constants, Kernel, NEAREST, Params, Slices, Tolerances};
 use crate::kernels::splat::{ALPHA_MIN, DILATION};
 
 /// What one Gaussian is on the image plane.
@@ -88,6 +88,13 @@ impl Projection {
         let ([w, h], [r, g, blue]) = (self.half_extent.to_array(), self.color.to_array());
         [x, y, a, b, c, opacity, w, h, r, g, blue, self.depth]
     }
+}
+
+/// By what visible Gaussians are sorted.
+fn depth_key(depth: f32, near: f32) -> u32 {
+    let nearest = near.max(NEAREST as f32);
+    let beyond = depth.max(nearest).to_bits() - nearest.to_bits();
+    (beyond >> 4).min(CULLED - 1)
 }
 
 /// The tiles of an image that a splat covers.
@@ -231,7 +238,7 @@ impl Reference for Kernel {
             }
             tile_counts[i] = tile_count(params, constants, &splats[i]);
             if tile_counts[i] > 0 {
-                depth_keys[i] = (projection.depth as f32).to_bits();
+                depth_keys[i] = depth_key(projection.depth as f32, params.near);
             }
         }
     }
@@ -257,13 +264,13 @@ impl Reference for Kernel {
             let count = tile_count(params, constants, &stored);
             let [fewest, most] = scene.tile_counts(&stored, &errors);
             tile_counts[i] = (count - count.min(fewest)).max(most.max(count) - count).into();
-            // The keys of positive numbers are as far apart as these in units of the last place.
+            // The keys of positive numbers are as far apart as these in sixteenths of units of the last place.
             let depth = projection.depth as f32;
             let last_place = f64::from(depth.next_up()) - f64::from(depth);
             depth_keys[i] = match (fewest, most) {
                 (_, 0) => 0.0,
                 (0, _) => f64::INFINITY,
-                _ => 1.0 + errors[11] / last_place,
+                _ => 1.0 + (1.0 + errors[11] / last_place) / 16.0,
             };
         }
         Tolerances {

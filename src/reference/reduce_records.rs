@@ -1,24 +1,50 @@
-use crate::gpu::Reference;
-use crate::kernels::reduce_records::{Constants, Kernel, Params, Slices};
+use super::rounding::{UNIT, chain};
+use crate::gpu::{Reference, Tolerance};
+use crate::kernels::reduce_records::{Constants, Kernel, Params, Slices, Tolerances};
+use crate::kernels::shared_slots::SHARED_SLOTS;
 use crate::kernels::splat::RECORD_HEAD;
 
-impl Reference for Kernel {
-    fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
-        let Slices { counts, sorted_ids, ordered_counts, offsets, records, d_splats } = slices;
-        let record = (RECORD_HEAD + constants.channels) as usize;
-        for rank in 0..params.gaussian_count as usize {
-            let d_splat = &mut d_splats[record * sorted_ids[rank] as usize..][..record];
-            d_splat.fill(0.0);
-            let first = offsets[rank] as usize;
-            let end = first + ordered_counts[rank] as usize;
-            if end > counts[0] as usize {
-                continue;
-            }
-            for slot in first..end {
-                for k in 0..record {
-                    d_splat[k] += records[record * slot + k];
-                }
-            }
+/// Calls `add` with every number of every Gaussian, the slots of the Gaussian, and where the slot has the number.
+fn for_each_number(
+    params: &Params,
+    constants: &Constants,
+    slices: &mut Slices<'_>,
+    mut add: impl FnMut(&mut f32, &mut dyn Iterator<Item = f32>, usize),
+) {
+    let record = (RECORD_HEAD + constants.channels) as usize;
+    for i in 0..params.gaussian_count as usize {
+        let range = slices.emitted[i];
+        for k in 0..record {
+            let slots = range.x as usize..range.y as usize;
+            let count = slots.len();
+            let mut numbers = slots.map(|slot| slices.records[record * slot + k]);
+            add(&mut slices.d_splats[record * i + k], &mut numbers, count);
         }
+    }
+}
+
+impl Reference for Kernel {
+    fn run(params: &Params, constants: &Constants, mut slices: Slices<'_>) {
+        for_each_number(params, constants, &mut slices, |d_splat, numbers, count| {
+            // In f32 what the kernel adds up in this very order.
+            *d_splat = match count as u32 {
+                0..=SHARED_SLOTS => numbers.fold(0.0, |sum, number| sum + number),
+                _ => numbers.map(f64::from).sum::<f64>() as f32,
+            };
+        });
+    }
+
+    /// The lanes of a subgroup add up the slots of a Gaussian that has many, in an order that is the device's.
+    fn tolerances(params: &Params, constants: &Constants, mut slices: Slices<'_>) -> Tolerances {
+        let mut bounds = vec![];
+        for_each_number(params, constants, &mut slices, |_, numbers, count| {
+            bounds.push(match count as u32 {
+                0..=SHARED_SLOTS => 0.0,
+                _ => {
+                    UNIT * chain(count) * numbers.map(|number| f64::from(number.abs())).sum::<f64>()
+                }
+            });
+        });
+        Tolerances { d_splats: Tolerance::Each(bounds) }
     }
 }

@@ -7,13 +7,12 @@ impl Reference for Kernel {
             slices;
         let count = counts[params.count_index as usize].min(params.capacity) as usize;
         let partition_size = constants.partition_size as usize;
-        let (digit_count, partition_count) =
-            (1 << params.digit_bits, count.div_ceil(partition_size));
-        for part in 0..partition_count {
+        let digit_count = 1 << params.digit_bits;
+        for part in 0..count.div_ceil(partition_size) {
             let mut next_place = vec![0; digit_count];
             let mut running = 0;
             for digit in 0..digit_count {
-                next_place[digit] = running + table[digit * partition_count + part];
+                next_place[digit] = running + table[part * digit_count + digit];
                 running += digit_totals[digit];
             }
             for i in part * partition_size..count.min((part + 1) * partition_size) {

@@ -6,10 +6,13 @@ use crate::Result;
 use crate::gpu::{Buffer, Gpu};
 use crate::kernels::ProjectedSplat;
 use crate::kernels::splat::RECORD_HEAD;
-use crate::kernels::status::{STATUS_NOT_FINITE, STATUS_OVERFLOWED, STATUS_WORDS};
+use crate::kernels::status::{STATUS_CROWDED, STATUS_NOT_FINITE, STATUS_OVERFLOWED, STATUS_WORDS};
 
 /// The first guess of how many tiles a Gaussian meets; a view that needs more makes the memory grow.
 const TILES_PER_GAUSSIAN: u32 = 6;
+
+/// How many depth ranks one subgroup counts the tiles of. Small: `emit` sums up what precedes a rank within them.
+pub(super) const RANKS_PER_PARTITION: u32 = 256;
 
 /// What the status words say.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -20,6 +23,8 @@ pub struct Status {
     pub not_finite: bool,
     /// The most intersections that a render had since the status was cleared.
     pub intersections: u32,
+    /// The most splats of one tile, where the device cannot follow so many; else 0.
+    pub crowd: u32,
 }
 
 impl Status {
@@ -30,6 +35,7 @@ impl Status {
             overflowed: word(0) & STATUS_OVERFLOWED != 0,
             not_finite: word(0) & STATUS_NOT_FINITE != 0,
             intersections: word(1),
+            crowd: if word(0) & STATUS_CROWDED == 0 { 0 } else { word(2) },
         }
     }
 }
@@ -50,7 +56,9 @@ pub struct Frame {
     pub ids: Buffer<u32>,
     pub tile_counts: Buffer<u32>,
     pub ordered_counts: Buffer<u32>,
-    pub offsets: Buffer<u32>,
+    /// One per partition of ranks.
+    pub sums: Buffer<u32>,
+    pub emitted: Buffer<UVec2>,
     pub d_splats: Buffer<f32>,
     // intersections
     pub tiles: Buffer<u32>,
@@ -62,9 +70,10 @@ pub struct Frame {
     pub transmittances: Buffer<f32>,
     pub tile_ranges: Buffer<UVec2>,
     // single numbers
-    pub total: Buffer<u32>,
     pub counts: Buffer<u32>,
     pub status: Buffer<u32>,
+    /// Workgroups of `order_counts` that are done; 0 between renders.
+    pub arrivals: Buffer<u32>,
 }
 
 impl Frame {
@@ -80,7 +89,8 @@ impl Frame {
             ids: gpu.uninit("ids", 0)?,
             tile_counts: gpu.uninit("tile_counts", 0)?,
             ordered_counts: gpu.uninit("ordered_counts", 0)?,
-            offsets: gpu.uninit("offsets", 0)?,
+            sums: gpu.uninit("sums", 1)?,
+            emitted: gpu.uninit("emitted", 0)?,
             d_splats: gpu.uninit("d_splats", 0)?,
             tiles: gpu.uninit("tiles", 0)?,
             slots: gpu.uninit("slots", 0)?,
@@ -89,31 +99,37 @@ impl Frame {
             render: gpu.uninit("render", 0)?,
             transmittances: gpu.uninit("transmittances", 0)?,
             tile_ranges: gpu.uninit("tile_ranges", 0)?,
-            total: gpu.zeros("total", 1)?,
             counts: gpu.zeros("counts", 1)?,
             status: gpu.zeros("status", STATUS_WORDS as usize)?,
+            arrivals: gpu.zeros("arrivals", 1)?,
         })
     }
 
-    /// Lengths follow the number of Gaussians exactly; pixels only grow; intersections begin with a guess.
+    /// Lengths only grow: to `capacity` where they do not suffice for `count` Gaussians, which render from now on;
+    /// intersections begin with a guess.
     pub(super) fn reserve(
         &mut self,
         gpu: &Gpu,
-        count: usize,
+        [count, capacity]: [usize; 2],
         pixels: usize,
         tiles: usize,
     ) -> Result<()> {
-        if self.gaussian_count as usize != count || self.splats.len() != count {
+        if self.gaussian_count as usize != count {
+            self.gaussian_count = count as u32;
+            gpu.write(&mut self.gaussian_counts, &[count as u32])?;
+        }
+        if self.splats.len() < count {
+            let count = capacity.max(count);
             self.splats = gpu.uninit("splats", count)?;
             self.colors = gpu.uninit("colors", self.channels * count)?;
             self.depth_keys = gpu.uninit("depth_keys", count)?;
             self.ids = gpu.uninit("ids", count)?;
             self.tile_counts = gpu.uninit("tile_counts", count)?;
             self.ordered_counts = gpu.uninit("ordered_counts", count)?;
-            self.offsets = gpu.uninit("offsets", count)?;
+            let partitions = (count as u32).div_ceil(RANKS_PER_PARTITION).max(1);
+            self.sums = gpu.uninit("sums", partitions as usize)?;
+            self.emitted = gpu.uninit("emitted", count)?;
             self.d_splats = gpu.uninit("d_splats", self.record() * count)?;
-            self.gaussian_count = count as u32;
-            gpu.write(&mut self.gaussian_counts, &[count as u32])?;
         }
         if self.render.len() < self.channels * pixels {
             self.render = gpu.uninit("render", self.channels * pixels)?;

@@ -1,6 +1,6 @@
 //! The radix sort: least significant digit first, up to 8 bits a pass.
 
-use super::{Count, DispatchArguments, common_len};
+use super::{Count, common_len};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::digit::MAX_DIGIT_BITS;
@@ -14,9 +14,17 @@ pub struct RadixSort {
     spine: Pipeline<sort_spine::Kernel>,
     downsweep: Pipeline<sort_downsweep::Kernel>,
     partition_size: u32,
-    arguments: DispatchArguments,
+    /// With more partitions, the spine is a pass of its own.
+    folded_partitions: u32,
+    /// Workgroups of an upsweep that are done; 0 between upsweeps.
+    arrivals: Buffer<u32>,
     scratch: Scratch,
 }
+
+/// One subgroup makes the prefix sums of so many partitions in less time than a pass of its own costs. A processor has
+/// no other lanes that would do it at the same time.
+const FOLDED_PARTITIONS_ON_A_GPU: u32 = 16;
+const FOLDED_PARTITIONS_ON_A_CPU: u32 = 1024;
 
 /// What a sort needs beside the pairs themselves.
 #[derive(Debug)]
@@ -24,7 +32,7 @@ struct Scratch {
     /// Each pass writes the pairs here, then these and the caller's buffers change places.
     keys: Buffer<u32>,
     values: Buffer<u32>,
-    /// (digits, partitions)
+    /// (partitions, digits)
     table: Buffer<u32>,
     /// (digits)
     digit_totals: Buffer<u32>,
@@ -45,7 +53,12 @@ impl RadixSort {
             downsweep: gpu
                 .pipeline(&sort_downsweep::Constants { partition_size, rank_by_ballot })?,
             partition_size,
-            arguments: DispatchArguments::new(gpu)?,
+            folded_partitions: if gpu.properties().is_cpu {
+                FOLDED_PARTITIONS_ON_A_CPU
+            } else {
+                FOLDED_PARTITIONS_ON_A_GPU
+            },
+            arrivals: gpu.zeros("sort_arrivals", 1)?,
             scratch: Scratch::new(gpu, capacity, partition_size)?,
         })
     }
@@ -65,11 +78,11 @@ impl RadixSort {
         values: &mut Buffer<u32>,
         bits: u32,
     ) -> Result<()> {
+        count.check()?;
         let capacity = common_len("sort", &[keys.len(), values.len()])?;
         if self.scratch.keys.len() != keys.len() {
             self.scratch = Scratch::new(&self.gpu, capacity, self.partition_size)?;
         }
-        self.arguments.record(pass, count, self.partition_size, capacity)?;
         for (shift, digit_bits) in digits(bits) {
             self.record_pass(pass, count, keys, values, shift, digit_bits)?;
             std::mem::swap(keys, &mut self.scratch.keys);
@@ -91,18 +104,29 @@ impl RadixSort {
         let capacity = common_len("sort", &[keys.len(), values.len()])?;
         let Scratch { keys: sorted_keys, values: sorted_values, table, digit_totals } =
             &mut self.scratch;
+        let arrivals = &mut self.arrivals;
+        let partitions = capacity.div_ceil(self.partition_size);
+        let folds_spine = partitions <= self.folded_partitions;
         pass.dispatch(
             &self.upsweep,
-            &sort_upsweep::Params { count_index, capacity, shift, digit_bits },
-            sort_upsweep::Buffers { counts, keys, table },
-            self.arguments.threads(),
+            &sort_upsweep::Params {
+                count_index,
+                capacity,
+                shift,
+                digit_bits,
+                folds_spine: folds_spine.into(),
+            },
+            sort_upsweep::Buffers { counts, keys, table, digit_totals, arrivals },
+            Threads::Workgroups([partitions, 1, 1]),
         )?;
-        pass.dispatch(
-            &self.spine,
-            &sort_spine::Params { count_index, capacity, digit_bits },
-            sort_spine::Buffers { counts, table, digit_totals },
-            Threads::Workgroups([1 << digit_bits, 1, 1]),
-        )?;
+        if !folds_spine {
+            pass.dispatch(
+                &self.spine,
+                &sort_spine::Params { count_index, capacity, digit_bits },
+                sort_spine::Buffers { counts, table, digit_totals },
+                Threads::Workgroups([1 << digit_bits, 1, 1]),
+            )?;
+        }
         pass.dispatch(
             &self.downsweep,
             &sort_downsweep::Params { count_index, capacity, shift, digit_bits },
@@ -115,7 +139,7 @@ impl RadixSort {
                 sorted_keys,
                 sorted_values,
             },
-            self.arguments.threads(),
+            Threads::Workgroups([partitions, 1, 1]),
         )
     }
 }

@@ -1,8 +1,8 @@
 //! The exclusive scan: where each item's output begins, from how much output it has.
 
-use super::{Count, DispatchArguments, common_len};
+use super::{Count, common_len};
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
-use crate::kernels::{scan_downsweep, scan_spine, scan_upsweep};
+use crate::kernels::{scan_downsweep, scan_upsweep};
 use crate::{Error, Result};
 
 /// Exclusive prefix sums of `u32` values, modulo 2^32.
@@ -10,12 +10,12 @@ use crate::{Error, Result};
 pub struct Scan {
     gpu: Gpu,
     upsweep: Pipeline<scan_upsweep::Kernel>,
-    spine: Pipeline<scan_spine::Kernel>,
     downsweep: Pipeline<scan_downsweep::Kernel>,
     partition_size: u32,
-    arguments: DispatchArguments,
     /// (partitions)
     sums: Buffer<u32>,
+    /// Workgroups of an upsweep that are done; 0 between upsweeps.
+    arrivals: Buffer<u32>,
 }
 
 impl Scan {
@@ -28,11 +28,10 @@ impl Scan {
         Ok(Self {
             gpu: gpu.clone(),
             upsweep: gpu.pipeline(&scan_upsweep::Constants { partition_size })?,
-            spine: gpu.pipeline(&scan_spine::Constants { partition_size })?,
             downsweep: gpu.pipeline(&scan_downsweep::Constants { partition_size })?,
             partition_size,
-            arguments: DispatchArguments::new(gpu)?,
-            sums: gpu.uninit("scan_sums", capacity.div_ceil(partition_size) as usize)?,
+            sums: gpu.uninit("scan_sums", capacity.div_ceil(partition_size).max(1) as usize)?,
+            arrivals: gpu.zeros("scan_arrivals", 1)?,
         })
     }
 
@@ -56,29 +55,24 @@ impl Scan {
             let problem = format!("scan: buffer `{name}` is empty; give the total one element");
             return Err(Error::Usage(problem));
         }
-        let partitions = capacity.div_ceil(self.partition_size) as usize;
-        if self.sums.len() < partitions {
-            self.sums = self.gpu.uninit("scan_sums", partitions)?;
+        count.check()?;
+        let partitions = capacity.div_ceil(self.partition_size).max(1);
+        if self.sums.len() < partitions as usize {
+            self.sums = self.gpu.uninit("scan_sums", partitions as usize)?;
         }
         let Count { counts, index: count_index } = count;
-        self.arguments.record(pass, count, self.partition_size, capacity)?;
+        let (sums, arrivals) = (&mut self.sums, &mut self.arrivals);
         pass.dispatch(
             &self.upsweep,
             &scan_upsweep::Params { count_index, capacity },
-            scan_upsweep::Buffers { counts, values, sums: &mut self.sums },
-            self.arguments.threads(),
-        )?;
-        pass.dispatch(
-            &self.spine,
-            &scan_spine::Params { count_index, capacity },
-            scan_spine::Buffers { counts, sums: &mut self.sums, total },
-            Threads::Workgroups([1, 1, 1]),
+            scan_upsweep::Buffers { counts, values, sums, total, arrivals },
+            Threads::Workgroups([partitions, 1, 1]),
         )?;
         pass.dispatch(
             &self.downsweep,
             &scan_downsweep::Params { count_index, capacity },
             scan_downsweep::Buffers { counts, values, sums: &self.sums, offsets },
-            self.arguments.threads(),
+            Threads::Workgroups([partitions, 1, 1]),
         )
     }
 }

@@ -55,9 +55,12 @@ impl Trainer {
         let metadata = HashMap::from([(HEADER.to_owned(), header)]);
         let mut downloads = vec![];
         for State { name, shape, buffer } in self.state() {
-            downloads.push((name, shape, gpu.read(buffer)?));
+            let mut values = gpu.read(buffer)?;
+            values.truncate(shape.iter().product());
+            downloads.push((name, shape, values));
         }
-        let visits = gpu.read(&self.model.visit_counts)?;
+        let mut visits = gpu.read(&self.model.visit_counts)?;
+        visits.truncate(self.model.count());
         let view = |name: &str, shape: &[usize], dtype, bytes| -> std::io::Result<_> {
             let view = TensorView::new(dtype, shape.to_vec(), bytes);
             Ok((name.to_owned(), view.map_err(std::io::Error::other)?))

@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::parts::ModelConfig;
 use super::streams;
 use crate::dataset::{Dataset, DepthOptions, LoadOptions};
+use crate::densify::DensityControl;
 use crate::loss::LossConfig;
 use crate::optimizer::Schedule;
 use crate::random::Stream;
@@ -38,7 +39,8 @@ impl std::str::FromStr for Background {
     }
 }
 
-/// A training run. The defaults are the paper's protocol for LOM.
+/// A training run. The defaults are the paper's protocol for LOM but for density control and its schedule, which reach the
+/// same score in less time ([`super::Preset::Lom`] has the paper's).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct TrainConfig {
@@ -98,9 +100,11 @@ pub struct CheckConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DensityConfig {
+    /// What comes of those that multiply.
+    pub control: DensityControl,
     /// Mean norm of the screen-space gradient, in normalised device units, from which a Gaussian multiplies.
     pub gradient_threshold: f64,
-    /// Larger than this fraction of the extent: split; smaller: cloned.
+    /// Larger than this fraction of the extent: split; smaller: cloned. Of the paper's control alone.
     pub split_scale: f64,
     /// Fainter Gaussians are removed.
     pub min_opacity: f64,
@@ -134,7 +138,19 @@ impl Default for TrainConfig {
 
 impl Default for DensityConfig {
     fn default() -> Self {
-        Self { gradient_threshold: 2e-4, split_scale: 0.01, min_opacity: 0.005 }
+        Self {
+            control: DensityControl::Conserving,
+            gradient_threshold: 4e-4,
+            split_scale: 0.01,
+            min_opacity: 0.005,
+        }
+    }
+}
+
+impl DensityConfig {
+    /// Those of LITA-GS.
+    pub fn paper() -> Self {
+        Self { control: DensityControl::Paper, gradient_threshold: 2e-4, ..Self::default() }
     }
 }
 
@@ -253,6 +269,12 @@ impl TrainConfig {
                 density.gradient_threshold,
                 density.gradient_threshold > 0.0,
                 "above 0",
+            ),
+            (
+                "schedule.boost",
+                self.schedule.boost,
+                (1e-3..=1e3).contains(&self.schedule.boost),
+                "0.001 to 1000",
             ),
         ];
         for (name, value, holds, rule) in rules {

@@ -1,12 +1,13 @@
 //! The Gaussians in training, on the device.
 
 use crate::Result;
-use crate::densify::{Densifier, DensifyReport, DeviceGaussians, GradientStatistics};
+use crate::densify::{Densifier, DensifyInputs, DensifyReport, DeviceGaussians, Round};
 use crate::gpu::{Buffer, Gpu};
 use crate::optimizer::Moments;
 use crate::scene::{Gaussians, Shape, width};
 
-/// Planes of every attribute with their moments and gradients, and the statistics of density control.
+/// Planes of every attribute with their moments and gradients, and the statistics of density control. Buffers are as long
+/// as the Gaussians need or longer.
 #[derive(Debug)]
 pub(super) struct Model {
     pub(super) gaussians: DeviceGaussians,
@@ -59,7 +60,12 @@ impl Model {
         self.gaussians.count as usize
     }
 
-    /// One pass of density control after `step`; the statistics begin anew.
+    /// How many Gaussians the buffers have room for.
+    pub(super) fn capacity(&self) -> usize {
+        self.grad_norm_sums.len()
+    }
+
+    /// One round of density control; the statistics begin anew.
     ///
     /// # Errors
     /// The device is out of memory or lost.
@@ -67,21 +73,32 @@ impl Model {
         &mut self,
         gpu: &Gpu,
         densifier: &mut Densifier,
-        step: u64,
+        round: Round,
     ) -> Result<DensifyReport> {
-        let statistics = GradientStatistics {
+        let inputs = DensifyInputs {
             grad_norm_sums: &self.grad_norm_sums,
             visit_counts: &self.visit_counts,
+            gradients: &mut self.gradients,
         };
-        let (gaussians, report) = densifier.densify(&self.gaussians, statistics, step)?;
-        *self = Self::new(gpu, gaussians, self.shape)?;
+        let report = densifier.densify(&mut self.gaussians, inputs, round)?;
+        let capacity = self.gradients.len() / (self.gaussians.column_count as usize).max(1);
+        if self.capacity() < self.count() {
+            self.grad_norm_sums = gpu.uninit("grad_norm_sums", capacity)?;
+            self.visit_counts = gpu.uninit("visit_counts", capacity)?;
+        }
+        gpu.run("clear_statistics", |pass| {
+            pass.fill(&mut self.grad_norm_sums, 0);
+            pass.fill(&mut self.visit_counts, 0);
+            Ok(())
+        })?;
         Ok(report)
     }
 
     /// # Errors
     /// The device was lost.
     pub(super) fn download(&self, gpu: &Gpu) -> Result<Gaussians> {
-        let parameters = gpu.read(&self.gaussians.parameters)?;
+        let mut parameters = gpu.read(&self.gaussians.parameters)?;
+        parameters.truncate(self.count() * width(self.shape));
         Ok(Gaussians { count: self.count(), shape: self.shape, parameters })
     }
 }

@@ -1,15 +1,20 @@
-//! Presets: every constant that the paper and its code state for a benchmark.
+//! Presets: how much time a run takes for its score, and every constant that the paper and its code state for a benchmark.
 
 use std::str::FromStr;
 
-use super::TrainConfig;
+use super::{DensityConfig, TrainConfig};
 use crate::attributes::Attribute;
+use crate::optimizer::Schedule;
 use crate::tone::ToneCurve;
 use crate::{Error, Result};
 
-/// A benchmark that the paper reports.
+/// A trade of time for quality, or a benchmark that the paper reports.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Preset {
+    /// The defaults.
+    Balanced,
+    /// A good score in few steps.
+    Fast,
     /// LOM: `bike`, `buu`, `chair`, `shrub`, `sofa`.
     Lom,
     /// The low-light scenes of `RealX3D`.
@@ -20,20 +25,37 @@ pub enum Preset {
 
 impl Preset {
     /// Every preset.
-    pub const ALL: [Self; 3] = [Self::Lom, Self::RealX3d, Self::Mip360Varying];
+    pub const ALL: [Self; 5] =
+        [Self::Balanced, Self::Fast, Self::Lom, Self::RealX3d, Self::Mip360Varying];
 
     /// The name on the command line.
     pub fn name(self) -> &'static str {
         match self {
+            Self::Balanced => "balanced",
+            Self::Fast => "fast",
             Self::Lom => "lom",
             Self::RealX3d => "realx3d",
             Self::Mip360Varying => "mip360-varying",
         }
     }
 
-    /// Sets what the paper states for the benchmark and, where its code has a file for the scene that the dataset's
+    /// Sets density control and schedule; of a benchmark also what the paper states for it and, where its code has a file for the scene that the dataset's
     /// folder is named after, what that file states. c is that of the configuration's curve.
     pub fn apply(self, config: &mut TrainConfig) {
+        match self {
+            Self::Balanced => {
+                (config.schedule, config.density) = (Schedule::default(), DensityConfig::default());
+            }
+            Self::Fast => {
+                config.steps = FAST_STEPS;
+                (config.schedule, config.density) = (Schedule::fast(), DensityConfig::default());
+            }
+            Self::Lom | Self::RealX3d | Self::Mip360Varying => self.apply_benchmark(config),
+        }
+    }
+
+    fn apply_benchmark(self, config: &mut TrainConfig) {
+        (config.schedule, config.density) = (Schedule::paper(), DensityConfig::paper());
         let curve = config.tone.curve;
         let of_curve = |ase: f64, ap3: f64| match curve {
             ToneCurve::Ase => ase,
@@ -43,7 +65,7 @@ impl Preset {
         let gain_c = match self {
             Self::Lom => of_curve(3.0, 1.0),
             Self::RealX3d => of_curve(4.0, 2.0),
-            Self::Mip360Varying => of_curve(0.0, 0.0),
+            _ => of_curve(0.0, 0.0),
         };
         let tone = &mut config.tone;
         (tone.gain_c, tone.alpha, tone.beta, tone.base_gain) = (gain_c, 0.12, 2.5, 1.0);
@@ -78,6 +100,9 @@ impl Preset {
     }
 }
 
+/// The steps of [`Preset::Fast`].
+const FAST_STEPS: u64 = 700;
+
 impl FromStr for Preset {
     type Err = Error;
 
@@ -94,6 +119,7 @@ mod tests {
     use std::path::Path;
 
     use super::*;
+    use crate::densify::DensityControl;
     use crate::tone::ToneSettings;
 
     fn applied(preset: Preset, scene: &str, curve: ToneCurve) -> TrainConfig {
@@ -104,10 +130,23 @@ mod tests {
         config
     }
 
+    const BENCHMARKS: [Preset; 3] = [Preset::Lom, Preset::RealX3d, Preset::Mip360Varying];
+
+    #[test]
+    fn benchmarks_have_the_density_control_of_the_paper_and_nothing_else_has() {
+        for preset in Preset::ALL {
+            let config = applied(preset, "x", ToneCurve::Ap3);
+            let is_paper = config.density.control == DensityControl::Paper;
+            assert_eq!(is_paper, BENCHMARKS.contains(&preset), "{preset:?}");
+            assert_eq!(is_paper, config.schedule.densify_after == 500, "{preset:?}");
+            config.check().unwrap();
+        }
+        assert_eq!(applied(Preset::Balanced, "x", ToneCurve::None).schedule, Schedule::default());
+    }
+
     #[test]
     fn c_follows_benchmark_and_curve() {
-        for (preset, [ase, ap3]) in
-            Preset::ALL.into_iter().zip([[3.0, 1.0], [4.0, 2.0], [0.0, 0.0]])
+        for (preset, [ase, ap3]) in BENCHMARKS.into_iter().zip([[3.0, 1.0], [4.0, 2.0], [0.0, 0.0]])
         {
             assert_eq!(applied(preset, "x", ToneCurve::Ase).tone.gain_c, ase);
             assert_eq!(applied(preset, "x", ToneCurve::Ap3).tone.gain_c, ap3);

@@ -26,6 +26,8 @@ pub(super) struct TrainView {
     /// Index into the dataset's views.
     index: usize,
     pub(super) camera: Camera,
+    /// Depth from elsewhere, (H, W), where the dataset's is of another size.
+    depth: Option<Vec<f32>>,
     /// The dark photograph, planar (3, H, W), sRGB-encoded.
     pub(super) image: Buffer<f32>,
     /// The target, where the loss does not evaluate the curve.
@@ -34,42 +36,64 @@ pub(super) struct TrainView {
     pub(super) tone: Buffer<ToneParameters>,
 }
 
-/// All training views, in the dataset's order.
+/// All training views in the dataset's order, as they are and then by level of the resolution schedule, each half the
+/// size of the one before.
 #[derive(Debug)]
-pub(super) struct Views(Vec<TrainView>);
+pub(super) struct Views(Vec<Vec<TrainView>>);
+
+/// A view whose shorter side would fall below this is not shrunk any more, in pixels.
+const SHORTEST_SIDE: u32 = 32;
 
 impl Views {
-    /// Uploads every training photograph and takes its statistics once.
-    pub(super) fn upload(gpu: &Gpu, pseudo_gt: &mut PseudoGt, dataset: &Dataset) -> Result<Self> {
-        let (mut views, mut statistics) = (Vec::<TrainView>::new(), vec![]);
-        for (index, view) in dataset.views.iter().enumerate() {
-            let Some(image) = view.image.as_ref().filter(|_| view.is_train()) else { continue };
-            let pixels = gpu.buffer("low", &image.data)?;
-            gpu.run("statistics", |pass| {
-                pseudo_gt.statistics(pass, &pixels, [image.width, image.height])
-            })?;
-            let measured = pseudo_gt.measured()?;
-            statistics.push(measured);
-            views.push(TrainView {
-                name: view.name.clone(),
-                number: views.len(),
-                index,
-                camera: view.camera,
-                image: pixels,
-                baked: None,
-                tone: gpu.buffer("tone", &[pseudo_gt.settings().parameters(&measured)])?,
-            });
+    /// Uploads every training photograph in as many sizes as there are levels, and takes its statistics once.
+    pub(super) fn upload(
+        gpu: &Gpu,
+        pseudo_gt: &mut PseudoGt,
+        dataset: &Dataset,
+        levels: usize,
+    ) -> Result<Self> {
+        let photographs = dataset.views.iter().enumerate();
+        let photographs: Vec<_> = photographs
+            .filter(|(_, view)| view.is_train())
+            .filter_map(|(index, view)| view.image.as_ref().map(|image| (index, view, image)))
+            .collect();
+        let (mut views, mut statistics) = (vec![], vec![]);
+        views.resize_with(levels, Vec::<TrainView>::new);
+        for (place, &(index, view, image)) in photographs.iter().enumerate() {
+            for (level, views) in views.iter_mut().enumerate() {
+                let size = shrunk(UVec2::new(image.width, image.height), level as u32);
+                let own = image.resized(size.x, size.y);
+                let pixels = gpu.buffer("low", &own.data)?;
+                if level == 0 {
+                    gpu.run("statistics", |pass| {
+                        pseudo_gt.statistics(pass, &pixels, [image.width, image.height])
+                    })?;
+                    statistics.push(pseudo_gt.measured()?);
+                }
+                let depth = view.depth.as_ref().filter(|_| level > 0);
+                views.push(TrainView {
+                    name: view.name.clone(),
+                    number: level * photographs.len() + place,
+                    index,
+                    camera: view.camera.resized(size.x, size.y),
+                    depth: depth.map(|depth| resized_plane(depth, image, size)),
+                    image: pixels,
+                    baked: None,
+                    tone: gpu
+                        .buffer("tone", &[pseudo_gt.settings().parameters(&statistics[place])])?,
+                });
+            }
         }
         let settings = pseudo_gt.settings();
         if let Some(scene) = Statistics::mean_of(&statistics).filter(|_| settings.scene_statistics)
         {
             let parameters = settings.parameters(&scene);
-            for view in &mut views {
+            for view in views.iter_mut().flatten() {
                 gpu.write(&mut view.tone, &[parameters])?;
             }
         }
         if settings.needs_baking() {
-            for view in &mut views {
+            for view in views.iter_mut().flatten() {
                 view.bake(gpu, pseudo_gt)?;
             }
         }
@@ -85,33 +109,34 @@ impl Views {
     ) -> Vec<ViewSource<'a>> {
         let source = |view: &'a TrainView| ViewSource {
             size: view.size(),
-            depth: dataset.views[view.index].depth.as_deref(),
+            depth: view.depth.as_deref().or(dataset.views[view.index].depth.as_deref()),
             target: Box::new(|| view.target(gpu, pseudo_gt)),
         };
-        self.0.iter().map(source).collect()
+        self.0.iter().flatten().map(source).collect()
     }
 
-    /// The view that a step trains on: every epoch takes each view once, in an order of its own.
-    pub(super) fn of_step(&self, seed: u64, step: u64) -> &TrainView {
-        let count = self.0.len() as u64;
+    /// The view that a step trains on, at one of the levels: every epoch takes each view once, in an order of its own.
+    pub(super) fn of_step(&self, seed: u64, step: u64, level: usize) -> &TrainView {
+        let views = &self.0[level];
+        let count = views.len() as u64;
         let (epoch, place) = ((step - 1) / count, (step - 1) % count);
         let stream = Stream::new(seed, streams::VIEWS);
         // Fisher-Yates from the end; the picks of an epoch only depend on its number.
-        let mut order: Vec<usize> = (0..self.0.len()).collect();
+        let mut order: Vec<usize> = (0..views.len()).collect();
         for left in (1..count).rev() {
             let draw = stream.bits(epoch * count + left) % (left + 1);
             order.swap(left as usize, draw as usize);
         }
-        &self.0[order[place as usize]]
+        &views[order[place as usize]]
     }
 
     pub(super) fn cameras(&self) -> impl Iterator<Item = &Camera> {
-        self.0.iter().map(|view| &view.camera)
+        self.0.iter().flatten().map(|view| &view.camera)
     }
 
-    /// Width and height of every view.
+    /// Width and height of every view, unshrunk.
     pub(super) fn sizes(&self) -> Vec<UVec2> {
-        self.0.iter().map(TrainView::size).collect()
+        self.0.first().into_iter().flatten().map(TrainView::size).collect()
     }
 
     /// One Gaussian per point of the dataset, or per random point where there is none, coloured as the targets of the
@@ -137,7 +162,7 @@ impl Views {
         };
         let kept = &points[..points.len().min(config.max_gaussians)];
         let colors = init::colors_from_views(kept, &dataset.views, |index| {
-            let view = self.0.iter().find(|view| view.index == index);
+            let view = self.0.iter().flatten().find(|view| view.index == index);
             view.map(|view| view.target_image(gpu, pseudo_gt)).transpose()
         })?;
         let positions: Vec<DVec3> = kept.iter().map(|point| point.position).collect();
@@ -145,6 +170,20 @@ impl Views {
         let shape = Shape { sh_degree: config.sh_degree, features: config.model.features() };
         init::from_points(&positions, &colors, shape, seed)
     }
+}
+
+/// A size halved as often as its level says and its shorter side allows.
+fn shrunk(size: UVec2, level: u32) -> UVec2 {
+    let suits = |&level: &u32| level == 0 || (size >> level).min_element() >= SHORTEST_SIDE;
+    (0..=level).rev().find(suits).map_or(size, |level| size >> level)
+}
+
+/// A plane of the size of `image` at another size: the means of the areas.
+fn resized_plane(plane: &[f32], image: &Image, size: UVec2) -> Vec<f32> {
+    let Image { width, height, .. } = *image;
+    let mut data = Image { width, height, data: plane.repeat(3) }.resized(size.x, size.y).data;
+    data.truncate(size.x as usize * size.y as usize);
+    data
 }
 
 impl TrainView {

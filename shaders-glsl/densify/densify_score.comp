@@ -1,0 +1,56 @@
+#version 460
+#extension GL_GOOGLE_include_directive : require
+#include "kernel.glsl"
+#include "gaussian.glsl"
+#include "fate.glsl"
+
+//! Densify score: one thread per Gaussian makes the key that orders it by how much it asks to multiply.
+//!
+//! To go: fainter than the minimum or with a parameter that is not finite. Of the rest, those whose screen-space
+//! gradient, averaged over the steps that saw them, exceeds the threshold are candidates (Kerbl et al. 2023, section
+//! 5.2). Reference: `src/reference/densify_score.rs`.
+
+layout(local_size_x = 64) in;
+
+layout(push_constant) uniform Params {
+    uint  gaussian_count;
+    uint  column_count;
+    uint  feature_count;
+    float gradient_threshold;  // mean norm in normalised device units; exceeded, not met
+    float min_raw_opacity;     // before the sigmoid
+};
+
+layout(binding = 0) readonly  buffer Parameters   { float parameters[]; };      // planes
+layout(binding = 1) readonly  buffer GradNormSums { float grad_norm_sums[]; };  // (gaussian_count)
+layout(binding = 2) readonly  buffer VisitCounts  { uint visit_counts[]; };     // (gaussian_count)
+layout(binding = 3) writeonly buffer Keys         { uint keys[]; };             // (gaussian_count), KEY_*
+layout(binding = 4) writeonly buffer Ids          { uint ids[]; };              // (gaussian_count)
+layout(binding = 5) buffer Tally { uint tally[]; };                             // TALLY_*, zero before
+
+// Positive phrasing: a NaN fails the test.
+bool is_sound(uint i) {
+    if (!(parameters[RAW_OPACITIES_COLUMN * gaussian_count + i] >= min_raw_opacity)) return false;
+    for (uint plane = 0; plane < PLANE_COUNT; ++plane) {
+        uint column = plane_column(plane, feature_count, column_count);
+        uint width = plane_column(plane + 1, feature_count, column_count) - column;
+        uint first = column * gaussian_count + width * i;
+        for (uint k = 0; k < width; ++k) if (!(abs(parameters[first + k]) < 3e38)) return false;
+    }
+    return true;
+}
+
+void main() {
+    uint i = THREAD_INDEX;
+    if (i >= gaussian_count) return;
+    float mean_gradient = visit_counts[i] > 0 ? grad_norm_sums[i] / float(visit_counts[i]) : 0.0;
+    uint key = KEY_PRUNE;
+    if (is_sound(i)) key = mean_gradient > gradient_threshold ? KEY_TOP - floatBitsToUint(mean_gradient) : KEY_KEEP;
+    keys[i] = key;
+    ids[i] = i;
+    uint candidates = subgroupAdd(key < KEY_KEEP ? 1u : 0u);
+    uint pruned = subgroupAdd(key == KEY_PRUNE ? 1u : 0u);
+    if (subgroupElect()) {
+        atomicAdd(tally[TALLY_CANDIDATES], candidates);
+        atomicAdd(tally[TALLY_PRUNED], pruned);
+    }
+}

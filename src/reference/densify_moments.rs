@@ -1,0 +1,20 @@
+use super::densify_scatter::copies;
+use crate::attributes::planes;
+use crate::gpu::Reference;
+use crate::kernels::densify_moments::{Constants, Kernel, Params, Slices};
+
+impl Reference for Kernel {
+    fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
+        let (n, new_n) = (params.gaussian_count as usize, params.new_gaussian_count as usize);
+        let [features, columns] = [params.feature_count, params.column_count].map(|n| n as usize);
+        for copy in copies(n, slices.fates, slices.offsets) {
+            for (column, width) in planes(features, columns) {
+                for k in 0..width {
+                    let moment = slices.moments[column * n + width * copy.of + k];
+                    slices.new_moments[column * new_n + width * copy.to + k] =
+                        if copy.is_new { 0.0 } else { moment };
+                }
+            }
+        }
+    }
+}

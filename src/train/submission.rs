@@ -1,0 +1,158 @@
+//! Steps in submissions: while the device works on one, the next is recorded.
+//!
+//! A submission is long enough to be worth it and short enough for the watchdog of a slow device. How steps are grouped
+//! and how many submissions are in flight changes no bit: a step that cannot be done raises a flag on the device, and
+//! those behind it change nothing until the host has answered it.
+
+use std::collections::VecDeque;
+use std::ops::RangeInclusive;
+use std::time::{Duration, Instant};
+
+use super::{StepReport, Trainer};
+use crate::gpu::Download;
+use crate::loss::{LossLogDownload, StepLosses};
+use crate::render::Status;
+use crate::{Error, Result};
+
+/// Steps that one submission holds at most.
+pub(super) const MOST_STEPS: u64 = 64;
+/// What a submission is to take.
+const SUBMISSION: Duration = Duration::from_millis(50);
+/// Whoever trains hears of it about this often.
+const STRETCH: Duration = Duration::from_millis(500);
+/// One runs, one waits for it.
+const IN_FLIGHT: usize = 2;
+
+/// How steps are grouped, by what the last submission took.
+#[derive(Debug)]
+pub(super) struct Pace {
+    in_flight: usize,
+    /// As many steps always, where a test says so.
+    steps: Option<u64>,
+    step: Duration,
+    last_done: Instant,
+}
+
+impl Default for Pace {
+    fn default() -> Self {
+        Self { in_flight: IN_FLIGHT, steps: None, step: SUBMISSION, last_done: Instant::now() }
+    }
+}
+
+impl Pace {
+    /// Steps of the next submission.
+    fn steps(&self) -> u64 {
+        let fitting = SUBMISSION.as_secs_f64() / self.step.as_secs_f64().max(1e-6);
+        self.steps.unwrap_or(fitting as u64).clamp(1, MOST_STEPS)
+    }
+
+    /// Takes the time of a submission that is done: from when the device was free for it.
+    fn measure(&mut self, submitted: Instant, steps: u64) {
+        let done = Instant::now();
+        let took = done.duration_since(submitted.max(self.last_done));
+        (self.step, self.last_done) = (took / steps.max(1) as u32, done);
+    }
+}
+
+/// Steps on their way through the device.
+struct Submitted {
+    steps: RangeInclusive<u64>,
+    at: Instant,
+    log: LossLogDownload,
+    status: Download<u32>,
+}
+
+impl Trainer {
+    /// Has always so many submissions in flight, of so many steps each; none: as long as suits the device.
+    #[doc(hidden)]
+    pub fn set_pace(&mut self, in_flight: usize, steps: Option<u64>) {
+        self.pace = Pace { in_flight: in_flight.max(1), steps, ..Pace::default() };
+    }
+
+    /// Trains up to `until`, to the next step of density control, or for about half a second.
+    pub(super) fn submit_steps(&mut self, until: u64) -> Result<Vec<StepReport>> {
+        let (begin, mut next) = (Instant::now(), self.step + 1);
+        let until = until.min(self.config.steps);
+        // Density control may change the number of Gaussians.
+        let last = (next..until).find(|&step| self.densifies_at(step)).unwrap_or(until);
+        let (mut in_flight, mut reports) = (VecDeque::new(), vec![]);
+        loop {
+            while next <= last && in_flight.len() < self.pace.in_flight {
+                let has_news = !(reports.is_empty() && in_flight.is_empty());
+                if has_news && begin.elapsed() > STRETCH {
+                    break;
+                }
+                let steps = next..=last.min(next + self.pace.steps() - 1);
+                next = steps.end() + 1;
+                in_flight.push_back(self.submit(steps)?);
+            }
+            let Some(oldest) = in_flight.pop_front() else { break };
+            // What is in flight behind a step that failed changes nothing.
+            if !self.finish(oldest, &mut reports)? {
+                break;
+            }
+        }
+        if !reports.is_empty() && self.densifies_at(self.step) {
+            self.control_density()?;
+        }
+        Ok(reports)
+    }
+
+    fn submit(&mut self, steps: RangeInclusive<u64>) -> Result<Submitted> {
+        let gpu = self.gpu.clone();
+        let (first, mut downloads) = (*steps.start(), None);
+        gpu.submit("steps", |pass| {
+            self.log.clear(pass);
+            for step in steps.clone() {
+                self.record_step(pass, step, (step - first) as u32)?;
+            }
+            downloads = Some((self.log.download(pass)?, pass.download(self.renderer.status())?));
+            Ok(())
+        })?;
+        let Some((log, status)) = downloads else {
+            return Err(Error::Usage(
+                "steps that were not recorded cannot be waited for".to_owned(),
+            ));
+        };
+        Ok(Submitted { steps, at: Instant::now(), log, status })
+    }
+
+    /// Waits for a submission and reports its steps; false where one has to be done again.
+    fn finish(&mut self, submitted: Submitted, reports: &mut Vec<StepReport>) -> Result<bool> {
+        let Submitted { steps, at, log, status } = submitted;
+        let (log, status) = (log.wait()?, Status::from_words(&status.wait()?));
+        let count = steps.end() - steps.start() + 1;
+        self.pace.measure(at, count);
+        // The steps from the first failed one on have changed nothing.
+        let done = log.iter().take(count as usize).take_while(|losses| losses.status == 0).count();
+        let milliseconds = self.pace.step.as_secs_f64() * 1e3 * count as f64 / done.max(1) as f64;
+        let losses = steps.zip(&log[..done]);
+        reports.extend(losses.map(|(step, losses)| self.report(step, losses, milliseconds)));
+        self.step += done as u64;
+        if done == count as usize {
+            return Ok(true);
+        }
+        self.answer(status, &log[done])?;
+        Ok(false)
+    }
+
+    /// Does what a raised flag asks for, before the next step is done again.
+    fn answer(&mut self, status: Status, losses: &StepLosses) -> Result<()> {
+        let step = self.step + 1;
+        let view = || self.view_of(step).name.clone();
+        if status.overflowed {
+            self.renderer.grow(status.intersections)?;
+            let renderer = &mut self.renderer;
+            return self.gpu.clone().run("clear_status", |pass| {
+                renderer.clear_status(pass);
+                Ok(())
+            });
+        }
+        if status.crowd > 0 {
+            let view = format!("step {step}, view {}", view());
+            return Err(self.renderer.too_crowded(view, status.crowd));
+        }
+        let what = losses.first_not_finite().map_or("the loss", |term| term.name).to_owned();
+        Err(Error::NotFinite { step, view: view(), what })
+    }
+}
