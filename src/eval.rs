@@ -41,7 +41,8 @@ pub struct Player {
 }
 
 impl Player {
-    /// Uploads `gaussians`, whose colours are `raw_colors` or as viewers show them; `networks` belong to them.
+    /// Uploads `gaussians`, whose colours are `raw_colors` or as viewers show them; `networks` belong to them. Their run's
+    /// `tile` is taken where it suits the device.
     ///
     /// # Errors
     /// The device is out of memory or lost.
@@ -49,10 +50,12 @@ impl Player {
         gpu: &Gpu,
         gaussians: &Gaussians,
         raw_colors: bool,
+        tile: Option<[u32; 2]>,
         networks: Option<Networks>,
     ) -> Result<Self> {
         let shape = gaussians.shape;
-        let settings = RenderSettings { shape, raw_colors, ..RenderSettings::default() };
+        let tile = tile.filter(|&tile| gpu.properties().suits_tile(tile));
+        let settings = RenderSettings { shape, raw_colors, tile, ..RenderSettings::default() };
         Ok(Self {
             parameters: gpu.buffer("parameters", &gaussians.parameters)?,
             count: gaussians.count,

@@ -16,14 +16,16 @@ mod kernel;
 mod pipeline;
 mod recorder;
 mod requirements;
+mod statistics;
 mod submission;
 #[doc(hidden)]
 pub mod testing;
+mod tuning;
 mod validation;
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::thread::{self, ThreadId};
 
 use ash::{ext, khr, vk};
@@ -36,7 +38,9 @@ pub use kernel::{Binding, Bound, Kernel, Reference};
 pub use pipeline::Pipeline;
 pub use recorder::{Recorder, Threads};
 pub use requirements::{REQUIREMENTS, Requirement, required_device_features};
+pub use statistics::Statistic;
 pub use submission::{PassTime, Submission};
+pub use tuning::{TUNE_VARIABLE, TunedTile};
 
 use crate::{Error, Result};
 
@@ -71,6 +75,8 @@ pub struct Properties {
     pub is_cpu: bool,
     /// Products of 16-bit matrices; none where the device does not offer them or a host lends it.
     pub cooperative_matrix: Option<CooperativeMatrix>,
+    /// Kernels can be asked for their registers and spills; never of a device that a host lends.
+    pub tells_statistics: bool,
 }
 
 /// Everything that buffers, pipelines and submissions need to outlive their [`Gpu`].
@@ -80,6 +86,8 @@ struct Shared {
     push_descriptor: khr::push_descriptor::Device,
     /// Labels; absent where the instance does not offer them.
     debug: Option<ext::debug_utils::Device>,
+    /// Statistics of compiled kernels; absent where the device does not tell them.
+    executables: Option<khr::pipeline_executable_properties::Device>,
     allocator: Mutex<Option<gpu_allocator::vulkan::Allocator>>,
     queue: Mutex<Queue>,
     progress: Mutex<Progress>,
@@ -92,6 +100,8 @@ struct Shared {
     /// The threads whose submissions are checked.
     checks: checked::Checks,
     pipeline_cache: vk::PipelineCache,
+    /// What the file of the fastest tiles says; read when it is first asked.
+    tuned_tiles: OnceLock<Vec<TunedTile>>,
     /// What we created around the device and destroy with it; nothing for a borrowed device.
     owned: Option<device::Owned>,
 }

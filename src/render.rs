@@ -13,7 +13,7 @@ mod frame;
 use glam::UVec2;
 
 use crate::camera::Camera;
-use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
+use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Statistic, Threads};
 use crate::image::Image;
 use crate::kernels::project::DEPTH_BITS;
 use crate::kernels::splat::MAX_CHANNELS;
@@ -41,7 +41,7 @@ pub struct RenderSettings {
     pub shape: Shape,
     /// Colours are the bare SH sum, which can be negative, as in LITA-GS, instead of max(SH + 0.5, 0).
     pub raw_colors: bool,
-    /// The tile that one subgroup owns, in pixels; none: what suits the device.
+    /// The tile that one subgroup owns, in pixels; none: what is fastest on the device.
     pub tile: Option<[u32; 2]>,
 }
 
@@ -59,13 +59,25 @@ const CPU_TILE_CHANNELS: usize = 5;
 const CPU_SMALL_TILE: [u32; 2] = [8, 8];
 
 impl RenderSettings {
-    /// The tile on this device, in pixels.
-    pub fn tile_on(&self, gpu: &Gpu) -> [u32; 2] {
-        self.tile.unwrap_or(match self.channels() {
+    /// The tile on this device, in pixels: that of these settings, else the one that was measured to be the fastest
+    /// there ([`Gpu::tuned_tile`]), else what such devices are known to like.
+    ///
+    /// # Errors
+    /// The tile has no whole number of rows of lanes, or more than 32.
+    pub fn tile_on(&self, gpu: &Gpu) -> Result<[u32; 2]> {
+        let built_in = match self.channels() {
             _ if !gpu.properties().is_cpu => GPU_TILE,
             0..=CPU_TILE_CHANNELS => CPU_TILE,
             _ => CPU_SMALL_TILE,
-        })
+        };
+        let tile = self.tile.or_else(|| gpu.tuned_tile(self.channels())).unwrap_or(built_in);
+        if gpu.properties().suits_tile(tile) {
+            return Ok(tile);
+        }
+        let ([width, height], lanes) = (tile, gpu.properties().subgroup_size);
+        let remedy = format!("1 to 32 times {lanes} pixels; without `tile` the device chooses");
+        let problem = format!("{width}x{height} tiles do not suit {lanes} lanes");
+        Err(Error::Usage(format!("{problem}; take a tile of {remedy}")))
     }
 
     /// Values per pixel of a render: RGB and the features.
@@ -145,17 +157,9 @@ impl Renderer {
     /// Builds the kernels; memory comes with [`Renderer::reserve`].
     ///
     /// # Errors
-    /// The driver refuses a kernel, or the tile has more than 32 rows of lanes.
+    /// The driver refuses a kernel, or the tile does not suit the device.
     pub fn new(gpu: &Gpu, settings: RenderSettings) -> Result<Self> {
-        let [tile_width, tile_height] = settings.tile_on(gpu);
-        let lanes = gpu.properties().subgroup_size;
-        let pixels = tile_width.saturating_mul(tile_height);
-        if pixels == 0 || pixels % lanes != 0 || pixels / lanes > 32 {
-            let what = format!("{tile_width}x{tile_height} tiles do not suit {lanes} lanes");
-            return Err(Error::Usage(format!(
-                "{what}; take a tile of as many pixels, or of up to 32 times as many"
-            )));
-        }
+        let [tile_width, tile_height] = settings.tile_on(gpu)?;
         let channels = settings.channels() as u32;
         let (alpha_max, sh_degree) = (settings.max_alpha, settings.shape.sh_degree);
         let (raw_colors, partition_size) = (settings.raw_colors, RANKS_PER_PARTITION);
@@ -247,6 +251,15 @@ impl Renderer {
     /// How much of the background the last render lets through, (H, W): 1 where no splat is.
     pub fn transmittances(&self) -> &Buffer<f32> {
         &self.frame.transmittances
+    }
+
+    /// What the driver tells of the blend kernels, forward and backward; none where it tells nothing.
+    ///
+    /// # Errors
+    /// The driver refuses a kernel.
+    pub fn blend_statistics(&self) -> Result<Option<[Vec<Statistic>; 2]>> {
+        let forward = self.blend_forward.statistics()?;
+        Ok(forward.zip(self.blend_backward.statistics()?).map(<[_; 2]>::from))
     }
 
     /// Everything that the passes of the last render handed each other.

@@ -26,7 +26,7 @@ use crate::optimizer::{Adam, AdamBuffers, Learnable};
 use crate::pseudo_gt::PseudoGt;
 use crate::random::Stream;
 use crate::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer};
-use crate::scene::{Gaussians, Shape, width};
+use crate::scene::{Gaussians, width};
 use crate::{Error, Result};
 
 pub use config::{Background, CheckConfig, DensityConfig, TrainConfig};
@@ -185,12 +185,7 @@ impl Trainer {
     ) -> Result<Self> {
         config.check()?;
         config.leave_out_what_is_missing(dataset);
-        let shape = Shape { sh_degree: config.sh_degree, features: config.model.features() };
-        let settings = RenderSettings {
-            shape,
-            raw_colors: config.model.raw_colors,
-            ..RenderSettings::default()
-        };
+        let settings = config.render_settings();
         let density = density(&config, dataset.extent());
         thread::scope(|scope| {
             // The driver compiles on another thread while the views are uploaded and looked at.

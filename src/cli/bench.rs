@@ -1,7 +1,9 @@
-//! `nightsplat bench`: check a step against the CPU references pass by pass, then time its kernels and stages.
+//! `nightsplat bench`: check a step against the CPU references pass by pass, then time its kernels and stages, or find
+//! the fastest tiles.
 
 mod scene;
 mod stages;
+mod tune;
 
 use std::collections::BTreeMap;
 use std::io::Write;
@@ -17,31 +19,39 @@ use scene::Scene;
 
 /// Check a training step against the CPU references, pass by pass, then time its kernels and its stages.
 ///
-/// The scene is the same every time. Bounds are those of two processor cores at the default size.
+/// The scene is the same every time. Bounds are those of two processor cores at the default size. With --tune, it times
+/// the rasteriser with every tile that suits the device instead, and keeps the fastest in the user's cache folder;
+/// training takes them from there unless `NIGHTSPLAT_TUNE=off`.
 #[derive(Clone, Debug, clap::Args)]
 pub struct BenchArgs {
     /// Print JSON instead of tables: device, driver, largest errors, kernels, groups and the step
     #[arg(long)]
     pub json: bool,
+    /// Find the fastest tiles of the device, for 3 and 11 channels, and keep them
+    #[arg(long)]
+    pub tune: bool,
     /// The device: a part of its name or its index in `nightsplat doctor` [default: the best]
     #[arg(long, value_name = "NAME|INDEX")]
     pub device: Option<DeviceChoice>,
-    /// Pixels per row of the view
-    #[arg(long, default_value_t = WIDTH)]
-    pub width: u32,
-    /// Rows of the view
-    #[arg(long, default_value_t = HEIGHT)]
-    pub height: u32,
+    /// Pixels per row of the view [default: 512; with --tune, 500 and 1920]
+    #[arg(long)]
+    pub width: Option<u32>,
+    /// Rows of the view [default: 384; with --tune, 375 and 1080]
+    #[arg(long)]
+    pub height: Option<u32>,
     /// Gaussians in the scene
     #[arg(long, default_value_t = GAUSSIANS)]
     pub gaussians: usize,
+    /// Time without checking first: the references take minutes for a million Gaussians
+    #[arg(long)]
+    pub unchecked: bool,
     /// Timed runs, after one that is not timed; the median counts
     #[arg(long, default_value_t = 5, value_name = "N")]
     pub repeats: usize,
 }
 
-const WIDTH: u32 = 512;
-const HEIGHT: u32 = 384;
+const SIZE: [u32; 2] = [512, 384];
+const TUNED_SIZES: [[u32; 2]; 2] = [[500, 375], [1920, 1080]];
 const GAUSSIANS: usize = 20_000;
 
 /// What something took.
@@ -72,8 +82,9 @@ struct Findings {
 /// # Errors
 /// A kernel disagrees with its reference, or there is no such device.
 pub fn run(args: &BenchArgs) -> Result<()> {
-    let sizes_hold = (16..=8192).contains(&args.width)
-        && (16..=8192).contains(&args.height)
+    let [width, height] = [args.width.unwrap_or(SIZE[0]), args.height.unwrap_or(SIZE[1])];
+    let sizes_hold = (16..=8192).contains(&width)
+        && (16..=8192).contains(&height)
         && (1..=10_000_000).contains(&args.gaussians)
         && args.repeats > 0;
     if !sizes_hold {
@@ -83,9 +94,17 @@ pub fn run(args: &BenchArgs) -> Result<()> {
     }
     let gpu = Gpu::new(&args.device.clone().unwrap_or_default())?;
     let bench = Bench { gpu, repeats: args.repeats };
-    let scene = Scene::new(args.width, args.height, args.gaussians);
+    if args.tune {
+        let is_sized = args.width.is_some() || args.height.is_some();
+        let sizes = if is_sized { &[[width, height]][..] } else { &TUNED_SIZES };
+        return tune::run(&bench, sizes, args.gaussians, args.json);
+    }
+    let scene = Scene::new(width, height, args.gaussians);
     let mut trainers = scene::trainers(&bench.gpu, &scene)?;
-    let checked = stages::check(&bench, &mut trainers)?;
+    let checked = match args.unchecked {
+        true => CheckReport::default(),
+        false => stages::check(&bench, &mut trainers)?,
+    };
     checked.agree()?;
     let kernels = stages::time_kernels(&bench, &mut trainers)?;
     let stages = stages::time(&bench, &scene, &mut trainers)?;
@@ -94,7 +113,7 @@ pub fn run(args: &BenchArgs) -> Result<()> {
     if args.json {
         writeln!(out, "{:#}", findings.as_json(&bench))?;
     } else {
-        let has_bounds = (args.width, args.height, args.gaussians) == (WIDTH, HEIGHT, GAUSSIANS);
+        let has_bounds = ([width, height], args.gaussians) == (SIZE, GAUSSIANS);
         write!(out, "{}", findings.as_text(&bench, &scene, has_bounds))?;
     }
     Ok(())
@@ -139,10 +158,17 @@ impl Findings {
         );
         let header = |names: &[&str]| names.iter().map(|&name| name.to_owned()).collect::<Vec<_>>();
         let mut rows = vec![header(&["kernel", "largest error / bound", "ms"])];
-        rows.extend(self.checked.kernels().into_iter().map(|(name, _, error)| {
-            let milliseconds = self.kernels.get(name);
-            let milliseconds = milliseconds.map_or_else(|| "-".to_owned(), |ms| format!("{ms:.2}"));
-            vec![name.to_owned(), format!("{error:.3}"), milliseconds]
+        let or_dash = |text: Option<String>| text.unwrap_or_else(|| "-".to_owned());
+        let checked = self.checked.kernels();
+        let errors: BTreeMap<_, _> =
+            checked.iter().map(|&(name, _, error)| (name, error)).collect();
+        let is_timed_alone = |name: &&str| !errors.contains_key(name);
+        let unchecked = self.kernels.keys().copied().filter(is_timed_alone);
+        let names = checked.iter().map(|&(name, ..)| name).chain(unchecked);
+        rows.extend(names.map(|name| {
+            let error = errors.get(name).map(|error| format!("{error:.3}"));
+            let milliseconds = self.kernels.get(name).map(|ms| format!("{ms:.2}"));
+            vec![name.to_owned(), or_dash(error), or_dash(milliseconds)]
         }));
         let kernel_table = table::aligned(&rows);
         let mut rows = vec![header(&["stage", "ms", "bound", "within"])];

@@ -42,6 +42,7 @@ impl FinishedRun {
                 &gpu,
                 &gaussians,
                 raw_colors,
+                config.tile,
                 run::load_networks(&gpu, folder, &config.model, gaussians.shape.features)?,
             )?,
             config,

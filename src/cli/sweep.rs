@@ -194,6 +194,8 @@ impl Run {
             return Ok(false);
         }
         let found = load_config(&self.folder)?;
+        // A run records the tile that it took; where none is asked for, any is right.
+        let found = TrainConfig { tile: self.config.tile.and(found.tile), ..found };
         if found != self.config {
             let differs = difference(&found.to_toml()?, &self.config.to_toml()?);
             let problem = format!("holds another run ({differs}); choose another --out");

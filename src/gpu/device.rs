@@ -4,7 +4,7 @@ use std::ffi::{CStr, c_void};
 use std::path::PathBuf;
 use std::str::FromStr;
 use std::sync::atomic::AtomicU64;
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, OnceLock};
 
 use ash::vk::Handle as _;
 use ash::{ext, khr, vk};
@@ -13,7 +13,7 @@ use gpu_allocator::vulkan::{Allocator, AllocatorCreateDesc};
 use super::checked::Checks;
 use super::cooperative::{self, CooperativeMatrix};
 use super::requirements::{EXTENSIONS, Offered, required_device_features};
-use super::{Gpu, Properties, Queue, REQUIREMENTS, Shared, validation};
+use super::{Gpu, Properties, Queue, REQUIREMENTS, Shared, statistics, tuning, validation};
 use crate::{Error, Result};
 
 /// What to install where there is no Vulkan; the same words for a missing loader and a missing driver.
@@ -107,6 +107,8 @@ pub(super) struct Owned {
     instance: ash::Instance,
     messenger: Option<(ext::debug_utils::Instance, vk::DebugUtilsMessengerEXT)>,
     cache_path: Option<PathBuf>,
+    /// Where the fastest tiles are kept.
+    pub(super) tuning_path: Option<PathBuf>,
     /// Last, because the instance's functions live in the library.
     entry: ash::Entry,
 }
@@ -169,30 +171,35 @@ impl Gpu {
     /// ```
     pub fn new(choice: &DeviceChoice) -> Result<Self> {
         let validate = cfg!(debug_assertions) && validation_is_installed();
-        Self::open(choice, validate)
+        Self::open(choice, validate, true)
     }
 
-    /// Opens a device with validation and synchronization validation.
+    /// Opens a device with validation and synchronization validation; its tiles are the built-in ones.
     ///
     /// # Errors
     /// As [`Gpu::new`], or the validation layer is not installed.
     pub fn with_validation(choice: &DeviceChoice) -> Result<Self> {
         if validation_is_installed() {
-            return Self::open(choice, true);
+            return Self::open(choice, true, false);
         }
         let package = "on Debian `apt install vulkan-validationlayers`";
         Err(Error::NoDevice(format!("the Vulkan validation layer is not installed: {package}")))
     }
 
-    fn open(choice: &DeviceChoice, validate: bool) -> Result<Self> {
+    fn open(choice: &DeviceChoice, validate: bool, takes_tuning: bool) -> Result<Self> {
         let mut owned = instance(validate)?;
         let opened = choose(&owned.instance, choice).and_then(|(physical, offered)| {
             owned.cache_path = cache_path(&offered);
+            if takes_tuning {
+                let vk::PhysicalDeviceProperties { vendor_id, device_id, .. } = offered.properties;
+                owned.tuning_path = tuning::path(cache_folder(), vendor_id, device_id);
+            }
             let matrix = cooperative::offered(&owned.entry, &owned.instance, physical, &offered);
             create_device(&owned.instance, physical, &offered, matrix.is_some()).map(
                 |(device, queue)| {
                     let mut properties = properties(&owned.instance, physical, &offered);
                     properties.cooperative_matrix = matrix;
+                    properties.tells_statistics = tells_statistics(&offered);
                     (physical, properties, device, queue)
                 },
             )
@@ -281,11 +288,16 @@ impl Gpu {
         };
         let debug = owned.as_ref().and_then(|owned| owned.messenger.as_ref());
         let debug = debug.map(|_| ext::debug_utils::Device::new(instance, &device));
+        let executables = properties
+            .tells_statistics
+            .then(|| khr::pipeline_executable_properties::Device::new(instance, &device));
         Ok(Self {
             shared: Arc::new(Shared {
                 properties,
                 push_descriptor: khr::push_descriptor::Device::new(instance, &device),
                 debug,
+                executables,
+                tuned_tiles: OnceLock::new(),
                 device,
                 allocator: Mutex::new(Some(allocator)),
                 queue: Mutex::new(queue),
@@ -364,7 +376,7 @@ fn instance(validate: bool) -> Result<Owned> {
             })
             .transpose()
             .map_err(loader_error)?;
-        Ok(Owned { instance, messenger, cache_path: None, entry })
+        Ok(Owned { instance, messenger, cache_path: None, tuning_path: None, entry })
     }
 }
 
@@ -500,6 +512,7 @@ fn properties(
         timestamp_period: limits.timestamp_period,
         is_cpu: offered.properties.device_type == vk::PhysicalDeviceType::CPU,
         cooperative_matrix: None,
+        tells_statistics: false,
     }
 }
 
@@ -531,6 +544,12 @@ fn create_device(
             .vulkan_memory_model_device_scope(true);
         info = info.push_next(&mut matrices);
     }
+    let mut executables = vk::PhysicalDevicePipelineExecutablePropertiesFeaturesKHR::default()
+        .pipeline_executable_info(true);
+    if tells_statistics(offered) {
+        extensions.push(statistics::EXTENSION.as_ptr());
+        info = info.push_next(&mut executables);
+    }
     let info =
         info.enabled_extension_names(&extensions).push_next(&mut vulkan12).push_next(&mut vulkan13);
     let device = offered.device_name();
@@ -546,10 +565,20 @@ fn create_device(
 
 /// One file per device and driver, in the user's cache folder.
 fn cache_path(offered: &Offered) -> Option<PathBuf> {
+    let p = &offered.properties;
+    let name = format!("{:x}-{:x}-{:x}.pipelines", p.vendor_id, p.device_id, p.driver_version);
+    Some(cache_folder()?.join(name))
+}
+
+/// Ours in the user's.
+fn cache_folder() -> Option<PathBuf> {
     let folder = std::env::var_os("XDG_CACHE_HOME")
         .map(PathBuf::from)
         .or_else(|| Some(PathBuf::from(std::env::var_os("HOME")?).join(".cache")))?;
-    let p = &offered.properties;
-    let name = format!("{:x}-{:x}-{:x}.pipelines", p.vendor_id, p.device_id, p.driver_version);
-    Some(folder.join("nightsplat").join(name))
+    Some(folder.join("nightsplat"))
+}
+
+/// A device that has the extension has its one feature.
+fn tells_statistics(offered: &Offered) -> bool {
+    offered.extensions.contains(statistics::EXTENSION.to_string_lossy().as_ref())
 }

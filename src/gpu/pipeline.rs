@@ -16,7 +16,7 @@ pub struct Pipeline<K: Kernel> {
     /// What it is specialised for.
     pub(super) constants: K::Constants,
     set_layout: vk::DescriptorSetLayout,
-    shared: Arc<Shared>,
+    pub(super) shared: Arc<Shared>,
 }
 
 impl Gpu {
@@ -25,10 +25,6 @@ impl Gpu {
     /// # Errors
     /// The driver refuses the kernel.
     pub fn pipeline<K: Kernel>(&self, constants: &K::Constants) -> Result<Pipeline<K>> {
-        let mut values = K::constants(constants);
-        if let Some(id) = K::SUBGROUP_SIZE_ID {
-            values.push((id, self.properties().subgroup_size));
-        }
         let shared = &self.shared;
         let fail = |call| move |result| shared.error(call, result);
         // SAFETY: every create info points at live locals, and what fails half-way is destroyed here.
@@ -42,7 +38,7 @@ impl Gpu {
                     return Err(shared.error("vkCreatePipelineLayout", result));
                 }
             };
-            match raw_pipeline::<K>(shared, layout, &values) {
+            match raw_pipeline::<K>(shared, layout, constants, Default::default()) {
                 Ok(raw) => {
                     shared.name(raw, K::NAME);
                     let shared = Arc::clone(shared);
@@ -101,15 +97,20 @@ unsafe fn pipeline_layout<K: Kernel>(
 
 /// # Safety
 /// The device and the layout are live.
-unsafe fn raw_pipeline<K: Kernel>(
+pub(super) unsafe fn raw_pipeline<K: Kernel>(
     shared: &Shared,
     layout: vk::PipelineLayout,
-    constants: &[(u32, u32)],
+    constants: &K::Constants,
+    flags: vk::PipelineCreateFlags,
 ) -> Result<vk::Pipeline, vk::Result> {
     let code = ash::util::read_spv(&mut Cursor::new(K::SPIRV))
         .map_err(|_| vk::Result::ERROR_INITIALIZATION_FAILED)?;
+    let mut constants = K::constants(constants);
+    if let Some(id) = K::SUBGROUP_SIZE_ID {
+        constants.push((id, shared.properties.subgroup_size));
+    }
     let entries: Vec<_> = (0u32..)
-        .zip(constants)
+        .zip(&constants)
         .map(|(i, &(constant_id, _))| vk::SpecializationMapEntry {
             constant_id,
             offset: 4 * i,
@@ -136,8 +137,10 @@ unsafe fn raw_pipeline<K: Kernel>(
     // SAFETY: the create infos point at live locals; the module is not needed after the call.
     unsafe {
         let module = shared.device.create_shader_module(&info, None)?;
-        let info =
-            vk::ComputePipelineCreateInfo::default().stage(stage.module(module)).layout(layout);
+        let info = vk::ComputePipelineCreateInfo::default()
+            .stage(stage.module(module))
+            .layout(layout)
+            .flags(flags);
         let pipelines =
             shared.device.create_compute_pipelines(shared.pipeline_cache, &[info], None);
         shared.device.destroy_shader_module(module, None);

@@ -99,6 +99,7 @@ fn begin(
     held: HeldRun,
 ) -> Result<(RunDirectory, Trainer)> {
     let checkpoint = directory::checkpoint(out).filter(|_| held == HeldRun::Resume);
+    let config = &with_tile(gpu, config, checkpoint.is_some().then_some(out))?;
     if let Some(checkpoint) = checkpoint {
         let mut trainer = Trainer::new(gpu, config.clone(), dataset)?;
         trainer.restore(&checkpoint)?;
@@ -114,6 +115,18 @@ fn begin(
     };
     let directory = RunDirectory::create(out, config, replaces)?;
     Ok((directory, Trainer::new(gpu, config.clone(), dataset)?))
+}
+
+/// The configuration with the tile that is to be recorded: the same tiles give the same bits, whatever is measured later.
+/// It is the configuration's own, else that of the run that is `resumed`, else the fastest known on the device.
+fn with_tile(gpu: &Gpu, config: &TrainConfig, resumed: Option<&Path>) -> Result<TrainConfig> {
+    let mut config = config.clone();
+    if let Some(run) = resumed.filter(|_| config.tile.is_none()) {
+        let recorded = directory::load_config(run)?.tile;
+        config.tile = recorded.filter(|&tile| gpu.properties().suits_tile(tile));
+    }
+    config.tile = Some(config.render_settings().tile_on(gpu)?);
+    Ok(config)
 }
 
 /// Logs every step and writes checkpoints; gives the losses, and the seconds of all steps.

@@ -11,7 +11,8 @@ use crate::densify::DensityControl;
 use crate::loss::LossConfig;
 use crate::optimizer::Schedule;
 use crate::random::Stream;
-use crate::scene::MAX_SH_DEGREE;
+use crate::render::RenderSettings;
+use crate::scene::{MAX_SH_DEGREE, Shape};
 use crate::tone::ToneSettings;
 use crate::{Error, Result};
 
@@ -70,6 +71,9 @@ pub struct TrainConfig {
     pub check: CheckConfig,
     /// The device: a part of its name or its index; empty: the best.
     pub device: String,
+    /// The tile that one subgroup renders, in pixels; left out, it is the fastest known on the device, and recorded.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tile: Option<[u32; 2]>,
     /// Random points to begin with where the dataset has none.
     pub random_points: usize,
     /// The curve that lifts each photograph.
@@ -122,6 +126,7 @@ impl Default for TrainConfig {
             checkpoint_every: 1000,
             check: CheckConfig::default(),
             device: String::new(),
+            tile: None,
             random_points: 20_000,
             tone: ToneSettings::default(),
             schedule: Schedule::default(),
@@ -210,6 +215,16 @@ impl TrainConfig {
                 "{count} of {} training views have a depth map",
                 dataset.train_views().count()
             );
+        }
+    }
+
+    /// What the rasteriser is specialised for.
+    pub fn render_settings(&self) -> RenderSettings {
+        RenderSettings {
+            shape: Shape { sh_degree: self.sh_degree, features: self.model.features() },
+            raw_colors: self.model.raw_colors,
+            tile: self.tile,
+            ..RenderSettings::default()
         }
     }
 

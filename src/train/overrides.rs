@@ -28,13 +28,15 @@ impl TrainConfig {
     }
 
     /// The first setting in which a run of `self` differs from one of `other`, with both values: `tone.alpha = 0.1, not
-    /// 0.12`. Left out is what changes no step: how long the run is, where the photographs lie, when it is scored and saved.
+    /// 0.12`. Left out is what changes no step beyond its rounding: how long the run is, where the photographs lie, when it
+    /// is scored and saved, on which device and by which tiles.
     pub fn difference(&self, other: &Self) -> Option<String> {
-        const FREE: [&str; 8] = [
+        const FREE: [&str; 9] = [
             "steps",
             "dataset",
             "reference",
             "device",
+            "tile",
             "eval_every",
             "checkpoint_every",
             "check.every",

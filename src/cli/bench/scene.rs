@@ -11,7 +11,7 @@ use crate::gpu::{CheckReport, Gpu};
 use crate::image::Image;
 use crate::random::Stream;
 use crate::render::{RenderOptions, RenderSettings, Renderer, Status};
-use crate::scene::{Gaussians, SH_C0};
+use crate::scene::{Gaussians, SH_C0, Shape};
 use crate::tone::{ToneCurve, ToneSettings};
 use crate::train::{Part, TrainConfig, Trainer};
 
@@ -32,15 +32,8 @@ const DRAWS: u64 = 32;
 
 impl Scene {
     pub(super) fn new(width: u32, height: u32, count: usize) -> Self {
-        let camera = Camera {
-            width,
-            height,
-            focal: DVec2::splat(0.9 * f64::from(width)),
-            principal_point: DVec2::new(0.51 * f64::from(width), 0.49 * f64::from(height)),
-            view_from_world: DAffine3::IDENTITY,
-        };
-        let gaussians = gaussians(&camera, count);
-        Self { low: dark(width, height), gaussians, camera }
+        let camera = camera(width, height);
+        Self { low: dark(width, height), gaussians: gaussians(&camera, count, 3), camera }
     }
 
     /// One view, with a depth map and the Gaussians' means for points.
@@ -126,13 +119,25 @@ fn intersections(gpu: &Gpu, Scene { camera, gaussians, .. }: &Scene) -> Result<u
     Ok(Status::from_words(&gpu.read(renderer.status())?).intersections)
 }
 
-fn gaussians(camera: &Camera, count: usize) -> Gaussians {
+/// At the origin, looking along z.
+pub(super) fn camera(width: u32, height: u32) -> Camera {
+    Camera {
+        width,
+        height,
+        focal: DVec2::splat(0.9 * f64::from(width)),
+        principal_point: DVec2::new(0.51 * f64::from(width), 0.49 * f64::from(height)),
+        view_from_world: DAffine3::IDENTITY,
+    }
+}
+
+/// Spread over the camera's view, of the same sizes in pixels whatever its size.
+pub(super) fn gaussians(camera: &Camera, count: usize, shape: impl Into<Shape>) -> Gaussians {
     let stream = Stream::new(65, 0);
     let uniform = |gaussian: usize, draw: u64| stream.uniform(gaussian as u64 * DRAWS + draw);
     let normal =
         |gaussian: usize, draw: u64| stream.normal(gaussian as u64 * DRAWS / 2 + draw) as f32;
     let size = DVec2::new(camera.width.into(), camera.height.into());
-    let mut gaussians = Gaussians::zeros(count, 3);
+    let mut gaussians = Gaussians::zeros(count, shape);
     for i in 0..count {
         let depth = 2.0 + 4.0 * uniform(i, 0);
         let pixel = size * DVec2::new(uniform(i, 1), uniform(i, 2));
@@ -148,6 +153,9 @@ fn gaussians(camera: &Camera, count: usize) -> Gaussians {
         gaussians.raw_opacities_mut()[i] = (opacity / (1.0 - opacity)).ln() as f32;
         gaussians.dc_mut()[i] =
             Vec3::from_array([11, 12, 13].map(|draw| normal(i, draw))) / SH_C0 / 6.0;
+    }
+    for (i, feature) in (0..).zip(gaussians.features_mut()) {
+        *feature = Stream::new(65, 4).uniform(i) as f32;
     }
     // A trained model's view dependence is faint.
     for (i, coefficient) in (0..).zip(gaussians.rest_mut()) {

@@ -76,7 +76,7 @@ fn repeated(
     (0..bench.repeats).map(|_| profile()).collect()
 }
 
-fn of_kernels(times: &[PassTime], names: &[&str]) -> f64 {
+pub(super) fn of_kernels(times: &[PassTime], names: &[&str]) -> f64 {
     times.iter().filter(|time| names.contains(&time.name)).map(|time| time.milliseconds).sum()
 }
 

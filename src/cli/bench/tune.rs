@@ -1,0 +1,348 @@
+//! `--tune`: the rasteriser with every tile that suits the device; the fastest are kept for it.
+
+use std::io::Write;
+
+use anyhow::Result;
+use serde_json::{Map, Value, json};
+
+use super::{Bench, median, scene, stages, table, total};
+use crate::camera::Camera;
+use crate::gpu::{Buffer, Statistic, TUNE_VARIABLE, TunedTile};
+use crate::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer, Status};
+use crate::scene::{Features, MAX_SH_DEGREE, Shape};
+
+/// From the few pixels of a narrow subgroup to 32 rows of a wide one.
+const TILES: [[u32; 2]; 7] = [[8, 4], [8, 8], [16, 4], [16, 8], [16, 16], [32, 8], [32, 16]];
+
+/// Colour alone, and every feature: 3 and 11 channels.
+const FEATURES: [Features; 2] = [Features::NONE, Features::ALL];
+
+/// How far a render may be from that of the first tile: drivers may round each specialisation otherwise, and where a
+/// rounding decides whether a splat counts, by its faintest alpha.
+const LARGEST_DIFFERENCE: f32 = 0.01;
+const MEAN_DIFFERENCE: f64 = 1e-5;
+
+/// One image size and number of channels, with every tile.
+struct Case {
+    channels: usize,
+    size: [u32; 2],
+    tiles: Vec<Measured>,
+}
+
+/// What one tile took.
+struct Measured {
+    tile: [u32; 2],
+    intersections: u32,
+    /// Largest and mean difference from the render of the first tile.
+    differences: (f32, f64),
+    /// Milliseconds of blending there and back, and of all passes of the rasteriser: all that the tile changes.
+    forward: f64,
+    backward: f64,
+    rasteriser: f64,
+    /// Of the blend kernels, forward and backward.
+    statistics: Option<[Vec<Statistic>; 2]>,
+}
+
+/// Measures every case, keeps the fastest tiles and prints.
+///
+/// # Errors
+/// The device gives no timestamps, is out of memory or lost, or the file cannot be written.
+pub(super) fn run(
+    bench: &Bench,
+    sizes: &[[u32; 2]],
+    gaussians: usize,
+    as_json: bool,
+) -> Result<()> {
+    let mut cases = vec![];
+    for features in FEATURES {
+        for &size in sizes {
+            cases.push(Case::measure(bench, features, size, gaussians)?);
+        }
+    }
+    let chosen: Vec<_> = FEATURES.iter().filter_map(|f| fastest(&cases, f.channels())).collect();
+    let file = bench.gpu.keep_tuned_tiles(&chosen)?;
+    let mut out = std::io::stdout().lock();
+    if as_json {
+        let properties = bench.gpu.properties();
+        let report = json!({
+            "device": properties.name,
+            "driver": properties.driver,
+            "subgroup_size": properties.subgroup_size,
+            "gaussians": gaussians,
+            "repeats": bench.repeats,
+            "cases": cases.iter().map(Case::as_json).collect::<Vec<_>>(),
+            "tiles": chosen,
+            "file": file,
+        });
+        writeln!(out, "{report:#}")?;
+        return Ok(());
+    }
+    for case in &cases {
+        writeln!(out, "{}", case.as_text(gaussians))?;
+    }
+    if !bench.gpu.properties().tells_statistics {
+        writeln!(out, "registers and spills: the driver does not tell them")?;
+    }
+    let tile = |TunedTile { channels, tile: [width, height] }: &TunedTile| {
+        format!("{width}x{height} at {channels} channels")
+    };
+    let fastest = chosen.iter().map(tile).collect::<Vec<_>>().join(", ");
+    match file {
+        Some(file) => writeln!(out, "fastest: {fastest}; kept in {}", file.display())?,
+        None => writeln!(out, "fastest: {fastest}; not kept: {TUNE_VARIABLE} is off")?,
+    }
+    Ok(())
+}
+
+/// The tile whose times, each relative to the least of its size, have the least sum over the sizes.
+fn fastest(cases: &[Case], channels: usize) -> Option<TunedTile> {
+    let cases = || cases.iter().filter(|case| case.channels == channels);
+    let cost = |tile: [u32; 2]| {
+        let relative = |case: &Case| {
+            let own = case.tiles.iter().find(|measured| measured.tile == tile && measured.agrees());
+            own.map_or(f64::INFINITY, |own| own.rasteriser / case.least())
+        };
+        cases().map(relative).sum::<f64>()
+    };
+    let tiles = cases().next()?.tiles.iter().map(|measured| measured.tile);
+    let tile = tiles.min_by(|&a, &b| cost(a).total_cmp(&cost(b)))?;
+    Some(TunedTile { channels, tile })
+}
+
+/// A renderer for one tile, what it rendered and the passes it took so far.
+struct Candidate {
+    renderer: Renderer,
+    measured: Measured,
+    times: Vec<[f64; 3]>,
+}
+
+impl Case {
+    fn measure(
+        bench: &Bench,
+        features: Features,
+        [width, height]: [u32; 2],
+        gaussians: usize,
+    ) -> crate::Result<Self> {
+        let gpu = &bench.gpu;
+        let shape = Shape { sh_degree: MAX_SH_DEGREE, features };
+        let camera = scene::camera(width, height);
+        let scene = scene::gaussians(&camera, gaussians, shape);
+        let parameters = gpu.buffer("parameters", &scene.parameters)?;
+        let suits = |tile: &[u32; 2]| gpu.properties().suits_tile(*tile);
+        let (mut candidates, mut first) = (vec![], None);
+        for tile in TILES.into_iter().filter(suits) {
+            let settings = RenderSettings { shape, tile: Some(tile), ..RenderSettings::default() };
+            let mut renderer = Renderer::new(gpu, settings)?;
+            renderer.reserve(gaussians, [&camera])?;
+            let render = renderer.render_channels(&parameters, &camera, &OPTIONS)?;
+            let first = first.get_or_insert_with(|| render.clone());
+            let measured = Measured {
+                tile,
+                intersections: 0,
+                differences: differences(&render, first),
+                forward: 0.0,
+                backward: 0.0,
+                rasteriser: 0.0,
+                statistics: renderer.blend_statistics()?,
+            };
+            candidates.push(Candidate { renderer, measured, times: vec![] });
+        }
+        let mut pass = Pass::new(bench, camera, parameters, gaussians, features.channels())?;
+        // Round by round, so that whatever else the device does meets every tile alike; the first does not count.
+        for round in 0..=bench.repeats {
+            for candidate in &mut candidates {
+                let times = pass.profile(bench, &mut candidate.renderer)?;
+                candidate.times.extend((round > 0).then_some(times));
+            }
+        }
+        let tiles = candidates.into_iter().map(|candidate| candidate.finish(bench));
+        let tiles = tiles.collect::<crate::Result<_>>()?;
+        Ok(Self { channels: features.channels(), size: [width, height], tiles })
+    }
+
+    /// What the fastest tile took.
+    fn least(&self) -> f64 {
+        let agree = self.tiles.iter().filter(|measured| measured.agrees());
+        agree.map(|measured| measured.rasteriser).fold(f64::INFINITY, f64::min)
+    }
+
+    fn as_json(&self) -> Value {
+        json!({
+            "channels": self.channels,
+            "width": self.size[0],
+            "height": self.size[1],
+            "tiles": self.tiles.iter().map(Measured::as_json).collect::<Vec<_>>(),
+        })
+    }
+
+    fn as_text(&self, gaussians: usize) -> String {
+        let (channels, [width, height]) = (self.channels, self.size);
+        let head = ["tile", "blend forward", "backward", "rasteriser, ms", "intersections", ""];
+        let mut rows = vec![head.map(str::to_owned).to_vec()];
+        rows.extend(self.tiles.iter().map(|measured| {
+            let Measured { tile: [width, height], intersections, .. } = measured;
+            let note = match measured.agrees() {
+                false => "renders otherwise",
+                true if measured.rasteriser == self.least() => "fastest",
+                true => "",
+            };
+            let times = [measured.forward, measured.backward, measured.rasteriser];
+            let mut row = vec![format!("{width}x{height}")];
+            row.extend(times.map(|milliseconds| format!("{milliseconds:.3}")));
+            row.extend([intersections.to_string(), note.to_owned()]);
+            row
+        }));
+        let registers: String = self.tiles.iter().filter_map(Measured::registers).collect();
+        format!(
+            "{channels} channels, {width}x{height} pixels, {gaussians} Gaussians\n{}{registers}",
+            table::aligned(&rows)
+        )
+    }
+}
+
+const OPTIONS: RenderOptions = RenderOptions { sh_degree: MAX_SH_DEGREE, background: [0.0; 3] };
+
+/// All that a pass of the rasteriser reads and writes beside the memory of its renderer.
+struct Pass {
+    camera: Camera,
+    parameters: Buffer<f32>,
+    d_render: Buffer<f32>,
+    gradients: Buffer<f32>,
+    grad_norm_sums: Buffer<f32>,
+    visit_counts: Buffer<u32>,
+}
+
+impl Pass {
+    fn new(
+        Bench { gpu, .. }: &Bench,
+        camera: Camera,
+        parameters: Buffer<f32>,
+        gaussians: usize,
+        channels: usize,
+    ) -> crate::Result<Self> {
+        let values = channels * camera.width as usize * camera.height as usize;
+        Ok(Self {
+            camera,
+            d_render: gpu.buffer("d_render", &vec![1e-3; values])?,
+            gradients: gpu.zeros("gradients", parameters.len())?,
+            grad_norm_sums: gpu.zeros("grad_norm_sums", gaussians)?,
+            visit_counts: gpu.zeros("visit_counts", gaussians)?,
+            parameters,
+        })
+    }
+
+    /// Milliseconds of blending forward and backward, and of all passes.
+    fn profile(&mut self, bench: &Bench, renderer: &mut Renderer) -> crate::Result<[f64; 3]> {
+        let Self { camera, parameters, d_render, .. } = self;
+        let times = bench.gpu.profile("tune", |pass| {
+            renderer.forward(pass, parameters, camera, &OPTIONS)?;
+            let gradients = Gradients {
+                parameters: &mut self.gradients,
+                grad_norm_sums: &mut self.grad_norm_sums,
+                visit_counts: &mut self.visit_counts,
+            };
+            let damping = Damping { weight: 0.0, depth: 0.0 };
+            renderer.backward(pass, parameters, camera, &OPTIONS, damping, d_render, gradients)
+        })?;
+        let of = |name| stages::of_kernels(&times, &[name]);
+        Ok([of("blend_forward"), of("blend_backward"), total(&times)])
+    }
+}
+
+impl Candidate {
+    fn finish(self, bench: &Bench) -> crate::Result<Measured> {
+        let status = Status::from_words(&bench.gpu.read(self.renderer.status())?);
+        let [forward, backward, rasteriser] =
+            [0, 1, 2].map(|part| median(self.times.iter().map(|times| times[part]).collect()));
+        let intersections = status.intersections;
+        Ok(Measured { intersections, forward, backward, rasteriser, ..self.measured })
+    }
+}
+
+impl Measured {
+    /// Positive phrasing: a NaN does not agree.
+    fn agrees(&self) -> bool {
+        self.differences.0 <= LARGEST_DIFFERENCE && self.differences.1 <= MEAN_DIFFERENCE
+    }
+
+    fn as_json(&self) -> Value {
+        let of_kernel = |statistics: &Vec<Statistic>| {
+            let entry = |told: &Statistic| (told.name.clone(), json!(told.value));
+            statistics.iter().map(entry).collect::<Map<_, _>>()
+        };
+        let statistics = self.statistics.as_ref().map(|[forward, backward]| {
+            json!({ "blend_forward": of_kernel(forward), "blend_backward": of_kernel(backward) })
+        });
+        json!({
+            "tile": self.tile,
+            "intersections": self.intersections,
+            "agrees": self.agrees(),
+            "largest_difference": self.differences.0,
+            "blend_forward_ms": self.forward,
+            "blend_backward_ms": self.backward,
+            "rasteriser_ms": self.rasteriser,
+            "statistics": statistics,
+        })
+    }
+
+    /// A line with what the driver says of registers and spills.
+    fn registers(&self) -> Option<String> {
+        let counts = |statistics: &Vec<Statistic>| {
+            let is_meant = |told: &&Statistic| {
+                let name = told.name.to_lowercase();
+                ["regist", "gpr", "spill", "local mem"].iter().any(|part| name.contains(part))
+            };
+            let count = |told: &Statistic| format!("{} {}", told.name, told.value);
+            statistics.iter().filter(is_meant).map(count).collect::<Vec<_>>().join(", ")
+        };
+        let [forward, backward] = self.statistics.as_ref()?.each_ref().map(counts);
+        let [width, height] = self.tile;
+        Some(format!("{width}x{height}: forward {forward}; backward {backward}\n"))
+    }
+}
+
+/// The largest and the mean difference, relative to the largest value.
+fn differences(render: &[f32], first: &[f32]) -> (f32, f64) {
+    let scale = first.iter().fold(1.0f32, |scale, value| scale.max(value.abs()));
+    let each = || render.iter().zip(first).map(|(a, b)| (a - b).abs() / scale);
+    // Of a NaN the sum tells.
+    let sum: f64 = each().map(f64::from).sum();
+    (each().fold(0.0, f32::max), sum / first.len().max(1) as f64)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn case(channels: usize, times: &[([u32; 2], f64, f32)]) -> Case {
+        let measured = |&(tile, rasteriser, difference)| Measured {
+            tile,
+            intersections: 0,
+            differences: (difference, 0.0),
+            forward: 0.0,
+            backward: 0.0,
+            rasteriser,
+            statistics: None,
+        };
+        Case { channels, size: [4, 4], tiles: times.iter().map(measured).collect() }
+    }
+
+    #[test]
+    fn the_fastest_tile_is_good_at_every_size_and_renders_what_the_others_do() {
+        let (small, large, wrong) = ([8, 8], [16, 16], [32, 8]);
+        let cases = [
+            case(3, &[(small, 1.0, 0.0), (large, 1.1, 0.0), (wrong, 0.1, 1.0)]),
+            case(3, &[(small, 30.0, 0.0), (large, 20.0, 0.0), (wrong, 10.0, f32::NAN)]),
+            case(11, &[(small, 5.0, 0.0), (large, 6.0, 0.0)]),
+        ];
+        assert_eq!(fastest(&cases, 3), Some(TunedTile { channels: 3, tile: large }));
+        assert_eq!(fastest(&cases, 11), Some(TunedTile { channels: 11, tile: small }));
+    }
+
+    #[test]
+    fn a_difference_is_relative_and_nan_is_one() {
+        assert_eq!(differences(&[1.0, 4.0], &[1.0, 2.0]), (1.0, 0.5));
+        assert!(differences(&[1.0, f32::NAN], &[1.0, 2.0]).1.is_nan());
+        assert_eq!(differences(&[], &[]), (0.0, 0.0));
+    }
+}

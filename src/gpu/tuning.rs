@@ -1,0 +1,157 @@
+//! The fastest tiles of this device, as `nightsplat bench --tune` found them: a small file in the user's cache folder.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+
+use super::{Gpu, Properties};
+use crate::output::write_whole;
+use crate::{Error, Result};
+
+/// Names a file in place of the one in the user's cache folder, or is `off`: no file.
+pub const TUNE_VARIABLE: &str = "NIGHTSPLAT_TUNE";
+
+/// The fastest tile for renders of so many channels.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TunedTile {
+    /// Values per pixel.
+    pub channels: usize,
+    /// Width and height, in pixels.
+    pub tile: [u32; 2],
+}
+
+/// What was measured, and where.
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Tuning {
+    device: String,
+    driver: String,
+    tiles: Vec<TunedTile>,
+}
+
+impl Properties {
+    /// Whether a subgroup can own tiles of so many pixels across and down: they have 1 to 32 rows of its lanes.
+    pub fn suits_tile(&self, [width, height]: [u32; 2]) -> bool {
+        let pixels = u64::from(width) * u64::from(height);
+        let lanes = u64::from(self.subgroup_size);
+        pixels.is_multiple_of(lanes) && (1..=32).contains(&(pixels / lanes))
+    }
+}
+
+impl Gpu {
+    /// The tile that was fastest on this device and driver for the nearest number of channels; none where nothing was
+    /// measured, or the device is lent or opened to be validated.
+    pub fn tuned_tile(&self, channels: usize) -> Option<[u32; 2]> {
+        let path = self.tuning_path()?;
+        let tiles = self.shared.tuned_tiles.get_or_init(|| load(path, self.properties()));
+        let far = |tuned: &&TunedTile| tuned.channels.abs_diff(channels);
+        tiles.iter().min_by_key(far).map(|tuned| tuned.tile)
+    }
+
+    /// Keeps what was measured for the next time this device is opened; gives the file, or none where none is kept.
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    pub fn keep_tuned_tiles(&self, tiles: &[TunedTile]) -> Result<Option<PathBuf>> {
+        let Some(path) = self.tuning_path() else { return Ok(None) };
+        let Properties { name, driver, .. } = self.properties();
+        let tuning = Tuning { device: name.clone(), driver: driver.clone(), tiles: tiles.to_vec() };
+        let folder = path.parent().map_or(Ok(()), std::fs::create_dir_all);
+        folder.map_err(|error| Error::output(path, format!("cannot be made ({error})")))?;
+        write_whole(path, format!("{:#}\n", serde_json::json!(tuning)).as_bytes())?;
+        Ok(Some(path.to_owned()))
+    }
+
+    fn tuning_path(&self) -> Option<&Path> {
+        self.shared.owned.as_ref()?.tuning_path.as_deref()
+    }
+}
+
+/// The file of this kind of device; it says itself which driver it is of.
+pub(super) fn path(cache: Option<PathBuf>, vendor: u32, device: u32) -> Option<PathBuf> {
+    match std::env::var_os(TUNE_VARIABLE).filter(|value| !value.is_empty()) {
+        Some(value) if value == "off" => None,
+        Some(value) => Some(value.into()),
+        None => Some(cache?.join(format!("{vendor:x}-{device:x}.tiles.json"))),
+    }
+}
+
+/// The tiles in the file; none, and a line in the log, where they are not of this device.
+fn load(path: &Path, properties: &Properties) -> Vec<TunedTile> {
+    let tiles = match std::fs::read(path) {
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return vec![],
+        Err(error) => Err(format!("cannot be read ({error})")),
+        Ok(bytes) => tiles(&bytes, properties),
+    };
+    tiles.unwrap_or_else(|problem| {
+        let remedy = "`nightsplat bench --tune` measures anew";
+        tracing::warn!("{}: {problem}; it is ignored: {remedy}", path.display());
+        vec![]
+    })
+}
+
+fn tiles(bytes: &[u8], properties: &Properties) -> Result<Vec<TunedTile>, String> {
+    let damaged = |problem: String| format!("is damaged ({problem})");
+    let Tuning { device, driver, tiles } =
+        serde_json::from_slice(bytes).map_err(|error| damaged(error.to_string()))?;
+    let Properties { name, driver: own, subgroup_size, .. } = properties;
+    if (&device, &driver) != (name, own) {
+        return Err(format!("was measured on {device}, {driver}; this is {name}, {own}"));
+    }
+    let unsuitable = tiles.iter().find(|tuned| !properties.suits_tile(tuned.tile));
+    unsuitable.map_or(Ok(()), |TunedTile { tile: [width, height], .. }| {
+        Err(damaged(format!("{width}x{height} tiles do not suit {subgroup_size} lanes")))
+    })?;
+    Ok(tiles)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn properties() -> Properties {
+        Properties {
+            name: "Abacus 3000".to_owned(),
+            driver: "beads 1.0".to_owned(),
+            subgroup_size: 8,
+            subgroup_size_is_selectable: true,
+            max_storage_buffer_range: 1 << 27,
+            max_workgroups: 65_535,
+            max_loop_iterations: u32::MAX,
+            timestamp_bits: 64,
+            timestamp_period: 1.0,
+            is_cpu: false,
+            cooperative_matrix: None,
+            tells_statistics: false,
+        }
+    }
+
+    #[test]
+    fn a_tile_has_one_to_thirty_two_rows_of_lanes() {
+        let suits = |tile| properties().suits_tile(tile);
+        assert!(suits([8, 1]) && suits([16, 16]) && suits([32, 8]));
+        assert!(!suits([0, 8]) && !suits([3, 3]) && !suits([32, 16]) && !suits([u32::MAX; 2]));
+    }
+
+    #[test]
+    fn only_an_undamaged_file_of_this_device_and_driver_is_taken() {
+        let text = |device: &str, driver: &str, tile: [u32; 2]| {
+            let tiles = vec![TunedTile { channels: 3, tile }];
+            let tuning = Tuning { device: device.to_owned(), driver: driver.to_owned(), tiles };
+            serde_json::json!(tuning).to_string()
+        };
+        let read = |text: &str| tiles(text.as_bytes(), &properties());
+        let whole = text("Abacus 3000", "beads 1.0", [16, 4]);
+        assert_eq!(read(&whole).unwrap(), [TunedTile { channels: 3, tile: [16, 4] }]);
+        let refused = |text: &str, part: &str| {
+            let problem = read(text).unwrap_err();
+            assert!(problem.contains(part) && !problem.contains('\n'), "{problem}");
+        };
+        refused(&text("Abacus 2000", "beads 1.0", [16, 4]), "measured on Abacus 2000, beads 1.0");
+        refused(&text("Abacus 3000", "beads 0.9", [16, 4]), "this is Abacus 3000, beads 1.0");
+        refused(&text("Abacus 3000", "beads 1.0", [5, 5]), "5x5 tiles do not suit 8 lanes");
+        refused(&whole[..whole.len() / 2], "damaged");
+        refused("", "damaged");
+    }
+}
