@@ -73,7 +73,7 @@ fn ring() -> nightsplat::Result<Gaussians> {
         |angle: f64| [0.0, 1.0, 2.0].map(|third| 0.5 + 0.5 * (angle + third * TAU / 3.0).cos());
     let positions: Vec<DVec3> = angles.clone().map(position).collect();
     let colors: Vec<Vec3> = angles.map(|angle| DVec3::from(hue(angle)).as_vec3()).collect();
-    let mut gaussians = init::from_points(&positions, &colors, 0, 0)?;
+    let mut gaussians = init::from_points(&positions, &colors, 0, &init::Start::default(), 0)?;
     gaussians.raw_opacities_mut().fill(2.0);
     gaussians.log_scales_mut().fill(Vec3::splat(-3.0));
     Ok(gaussians)

@@ -2,7 +2,7 @@
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
-use glam::{DAffine3, DVec2, DVec3, Vec3};
+use glam::{DAffine3, DVec2, DVec3, Quat, Vec3};
 use nightsplat::attributes::planes;
 use nightsplat::camera::Camera;
 use nightsplat::dataset::{Point, Split, View};
@@ -95,7 +95,7 @@ mod from_points {
 
     fn scales(positions: &[DVec3]) -> Vec<f32> {
         let colors = vec![Vec3::ZERO; positions.len()];
-        let gaussians = init::from_points(positions, &colors, 0, 0).unwrap();
+        let gaussians = init::from_points(positions, &colors, 0, &Start::PAPER, 0).unwrap();
         gaussians.log_scales().iter().map(|log_scale| log_scale.x.exp()).collect()
     }
 
@@ -103,7 +103,7 @@ mod from_points {
     fn every_attribute_begins_as_in_3dgs() {
         let positions = [DVec3::ZERO, DVec3::X, DVec3::Y * 2.0, DVec3::Z * 3.0];
         let colors = [Vec3::new(0.1, 0.5, 0.9); 4];
-        let gaussians = init::from_points(&positions, &colors, 2, 0).unwrap();
+        let gaussians = init::from_points(&positions, &colors, 2, &Start::PAPER, 0).unwrap();
         assert_eq!((gaussians.count, gaussians.shape), (4, 2.into()));
         assert_eq!(gaussians.means()[2], Vec3::new(0.0, 2.0, 0.0));
         assert_eq!(gaussians.quats(), [[1.0, 0.0, 0.0, 0.0]; 4]);
@@ -114,6 +114,58 @@ mod from_points {
         assert!(gaussians.rest().iter().all(|&coefficient| coefficient == Vec3::ZERO));
         // The mean squared distance from the origin is (1 + 4 + 9) / 3.
         assert!((gaussians.log_scales()[0].y.exp() - (14.0f32 / 3.0).sqrt()).abs() < 1e-6);
+    }
+
+    #[test]
+    fn neighbours_on_a_plane_make_discs_along_it() {
+        let normal = DVec3::new(1.0, 2.0, -2.0) / 3.0;
+        let (right, up) =
+            (normal.any_orthonormal_vector(), normal.cross(normal.any_orthonormal_vector()));
+        let place = |i: i32| DVec3::ONE + right * f64::from(i % 9) + up * f64::from(i / 9);
+        let positions: Vec<DVec3> = (0..81).map(place).collect();
+        let colors = vec![Vec3::ONE; positions.len()];
+        let start = Start { opacity: 0.3, scale: 0.5, thinnest: 0.2 };
+        let gaussians = init::from_points(&positions, &colors, 0, &start, 0).unwrap();
+        // In the middle of the grid, where neighbours lie on all sides.
+        let middle = 40;
+        let [w, x, y, z] = gaussians.quats()[middle];
+        let scales = gaussians.log_scales()[middle].exp();
+        let thin = scales.min_position();
+        let axis = Quat::from_xyzw(x, y, z, w) * Vec3::AXES[thin];
+        assert!(axis.as_dvec3().dot(normal).abs() > 1.0 - 1e-6, "{axis}");
+        assert!((scales[thin] - 0.2 * scales.max_element()).abs() < 1e-6, "{scales}");
+        // The disc has the area of the round Gaussian at half the distance of the grid.
+        let area = scales.element_product() / scales.min_element();
+        assert!((area - 0.25).abs() < 1e-6, "{scales}");
+        let opacity = 1.0 / (1.0 + (-gaussians.raw_opacities()[middle]).exp());
+        assert!((opacity - 0.3).abs() < 1e-6);
+    }
+
+    #[test]
+    fn points_in_one_line_and_pairs_make_finite_gaussians() {
+        for count in [2, 3, 20] {
+            let positions: Vec<DVec3> = (0..count).map(|i| DVec3::X * f64::from(i)).collect();
+            let colors = vec![Vec3::ONE; positions.len()];
+            let start = Start::default();
+            let gaussians = init::from_points(&positions, &colors, 0, &start, 0).unwrap();
+            assert!(gaussians.parameters.iter().all(|value| value.is_finite()), "{count}");
+            for quat in gaussians.quats() {
+                let norm: f32 = quat.iter().map(|part| part * part).sum();
+                assert!((norm - 1.0).abs() < 1e-6, "{quat:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_start_that_makes_no_gaussian_is_refused_by_name() {
+        for (start, name) in [
+            (Start { opacity: 1.0, ..Start::PAPER }, "start.opacity"),
+            (Start { scale: 0.0, ..Start::PAPER }, "start.scale"),
+            (Start { thinnest: f64::NAN, ..Start::PAPER }, "start.thinnest"),
+        ] {
+            let message = init::from_points(&[], &[], 0, &start, 0).unwrap_err().to_string();
+            assert!(message.contains(name), "{message}");
+        }
     }
 
     #[test]
@@ -172,7 +224,7 @@ mod from_points {
     #[test]
     fn points_that_are_not_finite_or_lack_a_color_are_refused() {
         let refused = |positions: &[DVec3], colors: &[Vec3]| {
-            init::from_points(positions, colors, 0, 0).is_err()
+            init::from_points(positions, colors, 0, &Start::PAPER, 0).is_err()
         };
         assert!(refused(&[DVec3::new(0.0, f64::NAN, 0.0)], &[Vec3::ZERO]));
         assert!(refused(&[DVec3::ZERO], &[Vec3::splat(f32::INFINITY)]));

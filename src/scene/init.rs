@@ -2,8 +2,10 @@
 
 use std::borrow::Borrow;
 
-use glam::{DVec2, DVec3, Vec3};
+use glam::{DMat3, DQuat, DVec2, DVec3, Vec3};
+use nalgebra::{Matrix3, SymmetricEigen};
 use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 
 use super::neighbours::Neighbours;
 use super::{Gaussians, SH_C0, Shape};
@@ -13,8 +15,53 @@ use crate::image::Image;
 use crate::random::Stream;
 use crate::{Error, Result};
 
-/// The opacity of every new Gaussian (3DGS).
-const OPACITY: f32 = 0.1;
+/// What the first Gaussians look like; the points say where they are and in which colour.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Start {
+    /// The opacity of each, in (0, 1).
+    pub opacity: f64,
+    /// Standard deviation in units of the root mean squared distance to the three nearest points, above 0.
+    pub scale: f64,
+    /// The thinnest axis of a disc in units of its longest, in (0, 1]: neighbours that lie on a surface make discs along it.
+    /// 1: all are round.
+    pub thinnest: f64,
+}
+
+/// Denser and smaller than 3DGS begins, which scores higher after as many steps, in less time, since what is opaque hides
+/// what lies behind it (docs/benchmarks.md). Discs score as round ones do, with more Gaussians.
+impl Default for Start {
+    fn default() -> Self {
+        Self { opacity: 0.5, scale: 0.5, thinnest: 1.0 }
+    }
+}
+
+impl Start {
+    /// 3DGS's, and the paper's.
+    pub const PAPER: Self = Self { opacity: 0.1, scale: 1.0, thinnest: 1.0 };
+
+    /// Refuses values that make no Gaussian, naming the field.
+    ///
+    /// # Errors
+    /// [`Error::Usage`].
+    pub fn check(&self) -> Result<()> {
+        for (name, value, holds, rule) in [
+            (
+                "opacity",
+                self.opacity,
+                self.opacity > 0.0 && self.opacity < 1.0,
+                "above 0 and below 1",
+            ),
+            ("scale", self.scale, (1e-3..=1e3).contains(&self.scale), "0.001 to 1000"),
+            ("thinnest", self.thinnest, (1e-3..=1.0).contains(&self.thinnest), "0.001 to 1"),
+        ] {
+            if !holds {
+                return Err(Error::Usage(format!("start.{name} is {value}; it must be {rule}")));
+            }
+        }
+        Ok(())
+    }
+}
 
 /// The least mean squared distance to the neighbours, world units squared (3DGS).
 const LEAST_SQUARED_DISTANCE: f64 = 1e-7;
@@ -22,22 +69,23 @@ const LEAST_SQUARED_DISTANCE: f64 = 1e-7;
 /// The standard deviation of a Gaussian that has no neighbour at all, world units.
 const LONE_SCALE: f64 = 0.01;
 
-/// One round Gaussian per point, in the points' order.
+/// One Gaussian per point, in the points' order.
 ///
-/// Opacity 0.1, no rotation, SH degree 0 such that the colour is `colors[i]` (sRGB-encoded, [0, 1]), nothing above
-/// it. The standard deviation is the root of the mean squared distance to the three nearest other positions (3DGS);
-/// coincident points count as one position, so duplicates do not shrink to nothing. With fewer than four positions
-/// the mean goes over those there are; a single position has the standard deviation 0.01. Features are uniform in
-/// [0, 1), drawn from `seed` (LITA-GS).
+/// SH degree 0 is such that the colour is `colors[i]` (sRGB-encoded, [0, 1]), nothing above it. Scales are those of `start`
+/// times the root of the mean squared distance to the three nearest other positions (3DGS); coincident points count as one
+/// position, so duplicates do not shrink to nothing. With fewer than four positions the mean goes over those there are; a
+/// single position has the standard deviation 0.01. Features are uniform in [0, 1), drawn from `seed` (LITA-GS).
 ///
 /// # Errors
-/// [`Error::Usage`] where a position or colour is not finite or their numbers differ.
+/// [`Error::Usage`] where a position or colour is not finite or their numbers differ, or [`Start::check`] refuses.
 pub fn from_points(
     positions: &[DVec3],
     colors: &[Vec3],
     shape: impl Into<Shape>,
+    start: &Start,
     seed: u64,
 ) -> Result<Gaussians> {
+    start.check()?;
     if positions.len() != colors.len() {
         return Err(Error::Usage(format!(
             "{} points have {} colours",
@@ -56,11 +104,15 @@ pub fn from_points(
     for (mean, position) in gaussians.means_mut().iter_mut().zip(positions) {
         *mean = position.as_vec3();
     }
-    gaussians.quats_mut().fill([1.0, 0.0, 0.0, 0.0]);
-    for (log_scale, scale) in gaussians.log_scales_mut().iter_mut().zip(scales(positions)) {
-        *log_scale = Vec3::splat(scale.ln() as f32);
+    let ellipsoids = ellipsoids(positions, start);
+    for (quat, ellipsoid) in gaussians.quats_mut().iter_mut().zip(&ellipsoids) {
+        let [x, y, z, w] = ellipsoid.rotation.to_array().map(|part| part as f32);
+        *quat = [w, x, y, z];
     }
-    gaussians.raw_opacities_mut().fill((OPACITY / (1.0 - OPACITY)).ln());
+    for (log_scale, ellipsoid) in gaussians.log_scales_mut().iter_mut().zip(&ellipsoids) {
+        *log_scale = ellipsoid.scales.map(f64::ln).as_vec3();
+    }
+    gaussians.raw_opacities_mut().fill((start.opacity / (1.0 - start.opacity)).ln() as f32);
     for (dc, color) in gaussians.dc_mut().iter_mut().zip(colors) {
         *dc = (color - 0.5) / SH_C0;
     }
@@ -71,10 +123,19 @@ pub fn from_points(
     Ok(gaussians)
 }
 
-/// The standard deviation of each point's Gaussian, world units.
-fn scales(positions: &[DVec3]) -> Vec<f64> {
+/// Standard deviations along axes of its own, world units.
+#[derive(Clone, Copy)]
+struct Ellipsoid {
+    rotation: DQuat,
+    scales: DVec3,
+}
+
+/// What each point's Gaussian covers.
+fn ellipsoids(positions: &[DVec3], start: &Start) -> Vec<Ellipsoid> {
     // The nearest position is the point itself.
     const NEAREST: usize = 1 + 3;
+    /// So many tell the direction of a surface.
+    const AROUND: usize = 1 + 8;
     // Adding zero turns -0 into 0, so that equal coordinates have equal bits.
     let key = |position: &DVec3| (*position + 0.0).to_array().map(f64::to_bits);
     let mut distinct: Vec<_> = positions.iter().map(key).collect();
@@ -82,19 +143,45 @@ fn scales(positions: &[DVec3]) -> Vec<f64> {
     distinct.dedup();
     let distinct = distinct.into_iter().map(|bits| bits.map(f64::from_bits).into());
     let distinct: Vec<DVec3> = distinct.collect();
+    let round = |scale: f64| Ellipsoid { rotation: DQuat::IDENTITY, scales: DVec3::splat(scale) };
     if distinct.len() <= 1 {
-        return vec![LONE_SCALE; positions.len()];
+        return vec![round(LONE_SCALE * start.scale); positions.len()];
     }
 
-    let found = distinct.len().min(NEAREST);
+    let found = distinct.len().min(AROUND);
     let neighbours = Neighbours::new(distinct);
-    let scale = |position: &DVec3| {
-        let squared = neighbours.nearest::<NEAREST>(*position);
-        let others = &squared[1..found];
-        let mean = others.iter().sum::<f64>() / others.len() as f64;
-        mean.max(LEAST_SQUARED_DISTANCE).sqrt()
+    let ellipsoid = |position: &DVec3| {
+        let around = neighbours.nearest::<AROUND>(*position);
+        let others = &around[1..found];
+        let nearest = &others[..others.len().min(NEAREST - 1)];
+        let mean = nearest.iter().map(|(squared, _)| squared).sum::<f64>() / nearest.len() as f64;
+        let scale = start.scale * mean.max(LEAST_SQUARED_DISTANCE).sqrt();
+        if start.thinnest == 1.0 {
+            return round(scale);
+        }
+        let (rotation, spread) = spread(others.iter().map(|(_, other)| *other - *position));
+        let axes = spread.map(|axis| axis.max(start.thinnest));
+        // The area of the disc, the product of its two longer axes, stays that of the round one.
+        let area = axes.element_product() / axes.min_element();
+        Ellipsoid { rotation, scales: axes * (scale / area.sqrt()) }
     };
-    positions.par_iter().map(scale).collect()
+    positions.par_iter().map(ellipsoid).collect()
+}
+
+/// The principal axes of directions, and how far they spread along each: 1 along the one they spread along most. Each
+/// direction counts alike, however long.
+fn spread(directions: impl Iterator<Item = DVec3>) -> (DQuat, DVec3) {
+    let mut moments = Matrix3::zeros();
+    for direction in directions.filter_map(DVec3::try_normalize) {
+        let direction = nalgebra::Vector3::from(direction.to_array());
+        moments += direction * direction.transpose();
+    }
+    let SymmetricEigen { eigenvectors, eigenvalues } = SymmetricEigen::new(moments);
+    let axes = DMat3::from_cols_slice(eigenvectors.as_slice());
+    let axes = if axes.determinant() < 0.0 { -axes } else { axes };
+    let longest = eigenvalues.max().max(f64::MIN_POSITIVE);
+    let spread = DVec3::from_slice(eigenvalues.as_slice()) / longest;
+    (DQuat::from_mat3(&axes).normalize(), spread.max(DVec3::ZERO).map(f64::sqrt))
 }
 
 /// `count` random positions inside what the cameras see, for captures without points; none without cameras.

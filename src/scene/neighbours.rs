@@ -20,31 +20,32 @@ impl Neighbours {
         Self { positions, axes }
     }
 
-    /// The squared distances from `place` to the nearest positions, ascending; infinite where there are no more.
-    pub(super) fn nearest<const COUNT: usize>(&self, place: DVec3) -> [f64; COUNT] {
-        let mut found = [f64::INFINITY; COUNT];
+    /// The nearest positions to `place` with their squared distances, by these; infinity where there are no more.
+    pub(super) fn nearest<const COUNT: usize>(&self, place: DVec3) -> [(f64, DVec3); COUNT] {
+        let mut found = [(f64::INFINITY, DVec3::INFINITY); COUNT];
         self.search(0..self.positions.len(), place, &mut found);
         found
     }
 
-    fn search(&self, range: Range<usize>, place: DVec3, found: &mut [f64]) {
+    fn search(&self, range: Range<usize>, place: DVec3, found: &mut [(f64, DVec3)]) {
         if range.is_empty() {
             return;
         }
         let middle = range.start + range.len() / 2;
-        let mut squared = place.distance_squared(self.positions[middle]);
+        let position = self.positions[middle];
+        let mut candidate = (place.distance_squared(position), position);
         for slot in found.iter_mut() {
-            if squared < *slot {
-                std::mem::swap(slot, &mut squared);
+            if candidate.0 < slot.0 {
+                std::mem::swap(slot, &mut candidate);
             }
         }
         let axis = self.axes[middle];
-        let beyond = place[axis] - self.positions[middle][axis];
+        let beyond = place[axis] - position[axis];
         let (below, above) = (range.start..middle, middle + 1..range.end);
         let (near, far) = if beyond < 0.0 { (below, above) } else { (above, below) };
         self.search(near, place, found);
         // Rounding is monotone: no squared distance comes out below that of its part along one axis.
-        if found.last().is_some_and(|farthest| beyond * beyond < *farthest) {
+        if found.last().is_some_and(|(farthest, _)| beyond * beyond < *farthest) {
             self.search(far, place, found);
         }
     }
@@ -83,7 +84,12 @@ mod tests {
                     let squared = positions.iter().map(|other| place.distance_squared(*other));
                     let mut expected: Vec<f64> = squared.chain([f64::INFINITY; 4]).collect();
                     expected.sort_by(f64::total_cmp);
-                    assert_eq!(tree.nearest::<4>(place), expected[..4], "{count}, {grid}");
+                    let found = tree.nearest::<4>(place);
+                    assert_eq!(found.map(|(squared, _)| squared), expected[..4], "{count}, {grid}");
+                    for (squared, position) in found.into_iter().filter(|found| found.0.is_finite())
+                    {
+                        assert_eq!(place.distance_squared(position), squared, "{count}, {grid}");
+                    }
                 }
             }
         }

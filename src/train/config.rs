@@ -12,6 +12,7 @@ use crate::loss::LossConfig;
 use crate::optimizer::Schedule;
 use crate::random::Stream;
 use crate::render::RenderSettings;
+use crate::scene::init::Start;
 use crate::scene::{MAX_SH_DEGREE, Shape};
 use crate::tone::ToneSettings;
 use crate::{Error, Result};
@@ -39,8 +40,8 @@ impl std::str::FromStr for Background {
     }
 }
 
-/// A training run. The defaults are the paper's protocol for LOM but for density control and its schedule, which reach the
-/// same score in less time ([`super::Preset::Lom`] has the paper's).
+/// A training run. The defaults are the paper's protocol for LOM but for the first Gaussians, density control and its
+/// schedule, which reach the same score in less time ([`super::Preset::Lom`] has the paper's).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct TrainConfig {
@@ -78,6 +79,8 @@ pub struct TrainConfig {
     pub random_points: usize,
     /// The curve that lifts each photograph.
     pub tone: ToneSettings,
+    /// What the first Gaussians look like.
+    pub start: Start,
     /// Learning rates, and what else changes with the step.
     pub schedule: Schedule,
     /// Density control.
@@ -129,6 +132,7 @@ impl Default for TrainConfig {
             tile: None,
             random_points: 20_000,
             tone: ToneSettings::default(),
+            start: Start::default(),
             schedule: Schedule::default(),
             density: DensityConfig::default(),
             model: ModelConfig::default(),
@@ -246,6 +250,7 @@ impl TrainConfig {
     /// [`Error::Usage`].
     pub fn check(&self) -> Result<()> {
         self.tone.check()?;
+        self.start.check()?;
         self.model.check()?;
         self.loss().check()?;
         let density = &self.density;

@@ -5,6 +5,7 @@ use std::str::FromStr;
 use super::{DensityConfig, TrainConfig};
 use crate::attributes::Attribute;
 use crate::optimizer::Schedule;
+use crate::scene::init::Start;
 use crate::tone::ToneCurve;
 use crate::{Error, Result};
 
@@ -39,9 +40,10 @@ impl Preset {
         }
     }
 
-    /// Sets density control and schedule; of a benchmark also what the paper states for it and, where its code has a file for the scene that the dataset's
-    /// folder is named after, what that file states. c is that of the configuration's curve.
+    /// Sets the first Gaussians, density control and schedule; of a benchmark also what the paper states for it and, where
+    /// its code has a file for the scene that the dataset's folder is named after, what that file states. c is that of the configuration's curve.
     pub fn apply(self, config: &mut TrainConfig) {
+        config.start = Start::default();
         match self {
             Self::Balanced => {
                 (config.schedule, config.density) = (Schedule::default(), DensityConfig::default());
@@ -56,6 +58,7 @@ impl Preset {
 
     fn apply_benchmark(self, config: &mut TrainConfig) {
         (config.schedule, config.density) = (Schedule::paper(), DensityConfig::paper());
+        config.start = Start::PAPER;
         let curve = config.tone.curve;
         let of_curve = |ase: f64, ap3: f64| match curve {
             ToneCurve::Ase => ase,
@@ -139,6 +142,7 @@ mod tests {
             let is_paper = config.density.control == DensityControl::Paper;
             assert_eq!(is_paper, BENCHMARKS.contains(&preset), "{preset:?}");
             assert_eq!(is_paper, config.schedule.densify_after == 500, "{preset:?}");
+            assert_eq!(is_paper, config.start == Start::PAPER, "{preset:?}");
             config.check().unwrap();
         }
         assert_eq!(applied(Preset::Balanced, "x", ToneCurve::None).schedule, Schedule::default());

@@ -168,7 +168,7 @@ impl Views {
         let positions: Vec<DVec3> = kept.iter().map(|point| point.position).collect();
         let seed = Stream::new(config.seed, streams::FEATURES).bits(0);
         let shape = Shape { sh_degree: config.sh_degree, features: config.model.features() };
-        init::from_points(&positions, &colors, shape, seed)
+        init::from_points(&positions, &colors, shape, &config.start, seed)
     }
 }
 
