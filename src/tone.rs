@@ -16,9 +16,11 @@
 //! of values from a file is a curve too.
 
 mod catalogue;
+mod exposure;
 mod families;
 #[cfg(feature = "io")]
 mod file;
+mod histogram;
 mod law;
 mod real;
 mod settings;
@@ -29,9 +31,12 @@ use std::fmt;
 use std::str::FromStr;
 
 pub use self::catalogue::{FAMILIES, ToneCurve};
+pub use self::exposure::{Exposure, is_black, soft};
 pub use self::families::{Constant, Family, Law, White};
 #[cfg(feature = "io")]
 pub use self::file::CurveChoice;
+pub use self::histogram::LuminanceHistogram;
+pub(crate) use self::histogram::{BIN_SHIFT, FIRST_PREFIX};
 #[cfg(feature = "fit")]
 pub(crate) use self::law::{Numbers, law};
 pub(crate) use self::law::{clamped, curve_at, tone_curve};

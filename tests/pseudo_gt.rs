@@ -9,7 +9,7 @@ use nightsplat::kernels::{
     tone_map, tone_statistics,
 };
 use nightsplat::pseudo_gt::PseudoGt;
-use nightsplat::tone::{Statistics, ToneCurve, ToneSettings};
+use nightsplat::tone::{LuminanceHistogram, Statistics, ToneCurve, ToneSettings};
 use nightsplat::{Error, Result};
 
 #[macro_use]
@@ -62,6 +62,7 @@ fn on_device(
     let size = [image.len() as u32 / 3, 1];
     gpu.run("statistics", |pass| pseudo_gt.statistics(pass, &image, size))?;
     let measured = pseudo_gt.measured()?;
+    assert_eq!(pseudo_gt.luminance_histogram()?, LuminanceHistogram::of(&gpu.read(&image)?));
     let parameters = settings.parameters(&measured);
     let uploaded = gpu.buffer("tone parameters", &[parameters])?;
     gpu.run("target", |pass| pseudo_gt.map(pass, &image, &uploaded, 0, &mut target))?;
@@ -366,6 +367,8 @@ fn a_photograph_in_tiles_has_the_statistics_of_the_whole() {
             let mut pseudo_gt = PseudoGt::new(&gpu, &ToneSettings::new(curve)).unwrap();
             gpu.run("tiles", |pass| pseudo_gt.statistics_of_tiles(pass, &tiles)).unwrap();
             let found = pseudo_gt.measured().unwrap();
+            let luminance = pseudo_gt.luminance_histogram().unwrap();
+            assert_eq!(luminance, LuminanceHistogram::of(&image), "tiles of {tile_pixels}");
             assert_eq!([found.p10, found.p90], [host.p10, host.p90], "tiles of {tile_pixels}");
             assert!((found.mean_luminance - host.mean_luminance).abs() <= 1e-6 * host.mean);
             let [found, expected] =
