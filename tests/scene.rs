@@ -286,6 +286,7 @@ mod colors {
             split,
             camera: camera(position),
             image: None,
+            original: None,
             reference: None,
             depth: None,
         }

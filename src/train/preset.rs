@@ -41,7 +41,8 @@ impl Preset {
     }
 
     /// Sets the first Gaussians, density control and schedule; of a benchmark also what the paper states for it and, where
-    /// its code has a file for the scene that the dataset's folder is named after, what that file states. c is that of the configuration's curve.
+    /// its code has a file for the scene that the dataset's folder is named after, what that file states. c is that of the
+    /// configuration's curve, which is AP3 in place of the automatic one.
     pub fn apply(self, config: &mut TrainConfig) {
         config.start = Start::default();
         match self {
@@ -59,6 +60,9 @@ impl Preset {
     fn apply_benchmark(self, config: &mut TrainConfig) {
         (config.schedule, config.density) = (Schedule::paper(), DensityConfig::paper());
         config.start = Start::PAPER;
+        if config.tone.curve == ToneCurve::Auto {
+            config.tone = config.tone.with_curve(ToneCurve::Ap3);
+        }
         let curve = config.tone.curve;
         let of_curve = |ase: f64, ap3: f64| match curve {
             ToneCurve::Ase => ase,
