@@ -98,6 +98,8 @@ pub struct Round {
     pub step: u64,
     /// How many rounds are left, this one included. Each takes its share of the room below the limit; 1 takes it all.
     pub rounds_left: u64,
+    /// The most Gaussians that the views leave room for; [`DensifySettings::max_gaussians`] holds as well.
+    pub most: usize,
 }
 
 /// What one round did.
@@ -205,7 +207,7 @@ impl Densifier {
         round: Round,
     ) -> Result<DensifyReport> {
         check(gaussians, &inputs)?;
-        let limit = self.limit(gaussians.column_count);
+        let limit = self.limit(gaussians.column_count).min(round.most);
         let tally = self.decide(gaussians, &inputs, limit, round)?;
         let report = report(gaussians.count, &tally);
         if report.refused > 0 && limit < self.settings.max_gaussians && !self.has_warned {

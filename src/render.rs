@@ -226,13 +226,28 @@ impl Renderer {
         self.frame.reserve(&self.gpu, [gaussian_count, capacity], pixels, tiles)
     }
 
-    /// Makes room for `intersections`, and half as many again; what room there is stays.
+    /// Makes room for `intersections`, and half as many again where the device can bind them; what room there is stays.
     ///
     /// # Errors
-    /// The device is out of memory.
+    /// The device is out of memory, or cannot bind so many.
     pub fn grow(&mut self, intersections: u32) -> Result<()> {
-        let capacity = intersections.saturating_add(intersections / 2);
+        let headroom =
+            intersections.saturating_add(intersections / 2).min(self.most_intersections());
+        let capacity = headroom.max(intersections);
         self.set_intersection_capacity(capacity.max(self.frame.intersection_capacity()))
+    }
+
+    /// The most intersections of a view whose records the device can bind at once.
+    pub fn most_intersections(&self) -> u32 {
+        self.frame.most_intersections(&self.gpu)
+    }
+
+    /// How many intersections the last render had; waits for it.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub fn intersections(&self) -> Result<u32> {
+        Ok(self.gpu.read(&self.frame.counts)?[0])
     }
 
     /// Makes room for exactly so many intersections.

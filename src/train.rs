@@ -312,10 +312,22 @@ impl Trainer {
             DensityControl::Conserving => self.config.schedule.rounds_left(self.step),
             DensityControl::Paper => 1,
         };
-        let round = Round { step: self.step, rounds_left };
+        let round = Round { step: self.step, rounds_left, most: self.most_gaussians()? };
         let changed = self.model.densify(&gpu, &mut self.densifier, round)?;
         tracing::debug!("step {}: {changed:?}", self.step);
         self.reserve()
+    }
+
+    /// How many Gaussians leave the device able to bind the intersections of a view, should it have twice as many of them for
+    /// each Gaussian as the last one has; at least as many as there are.
+    fn most_gaussians(&self) -> Result<usize> {
+        let pixels = |size: UVec2| f64::from(size.x) * f64::from(size.y);
+        let largest = self.views.sizes().into_iter().map(pixels).fold(0.0, f64::max);
+        let shrunk = largest / pixels(self.view_of(self.step).size());
+        let met = 2.0 * shrunk * f64::from(self.renderer.intersections()?.max(1));
+        let count = self.model.count();
+        let growth = f64::from(self.renderer.most_intersections()) / met;
+        Ok(((count as f64 * growth) as usize).max(count))
     }
 
     /// Trains one step with every pass checked ([`Gpu::checked`]), density control included, and reports on them. The

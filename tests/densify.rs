@@ -28,7 +28,7 @@ const SETTINGS: DensifySettings = DensifySettings {
 const CONSERVING: DensifySettings =
     DensifySettings { control: DensityControl::Conserving, ..SETTINGS };
 const STEP: u64 = 600;
-const LAST: Round = Round { step: STEP, rounds_left: 1 };
+const LAST: Round = Round { step: STEP, rounds_left: 1, most: usize::MAX };
 
 /// Gaussians, their moments and their statistics in host memory.
 #[derive(Clone, Debug, PartialEq)]
@@ -548,6 +548,16 @@ fn a_round_takes_its_share_of_the_room_and_the_last_one_the_rest() {
         let (_, report) = before.densify(&gpu, settings, Round { rounds_left, ..LAST });
         assert_eq!(report.count, count, "{rounds_left} rounds left");
         assert_eq!(report.refused, 200 - count);
+    }
+}
+
+#[test]
+fn growth_ends_where_the_views_leave_no_more_room() {
+    let mut before = Host::calm(100);
+    (0..100).for_each(|i| before.pull_at(i));
+    for (most, count) in [(usize::MAX, 200), (130, 130), (100, 100), (0, 100)] {
+        let (_, report) = before.densify(&gpu(), CONSERVING, Round { most, ..LAST });
+        assert_eq!((report.count, report.refused), (count, 200 - count), "at most {most}");
     }
 }
 

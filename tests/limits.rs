@@ -49,6 +49,21 @@ fn the_most_intersections_that_can_be_counted_are_an_overflow() {
     }
 }
 
+#[test]
+fn memory_for_intersections_grows_to_what_the_device_can_bind_and_no_further() {
+    let mut renderer = Setup::new(1, [32, 32], 0, 1).render().renderer;
+    let most = renderer.most_intersections();
+    // Where a device binds gigabytes, allocating them is no test.
+    if most > 1 << 23 {
+        eprintln!("not run: this device binds {most} intersections at once");
+        return;
+    }
+    renderer.grow(most - most / 4).unwrap();
+    renderer.grow(most).unwrap();
+    let message = renderer.grow(most + 1).unwrap_err().to_string();
+    assert!(message.contains("records"), "{message}");
+}
+
 /// What `blend_forward` finds of the runs of `sorted_tiles` in a view of 5 x 24 tiles, and the status.
 fn tile_runs(sorted_tiles: Vec<u32>, longest_run: u32) -> (Vec<UVec2>, Vec<u32>) {
     let setup = Setup::new(1, [32, 32], 0, 1);

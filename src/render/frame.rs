@@ -160,6 +160,12 @@ impl Frame {
         RECORD_HEAD as usize + self.channels
     }
 
+    /// How many intersections' records one binding holds.
+    pub(super) fn most_intersections(&self, gpu: &Gpu) -> u32 {
+        let record = (self.record() * size_of::<f32>()) as u64;
+        (gpu.properties().max_storage_buffer_range / record).min(u32::MAX.into()) as u32
+    }
+
     pub(super) fn intersection_capacity(&self) -> u32 {
         self.tiles.len() as u32
     }
