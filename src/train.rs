@@ -142,7 +142,7 @@ pub struct Trainer {
     gpu: Gpu,
     config: TrainConfig,
     extent: f64,
-    exposure: Option<TargetExposure>,
+    target_exposure: Option<TargetExposure>,
     /// Steps done.
     step: u64,
     views: Views,
@@ -207,8 +207,9 @@ impl Trainer {
         let mut pseudo_gt = PseudoGt::new(gpu, &config.tone)?;
         let levels = config.schedule.resolution_levels();
         let has_networks = config.model.denoiser || config.model.tonemapper;
-        let (views, exposure) = Views::upload(gpu, &mut pseudo_gt, dataset, levels, has_networks)?;
-        if let Some(TargetExposure { scene, .. }) = &exposure {
+        let (views, target_exposure) =
+            Views::upload(gpu, &mut pseudo_gt, dataset, levels, has_networks)?;
+        if let Some(TargetExposure { scene, .. }) = &target_exposure {
             tracing::info!("{}", scene.reason());
         }
         let sizes = views.sizes();
@@ -231,7 +232,7 @@ impl Trainer {
         let mut trainer = Self {
             gpu: gpu.clone(),
             extent: dataset.extent(),
-            exposure,
+            target_exposure,
             step: 0,
             views,
             model: Model::upload(gpu, &gaussians)?,
@@ -255,8 +256,8 @@ impl Trainer {
     }
 
     /// How bright the targets are; none where the curve's constants say that.
-    pub fn exposure(&self) -> Option<&TargetExposure> {
-        self.exposure.as_ref()
+    pub fn target_exposure(&self) -> Option<&TargetExposure> {
+        self.target_exposure.as_ref()
     }
 
     /// The number of Gaussians.
@@ -372,7 +373,7 @@ impl Trainer {
             size: view.size(),
             features: model.shape().features,
             render,
-            low: &view.input,
+            low: view.loss_input(),
             tone: &view.tone,
         };
         self.losses.record(pass, inputs, d_render, log)?;

@@ -39,6 +39,9 @@ const FILES: [&str; 6] = ["metrics.json", "model.ply", NETWORKS, CHECKPOINT, LOG
 /// A line per step.
 const LOG: &str = "train.csv";
 
+/// Where `metrics.json` holds the [`crate::train::TargetExposure`].
+pub(crate) const TARGET_EXPOSURE: &str = "target_exposure";
+
 /// The weights of the networks.
 const NETWORKS: &str = "networks.safetensors";
 
@@ -168,6 +171,12 @@ pub(super) fn checkpoint(run: &Path) -> Option<PathBuf> {
 /// Whether a directory holds a run that reached its end.
 pub fn is_finished(run: &Path) -> bool {
     run.join("metrics.json").exists()
+}
+
+/// What `metrics.json` says; null where it does not exist.
+pub fn load_metrics(run: &Path) -> serde_json::Value {
+    let text = std::fs::read(run.join("metrics.json")).ok();
+    text.and_then(|text| serde_json::from_slice(&text).ok()).unwrap_or_default()
 }
 
 /// The configuration of a finished or unfinished run.

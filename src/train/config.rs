@@ -40,8 +40,8 @@ impl std::str::FromStr for Background {
     }
 }
 
-/// A training run. The defaults are the paper's protocol for LOM but for the first Gaussians, density control and its
-/// schedule, which reach the same score in less time ([`super::Preset::Lom`] has the paper's).
+/// A training run. The defaults are the paper's protocol for LOM but for the curve, the first Gaussians, density control and
+/// its schedule, which reach a better score in less time ([`super::Preset::Lom`] has the paper's).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct TrainConfig {
