@@ -7,6 +7,7 @@ use nightsplat::attributes::planes;
 use nightsplat::camera::Camera;
 use nightsplat::dataset::{Point, Split, View};
 use nightsplat::image::Image;
+use nightsplat::scene::init::Start;
 use nightsplat::scene::{
     ATTRIBUTES, Features, Gaussians, SH_C0, Shape, init, ply, rest_coefficients, width,
 };
