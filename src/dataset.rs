@@ -206,6 +206,19 @@ impl Dataset {
         Ok(sources.into_iter().filter_map(photograph).collect())
     }
 
+    /// Leaves out views by name; points forget them.
+    pub fn leave_out(&mut self, names: &[String]) {
+        let stays: Vec<bool> = self.views.iter().map(|view| !names.contains(&view.name)).collect();
+        let place = |view: u32| {
+            let stays_before = stays[..view as usize].iter().filter(|&&stays| stays).count();
+            stays[view as usize].then_some(stays_before as u32)
+        };
+        for point in &mut self.points {
+            point.views = point.views.iter().filter_map(|&view| place(view)).collect();
+        }
+        self.views.retain(|view| !names.contains(&view.name));
+    }
+
     /// The training views.
     pub fn train_views(&self) -> impl Iterator<Item = &View> {
         self.views.iter().filter(|view| view.split == Split::Train)

@@ -4,6 +4,6 @@ mod directory;
 mod events;
 mod train;
 
-pub use directory::{RunDirectory, is_finished, load_config, load_model, load_networks};
+pub use directory::{RunDirectory, is_finished, load_config, load_model, load_networks, plan_of};
 pub use events::Event;
-pub use train::{HeldRun, Trained, train};
+pub use train::{HeldRun, Trained, train, train_planned};

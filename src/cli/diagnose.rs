@@ -70,7 +70,7 @@ struct Output<'a> {
 /// The dataset is not usable or black altogether, there is no device, or a file cannot be written.
 pub fn run(args: &DiagnoseArgs) -> Result<()> {
     let mut config = TrainConfig { dataset: args.dataset.clone(), ..TrainConfig::default() };
-    args.preset.unwrap_or(Preset::Balanced).apply(&mut config);
+    args.preset.unwrap_or(Preset::Balanced).apply(&mut config)?;
     config.steps = args.steps.unwrap_or(config.steps);
     config.downscale = args.downscale.unwrap_or(config.downscale);
     let gpu = Gpu::new(&args.device.clone().unwrap_or_default())?;

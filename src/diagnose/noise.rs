@@ -21,6 +21,9 @@ const FLAT: f64 = 0.25;
 const BINS: usize = 24;
 /// A bin with fewer flat patches says nothing.
 const LEAST_PATCHES: usize = 12;
+/// Patches whose even rows have less than this fraction of the variance that whole codes add are flat to the code:
+/// compression, or too few codes, took their noise.
+const DEAD: f64 = 0.25;
 /// Where more values than this are black, noise is cut off at zero and looks smaller than it is.
 const MOST_ZEROS: f64 = 0.002;
 
@@ -100,6 +103,8 @@ pub(super) fn slope(linear: f64) -> f64 {
 
 /// The line through the flat patches; none where there are too few.
 pub(super) fn fit(mut patches: Vec<Patch>) -> Option<Noise> {
+    // A plane that is not in codes has no dead patches.
+    patches.retain(|patch| patch.variances[0] >= DEAD * patch.quantization);
     patches.sort_unstable_by(|a, b| a.signal.total_cmp(&b.signal));
     let per_bin = patches.len().div_ceil(BINS).max((LEAST_PATCHES as f64 / FLAT) as usize);
     let bins: Vec<Bin> = patches.chunks_mut(per_bin).filter_map(Bin::of).collect();

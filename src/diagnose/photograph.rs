@@ -129,8 +129,8 @@ fn unevenness(luminance: &[f32], width: usize) -> f64 {
     }
     let means: Vec<f64> = regions.iter().map(|&(sum, count)| sum / f64::max(count, 1.0)).collect();
     let whole = means.iter().sum::<f64>() / means.len() as f64;
-    // A black corner is no light source: what is below a hundredth of the mean counts as that.
-    let logs: Vec<f64> = means.iter().map(|mean| mean.max(0.01 * whole).log2()).collect();
+    // A black corner is no light source: what is below a thousandth of the mean counts as that.
+    let logs: Vec<f64> = means.iter().map(|mean| mean.max(1e-3 * whole).log2()).collect();
     super::deviation(logs.iter().copied()).filter(|_| whole > 0.0).unwrap_or(0.0)
 }
 

@@ -2,6 +2,7 @@
 //!
 //! ```text
 //! RUN/config.toml    everything the run used
+//!     plan.toml      what was decided for these photographs and why, where a plan was made
 //!     model.ply      the Gaussians, as splat viewers open them
 //!     networks.safetensors    the weights of the networks, where the model has any
 //!     train.csv      one line per step
@@ -15,6 +16,7 @@ use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
+use crate::diagnose::Plan;
 use crate::gpu::Gpu;
 use crate::loss::Term;
 use crate::output::write_whole;
@@ -34,10 +36,14 @@ pub struct RunDirectory {
 }
 
 /// The files of a run that a new run replaces; nothing else in the directory is touched.
-const FILES: [&str; 6] = ["metrics.json", "model.ply", NETWORKS, CHECKPOINT, LOG, "config.toml"];
+const FILES: [&str; 7] =
+    ["metrics.json", "model.ply", NETWORKS, CHECKPOINT, LOG, PLAN, "config.toml"];
 
 /// A line per step.
 const LOG: &str = "train.csv";
+
+/// What was decided for the photographs, and why.
+const PLAN: &str = "plan.toml";
 
 /// The weights of the networks.
 const NETWORKS: &str = "networks.safetensors";
@@ -97,6 +103,14 @@ impl RunDirectory {
         let log = BufWriter::new(log.map_err(|error| unwritable(&log_path, &error))?);
         let terms = config.loss().terms();
         Ok(Self { path: path.to_owned(), log, terms, seconds_before })
+    }
+
+    /// Writes the plan that the configuration follows.
+    ///
+    /// # Errors
+    /// The disk is full or gone.
+    pub fn save_plan(&self, plan: &Plan) -> Result<()> {
+        write_whole(&self.path.join(PLAN), plan.to_toml()?.as_bytes())
     }
 
     /// What the steps took that a resumed run had behind it, in seconds.
@@ -182,6 +196,11 @@ pub fn load_config(run: &Path) -> Result<TrainConfig> {
         return Err(Error::input(run, problem));
     }
     TrainConfig::load(&path)
+}
+
+/// The plan that a run keeps to; none where it keeps to none.
+pub fn plan_of(run: &Path) -> Option<PathBuf> {
+    Some(run.join(PLAN)).filter(|path| path.is_file())
 }
 
 /// The trained Gaussians of a run.

@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 use super::{Event, RunDirectory, directory};
 use crate::Result;
 use crate::dataset::Dataset;
+use crate::diagnose::Plan;
 use crate::eval::{self, ViewScore};
 use crate::gpu::Gpu;
 use crate::train::{TrainConfig, Trainer};
@@ -70,10 +71,29 @@ pub fn train(
     dataset: &Dataset,
     out: &Path,
     held: HeldRun,
+    observe: impl FnMut(Event<'_>),
+) -> Result<Trained> {
+    train_planned(gpu, config, None, dataset, out, held, observe)
+}
+
+/// As [`train`], by a plan that `config` and `dataset` follow already, which is kept in the run directory.
+///
+/// # Errors
+/// As there.
+pub fn train_planned(
+    gpu: &Gpu,
+    config: &TrainConfig,
+    plan: Option<&Plan>,
+    dataset: &Dataset,
+    out: &Path,
+    held: HeldRun,
     mut observe: impl FnMut(Event<'_>),
 ) -> Result<Trained> {
     gpu.reset_peak_memory();
     let (mut directory, mut trainer) = begin(gpu, config, dataset, out, held)?;
+    if let Some(plan) = plan {
+        directory.save_plan(plan)?;
+    }
     observe(Event::Started { step: trainer.steps_done(), steps: config.steps });
     let (losses, seconds) =
         train_to_the_end(&mut trainer, &mut directory, config, dataset, &mut observe)?;
