@@ -10,13 +10,16 @@
 //! makes the [`LuminanceHistogram`] from which the exposure follows. A photograph beyond the device's limits comes in tiles,
 //! whose counts and sums add up.
 
+mod photographs;
+
 use glam::Vec3;
 
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::rank_search::{BINS, SEARCHES, WORKGROUP};
 use crate::kernels::{self, RankSearch, ToneParameters, ToneStatistics};
-use crate::tone::{BIN_SHIFT, FIRST_PREFIX, LuminanceHistogram};
-use crate::tone::{Rank, Statistics, ToneSettings, White};
+use crate::tone::{
+    BIN_SHIFT, FIRST_PREFIX, LuminanceHistogram, Rank, Statistics, ToneSettings, White,
+};
 use crate::{Error, Result};
 
 /// Threads that share an image: enough to fill a large GPU, few enough that their partial sums add up quickly.

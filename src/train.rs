@@ -36,6 +36,7 @@ pub use parts::{ModelConfig, ModelName, NetworkRates, Part};
 pub use preset::Preset;
 use submission::{MOST_STEPS, Pace};
 use terms::NetworkTerms;
+pub use views::TargetExposure;
 use views::{TrainView, Views};
 
 /// The streams of random numbers that training draws from, one per purpose.
@@ -141,6 +142,7 @@ pub struct Trainer {
     gpu: Gpu,
     config: TrainConfig,
     extent: f64,
+    exposure: Option<TargetExposure>,
     /// Steps done.
     step: u64,
     views: Views,
@@ -203,8 +205,12 @@ impl Trainer {
         kernels: ScopedJoinHandle<'_, Result<Kernels>>,
     ) -> Result<Self> {
         let mut pseudo_gt = PseudoGt::new(gpu, &config.tone)?;
-        let views =
-            Views::upload(gpu, &mut pseudo_gt, dataset, config.schedule.resolution_levels())?;
+        let levels = config.schedule.resolution_levels();
+        let has_networks = config.model.denoiser || config.model.tonemapper;
+        let (views, exposure) = Views::upload(gpu, &mut pseudo_gt, dataset, levels, has_networks)?;
+        if let Some(TargetExposure { scene, .. }) = &exposure {
+            tracing::info!("{}", scene.reason());
+        }
         let sizes = views.sizes();
         say_what_parts_see(&config.model, &sizes);
         let gaussians = match gaussians {
@@ -225,6 +231,7 @@ impl Trainer {
         let mut trainer = Self {
             gpu: gpu.clone(),
             extent: dataset.extent(),
+            exposure,
             step: 0,
             views,
             model: Model::upload(gpu, &gaussians)?,
@@ -245,6 +252,11 @@ impl Trainer {
     /// Steps done so far.
     pub fn steps_done(&self) -> u64 {
         self.step
+    }
+
+    /// How bright the targets are; none where the curve's constants say that.
+    pub fn exposure(&self) -> Option<&TargetExposure> {
+        self.exposure.as_ref()
     }
 
     /// The number of Gaussians.
@@ -348,12 +360,12 @@ impl Trainer {
             size: view.size(),
             features: model.shape().features,
             render,
-            low: view.loss_input(),
+            low: &view.input,
             tone: &view.tone,
         };
         self.losses.record(pass, inputs, d_render, log)?;
         if let Some(networks) = &mut self.networks {
-            networks.record(pass, inputs, &view.image, d_render, log)?;
+            networks.record(pass, inputs, view.photograph(), d_render, log)?;
         }
         self.renderer.backward(
             pass,

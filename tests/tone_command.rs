@@ -9,7 +9,7 @@ use nightsplat::cli::ImageFormat;
 use nightsplat::cli::in_options;
 use nightsplat::cli::tone::{ToneArgs, ToneReport, apply};
 use nightsplat::image::Image;
-use nightsplat::tone::{Statistics, ToneCurve, ToneSettings};
+use nightsplat::tone::{GainChoice, Statistics, ToneCurve, ToneSettings};
 
 mod common;
 
@@ -19,6 +19,8 @@ fn args(input: &Path, out: PathBuf) -> ToneArgs {
         curve: ToneCurve::Ap3.into(),
         out: Some(out),
         gain: None,
+        brightness: None,
+        colour: None,
         theta: None,
         scene_statistics: false,
         reference: None,
@@ -49,7 +51,7 @@ fn a_folder_is_mapped_by_name_and_what_cannot_be_read_is_left_out() {
         let out = dir.path().join(curve.name());
         let args = ToneArgs {
             curve: curve.into(),
-            gain: Some(2.0),
+            gain: Some(GainChoice::C(2.0)),
             theta: Some(0.4),
             ..args(&photographs, out.clone())
         };
@@ -61,7 +63,7 @@ fn a_folder_is_mapped_by_name_and_what_cannot_be_read_is_left_out() {
             let statistics = Statistics::of(&image.data);
             let before = views[name].before;
             assert_eq!([before.p10, before.p90], statistics.percentiles());
-            let paper = ToneSettings::default().offset(statistics.printed_ratio());
+            let paper = ToneSettings::new(ToneCurve::Ap3).offset(statistics.printed_ratio());
             assert!((views[name].delta0 - paper).abs() < 1e-6);
             let parameters = settings.parameters(&statistics);
             let mapped = Image::load(out.join(name).with_extension("png")).unwrap();
@@ -138,7 +140,7 @@ fn bad_input_is_named_in_one_line() {
     assert_eq!(std::fs::read(path("good.png")).unwrap(), before);
 
     fails(args(&path("good.png"), path("broken.png")), "cannot be made", 1);
-    fails(ToneArgs { gain: Some(-1.0), ..args(&path("good.png"), out.clone()) }, "--gain", 2);
+    fails(ToneArgs { gain: Some(GainChoice::C(-1.0)), ..args(&path("good.png"), out.clone()) }, "--gain", 2);
     fails(ToneArgs { theta: Some(f64::NAN), ..args(&path("good.png"), out) }, "--theta", 2);
 }
 
@@ -159,7 +161,7 @@ fn a_photograph_that_exceeds_a_binding_is_mapped_in_tiles() {
     let view = apply(&args).unwrap().views["vast"];
     let statistics = Statistics::of(&image.data);
     assert_eq!([view.before.p10, view.before.p90], statistics.percentiles());
-    let parameters = ToneSettings::default().parameters(&statistics);
+    let parameters = ToneSettings::new(ToneCurve::Ap3).parameters(&statistics);
     let mapped = Image::load(dir.path().join("out/vast.png")).unwrap();
     for (&x, y) in image.data.iter().zip(&mapped.data).step_by(997) {
         assert!((ToneCurve::Ap3.apply(x, &parameters) - y).abs() < 1e-4, "{x}: {y}");

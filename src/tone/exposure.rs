@@ -15,6 +15,8 @@
 //! unbounded, so the mean, of which 0.46 is the encoded 18 % grey, is the guard. Power and constants come from pairs of low-
 //! and normal-light photographs (LOL, LOM, `RealX3D`).
 
+use serde::Serialize;
+
 use super::histogram::LuminanceHistogram;
 use super::real::Real;
 use crate::Error;
@@ -52,7 +54,8 @@ pub fn soft(x: f64, gain: f64) -> f64 {
 }
 
 /// What the rule finds for a set of photographs.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[serde(into = "Written")]
 pub struct Exposure {
     /// The gain of all training photographs together, those that are black left out.
     pub gain: f64,
@@ -155,6 +158,28 @@ impl Exposure {
         format!(
             "mean luminance {mean:.3}, {lift:.1} times that is {target:.2}: {verdict}{varies}{left_out}"
         )
+    }
+}
+
+/// The exposure as JSON has it.
+#[derive(Serialize)]
+struct Written {
+    gain: f64,
+    target: f64,
+    mean: f64,
+    lift: f64,
+    weight: f64,
+    spread: f64,
+    share: f64,
+    black: usize,
+    reason: String,
+}
+
+impl From<Exposure> for Written {
+    fn from(exposure: Exposure) -> Self {
+        let (lift, weight, reason) = (exposure.lift(), exposure.weight(), exposure.reason());
+        let Exposure { gain, target, mean, spread, share, black, .. } = exposure;
+        Self { gain, target, mean, lift, weight, spread, share, black, reason }
     }
 }
 

@@ -77,7 +77,7 @@ impl Preset {
 
     /// Sets what its TOML says; of a benchmark density control, schedule and what the paper states for it and, where its
     /// code has a file for the scene that the dataset's folder is named after, what that file states. c is that of the
-    /// configuration's curve.
+    /// configuration's curve; the automatic one gives way to AP3 there and with [`Preset::Paper`].
     ///
     /// # Errors
     /// None for the presets that there are.
@@ -86,11 +86,17 @@ impl Preset {
             Some(text) => *config = config.overlaid(text)?,
             None => self.apply_benchmark(config),
         }
+        if !self.is_planned() && config.tone.curve == ToneCurve::Auto {
+            config.tone = config.tone.with_curve(ToneCurve::Ap3);
+        }
         Ok(())
     }
 
     fn apply_benchmark(self, config: &mut TrainConfig) {
         (config.schedule, config.density) = (Schedule::paper(), DensityConfig::paper());
+        if config.tone.curve == ToneCurve::Auto {
+            config.tone = config.tone.with_curve(ToneCurve::Ap3);
+        }
         let curve = config.tone.curve;
         let of_curve = |ase: f64, ap3: f64| match curve {
             ToneCurve::Ase => ase,
