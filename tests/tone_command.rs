@@ -140,7 +140,11 @@ fn bad_input_is_named_in_one_line() {
     assert_eq!(std::fs::read(path("good.png")).unwrap(), before);
 
     fails(args(&path("good.png"), path("broken.png")), "cannot be made", 1);
-    fails(ToneArgs { gain: Some(GainChoice::C(-1.0)), ..args(&path("good.png"), out.clone()) }, "--gain", 2);
+    fails(
+        ToneArgs { gain: Some(GainChoice::C(-1.0)), ..args(&path("good.png"), out.clone()) },
+        "--gain",
+        2,
+    );
     fails(ToneArgs { theta: Some(f64::NAN), ..args(&path("good.png"), out) }, "--theta", 2);
 }
 

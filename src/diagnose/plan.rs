@@ -128,7 +128,7 @@ impl Plan {
             curve: curve(scene),
             exposure: exposure(scene, views),
             denoiser: denoiser(scene),
-            tonemapper: tonemapper(scene),
+            tonemapper: tonemapper(scene, views),
             structure: structure(scene),
             depth: depth(diagnosis),
             max_gaussians: max_gaussians(diagnosis, config, sh_degree.value, memory),
@@ -245,9 +245,11 @@ fn denoiser(scene: &SceneDiagnosis) -> Switch {
     Switch { on, why }
 }
 
-fn tonemapper(scene: &SceneDiagnosis) -> Switch {
+fn tonemapper(scene: &SceneDiagnosis, views: usize) -> Switch {
     let unevenness = scene.unevenness;
-    let on = unevenness >= LEAST_UNEVENNESS && scene.lift >= LEAST_LIFT;
+    // A learned exposure does not describe the dark photographs, to which the tonemapper holds the model.
+    let on =
+        unevenness >= LEAST_UNEVENNESS && scene.lift >= LEAST_LIFT && !exposure(scene, views).on;
     let why = format!(
         "light varies by {unevenness:.1} stops between large regions (an illumination of its own from {LEAST_UNEVENNESS}, in dark sets)"
     );
