@@ -150,7 +150,7 @@ impl Diagnosis {
     /// Every photograph is as good as black, or one cannot be read any more.
     pub fn of(dataset: &Dataset, options: &LoadOptions) -> Result<Self> {
         let views: Vec<(usize, &View)> =
-            dataset.views.iter().enumerate().filter(|(_, view)| view.is_train()).collect();
+            dataset.views.iter().enumerate().filter(|(_, view)| view.is_for_training()).collect();
         let files = Dataset::photographs(&dataset.root, options)?;
         let path = |view: &View| {
             let file = files.iter().find(|file| file.name == view.name);

@@ -2,6 +2,7 @@
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;
 
@@ -14,7 +15,7 @@ use nightsplat::train::{Preset, TrainConfig};
 mod common;
 use common::command::{refused, run, succeed};
 
-const SET: SyntheticOptions = SyntheticOptions { views: 12, width: 160, height: 120, seed: 3 };
+const SET: SyntheticOptions = SyntheticOptions { views: 12, width: 96, height: 72, seed: 3 };
 const MEMORY: u64 = 8 << 30;
 
 fn written(capture: &Capture) -> tempfile::TempDir {
@@ -105,7 +106,7 @@ fn an_injected_spread_of_exposures_is_found_within_a_tenth_view_by_view() {
 fn a_blurred_photograph_and_one_without_a_pose_are_named() {
     let set = written(&Capture::clean());
     edit(set.path(), |index, image| {
-        if index == 3 { image.resized(40, 30).resized(160, 120) } else { image.clone() }
+        if index == 3 { image.resized(24, 18).resized(96, 72) } else { image.clone() }
     });
     fs::copy(set.path().join("low/001.png"), set.path().join("low/stray.png")).unwrap();
     let found = diagnosis_of(set.path());
@@ -173,7 +174,7 @@ fn numbers_keep_to_views_steps_memory_and_preset() {
         (plan.sh_degree.value, plan.max_gaussians.value, plan.max_gaussians.why)
     };
     let (degree, budget, why) = plan(&config, MEMORY);
-    assert_eq!(budget, (10 * 160 * 120_u64 / 8).max(found.scene.points as u64), "{why}");
+    assert_eq!(budget, (10 * 96 * 72_u64 / 8).max(found.scene.points as u64), "{why}");
     assert!(degree >= 1, "{}", found.scene.views_per_point);
     let (_, small, why) = plan(&config, 1 << 20);
     assert!(small < budget && why.contains("GiB"), "{why}");
@@ -193,7 +194,7 @@ fn a_plan_survives_its_file_and_fits_its_dataset_alone() {
     assert_eq!(Plan::load(&path, &dataset).unwrap(), plan);
     let half = Dataset::load(set.path(), &LoadOptions { downscale: 2.0, ..options }).unwrap();
     let refusal = Plan::load(&path, &half).unwrap_err().to_string();
-    for part in ["plan.toml", "another dataset", "160x120", "80x60", "diagnose"] {
+    for part in ["plan.toml", "another dataset", "96x72", "48x36", "diagnose"] {
         assert!(refusal.contains(part), "{refusal}");
     }
     fs::write(&path, "[curve]\non = maybe\n").unwrap();
@@ -221,7 +222,7 @@ fn the_command_prints_json_writes_a_page_and_a_plan_that_train_keeps() {
     assert!(picture < html.find("<table").unwrap(), "pictures come first");
     assert!(!html.contains("http://") && !html.contains("https://"));
     let text = succeed(&format!("diagnose {root}"));
-    for part in ["10 photographs to train on (160x120), 2 held out", "denoiser", "views"] {
+    for part in ["10 photographs to train on (96x72), 2 held out", "denoiser", "views"] {
         assert!(text.contains(part), "{text}");
     }
 
@@ -233,7 +234,7 @@ fn the_command_prints_json_writes_a_page_and_a_plan_that_train_keeps() {
     let said = succeed(&format!(
         "train {root} --out {out} --plan {plan} --steps 9 --parts structure --set schedule.densify_after=99"
     ));
-    assert!(said.contains("3210") && said.contains("views of 160x120"), "{said}");
+    assert!(said.contains("3210") && said.contains("views of 96x72"), "{said}");
     let config = fs::read_to_string(set.path().join("run/config.toml")).unwrap();
     for line in ["max_gaussians = 3210", "structure = true", "denoiser = false"] {
         assert!(config.contains(line), "no `{line}` in {config}");
@@ -263,6 +264,36 @@ fn a_preset_of_the_paper_and_a_configuration_are_not_planned() {
     }
     succeed(&format!("train {root} --out {at} --overwrite --steps 1"));
     assert!(out.join("plan.toml").exists());
+}
+
+#[test]
+fn a_run_without_a_length_ends_when_held_out_views_have_converged() {
+    let set = written(&Capture::default());
+    let (root, out) = (set.path().display(), set.path().join("run"));
+    // Whatever is learned is too little.
+    let options = "--preset draft --set stop.views=1 --set stop.every=5 --set stop.gain=90 \
+                   --set schedule.resolution_steps=[0,0] --set checkpoint_every=10";
+    let train = format!("train {root} --out {} {options}", out.display());
+    succeed(&train);
+    let scores = fs::read_to_string(out.join("held_out.csv")).unwrap();
+    let steps = |text: &str| -> Vec<String> {
+        text.lines().skip(1).map(|line| line.split(',').next().unwrap().to_owned()).collect()
+    };
+    assert_eq!(steps(&scores), ["5", "10", "15"]);
+    let log = fs::read_to_string(out.join("train.csv")).unwrap();
+    assert_eq!(log.lines().count(), 16);
+    // The one that is held out is never trained on.
+    let views: BTreeSet<&str> =
+        log.lines().skip(1).map(|line| line.split(',').nth(1).unwrap()).collect();
+    assert_eq!(views.len(), 9);
+    let metrics = fs::read_to_string(out.join("metrics.json")).unwrap();
+    assert!(metrics.contains("\"steps\": 15"), "{metrics}");
+    // What goes on from the checkpoint at 10 comes to the same end.
+    let model = fs::read(out.join("model.ply")).unwrap();
+    fs::remove_file(out.join("metrics.json")).unwrap();
+    succeed(&format!("{train} --resume"));
+    assert!(model == fs::read(out.join("model.ply")).unwrap());
+    assert_eq!(scores, fs::read_to_string(out.join("held_out.csv")).unwrap());
 }
 
 #[test]

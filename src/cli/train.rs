@@ -211,13 +211,26 @@ impl TrainOptions {
 
     /// The configuration without a plan: defaults, then the file, then preset and model, then the other options.
     pub(crate) fn config(&self, dataset: PathBuf) -> crate::Result<TrainConfig> {
-        self.planned_config(dataset, None)
+        self.config_over(dataset, None, None)
     }
 
-    /// The same with a plan behind the preset.
+    /// The same for a run that is planned, whose preset is balanced where none is named; behind that, what the plan says.
     fn planned_config(&self, dataset: PathBuf, plan: Option<&Plan>) -> crate::Result<TrainConfig> {
-        let mut config =
-            self.config.as_deref().map_or_else(|| Ok(TrainConfig::default()), TrainConfig::load)?;
+        self.config_over(dataset, Some(Preset::Balanced), plan)
+    }
+
+    fn config_over(
+        &self,
+        dataset: PathBuf,
+        preset: Option<Preset>,
+        plan: Option<&Plan>,
+    ) -> crate::Result<TrainConfig> {
+        let mut config = TrainConfig::default();
+        if let Some(file) = &self.config {
+            config = TrainConfig::load(file)?;
+        } else if let Some(preset) = preset {
+            preset.apply(&mut config)?;
+        }
         config.dataset = dataset;
         match &self.curve {
             Some(CurveChoice::Named(curve)) => config.tone = config.tone.with_curve(*curve),
@@ -246,7 +259,10 @@ impl TrainOptions {
         config.tone.brightness = self.brightness.or(config.tone.brightness);
         set(&mut config.tone.colour, &self.colour);
         set(&mut config.tone.theta, &self.theta);
-        set(&mut config.steps, &self.steps);
+        if let Some(steps) = self.steps {
+            // Whoever says how long a run is to be wants neither less nor views kept from it.
+            (config.steps, config.stop.views) = (steps, 0);
+        }
         set(&mut config.downscale, &self.downscale);
         set(&mut config.seed, &self.seed);
         set(&mut config.sh_degree, &self.sh_degree);
@@ -307,14 +323,14 @@ struct Planned {
 /// Loads the dataset and plans the run, where no option says everything. A run that goes on keeps to its plan.
 fn planned(args: &TrainArgs, config: TrainConfig, gpu: &Gpu) -> crate::Result<Planned> {
     let is_resumed = args.resume && args.out.join("config.toml").is_file();
-    let given = args.plan.as_deref().filter(|path| *path != Path::new("none"));
-    let file = given.map(Path::to_owned);
-    let file = file.or_else(|| run::plan_of(&args.out).filter(|_| is_resumed));
+    let given = args.plan.clone().filter(|path| path != Path::new("none"));
+    let file = given.or_else(|| run::plan_of(&args.out).filter(|_| is_resumed));
     let diagnoses = args.plan.is_none() && !is_resumed && args.options.wants_a_plan();
     if file.is_none() && !diagnoses {
         let dataset = Dataset::load(&config.dataset, &config.load_options())?;
         return Ok(Planned { config, plan: None, dataset });
     }
+    let config = args.options.planned_config(config.dataset, None)?;
     let options = diagnose::load_options(&config);
     let mut dataset = Dataset::load(&config.dataset, &options)?;
     let plan = match file {

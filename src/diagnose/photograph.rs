@@ -1,7 +1,5 @@
 //! What one photograph is, as it is stored: brightness, code values, noise, blur.
 
-use std::collections::BTreeSet;
-
 use super::noise::{self, Noise, Patch};
 use super::sharpness;
 use crate::image::{Image, linear_from_srgb};
@@ -37,7 +35,6 @@ impl Measured {
         let fraction = |is: fn(f32) -> bool| {
             image.data.iter().filter(|&&value| is(value)).count() as f64 / values
         };
-        let codes: BTreeSet<u16> = codes(&image.data);
         let linear = Linear::of(image);
         let mut patches = vec![];
         for plane in linear.planes.chunks(image.pixel_count().max(1)) {
@@ -50,7 +47,7 @@ impl Measured {
             // Positive phrasing: a NaN is neither.
             clipped_fraction: fraction(|value| value >= 1.0),
             zero_fraction: fraction(|value| value <= 0.0),
-            code_values: codes.len(),
+            code_values: code_values(&image.data),
             noise: noise::fit(patches.clone()),
             patches,
             blur: blur(image),
@@ -87,13 +84,13 @@ impl Linear {
     }
 }
 
-/// The values as 16-bit codes.
-fn codes(data: &[f32]) -> BTreeSet<u16> {
+/// How many different values there are, as 16-bit codes.
+fn code_values(data: &[f32]) -> usize {
     let mut used = vec![false; 1 << 16];
     for &value in data {
         used[(measurable(value).min(1.0) * 65_535.0).round() as usize] = true;
     }
-    used.iter().zip(0..).filter(|&(&used, _)| used).map(|(_, code)| code).collect()
+    used.into_iter().filter(|&used| used).count()
 }
 
 fn luminances(planes: &[f32]) -> Vec<f32> {

@@ -69,7 +69,7 @@ pub struct Fingerprint {
 impl Fingerprint {
     /// The dataset's own.
     pub fn of(dataset: &Dataset) -> Self {
-        let views: Vec<_> = dataset.train_views().collect();
+        let views: Vec<_> = dataset.views.iter().filter(|view| view.is_for_training()).collect();
         let mut hash = 0xcbf2_9ce4_8422_2325_u64;
         for view in &views {
             let line = format!("{} {}x{}\n", view.name, view.camera.width, view.camera.height);

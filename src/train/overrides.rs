@@ -43,7 +43,7 @@ impl TrainConfig {
     /// 0.12`. Left out is what changes no step beyond its rounding: how long the run is, where the photographs lie, when it
     /// is scored and saved, on which device and by which tiles.
     pub fn difference(&self, other: &Self) -> Option<String> {
-        const FREE: [&str; 9] = [
+        const FREE: [&str; 11] = [
             "steps",
             "dataset",
             "reference",
@@ -53,6 +53,8 @@ impl TrainConfig {
             "checkpoint_every",
             "check.every",
             "check.stops",
+            "stop.every",
+            "stop.gain",
         ];
         let [own, others] =
             [self, other].map(|config| settings("", &Table::try_from(config).unwrap_or_default()));

@@ -182,12 +182,19 @@ mod tests {
     }
 
     #[test]
-    fn paper_is_what_the_library_defaults_to_and_balanced_differs_by_no_step() {
-        for preset in [Preset::Paper, Preset::Balanced] {
-            let mut config = TrainConfig::default();
-            preset.apply(&mut config).unwrap();
-            assert_eq!(config, TrainConfig::default(), "{preset:?}");
-        }
+    fn paper_is_what_the_library_defaults_to_with_ap3_and_balanced_but_for_its_end() {
+        let paper = applied(Preset::Paper, "x", ToneCurve::Auto);
+        let ap3 = ToneSettings::default().with_curve(ToneCurve::Ap3);
+        assert_eq!(
+            paper,
+            TrainConfig { dataset: "data/x".into(), tone: ap3, ..Default::default() }
+        );
+        let balanced = applied(Preset::Balanced, "x", ToneCurve::Ase);
+        assert_eq!((balanced.tone.curve, balanced.stop.views), (ToneCurve::Ase, 2));
+        let defaults = TrainConfig::default();
+        let plain =
+            TrainConfig { tone: defaults.tone.clone(), stop: defaults.stop.clone(), ..balanced };
+        assert_eq!(plain, TrainConfig { dataset: "data/x".into(), ..defaults });
         assert!(!Preset::Paper.is_planned() && Preset::Balanced.is_planned());
     }
 
