@@ -68,7 +68,7 @@ impl Map {
                 gpu.pipeline(&kernels::tone_table::Constants::default())?,
                 gpu.buffer("tone table", &table.knots())?,
             ),
-            None if settings.needs_baking() => {
+            None if !settings.curve.is_formula() => {
                 Self::Mix(gpu.pipeline(&kernels::tone_mix::Constants { tone_curve })?)
             }
             None => {

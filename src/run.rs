@@ -4,6 +4,9 @@ mod directory;
 mod events;
 mod train;
 
-pub use directory::{RunDirectory, is_finished, load_config, load_model, load_networks, plan_of};
+pub(crate) use directory::TARGET_EXPOSURE;
+pub use directory::{
+    RunDirectory, is_finished, load_config, load_metrics, load_model, load_networks, plan_of,
+};
 pub use events::Event;
 pub use train::{HeldRun, Trained, train, train_planned};

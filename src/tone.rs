@@ -35,7 +35,7 @@ use std::str::FromStr;
 
 pub use self::catalogue::{FAMILIES, ToneCurve};
 pub(crate) use self::exposure::all_black;
-pub use self::exposure::{Exposure, is_black, soft};
+pub use self::exposure::{Exposure, exposed_anew, is_black, soft};
 pub use self::families::{Constant, Family, Law, White};
 #[cfg(feature = "io")]
 pub use self::file::CurveChoice;

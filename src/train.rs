@@ -145,7 +145,7 @@ pub struct Trainer {
     gpu: Gpu,
     config: TrainConfig,
     extent: f64,
-    exposure: Option<TargetExposure>,
+    target_exposure: Option<TargetExposure>,
     held_out: HeldOut,
     /// Steps done.
     step: u64,
@@ -211,10 +211,10 @@ impl Trainer {
         let mut pseudo_gt = PseudoGt::new(gpu, &config.tone)?;
         let levels = config.schedule.resolution_levels();
         let has_networks = config.model.denoiser || config.model.tonemapper;
-        let (views, scene, exposure) =
+        let (views, scene, target_exposure) =
             Views::upload(gpu, &mut pseudo_gt, dataset, levels, has_networks)?;
         let held_out = HeldOut::new(&mut pseudo_gt, dataset, &scene)?;
-        if let Some(TargetExposure { scene, .. }) = &exposure {
+        if let Some(TargetExposure { scene, .. }) = &target_exposure {
             tracing::info!("{}", scene.reason());
         }
         let sizes = views.sizes();
@@ -237,7 +237,7 @@ impl Trainer {
         let mut trainer = Self {
             gpu: gpu.clone(),
             extent: dataset.extent(),
-            exposure,
+            target_exposure,
             held_out,
             step: 0,
             views,
@@ -262,8 +262,8 @@ impl Trainer {
     }
 
     /// How bright the targets are; none where the curve's constants say that.
-    pub fn exposure(&self) -> Option<&TargetExposure> {
-        self.exposure.as_ref()
+    pub fn target_exposure(&self) -> Option<&TargetExposure> {
+        self.target_exposure.as_ref()
     }
 
     /// The number of Gaussians.
@@ -367,7 +367,7 @@ impl Trainer {
             size: view.size(),
             features: model.shape().features,
             render,
-            low: &view.input,
+            low: view.loss_input(),
             tone: &view.tone,
         };
         self.losses.record(pass, inputs, d_render, log)?;

@@ -105,8 +105,23 @@ fn an_injected_spread_of_exposures_is_found_within_a_tenth_view_by_view() {
 #[test]
 fn a_blurred_photograph_and_one_without_a_pose_are_named() {
     let set = written(&Capture::clean());
+    // Moved by a few pixels while the shutter was open.
+    let moved = |image: &Image| {
+        Image::from_fn(image.width, image.height, |x, y| {
+            let places = (0..9).map(|step| image.pixel((x + step).min(SET.width - 1), y));
+            places.fold([0.0; 3], |sum, rgb| std::array::from_fn(|c| sum[c] + rgb[c] / 9.0))
+        })
+    };
     edit(set.path(), |index, image| {
-        if index == 3 { image.resized(24, 18).resized(96, 72) } else { image.clone() }
+        if index == 3 {
+            let turned = moved(image);
+            Image::from_fn(SET.width, SET.height, |x, y| {
+                let places = (0..9).map(|step| turned.pixel(x, (y + step).min(SET.height - 1)));
+                places.fold([0.0; 3], |sum, rgb| std::array::from_fn(|c| sum[c] + rgb[c] / 9.0))
+            })
+        } else {
+            image.clone()
+        }
     });
     fs::copy(set.path().join("low/001.png"), set.path().join("low/stray.png")).unwrap();
     let found = diagnosis_of(set.path());

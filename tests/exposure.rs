@@ -1,6 +1,6 @@
 //! How bright the automatic target is: the rule against a slow one over pixels, and what comes of odd sets.
 
-use nightsplat::tone::{Exposure, LuminanceHistogram, Statistics, soft};
+use nightsplat::tone::{Exposure, LuminanceHistogram, Statistics, exposed_anew, soft};
 
 /// A reproducible photograph whose luminance crowds near black, planar; `contrast` is the power that crowds it.
 fn photograph(pixels: usize, brightness: f32, contrast: i32, seed: u64) -> Vec<f32> {
@@ -112,6 +112,24 @@ fn darker_views_have_a_higher_gain_and_equal_ones_the_scene_s() {
     assert!(high - low < 0.03, "{means:?}");
     let shared = varied.clone().shared();
     assert_eq!(shared.gain_of(&histogram), varied.gain);
+}
+
+#[test]
+fn a_picture_at_one_gain_is_known_at_another() {
+    for gains in [[10.0, 14.0], [14.0, 10.0], [3.0, 60.0], [8.0, 8.0]] {
+        for weight in [1.0, 0.4] {
+            let knots = exposed_anew(gains, weight);
+            assert!(knots.is_sorted_by(|a, b| a[0] <= b[0] && a[1] <= b[1]), "{gains:?}");
+            for x in [0.0, 0.001, 0.02, 0.1, 0.3] {
+                let [from, to] =
+                    gains.map(|gain| ((1.0 - weight) * x + weight * soft(x, gain)) as f32);
+                let above = knots.partition_point(|knot| knot[0] <= from).clamp(1, knots.len() - 1);
+                let [[x0, y0], [x1, y1]] = [knots[above - 1], knots[above]];
+                let found = y0 + (from - x0) / (x1 - x0).max(f32::MIN_POSITIVE) * (y1 - y0);
+                assert!((found - to).abs() < 2e-3, "{gains:?} at {x}: {found}, not {to}");
+            }
+        }
+    }
 }
 
 #[test]

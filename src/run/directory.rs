@@ -49,6 +49,9 @@ const HELD_OUT: &str = "held_out.csv";
 /// What was decided for the photographs, and why.
 const PLAN: &str = "plan.toml";
 
+/// Where `metrics.json` holds the [`crate::train::TargetExposure`].
+pub(crate) const TARGET_EXPOSURE: &str = "target_exposure";
+
 /// The weights of the networks.
 const NETWORKS: &str = "networks.safetensors";
 
@@ -207,6 +210,12 @@ pub(super) fn checkpoint(run: &Path) -> Option<PathBuf> {
 /// Whether a directory holds a run that reached its end.
 pub fn is_finished(run: &Path) -> bool {
     run.join("metrics.json").exists()
+}
+
+/// What `metrics.json` says; null where it does not exist.
+pub fn load_metrics(run: &Path) -> serde_json::Value {
+    let text = std::fs::read(run.join("metrics.json")).ok();
+    text.and_then(|text| serde_json::from_slice(&text).ok()).unwrap_or_default()
 }
 
 /// The configuration of a finished or unfinished run.

@@ -3,6 +3,7 @@
 use std::path::Path;
 use std::time::{Duration, Instant};
 
+use super::directory::TARGET_EXPOSURE;
 use super::{Event, RunDirectory, directory};
 use crate::Result;
 use crate::dataset::Dataset;
@@ -103,7 +104,11 @@ pub fn train_planned(
     if let Some(networks) = trainer.networks() {
         directory.save_networks(networks)?;
     }
-    let metrics = eval::metrics(&scored, seconds, trainer.gaussian_count(), trainer.steps_done());
+    let (gaussians, steps) = (trainer.gaussian_count(), trainer.steps_done());
+    let mut metrics = eval::metrics(&scored, seconds, gaussians, steps);
+    if let Some(exposure) = trainer.target_exposure() {
+        metrics[TARGET_EXPOSURE] = serde_json::json!(exposure);
+    }
     directory.save_metrics(&metrics)?;
     let trained = Trained { trainer, scored, losses, seconds, peak_bytes };
     observe(Event::Finished(&trained));

@@ -161,6 +161,18 @@ impl Exposure {
     }
 }
 
+/// What a picture at one gain is at another, with so much weight of the curve: the values from which others are
+/// interpolated, ascending.
+pub fn exposed_anew([from, to]: [f64; 2], weight: f64) -> Vec<[f32; 2]> {
+    const KNOTS: u32 = 1024;
+    // Evenly spaced in what the curve makes of them, up to where it is white.
+    let knot = |i: u32| {
+        let x = -(1.0 - f64::from(i) / f64::from(KNOTS + 1)).ln() / from.min(to);
+        [from, to].map(|gain| ((1.0 - weight) * x.min(1.0) + weight * soft(x, gain)) as f32)
+    };
+    (0..=KNOTS).map(knot).collect()
+}
+
 /// The exposure as JSON has it.
 #[derive(Serialize)]
 struct Written {

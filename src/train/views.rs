@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use glam::{DVec3, UVec2};
+use serde::Serialize;
 
 use super::{TrainConfig, streams};
 use crate::Result;
@@ -31,7 +32,7 @@ pub(super) struct TrainView {
     /// Depth from elsewhere, (H, W), where the dataset's is of another size.
     depth: Option<Vec<f32>>,
     /// What the loss applies `tone` to, planar (3, H, W), sRGB-encoded: the dark photograph, or the target itself.
-    pub(super) input: Arc<Buffer<f32>>,
+    input: Arc<Buffer<f32>>,
     /// The dark photograph, where that is not the input and a network sees it.
     photograph: Option<Buffer<f32>>,
     /// The curve that the photograph gets; one element. Where the input is the target already, none.
@@ -40,9 +41,12 @@ pub(super) struct TrainView {
     is_baked: bool,
 }
 
-/// The exposure of the targets, and of what a model makes of them.
-#[derive(Clone, Debug)]
+/// How bright the targets are, and what a model makes of them.
+#[derive(Clone, Debug, Serialize)]
 pub struct TargetExposure {
+    /// The gain that a model of views with differing gains agrees on, their geometric mean: the exposure at which it
+    /// renders and is scored.
+    pub model_gain: f64,
     /// What was found for the training photographs together.
     pub scene: Exposure,
     /// The gain of every training view, by name.
@@ -50,10 +54,10 @@ pub struct TargetExposure {
 }
 
 impl TargetExposure {
-    /// The gain that a model of views with differing gains agrees on: their geometric mean.
-    pub fn model_gain(&self) -> f64 {
-        let logarithms: f64 = self.gains.values().map(|gain| gain.ln()).sum();
-        (logarithms / self.gains.len().max(1) as f64).exp()
+    fn new(scene: Exposure, gains: BTreeMap<String, f64>) -> Self {
+        let logarithms: f64 = gains.values().map(|gain| gain.ln()).sum();
+        let model_gain = (logarithms / gains.len().max(1) as f64).exp();
+        Self { model_gain, scene, gains }
     }
 }
 
@@ -133,7 +137,8 @@ impl Views {
                 });
             }
         }
-        let exposure = scene.exposure.clone().map(|scene| TargetExposure { scene, gains });
+        let exposure = scene.exposure.clone();
+        let exposure = exposure.map(|scene| TargetExposure::new(scene, gains));
         Ok((Self(views), scene, exposure))
     }
 
@@ -227,6 +232,11 @@ impl TrainView {
     /// Width and height in pixels.
     pub(super) fn size(&self) -> UVec2 {
         UVec2::new(self.camera.width, self.camera.height)
+    }
+
+    /// What the loss applies its curve to.
+    pub(super) fn loss_input(&self) -> &Buffer<f32> {
+        &self.input
     }
 
     /// The dark photograph, planar (3, H, W); only there where it is the input, or was kept.
