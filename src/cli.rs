@@ -15,6 +15,7 @@ mod comparison;
 pub mod curves;
 mod defaults;
 pub mod demo;
+pub mod diagnose;
 pub mod doctor;
 pub mod eval;
 mod finished_run;
@@ -42,6 +43,7 @@ pub struct Cli {
 const EXAMPLES: &str = "Start with:
   nightsplat demo                                   see it work, without any data
   nightsplat doctor                                 which devices there are
+  nightsplat diagnose photos                        what they are, and what their model needs
   nightsplat train photos --out run                 train from a folder of dark photographs
   nightsplat eval run --save-images                 score it where there are references
   nightsplat render run --split all --out pictures  see the model from every camera
@@ -50,6 +52,7 @@ const EXAMPLES: &str = "Start with:
 #[derive(Debug, Subcommand)]
 enum Command {
     Train(Box<train::TrainArgs>),
+    Diagnose(diagnose::DiagnoseArgs),
     Eval(eval::EvalArgs),
     Render(render::RenderArgs),
     Tone(tone::ToneArgs),
@@ -89,6 +92,7 @@ impl Cli {
     pub fn run(self) -> Result<()> {
         match self.command {
             Command::Train(args) => train::run(&args),
+            Command::Diagnose(args) => diagnose::run(&args),
             Command::Eval(args) => eval::run(&args),
             Command::Render(args) => render::run(&args),
             Command::Tone(args) => Ok(tone::run(&args)?),

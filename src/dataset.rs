@@ -66,6 +66,11 @@ impl View {
         self.split == Split::Train
     }
 
+    /// Whether it is for training, be it that it is kept from it to tell when it has converged.
+    pub fn is_for_training(&self) -> bool {
+        self.split != Split::Test
+    }
+
     /// The photograph as its camera took it, undistorted and not shrunk; none where the view has none.
     ///
     /// # Errors
@@ -85,6 +90,8 @@ pub enum Split {
     Train,
     /// Held out, for scores.
     Test,
+    /// A training photograph that is kept from training, to tell when it has converged.
+    HeldOut,
 }
 
 /// The files of one view.
@@ -180,6 +187,7 @@ impl Dataset {
             );
             return Err(Error::input(root, problem));
         }
+        let views = with_held_out(views, options.hold_out);
         let points = points(root, &views)?;
         for line in &skipped {
             tracing::warn!("skipped {line}");
@@ -219,6 +227,19 @@ impl Dataset {
             Some(Photograph { name, split, input: input?, reference })
         };
         Ok(sources.into_iter().filter_map(photograph).collect())
+    }
+
+    /// Leaves out views by name; points forget them.
+    pub fn leave_out(&mut self, names: &[String]) {
+        let stays: Vec<bool> = self.views.iter().map(|view| !names.contains(&view.name)).collect();
+        let place = |view: u32| {
+            let stays_before = stays[..view as usize].iter().filter(|&&stays| stays).count();
+            stays[view as usize].then_some(stays_before as u32)
+        };
+        for point in &mut self.points {
+            point.views = point.views.iter().filter_map(|&view| place(view)).collect();
+        }
+        self.views.retain(|view| !names.contains(&view.name));
     }
 
     /// The training views.
@@ -416,6 +437,17 @@ impl ListedView {
             NORMAL_FOLDERS.iter().filter_map(|folder| self.find(&root.join(folder), files));
         self.file.clone().into_iter().chain(beside).find(|file| Some(file) != input)
     }
+}
+
+/// Keeps so many training views from training, an eighth of them at most, spread evenly.
+fn with_held_out(mut views: Vec<View>, count: usize) -> Vec<View> {
+    const MOST: usize = 8;
+    let mut training: Vec<&mut View> = views.iter_mut().filter(|view| view.is_train()).collect();
+    let (of, count) = (training.len(), count.min(training.len() / MOST));
+    for place in 0..count {
+        training[(2 * place + 1) * of / (2 * count)].split = Split::HeldOut;
+    }
+    views
 }
 
 /// The points of the dataset's COLMAP model, brought into the views' world.

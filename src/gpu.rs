@@ -57,6 +57,8 @@ pub struct Properties {
     pub name: String,
     /// The driver's name and version, as the driver gives them.
     pub driver: String,
+    /// Bytes of device-local memory.
+    pub memory: u64,
     /// Lanes of a subgroup in our kernels.
     pub subgroup_size: u32,
     /// Kernels can ask for that subgroup size.

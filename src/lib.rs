@@ -36,6 +36,7 @@
 //! - [`loss`]: the loss terms with their gradients, and their log
 //! - [`densify`]: clone, split, prune
 //! - [`train`]: one step after another
+//! - [`diagnose`]: what a capture is, and what its model needs
 //! - [`metrics`]: PSNR and SSIM of a render against its reference image
 //! - [`eval`]: scores of the test views
 //! - [`run`]: a training run, its events and its directory
@@ -49,6 +50,8 @@ pub mod cli;
 #[cfg(feature = "io")]
 pub mod dataset;
 pub mod densify;
+#[cfg(feature = "io")]
+pub mod diagnose;
 pub mod error;
 #[cfg(feature = "io")]
 pub mod eval;

@@ -52,8 +52,31 @@ pub struct Picture {
 }
 
 impl Report {
-    /// The page as HTML.
+    /// The page as HTML: tables, plots, pictures.
     pub fn html(&self) -> String {
+        self.page(&(self.tables_html() + &self.plots_html() + &self.pictures_html()))
+    }
+
+    /// The same with the pictures first.
+    pub fn html_pictures_first(&self) -> String {
+        self.page(&(self.pictures_html() + &self.tables_html() + &self.plots_html()))
+    }
+
+    fn tables_html(&self) -> String {
+        self.tables.iter().map(Table::html).collect()
+    }
+
+    fn plots_html(&self) -> String {
+        let figure = |plot: &String| format!("<figure class=\"plot\">{plot}</figure>\n");
+        self.plots.iter().map(figure).collect()
+    }
+
+    fn pictures_html(&self) -> String {
+        self.comparisons.iter().map(Comparison::html).collect()
+    }
+
+    /// The page around its body.
+    fn page(&self, body: &str) -> String {
         let title = escape(&self.title);
         let mut html = format!(
             "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
@@ -65,17 +88,7 @@ impl Report {
         for paragraph in &self.intro {
             let _ = writeln!(html, "<p>{}</p>", escape(paragraph));
         }
-        for table in &self.tables {
-            html.push_str(&table.html());
-        }
-        for plot in &self.plots {
-            let _ = writeln!(html, "<figure class=\"plot\">{plot}</figure>");
-        }
-        for comparison in &self.comparisons {
-            html.push_str(&comparison.html());
-        }
-        html.push_str("</body>\n</html>\n");
-        html
+        html + body + "</body>\n</html>\n"
     }
 }
 

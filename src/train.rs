@@ -2,6 +2,7 @@
 
 mod checkpoint;
 mod config;
+mod held_out;
 mod model;
 mod networks;
 mod overrides;
@@ -30,6 +31,8 @@ use crate::scene::{Gaussians, width};
 use crate::{Error, Result};
 
 pub use config::{Background, CheckConfig, DensityConfig, TrainConfig};
+use held_out::HeldOut;
+pub use held_out::StopConfig;
 use model::Model;
 pub use networks::Networks;
 pub use parts::{ModelConfig, ModelName, NetworkRates, Part};
@@ -143,6 +146,7 @@ pub struct Trainer {
     config: TrainConfig,
     extent: f64,
     target_exposure: Option<TargetExposure>,
+    held_out: HeldOut,
     /// Steps done.
     step: u64,
     views: Views,
@@ -207,8 +211,9 @@ impl Trainer {
         let mut pseudo_gt = PseudoGt::new(gpu, &config.tone)?;
         let levels = config.schedule.resolution_levels();
         let has_networks = config.model.denoiser || config.model.tonemapper;
-        let (views, target_exposure) =
+        let (views, scene, target_exposure) =
             Views::upload(gpu, &mut pseudo_gt, dataset, levels, has_networks)?;
+        let held_out = HeldOut::new(&mut pseudo_gt, dataset, &scene)?;
         if let Some(TargetExposure { scene, .. }) = &target_exposure {
             tracing::info!("{}", scene.reason());
         }
@@ -233,6 +238,7 @@ impl Trainer {
             gpu: gpu.clone(),
             extent: dataset.extent(),
             target_exposure,
+            held_out,
             step: 0,
             views,
             model: Model::upload(gpu, &gaussians)?,

@@ -71,7 +71,7 @@ pub fn run(args: &AblateArgs) -> Result<()> {
         tracing::info!("{} of {}: {title}", i + 1, models.len());
         let out = args.out.join(folder);
         let held = held_unless(args.overwrite);
-        let trained = train_with_bar(&gpu, config, &dataset, &out, held)?;
+        let trained = train_with_bar(&gpu, config, None, &dataset, &out, held)?;
         runs.push(Run::new(title.clone(), trained));
     }
     let dark = eval::score(&dataset, |view| {

@@ -104,7 +104,7 @@ fn config(curve: ToneCurve, dataset: &Dataset, gpu: &Gpu) -> TrainConfig {
 fn train_with(curve: ToneCurve, gpu: &Gpu, dataset: &Dataset, out: &Path) -> crate::Result<Run> {
     let config = config(curve, dataset, gpu);
     let folder = out.join(curve.name());
-    let trained = train::train_with_bar(gpu, &config, dataset, &folder, HeldRun::Replace)?;
+    let trained = train::train_with_bar(gpu, &config, None, dataset, &folder, HeldRun::Replace)?;
     Ok(Run::new(title(curve), trained))
 }
 

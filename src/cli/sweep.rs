@@ -173,6 +173,8 @@ impl Run {
         let mut arguments = vec!["train".to_owned(), dataset.to_owned()];
         arguments.extend_from_slice(shared);
         arguments.extend(point.arguments());
+        // Points are to differ by what the grid says alone.
+        arguments.extend(["--plan", "none"].map(str::to_owned));
         arguments.extend(["--out".to_owned(), unicode(&folder)?, "--overwrite".to_owned()]);
         let train = TrainArgs::augment_args(clap::Command::new("train"));
         let parsed = train

@@ -6,19 +6,23 @@ use std::path::{Path, PathBuf};
 use anyhow::Result;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
+use super::diagnose;
 use crate::dataset::Dataset;
 use crate::densify::DensityControl;
+use crate::diagnose::{Diagnosis, Plan};
 use crate::eval::{self, ViewScore};
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::nn::Precision;
-use crate::run::{Event, HeldRun, Trained};
+use crate::run::{self, Event, HeldRun, Trained};
 use crate::tone::{CurveChoice, GainChoice, ToneCurve};
 use crate::train::{Background, ModelName, Part, Preset, TrainConfig};
 
 /// Train a 3D Gaussian Splatting model from dark photographs.
 ///
 /// Each photograph is lifted by a tone curve into the pseudo-GT that supervises training; normal-light reference images,
-/// where the dataset has them, are only ever used for scores.
+/// where the dataset has them, are only ever used for scores. What the model has is decided by looking at the photographs
+/// first (`nightsplat diagnose`), and said; any option wins over that. With --config, or a preset that states it all
+/// (paper, or a benchmark's), nothing is decided.
 #[derive(Clone, Debug, clap::Args)]
 pub struct TrainArgs {
     /// The dataset: a folder with transforms*.json (LOM, RealX3D, NeRF) or a COLMAP model in sparse/
@@ -32,6 +36,9 @@ pub struct TrainArgs {
     /// Go on from the checkpoint in RUN, or begin where there is none; the model gets the same bits as in one go
     #[arg(long, conflicts_with = "overwrite")]
     pub resume: bool,
+    /// The plan that `nightsplat diagnose --plan` wrote, in place of a diagnosis now; none: no plan, the defaults
+    #[arg(long, value_name = "FILE|none")]
+    pub plan: Option<PathBuf>,
     #[command(flatten)]
     pub(crate) options: TrainOptions,
 }
@@ -118,7 +125,7 @@ pub(crate) struct ModelOptions {
     /// Exactly these parts, parted by commas: denoiser, tonemapper, structure, depth
     #[arg(long, value_name = "LIST", value_delimiter = ',')]
     parts: Option<Vec<Part>>,
-    /// balanced: the defaults; fast: a good score in few steps; or the constants that the paper and its code state for a benchmark: lom, realx3d or mip360-varying; other options win
+    /// draft, fast, balanced (the default) or best: time for quality; paper: the paper's curve and length; or the constants that the paper and its code state for a benchmark: lom, realx3d or mip360-varying; other options win
     #[arg(long, value_name = "NAME")]
     preset: Option<Preset>,
     /// Train the networks on a random crop of at most N x N pixels a step; 0: on the whole view [default: {model.denoiser_crop}]
@@ -148,7 +155,7 @@ pub(crate) struct ModelOptions {
 }
 
 impl ModelOptions {
-    fn apply(&self, config: &mut TrainConfig) {
+    fn apply(&self, config: &mut TrainConfig) -> crate::Result<()> {
         match self.model {
             Some(ModelName::Plain) => config.model.set_parts(&[]),
             Some(ModelName::Lita) => {
@@ -158,7 +165,7 @@ impl ModelOptions {
             None => {}
         }
         if let Some(preset) = self.preset {
-            preset.apply(config);
+            preset.apply(config)?;
         }
         if let Some(parts) = &self.parts {
             config.model.set_parts(parts);
@@ -174,6 +181,7 @@ impl ModelOptions {
             model.depth_folder.clone_from(&self.depth);
         }
         model.depth_is_disparity |= self.depth_is_disparity;
+        Ok(())
     }
 }
 
@@ -190,17 +198,57 @@ impl TrainOptions {
         self.model.model.is_some() || self.model.parts.is_some()
     }
 
-    /// The configuration: defaults, then the file, then preset and model, then the other options.
+    /// Whether a diagnosis of the photographs is to decide what no option says.
+    fn wants_a_plan(&self) -> bool {
+        self.config.is_none() && self.model.preset.is_none_or(Preset::is_planned)
+    }
+
+    /// Whether the command line says how photographs are lifted.
+    fn names_a_curve(&self) -> bool {
+        let numbers = [self.brightness, self.colour, self.theta];
+        self.curve.is_some() || self.gain.is_some() || numbers.iter().any(Option::is_some)
+    }
+
+    /// The configuration without a plan: defaults, then the file, then preset and model, then the other options.
     pub(crate) fn config(&self, dataset: PathBuf) -> crate::Result<TrainConfig> {
-        let mut config =
-            self.config.as_deref().map_or_else(|| Ok(TrainConfig::default()), TrainConfig::load)?;
+        self.config_over(dataset, None, None)
+    }
+
+    /// The same for a run that is planned, whose preset is balanced where none is named; behind that, what the plan says.
+    fn planned_config(&self, dataset: PathBuf, plan: Option<&Plan>) -> crate::Result<TrainConfig> {
+        self.config_over(dataset, Some(Preset::Balanced), plan)
+    }
+
+    fn config_over(
+        &self,
+        dataset: PathBuf,
+        preset: Option<Preset>,
+        plan: Option<&Plan>,
+    ) -> crate::Result<TrainConfig> {
+        let mut config = TrainConfig::default();
+        if let Some(file) = &self.config {
+            config = TrainConfig::load(file)?;
+        } else if let Some(preset) = preset {
+            preset.apply(&mut config)?;
+        }
         config.dataset = dataset;
         match &self.curve {
             Some(CurveChoice::Named(curve)) => config.tone = config.tone.with_curve(*curve),
             Some(file) => config.tone = file.settings()?,
             None => {}
         }
-        self.model.apply(&mut config);
+        self.model.apply(&mut config)?;
+        if let Some(plan) = plan {
+            let given = config.clone();
+            plan.apply(&mut config);
+            // What is named is no question any more; the options below win by coming later.
+            if self.names_a_curve() {
+                config.tone = given.tone;
+            }
+            if self.picks_parts() {
+                config.model = given.model;
+            }
+        }
         if self.curve == Some(ToneCurve::Auto.into()) {
             // Benchmarks put the paper's curve in place of the default one; here it is named.
             config.tone = config.tone.with_curve(ToneCurve::Auto);
@@ -211,7 +259,10 @@ impl TrainOptions {
         config.tone.brightness = self.brightness.or(config.tone.brightness);
         set(&mut config.tone.colour, &self.colour);
         set(&mut config.tone.theta, &self.theta);
-        set(&mut config.steps, &self.steps);
+        if let Some(steps) = self.steps {
+            // Whoever says how long a run is to be wants neither less nor views kept from it.
+            (config.steps, config.stop.views) = (steps, 0);
+        }
         set(&mut config.downscale, &self.downscale);
         set(&mut config.seed, &self.seed);
         set(&mut config.sh_degree, &self.sh_degree);
@@ -240,21 +291,82 @@ impl TrainOptions {
 pub fn run(args: &TrainArgs) -> Result<()> {
     let config = args.options.config(args.dataset.clone())?;
     let gpu = Gpu::new(&config.device.parse::<DeviceChoice>()?)?;
-    let dataset = Dataset::load(&config.dataset, &config.load_options())?;
+    let Planned { config, plan, dataset } = planned(args, config, &gpu)?;
+    let mut out = std::io::stdout().lock();
+    if let Some(plan) = &plan {
+        say(&mut out, args, &gpu, &dataset, plan)?;
+    }
     let held = if args.resume { HeldRun::Resume } else { held_unless(args.overwrite) };
     let Trained { trainer, scored, seconds, .. } =
-        train_with_bar(&gpu, &config, &dataset, &args.out, held)?;
+        train_with_bar(&gpu, &config, plan.as_ref(), &dataset, &args.out, held)?;
     let gaussians = trainer.gaussian_count();
-    let mut out = std::io::stdout().lock();
     if let Some(line) = summary(&scored) {
         writeln!(out, "{line}")?;
     }
     writeln!(
         out,
         "{} steps, {gaussians} Gaussians, {seconds:.0} s -> {}",
-        config.steps,
+        trainer.steps_done(),
         args.out.display()
     )?;
+    Ok(())
+}
+
+/// What a run begins with.
+struct Planned {
+    config: TrainConfig,
+    plan: Option<Plan>,
+    /// Without the views that the plan leaves out.
+    dataset: Dataset,
+}
+
+/// Loads the dataset and plans the run, where no option says everything. A run that goes on keeps to its plan.
+fn planned(args: &TrainArgs, config: TrainConfig, gpu: &Gpu) -> crate::Result<Planned> {
+    let is_resumed = args.resume && args.out.join("config.toml").is_file();
+    let given = args.plan.clone().filter(|path| path != Path::new("none"));
+    let file = given.or_else(|| run::plan_of(&args.out).filter(|_| is_resumed));
+    let diagnoses = args.plan.is_none() && !is_resumed && args.options.wants_a_plan();
+    if file.is_none() && !diagnoses {
+        let dataset = Dataset::load(&config.dataset, &config.load_options())?;
+        return Ok(Planned { config, plan: None, dataset });
+    }
+    let config = args.options.planned_config(config.dataset, None)?;
+    let options = diagnose::load_options(&config);
+    let mut dataset = Dataset::load(&config.dataset, &options)?;
+    let plan = match file {
+        Some(file) => Plan::load(&file, &dataset)?,
+        None => {
+            let diagnosis = Diagnosis::of(&dataset, &options)?;
+            for remark in &diagnosis.remarks {
+                tracing::warn!("{remark}");
+            }
+            Plan::new(&diagnosis, &config, gpu.properties().memory)
+        }
+    };
+    dataset.leave_out(&plan.left_out);
+    let config = args.options.planned_config(config.dataset, Some(&plan))?;
+    Ok(Planned { config, plan: Some(plan), dataset })
+}
+
+/// Prints what is looked at, and the plan.
+fn say(
+    out: &mut impl Write,
+    args: &TrainArgs,
+    gpu: &Gpu,
+    dataset: &Dataset,
+    plan: &Plan,
+) -> Result<()> {
+    let [width, height] = plan.dataset.size;
+    writeln!(
+        out,
+        "{}: {} views of {width}x{height} to train on, {} held out, {} points; on {}",
+        args.dataset.display(),
+        dataset.train_views().count(),
+        dataset.test_views().count(),
+        dataset.points.len(),
+        gpu.properties().name
+    )?;
+    write!(out, "{}", diagnose::decisions(plan))?;
     Ok(())
 }
 
@@ -267,12 +379,13 @@ pub(crate) fn held_unless(overwrite: bool) -> HeldRun {
 pub(crate) fn train_with_bar(
     gpu: &Gpu,
     config: &TrainConfig,
+    plan: Option<&Plan>,
     dataset: &Dataset,
     out: &Path,
     held: HeldRun,
 ) -> crate::Result<Trained> {
     let mut bar = ProgressBar::hidden();
-    crate::run::train(gpu, config, dataset, out, held, |event| match event {
+    run::train_planned(gpu, config, plan, dataset, out, held, |event| match event {
         Event::Started { step, steps } => bar = progress_bar(steps).with_position(step),
         Event::Step(report) => {
             bar.set_position(report.step);

@@ -13,6 +13,8 @@ pub struct LoadOptions {
     pub reference: Option<PathBuf>,
     /// Whether test views load their dark photograph too, where there is one.
     pub load_low_test: bool,
+    /// How many training views are kept from training, an eighth of them at most, to tell when it has converged.
+    pub hold_out: usize,
     /// What is looked for as the training views' depth.
     pub depth: DepthOptions,
 }
@@ -34,6 +36,7 @@ impl Default for LoadOptions {
             downscale: 1.0,
             reference: None,
             load_low_test: true,
+            hold_out: 0,
             depth: DepthOptions::default(),
         }
     }

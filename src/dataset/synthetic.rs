@@ -29,6 +29,38 @@ const FULL_WELL: f64 = 9000.0;
 /// Standard deviation of the read noise, electrons.
 const READ_NOISE: f64 = 2.0;
 
+/// How the dark photographs of a set are taken.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Capture {
+    /// How much darker they are than the references, in linear light.
+    pub darkening: f64,
+    /// Electrons that a pixel holds at the reference's white: shot noise has the variance of signal / this.
+    pub full_well: f64,
+    /// Standard deviation of the read noise, electrons.
+    pub read_noise: f64,
+    /// By how many stops each view is brighter than the others, in turn, from the first on.
+    pub stops: Vec<f64>,
+}
+
+/// A small sensor, far too short.
+impl Default for Capture {
+    fn default() -> Self {
+        Self {
+            darkening: DARKENING,
+            full_well: FULL_WELL,
+            read_noise: READ_NOISE,
+            stops: vec![0.0],
+        }
+    }
+}
+
+impl Capture {
+    /// Well lit, and without noise.
+    pub fn clean() -> Self {
+        Self { darkening: 1.0, full_well: f64::INFINITY, read_noise: 0.0, ..Self::default() }
+    }
+}
+
 /// Every this many views, from the first, one is for testing.
 const TEST_EVERY: usize = 8;
 
@@ -84,6 +116,18 @@ impl SyntheticOptions {
 /// # Errors
 /// [`Error::Usage`] for options that make no sense, [`Error::Output`] where a file cannot be written.
 pub fn write(dir: impl AsRef<Path>, options: &SyntheticOptions) -> Result<()> {
+    write_captured(dir, options, &Capture::default())
+}
+
+/// As [`write()`], with dark photographs taken another way.
+///
+/// # Errors
+/// As there.
+pub fn write_captured(
+    dir: impl AsRef<Path>,
+    options: &SyntheticOptions,
+    capture: &Capture,
+) -> Result<()> {
     options.check()?;
     let dir = dir.as_ref();
     let (low, high, sparse) = (dir.join("low"), dir.join("high"), dir.join("colmap_sparse/0"));
@@ -106,7 +150,10 @@ pub fn write(dir: impl AsRef<Path>, options: &SyntheticOptions) -> Result<()> {
         let radiance = render(&room, camera);
         reference(&radiance, camera).save_png8(high.join(file_name(view)))?;
         let noise = Stream::new(options.seed, NOISE_STREAM << 32 | view as u64);
-        dark_photograph(&radiance, camera, noise).save_png8(low.join(file_name(view)))?;
+        let stops = capture.stops.get(view % capture.stops.len().max(1)).copied();
+        let darkening = capture.darkening / stops.unwrap_or(0.0).exp2();
+        dark_photograph(&radiance, camera, capture, darkening, noise)
+            .save_png8(low.join(file_name(view)))?;
     }
     for (name, text) in colmap_model(&room, &cameras, options.seed) {
         write_file(&sparse.join(name), &text)?;
@@ -191,12 +238,21 @@ fn reference(radiance: &[DVec3], camera: &Camera) -> Image {
 }
 
 /// The photograph that was exposed too short.
-fn dark_photograph(radiance: &[DVec3], camera: &Camera, noise: Stream) -> Image {
+fn dark_photograph(
+    radiance: &[DVec3],
+    camera: &Camera,
+    &Capture { full_well, read_noise, .. }: &Capture,
+    darkening: f64,
+    noise: Stream,
+) -> Image {
+    if full_well.is_infinite() {
+        return photograph(camera, |pixel, channel| radiance[pixel][channel] / darkening);
+    }
     photograph(camera, |pixel, channel| {
-        let electrons = FULL_WELL * radiance[pixel][channel] / DARKENING;
+        let electrons = full_well * radiance[pixel][channel] / darkening;
         // Shot noise is Poisson; at tens of electrons the normal distribution of equal variance is close.
-        let deviation = (electrons + READ_NOISE * READ_NOISE).sqrt();
-        (electrons + deviation * noise.normal(3 * pixel as u64 + channel as u64)) / FULL_WELL
+        let deviation = (electrons + read_noise * read_noise).sqrt();
+        (electrons + deviation * noise.normal(3 * pixel as u64 + channel as u64)) / full_well
     })
 }
 

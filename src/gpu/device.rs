@@ -445,8 +445,6 @@ fn report(
     physical: vk::PhysicalDevice,
 ) -> Result<DeviceReport> {
     let offered = Offered::gather(instance, physical).map_err(loader_error)?;
-    // SAFETY: the handle was just enumerated.
-    let memory = unsafe { instance.get_physical_device_memory_properties(physical) };
     let version = offered.properties.api_version;
     let (major, minor, patch) = (
         vk::api_version_major(version),
@@ -464,18 +462,22 @@ fn report(
         },
         api_version: format!("{major}.{minor}.{patch}"),
         subgroup_size: offered.subgroup_size,
-        memory: memory
-            .memory_heaps_as_slice()
-            .iter()
-            .filter(|heap| heap.flags.contains(vk::MemoryHeapFlags::DEVICE_LOCAL))
-            .map(|heap| heap.size)
-            .sum(),
+        memory: device_memory(instance, physical),
         cooperative_matrix: cooperative::offered(entry, instance, physical, &offered),
         requirements: REQUIREMENTS
             .iter()
             .map(|r| RequirementReport { name: r.name, why: r.why, met: r.met_by(&offered) })
             .collect(),
     })
+}
+
+/// Bytes of device-local memory.
+fn device_memory(instance: &ash::Instance, physical: vk::PhysicalDevice) -> u64 {
+    // SAFETY: the handle was enumerated from the instance.
+    let memory = unsafe { instance.get_physical_device_memory_properties(physical) };
+    let heaps = memory.memory_heaps_as_slice().iter();
+    let local = heaps.filter(|heap| heap.flags.contains(vk::MemoryHeapFlags::DEVICE_LOCAL));
+    local.map(|heap| heap.size).sum()
 }
 
 fn properties(
@@ -497,6 +499,7 @@ fn properties(
             text(driver.driver_name_as_c_str()),
             text(driver.driver_info_as_c_str())
         ),
+        memory: device_memory(instance, physical),
         subgroup_size: offered.subgroup_size,
         subgroup_size_is_selectable: offered
             .required_subgroup_size_stages

@@ -114,6 +114,7 @@ mod tests {
         Properties {
             name: "Abacus 3000".to_owned(),
             driver: "beads 1.0".to_owned(),
+            memory: 0,
             subgroup_size: 8,
             subgroup_size_is_selectable: true,
             max_storage_buffer_range: 1 << 27,

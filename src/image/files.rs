@@ -26,10 +26,6 @@ pub(crate) fn stem(listed: &str) -> &str {
 ///
 /// # Errors
 /// [`Error::Input`] where the folder cannot be read.
-#[cfg_attr(
-    not(any(feature = "cli", feature = "fit")),
-    expect(dead_code, reason = "what lifts and what fits takes whole folders")
-)]
 pub(crate) fn photographs_in(folder: &Path) -> Result<Vec<PathBuf>> {
     let unreadable = |error| Error::input(folder, format!("cannot be read: {error}"));
     let mut paths = files_in(folder).map_err(unreadable)?;

@@ -121,11 +121,6 @@ impl Schedule {
         }
     }
 
-    /// For 700 steps: the budget is shared among the rounds of so short a run.
-    pub fn fast() -> Self {
-        Self { densify_before: 700, ..Self::default() }
-    }
-
     /// The rates of `step` in a scene of `extent`: the means' decay log-linearly, the others stay.
     pub fn learning_rates(&self, step: u64, extent: f64) -> LearningRates {
         let done = (step as f64 / self.means_rate_steps.max(1) as f64).min(1.0);

@@ -2,9 +2,11 @@
 //!
 //! ```text
 //! RUN/config.toml    everything the run used
+//!     plan.toml      what was decided for these photographs and why, where a plan was made
 //!     model.ply      the Gaussians, as splat viewers open them
 //!     networks.safetensors    the weights of the networks, where the model has any
 //!     train.csv      one line per step
+//!     held_out.csv   scores of the views that were kept from training, where there are any
 //!     checkpoint.safetensors  what the run goes on from, overwritten every so many steps
 //!     metrics.json   scores of the test views
 //! ```
@@ -15,6 +17,7 @@ use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
+use crate::diagnose::Plan;
 use crate::gpu::Gpu;
 use crate::loss::Term;
 use crate::output::write_whole;
@@ -34,10 +37,17 @@ pub struct RunDirectory {
 }
 
 /// The files of a run that a new run replaces; nothing else in the directory is touched.
-const FILES: [&str; 6] = ["metrics.json", "model.ply", NETWORKS, CHECKPOINT, LOG, "config.toml"];
+const FILES: [&str; 8] =
+    ["metrics.json", "model.ply", NETWORKS, CHECKPOINT, LOG, HELD_OUT, PLAN, "config.toml"];
 
 /// A line per step.
 const LOG: &str = "train.csv";
+
+/// PSNR of the views that were kept from training, against their targets.
+const HELD_OUT: &str = "held_out.csv";
+
+/// What was decided for the photographs, and why.
+const PLAN: &str = "plan.toml";
 
 /// Where `metrics.json` holds the [`crate::train::TargetExposure`].
 pub(crate) const TARGET_EXPOSURE: &str = "target_exposure";
@@ -100,6 +110,35 @@ impl RunDirectory {
         let log = BufWriter::new(log.map_err(|error| unwritable(&log_path, &error))?);
         let terms = config.loss().terms();
         Ok(Self { path: path.to_owned(), log, terms, seconds_before })
+    }
+
+    /// The scores of the held-out views up to a step, in order: step, PSNR in dB.
+    pub fn held_out_scores(&self, step: u64) -> Vec<(u64, f64)> {
+        let path = self.path.join(HELD_OUT);
+        let text = std::fs::read_to_string(&path).unwrap_or_default();
+        let entry = |line: &str| -> Option<(u64, f64)> {
+            let (step, score) = line.split_once(',')?;
+            Some((step.parse().ok()?, score.parse().ok()?))
+        };
+        text.lines().filter_map(entry).filter(|one| one.0 <= step).collect()
+    }
+
+    /// Writes the scores of the held-out views: step, PSNR in dB.
+    ///
+    /// # Errors
+    /// The disk is full or gone.
+    pub fn save_held_out(&self, scores: &[(u64, f64)]) -> Result<()> {
+        let lines = scores.iter().map(|(step, psnr)| format!("{step},{psnr}\n"));
+        let text = "step,psnr\n".to_owned() + &lines.collect::<String>();
+        write_whole(&self.path.join(HELD_OUT), text.as_bytes())
+    }
+
+    /// Writes the plan that the configuration follows.
+    ///
+    /// # Errors
+    /// The disk is full or gone.
+    pub fn save_plan(&self, plan: &Plan) -> Result<()> {
+        write_whole(&self.path.join(PLAN), plan.to_toml()?.as_bytes())
     }
 
     /// What the steps took that a resumed run had behind it, in seconds.
@@ -191,6 +230,11 @@ pub fn load_config(run: &Path) -> Result<TrainConfig> {
         return Err(Error::input(run, problem));
     }
     TrainConfig::load(&path)
+}
+
+/// The plan that a run keeps to; none where it keeps to none.
+pub fn plan_of(run: &Path) -> Option<PathBuf> {
+    Some(run.join(PLAN)).filter(|path| path.is_file())
 }
 
 /// The trained Gaussians of a run.

@@ -22,6 +22,13 @@ pub enum Event<'a> {
         /// Steps done.
         step: u64,
     },
+    /// The views that are kept from training were scored against their targets.
+    HeldOut {
+        /// Steps done.
+        step: u64,
+        /// Their mean, dB.
+        psnr: f64,
+    },
     /// The test views were scored, on the way or behind the last step.
     Evaluated {
         /// Steps done.

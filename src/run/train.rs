@@ -7,6 +7,7 @@ use super::directory::TARGET_EXPOSURE;
 use super::{Event, RunDirectory, directory};
 use crate::Result;
 use crate::dataset::Dataset;
+use crate::diagnose::Plan;
 use crate::eval::{self, ViewScore};
 use crate::gpu::Gpu;
 use crate::train::{TrainConfig, Trainer};
@@ -71,10 +72,29 @@ pub fn train(
     dataset: &Dataset,
     out: &Path,
     held: HeldRun,
+    observe: impl FnMut(Event<'_>),
+) -> Result<Trained> {
+    train_planned(gpu, config, None, dataset, out, held, observe)
+}
+
+/// As [`train`], by a plan that `config` and `dataset` follow already, which is kept in the run directory.
+///
+/// # Errors
+/// As there.
+pub fn train_planned(
+    gpu: &Gpu,
+    config: &TrainConfig,
+    plan: Option<&Plan>,
+    dataset: &Dataset,
+    out: &Path,
+    held: HeldRun,
     mut observe: impl FnMut(Event<'_>),
 ) -> Result<Trained> {
     gpu.reset_peak_memory();
     let (mut directory, mut trainer) = begin(gpu, config, dataset, out, held)?;
+    if let Some(plan) = plan {
+        directory.save_plan(plan)?;
+    }
     observe(Event::Started { step: trainer.steps_done(), steps: config.steps });
     let (losses, seconds) =
         train_to_the_end(&mut trainer, &mut directory, config, dataset, &mut observe)?;
@@ -84,7 +104,8 @@ pub fn train(
     if let Some(networks) = trainer.networks() {
         directory.save_networks(networks)?;
     }
-    let mut metrics = eval::metrics(&scored, seconds, trainer.gaussian_count(), config.steps);
+    let (gaussians, steps) = (trainer.gaussian_count(), trainer.steps_done());
+    let mut metrics = eval::metrics(&scored, seconds, gaussians, steps);
     if let Some(exposure) = trainer.target_exposure() {
         metrics[TARGET_EXPOSURE] = serde_json::json!(exposure);
     }
@@ -133,7 +154,8 @@ fn with_tile(gpu: &Gpu, config: &TrainConfig, resumed: Option<&Path>) -> Result<
     Ok(config)
 }
 
-/// Logs every step and writes checkpoints; gives the losses, and the seconds of all steps.
+/// Logs every step, writes checkpoints and ends early where that is asked for; gives the losses, and the seconds of all
+/// steps.
 fn train_to_the_end(
     trainer: &mut Trainer,
     directory: &mut RunDirectory,
@@ -142,10 +164,12 @@ fn train_to_the_end(
     observe: &mut impl FnMut(Event<'_>),
 ) -> Result<(Vec<f64>, f64)> {
     let (mut losses, mut spent) = (vec![], Duration::ZERO);
+    let score_every = if config.stop.views > 0 { config.stop.every } else { 0 };
+    let mut held_out = directory.held_out_scores(trainer.steps_done());
     while trainer.steps_done() < config.steps {
         let next = |every| (trainer.steps_done() + 1).checked_next_multiple_of(every);
-        let until = [config.eval_every, config.checkpoint_every].into_iter().filter_map(next);
-        let until = until.min().unwrap_or(config.steps);
+        let until = [config.eval_every, config.checkpoint_every, score_every];
+        let until = until.into_iter().filter_map(next).min().unwrap_or(config.steps);
         let begin = Instant::now();
         let reports = trainer.advance(until)?;
         spent += begin.elapsed();
@@ -156,15 +180,35 @@ fn train_to_the_end(
         }
         let Some(step) = reports.last().map(|report| report.step) else { continue };
         let falls_on = |every: u64| every > 0 && step.is_multiple_of(every);
+        // Before the checkpoint: what goes on from there knows the score.
+        if falls_on(score_every)
+            && let Some(psnr) = trainer.held_out_psnr()?
+        {
+            held_out.push((step, psnr));
+            directory.save_held_out(&held_out)?;
+            observe(Event::HeldOut { step, psnr });
+        }
         if falls_on(config.checkpoint_every) {
             directory.save_checkpoint(trainer)?;
             observe(Event::Checkpointed { step });
+        }
+        if falls_on(score_every) && has_converged(config, &held_out) && step < config.steps {
+            tracing::info!("step {step}: the held-out views have converged");
+            break;
         }
         if falls_on(config.eval_every) && step < config.steps {
             evaluate(trainer, dataset, observe)?;
         }
     }
     Ok((losses, directory.seconds_before() + spent.as_secs_f64()))
+}
+
+/// By the scores since the views have had their size.
+fn has_converged(config: &TrainConfig, held_out: &[(u64, f64)]) -> bool {
+    let [_, whole] = config.schedule.resolution_steps;
+    let scores: Vec<f64> =
+        held_out.iter().filter(|(step, _)| *step >= whole).map(|&(_, psnr)| psnr).collect();
+    config.stop.has_converged(&scores)
 }
 
 fn evaluate(

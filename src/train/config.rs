@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
+use super::held_out::StopConfig;
 use super::parts::ModelConfig;
 use super::streams;
 use crate::dataset::{Dataset, DepthOptions, LoadOptions};
@@ -87,6 +88,8 @@ pub struct TrainConfig {
     pub density: DensityConfig,
     /// What the model has beside colour.
     pub model: ModelConfig,
+    /// When a run ends before its last step.
+    pub stop: StopConfig,
 }
 
 /// Steps whose every pass is compared with its CPU reference.
@@ -136,6 +139,7 @@ impl Default for TrainConfig {
             schedule: Schedule::default(),
             density: DensityConfig::default(),
             model: ModelConfig::default(),
+            stop: StopConfig::default(),
         }
     }
 }
@@ -194,6 +198,7 @@ impl TrainConfig {
         LoadOptions {
             downscale: self.downscale,
             reference: self.reference.clone(),
+            hold_out: self.stop.views,
             depth: DepthOptions {
                 load: self.model.depth,
                 folder: self.model.depth_folder.clone(),
@@ -252,6 +257,7 @@ impl TrainConfig {
         self.tone.check()?;
         self.start.check()?;
         self.model.check()?;
+        self.stop.check()?;
         self.loss().check()?;
         let density = &self.density;
         let rules = [

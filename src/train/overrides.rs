@@ -27,11 +27,23 @@ impl TrainConfig {
         Ok(config)
     }
 
+    /// The configuration with every setting that a TOML text has.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] for text that is no TOML, a setting that no configuration has, or a value of another type.
+    pub(super) fn overlaid(&self, text: &str) -> Result<Self> {
+        let refused = |error: toml::de::Error| Error::Usage(error.message().to_owned());
+        let over: Table = toml::from_str(text).map_err(refused)?;
+        let mut table = Table::try_from(self).map_err(|error| Error::Usage(error.to_string()))?;
+        overlay(&mut table, over);
+        table.try_into().map_err(refused)
+    }
+
     /// The first setting in which a run of `self` differs from one of `other`, with both values: `tone.alpha = 0.1, not
     /// 0.12`. Left out is what changes no step beyond its rounding: how long the run is, where the photographs lie, when it
     /// is scored and saved, on which device and by which tiles.
     pub fn difference(&self, other: &Self) -> Option<String> {
-        const FREE: [&str; 9] = [
+        const FREE: [&str; 11] = [
             "steps",
             "dataset",
             "reference",
@@ -41,6 +53,8 @@ impl TrainConfig {
             "checkpoint_every",
             "check.every",
             "check.stops",
+            "stop.every",
+            "stop.gain",
         ];
         let [own, others] =
             [self, other].map(|config| settings("", &Table::try_from(config).unwrap_or_default()));
@@ -76,6 +90,18 @@ impl TrainConfig {
             let is_known = known.iter().any(|known| known == key);
             if is_known { refused(error.message().trim()) } else { unknown(key, &known) }
         })
+    }
+}
+
+/// Puts the values of one table in place of another's, section by section.
+fn overlay(table: &mut Table, over: Table) {
+    for (name, value) in over {
+        match (table.get_mut(&name), value) {
+            (Some(Value::Table(section)), Value::Table(over)) => overlay(section, over),
+            (_, value) => {
+                table.insert(name, value);
+            }
+        }
     }
 }
 

@@ -1,4 +1,6 @@
 //! Presets: how much time a run takes for its score, and every constant that the paper and its code state for a benchmark.
+//!
+//! Those of the first kind are files in `presets/`: settings as config.toml has them, over whatever is set already.
 
 use std::str::FromStr;
 
@@ -12,10 +14,16 @@ use crate::{Error, Result};
 /// A trade of time for quality, or a benchmark that the paper reports.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Preset {
-    /// The defaults.
-    Balanced,
+    /// A first look.
+    Draft,
     /// A good score in few steps.
     Fast,
+    /// The defaults: the best score per second.
+    Balanced,
+    /// The best score.
+    Best,
+    /// The paper's curve, length and density control; nothing is diagnosed.
+    Paper,
     /// LOM: `bike`, `buu`, `chair`, `shrub`, `sofa`.
     Lom,
     /// The low-light scenes of `RealX3D`.
@@ -26,43 +34,68 @@ pub enum Preset {
 
 impl Preset {
     /// Every preset.
-    pub const ALL: [Self; 5] =
-        [Self::Balanced, Self::Fast, Self::Lom, Self::RealX3d, Self::Mip360Varying];
+    pub const ALL: [Self; 8] = [
+        Self::Draft,
+        Self::Fast,
+        Self::Balanced,
+        Self::Best,
+        Self::Paper,
+        Self::Lom,
+        Self::RealX3d,
+        Self::Mip360Varying,
+    ];
 
     /// The name on the command line.
     pub fn name(self) -> &'static str {
         match self {
-            Self::Balanced => "balanced",
+            Self::Draft => "draft",
             Self::Fast => "fast",
+            Self::Balanced => "balanced",
+            Self::Best => "best",
+            Self::Paper => "paper",
             Self::Lom => "lom",
             Self::RealX3d => "realx3d",
             Self::Mip360Varying => "mip360-varying",
         }
     }
 
-    /// Sets the first Gaussians, density control and schedule; of a benchmark also what the paper states for it and, where
-    /// its code has a file for the scene that the dataset's folder is named after, what that file states. c is that of the
-    /// configuration's curve, which is AP3 in place of the automatic one.
-    pub fn apply(self, config: &mut TrainConfig) {
-        config.start = Start::default();
+    /// The settings of a preset that trades time for quality, as TOML; a benchmark's depend on curve and scene.
+    pub fn toml(self) -> Option<&'static str> {
         match self {
-            Self::Balanced => {
-                (config.schedule, config.density) = (Schedule::default(), DensityConfig::default());
-            }
-            Self::Fast => {
-                config.steps = FAST_STEPS;
-                (config.schedule, config.density) = (Schedule::fast(), DensityConfig::default());
-            }
-            Self::Lom | Self::RealX3d | Self::Mip360Varying => self.apply_benchmark(config),
+            Self::Draft => Some(include_str!("presets/draft.toml")),
+            Self::Fast => Some(include_str!("presets/fast.toml")),
+            Self::Balanced => Some(include_str!("presets/balanced.toml")),
+            Self::Best => Some(include_str!("presets/best.toml")),
+            Self::Paper => Some(include_str!("presets/paper.toml")),
+            Self::Lom | Self::RealX3d | Self::Mip360Varying => None,
         }
+    }
+
+    /// Whether a run with this preset is planned by a diagnosis of its photographs.
+    pub fn is_planned(self) -> bool {
+        matches!(self, Self::Draft | Self::Fast | Self::Balanced | Self::Best)
+    }
+
+    /// Sets what its TOML says; of a benchmark the first Gaussians, density control, schedule and what the paper states for it and, where its
+    /// code has a file for the scene that the dataset's folder is named after, what that file states. c is that of the
+    /// configuration's curve; the automatic one gives way to AP3 there and with [`Preset::Paper`].
+    ///
+    /// # Errors
+    /// None for the presets that there are.
+    pub fn apply(self, config: &mut TrainConfig) -> Result<()> {
+        if !self.is_planned() && config.tone.curve == ToneCurve::Auto {
+            config.tone = config.tone.with_curve(ToneCurve::Ap3);
+        }
+        match self.toml() {
+            Some(text) => *config = config.overlaid(text)?,
+            None => self.apply_benchmark(config),
+        }
+        Ok(())
     }
 
     fn apply_benchmark(self, config: &mut TrainConfig) {
         (config.schedule, config.density) = (Schedule::paper(), DensityConfig::paper());
         config.start = Start::PAPER;
-        if config.tone.curve == ToneCurve::Auto {
-            config.tone = config.tone.with_curve(ToneCurve::Ap3);
-        }
         let curve = config.tone.curve;
         let of_curve = |ase: f64, ap3: f64| match curve {
             ToneCurve::Ase => ase,
@@ -107,9 +140,6 @@ impl Preset {
     }
 }
 
-/// The steps of [`Preset::Fast`].
-const FAST_STEPS: u64 = 700;
-
 impl FromStr for Preset {
     type Err = Error;
 
@@ -133,23 +163,65 @@ mod tests {
         let tone = ToneSettings::new(curve);
         let mut config =
             TrainConfig { dataset: Path::new("data").join(scene), tone, ..Default::default() };
-        preset.apply(&mut config);
+        preset.apply(&mut config).unwrap();
         config
     }
 
     const BENCHMARKS: [Preset; 3] = [Preset::Lom, Preset::RealX3d, Preset::Mip360Varying];
 
+    const PAPER: [Preset; 4] = [Preset::Paper, Preset::Lom, Preset::RealX3d, Preset::Mip360Varying];
+
     #[test]
-    fn benchmarks_have_the_density_control_of_the_paper_and_nothing_else_has() {
+    fn the_paper_and_its_benchmarks_have_its_density_control_and_nothing_else_has() {
         for preset in Preset::ALL {
             let config = applied(preset, "x", ToneCurve::Ap3);
             let is_paper = config.density.control == DensityControl::Paper;
-            assert_eq!(is_paper, BENCHMARKS.contains(&preset), "{preset:?}");
+            assert_eq!(is_paper, PAPER.contains(&preset), "{preset:?}");
             assert_eq!(is_paper, config.schedule.densify_after == 500, "{preset:?}");
             assert_eq!(is_paper, config.start == Start::PAPER, "{preset:?}");
             config.check().unwrap();
         }
-        assert_eq!(applied(Preset::Balanced, "x", ToneCurve::None).schedule, Schedule::default());
+    }
+
+    #[test]
+    fn paper_is_the_paper_and_balanced_is_what_the_library_defaults_to_but_for_its_end() {
+        let paper = applied(Preset::Paper, "x", ToneCurve::Auto);
+        let expected = TrainConfig {
+            dataset: "data/x".into(),
+            tone: ToneSettings::default().with_curve(ToneCurve::Ap3),
+            start: Start::PAPER,
+            schedule: Schedule::paper(),
+            density: DensityConfig::paper(),
+            ..Default::default()
+        };
+        assert_eq!(paper, expected);
+        let balanced = applied(Preset::Balanced, "x", ToneCurve::Ase);
+        assert_eq!((balanced.tone.curve, balanced.stop.views), (ToneCurve::Ase, 2));
+        let defaults = TrainConfig::default();
+        let plain =
+            TrainConfig { tone: defaults.tone.clone(), stop: defaults.stop.clone(), ..balanced };
+        assert_eq!(plain, TrainConfig { dataset: "data/x".into(), ..defaults });
+        assert!(!Preset::Paper.is_planned() && Preset::Balanced.is_planned());
+    }
+
+    #[test]
+    fn the_guide_shows_every_preset_as_it_is() {
+        let guide = include_str!("../../docs/guide.md");
+        for preset in Preset::ALL {
+            let Some(text) = preset.toml() else { continue };
+            let shown = format!("```toml\n# --preset {}\n{text}```", preset.name());
+            assert!(guide.contains(&shown), "docs/guide.md lacks\n{shown}");
+        }
+    }
+
+    #[test]
+    fn a_preset_sets_what_it_says_and_leaves_the_rest() {
+        let mut config = TrainConfig { seed: 4, ..Default::default() };
+        config.schedule.means_rate_steps = 7;
+        Preset::Draft.apply(&mut config).unwrap();
+        assert_eq!((config.seed, config.schedule.means_rate_steps), (4, 7));
+        assert_eq!((config.sh_degree, config.schedule.densify_interval), (0, 50));
+        assert!(config.overlaid("stepz = 3").unwrap_err().to_string().contains("stepz"));
     }
 
     #[test]

@@ -18,7 +18,7 @@ use crate::loss::ViewSource;
 use crate::pseudo_gt::PseudoGt;
 use crate::random::Stream;
 use crate::scene::{Gaussians, Shape, init};
-use crate::tone::{Exposure, Statistics, ToneCurve, ToneSettings, all_black};
+use crate::tone::{Exposure, Scene, Statistics, ToneCurve, ToneSettings, all_black};
 
 /// One training view.
 #[derive(Debug)]
@@ -82,7 +82,7 @@ impl Views {
         dataset: &Dataset,
         levels: usize,
         keeps_photographs: bool,
-    ) -> Result<(Self, Option<TargetExposure>)> {
+    ) -> Result<(Self, Scene, Option<TargetExposure>)> {
         let settings = pseudo_gt.settings().clone();
         let photographs: Vec<(usize, &View, &Image)> = (dataset.views.iter().enumerate())
             .filter(|(_, view)| view.is_train())
@@ -137,7 +137,9 @@ impl Views {
                 });
             }
         }
-        Ok((Self(views), scene.exposure.map(|scene| TargetExposure::new(scene, gains))))
+        let exposure = scene.exposure.clone();
+        let exposure = exposure.map(|scene| TargetExposure::new(scene, gains));
+        Ok((Self(views), scene, exposure))
     }
 
     /// What the loss terms may compare the views with.

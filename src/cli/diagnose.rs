@@ -1,0 +1,220 @@
+//! `nightsplat diagnose`: what a capture is, what its model needs, and why.
+
+mod page;
+
+use std::io::Write;
+use std::path::PathBuf;
+
+use anyhow::Result;
+use serde::Serialize;
+
+use super::table;
+use crate::Error;
+use crate::dataset::{Dataset, LoadOptions};
+use crate::diagnose::{Diagnosis, Noise, Plan, SceneDiagnosis, ViewDiagnosis};
+use crate::gpu::{DeviceChoice, Gpu};
+use crate::output::write_whole;
+use crate::train::{Preset, TrainConfig};
+
+/// Look at dark photographs before training: what they are, and what a model of them needs.
+///
+/// Measures brightness, noise, blur, exposures and overlap of the training photographs, in seconds, and decides which parts
+/// the model has, each with its reason. `nightsplat train` does the same by itself; here one sees why, and may disagree:
+///
+///   nightsplat diagnose photos --report photos.html
+///   nightsplat diagnose photos --plan plan.toml         edit plan.toml, then
+///   nightsplat train photos --out run --plan plan.toml
+///
+/// Light is linear, everything else is of encoded values from 0 to 1. Reference images are never looked at.
+#[expect(clippy::doc_markdown, reason = "in help, {setting} stands for its default")]
+#[derive(Clone, Debug, clap::Args)]
+#[command(verbatim_doc_comment)]
+pub struct DiagnoseArgs {
+    /// The dataset: a folder with transforms*.json (LOM, RealX3D, NeRF) or a COLMAP model in sparse/
+    pub dataset: PathBuf,
+    /// Print everything as JSON
+    #[arg(long)]
+    pub json: bool,
+    /// Write a page with the photographs, dark and lifted, and every figure
+    #[arg(long, value_name = "FILE.html")]
+    pub report: Option<PathBuf>,
+    /// Write the plan, for `nightsplat train --plan`
+    #[arg(long, value_name = "FILE.toml")]
+    pub plan: Option<PathBuf>,
+    /// Plan for photographs shrunk by this factor; they are measured as stored [default: {downscale}]
+    #[arg(long, value_name = "F")]
+    pub downscale: Option<f64>,
+    /// Plan for this preset: draft, fast, balanced or best [default: balanced]
+    #[arg(long, value_name = "NAME")]
+    pub preset: Option<Preset>,
+    /// Plan for so many steps [default: the preset's]
+    #[arg(long, value_name = "N")]
+    pub steps: Option<u64>,
+    /// The device: a part of its name or its index in `nightsplat doctor` [default: the best]
+    #[arg(long, value_name = "NAME|INDEX")]
+    pub device: Option<DeviceChoice>,
+}
+
+/// What `--json` prints.
+#[derive(Serialize)]
+struct Output<'a> {
+    device: &'a str,
+    #[serde(flatten)]
+    diagnosis: &'a Diagnosis,
+    plan: &'a Plan,
+}
+
+/// Measures, plans and prints.
+///
+/// # Errors
+/// The dataset is not usable or black altogether, there is no device, or a file cannot be written.
+pub fn run(args: &DiagnoseArgs) -> Result<()> {
+    let mut config = TrainConfig { dataset: args.dataset.clone(), ..TrainConfig::default() };
+    args.preset.unwrap_or(Preset::Balanced).apply(&mut config)?;
+    config.steps = args.steps.unwrap_or(config.steps);
+    config.downscale = args.downscale.unwrap_or(config.downscale);
+    let gpu = Gpu::new(&args.device.clone().unwrap_or_default())?;
+    let options = load_options(&config);
+    let dataset = Dataset::load(&config.dataset, &options)?;
+    let diagnosis = Diagnosis::of(&dataset, &options)?;
+    let plan = Plan::new(&diagnosis, &config, gpu.properties().memory);
+    if let Some(path) = &args.plan {
+        write_whole(path, plan.to_toml()?.as_bytes())?;
+    }
+    if let Some(path) = &args.report {
+        write_whole(path, page::html(&dataset, &diagnosis, &plan).as_bytes())?;
+    }
+    let device = gpu.properties().name.as_str();
+    let text = if args.json {
+        let output = Output { device, diagnosis: &diagnosis, plan: &plan };
+        let json = serde_json::to_string_pretty(&output);
+        json.map_err(|error| Error::output("standard output", error.to_string()))? + "\n"
+    } else {
+        text(device, &dataset, &diagnosis, &plan)
+    };
+    write!(std::io::stdout().lock(), "{text}")?;
+    Ok(())
+}
+
+/// As the configuration's, with depth maps wherever there are some: whether there are is part of the diagnosis.
+pub(super) fn load_options(config: &TrainConfig) -> LoadOptions {
+    let mut options = config.load_options();
+    options.depth.load = true;
+    options
+}
+
+fn text(device: &str, dataset: &Dataset, diagnosis: &Diagnosis, plan: &Plan) -> String {
+    let Diagnosis { views, test_views, remarks, .. } = diagnosis;
+    let mut text = format!(
+        "{}\n{} photographs to train on ({}), {test_views} held out, {} points; on {device}\n\n",
+        dataset.root.display(),
+        views.len(),
+        sizes(views),
+        dataset.points.len()
+    );
+    text += &table::aligned(&rows(diagnosis));
+    text.push('\n');
+    text += &scene_text(&diagnosis.scene);
+    for remark in remarks {
+        text += &format!("note: {remark}\n");
+    }
+    text.push('\n');
+    text + &decisions(plan)
+}
+
+/// The plan, a decision a line.
+pub(super) fn decisions(plan: &Plan) -> String {
+    let decisions = plan.decisions();
+    let width =
+        |of: fn(&(&str, String, &str)) -> usize| decisions.iter().map(of).max().unwrap_or(0);
+    let (name, value) = (width(|one| one.0.len()), width(|one| one.1.len()));
+    let line = |(part, decided, why): &(&str, String, &str)| {
+        format!("{part:name$}  {decided:value$}  {why}\n")
+    };
+    decisions.iter().map(line).collect()
+}
+
+/// The size of the photographs, or the smallest and the largest.
+fn sizes(views: &[ViewDiagnosis]) -> String {
+    let area = |view: &&ViewDiagnosis| u64::from(view.size[0]) * u64::from(view.size[1]);
+    let size = |view: Option<&ViewDiagnosis>| {
+        view.map_or_else(String::new, |view| format!("{}x{}", view.size[0], view.size[1]))
+    };
+    let (least, most) = (size(views.iter().min_by_key(area)), size(views.iter().max_by_key(area)));
+    if least == most { least } else { format!("{least} to {most}") }
+}
+
+/// What each column of the table is.
+const COLUMNS: [&str; 14] = [
+    "view", "p10", "p90", "r", "mean", "cubic", "EV", "white %", "black %", "codes", "noise",
+    "blur", "points", "overlap",
+];
+
+fn rows(diagnosis: &Diagnosis) -> Vec<Vec<String>> {
+    let mut rows = vec![COLUMNS.map(str::to_owned).to_vec()];
+    rows.extend(diagnosis.views.iter().map(|view| {
+        let mut row = vec![view.name.clone()];
+        row.extend(values(view).iter().zip(DIGITS).map(|(value, digits)| cell(*value, digits)));
+        row
+    }));
+    rows
+}
+
+/// Digits after the point of the columns behind the name.
+const DIGITS: [usize; 13] = [4, 4, 2, 4, 4, 2, 2, 1, 0, 4, 1, 0, 2];
+
+fn cell(value: Option<f64>, digits: usize) -> String {
+    value.map_or_else(|| "-".to_owned(), |value| format!("{value:.digits$}"))
+}
+
+/// The numbers of a view, in the order of the columns.
+fn values(view: &ViewDiagnosis) -> [Option<f64>; 13] {
+    [
+        Some(view.p10),
+        Some(view.p90),
+        Some(view.r),
+        Some(view.mean_luminance),
+        Some(view.cubic_mean),
+        view.exposure,
+        Some(100.0 * view.clipped_fraction),
+        Some(100.0 * view.zero_fraction),
+        Some(view.code_values as f64),
+        view.noise.map(|noise| noise.deviation(view.light)),
+        view.blur,
+        Some(view.points as f64),
+        Some(view.overlap),
+    ]
+}
+
+fn scene_text(scene: &SceneDiagnosis) -> String {
+    let noise = match scene.noise {
+        Some(Noise { gain, read }) => format!(
+            "noise       gain {gain:.2e}, read {read:.2e} of white in linear light; {:.3} in a target, averaged over its views",
+            scene.target_noise
+        ),
+        None => "noise       not measurable: no part of the photographs is flat and not cut off"
+            .to_owned(),
+    };
+    let blur = scene.blur.map_or_else(|| "-".to_owned(), |blur| format!("{blur:.1} pixels"));
+    format!(
+        "brightness  mean {:.4}, p10 {:.4}, p90 {:.4}, cubic mean {:.4}; lift {:.1}, {:.0} times too little light\n\
+         exposure    spread {:.2} stops between the views, light uneven by {:.1} stops within\n\
+         {noise}\n\
+         detail      blur {blur}, {:.0} code values in use, {:.2} % white, {:.1} % black\n\
+         cameras     a place is seen by {:.0} views, overlap {:.2}, {} points\n",
+        scene.mean_luminance,
+        scene.p10,
+        scene.p90,
+        scene.cubic_mean,
+        scene.lift,
+        scene.darkening,
+        scene.exposure_spread,
+        scene.unevenness,
+        scene.code_values,
+        100.0 * scene.clipped_fraction,
+        100.0 * scene.zero_fraction,
+        scene.views_per_point,
+        scene.overlap,
+        scene.points
+    )
+}

@@ -1,0 +1,127 @@
+//! Training views that are kept from training: how well the model shows their targets says when it has converged.
+
+use std::borrow::Cow;
+
+use serde::{Deserialize, Serialize};
+
+use super::Trainer;
+use crate::camera::Camera;
+use crate::dataset::{Dataset, Split};
+use crate::image::Image;
+use crate::pseudo_gt::PseudoGt;
+use crate::tone::Scene;
+use crate::{Error, Result};
+
+/// When a run ends before its last step. The scores are against targets, never against references.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct StopConfig {
+    /// So many training views are kept from training, an eighth of them at most; 0: none, and no run ends early.
+    pub views: usize,
+    /// They are scored every so many steps.
+    pub every: u64,
+    /// The run ends once two scores in a row are not better than the best before by so many dB.
+    pub gain: f64,
+}
+
+impl Default for StopConfig {
+    fn default() -> Self {
+        Self { views: 0, every: 250, gain: 0.05 }
+    }
+}
+
+impl StopConfig {
+    /// Whether a run with these scores, in order, is to end.
+    pub fn has_converged(&self, scores: &[f64]) -> bool {
+        const PATIENCE: usize = 2;
+        let Some(before) = scores.len().checked_sub(PATIENCE).filter(|&before| before > 0) else {
+            return false;
+        };
+        let best = |of: &[f64]| of.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        best(&scores[before..]) < best(&scores[..before]) + self.gain
+    }
+
+    /// # Errors
+    /// [`Error::Usage`] names a value that makes no sense.
+    pub(super) fn check(&self) -> Result<()> {
+        let rules = [
+            ("stop.every", self.every as f64, self.every >= 1, "at least 1"),
+            ("stop.gain", self.gain, self.gain.is_finite() && self.gain >= 0.0, "0 or more"),
+        ];
+        match rules.into_iter().find(|(_, _, holds, _)| !holds) {
+            Some((name, value, _, rule)) => {
+                Err(Error::Usage(format!("{name} is {value}; it must be {rule}")))
+            }
+            None => Ok(()),
+        }
+    }
+}
+
+/// Cameras, and what they are to show.
+#[derive(Debug, Default)]
+pub(super) struct HeldOut(Vec<(Camera, Image)>);
+
+impl HeldOut {
+    /// The held-out views of a dataset with their targets, made as those of its training views.
+    pub(super) fn new(pseudo_gt: &mut PseudoGt, dataset: &Dataset, scene: &Scene) -> Result<Self> {
+        let settings = pseudo_gt.settings().clone();
+        let mut views = vec![];
+        for view in dataset.views.iter().filter(|view| view.split == Split::HeldOut) {
+            let Some(image) = &view.image else { continue };
+            let original = if settings.lift_first { view.photograph()? } else { None };
+            let whole = original.unwrap_or(Cow::Borrowed(image));
+            let lift = settings.lift(scene, &pseudo_gt.measure(&whole.data)?);
+            let target = pseudo_gt.lifted(&whole, &lift)?;
+            views.push((view.camera, target.resized(image.width, image.height)));
+        }
+        Ok(Self(views))
+    }
+}
+
+impl Trainer {
+    /// The mean PSNR, dB, of what the model shows of the held-out views against their targets; none where there are none.
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub fn held_out_psnr(&mut self) -> Result<Option<f64>> {
+        let views = std::mem::take(&mut self.held_out);
+        let scores = views.0.iter().map(|(camera, target)| {
+            let render = self.render(camera)?;
+            Ok(psnr(&render.output().data, &target.data))
+        });
+        let scores = scores.collect::<Result<Vec<f64>>>();
+        self.held_out = views;
+        let scores = scores?;
+        let mean = scores.iter().sum::<f64>() / scores.len() as f64;
+        Ok((!scores.is_empty()).then_some(mean))
+    }
+}
+
+fn psnr(render: &[f32], target: &[f32]) -> f64 {
+    let pairs = render.iter().zip(target);
+    let square = |(&own, &other): (&f32, &f32)| f64::from(own.clamp(0.0, 1.0) - other).powi(2);
+    let mean = pairs.map(square).sum::<f64>() / target.len().max(1) as f64;
+    // Equal pictures: as good as 8 bits can tell apart.
+    -10.0 * mean.max(1e-10).log10()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_run_ends_once_two_scores_in_a_row_gain_too_little() {
+        let stop = StopConfig { gain: 0.05, ..StopConfig::default() };
+        for (scores, ends) in [
+            (&[][..], false),
+            (&[20.0, 20.0], false),
+            (&[20.0, 20.02, 20.04], true),
+            (&[20.0, 19.0, 20.06], false),
+            (&[20.0, 20.5, 20.5, 20.5], true),
+            (&[20.0, 21.0, 20.0, 20.9], true),
+            (&[20.0, 20.1, 20.2, 20.3, 20.4], false),
+        ] {
+            assert_eq!(stop.has_converged(scores), ends, "{scores:?}");
+        }
+    }
+}
