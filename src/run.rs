@@ -4,6 +4,8 @@ mod directory;
 mod events;
 mod train;
 
-pub use directory::{RunDirectory, is_finished, load_config, load_model, load_networks};
+pub use directory::{
+    RunDirectory, is_finished, load_config, load_exposures, load_model, load_networks,
+};
 pub use events::Event;
 pub use train::{HeldRun, Trained, train};

@@ -10,6 +10,7 @@ use super::{progress_bar, table};
 use crate::eval::{self, ViewScore};
 use crate::gpu::DeviceChoice;
 use crate::metrics::Scores;
+use crate::train::Learning;
 
 /// Score a finished run on the test views of its dataset.
 ///
@@ -53,7 +54,10 @@ pub fn run(args: &EvalArgs) -> Result<()> {
     let mut out = std::io::stdout().lock();
     if args.json {
         let seconds = trained_seconds(&args.run);
-        let metrics = eval::metrics(&scored, seconds, gaussian_count, config.steps);
+        let mut metrics = eval::metrics(&scored, seconds, gaussian_count, config.steps);
+        if config.exposure.learn == Learning::On {
+            eval::add_exposure(&mut metrics, &scored)?;
+        }
         writeln!(out, "{metrics:#}")?;
     } else {
         write!(out, "{}", score_table(&scored))?;

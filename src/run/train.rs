@@ -83,7 +83,11 @@ pub fn train(
     if let Some(networks) = trainer.networks() {
         directory.save_networks(networks)?;
     }
-    let metrics = eval::metrics(&scored, seconds, trainer.gaussian_count(), config.steps);
+    let mut metrics = eval::metrics(&scored, seconds, trainer.gaussian_count(), config.steps);
+    if let Some(exposures) = trainer.exposures()? {
+        directory.save_exposures(&exposures)?;
+        eval::add_exposure(&mut metrics, &scored)?;
+    }
     directory.save_metrics(&metrics)?;
     let trained = Trained { trainer, scored, losses, seconds, peak_bytes };
     observe(Event::Finished(&trained));

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
+use super::exposures::{ExposureConfig, Learning};
 use super::parts::ModelConfig;
 use super::streams;
 use crate::dataset::{Dataset, DepthOptions, LoadOptions};
@@ -84,6 +85,8 @@ pub struct TrainConfig {
     pub density: DensityConfig,
     /// What the model has beside colour.
     pub model: ModelConfig,
+    /// Gain and bias of each training view.
+    pub exposure: ExposureConfig,
 }
 
 /// Steps whose every pass is compared with its CPU reference.
@@ -132,6 +135,7 @@ impl Default for TrainConfig {
             schedule: Schedule::default(),
             density: DensityConfig::default(),
             model: ModelConfig::default(),
+            exposure: ExposureConfig::default(),
         }
     }
 }
@@ -248,6 +252,12 @@ impl TrainConfig {
         self.tone.check()?;
         self.model.check()?;
         self.loss().check()?;
+        self.exposure.check()?;
+        if self.exposure.learn == Learning::On && self.model.tonemapper {
+            let problem = "`ExposureConfig::learn` is on, and the tonemapper holds the model to the dark photographs, whose \
+                exposures a gain on their lifted targets does not describe; leave one of them out";
+            return Err(Error::Usage(problem.to_owned()));
+        }
         let density = &self.density;
         let rules = [
             ("`TrainConfig::steps`", self.steps as f64, self.steps >= 1, "at least 1"),
