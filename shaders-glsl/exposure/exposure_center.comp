@@ -7,7 +7,7 @@
 //!
 //! Numbers become n / QUANTA with n whole. With S the sum of n and N views, each n loses floor(S / N) and the first
 //! S mod N of them one more: in integers no rounding is left to drift, and no order of summation matters.
-//! Centred numbers stay as they are, and so does everything while status[0] is set.
+//! What is centred and within BOUND stays as it is, and so does everything while status[0] is set.
 //! One subgroup per number. Reference: `src/reference/exposure_center.rs`.
 
 layout(local_size_x_id = 100) in;

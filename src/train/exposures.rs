@@ -6,8 +6,8 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-use super::TrainConfig;
 use super::views::Views;
+use super::{TrainConfig, Trainer};
 use crate::dataset::{Dataset, LoadOptions, Photograph};
 use crate::exposure::{Affine, ExposureRates, table};
 use crate::gpu::Gpu;
@@ -67,6 +67,18 @@ impl ExposureConfig {
     }
 }
 
+impl Trainer {
+    /// What the exposure of each training view makes of the model, by name; none where exposures are not learned.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub fn exposures(&self) -> Result<Option<Vec<(String, Affine)>>> {
+        let Some(exposures) = &self.exposures else { return Ok(None) };
+        let names = self.views.names().map(str::to_owned);
+        Ok(Some(names.zip(exposures.affines()?).collect()))
+    }
+}
+
 /// Where the exposure of a view begins.
 #[derive(Clone, Copy, Debug)]
 enum Start {
@@ -79,8 +91,8 @@ enum Start {
 impl Views {
     /// Where the exposures of the training views begin; none where they are not learned.
     ///
-    /// A table says what is known; without one the photographs do, where a camera has written its exposure into all of
-    /// them. A view of which nothing is known begins at the identity.
+    /// A table says what is known; without one the photographs do, where cameras have written their exposure. A view of
+    /// which nothing is known begins at the identity.
     ///
     /// # Errors
     /// The table cannot be read or names a view that there is not; the device is out of memory or lost.
