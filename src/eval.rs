@@ -6,6 +6,7 @@ use std::str::FromStr;
 use serde_json::{Map, Value, json};
 
 use crate::dataset::{Dataset, View};
+use crate::exposure::Affine;
 use crate::gpu::{Buffer, Gpu};
 use crate::image::Image;
 use crate::metrics::Scores;
@@ -215,6 +216,32 @@ pub fn metrics(
         "gaussians": gaussians,
         "steps": steps,
     })
+}
+
+/// Says in `metrics.json` of a model with learned exposures at which one the test views were scored, as no photograph of
+/// theirs was trained on: at the neutral one, the mean of the training views. Beside it stand the scores behind the affine
+/// of each channel that brings each render nearest to its reference image, which is what others report; they know the
+/// reference and compare with nothing else here.
+///
+/// # Errors
+/// None for what [`score`] gives.
+pub fn add_exposure(metrics: &mut Value, scored: &[ViewScore]) -> Result<()> {
+    let aligned = |view: &ViewScore| -> Result<(String, Scores)> {
+        let affine = Affine::least_squares(&view.render, &view.reference)?;
+        let render = quantized(&affine.applied(&view.render));
+        Ok((view.name.clone(), Scores::of(&render, &view.reference)?))
+    };
+    let aligned = scored.iter().map(aligned).collect::<Result<Vec<_>>>()?;
+    let scores: Vec<Scores> = aligned.iter().map(|(_, scores)| *scores).collect();
+    let views: Map<String, Value> =
+        aligned.into_iter().map(|(name, scores)| (name, entry(&scores, None))).collect();
+    metrics["exposure"] = json!("neutral: the mean of the training views'");
+    metrics["aligned_with_reference"] = json!({
+        "what": "behind the least-squares gain and bias of each channel of each test view against its reference image",
+        "mean": Scores::mean(&scores).map(|mean| entry(&mean, None)),
+        "views": views,
+    });
+    Ok(())
 }
 
 /// The mean scores, and those of R_0 where the model has a denoiser.

@@ -7,12 +7,16 @@
 #[cfg(feature = "io")]
 mod codec;
 #[cfg(feature = "io")]
+mod exif;
+#[cfg(feature = "io")]
 mod exr_file;
 #[cfg(feature = "io")]
 pub(crate) mod files;
 #[cfg(feature = "io")]
 mod jpeg;
 
+#[cfg(feature = "io")]
+pub use exif::exposure_value;
 use rayon::prelude::*;
 
 /// A colour image: planes of red, green and blue, sRGB-encoded, [0, 1] but for EXR input, which may exceed 1.

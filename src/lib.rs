@@ -28,6 +28,7 @@
 //! - [`dataset`]: photographs with their cameras and points, from disk
 //! - [`scene`]: Gaussians on the host, PLY
 //! - [`optimizer`]: Adam, what it learns beside the Gaussians, and the schedules of its rates
+//! - [`exposure`]: gain and bias of each training view, learned
 //! - [`pseudo_gt`]: dark photograph and curve to target, on the device
 //! - [`structure`]: the edges of a pseudo-GT that do not depend on its illumination
 //! - [`render`]: the differentiable rasteriser
@@ -55,6 +56,7 @@ pub mod diagnose;
 pub mod error;
 #[cfg(feature = "io")]
 pub mod eval;
+pub mod exposure;
 #[cfg(feature = "fit")]
 pub mod fit;
 #[expect(unsafe_code, reason = "the only module that speaks Vulkan")]

@@ -179,6 +179,9 @@ pub struct TermInputs<'a> {
     pub features: Features,
     /// (channels, H, W), not clamped.
     pub render: &'a Buffer<f32>,
+    /// What is held to the target, (3, H, W) or longer, not clamped: the colours of the render, or what the view's exposure
+    /// makes of them.
+    pub colors: &'a Buffer<f32>,
     /// (3, H, W), sRGB-encoded; its tone curve is the pseudo-GT.
     pub low: &'a Buffer<f32>,
     /// The curve of this view, one element.

@@ -6,7 +6,8 @@ mod train;
 
 pub(crate) use directory::TARGET_EXPOSURE;
 pub use directory::{
-    RunDirectory, is_finished, load_config, load_metrics, load_model, load_networks, plan_of,
+    RunDirectory, is_finished, load_config, load_exposures, load_metrics, load_model,
+    load_networks, plan_of,
 };
 pub use events::Event;
 pub use train::{HeldRun, Trained, train, train_planned};

@@ -2,6 +2,7 @@
 
 mod checkpoint;
 mod config;
+mod exposures;
 mod held_out;
 mod model;
 mod networks;
@@ -20,6 +21,7 @@ use glam::UVec2;
 use crate::camera::Camera;
 use crate::dataset::Dataset;
 use crate::densify::{Densifier, DensifySettings, DensityControl, Round};
+use crate::exposure::Exposures;
 use crate::gpu::{Buffer, CheckReport, Gpu, PassTime, Recorder};
 use crate::image::Image;
 use crate::loss::{DepthBoxes, LogSlot, LossLog, Losses, StepLosses, Term, TermInputs};
@@ -31,6 +33,7 @@ use crate::scene::{Gaussians, width};
 use crate::{Error, Result};
 
 pub use config::{Background, CheckConfig, DensityConfig, TrainConfig};
+pub use exposures::{ExposureConfig, Learning};
 use held_out::HeldOut;
 pub use held_out::StopConfig;
 use model::Model;
@@ -154,6 +157,7 @@ pub struct Trainer {
     renderer: Renderer,
     losses: Losses,
     networks: Option<NetworkTerms>,
+    exposures: Option<Exposures>,
     adam: Adam,
     densifier: Densifier,
     d_render: Buffer<f32>,
@@ -219,19 +223,27 @@ impl Trainer {
         }
         let sizes = views.sizes();
         say_what_parts_see(&config.model, &sizes);
+        let starts = views.exposures(gpu, &pseudo_gt, dataset, &config)?;
         let gaussians = match gaussians {
             Some(gaussians) if gaussians.shape == settings.shape => gaussians.clone(),
             Some(Gaussians { shape: own, .. }) => {
                 let problem = format!("Gaussians of {own:?} make no model of {:?}", settings.shape);
                 return Err(Error::Usage(problem));
             }
-            None => views.initial_gaussians(gpu, &pseudo_gt, dataset, &config)?,
+            None => {
+                views.initial_gaussians(gpu, &pseudo_gt, dataset, &config, starts.as_deref())?
+            }
         };
         let pixels = sizes.iter().map(|size| size.x as usize * size.y as usize).max();
         let values = settings.channels() * pixels.unwrap_or_default();
         let sources = views.sources(gpu, &pseudo_gt, dataset);
         let losses = Losses::new(gpu, &config.loss(), &sources)?;
         drop(sources);
+        let exposures = starts.map(|starts| Exposures::new(gpu, config.exposure.rates, &starts));
+        let mut exposures = exposures.transpose()?;
+        if let Some(exposures) = &mut exposures {
+            sizes.iter().try_for_each(|&size| exposures.reserve(size))?;
+        }
         let Kernels { renderer, adam, densifier } =
             kernels.join().unwrap_or_else(|panic| resume_unwind(panic))?;
         let mut trainer = Self {
@@ -245,6 +257,7 @@ impl Trainer {
             renderer,
             losses,
             networks: NetworkTerms::new(gpu, &config, &sizes)?,
+            exposures,
             adam,
             densifier,
             d_render: gpu.uninit("d_render", values)?,
@@ -371,18 +384,27 @@ impl Trainer {
 
         self.renderer.forward(pass, &model.gaussians.parameters, &view.camera, &options)?;
         let (render, status) = self.renderer.render_and_status();
-        let d_render = &mut self.d_render;
+        let (d_render, size) = (&mut self.d_render, view.size());
         let log = &mut LogSlot { log: &mut self.log, slot, status };
         let inputs = &TermInputs {
             step,
             view: view.number,
-            size: view.size(),
+            size,
             features: model.shape().features,
             render,
+            colors: render,
             low: view.loss_input(),
             tone: &view.tone,
         };
-        self.losses.record(pass, inputs, d_render, log)?;
+        match &mut self.exposures {
+            Some(exposures) => {
+                exposures.expose(pass, view.place, size, render)?;
+                let inputs = &TermInputs { colors: exposures.exposed(), ..*inputs };
+                self.losses.record(pass, inputs, d_render, log)?;
+                exposures.backward(pass, view.place, size, render, d_render)?;
+            }
+            None => self.losses.record(pass, inputs, d_render, log)?,
+        }
         if let Some(networks) = &mut self.networks {
             networks.record(pass, inputs, view.photograph(), d_render, log)?;
         }
@@ -414,9 +436,13 @@ impl Trainer {
             },
             self.renderer.status(),
         )?;
-        learnables(&mut self.networks).try_for_each(|learnable| {
+        learnables(&mut self.networks, &mut self.exposures).try_for_each(|learnable| {
             self.adam.update(pass, step, learnable, self.renderer.status())
-        })
+        })?;
+        match &mut self.exposures {
+            Some(exposures) => exposures.center(pass, self.renderer.status()),
+            None => Ok(()),
+        }
     }
 
     /// The networks; none where the model has none.
@@ -486,9 +512,13 @@ impl Kernels {
 }
 
 /// Everything that is learned beside the Gaussians: Adam trains it, and checkpoints keep it.
-fn learnables(networks: &mut Option<NetworkTerms>) -> impl Iterator<Item = &mut dyn Learnable> {
+fn learnables<'a>(
+    networks: &'a mut Option<NetworkTerms>,
+    exposures: &'a mut Option<Exposures>,
+) -> impl Iterator<Item = &'a mut dyn Learnable> {
     let networks = networks.iter_mut().flat_map(|terms| terms.networks.parameters_mut());
-    networks.map(|parameters| parameters as &mut dyn Learnable)
+    let networks = networks.map(|parameters| parameters as &mut dyn Learnable);
+    networks.chain(exposures.iter_mut().map(|exposures| exposures as &mut dyn Learnable))
 }
 
 /// Says where the parts of a model see less than they are set to.

@@ -11,6 +11,7 @@ use crate::eval::{self, ViewScore};
 use crate::gpu::DeviceChoice;
 use crate::metrics::Scores;
 use crate::run;
+use crate::train::Learning;
 
 /// Score a finished run on the test views of its dataset.
 ///
@@ -58,6 +59,9 @@ pub fn run(args: &EvalArgs) -> Result<()> {
         let mut metrics = eval::metrics(&scored, seconds, gaussian_count, config.steps);
         if let Some(exposure) = recorded.get(run::TARGET_EXPOSURE) {
             metrics[run::TARGET_EXPOSURE] = exposure.clone();
+        }
+        if config.exposure.learn == Learning::On {
+            eval::add_exposure(&mut metrics, &scored)?;
         }
         writeln!(out, "{metrics:#}")?;
     } else {

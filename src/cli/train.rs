@@ -15,7 +15,7 @@ use crate::gpu::{DeviceChoice, Gpu};
 use crate::nn::Precision;
 use crate::run::{self, Event, HeldRun, Trained};
 use crate::tone::{CurveChoice, GainChoice, ToneCurve};
-use crate::train::{Background, ModelName, Part, Preset, TrainConfig};
+use crate::train::{Background, Learning, ModelName, Part, Preset, TrainConfig};
 
 /// Train a 3D Gaussian Splatting model from dark photographs.
 ///
@@ -86,6 +86,12 @@ pub(crate) struct TrainOptions {
     /// black, or random: another colour every step [default: {background}]
     #[arg(long)]
     background: Option<Background>,
+    /// on: learn gain and bias of each channel of each training view, where photographs are not equally bright; off [default: {exposure.learn}]
+    #[arg(long, value_name = "on|off")]
+    exposure: Option<Learning>,
+    /// Learn exposures from where this table has them: name,ev or name,gain_r,gain_g,gain_b,bias_r,bias_g,bias_b [default: exposures.csv of the dataset]
+    #[arg(long, value_name = "FILE")]
+    exposures: Option<PathBuf>,
     /// A folder of reference images by name, for scores only
     #[arg(long, value_name = "DIR")]
     reference: Option<PathBuf>,
@@ -275,6 +281,10 @@ impl TrainOptions {
         set(&mut config.checkpoint_every, &self.checkpoint_every);
         set(&mut config.check.every, &self.check_every);
         config.check.stops |= self.check_stops;
+        if self.exposures.is_some() {
+            (config.exposure.learn, config.exposure.start) = (Learning::On, self.exposures.clone());
+        }
+        set(&mut config.exposure.learn, &self.exposure);
         if self.reference.is_some() {
             config.reference.clone_from(&self.reference);
         }

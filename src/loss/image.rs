@@ -343,7 +343,7 @@ impl LossTerm for Loss {
     fn record_step(
         &mut self,
         pass: &mut Recorder<'_>,
-        &TermInputs { size, render, low, tone, .. }: &TermInputs<'_>,
+        &TermInputs { size, colors: render, low, tone, .. }: &TermInputs<'_>,
         d_render: &mut Buffer<f32>,
         log: &mut LogSlot<'_>,
     ) -> Result<()> {

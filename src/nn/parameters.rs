@@ -62,7 +62,7 @@ impl Learnable for Parameters {
         self.name
     }
 
-    fn learning_rate(&self) -> f64 {
+    fn learning_rate(&self, _: u64) -> f64 {
         self.learning_rate
     }
 

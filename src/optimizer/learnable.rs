@@ -9,8 +9,8 @@ pub trait Learnable {
     /// What its tensors are called in a checkpoint: `NAME.parameters`, `NAME.first_moments`, `NAME.second_moments`.
     fn name(&self) -> &'static str;
 
-    /// Adam's learning rate.
-    fn learning_rate(&self) -> f64;
+    /// Adam's learning rate at a step, counted from 1.
+    fn learning_rate(&self, step: u64) -> f64;
 
     /// What is learned, with the gradients of the step and what Adam keeps.
     fn buffers(&mut self) -> AdamBuffers<'_>;
@@ -28,7 +28,7 @@ impl Adam {
         learnable: &mut dyn Learnable,
         status: &Buffer<u32>,
     ) -> Result<()> {
-        let rates = LearningRates::uniform(learnable.learning_rate());
+        let rates = LearningRates::uniform(learnable.learning_rate(step));
         let buffers = learnable.buffers();
         // One column of planes.
         let shape = [buffers.parameters.len() as u32, 1, 0];

@@ -7,17 +7,20 @@
 //!     networks.safetensors    the weights of the networks, where the model has any
 //!     train.csv      one line per step
 //!     held_out.csv   scores of the views that were kept from training, where there are any
+//!     exposures.csv  gain and bias of the training views, where they are learned
 //!     checkpoint.safetensors  what the run goes on from, overwritten every so many steps
 //!     metrics.json   scores of the test views
 //! ```
 //!
 //! A file appears under its name only once it is complete, `metrics.json` last: a directory that has it is whole.
 
+use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
 use crate::diagnose::Plan;
+use crate::exposure::{Affine, table};
 use crate::gpu::Gpu;
 use crate::loss::Term;
 use crate::output::write_whole;
@@ -37,8 +40,17 @@ pub struct RunDirectory {
 }
 
 /// The files of a run that a new run replaces; nothing else in the directory is touched.
-const FILES: [&str; 8] =
-    ["metrics.json", "model.ply", NETWORKS, CHECKPOINT, LOG, HELD_OUT, PLAN, "config.toml"];
+const FILES: [&str; 9] = [
+    "metrics.json",
+    "model.ply",
+    NETWORKS,
+    EXPOSURES,
+    CHECKPOINT,
+    LOG,
+    HELD_OUT,
+    PLAN,
+    "config.toml",
+];
 
 /// A line per step.
 const LOG: &str = "train.csv";
@@ -51,6 +63,8 @@ const PLAN: &str = "plan.toml";
 
 /// Where `metrics.json` holds the [`crate::train::TargetExposure`].
 pub(crate) const TARGET_EXPOSURE: &str = "target_exposure";
+/// Gain and bias of the training views.
+const EXPOSURES: &str = "exposures.csv";
 
 /// The weights of the networks.
 const NETWORKS: &str = "networks.safetensors";
@@ -97,7 +111,7 @@ impl RunDirectory {
         }
         let milliseconds = |line: &&str| line.trim_end().rsplit(',').next()?.parse::<f64>().ok();
         let seconds_before = lines.iter().filter_map(milliseconds).sum::<f64>() / 1e3;
-        remove(path, &["metrics.json", "model.ply", NETWORKS])?;
+        remove(path, &["metrics.json", "model.ply", NETWORKS, EXPOSURES])?;
         Self::open(path, config, &lines.concat(), seconds_before)
     }
 
@@ -189,6 +203,14 @@ impl RunDirectory {
         networks.save(&self.path.join(NETWORKS))
     }
 
+    /// Writes the exposures of the training views.
+    ///
+    /// # Errors
+    /// The disk is full or gone.
+    pub fn save_exposures(&self, exposures: &[(String, Affine)]) -> Result<()> {
+        table::save(&self.path.join(EXPOSURES), exposures)
+    }
+
     /// Writes `metrics.json`, the sign that the run is whole.
     ///
     /// # Errors
@@ -270,6 +292,16 @@ pub fn load_networks(
     let mut networks = Networks::new(gpu, model, features, 0)?;
     networks.load(&run.join(NETWORKS))?;
     Ok(Some(networks))
+}
+
+/// What the exposures of a run's training views make of its model, by name; none where it has learned none.
+///
+/// # Errors
+/// The file is damaged.
+pub fn load_exposures(run: &Path) -> Result<BTreeMap<String, Affine>> {
+    let path = run.join(EXPOSURES);
+    let known = if path.is_file() { table::load(&path)? } else { vec![] };
+    Ok(known.into_iter().filter_map(|known| Some((known.name, known.affine?))).collect())
 }
 
 fn remove(run: &Path, files: &[&str]) -> Result<()> {

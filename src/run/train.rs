@@ -109,6 +109,10 @@ pub fn train_planned(
     if let Some(exposure) = trainer.target_exposure() {
         metrics[TARGET_EXPOSURE] = serde_json::json!(exposure);
     }
+    if let Some(exposures) = trainer.exposures()? {
+        directory.save_exposures(&exposures)?;
+        eval::add_exposure(&mut metrics, &scored)?;
+    }
     directory.save_metrics(&metrics)?;
     let trained = Trained { trainer, scored, losses, seconds, peak_bytes };
     observe(Event::Finished(&trained));

@@ -164,7 +164,7 @@ impl Trainer {
         let name = "density.grad_norm_sums".to_owned();
         let mut state = vec![State { name, shape: vec![count], buffer: grad_norm_sums }];
         state.extend(optimized("gaussians", &[columns, count], parameters, moments));
-        for learnable in learnables(&mut self.networks) {
+        for learnable in learnables(&mut self.networks, &mut self.exposures) {
             let name = learnable.name();
             let AdamBuffers { parameters, moments, .. } = learnable.buffers();
             let len = parameters.len();

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
+use super::exposures::{ExposureConfig, Learning};
 use super::held_out::StopConfig;
 use super::parts::ModelConfig;
 use super::streams;
@@ -90,6 +91,8 @@ pub struct TrainConfig {
     pub model: ModelConfig,
     /// When a run ends before its last step.
     pub stop: StopConfig,
+    /// Gain and bias of each training view.
+    pub exposure: ExposureConfig,
 }
 
 /// Steps whose every pass is compared with its CPU reference.
@@ -140,6 +143,7 @@ impl Default for TrainConfig {
             density: DensityConfig::default(),
             model: ModelConfig::default(),
             stop: StopConfig::default(),
+            exposure: ExposureConfig::default(),
         }
     }
 }
@@ -259,6 +263,12 @@ impl TrainConfig {
         self.model.check()?;
         self.stop.check()?;
         self.loss().check()?;
+        self.exposure.check()?;
+        if self.exposure.learn == Learning::On && self.model.tonemapper {
+            let problem = "`ExposureConfig::learn` is on, and the tonemapper holds the model to the dark photographs, whose \
+                exposures a gain on their lifted targets does not describe; leave one of them out";
+            return Err(Error::Usage(problem.to_owned()));
+        }
         let density = &self.density;
         let rules = [
             ("`TrainConfig::steps`", self.steps as f64, self.steps >= 1, "at least 1"),

@@ -11,6 +11,7 @@ use super::{TrainConfig, streams};
 use crate::Result;
 use crate::camera::Camera;
 use crate::dataset::{Dataset, Point, View};
+use crate::exposure::Affine;
 use crate::gpu::{Buffer, Gpu};
 use crate::image::Image;
 use crate::kernels::ToneParameters;
@@ -24,8 +25,10 @@ use crate::tone::{Exposure, Scene, Statistics, ToneCurve, ToneSettings, all_blac
 #[derive(Debug)]
 pub(super) struct TrainView {
     pub(super) name: String,
-    /// Its place among the training views.
+    /// Its place among the training views of all levels.
     pub(super) number: usize,
+    /// Its place among those of its level.
+    pub(super) place: usize,
     /// Index into the dataset's views.
     index: usize,
     pub(super) camera: Camera,
@@ -127,6 +130,7 @@ impl Views {
                 views.push(TrainView {
                     name: view.name.clone(),
                     number: level * photographs.len() + place,
+                    place,
                     index,
                     camera: view.camera.resized(size.x, size.y),
                     depth: depth.map(|depth| resized_plane(depth, image, size)),
@@ -176,6 +180,11 @@ impl Views {
         self.0.iter().flatten().map(|view| &view.camera)
     }
 
+    /// The names of the training photographs.
+    pub(super) fn names(&self) -> impl Iterator<Item = &str> {
+        self.0.first().into_iter().flatten().map(|view| view.name.as_str())
+    }
+
     /// Width and height of every view, unshrunk.
     pub(super) fn sizes(&self) -> Vec<UVec2> {
         self.0.first().into_iter().flatten().map(TrainView::size).collect()
@@ -189,6 +198,7 @@ impl Views {
         pseudo_gt: &PseudoGt,
         dataset: &Dataset,
         config: &TrainConfig,
+        exposures: Option<&[Affine]>,
     ) -> Result<Gaussians> {
         let random;
         let points = if dataset.points.is_empty() {
@@ -205,7 +215,12 @@ impl Views {
         let kept = &points[..points.len().min(config.max_gaussians)];
         let colors = init::colors_from_views(kept, &dataset.views, |index| {
             let view = self.0.iter().flatten().find(|view| view.index == index);
-            view.map(|view| view.target_image(gpu, pseudo_gt)).transpose()
+            let target = view.map(|view| {
+                let target = view.target_image(gpu, pseudo_gt)?;
+                let exposure = exposures.and_then(|exposures| exposures.get(view.place));
+                Ok(exposure.map_or(target.clone(), |own| own.inverse().applied(&target)))
+            });
+            target.transpose()
         })?;
         let positions: Vec<DVec3> = kept.iter().map(|point| point.position).collect();
         let seed = Stream::new(config.seed, streams::FEATURES).bits(0);

@@ -14,7 +14,7 @@ use super::{Random, assert_close};
 /// A setup and the gradient of its render, (channels, H, W): the functional that is differentiated is their product.
 pub(crate) struct Chain<'a> {
     setup: &'a Setup,
-    d_render: Vec<f64>,
+    pub(crate) d_render: Vec<f64>,
 }
 
 /// The splats of a render, front to back, with the Gaussians they come from.

@@ -1,0 +1,40 @@
+#version 460
+#extension GL_GOOGLE_include_directive : require
+#include "kernel.glsl"
+#include "exposure.glsl"
+
+//! The gradient behind `expose`: of the render, in place of that of the exposed one, and per chunk what that of the
+//! exposure is made of, the sums of d c and of d.
+//!
+//! A subgroup takes `CHUNK` values of one channel, in a fixed order: how a sum is parted is not the device's choice.
+//! Reference: `src/reference/expose_backward.rs`.
+
+layout(local_size_x_id = 100) in;
+layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
+layout(constant_id = 0) const uint CHUNK = 1024;
+
+layout(push_constant) uniform Params {
+    uint pixel_count;  // of a channel
+    uint view;
+};
+
+layout(binding = 0) readonly  buffer Exposures { float exposures[]; };  // (views, EXPOSURE_WIDTH)
+layout(binding = 1) readonly  buffer Render    { float render[]; };     // (3, H, W) and more, not clamped
+layout(binding = 2)           buffer DRender   { float d_render[]; };   // (3, H, W) and more: d, then that of the render
+layout(binding = 3) writeonly buffer Partials  { vec2 partials[]; };    // (3, chunks)
+
+void main() {
+    uint channel = gl_WorkGroupID.y;
+    uint chunk_count = (pixel_count + CHUNK - 1) / CHUNK;
+    uint end = min((gl_WorkGroupID.x + 1) * CHUNK, pixel_count);
+    float gain = 1.0 + exposures[view * EXPOSURE_WIDTH + channel];
+    vec2 sums = vec2(0.0);
+    for (uint k = gl_WorkGroupID.x * CHUNK + gl_SubgroupInvocationID; k < end; k += SUBGROUP_SIZE) {
+        uint i = channel * pixel_count + k;
+        float d = d_render[i];
+        sums += d * vec2(render[i], 1.0);
+        d_render[i] = gain * d;
+    }
+    sums = subgroupAdd(sums);
+    if (subgroupElect()) partials[channel * chunk_count + gl_WorkGroupID.x] = sums;
+}

@@ -1,0 +1,46 @@
+#version 460
+#extension GL_GOOGLE_include_directive : require
+#include "kernel.glsl"
+#include "exposure.glsl"
+
+//! Centres every one of the EXPOSURE_WIDTH numbers: afterwards its sum over the views is exactly 0.
+//!
+//! Numbers become n / QUANTA with n whole. With S the sum of n and N views, each n loses floor(S / N) and the first
+//! S mod N of them one more: in integers no rounding is left to drift, and no order of summation matters.
+//! What is centred and within BOUND stays as it is, and so does everything while status[0] is set.
+//! One subgroup per number. Reference: `src/reference/exposure_center.rs`.
+
+layout(local_size_x_id = 100) in;
+layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
+
+layout(push_constant) uniform Params {
+    uint view_count;
+};
+
+layout(binding = 0)           buffer Exposures { float exposures[]; };  // (views, EXPOSURE_WIDTH)
+layout(binding = 1) readonly  buffer Status    { uint status[]; };
+
+// A centred number is at most 2 BOUND; a float holds so many quanta, 2^24, exactly.
+const float QUANTA = 2097152.0;
+const float BOUND = 4.0;
+
+int quanta(float x) { return int(roundEven(clamp(x, -BOUND, BOUND) * QUANTA)); }
+
+void main() {
+    uint number = gl_WorkGroupID.x;
+    if (number >= EXPOSURE_WIDTH || status[0] != 0) return;
+    // Integers wrap: the sum is right wherever it fits in itself, whatever the parts of it are.
+    int sum = 0;
+    for (uint view = gl_SubgroupInvocationID; view < view_count; view += SUBGROUP_SIZE)
+        sum += quanta(exposures[view * EXPOSURE_WIDTH + number]);
+    sum = subgroupAdd(sum);
+    int count = int(view_count);
+    // GLSL leaves the remainder of a negative number open.
+    int mean = sum >= 0 ? sum / count : -((-sum + count - 1) / count);
+    uint rest = uint(sum - mean * count);
+    for (uint view = gl_SubgroupInvocationID; view < view_count; view += SUBGROUP_SIZE) {
+        uint at = view * EXPOSURE_WIDTH + number;
+        int centred = quanta(exposures[at]) - mean - (view < rest ? 1 : 0);
+        exposures[at] = float(centred) * (1.0 / QUANTA);
+    }
+}

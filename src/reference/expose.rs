@@ -1,0 +1,34 @@
+//! What an exposure is, in any number.
+
+use super::rounding::{Rounded, values};
+use crate::gpu::Reference;
+use crate::kernels::expose::{Constants, Kernel, Params, Slices, Tolerances};
+use crate::kernels::exposure::{BIAS_SCALE, EXPOSURE_WIDTH};
+use crate::tone::Real;
+
+/// Gain and bias of a channel of a view, in any number.
+pub fn gain_and_bias<T: Real>(exposures: &[T], view: usize, channel: usize) -> [T; 2] {
+    let at = view * EXPOSURE_WIDTH as usize + channel;
+    [T::of(1.0) + exposures[at], T::of(BIAS_SCALE) * exposures[at + 3]]
+}
+
+/// Every exposed value.
+fn exposed<'a>(params: &Params, slices: &'a Slices<'_>) -> impl Iterator<Item = Rounded> + 'a {
+    let (pixels, view) = (params.pixel_count as usize, params.view as usize);
+    let exposures: Vec<Rounded> = slices.exposures.iter().copied().map(Rounded::exact).collect();
+    slices.render[..3 * pixels].iter().enumerate().map(move |(i, &value)| {
+        let [gain, bias] = gain_and_bias(&exposures, view, i / pixels);
+        gain * Rounded::exact(value) + bias
+    })
+}
+
+impl Reference for Kernel {
+    fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
+        let exposed: Vec<f32> = values(exposed(params, &slices)).collect();
+        slices.exposed[..exposed.len()].copy_from_slice(&exposed);
+    }
+
+    fn tolerances(params: &Params, _: &Constants, slices: Slices<'_>) -> Tolerances {
+        Tolerances { exposed: exposed(params, &slices).collect() }
+    }
+}

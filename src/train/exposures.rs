@@ -1,0 +1,233 @@
+//! What is learned of the training views' exposures, and where they begin.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+
+use serde::{Deserialize, Serialize};
+
+use super::views::Views;
+use super::{TrainConfig, Trainer};
+use crate::dataset::{Dataset, LoadOptions, Photograph};
+use crate::exposure::{Affine, ExposureRates, table};
+use crate::gpu::Gpu;
+use crate::image::{Image, exposure_value, linear_from_srgb, srgb_from_linear};
+use crate::pseudo_gt::PseudoGt;
+use crate::tone::Statistics;
+use crate::{Error, Result};
+
+/// Whether something is learned.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Learning {
+    /// It is not there: no buffer, no kernel.
+    #[default]
+    Off,
+    /// It is.
+    On,
+}
+
+impl FromStr for Learning {
+    type Err = Error;
+
+    fn from_str(name: &str) -> Result<Self> {
+        match name {
+            "off" => Ok(Self::Off),
+            "on" => Ok(Self::On),
+            _ => Err(Error::Usage(format!("`{name}` is neither off nor on"))),
+        }
+    }
+}
+
+/// Gain and bias of each channel of each training view, [`crate::exposure`].
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ExposureConfig {
+    /// Whether they are learned.
+    pub learn: Learning,
+    /// A table of where they begin ([`table`]), in place of `exposures.csv` of the dataset.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub start: Option<PathBuf>,
+    /// Adam's learning rate.
+    pub rates: ExposureRates,
+}
+
+impl ExposureConfig {
+    /// # Errors
+    /// [`Error::Usage`] names a value that makes no sense.
+    pub(super) fn check(&self) -> Result<()> {
+        let ExposureRates { initial, last, .. } = self.rates;
+        for (name, rate) in [("initial", initial), ("last", last)] {
+            if !(rate.is_finite() && rate > 0.0) {
+                let problem = format!("exposure.rates.{name} is {rate}; it must be above 0");
+                return Err(Error::Usage(problem));
+            }
+        }
+        Ok(())
+    }
+}
+
+impl Trainer {
+    /// What the exposure of each training view makes of the model, by name; none where exposures are not learned.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub fn exposures(&self) -> Result<Option<Vec<(String, Affine)>>> {
+        let Some(exposures) = &self.exposures else { return Ok(None) };
+        let names = self.views.names().map(str::to_owned);
+        Ok(Some(names.zip(exposures.affines()?).collect()))
+    }
+}
+
+/// Where the exposure of a view begins.
+#[derive(Clone, Copy, Debug)]
+enum Start {
+    /// At these stops of the photograph, from anywhere.
+    Stops(f64),
+    /// At this affine of the target.
+    Affine(Affine),
+}
+
+impl Views {
+    /// Where the exposures of the training views begin; none where they are not learned.
+    ///
+    /// A table says what is known; without one the photographs do, where cameras have written their exposure. A view of
+    /// which nothing is known begins at the identity.
+    ///
+    /// # Errors
+    /// The table cannot be read or names a view that there is not; the device is out of memory or lost.
+    pub(super) fn exposures(
+        &self,
+        gpu: &Gpu,
+        pseudo_gt: &PseudoGt,
+        dataset: &Dataset,
+        config: &TrainConfig,
+    ) -> Result<Option<Vec<Affine>>> {
+        if config.exposure.learn == Learning::Off {
+            return Ok(None);
+        }
+        let beside = Some(dataset.root.join("exposures.csv")).filter(|path| path.is_file());
+        let starts = match config.exposure.start.clone().or(beside) {
+            Some(path) => self.starts_of_table(&path, dataset)?,
+            None => self.starts_of_photographs(dataset, &config.load_options())?,
+        };
+        let stops = starts.values().filter_map(|start| match start {
+            Start::Stops(stops) => Some(*stops),
+            Start::Affine(_) => None,
+        });
+        let stops: Vec<f64> = stops.collect();
+        let mean = stops.iter().sum::<f64>() / stops.len().max(1) as f64;
+        let lift = (!stops.is_empty()).then(|| Lift::new(gpu, pseudo_gt, dataset));
+        let affine = |name: &str| match (starts.get(name), &lift) {
+            (Some(Start::Affine(affine)), _) => Ok(*affine),
+            (Some(Start::Stops(stops)), Some(lift)) => lift.affine_of_stops(name, stops - mean),
+            _ => Ok(Affine::IDENTITY),
+        };
+        self.names().map(affine).collect::<Result<Vec<_>>>().map(Some)
+    }
+
+    fn starts_of_table(&self, path: &Path, dataset: &Dataset) -> Result<BTreeMap<String, Start>> {
+        let known = table::load(path)?;
+        let views: BTreeSet<&str> = dataset.views.iter().map(|view| view.name.as_str()).collect();
+        let names = known.iter().map(|known| known.name.as_str());
+        let unknown: Vec<&str> = names.filter(|name| !views.contains(name)).collect();
+        if !unknown.is_empty() {
+            let problem = format!(
+                "names views that the dataset has not: {}; take them out, or name the photographs",
+                unknown.join(", ")
+            );
+            return Err(Error::input(path, problem));
+        }
+        let start = |known: table::KnownExposure| {
+            let stops = known.ev.map(Start::Stops);
+            Some((known.name, known.affine.map(Start::Affine).or(stops)?))
+        };
+        let starts: BTreeMap<String, Start> = known.into_iter().filter_map(start).collect();
+        let missing: Vec<&str> = self.names().filter(|name| !starts.contains_key(*name)).collect();
+        let place = path.display();
+        if missing.is_empty() {
+            tracing::info!("{place}: exposures begin there");
+        } else {
+            let names = missing.join(", ");
+            tracing::warn!(
+                "{place}: says nothing of {names}: their exposures begin at the identity"
+            );
+        }
+        Ok(starts)
+    }
+
+    fn starts_of_photographs(
+        &self,
+        dataset: &Dataset,
+        options: &LoadOptions,
+    ) -> Result<BTreeMap<String, Start>> {
+        let photographs = Dataset::photographs(&dataset.root, options).unwrap_or_default();
+        let names: BTreeSet<&str> = self.names().collect();
+        let own = photographs.iter().filter(|photograph| names.contains(photograph.name.as_str()));
+        let start = |photograph: &Photograph| {
+            let stops = exposure_value(&photograph.input)?;
+            Some((photograph.name.clone(), Start::Stops(stops)))
+        };
+        let starts: BTreeMap<String, Start> = own.filter_map(start).collect();
+        match starts.len() {
+            0 => {}
+            all if all == names.len() => {
+                tracing::info!("exposures begin where the photographs' EXIF has them");
+            }
+            some => {
+                tracing::warn!(
+                    "{some} of {} photographs have their exposure in EXIF; those of the others begin at the identity",
+                    names.len()
+                );
+            }
+        }
+        Ok(starts)
+    }
+}
+
+/// Makes targets of photographs that are not in the dataset, as those of it are made.
+struct Lift<'a> {
+    gpu: &'a Gpu,
+    pseudo_gt: &'a PseudoGt,
+    dataset: &'a Dataset,
+    /// Where one curve serves all.
+    scene: Option<Statistics>,
+}
+
+impl<'a> Lift<'a> {
+    fn new(gpu: &'a Gpu, pseudo_gt: &'a PseudoGt, dataset: &'a Dataset) -> Self {
+        let images = dataset.train_views().filter_map(|view| view.image.as_ref());
+        let statistics: Vec<Statistics> = match pseudo_gt.settings().scene_statistics {
+            true => images.map(|image| Statistics::of(&image.data)).collect(),
+            false => vec![],
+        };
+        Self { gpu, pseudo_gt, dataset, scene: Statistics::mean_of(&statistics) }
+    }
+
+    fn target(&self, photograph: &Image) -> Result<Image> {
+        let statistics = self.scene.unwrap_or_else(|| Statistics::of(&photograph.data));
+        let tone = [self.pseudo_gt.settings().parameters(&statistics)];
+        let tone = self.gpu.buffer("tone", &tone)?;
+        let image = self.gpu.buffer("low", &photograph.data)?;
+        let mut target = self.gpu.uninit("target", image.len())?;
+        self.gpu.run("target", |pass| self.pseudo_gt.map(pass, &image, &tone, 0, &mut target))?;
+        Ok(Image { data: self.gpu.read(&target)?, ..*photograph })
+    }
+
+    /// What `stops` of a photograph's exposure, in linear light, make of its target: the affine that brings the target of the
+    /// photograph without them nearest to the target of the photograph as it is. A curve that follows from each photograph
+    /// takes much of the difference away before.
+    fn affine_of_stops(&self, name: &str, stops: f64) -> Result<Affine> {
+        let mut views = self.dataset.train_views().filter(|view| view.name == name);
+        let Some(photograph) = views.find_map(|view| view.image.as_ref()) else {
+            return Ok(Affine::IDENTITY);
+        };
+        let scale = (-stops).exp2() as f32;
+        let without = |&x: &f32| srgb_from_linear(scale * linear_from_srgb(x));
+        let neutral = Image { data: photograph.data.iter().map(without).collect(), ..*photograph };
+        let affine = Affine::least_squares(&self.target(&neutral)?, &self.target(photograph)?)?;
+        // Of a photograph of one colour there is no more to say than that.
+        let is_exposure = affine.gain.iter().all(|&gain| gain > 0.0);
+        Ok(if is_exposure { affine } else { Affine::IDENTITY })
+    }
+}
