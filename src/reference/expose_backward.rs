@@ -17,7 +17,7 @@ fn backward(
     for channel in 0..3 {
         let [gain, _] = gain_and_bias(&exposures, params.view as usize, channel);
         let plane = channel * pixels..(channel + 1) * pixels;
-        let [c, d] = [&*slices.render, &*slices.d_render].map(|planes| &planes[plane.clone()]);
+        let (c, d) = (&slices.render[plane.clone()], &slices.d_render[plane]);
         d_render.extend(d.iter().map(|&d| gain * Rounded::exact(d)));
         for (c, d) in c.chunks(chunk).zip(d.chunks(chunk)) {
             let products = c.iter().zip(d).map(|(&c, &d)| Rounded::exact(c) * Rounded::exact(d));

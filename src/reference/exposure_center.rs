@@ -10,7 +10,7 @@ fn quanta(x: f32) -> i64 {
     (x.clamp(-bound, bound) * QUANTA as f32).round_ties_even() as i64
 }
 
-/// Centres every number of (views, EXPOSURE_WIDTH) so that its sum over the views is exactly 0.
+/// Centres every number of (views, `EXPOSURE_WIDTH`) so that its sum over the views is exactly 0.
 pub fn center(exposures: &mut [f32]) {
     let width = EXPOSURE_WIDTH as usize;
     let view_count = (exposures.len() / width) as i64;
