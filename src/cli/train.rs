@@ -254,6 +254,10 @@ impl TrainOptions {
             if self.picks_parts() {
                 config.model = given.model;
             }
+            if config.model.tonemapper {
+                // The two exclude each other, and a plan never asks for both.
+                config.exposure = given.exposure;
+            }
         }
         if self.curve == Some(ToneCurve::Auto.into()) {
             // Benchmarks put the paper's curve in place of the default one; here it is named.

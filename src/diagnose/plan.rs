@@ -8,7 +8,7 @@ use super::{Diagnosis, SceneDiagnosis};
 use crate::dataset::Dataset;
 use crate::scene::{Features, Shape, width};
 use crate::tone::ToneCurve;
-use crate::train::{Part, TrainConfig};
+use crate::train::{Learning, Part, TrainConfig};
 use crate::{Error, Result};
 
 /// Targets less than this many times brighter than their photographs are the photographs: the rule of `--curve auto`.
@@ -141,6 +141,7 @@ impl Plan {
         if !self.curve.on {
             config.tone = config.tone.with_curve(ToneCurve::None);
         }
+        config.exposure.learn = if self.exposure.on { Learning::On } else { Learning::Off };
         let parts = [
             (Part::Denoiser, &self.denoiser),
             (Part::Tonemapper, &self.tonemapper),
