@@ -95,7 +95,7 @@ fn darker_views_have_a_higher_gain_and_equal_ones_the_scene_s() {
     let equal = exposure(&vec![view.clone(); 3]).unwrap();
     assert_eq!(equal.spread, 0.0);
     assert!((equal.gain_of(&histogram) / equal.gain - 1.0).abs() < 1e-9);
-    let single = exposure(&[view.clone()]).unwrap();
+    let single = exposure(std::slice::from_ref(&view)).unwrap();
     assert!((single.gain / equal.gain - 1.0).abs() < 1e-12);
 
     let factors = [1.0, 0.5, 0.25, 2.0];
