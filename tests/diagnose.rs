@@ -193,7 +193,7 @@ fn each_part_comes_with_its_cause() {
     let stops = vec![0.0, -1.0, 0.6];
     let spread = planned(&Capture { stops, darkening: 2.0, ..Capture::clean() });
     assert!(spread.contains(&"exposure") && !spread.contains(&"denoiser"), "{spread:?}");
-    let grainy = Capture { full_well: 25.0, read_noise: 1.0, darkening: 3.0, ..Capture::clean() };
+    let grainy = Capture { full_well: 5.0, read_noise: 0.5, darkening: 3.0, ..Capture::clean() };
     let noisy = planned(&grainy);
     assert!(noisy.contains(&"denoiser") && !noisy.contains(&"exposure"), "{noisy:?}");
 
