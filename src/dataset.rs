@@ -212,6 +212,18 @@ impl Dataset {
     /// # Errors
     /// As [`Dataset::load`], but for what is wrong with pixels.
     pub fn photographs(root: &Path, options: &LoadOptions) -> Result<Vec<Photograph>> {
+        let (photographs, skipped) = Self::listed(root, options)?;
+        for line in &skipped {
+            tracing::warn!("skipped {line}");
+        }
+        Ok(photographs)
+    }
+
+    /// The same, and what was left out.
+    pub(crate) fn listed(
+        root: &Path,
+        options: &LoadOptions,
+    ) -> Result<(Vec<Photograph>, Vec<String>)> {
         options.check()?;
         let files = Files::default();
         let Listing { mut frames, mut skipped } = list(root, &files)?;
@@ -219,14 +231,11 @@ impl Dataset {
         frames.sort_by(|a, b| a.name.cmp(&b.name));
         split(root, &mut frames)?;
         let sources = sources(root, &frames, options, &files, &mut skipped);
-        for line in &skipped {
-            tracing::warn!("skipped {line}");
-        }
         let photograph = |source: Source| {
             let Source { name, split, input, reference, .. } = source;
             Some(Photograph { name, split, input: input?, reference })
         };
-        Ok(sources.into_iter().filter_map(photograph).collect())
+        Ok((sources.into_iter().filter_map(photograph).collect(), skipped))
     }
 
     /// Leaves out views by name; points forget them.

@@ -314,8 +314,8 @@ fn demo_touches_no_folder_of_somebody_else() {
 #[test]
 fn help_teaches_every_command_in_lines_that_fit() {
     let commands = [
-        "", "train", "eval", "render", "tone", "curves", "fit", "sweep", "ablate", "synth", "demo",
-        "doctor", "bench", "check",
+        "", "train", "diagnose", "eval", "render", "tone", "curves", "fit", "sweep", "ablate",
+        "synth", "demo", "doctor", "bench", "check",
     ];
     for command in commands {
         let help = succeed(&format!("{command} --help"));

@@ -10,6 +10,7 @@ use nightsplat::dataset::synthetic::{self, Capture, SyntheticOptions};
 use nightsplat::dataset::{Dataset, DepthOptions, LoadOptions};
 use nightsplat::diagnose::{Diagnosis, Plan};
 use nightsplat::image::{Image, linear_from_srgb, srgb_from_linear};
+use nightsplat::random::Stream;
 use nightsplat::train::{Preset, TrainConfig};
 
 mod common;
@@ -57,19 +58,53 @@ fn edit(folder: &Path, change: impl Fn(usize, &Image) -> Image) {
     }
 }
 
+/// A photograph at four times the size, a third of the light, and with noise: surfaces wider than the few pixels that the
+/// noise is measured in.
+fn taken(image: &Image, gain: f64, read: f64, index: usize) -> Image {
+    const TIMES: u32 = 4;
+    let noise = Stream::new(7, index as u64);
+    let (width, height) = (TIMES * image.width, TIMES * image.height);
+    let linear = |x: f32, y: f32| -> [f32; 3] {
+        let (x0, y0) = (x.floor(), y.floor());
+        let at = |dx: u32, dy: u32| {
+            let pixel = image.pixel(
+                (x0 as u32 + dx).min(image.width - 1),
+                (y0 as u32 + dy).min(image.height - 1),
+            );
+            pixel.map(|value| linear_from_srgb(value) / 3.0)
+        };
+        let (tx, ty) = (x - x0, y - y0);
+        let [a, b, c, d] = [at(0, 0), at(1, 0), at(0, 1), at(1, 1)];
+        std::array::from_fn(|i| {
+            (1.0 - ty) * ((1.0 - tx) * a[i] + tx * b[i]) + ty * ((1.0 - tx) * c[i] + tx * d[i])
+        })
+    };
+    Image::from_fn(width, height, |x, y| {
+        let signal = linear(x as f32 / TIMES as f32, y as f32 / TIMES as f32);
+        std::array::from_fn(|channel| {
+            let signal = f64::from(signal[channel]);
+            let draw = noise.normal(u64::from(3 * (y * width + x)) + channel as u64);
+            let noisy = signal + (gain * signal + read * read).sqrt() * draw;
+            srgb_from_linear(noisy as f32).clamp(0.0, 1.0)
+        })
+    })
+}
+
 // ---------------------------------------------------------------------------
 // What is found
 
 #[test]
 fn injected_noise_is_found_within_a_tenth() {
-    for (full_well, read_noise) in [(2000.0, 12.0), (600.0, 6.0)] {
-        let capture = Capture { darkening: 3.0, full_well, read_noise, ..Capture::default() };
-        let noise = diagnosis(&capture).scene.noise.unwrap();
-        close(noise.gain, 1.0 / full_well, "gain");
-        close(noise.read, read_noise / full_well, "read noise");
+    let set = written(&Capture::clean());
+    let clean: Vec<Image> = (0..SET.views)
+        .map(|view| Image::load(set.path().join(format!("low/{view:03}.png"))).unwrap())
+        .collect();
+    for (gain, read) in [(5e-4, 6e-3), (1.5e-3, 1e-2)] {
+        edit(set.path(), |index, _| taken(&clean[index], gain, read, index));
+        let noise = diagnosis_of(set.path()).scene.noise.unwrap();
+        close(noise.gain, gain, "gain");
+        close(noise.read, read, "read noise");
     }
-    let noise = diagnosis(&Capture::default()).scene.noise.unwrap();
-    close(noise.gain, 1.0 / Capture::default().full_well, "gain in the dark");
 }
 
 #[test]
@@ -158,7 +193,7 @@ fn each_part_comes_with_its_cause() {
     let stops = vec![0.0, -1.0, 0.6];
     let spread = planned(&Capture { stops, darkening: 2.0, ..Capture::clean() });
     assert!(spread.contains(&"exposure") && !spread.contains(&"denoiser"), "{spread:?}");
-    let grainy = Capture { full_well: 100.0, read_noise: 4.0, darkening: 8.0, ..Capture::clean() };
+    let grainy = Capture { full_well: 5.0, read_noise: 0.5, darkening: 3.0, ..Capture::clean() };
     let noisy = planned(&grainy);
     assert!(noisy.contains(&"denoiser") && !noisy.contains(&"exposure"), "{noisy:?}");
 
@@ -196,8 +231,9 @@ fn numbers_keep_to_views_steps_memory_and_preset() {
     assert_eq!(plan(&TrainConfig { steps: 400, ..config.clone() }, MEMORY).0, 0);
     let mut draft = config;
     Preset::Draft.apply(&mut draft).unwrap();
+    draft.max_gaussians = 3000;
     let (degree, capped, why) = plan(&draft, MEMORY);
-    assert!(degree == 0 && capped <= 15_000 && why.contains("preset"), "{why}");
+    assert!(degree == 0 && capped == 3000 && why.contains("limit"), "{why}");
 }
 
 #[test]
@@ -259,6 +295,7 @@ fn the_command_prints_json_writes_a_page_and_a_plan_that_train_keeps() {
 
     // A run that goes on keeps to the plan it has.
     let model = fs::read(set.path().join("run/model.ply")).unwrap();
+    fs::remove_file(set.path().join("run/metrics.json")).unwrap();
     succeed(&format!(
         "train {root} --out {out} --resume --steps 9 --parts structure --set schedule.densify_after=99"
     ));
@@ -355,7 +392,7 @@ fn sets_of_any_kind_have_a_plan_or_one_clear_error() {
     assert!(remarks.contains("the same photograph") && remarks.contains("one spot"), "{remarks}");
 
     // One view and two.
-    for count in [1, 2] {
+    for count in [2, 1] {
         list["frames"].as_array_mut().unwrap().truncate(count);
         fs::write(&path, list.to_string()).unwrap();
         let found = diagnosis_of(set.path());

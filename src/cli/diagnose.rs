@@ -18,14 +18,18 @@ use crate::train::{Preset, TrainConfig};
 
 /// Look at dark photographs before training: what they are, and what a model of them needs.
 ///
-/// Measures brightness, noise, blur, exposures and overlap of the training photographs, in seconds, and decides which parts
-/// the model has, each with its reason. `nightsplat train` does the same by itself; here one sees why, and may disagree:
+/// Measures brightness, noise, blur, exposures and overlap of the training photographs, in
+/// seconds, and decides which parts the model has, each with its reason. `nightsplat train`
+/// does the same by itself; here one sees why, and may disagree:
 ///
 ///   nightsplat diagnose photos --report photos.html
 ///   nightsplat diagnose photos --plan plan.toml         edit plan.toml, then
 ///   nightsplat train photos --out run --plan plan.toml
 ///
-/// Light is linear, everything else is of encoded values from 0 to 1. Reference images are never looked at.
+/// In the table, p10, p90, mean and cubic mean are of the luminance of encoded values, r is
+/// p10 / p90; EV are stops more light than the other views show of the same points; noise is
+/// its standard deviation at the mean, in linear light; blur is that of the edges, in pixels;
+/// overlap is how much of what a view shows the others look at. No reference image is looked at.
 #[expect(clippy::doc_markdown, reason = "in help, {setting} stands for its default")]
 #[derive(Clone, Debug, clap::Args)]
 #[command(verbatim_doc_comment)]

@@ -8,8 +8,8 @@
 //! encoded values, so photographs are linearised first. What encoding them to whole codes adds is known and taken off.
 //!
 //! Second differences along rows see no brightness and no gradient; of white noise their mean square is six variances.
-//! The even rows of a patch say how flat it is, its odd rows how noisy: the choice of the flattest patches knows nothing
-//! of the noise that is measured in them, so it does not make it smaller.
+//! How flat a patch is say the means of 2x2 pixels: they know next to nothing of what the second differences measure, so
+//! that choosing the flattest patches does not make their noise smaller.
 
 use serde::Serialize;
 
@@ -21,7 +21,7 @@ const FLAT: f64 = 0.25;
 const BINS: usize = 24;
 /// A bin with fewer flat patches says nothing.
 const LEAST_PATCHES: usize = 12;
-/// Patches whose even rows have less than this fraction of the variance that whole codes add are flat to the code:
+/// Patches with less than this fraction of the variance that whole codes add are flat to the code:
 /// compression, or too few codes, took their noise.
 const DEAD: f64 = 0.25;
 /// Where more values than this are black, noise is cut off at zero and looks smaller than it is.
@@ -48,8 +48,10 @@ impl Noise {
 pub(super) struct Patch {
     /// Its mean, linear light.
     signal: f64,
-    /// The variance that its even rows have, and its odd rows.
-    variances: [f64; 2],
+    /// The variance of its noise, if it is flat.
+    variance: f64,
+    /// The variance of the means of 2x2 pixels.
+    texture: f64,
     /// The variance that whole codes add.
     quantization: f64,
     /// The fraction of its values that are 0.
@@ -77,15 +79,18 @@ fn patch(rows: [&[f32]; SIDE], step: f64) -> Patch {
     let count = (SIDE * SIDE) as f64;
     let is_clipped = values().any(|value| value >= 1.0);
     let signal = if is_clipped { f64::NAN } else { values().sum::<f64>() / count };
-    let mut variances = [0.0; 2];
-    for (y, row) in rows.iter().enumerate() {
-        let squares = row.windows(3).map(|of| f64::from(of[0] - 2.0 * of[1] + of[2]).powi(2));
-        variances[y % 2] += squares.sum::<f64>();
+    let curved = |of: &[f32]| f64::from(of[0] - 2.0 * of[1] + of[2]).powi(2);
+    let squares: f64 = rows.iter().flat_map(|row| row.windows(3).map(curved)).sum();
+    let mut squared_means = 0.0;
+    for two in rows.chunks_exact(2) {
+        for (above, below) in two[0].chunks_exact(2).zip(two[1].chunks_exact(2)) {
+            squared_means += (f64::from(above[0] + above[1] + below[0] + below[1]) / 4.0).powi(2);
+        }
     }
-    let differences = (SIDE / 2 * (SIDE - 2)) as f64;
     Patch {
         signal,
-        variances: variances.map(|sum| sum / differences / 6.0),
+        variance: squares / (SIDE * (SIDE - 2)) as f64 / 6.0,
+        texture: squared_means / (count / 4.0) - signal * signal,
         quantization: (step * slope(signal)).powi(2) / 12.0,
         zeros: values().filter(|&value| value <= 0.0).count() as f64 / count,
     }
@@ -104,10 +109,14 @@ pub(super) fn slope(linear: f64) -> f64 {
 /// The line through the flat patches; none where there are too few.
 pub(super) fn fit(mut patches: Vec<Patch>) -> Option<Noise> {
     // A plane that is not in codes has no dead patches.
-    patches.retain(|patch| patch.variances[0] >= DEAD * patch.quantization);
+    patches.retain(|patch| patch.variance >= DEAD * patch.quantization);
     patches.sort_unstable_by(|a, b| a.signal.total_cmp(&b.signal));
     let per_bin = patches.len().div_ceil(BINS).max((LEAST_PATCHES as f64 / FLAT) as usize);
-    let bins: Vec<Bin> = patches.chunks_mut(per_bin).filter_map(Bin::of).collect();
+    let mut bins: Vec<Bin> = patches.chunks_mut(per_bin).filter_map(Bin::of).collect();
+    // Where noise is cut off everywhere, what is left of it is the best that there is.
+    if bins.iter().any(|bin| bin.zeros <= MOST_ZEROS) {
+        bins.retain(|bin| bin.zeros <= MOST_ZEROS);
+    }
     (!bins.is_empty()).then(|| line(&bins))
 }
 
@@ -116,20 +125,22 @@ struct Bin {
     signal: f64,
     variance: f64,
     count: f64,
+    zeros: f64,
 }
 
 impl Bin {
     fn of(patches: &mut [Patch]) -> Option<Self> {
         let zeros = patches.iter().map(|patch| patch.zeros).sum::<f64>() / patches.len() as f64;
         let flat = (patches.len() as f64 * FLAT) as usize;
-        if flat < LEAST_PATCHES || zeros > MOST_ZEROS {
+        if flat < LEAST_PATCHES {
             return None;
         }
-        patches.sort_unstable_by(|a, b| a.variances[0].total_cmp(&b.variances[0]));
+        patches.sort_unstable_by(|a, b| a.texture.total_cmp(&b.texture));
         let flat = &patches[..flat];
         let mean = |of: fn(&Patch) -> f64| flat.iter().map(of).sum::<f64>() / flat.len() as f64;
-        let variance = mean(|patch| patch.variances[1] - patch.quantization);
-        Some(Self { signal: mean(|patch| patch.signal), variance, count: flat.len() as f64 })
+        let variance = mean(|patch| patch.variance - patch.quantization);
+        let count = flat.len() as f64;
+        Some(Self { signal: mean(|patch| patch.signal), variance, count, zeros })
     }
 }
 
@@ -142,7 +153,7 @@ fn line(bins: &[Bin]) -> Noise {
     let (mut gain, mut square) = (0.0, mean);
     for _ in 0..ROUNDS {
         let mut sums = [0.0; 5];
-        for Bin { signal, variance, count } in bins {
+        for Bin { signal, variance, count, .. } in bins {
             let weight = count / (gain * signal + square).max(floor).powi(2);
             let terms = [1.0, *signal, signal * signal, *variance, signal * variance];
             sums.iter_mut().zip(terms).for_each(|(sum, term)| *sum += weight * term);

@@ -277,7 +277,9 @@ fn sh_degree(scene: &SceneDiagnosis, config: &TrainConfig) -> Number {
     let last = (config.steps as f64 * LATEST_DEGREE) as u64;
     let trained = config.schedule.sh_degree(last, u32::MAX);
     let value = config.sh_degree.min(seen).min(trained);
-    let why = if trained < seen.min(config.sh_degree) {
+    let why = if config.sh_degree < seen.min(trained) {
+        "the preset's or the configuration's limit".to_owned()
+    } else if trained < seen.min(config.sh_degree) {
         format!("{} steps are too few to train a higher one", config.steps)
     } else {
         let views = scene.views_per_point;
@@ -302,7 +304,7 @@ fn max_gaussians(
     let fitting = MEMORY_SHARE * memory as f64 / bytes;
     let limit = config.max_gaussians as f64;
     let why = if limit < wanted.min(fitting) {
-        "the preset's limit".to_owned()
+        "the preset's or the configuration's limit".to_owned()
     } else if fitting < wanted {
         let gib = memory as f64 / f64::from(1 << 30);
         format!("half of the device's {gib:.1} GiB at {bytes:.0} bytes each")
