@@ -506,7 +506,7 @@ impl Renderer {
             order_counts::Buffers {
                 sorted_ids: &frame.ids,
                 tile_counts: &frame.tile_counts,
-                ordered_counts: &mut frame.ordered_counts,
+                slots_before: &mut frame.slots_before,
                 sums: &mut frame.sums,
                 counts: &mut frame.counts,
                 status: &mut frame.status,
@@ -520,7 +520,8 @@ impl Renderer {
             emit::Buffers {
                 counts: &frame.counts,
                 sorted_ids: &frame.ids,
-                ordered_counts: &frame.ordered_counts,
+                tile_counts: &frame.tile_counts,
+                slots_before: &frame.slots_before,
                 sums: &frame.sums,
                 splats: &frame.splats,
                 tiles: &mut frame.tiles,

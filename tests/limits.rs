@@ -33,7 +33,7 @@ fn the_most_intersections_that_can_be_counted_are_an_overflow() {
         let gaussian_count = tile_counts.len() as u32;
         let constants = order_counts::Constants { partition_size: 2 };
         let sorted_ids: Vec<u32> = (0..gaussian_count).rev().collect();
-        let (ordered_counts, sums, arrivals) = (vec![7; 5], vec![7; 3], vec![0]);
+        let (slots_before, sums, arrivals) = (vec![7; 5], vec![7; 3], vec![0]);
         let (counts, status) = (vec![7], vec![before[0], before[1], 0]);
         let (_, _, counts, after, arrivals) = run_kernel!(
             order_counts,
@@ -41,7 +41,7 @@ fn the_most_intersections_that_can_be_counted_are_an_overflow() {
             order_counts::Params { gaussian_count, capacity: 5 },
             Threads::Workgroups([3, 1, 1]),
             [sorted_ids, tile_counts],
-            [ordered_counts, sums, counts, status, arrivals]
+            [slots_before, sums, counts, status, arrivals]
         );
         assert_eq!(counts[0], if flag == 0 { total } else { 0 });
         assert_eq!(after, [before[0] | flag, before[1].max(total), 0]);
@@ -115,8 +115,8 @@ fn a_count_that_wrapped_around_writes_no_slot_beyond_the_counted() {
     let setup = Setup::new(3, [32, 32], 0, 1);
     let splats = gpu().read(&setup.render().renderer.frame().splats).unwrap();
     // As if the offsets of later ranks had run past the total.
-    let (counts, sorted_ids, ordered_counts) = (vec![2], vec![0, 1, 2], vec![4, 4, u32::MAX - 5]);
-    let sums = vec![0];
+    let (counts, sorted_ids, tile_counts) = (vec![2], vec![0, 1, 2], vec![4, 4, u32::MAX - 5]);
+    let (sums, slots_before) = (vec![0], vec![0, 4, 8]);
     let [tiles, slots, owners] = [0; 3].map(|_| vec![7u32; 16]);
     let emitted = vec![UVec2::splat(7); 3];
     let (tiles, slots, owners, emitted) = run_kernel!(
@@ -124,7 +124,7 @@ fn a_count_that_wrapped_around_writes_no_slot_beyond_the_counted() {
         emit::Constants { partition_size: 256, ..Default::default() },
         emit::Params { size: UVec2::new(32, 32), gaussian_count: 3, tile_columns: 2 },
         Threads::Exactly([3, 1, 1]),
-        [counts, sorted_ids, ordered_counts, sums, splats],
+        [counts, sorted_ids, slots_before, sums, splats, tile_counts],
         [tiles, slots, owners, emitted]
     );
     let untouched = |slots: &[u32]| slots[2..].iter().all(|&slot| slot == 7);
@@ -146,7 +146,8 @@ fn emit_wide(count: u32, size: UVec2, extra: u32) -> (Vec<u32>, Vec<UVec2>, u32)
     let per_splat = tiles.element_product() + extra;
     let (splats, sorted_ids) = (vec![splat; count as usize], (0..count).rev().collect::<Vec<_>>());
     let (counts, sums) = (vec![count * per_splat], vec![0; 1 + count as usize / 256]);
-    let ordered_counts = vec![per_splat; count as usize];
+    let tile_counts = vec![per_splat; count as usize];
+    let slots_before: Vec<u32> = (0..count).map(|rank| rank * per_splat).collect();
     let [tiles_, slots, owners] = [0; 3].map(|_| vec![7u32; counts[0] as usize]);
     let (tiles, emitted) = (tiles_, vec![UVec2::ZERO; count as usize]);
     let (tiles, _, _, emitted) = run_kernel!(
@@ -154,7 +155,7 @@ fn emit_wide(count: u32, size: UVec2, extra: u32) -> (Vec<u32>, Vec<UVec2>, u32)
         constants,
         emit::Params { size, gaussian_count: count, tile_columns: size.x.div_ceil(tile.x) },
         Threads::Exactly([count, 1, 1]),
-        [counts, sorted_ids, ordered_counts, sums, splats],
+        [counts, sorted_ids, slots_before, sums, splats, tile_counts],
         [tiles, slots, owners, emitted]
     );
     (tiles, emitted, per_splat)
@@ -167,11 +168,12 @@ fn gaussians_that_cover_the_whole_of_a_large_image_fill_their_slots_and_are_summ
     let (tiles, emitted, per_splat) = emit_wide(9, size, 0);
     assert!(per_splat > 32_000 && tiles.len() == 9 * per_splat as usize);
     assert!(tiles.chunks(per_splat as usize).all(|own| (0..per_splat).eq(own.iter().copied())));
-    let record = 9;
+    let vectors = 3;
     let mut random = Random::new(3);
-    let records: Vec<f32> =
-        (0..tiles.len() * record).map(|_| random.between(-1.0, 1.0) as f32).collect();
-    let d_splats = vec![f32::NAN; 9 * record];
+    let mut number = || random.between(-1.0, 1.0) as f32;
+    let records: Vec<Vec3> =
+        (0..tiles.len() * vectors).map(|_| Vec3::new(number(), number(), number())).collect();
+    let d_splats = vec![Vec3::NAN; 9 * vectors];
     run_kernel!(
         reduce_records,
         reduce_records::Constants::default(),
@@ -190,9 +192,9 @@ fn slots_that_no_tile_fills_are_padding_and_leave_no_trace_in_the_sums() {
         let is_padding = |slot: usize| slot as u32 % per_splat >= per_splat - 5;
         assert!((0..tiles.len()).all(|slot| (tiles[slot] == emit::NO_TILE) == is_padding(slot)));
         // No tile has written the records of padding.
-        let record = |slot: usize| [if is_padding(slot) { f32::NAN } else { 1.0 }; 9];
-        let records: Vec<f32> = (0..tiles.len()).flat_map(record).collect();
-        let d_splats = vec![f32::NAN; 11 * 9];
+        let record = |slot: usize| [if is_padding(slot) { Vec3::NAN } else { Vec3::ONE }; 3];
+        let records: Vec<Vec3> = (0..tiles.len()).flat_map(record).collect();
+        let d_splats = vec![Vec3::NAN; 11 * 3];
         let sums = run_kernel!(
             reduce_records,
             reduce_records::Constants::default(),
@@ -201,7 +203,7 @@ fn slots_that_no_tile_fills_are_padding_and_leave_no_trace_in_the_sums() {
             [emitted, records],
             [d_splats]
         );
-        assert!(sums.iter().all(|&sum| sum == (per_splat - 5) as f32), "{sums:?}");
+        assert!(sums.iter().all(|&sum| sum == Vec3::splat((per_splat - 5) as f32)), "{sums:?}");
     }
 }
 

@@ -187,6 +187,20 @@ fn a_plain_step_is_at_most_24_dispatches_and_20_barriers() {
     assert!(dispatches <= 24 && barriers <= 20, "{dispatches} dispatches, {barriers} barriers");
 }
 
+#[test]
+fn twenty_five_trainings_give_the_same_bits() {
+    let dataset = dataset();
+    let run = || {
+        let mut trainer = Trainer::new(&gpu(), config(), &dataset).unwrap();
+        let losses: Vec<f64> = advance(&mut trainer, 6).iter().map(|report| report.loss).collect();
+        (losses, trainer.gaussians().unwrap())
+    };
+    let first = run();
+    for repeat in 1..25 {
+        assert_eq!(run(), first, "repeat {repeat}");
+    }
+}
+
 /// Trains a few steps on views of one size, from the points there are.
 fn train_on(size: [u32; 2], points: usize) -> (Vec<StepReport>, Gaussians) {
     let mut dataset = common::train::dataset(3, [64, 48]);

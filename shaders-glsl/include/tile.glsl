@@ -39,11 +39,3 @@ uint splat_groups(ProjectedSplat splat, uvec2 origin) {
     }
     return SKIPS_GROUPS ? groups : ~0u;
 }
-
-// The sum of `x` over the subgroup, in every lane: a butterfly, which a processor does faster than subgroupAdd.
-float subgroup_sum(float x) {
-    // Counted, so that drivers unroll it: subgroups have at most 128 lanes.
-    [[unroll]] for (uint bit = 0; bit < 7; bit++)
-        if ((1u << bit) < SUBGROUP_SIZE) x += subgroupShuffle(x, gl_SubgroupInvocationID ^ (1u << bit));
-    return x;
-}

@@ -2,13 +2,12 @@
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
 #include "tone.glsl"
-#include "ssim.glsl"
 
 //! The gradient of (1 - w) mean|a - b| + w (1 - mean SSIM) with respect to the render a, and partial sums of |a - b|.
 //!
 //! dSSIM/da = E[dS/dE[a]] + 2 a E[dS/dE[aa]] + b E[dS/dE[ab]]: the window is symmetric and zero outside the
 //! image, so the transposed blur is the blur. The derivatives come from `ssim_forward`, which shares the
-//! thread mapping. At a = b the gradient of the L1 term is 0. Means are over the interior; the L1 term stays
+//! mapping to subgroups. At a = b the gradient of the L1 term is 0. Means are over the interior; the L1 term stays
 //! inside it, the SSIM term reaches a window's radius beyond. Reference: `src/reference/ssim_backward.rs`.
 
 layout(local_size_x_id = 100) in;
@@ -23,18 +22,21 @@ layout(push_constant) uniform Params {
     float ssim_scale;      // w / (3hw)
 };
 
-layout(binding = 0) readonly  buffer Render   { float render[]; };          // (3, H, W), not clamped
-layout(binding = 1) readonly  buffer Low      { float low[]; };             // (3, H, W), sRGB-encoded
+layout(binding = 0) readonly  buffer Render   { vec4 render[]; };           // (3, H, W), not clamped
+layout(binding = 1) readonly  buffer Low      { vec4 low[]; };              // (3, H, W), sRGB-encoded
 layout(binding = 2) readonly  buffer Tone     { ToneParameters tone[]; };   // (1,)
 layout(binding = 3) readonly  buffer DMoments { vec3 d_moments[]; };        // (3, H, W, 3), dS/dE[a], dS/dE[aa], dS/dE[ab]
 layout(binding = 4) writeonly buffer DRender  { float d_render[]; };        // (3, H, W)
 layout(binding = 5) writeonly buffer Partials { float partials[]; };        // one per workgroup
 
+#include "ssim.glsl"
+
 // The three derivatives, in the order of the arrays below.
 const uint MEAN = 0, SQUARE = 1, PRODUCT = 2, DERIVATIVES = 3;
 
 void main() {
-    Strip strip = strip_of(THREAD_INDEX, width, height);
+    Strip strip = strip_of(WORKGROUP_INDEX, width, height);
+    if (strip.channel >= 3) return;
     uint plane = strip.channel * width * height;
     float pending[DERIVATIVES][COLUMNS][PENDING];
     [[unroll]] for (uint m = 0; m < DERIVATIVES; ++m)
@@ -43,18 +45,20 @@ void main() {
 
     ToneParameters curve = tone[0];
     float sum = 0.0;
-    // A workgroup's last threads can be beyond the image: no rows, yet they take part in the sum.
-    int end = strip.channel < 3 ? strip.end + RADIUS : strip.y - RADIUS;
-    for (int y = strip.y - RADIUS; y < end; ++y) {
-        float row[DERIVATIVES][REACH];
-        [[unroll]] for (int k = 0; k < REACH; ++k) {
-            int x = strip.x + k - RADIUS;
-            bool inside = x >= 0 && x < int(width) && y >= 0 && y < int(height);
-            uint i = inside ? plane + uint(y) * width + uint(x) : 0;
-            vec3 d = d_moments[i];
-            [[unroll]] for (uint m = 0; m < DERIVATIVES; ++m) row[m][k] = inside ? d[m] : 0.0;
-        }
+    for (int y = strip.y - RADIUS; y < strip.end + RADIUS; ++y) {
         int done = y - RADIUS;
+        float own[DERIVATIVES][COLUMNS];
+        [[unroll]] for (uint c = 0; c < COLUMNS; ++c) {
+            uint x = uint(strip.x) + c;
+            bool inside = x < width && uint(y) < height;
+            vec3 d = d_moments[inside ? plane + uint(y) * width + x : 0];
+            [[unroll]] for (uint m = 0; m < DERIVATIVES; ++m) own[m][c] = inside ? d[m] : 0.0;
+        }
+        float a[COLUMNS], b[COLUMNS];
+        load_row(strip, done, uvec2(width, height), curve, a, b);
+        float row[DERIVATIVES][REACH];
+        [[unroll]] for (uint m = 0; m < DERIVATIVES; ++m)
+            [[unroll]] for (uint k = 0; k < REACH; ++k) row[m][k] = seen(own[m], k);
         [[unroll]] for (uint x = 0; x < COLUMNS; ++x) {
             float blurred[DERIVATIVES];
             [[unroll]] for (uint m = 0; m < DERIVATIVES; ++m) {
@@ -64,14 +68,12 @@ void main() {
                     pending[m][x][k - 1] = pending[m][x][k] + TAPS[abs(k - RADIUS)] * value;
                 pending[m][x][PENDING - 1] = TAPS[RADIUS] * value;
             }
-            uint column = uint(strip.x) + x;
-            if (done >= strip.y && column < width) {
-                uint i = plane + uint(done) * width + column;
-                float a = render[i];
-                float b = tone_curve(low[i], curve);
-                float d_ssim = blurred[MEAN] + 2.0 * a * blurred[SQUARE] + b * blurred[PRODUCT];
-                float difference = is_inside(column, uint(done), interior_begin, interior_end) ? a - b : 0.0;
-                d_render[i] = l1_scale * sign(difference) - ssim_scale * d_ssim;
+            if (done >= strip.y && has_output(strip, x, width)) {
+                uint column = uint(strip.x) + x;
+                float d_ssim = blurred[MEAN] + 2.0 * a[x] * blurred[SQUARE] + b[x] * blurred[PRODUCT];
+                bool counts = is_inside(column, uint(done), interior_begin, interior_end);
+                float difference = counts ? a[x] - b[x] : 0.0;
+                d_render[plane + uint(done) * width + column] = l1_scale * sign(difference) - ssim_scale * d_ssim;
                 sum += abs(difference);
             }
         }

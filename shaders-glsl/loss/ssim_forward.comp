@@ -2,7 +2,6 @@
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
 #include "tone.glsl"
-#include "ssim.glsl"
 
 //! SSIM of a render against the pseudo-GT, and its derivatives with respect to the blurred moments.
 //!
@@ -11,7 +10,7 @@
 //!   / ((E[a]^2 + E[b]^2 + C1) (E[aa] - E[a]^2 + E[bb] - E[b]^2 + C2)).
 //! Writes dS/dE[a], dS/dE[aa], dS/dE[ab] for `ssim_backward`, and one partial sum of S per workgroup. Pixels outside the
 //! interior are seen by the windows, but their S counts neither in the sum nor in the derivatives, which are 0 there.
-//! The thread mapping is that of include/ssim.glsl. Reference: `src/reference/ssim_forward.rs`.
+//! The mapping to subgroups is that of include/ssim.glsl. Reference: `src/reference/ssim_forward.rs`.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
@@ -29,20 +28,22 @@ layout(binding = 2) readonly  buffer Tone     { ToneParameters tone[]; };   // (
 layout(binding = 3) writeonly buffer DMoments { vec3 d_moments[]; };        // (3, H, W, 3), dS/dE[a], dS/dE[aa], dS/dE[ab]
 layout(binding = 4) writeonly buffer Partials { float partials[]; };        // one per workgroup
 
+#include "ssim.glsl"
+
 const float C1 = 0.0001;  // (0.01 L)^2, L = 1
 const float C2 = 0.0009;  // (0.03 L)^2
 
-// The five blurred moments, in the order of the arrays below.
-const uint A = 0, B = 1, AA = 2, BB = 3, AB = 4, MOMENTS = 5;
+// The blurred moments, in the order of the arrays below: of the squares, SSIM knows the sum alone.
+const uint A = 0, B = 1, SQUARES = 2, PRODUCT = 3, MOMENTS = 4;
 
 // S at one pixel, 0 where it does not count; leaves its three derivatives at `i`.
 float ssim(float moments[MOMENTS], uint i, bool counts) {
     float a = moments[A], b = moments[B];
     float a1 = 2.0 * a * b + C1;
-    float a2 = 2.0 * (moments[AB] - a * b) + C2;
+    float a2 = 2.0 * (moments[PRODUCT] - a * b) + C2;
     float b1 = a * a + b * b + C1;
     // The variances are not negative: only the cancellation of large bright values reaches the floor.
-    float b2 = max(moments[AA] - a * a + moments[BB] - b * b, 0.0) + C2;
+    float b2 = max(moments[SQUARES] - (a * a + b * b), 0.0) + C2;
     float scale = 1.0 / (b1 * b2);
     float s = a1 * a2 * scale;
     vec3 d = vec3(2.0 * (b * (a2 - a1) * scale - a * s * (1.0 / b1 - 1.0 / b2)), -s / b2, 2.0 * a1 * scale);
@@ -51,7 +52,8 @@ float ssim(float moments[MOMENTS], uint i, bool counts) {
 }
 
 void main() {
-    Strip strip = strip_of(THREAD_INDEX, width, height);
+    Strip strip = strip_of(WORKGROUP_INDEX, width, height);
+    if (strip.channel >= 3) return;
     uint plane = strip.channel * width * height;
     float pending[MOMENTS][COLUMNS][PENDING];
     [[unroll]] for (uint m = 0; m < MOMENTS; ++m)
@@ -60,31 +62,19 @@ void main() {
 
     ToneParameters curve = tone[0];
     float sum = 0.0;
-    int last_quad = int(3 * width * height - 1) / 4;
-    // A workgroup's last threads can be beyond the image: no rows, yet they take part in the sum.
-    int end = strip.channel < 3 ? strip.end + RADIUS : strip.y - RADIUS;
-    for (int y = strip.y - RADIUS; y < end; ++y) {
-        int from = (int(strip.channel * height) + y) * int(width) + strip.x - RADIUS;
-        vec4 render_quads[QUADS], low_quads[QUADS];
-        [[unroll]] for (int q = 0; q < QUADS; ++q) {
-            // Beyond the image a window sees zeros, whatever is loaded.
-            int quad = clamp((from >> 2) + q, 0, last_quad);
-            render_quads[q] = render[quad];
-            low_quads[q] = low[quad];
-        }
-        float row[MOMENTS][REACH];
-        [[unroll]] for (int k = 0; k < REACH; ++k) {
-            int x = strip.x + k - RADIUS;
-            bool inside = x >= 0 && x < int(width) && y >= 0 && y < int(height);
-            float a = inside ? unpack(render_quads, k, from & 3) : 0.0;
-            float b = inside ? tone_curve(unpack(low_quads, k, from & 3), curve) : 0.0;
-            row[A][k] = a;
-            row[B][k] = b;
-            row[AA][k] = a * a;
-            row[BB][k] = b * b;
-            row[AB][k] = a * b;
-        }
+    for (int y = strip.y - RADIUS; y < strip.end + RADIUS; ++y) {
         int done = y - RADIUS;
+        float a[COLUMNS], b[COLUMNS];
+        load_row(strip, y, uvec2(width, height), curve, a, b);
+        float row[MOMENTS][REACH];
+        [[unroll]] for (uint k = 0; k < REACH; ++k) {
+            float a_here = seen(a, k);
+            float b_here = seen(b, k);
+            row[A][k] = a_here;
+            row[B][k] = b_here;
+            row[SQUARES][k] = a_here * a_here + b_here * b_here;
+            row[PRODUCT][k] = a_here * b_here;
+        }
         [[unroll]] for (uint x = 0; x < COLUMNS; ++x) {
             float moments[MOMENTS];
             [[unroll]] for (uint m = 0; m < MOMENTS; ++m) {
@@ -94,8 +84,8 @@ void main() {
                     pending[m][x][k - 1] = pending[m][x][k] + TAPS[abs(k - RADIUS)] * value;
                 pending[m][x][PENDING - 1] = TAPS[RADIUS] * value;
             }
-            uint column = uint(strip.x) + x;
-            if (done >= strip.y && column < width) {
+            if (done >= strip.y && has_output(strip, x, width)) {
+                uint column = uint(strip.x) + x;
                 bool counts = is_inside(column, uint(done), interior_begin, interior_end);
                 sum += ssim(moments, plane + uint(done) * width + column, counts);
             }

@@ -4,6 +4,7 @@
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 #include "splat.glsl"
 #include "tile.glsl"
+#include "subgroup_sum.glsl"
 
 //! Blend backward: one subgroup owns a tile and records the gradient of every intersection in its slot.
 //!
@@ -23,8 +24,8 @@ layout(binding = 3) readonly  buffer Splats  { ProjectedSplat splats[]; };
 layout(binding = 4) readonly  buffer Colors  { float colors[]; };
 layout(binding = 5) readonly  buffer Render  { float render[]; };    // (CHANNELS, H, W)
 layout(binding = 6) readonly  buffer DRender { float d_render[]; };  // (CHANNELS, H, W)
-// (slots, RECORD): mean2d 2, conic 3, opacity 1, colour CHANNELS
-layout(binding = 7) writeonly buffer Records { float records[]; };
+// (slots, RECORD_VECTORS): mean2d 2, conic 3, opacity 1, colour CHANNELS, zeros
+layout(binding = 7) writeonly buffer Records { vec3 records[]; };
 
 void main() {
     uint tile = WORKGROUP_INDEX;
@@ -134,19 +135,22 @@ void main() {
             if (turn >= batch) break;
         }
         if (lane < batch) {
-            uint at = RECORD * slot;
-            records[at] = my_d_mean2d.x;
-            records[at + 1] = my_d_mean2d.y;
-            records[at + 2] = my_d_conic.x;
-            records[at + 3] = my_d_conic.y;
-            records[at + 4] = my_d_conic.z;
-            records[at + 5] = my_d_opacity;
-            [[unroll]] for (uint c = 0; c < CHANNELS; c++) records[at + RECORD_HEAD + c] = my_d_color[c];
+            float record[3 * RECORD_VECTORS];
+            [[unroll]] for (uint k = 0; k < 3 * RECORD_VECTORS; k++) record[k] = 0.0;
+            record[0] = my_d_mean2d.x;
+            record[1] = my_d_mean2d.y;
+            record[2] = my_d_conic.x;
+            record[3] = my_d_conic.y;
+            record[4] = my_d_conic.z;
+            record[5] = my_d_opacity;
+            [[unroll]] for (uint c = 0; c < CHANNELS; c++) record[RECORD_HEAD + c] = my_d_color[c];
+            [[unroll]] for (uint k = 0; k < RECORD_VECTORS; k++)
+                records[RECORD_VECTORS * slot + k] = vec3(record[3 * k], record[3 * k + 1], record[3 * k + 2]);
         }
     }
     // Behind a tile that is done every gradient is zero.
     for (uint i = first + lane; i < range.y; i += SUBGROUP_SIZE) {
-        uint at = RECORD * sorted_slots[i];
-        [[unroll]] for (uint k = 0; k < RECORD; k++) records[at + k] = 0.0;
+        uint at = RECORD_VECTORS * sorted_slots[i];
+        [[unroll]] for (uint k = 0; k < RECORD_VECTORS; k++) records[at + k] = vec3(0.0);
     }
 }

@@ -12,22 +12,24 @@
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
+#include "subgroup_sum.glsl"
 
 layout(push_constant, scalar) uniform Params { uvec2 size; uint gaussian_count; uint tile_columns; };
 
 layout(binding = 0) readonly  buffer Counts  { uint counts[]; };       // [0]: intersections; 0 after an overflow
 layout(binding = 1) readonly  buffer Ids     { uint sorted_ids[]; };
-layout(binding = 2) readonly  buffer Ordered { uint ordered_counts[]; };
-layout(binding = 3) readonly  buffer Sums    { uint sums[]; };         // what precedes each partition of ranks
+layout(binding = 2) readonly  buffer Before  { uint slots_before[]; };  // by rank, within its partition
+layout(binding = 3) readonly  buffer Sums    { uint sums[]; };          // what precedes each partition of ranks
 layout(binding = 4) readonly  buffer Splats  { ProjectedSplat splats[]; };
 layout(binding = 5) writeonly buffer Tiles   { uint tiles[]; };        // tile of each slot
 layout(binding = 6) writeonly buffer Slots   { uint slots[]; };        // 0, 1, 2, ...
 layout(binding = 7) writeonly buffer Owners  { uint owners[]; };       // Gaussian of each slot
-layout(binding = 8) writeonly buffer Emitted { uvec2 emitted[]; };     // by Gaussian: first slot, one past the last
+layout(binding = 8) writeonly buffer Emitted { uvec2 emitted[]; };      // by Gaussian: first slot, one past the last
+layout(binding = 9) readonly  buffer TileCounts { uint tile_counts[]; };  // by Gaussian
 
 const uint NO_TILE = 0xffffffffu;
-// What a lane writes of a shared Gaussian in one go.
-const uint SLOTS_PER_LANE = 4;
+// The tiles of a row that a lane writes in one turn.
+const uint TILES_PER_TURN = 2;
 
 void write_slot(uint slot, uint tile, uint id) {
     tiles[slot] = tile;
@@ -35,86 +37,62 @@ void write_slot(uint slot, uint tile, uint id) {
     owners[slot] = id;
 }
 
-// The first slot of this lane's rank, which has `count` slots.
-uint first_slot(uint rank, uint count) {
-    uint part = rank / PARTITION_SIZE;
-    uint subgroup_begin = rank - gl_SubgroupInvocationID;
-    uint before = 0;
-    for (uint i = partition_begin(part) + gl_SubgroupInvocationID; i < subgroup_begin; i += SUBGROUP_SIZE) {
-        before += ordered_counts[i];
+// The tiles of a row into slots from `slot` to before `end`.
+void emit_row(uint tile, uint slot, uint end, uint id) {
+    for (; slot < end; slot += TILES_PER_TURN, tile += TILES_PER_TURN) {
+        [[unroll]] for (uint k = 0; k < TILES_PER_TURN; k++) if (slot + k < end) write_slot(slot + k, tile + k, id);
     }
-    return sums[part] + subgroupAdd(before) + subgroupExclusiveAdd(count);
-}
-
-// The tiles of a splat row by row into slots from `slot` to before `end`; gives one past the last that it took.
-uint emit_alone(ProjectedSplat splat, uint id, uint slot, uint end) {
-    uvec2 tile_rows = splat_tile_rows(splat, size.y);
-    for (uint row = tile_rows.x; row < tile_rows.y; row++) {
-        uvec2 columns = splat_tiles(splat, row, size.x);
-        for (uint column = columns.x; column < columns.y && slot < end; column++, slot++) {
-            write_slot(slot, row * tile_columns + column, id);
-        }
-    }
-    return slot;
-}
-
-// The same by all lanes: a row of tiles for each, then a slot for each.
-uint emit_together(ProjectedSplat splat, uint id, uint slot, uint end) {
-    uvec2 tile_rows = splat_tile_rows(splat, size.y);
-    for (uint top = tile_rows.x; top < tile_rows.y; top += SUBGROUP_SIZE) {
-        uint row = top + gl_SubgroupInvocationID;
-        uvec2 columns = row < tile_rows.y ? splat_tiles(splat, row, size.x) : uvec2(0);
-        uint row_end = subgroupInclusiveAdd(columns.y - columns.x);
-        // The tile of the row's first slot, less the number of that slot: what a slot's number is to be added to.
-        uint row_tile = row * tile_columns + columns.y - row_end;
-        uint count = subgroupShuffle(row_end, SUBGROUP_SIZE - 1);
-        for (uint first = 0; first < count; first += SLOTS_PER_LANE * SUBGROUP_SIZE) {
-            [[unroll]] for (uint k = 0; k < SLOTS_PER_LANE; k++) {
-                uint i = first + k * SUBGROUP_SIZE + gl_SubgroupInvocationID;
-                // How many rows end at or before slot i.
-                uint lane = 0;
-                [[unroll]] for (uint bit = 0; bit < 7; bit++) {
-                    uint lanes = 64u >> bit;
-                    if (lanes < SUBGROUP_SIZE && subgroupShuffle(row_end, lane + lanes - 1) <= i) lane += lanes;
-                }
-                uint tile = subgroupShuffle(row_tile, lane) + i;
-                if (i < count && slot + i < end) write_slot(slot + i, tile, id);
-            }
-        }
-        slot = min(slot + count, end);
-    }
-    return slot;
 }
 
 void main() {
     uint rank = THREAD_INDEX;
-    if (rank - gl_SubgroupInvocationID >= gaussian_count) return;
+    uint lane = gl_SubgroupInvocationID;
+    if (rank - lane >= gaussian_count) return;
     bool is_rank = rank < gaussian_count;
-    uint count = is_rank ? ordered_counts[rank] : 0;
-    uint begin = first_slot(rank, count);
-    // No slot beyond those that were counted is ever written, not even where the sum of all counts wrapped around.
-    uint end = begin + count;
-    if (end > counts[0] || end < begin) end = begin;
     uint id = is_rank ? sorted_ids[rank] : 0;
+    uint begin = is_rank ? sums[rank / PARTITION_SIZE] + slots_before[rank] : 0;
+    // No slot beyond those that were counted is ever written, not even where the sum of all counts wrapped around.
+    uint end = begin + (is_rank ? tile_counts[id] : 0);
+    if (end > counts[0] || end < begin) end = begin;
     ProjectedSplat splat = splats[id];
+    uvec2 rows = end > begin ? splat_tile_rows(splat, size.y) : uvec2(0);
     bool is_shared = end - begin > SHARED_SLOTS;
-
-    uint slot = begin;
-    if (end > begin && !is_shared) slot = emit_alone(splat, id, begin, end);
     uvec4 sharing = subgroupBallot(is_shared);
-    while (any(notEqual(sharing, uvec4(0)))) {
-        uint lane = subgroupBallotFindLSB(sharing);
-        sharing[lane / 32] &= sharing[lane / 32] - 1;
-        ProjectedSplat shared_splat;
-        shared_splat.mean2d = subgroupShuffle(splat.mean2d, lane);
-        shared_splat.conic = subgroupShuffle(splat.conic, lane);
-        shared_splat.opacity = subgroupShuffle(splat.opacity, lane);
-        shared_splat.half_extent = subgroupShuffle(splat.half_extent, lane);
-        uint last = emit_together(
-            shared_splat, subgroupShuffle(id, lane), subgroupShuffle(begin, lane), subgroupShuffle(end, lane));
-        if (gl_SubgroupInvocationID == lane) slot = last;
+
+    // First every lane its own splat, then all together those that are shared, a row for each: in one loop, for a device
+    // that does not jump over branches pays for a second one even where nothing is shared.
+    ProjectedSplat walked = splat;
+    uint walked_id = id, slot = begin, walked_end = end, walked_rows = rows.y;
+    uint row = is_shared ? rows.y : rows.x;
+    uint owner = lane, last = begin, stride = 1;
+    while (true) {
+        while (subgroupAny(row < walked_rows)) {
+            uvec2 columns = row < walked_rows ? splat_tiles(walked, row, size.x) : uvec2(0);
+            uint count = columns.y - columns.x;
+            uint count_to_here = subgroup_inclusive_sum(count);
+            bool is_alone = stride == 1;
+            uint first = is_alone ? slot : slot + count_to_here - count;
+            emit_row(row * tile_columns + columns.x, first, min(first + count, walked_end), walked_id);
+            slot += is_alone ? count : subgroupShuffle(count_to_here, SUBGROUP_SIZE - 1);
+            slot = min(slot, walked_end);
+            row += stride;
+        }
+        if (owner == lane) last = slot;
+        if (all(equal(sharing, uvec4(0)))) break;
+        owner = subgroupBallotFindLSB(sharing);
+        sharing[owner / 32] &= sharing[owner / 32] - 1;
+        stride = SUBGROUP_SIZE;
+        walked.mean2d = subgroupShuffle(splat.mean2d, owner);
+        walked.conic = subgroupShuffle(splat.conic, owner);
+        walked.opacity = subgroupShuffle(splat.opacity, owner);
+        walked.half_extent = subgroupShuffle(splat.half_extent, owner);
+        walked_id = subgroupShuffle(id, owner);
+        slot = subgroupShuffle(begin, owner);
+        walked_end = subgroupShuffle(end, owner);
+        row = subgroupShuffle(rows.x, owner) + lane;
+        walked_rows = subgroupShuffle(rows.y, owner);
     }
-    if (is_rank) emitted[id] = uvec2(begin, slot);
+    if (is_rank) emitted[id] = uvec2(begin, last);
     // Counting and emitting share one function; should a compiler still make them disagree, nothing is left unwritten.
-    for (; slot < end; slot++) write_slot(slot, NO_TILE, id);
+    for (; last < end; last++) write_slot(last, NO_TILE, id);
 }

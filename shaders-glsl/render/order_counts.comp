@@ -4,7 +4,7 @@
 #include "partition.glsl"
 #include "status.glsl"
 
-//! Order counts: how many tiles the Gaussian of each depth rank covers, and what precedes each partition of ranks.
+//! Order counts: how many slots precede those of each depth rank within its partition, and those of each partition.
 //!
 //! One subgroup per partition; the last of them to be done makes prefix sums of the partitions' sums and knows the total.
 //! More intersections than the buffers hold raise a flag that stays: the step then renders nothing and updates nothing;
@@ -12,6 +12,7 @@
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
+#include "subgroup_sum.glsl"
 
 layout(push_constant) uniform Params {
     uint gaussian_count;
@@ -20,7 +21,7 @@ layout(push_constant) uniform Params {
 
 layout(binding = 0) readonly  buffer Ids        { uint sorted_ids[]; };   // by depth
 layout(binding = 1) readonly  buffer TileCounts { uint tile_counts[]; };  // by Gaussian
-layout(binding = 2) writeonly buffer Ordered    { uint ordered_counts[]; };
+layout(binding = 2) writeonly buffer Before     { uint slots_before[]; };  // by rank, within its partition
 layout(binding = 3) coherent  buffer Sums       { uint sums[]; };    // (partitions), exclusive prefix sums
 layout(binding = 4) writeonly buffer Counts     { uint counts[]; };  // [0]: intersections to blend
 layout(binding = 5)           buffer Status     { uint status[]; };
@@ -37,12 +38,13 @@ void main() {
 
     uint sum = 0;
     uint end = gaussian_count == 0 ? 0 : partition_end(part, gaussian_count);
-    for (uint rank = partition_begin(part) + lane; rank < end; rank += SUBGROUP_SIZE) {
-        uint count = tile_counts[sorted_ids[rank]];
-        ordered_counts[rank] = count;
-        sum += count;
+    for (uint first = partition_begin(part); first < end; first += SUBGROUP_SIZE) {
+        uint rank = first + lane;
+        uint count = rank < end ? tile_counts[sorted_ids[rank]] : 0;
+        uint inclusive = subgroup_inclusive_sum(count);
+        if (rank < end) slots_before[rank] = sum + inclusive - count;
+        sum += subgroupShuffle(inclusive, SUBGROUP_SIZE - 1);
     }
-    sum = subgroupAdd(sum);
     if (subgroupElect()) sums[part] = sum;
 
     if (!is_last_workgroup(partition_count)) return;

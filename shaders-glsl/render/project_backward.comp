@@ -28,7 +28,7 @@ layout(binding = 0) readonly  buffer Parameters { float parameters[]; };  // (co
 layout(binding = 1) readonly  buffer Splats     { ProjectedSplat splats[]; };
 layout(binding = 2) readonly  buffer Colors     { float colors[]; };      // (gaussian_count, CHANNELS)
 layout(binding = 3) readonly  buffer TileCounts { uint tile_counts[]; };
-layout(binding = 4) readonly  buffer DSplats    { float d_splats[]; };    // (gaussian_count, RECORD)
+layout(binding = 4) readonly  buffer DSplats    { vec3 d_splats[]; };     // (gaussian_count, RECORD_VECTORS)
 layout(binding = 5) readonly  buffer Status     { uint status[]; };
 layout(binding = 6) writeonly buffer Gradients  { float gradients[]; };   // (columns x gaussian_count)
 layout(binding = 7) buffer GradNormSums { float grad_norm_sums[]; };
@@ -93,19 +93,23 @@ void main() {
         return;
     }
     ProjectedSplat splat = splats[i];
-    uint record = RECORD * i;
-    vec2 d_mean2d = vec2(d_splats[record], d_splats[record + 1]);
-    vec3 d_conic = vec3(d_splats[record + 2], d_splats[record + 3], d_splats[record + 4]);
-    float d_opacity = d_splats[record + 5];
+    float record[3 * RECORD_VECTORS];
+    [[unroll]] for (uint k = 0; k < RECORD_VECTORS; k++) {
+        vec3 part = d_splats[RECORD_VECTORS * i + k];
+        [[unroll]] for (uint c = 0; c < 3; c++) record[3 * k + c] = part[c];
+    }
+    vec2 d_mean2d = vec2(record[0], record[1]);
+    vec3 d_conic = vec3(record[2], record[3], record[4]);
+    float d_opacity = record[5];
     vec3 d_color;
     for (uint c = 0; c < 3; c++) {
         // A colour clamped at zero passes nothing on.
         bool passes = colors[CHANNELS * i + c] > 0.0;
         if (RAW_COLORS) passes = true;
-        d_color[c] = passes ? d_splats[record + RECORD_HEAD + c] : 0.0;
+        d_color[c] = passes ? record[RECORD_HEAD + c] : 0.0;
     }
     uint features = FEATURES_COLUMN * gaussian_count + FEATURE_COUNT * i;
-    for (uint k = 0; k < FEATURE_COUNT; k++) gradients[features + k] = d_splats[record + RECORD_HEAD + 3 + k];
+    [[unroll]] for (uint k = 0; k < FEATURE_COUNT; k++) gradients[features + k] = record[RECORD_HEAD + 3 + k];
 
     // The forward pass again.
     mat3 view_rotation = mat3(camera.view_from_world);

@@ -11,6 +11,7 @@ use super::{
     Interior, LossSpec, LossTerm, Term, TermInputs, ViewSource, holds, no_scratch, value_count,
 };
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
+use crate::kernels::ssim::RADIUS;
 use crate::kernels::{ToneParameters, l1, ssim_backward, ssim_forward};
 use crate::scene::Feature;
 use crate::{Error, Result};
@@ -71,17 +72,33 @@ impl Term {
     };
 }
 
-/// The columns and rows of a view that one thread of the SSIM kernels takes.
-///
-/// On a processor a load costs the most, so wide strips, which share their borders' loads, win over registers that
-/// spill into the first-level cache; a GPU needs narrow ones that stay in registers.
-const CPU_STRIP: [u32; 2] = [16, 64];
-const GPU_STRIP: [u32; 2] = [2, 32];
-
-/// The strip that suits the device.
-fn strip(gpu: &Gpu) -> [u32; 2] {
-    if gpu.properties().is_cpu { CPU_STRIP } else { GPU_STRIP }
+/// How the SSIM kernels march over a view: the columns of a lane and the rows of a subgroup.
+#[derive(Clone, Copy, Debug)]
+struct March {
+    columns: u32,
+    rows: u32,
 }
+
+impl March {
+    /// What suits the device: on a processor loads and stores cost the most, so that a subgroup is wide and goes far, for
+    /// registers that spill stay in the first-level cache; a GPU needs narrow strips, which stay in registers.
+    fn on(gpu: &Gpu) -> Self {
+        let properties = gpu.properties();
+        match properties.is_cpu {
+            true => Self { columns: 16, rows: 128 },
+            false => Self { columns: (GPU_COLUMNS / properties.subgroup_size).max(2), rows: 32 },
+        }
+    }
+
+    /// The subgroups for all channels of a view of `size`, where one has so many lanes.
+    fn subgroups(self, size: UVec2, lanes: u32) -> u32 {
+        let outputs = lanes * self.columns - 2 * RADIUS as u32;
+        3 * size.x.div_ceil(outputs) * size.y.div_ceil(self.rows)
+    }
+}
+
+/// The columns that a subgroup of a GPU loads at least: the fewer, the more of them are its ends, which have no outputs.
+const GPU_COLUMNS: u32 = 64;
 
 /// What a loss compares and how.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -134,8 +151,8 @@ enum Kernels {
 #[derive(Debug)]
 struct Ssim {
     weight: f64,
-    strip: [u32; 2],
-    subgroup_size: u32,
+    march: March,
+    lanes: u32,
     forward: Pipeline<ssim_forward::Kernel>,
     backward: Pipeline<ssim_backward::Kernel>,
     /// (3, H, W), dS/dE\[a\], dS/dE\[aa\], dS/dE\[ab\].
@@ -156,11 +173,12 @@ impl Loss {
         }
         let subgroup_size = gpu.properties().subgroup_size;
         let kernels = if ssim_weight > 0.0 {
-            let [columns, rows] = strip(gpu);
+            let march = March::on(gpu);
+            let March { columns, rows } = march;
             Kernels::Ssim(Ssim {
                 weight: ssim_weight,
-                strip: [columns, rows],
-                subgroup_size,
+                march,
+                lanes: subgroup_size,
                 forward: gpu.pipeline(&ssim_forward::Constants { columns, rows, tone_curve })?,
                 backward: gpu.pipeline(&ssim_backward::Constants { columns, rows, tone_curve })?,
                 d_moments: gpu.uninit("d_moments", 0)?,
@@ -285,10 +303,7 @@ impl Kernels {
             Self::L1 { values_per_workgroup, .. } => {
                 value_count(size).div_ceil(*values_per_workgroup)
             }
-            Self::Ssim(ssim) => {
-                let [columns, rows] = ssim.strip;
-                (3 * size.x.div_ceil(columns) * size.y.div_ceil(rows)).div_ceil(ssim.subgroup_size)
-            }
+            Self::Ssim(ssim) => ssim.march.subgroups(size, ssim.lanes),
         }
     }
 }

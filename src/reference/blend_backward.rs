@@ -5,7 +5,7 @@ use glam::{DVec2, UVec2};
 use super::blend_forward::{TileList, tile_pixels};
 use super::blending::PixelModel;
 use super::rounding::{UNIT, chain};
-use super::splat::{Splat, fragments};
+use super::splat::{Splat, fragments, stored_record};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::blend_backward::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::splat::RECORD_HEAD;
@@ -79,8 +79,12 @@ fn for_each_tile(
             let (render, d_render) = (values(render), values(d_render));
             visit(&list, &Pixel { center: pixel.as_dvec2() + 0.5, render, d_render }, &mut sums);
         }
+        let stored = stored_record(constants.channels);
         for (sums, &slot) in sums.chunks(record).zip(&list.slots) {
-            (0..record).for_each(|k| write(record * slot as usize + k, sums[k]));
+            let padded = sums.iter().copied().chain(std::iter::repeat(0.0));
+            (stored * slot as usize..)
+                .zip(padded.take(stored))
+                .for_each(|(at, sum)| write(at, sum));
         }
     }
 }
@@ -124,7 +128,7 @@ fn add_bounds(constants: &Constants, list: &TileList, pixel: &Pixel, bounds: &mu
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, mut slices: Slices<'_>) {
         let alpha_max = constants.alpha_max.into();
-        let records = std::mem::take(&mut slices.records);
+        let records: &mut [f32] = bytemuck::cast_slice_mut(std::mem::take(&mut slices.records));
         let write = |at: usize, sum: f64| records[at] = sum as f32;
         for_each_tile(params, constants, &slices, write, |list, pixel, sums| {
             let Pixel { center, render, d_render } = pixel;
@@ -141,7 +145,7 @@ impl Reference for Kernel {
     }
 
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
-        let mut bounds = vec![0.0; slices.records.len()];
+        let mut bounds = vec![0.0; 3 * slices.records.len()];
         let write = |at: usize, bound: f64| bounds[at] = bound;
         for_each_tile(params, constants, &slices, write, |list, pixel, bounds| {
             add_bounds(constants, list, pixel, bounds);

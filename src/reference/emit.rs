@@ -23,16 +23,14 @@ fn reserved(
     constants: &Constants,
     slices: &Slices<'_>,
 ) -> Vec<(u32, std::ops::Range<u32>)> {
-    let mut next = 0u32;
     let ranks = 0..params.gaussian_count as usize;
-    let one = |rank| {
-        if rank % constants.partition_size as usize == 0 {
-            next = slices.sums[rank / constants.partition_size as usize];
-        }
-        let first = next;
-        next = next.wrapping_add(slices.ordered_counts[rank]);
-        let is_counted = first <= next && next <= slices.counts[0];
-        (slices.sorted_ids[rank], first..if is_counted { next } else { first })
+    let one = |rank: usize| {
+        let id = slices.sorted_ids[rank];
+        let before = slices.sums[rank / constants.partition_size as usize];
+        let first = before.wrapping_add(slices.slots_before[rank]);
+        let end = first.wrapping_add(slices.tile_counts[id as usize]);
+        let is_counted = first <= end && end <= slices.counts[0];
+        (id, first..if is_counted { end } else { first })
     };
     ranks.map(one).collect()
 }

@@ -4,17 +4,20 @@ use crate::kernels::status::STATUS_OVERFLOWED;
 
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
-        let Slices { sorted_ids, tile_counts, ordered_counts, sums, counts, status, .. } = slices;
+        let Slices { sorted_ids, tile_counts, slots_before, sums, counts, status, .. } = slices;
         let (count, partition_size) =
             (params.gaussian_count as usize, constants.partition_size as usize);
         sums[0] = 0;
-        let mut total = 0u64;
+        let (mut total, mut before) = (0u64, 0u32);
         for rank in 0..count {
             if rank % partition_size == 0 {
                 sums[rank / partition_size] = total as u32;
+                before = 0;
             }
-            ordered_counts[rank] = tile_counts[sorted_ids[rank] as usize];
-            total += u64::from(ordered_counts[rank]);
+            let count = tile_counts[sorted_ids[rank] as usize];
+            slots_before[rank] = before;
+            before = before.wrapping_add(count);
+            total += u64::from(count);
         }
         let total = u32::try_from(total).unwrap_or(u32::MAX);
         let fits = total <= params.capacity;

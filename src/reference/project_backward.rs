@@ -1,12 +1,12 @@
 //! From the gradients of a splat to those of its Gaussian, in f64.
 
-use glam::{DMat3, DVec2, DVec3, DVec4};
+use glam::{DMat3, DVec2, DVec3, DVec4, Vec3};
 
 use super::camera::{Camera, rotation, unit_quat};
 use super::gaussian::{Gaussian, Planes, sigmoid};
 use super::rounding::{UNIT, sensitivity};
 use super::sh::{sh_basis, sh_basis_gradient};
-use super::splat::Splat;
+use super::splat::{Splat, stored_record};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::project_backward::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::splat::RECORD_HEAD;
@@ -182,9 +182,11 @@ impl<'a> Scene<'a> {
     }
 
     /// The record of Gaussian `i`.
-    fn record(&self, d_splats: &[f32], i: usize) -> Vec<f64> {
-        let len = HEAD + self.constants.channels as usize;
-        d_splats[len * i..][..len].iter().map(|&d| d.into()).collect()
+    fn record(&self, d_splats: &[Vec3], i: usize) -> Vec<f64> {
+        let channels = self.constants.channels;
+        let d_splats: &[f32] = bytemuck::cast_slice(d_splats);
+        let own = &d_splats[stored_record(channels) * i..][..HEAD + channels as usize];
+        own.iter().map(|&d| d.into()).collect()
     }
 }
 

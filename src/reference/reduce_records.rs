@@ -1,8 +1,8 @@
 use super::rounding::{UNIT, chain};
+use super::splat::stored_record;
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::reduce_records::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::shared_slots::SHARED_SLOTS;
-use crate::kernels::splat::RECORD_HEAD;
 
 /// Calls `add` with every number of every Gaussian, the slots of the Gaussian, and where the slot has the number.
 fn for_each_number(
@@ -11,14 +11,16 @@ fn for_each_number(
     slices: &mut Slices<'_>,
     mut add: impl FnMut(&mut f32, &mut dyn Iterator<Item = f32>, usize),
 ) {
-    let record = (RECORD_HEAD + constants.channels) as usize;
+    let record = stored_record(constants.channels);
+    let records: &[f32] = bytemuck::cast_slice(slices.records);
+    let d_splats: &mut [f32] = bytemuck::cast_slice_mut(slices.d_splats);
     for i in 0..params.gaussian_count as usize {
         let range = slices.emitted[i];
         for k in 0..record {
             let slots = range.x as usize..range.y as usize;
             let count = slots.len();
-            let mut numbers = slots.map(|slot| slices.records[record * slot + k]);
-            add(&mut slices.d_splats[record * i + k], &mut numbers, count);
+            let mut numbers = slots.map(|slot| records[record * slot + k]);
+            add(&mut d_splats[record * i + k], &mut numbers, count);
         }
     }
 }

@@ -4,7 +4,12 @@ use glam::{DVec2, DVec3, UVec2};
 
 use super::rounding::UNIT;
 use crate::kernels::ProjectedSplat;
-use crate::kernels::splat::{ALPHA_MIN, TRANSMITTANCE_MIN};
+use crate::kernels::splat::{ALPHA_MIN, RECORD_HEAD, TRANSMITTANCE_MIN};
+
+/// Numbers of a gradient record as it is stored: in vectors of three, the last one filled up with zeros.
+pub(super) fn stored_record(channels: u32) -> usize {
+    (RECORD_HEAD + channels).next_multiple_of(3) as usize
+}
 
 /// What of a [`ProjectedSplat`] makes its light.
 #[derive(Clone, Copy, Debug)]

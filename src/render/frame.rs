@@ -1,6 +1,6 @@
 //! The memory of one view: what the passes of a render hand each other.
 
-use glam::UVec2;
+use glam::{UVec2, Vec3};
 
 use crate::Result;
 use crate::gpu::{Buffer, Gpu};
@@ -55,16 +55,16 @@ pub struct Frame {
     pub depth_keys: Buffer<u32>,
     pub ids: Buffer<u32>,
     pub tile_counts: Buffer<u32>,
-    pub ordered_counts: Buffer<u32>,
+    pub slots_before: Buffer<u32>,
     /// One per partition of ranks.
     pub sums: Buffer<u32>,
     pub emitted: Buffer<UVec2>,
-    pub d_splats: Buffer<f32>,
+    pub d_splats: Buffer<Vec3>,
     // intersections
     pub tiles: Buffer<u32>,
     pub slots: Buffer<u32>,
     pub owners: Buffer<u32>,
-    pub records: Buffer<f32>,
+    pub records: Buffer<Vec3>,
     // pixels and tiles
     pub render: Buffer<f32>,
     pub transmittances: Buffer<f32>,
@@ -88,7 +88,7 @@ impl Frame {
             depth_keys: gpu.uninit("depth_keys", 0)?,
             ids: gpu.uninit("ids", 0)?,
             tile_counts: gpu.uninit("tile_counts", 0)?,
-            ordered_counts: gpu.uninit("ordered_counts", 0)?,
+            slots_before: gpu.uninit("slots_before", 0)?,
             sums: gpu.uninit("sums", 1)?,
             emitted: gpu.uninit("emitted", 0)?,
             d_splats: gpu.uninit("d_splats", 0)?,
@@ -125,11 +125,11 @@ impl Frame {
             self.depth_keys = gpu.uninit("depth_keys", count)?;
             self.ids = gpu.uninit("ids", count)?;
             self.tile_counts = gpu.uninit("tile_counts", count)?;
-            self.ordered_counts = gpu.uninit("ordered_counts", count)?;
+            self.slots_before = gpu.uninit("slots_before", count)?;
             let partitions = (count as u32).div_ceil(RANKS_PER_PARTITION).max(1);
             self.sums = gpu.uninit("sums", partitions as usize)?;
             self.emitted = gpu.uninit("emitted", count)?;
-            self.d_splats = gpu.uninit("d_splats", self.record() * count)?;
+            self.d_splats = gpu.uninit("d_splats", self.record_vectors() * count)?;
         }
         if self.render.len() < self.channels * pixels {
             self.render = gpu.uninit("render", self.channels * pixels)?;
@@ -150,14 +150,14 @@ impl Frame {
             self.tiles = gpu.uninit("tiles", capacity)?;
             self.slots = gpu.uninit("slots", capacity)?;
             self.owners = gpu.uninit("owners", capacity)?;
-            self.records = gpu.uninit("records", self.record() * capacity)?;
+            self.records = gpu.uninit("records", self.record_vectors() * capacity)?;
         }
         Ok(())
     }
 
-    /// Values of a gradient record.
-    fn record(&self) -> usize {
-        RECORD_HEAD as usize + self.channels
+    /// The vectors of a gradient record.
+    fn record_vectors(&self) -> usize {
+        (RECORD_HEAD as usize + self.channels).div_ceil(3)
     }
 
     /// How many intersections' records one binding holds.
