@@ -162,7 +162,7 @@ impl Frame {
 
     /// How many intersections' records one binding holds.
     pub(super) fn most_intersections(&self, gpu: &Gpu) -> u32 {
-        let record = (self.record() * size_of::<f32>()) as u64;
+        let record = (self.record_vectors() * size_of::<Vec3>()) as u64;
         (gpu.properties().max_storage_buffer_range / record).min(u32::MAX.into()) as u32
     }
 
