@@ -12,6 +12,7 @@ pub mod synthetic;
 mod transforms;
 mod undistort;
 
+use std::borrow::Cow;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::{Path, PathBuf};
 
@@ -22,6 +23,7 @@ use crate::image::Image;
 use crate::image::files::{self, Files};
 use crate::{Error, Result};
 pub use options::{DepthOptions, LoadOptions};
+pub use pixels::Original;
 use pixels::Source;
 use similarity::Similarity;
 
@@ -49,6 +51,8 @@ pub struct View {
     pub camera: Camera,
     /// The photograph to train on; every training view has one.
     pub image: Option<Image>,
+    /// Where it is read from at its own size, if that is larger.
+    pub original: Option<Original>,
     /// The normal-light photograph to score against, of the camera's size; test views only.
     pub reference: Option<Image>,
     /// Depth from elsewhere, (H, W) of the camera's size, in units and with an offset of its own; larger is farther.
@@ -60,6 +64,17 @@ impl View {
     /// Whether the view is trained on.
     pub fn is_train(&self) -> bool {
         self.split == Split::Train
+    }
+
+    /// The photograph as its camera took it, undistorted and not shrunk; none where the view has none.
+    ///
+    /// # Errors
+    /// [`Error::Input`] where it was shrunk on loading and its file can no longer be read.
+    pub fn photograph(&self) -> Result<Option<Cow<'_, Image>>> {
+        match &self.original {
+            Some(original) => original.load().map(Cow::Owned).map(Some),
+            None => Ok(self.image.as_ref().map(Cow::Borrowed)),
+        }
     }
 }
 

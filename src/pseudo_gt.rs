@@ -6,15 +6,20 @@
 //!
 //! Percentiles are exact: luminance is not negative, so its bits sort as integers, and a radix select finds both
 //! neighbours of both ranks in three digits of 11, 10 and 10 bits; the same photograph gives the same bits every time. What
-//! curve the statistics give is said once, on the host ([`ToneSettings::parameters`]). A photograph beyond the device's
-//! limits comes in tiles, whose counts and sums add up.
+//! curve the statistics give is said once, on the host ([`ToneSettings::parameters`]). The same counting, over fixed bins,
+//! makes the [`LuminanceHistogram`] from which the exposure follows. A photograph beyond the device's limits comes in tiles,
+//! whose counts and sums add up.
+
+mod photographs;
 
 use glam::Vec3;
 
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::rank_search::{BINS, SEARCHES, WORKGROUP};
 use crate::kernels::{self, RankSearch, ToneParameters, ToneStatistics};
-use crate::tone::{Rank, Statistics, ToneSettings, White};
+use crate::tone::{
+    BIN_SHIFT, FIRST_PREFIX, LuminanceHistogram, Rank, Statistics, ToneSettings, White,
+};
 use crate::{Error, Result};
 
 /// Threads that share an image: enough to fill a large GPU, few enough that their partial sums add up quickly.
@@ -36,6 +41,11 @@ pub struct PseudoGt {
     searches: Buffer<RankSearch>,
     histograms: Buffer<u32>,
     measured: Buffer<ToneStatistics>,
+    /// Searches that together find the bin of every luminance.
+    bins: Buffer<RankSearch>,
+    counts: Buffer<u32>,
+    /// Of the photograph measured last.
+    pixel_count: u32,
 }
 
 /// What applies the curve to a whole image.
@@ -58,7 +68,7 @@ impl Map {
                 gpu.pipeline(&kernels::tone_table::Constants::default())?,
                 gpu.buffer("tone table", &table.knots())?,
             ),
-            None if settings.needs_baking() => {
+            None if !settings.curve.is_formula() => {
                 Self::Mix(gpu.pipeline(&kernels::tone_mix::Constants { tone_curve })?)
             }
             None => {
@@ -78,6 +88,11 @@ impl PseudoGt {
     pub fn new(gpu: &Gpu, settings: &ToneSettings) -> Result<Self> {
         settings.check()?;
         let takes_p80 = settings.white() == White::P80;
+        let bins = (0..SEARCHES).map(|histogram| RankSearch {
+            prefix: FIRST_PREFIX + histogram,
+            rank: 0,
+            histogram,
+        });
         Ok(Self {
             gpu: gpu.clone(),
             luminance: gpu.pipeline(&kernels::luminance::Constants {})?,
@@ -90,6 +105,9 @@ impl PseudoGt {
             searches: gpu.uninit("rank searches", 2 * SEARCHES as usize)?,
             histograms: gpu.zeros("luminance histograms", (SEARCHES * BINS) as usize)?,
             measured: gpu.uninit("tone statistics", 1)?,
+            bins: gpu.buffer("luminance bins", &bins.collect::<Vec<_>>())?,
+            counts: gpu.zeros("luminance counts", (SEARCHES * BINS) as usize)?,
+            pixel_count: 0,
             settings: settings.clone(),
         })
     }
@@ -141,6 +159,15 @@ impl PseudoGt {
         self.search_ranks(pass, tiles, [p10, p90], 0)?;
         if self.settings.white() == White::P80 {
             self.search_ranks(pass, tiles, [p80, p80], SEARCHES)?;
+        }
+        self.pixel_count = pixel_count;
+        pass.fill(&mut self.counts, 0);
+        for (tile, luminances) in tiles.iter().zip(&self.luminances) {
+            let params = histogram_params(tile, BIN_SHIFT, 0);
+            let (searches, histograms) = (&self.bins, &mut self.counts);
+            let buffers =
+                kernels::luminance_histogram::Buffers { luminances, searches, histograms };
+            pass.dispatch(&self.histogram, &params, buffers, Threads::Exactly([THREADS, 1, 1]))?;
         }
         pass.dispatch(
             &self.statistics,
@@ -209,12 +236,7 @@ impl PseudoGt {
             for (tile, luminances) in tiles.iter().zip(&self.luminances) {
                 pass.dispatch(
                     &self.histogram,
-                    &kernels::luminance_histogram::Params {
-                        pixel_count: (tile.len() / 3) as u32,
-                        thread_count: THREADS,
-                        shift,
-                        first_search,
-                    },
+                    &histogram_params(tile, shift, first_search),
                     kernels::luminance_histogram::Buffers {
                         luminances,
                         searches: &self.searches,
@@ -301,6 +323,28 @@ impl PseudoGt {
     pub fn measured(&self) -> Result<Statistics> {
         let read = self.gpu.read(&self.measured)?;
         Ok(Statistics::from(read[0]))
+    }
+
+    /// The luminance of the photograph measured last; waits for it.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub fn luminance_histogram(&self) -> Result<LuminanceHistogram> {
+        let counts = self.gpu.read(&self.counts)?;
+        Ok(LuminanceHistogram::from_counts(&counts, self.pixel_count.into()))
+    }
+}
+
+fn histogram_params(
+    tile: &Buffer<f32>,
+    shift: u32,
+    first_search: u32,
+) -> kernels::luminance_histogram::Params {
+    kernels::luminance_histogram::Params {
+        pixel_count: (tile.len() / 3) as u32,
+        thread_count: THREADS,
+        shift,
+        first_search,
     }
 }
 

@@ -4,8 +4,9 @@ mod directory;
 mod events;
 mod train;
 
+pub(crate) use directory::TARGET_EXPOSURE;
 pub use directory::{
-    RunDirectory, is_finished, load_config, load_exposures, load_model, load_networks,
+    RunDirectory, is_finished, load_config, load_exposures, load_metrics, load_model, load_networks,
 };
 pub use events::Event;
 pub use train::{HeldRun, Trained, train};

@@ -8,18 +8,23 @@
 //! ASE     delta0 + (1 - delta0) (1 - exp(-g t))              g = g0 + c Y
 //! AP3     delta0 + b (0.0720 t^3 - 0.4376 t^2 + 0.9948 t)    b = 1 + c Y
 //! others  delta0 + b f(t)                                    delta0 = 0, b = 1 unless told
+//! auto    delta + (1 - delta) [(1 - lambda) s(x) + lambda x s(Y) / Y]    s(x) = 1 - exp(-k x), delta = 0.075
 //! ```
 //!
 //! clamped to [0, 1], where t = x / p90, Y is the mean luminance, and the black level
 //! delta0 = alpha (1 - p10 / p90)^beta is high where shadows are crushed. The statistics are those of
-//! one photograph, or the means over a scene's, see [`Statistics`]. [`FAMILIES`] is the table of all curves; a [`Table`]
+//! one photograph, or the means over a scene's, see [`Statistics`]. The gain k of the automatic curve, whose Y is the pixel's,
+//! follows from the luminance of all photographs, see [`Exposure`]; so may that of every other curve. [`FAMILIES`] is the table of all curves; a [`Table`]
 //! of values from a file is a curve too.
 
 mod catalogue;
+mod exposure;
 mod families;
 #[cfg(feature = "io")]
 mod file;
+mod histogram;
 mod law;
+mod lift;
 mod real;
 mod settings;
 mod statistics;
@@ -29,16 +34,21 @@ use std::fmt;
 use std::str::FromStr;
 
 pub use self::catalogue::{FAMILIES, ToneCurve};
+pub(crate) use self::exposure::all_black;
+pub use self::exposure::{Exposure, exposed_anew, is_black, soft};
 pub use self::families::{Constant, Family, Law, White};
 #[cfg(feature = "io")]
 pub use self::file::CurveChoice;
+pub use self::histogram::LuminanceHistogram;
+pub(crate) use self::histogram::{BIN_SHIFT, FIRST_PREFIX};
 #[cfg(feature = "fit")]
 pub(crate) use self::law::{Numbers, law};
 pub(crate) use self::law::{clamped, curve_at, tone_curve};
+pub use self::lift::{Lift, Measured, Scene};
 #[cfg(feature = "fit")]
 pub(crate) use self::real::Dual;
 pub use self::real::Real;
-pub use self::settings::ToneSettings;
+pub use self::settings::{GainChoice, ToneSettings};
 pub(crate) use self::statistics::{Rank, luminance, measurable};
 pub use self::statistics::{Statistics, percentile};
 pub(crate) use self::table::interpolate;
@@ -49,15 +59,27 @@ use crate::{Error, Result};
 /// The name of the curve that a table of values makes.
 const TABLE_NAME: &str = "table";
 
+/// The name of the curve whose gain the photographs give.
+const AUTO_NAME: &str = "auto";
+
 impl ToneCurve {
-    /// The curve's row in the table; of a [`Table`] that of `none`, as it has no formula.
+    /// The curve's row in the table; of a [`Table`] that of `none`, as it has no formula, and of the automatic curve that
+    /// of `ase`, which is its formula on grey.
     pub fn family(self) -> &'static Family {
-        &FAMILIES[self as usize % FAMILIES.len()]
+        &FAMILIES[match self {
+            Self::Table => Self::None,
+            Self::Auto => Self::Ase,
+            family => family,
+        } as usize]
     }
 
     /// The name on the command line.
     pub fn name(self) -> &'static str {
-        if self == Self::Table { TABLE_NAME } else { self.family().name }
+        match self {
+            Self::Table => TABLE_NAME,
+            Self::Auto => AUTO_NAME,
+            family => family.family().name,
+        }
     }
 
     /// The curve's number in `include/curves.glsl`: the specialization constant `TONE_CURVE`.
@@ -80,12 +102,13 @@ impl ToneCurve {
 
     /// Whether each value of the target depends on one value of the photograph alone, by a formula.
     pub(crate) fn is_formula(self) -> bool {
-        !matches!(self, Self::Table | Self::LumPreserve | Self::PerChannel)
+        !matches!(self, Self::Table | Self::LumPreserve | Self::PerChannel | Self::Auto)
     }
 
     /// All names, for help texts and errors.
     pub fn names() -> String {
-        Self::ALL.map(Self::name).join(", ")
+        let families = Self::ALL.map(Self::name).join(", ");
+        format!("{AUTO_NAME}, {families}")
     }
 }
 
@@ -99,8 +122,10 @@ impl FromStr for ToneCurve {
     type Err = Error;
 
     fn from_str(name: &str) -> Result<Self> {
-        if name == TABLE_NAME {
-            return Ok(Self::Table);
+        match name {
+            TABLE_NAME => return Ok(Self::Table),
+            AUTO_NAME => return Ok(Self::Auto),
+            _ => {}
         }
         Family::find(name).map(|family| family.curve).ok_or_else(|| {
             Error::Usage(format!("unknown curve `{name}`; the curves are {}", Self::names()))

@@ -39,6 +39,7 @@ pub use parts::{ModelConfig, ModelName, NetworkRates, Part};
 pub use preset::Preset;
 use submission::{MOST_STEPS, Pace};
 use terms::NetworkTerms;
+pub use views::TargetExposure;
 use views::{TrainView, Views};
 
 /// The streams of random numbers that training draws from, one per purpose.
@@ -144,6 +145,7 @@ pub struct Trainer {
     gpu: Gpu,
     config: TrainConfig,
     extent: f64,
+    target_exposure: Option<TargetExposure>,
     /// Steps done.
     step: u64,
     views: Views,
@@ -207,11 +209,16 @@ impl Trainer {
         kernels: ScopedJoinHandle<'_, Result<Kernels>>,
     ) -> Result<Self> {
         let mut pseudo_gt = PseudoGt::new(gpu, &config.tone)?;
-        let views =
-            Views::upload(gpu, &mut pseudo_gt, dataset, config.schedule.resolution_levels())?;
+        let levels = config.schedule.resolution_levels();
+        let has_networks = config.model.denoiser || config.model.tonemapper;
+        let (views, target_exposure) =
+            Views::upload(gpu, &mut pseudo_gt, dataset, levels, has_networks)?;
+        if let Some(TargetExposure { scene, .. }) = &target_exposure {
+            tracing::info!("{}", scene.reason());
+        }
         let sizes = views.sizes();
         say_what_parts_see(&config.model, &sizes);
-        let starts = views.exposures(gpu, &pseudo_gt, dataset, &config)?;
+        let starts = views.exposures(&mut pseudo_gt, dataset, &config)?;
         let gaussians = match gaussians {
             Some(gaussians) if gaussians.shape == settings.shape => gaussians.clone(),
             Some(Gaussians { shape: own, .. }) => {
@@ -237,6 +244,7 @@ impl Trainer {
         let mut trainer = Self {
             gpu: gpu.clone(),
             extent: dataset.extent(),
+            target_exposure,
             step: 0,
             views,
             model: Model::upload(gpu, &gaussians)?,
@@ -258,6 +266,11 @@ impl Trainer {
     /// Steps done so far.
     pub fn steps_done(&self) -> u64 {
         self.step
+    }
+
+    /// How bright the targets are; none where the curve's constants say that.
+    pub fn target_exposure(&self) -> Option<&TargetExposure> {
+        self.target_exposure.as_ref()
     }
 
     /// The number of Gaussians.
@@ -375,7 +388,7 @@ impl Trainer {
             None => self.losses.record(pass, inputs, d_render, log)?,
         }
         if let Some(networks) = &mut self.networks {
-            networks.record(pass, inputs, &view.image, d_render, log)?;
+            networks.record(pass, inputs, view.photograph(), d_render, log)?;
         }
         self.renderer.backward(
             pass,

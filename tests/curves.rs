@@ -237,11 +237,17 @@ fn tone_mix_matches_its_reference() {
         let mut image = photograph(pixels);
         image[0] = f32::NAN;
         image[pixels - 1] = 0.0;
-        for curve in [ToneCurve::LumPreserve, ToneCurve::PerChannel] {
+        let whites = [0.2, 0.3, 0.4, 0.0, 0.0, 0.0, 0.0, 0.0];
+        let plain = ToneParameters { white: 1.0, offset: 0.0, gain: 3.0, constants: whites };
+        let automatic = ToneParameters { white: 0.07, offset: 0.075, gain: 1.0, ..plain };
+        for (curve, tone) in [
+            (ToneCurve::LumPreserve, plain),
+            (ToneCurve::PerChannel, plain),
+            (ToneCurve::Auto, automatic),
+            (ToneCurve::Auto, ToneParameters { white: 1.0 / 128.0, ..automatic }),
+        ] {
             let constants = tone_mix::Constants { tone_curve: curve.constant() };
             let params = tone_mix::Params { pixel_count: pixels as u32, view: 0 };
-            let whites = [0.2, 0.3, 0.4, 0.0, 0.0, 0.0, 0.0, 0.0];
-            let tone = ToneParameters { white: 1.0, offset: 0.0, gain: 3.0, constants: whites };
             let mut expected = vec![0.0; 3 * pixels];
             let slices =
                 tone_mix::Slices { image: &image, parameters: &[tone], target: &mut expected };
@@ -321,4 +327,42 @@ fn a_table_goes_through_its_knots_and_rises_where_they_do() {
     assert!(values.windows(2).all(|pair| pair[1] >= pair[0] - 1e-12), "it overshoots");
     assert_eq!(table.value(9.0, 0), 1.0);
     assert_eq!(table.value(f64::NAN, 0), 0.0);
+}
+
+/// Grey keeps to the curve of one value whatever lambda is, and colours keep their ratios where it is 1.
+#[test]
+fn the_automatic_curve_is_one_on_grey_and_keeps_the_ratios_of_colours() {
+    let gpu = gpu();
+    for share in [0.0, 1.0 / 3.0, 1.0] {
+        let mut constants = [0.0; 8];
+        constants[0] = share;
+        let tone = ToneParameters { white: 0.1, offset: 0.075, gain: 1.0, constants };
+        let grey: Vec<f32> = (0..600).map(|i| i as f32 / 600.0).collect();
+        let colour = [0.01, 0.02, 0.005];
+        let image: Vec<f32> =
+            colour.iter().flat_map(|&c| [grey.as_slice(), &[c]].concat()).collect();
+        let curve = tone_mix::Constants { tone_curve: ToneCurve::Auto.constant() };
+        let pipeline = gpu.pipeline::<tone_mix::Kernel>(&curve).unwrap();
+        let mut target = gpu.zeros("target", image.len()).unwrap();
+        let buffers = tone_mix::Buffers {
+            image: &gpu.buffer("image", &image).unwrap(),
+            parameters: &gpu.buffer("parameters", &[tone]).unwrap(),
+            target: &mut target,
+        };
+        let params = tone_mix::Params { pixel_count: 601, view: 0 };
+        let threads = Threads::Exactly([601, 1, 1]);
+        gpu.run("tone_mix", |pass| pass.dispatch(&pipeline, &params, buffers, threads)).unwrap();
+        let target = gpu.read(&target).unwrap();
+        for (i, &x) in grey.iter().enumerate() {
+            let exact = ToneCurve::Auto.value(f64::from(x) / 0.1, 0.075, 1.0, &[]);
+            for channel in 0..3 {
+                let found = f64::from(target[601 * channel + i]);
+                assert!((found - exact).abs() < 1e-6, "{x}: {found}, not {exact}");
+            }
+        }
+        let above_black = |channel: usize| f64::from(target[601 * channel + 600]) - 0.075;
+        let ratio = above_black(1) / above_black(0);
+        let kept = (ratio - 2.0).abs() < 1e-4;
+        assert_eq!(kept, share == 1.0, "lambda {share}: a ratio of 2 became {ratio}");
+    }
 }

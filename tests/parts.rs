@@ -9,6 +9,7 @@ use nightsplat::dataset::Dataset;
 use nightsplat::dataset::synthetic::{self, SyntheticOptions};
 use nightsplat::image::Image;
 use nightsplat::loss::Term;
+use nightsplat::tone::{ToneCurve, ToneSettings};
 use nightsplat::train::{Part, StepReport, TrainConfig};
 
 mod common;
@@ -32,7 +33,8 @@ fn make_set(folder: &Path, with_depth: bool) {
 }
 
 fn config(parts: &[Part]) -> TrainConfig {
-    let mut config = TrainConfig { steps: 40, sh_degree: 0, ..Default::default() };
+    let tone = ToneSettings::new(ToneCurve::Ap3);
+    let mut config = TrainConfig { steps: 40, sh_degree: 0, tone, ..Default::default() };
     config.schedule.densify_after = 10;
     config.schedule.densify_interval = 15;
     config.model.set_parts(parts);

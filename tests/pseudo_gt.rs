@@ -9,7 +9,7 @@ use nightsplat::kernels::{
     tone_map, tone_statistics,
 };
 use nightsplat::pseudo_gt::PseudoGt;
-use nightsplat::tone::{Statistics, ToneCurve, ToneSettings};
+use nightsplat::tone::{LuminanceHistogram, Statistics, ToneCurve, ToneSettings};
 use nightsplat::{Error, Result};
 
 #[macro_use]
@@ -62,6 +62,7 @@ fn on_device(
     let size = [image.len() as u32 / 3, 1];
     gpu.run("statistics", |pass| pseudo_gt.statistics(pass, &image, size))?;
     let measured = pseudo_gt.measured()?;
+    assert_eq!(pseudo_gt.luminance_histogram()?, LuminanceHistogram::of(&gpu.read(&image)?));
     let parameters = settings.parameters(&measured);
     let uploaded = gpu.buffer("tone parameters", &[parameters])?;
     gpu.run("target", |pass| pseudo_gt.map(pass, &image, &uploaded, 0, &mut target))?;
@@ -330,7 +331,7 @@ fn device_statistics_equal_the_host_s() {
 #[test]
 fn photographs_of_different_sizes_share_one_recording() {
     let gpu = gpu();
-    let mut pseudo_gt = PseudoGt::new(&gpu, &ToneSettings::default()).unwrap();
+    let mut pseudo_gt = PseudoGt::new(&gpu, &ToneSettings::new(ToneCurve::Ap3)).unwrap();
     let images = [(40, 30, 1), (200, 100, 2), (7, 3, 3)]
         .map(|(w, h, seed)| ([w, h], dark((w * h) as usize, seed)));
     let buffers =
@@ -366,6 +367,8 @@ fn a_photograph_in_tiles_has_the_statistics_of_the_whole() {
             let mut pseudo_gt = PseudoGt::new(&gpu, &ToneSettings::new(curve)).unwrap();
             gpu.run("tiles", |pass| pseudo_gt.statistics_of_tiles(pass, &tiles)).unwrap();
             let found = pseudo_gt.measured().unwrap();
+            let luminance = pseudo_gt.luminance_histogram().unwrap();
+            assert_eq!(luminance, LuminanceHistogram::of(&image), "tiles of {tile_pixels}");
             assert_eq!([found.p10, found.p90], [host.p10, host.p90], "tiles of {tile_pixels}");
             assert!((found.mean_luminance - host.mean_luminance).abs() <= 1e-6 * host.mean);
             let [found, expected] =
@@ -379,16 +382,16 @@ fn a_photograph_in_tiles_has_the_statistics_of_the_whole() {
 fn the_same_photograph_gives_the_same_bits() {
     let gpu = gpu();
     let image = dark(50_000, 4);
-    let first = on_device(&gpu, ToneSettings::default(), &image).unwrap();
+    let first = on_device(&gpu, ToneSettings::new(ToneCurve::Ap3), &image).unwrap();
     for _ in 0..24 {
-        assert_eq!(on_device(&gpu, ToneSettings::default(), &image).unwrap(), first);
+        assert_eq!(on_device(&gpu, ToneSettings::new(ToneCurve::Ap3), &image).unwrap(), first);
     }
 }
 
 #[test]
 fn what_cannot_be_measured_or_mapped_is_refused() {
     let gpu = gpu();
-    let mut pseudo_gt = PseudoGt::new(&gpu, &ToneSettings::default()).unwrap();
+    let mut pseudo_gt = PseudoGt::new(&gpu, &ToneSettings::new(ToneCurve::Ap3)).unwrap();
     let image = gpu.zeros("image", 36).unwrap();
     let empty = gpu.zeros("image", 0).unwrap();
     let parameters = gpu.zeros("tone parameters", 1).unwrap();
@@ -402,7 +405,7 @@ fn what_cannot_be_measured_or_mapped_is_refused() {
     refused("no pixels", &mut |pass| pseudo_gt.statistics(pass, &empty, [0, 4]));
     refused("no such view", &mut |pass| pseudo_gt.map(pass, &image, &parameters, 1, &mut short));
     refused("short target", &mut |pass| pseudo_gt.map(pass, &image, &parameters, 0, &mut short));
-    let bad = ToneSettings { theta: 0.0, ..ToneSettings::default() };
+    let bad = ToneSettings { theta: 0.0, ..ToneSettings::new(ToneCurve::Ap3) };
     assert!(matches!(PseudoGt::new(&gpu, &bad), Err(Error::Usage(_))));
 }
 
@@ -424,7 +427,7 @@ fn a_photograph_maps_on_the_device_as_on_the_host() {
 #[test]
 fn a_fixed_offset_is_that_of_every_photograph() {
     let gpu = gpu();
-    let settings = ToneSettings { alpha: 0.07, beta: 0.0, ..ToneSettings::default() };
+    let settings = ToneSettings { alpha: 0.07, beta: 0.0, ..ToneSettings::new(ToneCurve::Ap3) };
     for image in [dark(400, 5), vec![0.0; 300], vec![0.2; 300]] {
         let expected = settings.parameters(&Statistics::of(&image));
         assert_eq!(expected.offset, 0.07);

@@ -234,6 +234,7 @@ mod colors {
             split,
             camera: camera(position),
             image: None,
+            original: None,
             reference: None,
             depth: None,
         }

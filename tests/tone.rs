@@ -50,7 +50,7 @@ fn sorted_quantile(values: &[f32], q: f64) -> f64 {
 
 #[test]
 fn the_offset_has_the_paper_s_values() {
-    let settings = ToneSettings::default();
+    let settings = ToneSettings::new(ToneCurve::Ap3);
     for (ratio, offset) in
         [(0.37, 0.0378), (0.26, 0.0565), (0.22, 0.0645), (0.17, 0.0753), (0.12, 0.0872)]
     {
@@ -157,7 +157,7 @@ fn settings_survive_toml() {
 
 #[test]
 fn settings_that_leave_a_curve_undefined_are_refused() {
-    let good = ToneSettings::default();
+    let good = ToneSettings::new(ToneCurve::Ap3);
     good.check().unwrap();
     for bad in [
         ToneSettings { gain_c: -0.1, ..good.clone() },
@@ -270,7 +270,7 @@ fn a_photograph_has_the_statistics_that_others_find() {
     for (name, expected) in KNOWN_STATISTICS {
         let statistics = Statistics::of(&load(&fixture("lom/low").join(name)));
         let [p10, p90] = statistics.percentiles();
-        let delta0 = ToneSettings::default().offset(statistics.printed_ratio());
+        let delta0 = ToneSettings::new(ToneCurve::Ap3).offset(statistics.printed_ratio());
         let means = [statistics.mean_luminance, statistics.mean].map(f64::from);
         for (found, expected) in [p10, p90, delta0].into_iter().chain(means).zip(expected) {
             assert!((found - expected).abs() < 1e-6, "{name}: {found}, not {expected}");
@@ -287,7 +287,7 @@ fn the_training_photographs_have_the_paper_s_statistics() {
         ("sofa", [0.1251, 0.258, 0.0569, 0.0704]),
     ] {
         let names = names(&lom.join(scene), "train");
-        let settings = ToneSettings::default();
+        let settings = ToneSettings::new(ToneCurve::Ap3);
         let mut mean = [0.0; 4];
         for name in &names {
             let statistics = Statistics::of(&load(&lom.join(scene).join("low").join(name)));

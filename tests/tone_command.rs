@@ -9,7 +9,7 @@ use nightsplat::cli::ImageFormat;
 use nightsplat::cli::in_options;
 use nightsplat::cli::tone::{ToneArgs, ToneReport, apply};
 use nightsplat::image::Image;
-use nightsplat::tone::{Statistics, ToneCurve, ToneSettings};
+use nightsplat::tone::{GainChoice, Statistics, ToneCurve, ToneSettings};
 
 mod common;
 
@@ -19,6 +19,8 @@ fn args(input: &Path, out: PathBuf) -> ToneArgs {
         curve: ToneCurve::Ap3.into(),
         out: Some(out),
         gain: None,
+        brightness: None,
+        colour: None,
         theta: None,
         scene_statistics: false,
         reference: None,
@@ -49,7 +51,7 @@ fn a_folder_is_mapped_by_name_and_what_cannot_be_read_is_left_out() {
         let out = dir.path().join(curve.name());
         let args = ToneArgs {
             curve: curve.into(),
-            gain: Some(2.0),
+            gain: Some(GainChoice::C(2.0)),
             theta: Some(0.4),
             ..args(&photographs, out.clone())
         };
@@ -61,7 +63,7 @@ fn a_folder_is_mapped_by_name_and_what_cannot_be_read_is_left_out() {
             let statistics = Statistics::of(&image.data);
             let before = views[name].before;
             assert_eq!([before.p10, before.p90], statistics.percentiles());
-            let paper = ToneSettings::default().offset(statistics.printed_ratio());
+            let paper = ToneSettings::new(ToneCurve::Ap3).offset(statistics.printed_ratio());
             assert!((views[name].delta0 - paper).abs() < 1e-6);
             let parameters = settings.parameters(&statistics);
             let mapped = Image::load(out.join(name).with_extension("png")).unwrap();
@@ -138,7 +140,11 @@ fn bad_input_is_named_in_one_line() {
     assert_eq!(std::fs::read(path("good.png")).unwrap(), before);
 
     fails(args(&path("good.png"), path("broken.png")), "cannot be made", 1);
-    fails(ToneArgs { gain: Some(-1.0), ..args(&path("good.png"), out.clone()) }, "--gain", 2);
+    fails(
+        ToneArgs { gain: Some(GainChoice::C(-1.0)), ..args(&path("good.png"), out.clone()) },
+        "--gain",
+        2,
+    );
     fails(ToneArgs { theta: Some(f64::NAN), ..args(&path("good.png"), out) }, "--theta", 2);
 }
 
@@ -159,7 +165,7 @@ fn a_photograph_that_exceeds_a_binding_is_mapped_in_tiles() {
     let view = apply(&args).unwrap().views["vast"];
     let statistics = Statistics::of(&image.data);
     assert_eq!([view.before.p10, view.before.p90], statistics.percentiles());
-    let parameters = ToneSettings::default().parameters(&statistics);
+    let parameters = ToneSettings::new(ToneCurve::Ap3).parameters(&statistics);
     let mapped = Image::load(dir.path().join("out/vast.png")).unwrap();
     for (&x, y) in image.data.iter().zip(&mapped.data).step_by(997) {
         assert!((ToneCurve::Ap3.apply(x, &parameters) - y).abs() < 1e-4, "{x}: {y}");
@@ -351,4 +357,86 @@ fn an_unknown_curve_is_misuse_and_lists_the_curves() {
     assert_eq!(error.exit_code(), 2);
     assert!(error.to_string().contains("linear, ase, ap3"), "{error}");
     assert!(matches!("gama".parse::<ToneCurve>(), Err(Error::Usage(_))));
+}
+
+/// What the automatic curve makes of a folder.
+fn automatic(input: &Path) -> ToneArgs {
+    ToneArgs { curve: ToneCurve::Auto.into(), out: None, ..args(input, PathBuf::new()) }
+}
+
+#[test]
+fn the_automatic_curve_says_how_bright_and_why_and_lends_its_brightness() {
+    let dir = tempfile::tempdir().unwrap();
+    let [low, _] = pairs(dir.path());
+    let output = apply(&automatic(&low)).unwrap();
+    let exposure = output.exposure.unwrap();
+    assert!(exposure.reason().contains("gain"), "{}", exposure.reason());
+    assert_eq!(output.curve.colour, 0.0, "single pictures keep their curve");
+    let means: Vec<f64> = output.views.values().map(|view| view.after.mean_luminance).collect();
+    assert!(means.iter().all(|mean| (0.43..0.55).contains(mean)), "{means:?}");
+    let json = serde_json::to_value(&apply(&automatic(&low)).unwrap()).unwrap();
+    for key in ["gain", "target", "mean", "lift", "weight", "spread", "share", "black"] {
+        assert!(json["exposure"][key].is_number(), "{key}");
+    }
+    assert!(json["views"]["a"]["gain"].is_number() && json["exposure"]["reason"].is_string());
+    // Every curve with a gain takes the same brightness, or another that is asked for.
+    for curve in [ToneCurve::Ase, ToneCurve::Ap3, ToneCurve::Linear, ToneCurve::Gamma] {
+        let lent =
+            ToneArgs { curve: curve.into(), gain: Some(GainChoice::Auto), ..automatic(&low) };
+        let views = apply(&lent).unwrap().views;
+        for (view, mean) in views.values().zip(&means) {
+            let found = view.after.mean_luminance;
+            assert!((found - mean).abs() < 0.006, "{curve}: {found}, not {mean}");
+        }
+        // A view has a quarter of the scene's gain.
+        let brighter = ToneArgs { brightness: Some(0.6), ..lent };
+        for view in apply(&brighter).unwrap().views.values() {
+            let found = view.after.mean_luminance;
+            assert!((found - 0.6).abs() < 0.03, "{curve}: {found}");
+        }
+    }
+}
+
+#[test]
+fn a_well_lit_folder_stays_as_it_is_and_a_black_one_is_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let folder = dir.path().join("bright");
+    std::fs::create_dir(&folder).unwrap();
+    let bright = Image::from_fn(40, 30, |x, y| [x, y, x + y].map(|v| 0.3 + v as f32 / 120.0));
+    bright.save_png8(folder.join("a.png")).unwrap();
+    let out = dir.path().join("out");
+    let args = ToneArgs { out: Some(out.clone()), ..automatic(&folder) };
+    assert!(apply(&args).unwrap().exposure.unwrap().reason().contains("well lit"));
+    let stored = Image::load(folder.join("a.png")).unwrap();
+    assert_eq!(Image::load(out.join("a.png")).unwrap(), stored);
+
+    Image::filled(40, 30, [0.004; 3]).save_png8(folder.join("a.png")).unwrap();
+    let error = apply(&args).unwrap_err();
+    assert!(error.to_string().contains("as good as black"), "{error}");
+    assert_eq!(error.exit_code(), 1);
+    let refused = |args: ToneArgs, part: &str| {
+        let message = in_options(&apply(&args).unwrap_err().to_string());
+        assert!(message.contains(part) && !message.contains('\n'), "{message}");
+    };
+    let auto = Some(GainChoice::Auto);
+    let of = |curve: ToneCurve| ToneArgs { curve: curve.into(), ..automatic(&folder) };
+    refused(ToneArgs { gain: Some(GainChoice::C(2.0)), ..of(ToneCurve::Auto) }, "--brightness");
+    refused(ToneArgs { brightness: Some(0.5), ..of(ToneCurve::Ap3) }, "--brightness");
+    refused(ToneArgs { brightness: Some(2.0), ..of(ToneCurve::Auto) }, "--brightness");
+    refused(ToneArgs { colour: Some(-0.5), ..of(ToneCurve::Auto) }, "--colour");
+    refused(ToneArgs { gain: auto, ..of(ToneCurve::LumPreserve) }, "no gain");
+}
+
+/// PSNR of the curve alone on the test views; ASE and AP3 with constants have 23.4 and 23.0 dB on the mean.
+#[test]
+fn the_automatic_curve_scores_as_known() {
+    let Some(lom) = common::shared("data/lom") else { return };
+    let mut mean = 0.0;
+    for (scene, known) in [("chair", 25.82), ("sofa", 29.79), ("shrub", 18.86)] {
+        let output = apply(&automatic(&lom.join(scene))).unwrap();
+        let psnr = output.scene.scores.unwrap().psnr;
+        assert!((psnr - known).abs() < 0.05, "{scene}: {psnr}");
+        mean += psnr / 3.0;
+    }
+    assert!(mean >= 24.7, "{mean}");
 }

@@ -14,6 +14,7 @@ use nightsplat::gpu::{DeviceChoice, Gpu};
 use nightsplat::image::Image;
 use nightsplat::metrics::Scores;
 use nightsplat::scene::{Gaussians, Shape};
+use nightsplat::tone::{ToneCurve, ToneSettings};
 use nightsplat::train::{Background, StepReport, TrainConfig, Trainer};
 
 mod common;
@@ -26,7 +27,8 @@ fn dataset() -> Dataset {
 
 /// Density control acts twice within sixty steps.
 fn config() -> TrainConfig {
-    let mut config = TrainConfig { steps: 60, ..Default::default() };
+    let tone = ToneSettings::new(ToneCurve::Ap3);
+    let mut config = TrainConfig { steps: 60, tone, ..Default::default() };
     config.schedule.densify_after = 10;
     config.schedule.densify_interval = 20;
     config.schedule.sh_degree_interval = 15;

@@ -29,15 +29,19 @@ int quanta(float x) { return int(roundEven(clamp(x, -BOUND, BOUND) * QUANTA)); }
 void main() {
     uint number = gl_WorkGroupID.x;
     if (number >= EXPOSURE_WIDTH || status[0] != 0) return;
-    // Integers wrap: the sum is right wherever it fits in itself, whatever the parts of it are.
-    int sum = 0;
-    for (uint view = gl_SubgroupInvocationID; view < view_count; view += SUBGROUP_SIZE)
-        sum += quanta(exposures[view * EXPOSURE_WIDTH + number]);
+    // n = 256 h + l, 0 <= l < 256: neither sum passes 32 bits below 32768 views.
+    ivec2 sum = ivec2(0);
+    for (uint view = gl_SubgroupInvocationID; view < view_count; view += SUBGROUP_SIZE) {
+        int n = quanta(exposures[view * EXPOSURE_WIDTH + number]);
+        sum += ivec2(n >> 8, n & 255);
+    }
     sum = subgroupAdd(sum);
     int count = int(view_count);
-    // GLSL leaves the remainder of a negative number open.
-    int mean = sum >= 0 ? sum / count : -((-sum + count - 1) / count);
-    uint rest = uint(sum - mean * count);
+    // Down, not towards 0: what is left is not negative.
+    int high = sum.x >= 0 ? sum.x / count : -((count - 1 - sum.x) / count);
+    int left = 256 * (sum.x - high * count) + sum.y;
+    int mean = 256 * high + left / count;
+    uint rest = uint(left % count);
     for (uint view = gl_SubgroupInvocationID; view < view_count; view += SUBGROUP_SIZE) {
         uint at = view * EXPOSURE_WIDTH + number;
         int centred = quanta(exposures[at]) - mean - (view < rest ? 1 : 0);

@@ -39,6 +39,7 @@ const uint CURVE_P80                 = 34;
 const uint CURVE_LUM_PRESERVE        = 35;
 const uint CURVE_PER_CHANNEL         = 36;
 const uint CURVE_TABLE               = 37;
+const uint CURVE_AUTO                = 38;
 
 const uint MAX_CONSTANTS = 8;  // of a family
 
@@ -214,6 +215,7 @@ float richards_standard(float t, float c[MAX_CONSTANTS]) {
 float curve_shape(uint curve, float t, float c[MAX_CONSTANTS]) {
     switch (curve) {
     case CURVE_ASE:
+    case CURVE_AUTO:
     case CURVE_ASE_FLOOR:
     case CURVE_P80:                 return one_minus_exp(t);
     case CURVE_AP3:                 return ap3(t);

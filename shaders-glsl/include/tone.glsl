@@ -26,6 +26,7 @@ float tone_curve(float x, ToneParameters tone) {
         y = t;
         break;
     case CURVE_ASE:
+    case CURVE_AUTO:
         y = tone.offset + (1.0 - tone.offset) * one_minus_exp(tone.gain * t);
         break;
     case CURVE_AP3:

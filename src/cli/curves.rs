@@ -36,6 +36,10 @@ pub struct CurvesArgs {
     pub dataset: Option<PathBuf>,
 }
 
+/// What there is to say of the automatic curve.
+const AUTO: &str = "0.075 + 0.925 ((1 - lambda) s(x) + lambda x s(Y) / Y), s(x) = 1 - exp(-k x)
+    monotone, bounded; k from the luminance of all photographs, see the guide; drawn over t = k x";
+
 /// A curve with what it is called here.
 struct Curve {
     name: String,
@@ -76,8 +80,13 @@ pub fn text(args: &CurvesArgs) -> Result<String> {
     Ok(text)
 }
 
+/// The automatic curve, then the table.
+fn every_curve() -> impl Iterator<Item = ToneCurve> {
+    std::iter::once(ToneCurve::Auto).chain(ToneCurve::ALL)
+}
+
 fn chosen(choices: &[CurveChoice]) -> Result<Vec<Curve>> {
-    let all: Vec<CurveChoice> = ToneCurve::ALL.map(CurveChoice::Named).to_vec();
+    let all: Vec<CurveChoice> = every_curve().map(CurveChoice::Named).collect();
     let choices = if choices.is_empty() { &all } else { choices };
     let curve =
         |choice: &CurveChoice| Ok(Curve { name: choice.to_string(), settings: choice.settings()? });
@@ -104,6 +113,10 @@ fn listing(curves: &[Curve]) -> String {
             text += &format!("{name}\n    a table of values, monotone cubics between them\n");
             continue;
         }
+        if settings.curve == ToneCurve::Auto {
+            text += &format!("{name}\n    {AUTO}\n");
+            continue;
+        }
         let also =
             if aliases.is_empty() { String::new() } else { format!(" ({})", aliases.join(", ")) };
         let rises = if *monotone { "monotone" } else { "not monotone" };
@@ -117,7 +130,7 @@ fn listing(curves: &[Curve]) -> String {
         }
         text += &format!("    {rises}, {clips}; {source}\n");
     }
-    if curves.len() == FAMILIES.len() {
+    if curves.len() > FAMILIES.len() {
         text += "\nt = x / p90, Y the mean luminance, delta0 = alpha (1 - p10 / p90)^beta.\n\
                  Every curve is clamped to [0, 1].\n";
     }

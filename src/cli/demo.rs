@@ -6,7 +6,6 @@ use std::path::{Path, PathBuf};
 use anyhow::Result;
 
 use super::comparison::{self, Run};
-use super::tone::Mapper;
 use super::{table, train};
 use crate::Error;
 use crate::dataset::Dataset;
@@ -15,9 +14,10 @@ use crate::eval::{self, ViewScore};
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::optimizer::Schedule;
 use crate::output::write_whole;
+use crate::pseudo_gt::PseudoGt;
 use crate::report::{Distribution, Report, distributions, plot};
 use crate::run::HeldRun;
-use crate::tone::{ToneCurve, ToneSettings};
+use crate::tone::{Scene, ToneCurve, ToneSettings};
 use crate::train::TrainConfig;
 
 /// Make a small dark multi-view set, train on it with three tone curves, and show the results side by side.
@@ -140,11 +140,13 @@ fn luminances(gpu: &Gpu, dataset: &Dataset) -> crate::Result<String> {
     }
     let mut drawn = vec![photographs];
     for curve in CURVES {
-        let mut mapper = Mapper::new(gpu, &ToneSettings::new(curve))?;
+        let settings = ToneSettings::new(curve);
+        let mut pseudo_gt = PseudoGt::new(gpu, &settings)?;
         let mut targets = Distribution::new(title(curve));
         for (photograph, _) in &pairs {
-            mapper.statistics(&photograph.data)?;
-            targets.add(&mapper.map(photograph)?.data);
+            let measured = pseudo_gt.measure(&photograph.data)?;
+            let lift = settings.lift(&Scene::default(), &measured);
+            targets.add(&pseudo_gt.lifted(photograph, &lift)?.data);
         }
         drawn.push(targets);
     }

@@ -1,7 +1,7 @@
 //! `nightsplat eval`: score a finished run on its test views.
 
 use std::io::Write;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::Result;
 
@@ -10,6 +10,7 @@ use super::{progress_bar, table};
 use crate::eval::{self, ViewScore};
 use crate::gpu::DeviceChoice;
 use crate::metrics::Scores;
+use crate::run;
 use crate::train::Learning;
 
 /// Score a finished run on the test views of its dataset.
@@ -53,8 +54,12 @@ pub fn run(args: &EvalArgs) -> Result<()> {
     }
     let mut out = std::io::stdout().lock();
     if args.json {
-        let seconds = trained_seconds(&args.run);
+        let recorded = run::load_metrics(&args.run);
+        let seconds = recorded["seconds"].as_f64();
         let mut metrics = eval::metrics(&scored, seconds, gaussian_count, config.steps);
+        if let Some(exposure) = recorded.get(run::TARGET_EXPOSURE) {
+            metrics[run::TARGET_EXPOSURE] = exposure.clone();
+        }
         if config.exposure.learn == Learning::On {
             eval::add_exposure(&mut metrics, &scored)?;
         }
@@ -63,12 +68,6 @@ pub fn run(args: &EvalArgs) -> Result<()> {
         write!(out, "{}", score_table(&scored))?;
     }
     Ok(())
-}
-
-/// What training took, as the run's metrics.json has it.
-fn trained_seconds(run: &Path) -> Option<f64> {
-    let text = std::fs::read_to_string(run.join("metrics.json")).ok()?;
-    serde_json::from_str::<serde_json::Value>(&text).ok()?["seconds"].as_f64()
 }
 
 fn score_table(scored: &[ViewScore]) -> String {

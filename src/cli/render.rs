@@ -1,16 +1,19 @@
 //! `nightsplat render`: pictures of a finished run from the cameras of its dataset.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::Result;
 
 use super::finished_run::FinishedRun;
 use super::{ImageFormat, progress_bar};
-use crate::Error;
 use crate::dataset::{Dataset, Split, View};
 use crate::eval::Layer;
+use crate::exposure::Affine;
 use crate::gpu::DeviceChoice;
 use crate::image::Image;
+use crate::tone::exposed_anew;
+use crate::{Error, run};
 
 /// Render a finished run from the cameras of its dataset, whether they took an image or not.
 #[derive(Clone, Debug, clap::Args)]
@@ -27,6 +30,10 @@ pub struct RenderArgs {
     /// denoiser, else rgb]. A PNG of depth stretches from the least to the largest value of the view
     #[arg(long)]
     pub layer: Option<Layer>,
+    /// Show every training view as bright as its target, where the photographs differ in exposure; without it, and where a
+    /// view was not trained on, the model's own exposure
+    #[arg(long)]
+    pub view_exposure: bool,
     /// The files to write
     #[arg(long, value_enum, default_value_t)]
     pub format: ImageFormat,
@@ -61,7 +68,8 @@ impl SplitChoice {
 /// # Errors
 /// The folder holds no finished run, its dataset is gone or has no such view, or a file cannot be written.
 pub fn run(args: &RenderArgs) -> Result<()> {
-    let RenderArgs { run, split, out, layer, format, device } = args;
+    let RenderArgs { run, split, out, layer, view_exposure, format, device } = args;
+    let exposures = if *view_exposure { Some(ViewExposures::of(run)?) } else { None };
     let FinishedRun { dataset, mut player, .. } = FinishedRun::open(run, device.as_ref())?;
     let views: Vec<&View> = dataset.views.iter().filter(|view| split.includes(view)).collect();
     if views.is_empty() {
@@ -73,9 +81,13 @@ pub fn run(args: &RenderArgs) -> Result<()> {
     for view in &views {
         bar.set_message(view.name.clone());
         let path = out.join(format!("{}.{}", view.name, format.extension()));
+        let color = |image: Image| match &exposures {
+            Some(exposures) => format.save(&exposures.applied(view, image), &path),
+            None => format.save(&image, &path),
+        };
         match layer {
-            None => format.save(player.render(view)?.output(), &path)?,
-            Some(layer) if layer.is_color() => format.save(&player.layer(view, *layer)?, &path)?,
+            None => color(player.render(view)?.output().clone())?,
+            Some(layer) if layer.is_color() => color(player.layer(view, *layer)?)?,
             Some(layer) => save_numbers(player.layer(view, *layer)?, *layer, *format, &path)?,
         }
         bar.inc(1);
@@ -83,6 +95,52 @@ pub fn run(args: &RenderArgs) -> Result<()> {
     bar.finish_and_clear();
     tracing::info!("{} pictures are in {}", views.len(), out.display());
     Ok(())
+}
+
+/// The exposures of a run's training views beside the one of its model.
+enum ViewExposures {
+    /// Gain and bias, learned.
+    Learned(BTreeMap<String, Affine>),
+    /// Of the targets.
+    OfTargets(serde_json::Value),
+}
+
+impl ViewExposures {
+    fn of(run: &Path) -> crate::Result<Self> {
+        let learned = run::load_exposures(run)?;
+        if !learned.is_empty() {
+            return Ok(Self::Learned(learned));
+        }
+        let exposure = run::load_metrics(run)[run::TARGET_EXPOSURE].take();
+        if exposure["model_gain"].is_number() {
+            return Ok(Self::OfTargets(exposure));
+        }
+        let problem = "has targets of no exposure of their own: its curve has a gain by its constants; leave out --view-exposure";
+        Err(Error::input(run, problem))
+    }
+
+    /// The model's picture of a view at the exposure of the view's target.
+    fn applied(&self, view: &View, mut image: Image) -> Image {
+        let number = |value: &serde_json::Value| value.as_f64();
+        let exposure = match self {
+            Self::Learned(exposures) => {
+                let own = exposures.get(&view.name);
+                return own.map_or(image.clone(), |own| own.applied(&image));
+            }
+            Self::OfTargets(exposure) => exposure,
+        };
+        let gains = number(&exposure["model_gain"]).zip(number(&exposure["gains"][&view.name]));
+        let Some((from, to)) = gains else { return image };
+        let knots = exposed_anew([from, to], number(&exposure["scene"]["weight"]).unwrap_or(1.0));
+        for x in &mut image.data {
+            let inside = x.clamp(knots[0][0], knots[knots.len() - 1][0]);
+            let above = knots.partition_point(|knot| knot[0] <= inside).clamp(1, knots.len() - 1);
+            let [[x0, y0], [x1, y1]] = [knots[above - 1], knots[above]];
+            let y = y0 + (inside - x0) / (x1 - x0).max(f32::MIN_POSITIVE) * (y1 - y0);
+            *x = y + (*x - inside);
+        }
+        image
+    }
 }
 
 /// Numbers that are no colour: an EXR file holds them as they are.

@@ -1,6 +1,5 @@
 //! `nightsplat tone`: measure photographs and apply a tone curve to them.
 
-mod mapper;
 mod page;
 mod photographs;
 
@@ -10,16 +9,18 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
-pub(super) use self::mapper::Mapper;
 use self::page::Page;
 use self::photographs::{Listed, listed};
 use super::{ImageFormat, progress_bar, table};
-use crate::dataset::Split;
+use crate::dataset::{Dataset, Split};
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::image::Image;
 use crate::metrics::Scores;
+use crate::pseudo_gt::PseudoGt;
 use crate::report::Distribution;
-use crate::tone::{CurveChoice, Statistics, ToneSettings};
+use crate::tone::{
+    CurveChoice, Exposure, GainChoice, Scene, Statistics, ToneCurve, ToneSettings, all_black,
+};
 use crate::{Error, Result};
 
 /// Apply a tone curve to a photograph, a folder of them or a dataset, and tell what that does.
@@ -34,9 +35,15 @@ pub struct ToneArgs {
     /// The folder to write to, names are kept; made if it does not exist. Without it nothing is written
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
-    /// c: how much a brighter photograph raises the gain [default: {tone.gain_c of ase} for ase, {tone.gain_c of ap3} for ap3, else {tone.gain_c of linear}]
-    #[arg(long, value_name = "C")]
-    pub gain: Option<f64>,
+    /// c: how much a brighter photograph raises the gain, or auto: the gain that the photographs ask for, as the curve auto has it [default: {tone.gain_c of ase} for ase, {tone.gain_c of ap3} for ap3, else {tone.gain_c of linear}]
+    #[arg(long, value_name = "C|auto")]
+    pub gain: Option<GainChoice>,
+    /// The mean luminance of the results, 0.1 to 0.9, where the gain is automatic [default: found between 0.44 and 0.54]
+    #[arg(long, value_name = "T")]
+    pub brightness: Option<f64>,
+    /// lambda: how much of the curve auto keeps the ratios of the channels, 0 to 1 [default: a third for a dataset, else none]
+    #[arg(long, value_name = "L")]
+    pub colour: Option<f64>,
     /// The mean that linear scaling aims at [default: {tone.theta}]
     #[arg(long, value_name = "T")]
     pub theta: Option<f64>,
@@ -94,6 +101,9 @@ pub struct ToneReport {
     pub unusable_pixels: usize,
     /// Of the result.
     pub after: Measures,
+    /// k of soft(x; k), whose brightness the result has, where the photographs give it; of a scene that of all together.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub gain: Option<f64>,
     /// The result against the reference image.
     #[serde(flatten)]
     pub scores: Option<Scores>,
@@ -104,6 +114,9 @@ pub struct ToneReport {
 pub struct ToneOutput {
     /// The curve.
     pub curve: ToneSettings,
+    /// How bright the results are to be and why, where the photographs give it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub exposure: Option<Exposure>,
     /// Means: of measures over the training views, of scores over the test views; over all where nothing says which.
     pub scene: ToneReport,
     /// By name.
@@ -181,7 +194,8 @@ fn text_table(output: &ToneOutput) -> String {
             score(|scores| format!("{:.3}", scores.ssim)),
         ]);
     }
-    table::aligned(&rows)
+    let reason = output.exposure.as_ref().map(|exposure| format!("{}\n", exposure.reason()));
+    reason.unwrap_or_default() + &table::aligned(&rows)
 }
 
 /// Maps every photograph and writes it to `args.out` under its own name.
@@ -200,22 +214,15 @@ pub fn apply(args: &ToneArgs) -> Result<ToneOutput> {
             .map_err(|error| Error::output(out, format!("cannot be made: {error}")))?;
     }
     let gpu = Gpu::new(&args.device.clone().unwrap_or_default())?;
-    let mut mapper = Mapper::new(&gpu, &settings)?;
+    let mut set = CurveOnSet::new(&gpu, settings.clone(), &photographs, &args.input)?;
     let mut page = args.report.as_ref().map(|_| Page::new(&gpu, args, &photographs)).transpose()?;
-    if settings.scene_statistics {
-        let scene = scene_statistics(&photographs)?;
-        mapper.set_scene(&scene);
-        if let Some(page) = &mut page {
-            page.set_scene(&scene);
-        }
-    }
 
     let progress = progress_bar(photographs.len());
     let mut views = vec![];
     let mut unusable = None;
     for photograph in &photographs {
         progress.set_message(photograph.name.clone());
-        match mapped(&mut mapper, photograph) {
+        match mapped(&mut set, photograph) {
             Ok(mapped) => {
                 if let Some(target) = &photograph.target {
                     args.format.save(&mapped.image, target)?;
@@ -235,12 +242,14 @@ pub fn apply(args: &ToneArgs) -> Result<ToneOutput> {
         progress.inc(1);
     }
     progress.finish_and_clear();
-    let Some(scene) = scene(&views) else {
+    let exposure = set.scene.exposure;
+    let Some(mut scene) = scene(&views) else {
         let nothing = || Error::input(&args.input, "holds no photograph");
         return Err(unusable.unwrap_or_else(nothing));
     };
     let views = views.into_iter().map(|(listed, report)| (listed.name.clone(), report)).collect();
-    let output = ToneOutput { curve: settings, scene, views };
+    scene.gain = exposure.as_ref().map(|exposure| exposure.gain);
+    let output = ToneOutput { curve: settings, exposure, scene, views };
     if let (Some(page), Some(path)) = (page, &args.report) {
         page.write(path, &output)?;
     }
@@ -250,11 +259,75 @@ pub fn apply(args: &ToneArgs) -> Result<ToneOutput> {
 /// The settings of a curve under the options of the command line.
 fn settings(args: &ToneArgs, curve: &CurveChoice) -> Result<ToneSettings> {
     let mut settings = curve.settings()?;
+    if *curve == ToneCurve::Auto.into() && !Dataset::is_at(&args.input) {
+        // The references of single pictures are paler than those of scenes.
+        settings.colour = 0.0;
+    }
     settings.theta = args.theta.unwrap_or(settings.theta);
-    settings.gain_c = args.gain.unwrap_or(settings.gain_c);
+    if let Some(gain) = args.gain {
+        settings = settings.with_gain(gain);
+    }
+    settings.brightness = args.brightness.or(settings.brightness);
+    settings.colour = args.colour.unwrap_or(settings.colour);
     settings.scene_statistics |= args.scene_statistics;
     settings.check()?;
     Ok(settings)
+}
+
+/// A curve, and what the photographs of a set have in common for it.
+struct CurveOnSet {
+    pseudo_gt: PseudoGt,
+    scene: Scene,
+}
+
+impl CurveOnSet {
+    /// Measures the training photographs where the curve of one depends on the others.
+    fn new(
+        gpu: &Gpu,
+        settings: ToneSettings,
+        photographs: &[Listed],
+        input: &Path,
+    ) -> Result<Self> {
+        let mut pseudo_gt = PseudoGt::new(gpu, &settings)?;
+        let mut measured = vec![];
+        if settings.scene_statistics || settings.takes_exposure() {
+            for listed in photographs.iter().filter(|listed| listed.split != Some(Split::Test)) {
+                // What cannot be used is named where it would be mapped.
+                let Ok((photograph, gaps)) = loaded(listed) else { continue };
+                measured.push(pseudo_gt.measure(&without(&photograph, &gaps))?);
+            }
+            if measured.is_empty() && settings.scene_statistics {
+                let problem = "--scene-statistics needs training photographs; there are none";
+                return Err(Error::Usage(problem.to_owned()));
+            }
+        }
+        let scene = match settings.scene(&measured) {
+            Some(scene) => scene,
+            None if measured.is_empty() => Scene::default(),
+            None => return Err(all_black(input)),
+        };
+        Ok(Self { pseudo_gt, scene })
+    }
+
+    /// What was measured of a photograph, what the curve makes of it, and at which gain.
+    fn result(
+        &mut self,
+        photograph: &Image,
+        gaps: &[usize],
+    ) -> Result<(Statistics, Image, Option<f64>)> {
+        let measured = self.pseudo_gt.measure(&without(photograph, gaps))?;
+        let lift = self.pseudo_gt.settings().lift(&self.scene, &measured);
+        Ok((measured.statistics, self.pseudo_gt.lifted(photograph, &lift)?, lift.gain))
+    }
+}
+
+/// A photograph with those of its pixels that are no numbers.
+fn loaded(listed: &Listed) -> Result<(Image, Vec<usize>)> {
+    let (photograph, gaps) = Image::load_with_gaps(&listed.input)?;
+    if gaps.len() == photograph.pixel_count() {
+        return Err(Error::input(&listed.input, "has no pixel that is a number; export it anew"));
+    }
+    Ok((photograph, gaps))
 }
 
 /// A photograph, what was measured of it, and what the curve made of it.
@@ -263,23 +336,20 @@ struct Mapped {
     gaps: Vec<usize>,
     statistics: Statistics,
     image: Image,
+    gain: Option<f64>,
     reference: Option<Image>,
 }
 
-fn mapped(mapper: &mut Mapper, listed: &Listed) -> Result<Mapped> {
-    let (photograph, gaps) = Image::load_with_gaps(&listed.input)?;
-    if gaps.len() == photograph.pixel_count() {
-        return Err(Error::input(&listed.input, "has no pixel that is a number; export it anew"));
-    }
+fn mapped(set: &mut CurveOnSet, listed: &Listed) -> Result<Mapped> {
+    let (photograph, gaps) = loaded(listed)?;
     let reference = listed.reference.as_ref().map(Image::load).transpose()?;
-    let statistics = mapper.statistics(&without(&photograph, &gaps))?;
-    let image = mapper.map(&photograph)?;
-    Ok(Mapped { photograph, gaps, statistics, image, reference })
+    let (statistics, image, gain) = set.result(&photograph, &gaps)?;
+    Ok(Mapped { photograph, gaps, statistics, image, gain, reference })
 }
 
 impl Mapped {
     fn report(&self, settings: &ToneSettings, listed: &Listed) -> Result<ToneReport> {
-        let Self { photograph, gaps, statistics, image, reference } = self;
+        let Self { photograph, gaps, statistics, image, gain, reference } = self;
         let (usable, result) = (without(photograph, gaps), without(image, gaps));
         let scores = reference.as_ref().map(|reference| {
             let size = |image: &Image| format!("{}x{}", image.width, image.height);
@@ -295,14 +365,15 @@ impl Mapped {
             }
             Scores::of(image, reference)
         });
-        let alpha =
-            if settings.alpha > 0.0 { settings.alpha } else { ToneSettings::default().alpha };
+        let paper = ToneSettings::new(ToneCurve::Ap3);
+        let alpha = if settings.alpha > 0.0 { settings.alpha } else { paper.alpha };
         let black_level = ToneSettings { alpha, ..settings.clone() };
         Ok(ToneReport {
             before: Measures::of(&usable, statistics),
             delta0: black_level.offset(statistics.printed_ratio()),
             unusable_pixels: gaps.len(),
             after: Measures::of(&result, &Statistics::of(&result)),
+            gain: *gain,
             scores: scores.transpose()?,
         })
     }
@@ -316,18 +387,6 @@ fn without<'a>(image: &'a Image, gaps: &[usize]) -> std::borrow::Cow<'a, [f32]> 
     let pixels = image.pixel_count();
     let is_usable = |index: &usize| gaps.binary_search(&(index % pixels)).is_err();
     (0..image.data.len()).filter(is_usable).map(|index| image.data[index]).collect()
-}
-
-/// The means over the training photographs.
-fn scene_statistics(photographs: &[Listed]) -> Result<Statistics> {
-    let mut statistics = vec![];
-    for listed in photographs.iter().filter(|listed| listed.split != Some(Split::Test)) {
-        let (image, gaps) = Image::load_with_gaps(&listed.input)?;
-        statistics.push(Statistics::of(&without(&image, &gaps)));
-    }
-    Statistics::mean_of(&statistics).ok_or_else(|| {
-        Error::Usage("--scene-statistics needs training photographs; there are none".to_owned())
-    })
 }
 
 /// The means over the views; none of nothing.
@@ -351,6 +410,7 @@ fn scene(views: &[(&Listed, ToneReport)]) -> Option<ToneReport> {
         delta0: training.iter().map(|report| report.delta0).sum::<f64>() / training.len() as f64,
         unusable_pixels: views.iter().map(|(_, report)| report.unusable_pixels).sum(),
         after: measures(|report| report.after),
+        gain: None,
         scores: Scores::mean(&scores),
     })
 }

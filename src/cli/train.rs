@@ -12,7 +12,7 @@ use crate::eval::{self, ViewScore};
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::nn::Precision;
 use crate::run::{Event, HeldRun, Trained};
-use crate::tone::CurveChoice;
+use crate::tone::{CurveChoice, GainChoice, ToneCurve};
 use crate::train::{Background, Learning, ModelName, Part, Preset, TrainConfig};
 
 /// Train a 3D Gaussian Splatting model from dark photographs.
@@ -43,9 +43,15 @@ pub(crate) struct TrainOptions {
     /// The tone curve: a name that `nightsplat curves` lists, or a .toml, .csv or .cube file [default: {tone.curve}]
     #[arg(long, value_name = "NAME|FILE")]
     curve: Option<CurveChoice>,
-    /// c: how much a brighter photograph raises the curve's gain [default: {tone.gain_c of ase} for ase, {tone.gain_c of ap3} for ap3, else {tone.gain_c of linear}]
-    #[arg(long, value_name = "C")]
-    gain: Option<f64>,
+    /// c: how much a brighter photograph raises the curve's gain, or auto: the gain that the photographs ask for, as the curve auto has it [default: {tone.gain_c of ase} for ase, {tone.gain_c of ap3} for ap3, else {tone.gain_c of linear}]
+    #[arg(long, value_name = "C|auto")]
+    gain: Option<GainChoice>,
+    /// The mean luminance of the targets, 0.1 to 0.9, where the gain is automatic [default: found between 0.44 and 0.54]
+    #[arg(long, value_name = "T")]
+    brightness: Option<f64>,
+    /// lambda: how much of the curve auto keeps the ratios of the channels, 0 to 1 [default: one third]
+    #[arg(long, value_name = "L")]
+    colour: Option<f64>,
     /// The mean that the linear curve aims at [default: {tone.theta}]
     #[arg(long, value_name = "T")]
     theta: Option<f64>,
@@ -201,7 +207,15 @@ impl TrainOptions {
             None => {}
         }
         self.model.apply(&mut config);
-        set(&mut config.tone.gain_c, &self.gain);
+        if self.curve == Some(ToneCurve::Auto.into()) {
+            // Benchmarks put the paper's curve in place of the default one; here it is named.
+            config.tone = config.tone.with_curve(ToneCurve::Auto);
+        }
+        if let Some(gain) = self.gain {
+            config.tone = config.tone.with_gain(gain);
+        }
+        config.tone.brightness = self.brightness.or(config.tone.brightness);
+        set(&mut config.tone.colour, &self.colour);
         set(&mut config.tone.theta, &self.theta);
         set(&mut config.steps, &self.steps);
         set(&mut config.downscale, &self.downscale);

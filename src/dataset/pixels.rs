@@ -53,6 +53,23 @@ pub(super) fn load(
     Ok(views)
 }
 
+/// A photograph that was shrunk on loading.
+#[derive(Clone, Debug)]
+pub struct Original {
+    path: PathBuf,
+    /// Fitted to the photograph's size.
+    lens: Lens,
+}
+
+impl Original {
+    /// Reads it anew, undistorted, at its own size.
+    pub(super) fn load(&self) -> Result<Image> {
+        let Self { path, lens } = self;
+        let undistortion = undistortion(lens, &path.to_string_lossy())?;
+        prepared(Image::load(path)?, path, lens, undistortion.as_ref(), (lens.width, lens.height))
+    }
+}
+
 struct Loaded {
     name: String,
     /// `None`: a training view whose photograph does not decode.
@@ -102,17 +119,22 @@ fn load_group(lens: &Lens, group: Vec<Source>, options: &LoadOptions) -> Result<
             size.0, size.1
         )));
     }
+    let undistortion = undistortion(lens, name)?;
+    group
+        .into_par_iter()
+        .map(|source| load_view(source, lens, undistortion.as_ref(), size, options))
+        .collect()
+}
+
+/// What makes a pinhole of the lens; none where it is one.
+fn undistortion(lens: &Lens, name: &str) -> Result<Option<Undistortion>> {
     let undistortion = (!lens.is_pinhole()).then(|| {
         Undistortion::new(lens).ok_or_else(|| {
             let problem = "its distortion coefficients describe no lens; calibrate again or undistort with COLMAP";
             Error::input(name, problem)
         })
     });
-    let undistortion = undistortion.transpose()?;
-    group
-        .into_par_iter()
-        .map(|source| load_view(source, lens, undistortion.as_ref(), size, options))
-        .collect()
+    undistortion.transpose()
 }
 
 fn load_view(
@@ -134,6 +156,8 @@ fn load_view(
             }
         }
     };
+    let is_shrunk = size != (lens.width, lens.height);
+    let original = input.clone().filter(|_| is_shrunk).map(|path| Original { path, lens: *lens });
     let (image, reference) = (image(input)?, image(reference)?);
     let depth = depth.and_then(|path| {
         depth_map(&path, lens, undistortion, size, options.depth.is_disparity)
@@ -148,7 +172,8 @@ fn load_view(
         view_from_world,
     };
     let camera = camera.resized(size.0, size.1);
-    let view = View { name: name.clone(), split, camera, image, reference, depth };
+    let original = original.filter(|_| image.is_some());
+    let view = View { name: name.clone(), split, camera, image, original, reference, depth };
     let view = (split == Split::Test || view.image.is_some()).then_some(view);
     Ok(Loaded { name, view, problems })
 }

@@ -46,6 +46,9 @@ const LOG: &str = "train.csv";
 /// Gain and bias of the training views.
 const EXPOSURES: &str = "exposures.csv";
 
+/// Where `metrics.json` holds the [`crate::train::TargetExposure`].
+pub(crate) const TARGET_EXPOSURE: &str = "target_exposure";
+
 /// The weights of the networks.
 const NETWORKS: &str = "networks.safetensors";
 
@@ -183,6 +186,12 @@ pub(super) fn checkpoint(run: &Path) -> Option<PathBuf> {
 /// Whether a directory holds a run that reached its end.
 pub fn is_finished(run: &Path) -> bool {
     run.join("metrics.json").exists()
+}
+
+/// What `metrics.json` says; null where it does not exist.
+pub fn load_metrics(run: &Path) -> serde_json::Value {
+    let text = std::fs::read(run.join("metrics.json")).ok();
+    text.and_then(|text| serde_json::from_slice(&text).ok()).unwrap_or_default()
 }
 
 /// The configuration of a finished or unfinished run.

@@ -3,6 +3,7 @@
 use std::path::Path;
 use std::time::{Duration, Instant};
 
+use super::directory::TARGET_EXPOSURE;
 use super::{Event, RunDirectory, directory};
 use crate::Result;
 use crate::dataset::Dataset;
@@ -84,6 +85,9 @@ pub fn train(
         directory.save_networks(networks)?;
     }
     let mut metrics = eval::metrics(&scored, seconds, trainer.gaussian_count(), config.steps);
+    if let Some(exposure) = trainer.target_exposure() {
+        metrics[TARGET_EXPOSURE] = serde_json::json!(exposure);
+    }
     if let Some(exposures) = trainer.exposures()? {
         directory.save_exposures(&exposures)?;
         eval::add_exposure(&mut metrics, &scored)?;

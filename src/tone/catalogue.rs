@@ -66,9 +66,11 @@ macro_rules! families {
             $(#[doc = $formula] $variant = $number,)*
             /// What a [`super::Table`] makes.
             Table = CURVE_TABLE,
+            /// The curve whose gain [`super::Exposure`] finds: (1 - lambda) soft(x) + lambda x soft(Y) / Y.
+            Auto = CURVE_AUTO,
         }
 
-        /// Every family, by its number; the table of values a file gives is no family.
+        /// Every family, by its number; the table of values a file gives is no family, nor is the automatic curve.
         pub static FAMILIES: [Family; ToneCurve::Table as usize] = [$(Family {
             curve: ToneCurve::$variant,
             name: $name,

@@ -111,7 +111,7 @@ pub(crate) fn curve_at<T: Real>(curve: u32, t: T, [offset, gain]: [T; 2], c: &Co
     let one = T::of(1.0);
     match curve {
         CURVE_NONE | CURVE_LINEAR => t,
-        CURVE_ASE => offset + (one - offset) * (gain * t).one_minus_exp(),
+        CURVE_ASE | CURVE_AUTO => offset + (one - offset) * (gain * t).one_minus_exp(),
         CURVE_AP3 => offset + gain * curve_shape(curve, t, c),
         CURVE_TANH => offset + (one - offset) * (gain * within(t)).tanh(),
         CURVE_ASE_FLOOR => {

@@ -1,13 +1,18 @@
 //! A curve with all its constants, as the command line, TOML files and run directories give it.
 
 use std::collections::BTreeMap;
+use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
+use super::exposure::BLACK_LEVEL;
 use super::families::White;
 use super::law::{Numbers, black_level, law};
 use super::{Statistics, Table, ToneCurve, ToneParameters};
 use crate::{Error, Result};
+
+/// lambda where none is given: the references of views keep more colour than single curves leave.
+const COLOUR: f64 = 1.0 / 3.0;
 
 /// A shape that passes this near p90 has a pole there.
 const LARGEST_SHAPE: f64 = 1e8;
@@ -30,8 +35,19 @@ pub struct ToneSettings {
     pub beta: f64,
     /// g0: the gain of ASE on a black photograph.
     pub base_gain: f64,
-    /// Whether one curve serves a scene: its statistics are the means over the training views.
+    /// Whether one curve serves a scene: its statistics are the means over the training views, its gain that of all of
+    /// them together.
     pub scene_statistics: bool,
+    /// Whether the gain is solved for the brightness that [`super::Exposure`] finds: t is k x then, in place of x / white,
+    /// and c and g0 have no say. The automatic curve has no other.
+    pub auto_gain: bool,
+    /// The mean luminance of the targets, in place of the one that is found.
+    pub brightness: Option<f64>,
+    /// lambda: how much of the automatic curve keeps the ratios of the channels.
+    pub colour: f64,
+    /// Whether a photograph is lifted at its own size and shrunk behind that. References were shrunk behind their own tone
+    /// curve, and the mean of a curve is not the curve of a mean.
+    pub lift_first: bool,
     /// The family's constants in the order of [`super::Family::constants`].
     pub constants: Vec<f64>,
     /// The values of [`ToneCurve::Table`].
@@ -39,31 +55,54 @@ pub struct ToneSettings {
 }
 
 impl ToneSettings {
-    /// The family's constants, and the paper's for LOM; c is 3 for ASE and 1 for AP3.
+    /// The family's constants, and the paper's for LOM; c is 3 for ASE and 1 for AP3. The automatic curve lifts before
+    /// photographs are shrunk, the others behind it.
     pub fn new(curve: ToneCurve) -> Self {
         let family = curve.family();
+        let is_auto = curve == ToneCurve::Auto;
         Self {
             curve,
-            gain_c: family.gain_c,
+            gain_c: if is_auto { 0.0 } else { family.gain_c },
             theta: 0.49,
-            alpha: family.alpha,
+            alpha: if is_auto { BLACK_LEVEL } else { family.alpha },
             beta: 2.5,
             base_gain: 1.0,
             scene_statistics: false,
+            auto_gain: is_auto,
+            brightness: None,
+            colour: COLOUR,
+            lift_first: is_auto,
             constants: family.defaults(),
             table: None,
         }
     }
 
-    /// Another family with its own constants, c and alpha; theta, beta, g0 and the choice of statistics stay. The same
-    /// family keeps everything.
+    /// Another curve with its own constants, c and alpha; theta, beta, g0, brightness and the choice of statistics stay. The
+    /// same curve keeps everything.
     #[must_use]
     pub fn with_curve(&self, curve: ToneCurve) -> Self {
         if curve == self.curve {
             return self.clone();
         }
-        let Self { theta, beta, base_gain, scene_statistics, .. } = *self;
-        Self { theta, beta, base_gain, scene_statistics, ..Self::new(curve) }
+        let Self { theta, beta, base_gain, scene_statistics, brightness, .. } = *self;
+        Self { theta, beta, base_gain, scene_statistics, brightness, ..Self::new(curve) }
+    }
+
+    /// The same curve with another gain. One that the photographs ask for belongs to photographs at their own size.
+    #[must_use]
+    pub fn with_gain(self, gain: GainChoice) -> Self {
+        match gain {
+            GainChoice::Auto => Self { auto_gain: true, lift_first: true, ..self },
+            GainChoice::C(gain_c) if self.auto_gain => {
+                Self { gain_c, auto_gain: false, lift_first: false, ..self }
+            }
+            GainChoice::C(gain_c) => Self { gain_c, ..self },
+        }
+    }
+
+    /// Whether the gain follows from the photographs' [`super::Exposure`].
+    pub fn takes_exposure(&self) -> bool {
+        self.auto_gain || self.curve == ToneCurve::Auto
     }
 
     /// The curve of a table of values.
@@ -76,12 +115,25 @@ impl ToneSettings {
     /// # Errors
     /// [`Error::Usage`] names the constant.
     pub fn check(&self) -> Result<()> {
+        let brightness = self.brightness.unwrap_or(0.5);
         let rules = [
             ("`ToneSettings::gain_c`", self.gain_c, self.gain_c >= 0.0, "at least 0"),
             ("`ToneSettings::theta`", self.theta, self.theta > 0.0, "above 0"),
             ("alpha", self.alpha, (0.0..=1.0).contains(&self.alpha), "from 0 to 1"),
             ("beta", self.beta, self.beta >= 0.0, "at least 0"),
             ("base_gain (g0)", self.base_gain, self.base_gain > 0.0, "above 0"),
+            (
+                "`ToneSettings::colour`",
+                self.colour,
+                (0.0..=1.0).contains(&self.colour),
+                "from 0 to 1",
+            ),
+            (
+                "`ToneSettings::brightness`",
+                brightness,
+                (0.1..=0.9).contains(&brightness),
+                "from 0.1 to 0.9",
+            ),
         ];
         for (name, value, holds, rule) in rules {
             if !(holds && (value as f32).is_finite()) {
@@ -90,7 +142,30 @@ impl ToneSettings {
                 )));
             }
         }
-        self.check_constants().map_err(Error::Usage)
+        self.check_gain().and_then(|()| self.check_constants()).map_err(Error::Usage)
+    }
+
+    /// Whether what sets the brightness goes together.
+    fn check_gain(&self) -> Result<(), String> {
+        let name = self.curve.name();
+        let has_gain = self.curve.is_formula() && self.curve != ToneCurve::None;
+        if self.curve == ToneCurve::Auto && self.gain_c != 0.0 {
+            return Err(format!(
+                "the curve `{name}` takes no `ToneSettings::gain_c`; `ToneSettings::brightness` is its mean"
+            ));
+        }
+        if self.auto_gain && self.curve != ToneCurve::Auto && !has_gain {
+            return Err(format!(
+                "the curve `{name}` has no gain that could be solved for; name `auto`, `ase` or `ap3`"
+            ));
+        }
+        if self.brightness.is_some() && !self.takes_exposure() {
+            return Err(format!(
+                "the curve `{name}` has the brightness that its gain gives it; `ToneSettings::brightness` is for a gain \
+                 that is `auto`"
+            ));
+        }
+        Ok(())
     }
 
     fn check_constants(&self) -> Result<(), String> {
@@ -128,13 +203,24 @@ impl ToneSettings {
         }
     }
 
-    /// delta0 = alpha (1 - r)^beta: the black level of a photograph with r = p10 / p90.
+    /// delta0 = alpha (1 - r)^beta: the black level of a photograph with r = p10 / p90. The automatic curve has alpha for
+    /// every photograph.
     pub fn offset(&self, ratio: f64) -> f64 {
-        black_level(self.alpha, self.beta, ratio)
+        if self.curve == ToneCurve::Auto {
+            self.alpha
+        } else {
+            black_level(self.alpha, self.beta, ratio)
+        }
     }
 
-    /// The curve that these settings give a photograph with these statistics.
+    /// The curve that these settings give a photograph with these statistics; where the gain follows from the exposure, it
+    /// is another ([`Self::lift`]).
     pub fn parameters(&self, statistics: &Statistics) -> ToneParameters {
+        if self.curve == ToneCurve::Auto {
+            let mut constants = [0.0; _];
+            constants[0] = self.colour as f32;
+            return ToneParameters { white: 1.0, offset: self.alpha as f32, gain: 1.0, constants };
+        }
         let numbers = Numbers::<f64>::from(self);
         let curve = law(self.curve.family(), self.white(), &numbers, statistics);
         ToneParameters {
@@ -149,6 +235,7 @@ impl ToneSettings {
     pub fn white(&self) -> White {
         match &self.table {
             Some(table) => table.input.white(),
+            None if self.curve == ToneCurve::Auto => White::One,
             None => self.curve.family().white,
         }
     }
@@ -161,7 +248,11 @@ impl ToneSettings {
         if self.white() == White::ChannelMeans {
             white = constants[0];
         }
-        let t = t * f64::from(statistics.p90) / f64::from(white);
+        let t = match self.curve {
+            // As it is without a scene that says k: over k x.
+            ToneCurve::Auto => t,
+            _ => t * f64::from(statistics.p90) / f64::from(white),
+        };
         match &self.table {
             Some(table) => table.value(t, 1),
             None => self.curve.value(t, offset.into(), gain.into(), &self.constants),
@@ -175,10 +266,10 @@ impl ToneSettings {
         Statistics { p10: 1.0, p80: theta, p90: 1.0, ..means }
     }
 
-    /// Whether the target is made once, at upload, instead of in the loss kernels: tables, and curves whose channels
-    /// depend on each other.
+    /// Whether the target is made once, at upload, instead of in the loss kernels: tables, curves whose channels depend on
+    /// each other, and what is lifted before it is shrunk or lifted in part.
     pub fn needs_baking(&self) -> bool {
-        !self.curve.is_formula()
+        !self.curve.is_formula() || self.lift_first || self.takes_exposure()
     }
 
     /// The curve that the loss kernels evaluate, as a `CURVE_*`: none on a target that is baked.
@@ -187,9 +278,32 @@ impl ToneSettings {
     }
 }
 
+/// What `--gain` says.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum GainChoice {
+    /// The gain that the photographs ask for.
+    Auto,
+    /// c: how much a brighter photograph raises the gain.
+    C(f64),
+}
+
+impl FromStr for GainChoice {
+    type Err = Error;
+
+    fn from_str(text: &str) -> Result<Self> {
+        if text == "auto" {
+            return Ok(Self::Auto);
+        }
+        let number = text.parse();
+        number
+            .map(Self::C)
+            .map_err(|_| Error::Usage(format!("`{text}` is no gain; a number, or auto")))
+    }
+}
+
 impl Default for ToneSettings {
     fn default() -> Self {
-        Self::new(ToneCurve::Ap3)
+        Self::new(ToneCurve::Auto)
     }
 }
 
@@ -205,6 +319,11 @@ struct Written {
     beta: Option<f64>,
     base_gain: Option<f64>,
     scene_statistics: Option<bool>,
+    auto_gain: Option<bool>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    brightness: Option<f64>,
+    colour: Option<f64>,
+    lift_first: Option<bool>,
     #[serde(skip_serializing_if = "Option::is_none")]
     constants: Option<BTreeMap<String, f64>>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -215,7 +334,7 @@ impl TryFrom<Written> for ToneSettings {
     type Error = String;
 
     fn try_from(written: Written) -> Result<Self, String> {
-        let given = if written.table.is_some() { ToneCurve::Table } else { ToneCurve::Ap3 };
+        let given = if written.table.is_some() { ToneCurve::Table } else { ToneCurve::Auto };
         let defaults = Self::new(written.curve.unwrap_or(given));
         let family = defaults.curve.family();
         let constants = match written.constants {
@@ -239,6 +358,7 @@ impl TryFrom<Written> for ToneSettings {
                 constants
             }
         };
+        let auto_gain = written.auto_gain.unwrap_or(defaults.auto_gain);
         let settings = Self {
             curve: defaults.curve,
             gain_c: written.gain_c.unwrap_or(defaults.gain_c),
@@ -247,6 +367,10 @@ impl TryFrom<Written> for ToneSettings {
             beta: written.beta.unwrap_or(defaults.beta),
             base_gain: written.base_gain.unwrap_or(defaults.base_gain),
             scene_statistics: written.scene_statistics.unwrap_or(defaults.scene_statistics),
+            auto_gain,
+            brightness: written.brightness,
+            colour: written.colour.unwrap_or(defaults.colour),
+            lift_first: written.lift_first.unwrap_or(auto_gain),
             constants,
             table: written.table,
         };
@@ -268,6 +392,10 @@ impl From<ToneSettings> for Written {
             beta: Some(settings.beta),
             base_gain: Some(settings.base_gain),
             scene_statistics: Some(settings.scene_statistics),
+            auto_gain: Some(settings.auto_gain),
+            brightness: settings.brightness,
+            colour: Some(settings.colour),
+            lift_first: Some(settings.lift_first),
             constants: Some(constants).filter(|constants| !constants.is_empty()),
             table: settings.table,
         }

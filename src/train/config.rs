@@ -40,7 +40,7 @@ impl std::str::FromStr for Background {
     }
 }
 
-/// A training run. The defaults are the paper's protocol for LOM but for density control and its schedule, which reach the
+/// A training run. The defaults are the paper's protocol for LOM but for the curve, density control and its schedule, which reach the
 /// same score in less time ([`super::Preset::Lom`] has the paper's).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]

@@ -40,7 +40,8 @@ impl Preset {
     }
 
     /// Sets density control and schedule; of a benchmark also what the paper states for it and, where its code has a file for the scene that the dataset's
-    /// folder is named after, what that file states. c is that of the configuration's curve.
+    /// folder is named after, what that file states. c is that of the configuration's curve, which is AP3 in place of the
+    /// automatic one.
     pub fn apply(self, config: &mut TrainConfig) {
         match self {
             Self::Balanced => {
@@ -56,6 +57,9 @@ impl Preset {
 
     fn apply_benchmark(self, config: &mut TrainConfig) {
         (config.schedule, config.density) = (Schedule::paper(), DensityConfig::paper());
+        if config.tone.curve == ToneCurve::Auto {
+            config.tone = config.tone.with_curve(ToneCurve::Ap3);
+        }
         let curve = config.tone.curve;
         let of_curve = |ase: f64, ap3: f64| match curve {
             ToneCurve::Ase => ase,

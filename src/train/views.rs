@@ -1,13 +1,16 @@
 //! The training views on the device: dark photographs, their curves, and the order in which steps take them.
 
+use std::borrow::Cow;
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use glam::{DVec3, UVec2};
+use serde::Serialize;
 
 use super::{TrainConfig, streams};
 use crate::Result;
 use crate::camera::Camera;
-use crate::dataset::{Dataset, Point};
+use crate::dataset::{Dataset, Point, View};
 use crate::exposure::Affine;
 use crate::gpu::{Buffer, Gpu};
 use crate::image::Image;
@@ -16,7 +19,7 @@ use crate::loss::ViewSource;
 use crate::pseudo_gt::PseudoGt;
 use crate::random::Stream;
 use crate::scene::{Gaussians, Shape, init};
-use crate::tone::{Statistics, ToneCurve, ToneSettings};
+use crate::tone::{Exposure, Statistics, ToneCurve, ToneSettings, all_black};
 
 /// One training view.
 #[derive(Debug)]
@@ -31,12 +34,34 @@ pub(super) struct TrainView {
     pub(super) camera: Camera,
     /// Depth from elsewhere, (H, W), where the dataset's is of another size.
     depth: Option<Vec<f32>>,
-    /// The dark photograph, planar (3, H, W), sRGB-encoded.
-    pub(super) image: Buffer<f32>,
-    /// The target, where the loss does not evaluate the curve.
-    baked: Option<Arc<Buffer<f32>>>,
-    /// The curve that its statistics give; one element. Of a baked target none.
+    /// What the loss applies `tone` to, planar (3, H, W), sRGB-encoded: the dark photograph, or the target itself.
+    input: Arc<Buffer<f32>>,
+    /// The dark photograph, where that is not the input and a network sees it.
+    photograph: Option<Buffer<f32>>,
+    /// The curve that the photograph gets; one element. Where the input is the target already, none.
     pub(super) tone: Buffer<ToneParameters>,
+    /// Whether the input is the target.
+    is_baked: bool,
+}
+
+/// How bright the targets are, and what a model makes of them.
+#[derive(Clone, Debug, Serialize)]
+pub struct TargetExposure {
+    /// The gain that a model of views with differing gains agrees on, their geometric mean: the exposure at which it
+    /// renders and is scored.
+    pub model_gain: f64,
+    /// What was found for the training photographs together.
+    pub scene: Exposure,
+    /// The gain of every training view, by name.
+    pub gains: BTreeMap<String, f64>,
+}
+
+impl TargetExposure {
+    fn new(scene: Exposure, gains: BTreeMap<String, f64>) -> Self {
+        let logarithms: f64 = gains.values().map(|gain| gain.ln()).sum();
+        let model_gain = (logarithms / gains.len().max(1) as f64).exp();
+        Self { model_gain, scene, gains }
+    }
 }
 
 /// All training views in the dataset's order, as they are and then by level of the resolution schedule, each half the
@@ -48,31 +73,59 @@ pub(super) struct Views(Vec<Vec<TrainView>>);
 const SHORTEST_SIDE: u32 = 32;
 
 impl Views {
-    /// Uploads every training photograph in as many sizes as there are levels, and takes its statistics once.
+    /// Measures every training photograph, and uploads it or its target in as many sizes as there are levels; the
+    /// photographs too where `keeps_photographs`. One photograph at a time is in memory at its own size.
+    ///
+    /// # Errors
+    /// Every photograph is as good as black where their exposure is asked for; a photograph can no longer be read; the
+    /// device is out of memory or lost.
     pub(super) fn upload(
         gpu: &Gpu,
         pseudo_gt: &mut PseudoGt,
         dataset: &Dataset,
         levels: usize,
-    ) -> Result<Self> {
-        let photographs = dataset.views.iter().enumerate();
-        let photographs: Vec<_> = photographs
+        keeps_photographs: bool,
+    ) -> Result<(Self, Option<TargetExposure>)> {
+        let settings = pseudo_gt.settings().clone();
+        let photographs: Vec<(usize, &View, &Image)> = (dataset.views.iter().enumerate())
             .filter(|(_, view)| view.is_train())
             .filter_map(|(index, view)| view.image.as_ref().map(|image| (index, view, image)))
             .collect();
-        let (mut views, mut statistics) = (vec![], vec![]);
+        // What is measured, and what is lifted before it is shrunk.
+        let whole = |view: &'_ View, image: &'_ Image| -> Result<Image> {
+            let original = if settings.lift_first { view.photograph()? } else { None };
+            Ok(original.map_or_else(|| image.clone(), Cow::into_owned))
+        };
+        let mut measured = vec![];
+        for &(_, view, image) in &photographs {
+            measured.push(pseudo_gt.measure(&whole(view, image)?.data)?);
+        }
+        let scene = settings.scene(&measured).ok_or_else(|| all_black(&dataset.root))?;
+        let mut views = vec![];
         views.resize_with(levels, Vec::<TrainView>::new);
-        for (place, &(index, view, image)) in photographs.iter().enumerate() {
+        let mut gains = BTreeMap::new();
+        for (place, (&(index, view, image), measured)) in
+            photographs.iter().zip(&measured).enumerate()
+        {
+            let lift = settings.lift(&scene, measured);
+            gains.extend(lift.gain.map(|gain| (view.name.clone(), gain)));
+            let target = (settings.lift_first)
+                .then(|| pseudo_gt.lifted(&whole(view, image)?, &lift))
+                .transpose()?;
             for (level, views) in views.iter_mut().enumerate() {
                 let size = shrunk(UVec2::new(image.width, image.height), level as u32);
-                let own = image.resized(size.x, size.y);
-                let pixels = gpu.buffer("low", &own.data)?;
-                if level == 0 {
-                    gpu.run("statistics", |pass| {
-                        pseudo_gt.statistics(pass, &pixels, [image.width, image.height])
-                    })?;
-                    statistics.push(pseudo_gt.measured()?);
-                }
+                let photograph = image.resized(size.x, size.y);
+                let target = match &target {
+                    Some(target) => Some(target.resized(size.x, size.y)),
+                    None if settings.needs_baking() => Some(pseudo_gt.lifted(&photograph, &lift)?),
+                    None => None,
+                };
+                let is_baked = target.is_some();
+                let kept =
+                    (is_baked && keeps_photographs).then(|| gpu.buffer("low", &photograph.data));
+                let name = if is_baked { "target" } else { "low" };
+                let input = gpu.buffer(name, &target.as_ref().unwrap_or(&photograph).data)?;
+                let none = ToneSettings::new(ToneCurve::None).parameters(&Statistics::default());
                 let depth = view.depth.as_ref().filter(|_| level > 0);
                 views.push(TrainView {
                     name: view.name.clone(),
@@ -81,27 +134,14 @@ impl Views {
                     index,
                     camera: view.camera.resized(size.x, size.y),
                     depth: depth.map(|depth| resized_plane(depth, image, size)),
-                    image: pixels,
-                    baked: None,
-                    tone: gpu
-                        .buffer("tone", &[pseudo_gt.settings().parameters(&statistics[place])])?,
+                    input: Arc::new(input),
+                    photograph: kept.transpose()?,
+                    tone: gpu.buffer("tone", &[if is_baked { none } else { lift.parameters }])?,
+                    is_baked,
                 });
             }
         }
-        let settings = pseudo_gt.settings();
-        if let Some(scene) = Statistics::mean_of(&statistics).filter(|_| settings.scene_statistics)
-        {
-            let parameters = settings.parameters(&scene);
-            for view in views.iter_mut().flatten() {
-                gpu.write(&mut view.tone, &[parameters])?;
-            }
-        }
-        if settings.needs_baking() {
-            for view in views.iter_mut().flatten() {
-                view.bake(gpu, pseudo_gt)?;
-            }
-        }
-        Ok(Self(views))
+        Ok((Self(views), scene.exposure.map(|scene| TargetExposure::new(scene, gains))))
     }
 
     /// What the loss terms may compare the views with.
@@ -209,25 +249,21 @@ impl TrainView {
 
     /// What the loss applies its curve to.
     pub(super) fn loss_input(&self) -> &Buffer<f32> {
-        self.baked.as_deref().unwrap_or(&self.image)
+        &self.input
     }
 
-    /// Makes the target now, in place of the loss kernels.
-    fn bake(&mut self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<()> {
-        self.baked = Some(self.target(gpu, pseudo_gt)?);
-        gpu.write(
-            &mut self.tone,
-            &[ToneSettings::new(ToneCurve::None).parameters(&Statistics::default())],
-        )
+    /// The dark photograph, planar (3, H, W); only there where it is the input, or was kept.
+    pub(super) fn photograph(&self) -> &Buffer<f32> {
+        self.photograph.as_ref().unwrap_or(&self.input)
     }
 
     /// The pseudo-GT of the view, (3, H, W).
     fn target(&self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<Arc<Buffer<f32>>> {
-        if let Some(baked) = &self.baked {
-            return Ok(Arc::clone(baked));
+        if self.is_baked {
+            return Ok(Arc::clone(&self.input));
         }
-        let mut target = gpu.uninit("target", self.image.len())?;
-        gpu.run("target", |pass| pseudo_gt.map(pass, &self.image, &self.tone, 0, &mut target))?;
+        let mut target = gpu.uninit("target", self.input.len())?;
+        gpu.run("target", |pass| pseudo_gt.map(pass, &self.input, &self.tone, 0, &mut target))?;
         Ok(Arc::new(target))
     }
 

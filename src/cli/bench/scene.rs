@@ -45,6 +45,7 @@ impl Scene {
             split: Split::Train,
             camera: self.camera,
             image: Some(self.low.clone()),
+            original: None,
             reference: None,
             depth: Some(depth.collect()),
         };

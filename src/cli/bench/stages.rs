@@ -154,7 +154,7 @@ impl Photograph {
     fn new(gpu: &Gpu) -> Result<Self> {
         let image = gpu.buffer("low", &scene::dark(1920, 1080).data)?;
         Ok(Self {
-            pseudo_gt: PseudoGt::new(gpu, &ToneSettings::default())?,
+            pseudo_gt: PseudoGt::new(gpu, &ToneSettings::new(ToneCurve::Ap3))?,
             parameters: gpu
                 .buffer("tone", &[ToneParameters { white: 1.0, ..Default::default() }])?,
             target: gpu.uninit("target", image.len())?,

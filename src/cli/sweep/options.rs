@@ -12,7 +12,11 @@ use crate::cli::train::TrainOptions;
 /// The options of `train` that take a list here: their name there, their name here, and what the list holds.
 const LISTS: [(&str, &str, &str); 4] = [
     ("curve", "curves", "Tone curves by name or file, or `all` [default: {tone.curve}]"),
-    ("gain", "gain", "Values of c: how much a brighter photograph raises the curve's gain"),
+    (
+        "gain",
+        "gain",
+        "Values of c: how much a brighter photograph raises the curve's gain, or auto",
+    ),
     ("theta", "theta", "Means that the linear curve aims at"),
     (
         "seed",

@@ -2,9 +2,8 @@
 
 use std::path::Path;
 
-use super::mapper::Mapper;
 use super::photographs::Listed;
-use super::{Mapped, Measures, ToneArgs, ToneOutput, settings, without};
+use super::{CurveOnSet, Mapped, Measures, ToneArgs, ToneOutput, settings, without};
 use crate::Result;
 use crate::gpu::Gpu;
 use crate::image::Image;
@@ -13,7 +12,6 @@ use crate::output::write_whole;
 use crate::report::{
     Best, Column, Comparison, Distribution, Picture, Report, Table, distributions,
 };
-use crate::tone::Statistics;
 
 /// The widest picture on the page, pixels.
 const PICTURE_WIDTH: u32 = 480;
@@ -25,7 +23,7 @@ pub(super) struct Page {
     only_referenced: bool,
     input: Distribution,
     result: Distribution,
-    compared: Vec<(Mapper, Distribution)>,
+    compared: Vec<(CurveOnSet, Distribution)>,
     reference: Distribution,
     comparison: Option<Comparison>,
 }
@@ -33,8 +31,8 @@ pub(super) struct Page {
 impl Page {
     pub(super) fn new(gpu: &Gpu, args: &ToneArgs, photographs: &[Listed]) -> Result<Self> {
         let compared = args.compare.iter().map(|curve| {
-            let mapper = Mapper::new(gpu, &settings(args, curve)?)?;
-            Ok((mapper, Distribution::new(curve.to_string())))
+            let set = CurveOnSet::new(gpu, settings(args, curve)?, photographs, &args.input)?;
+            Ok((set, Distribution::new(curve.to_string())))
         });
         let curve = args.curve.to_string();
         Ok(Self {
@@ -46,12 +44,6 @@ impl Page {
             comparison: None,
             curve,
         })
-    }
-
-    pub(super) fn set_scene(&mut self, scene: &Statistics) {
-        for (mapper, _) in &mut self.compared {
-            mapper.set_scene(scene);
-        }
     }
 
     /// Adds a photograph and its result; the first one's pictures are shown.
@@ -69,9 +61,8 @@ impl Page {
         self.result.add(&without(image, gaps));
         let mut pictures =
             vec![picture("photograph", None, photograph), picture(&self.curve, scores, image)];
-        for (mapper, distribution) in &mut self.compared {
-            mapper.statistics(&without(photograph, gaps))?;
-            let image = mapper.map(photograph)?;
+        for (set, distribution) in &mut self.compared {
+            let (_, image, _) = set.result(photograph, gaps)?;
             distribution.add(&without(&image, gaps));
             let scores = reference.as_ref().map(|reference| Scores::of(&image, reference));
             pictures.push(picture(&distribution.name, scores.transpose()?, &image));

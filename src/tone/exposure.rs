@@ -1,0 +1,242 @@
+//! How bright a target is to be: the gain that the luminance of dark photographs asks for.
+//!
+//! ```text
+//! soft(x; k) = delta + (1 - delta) (1 - exp(-k x))                       delta = 0.075
+//! gain(H)    k = 0.90 / (mean W^3)^(1/3), W = min(Y, 99.9 % quantile of Y)
+//!            within the gains at which the mean of soft(Y; k) is 0.44 and 0.54, at most 128
+//! ln k_v     = s ln gain(view) + (1 - s) ln gain(scene)
+//! s          = max(0.75, sigma^2 / (sigma^2 + 0.1^2))
+//! lift       = mean soft(Y; k) / mean Y, over the scene
+//! ```
+//!
+//! H is the histogram of the encoded luminance Y of one photograph, or of all training photographs together, sigma the
+//! standard deviation of ln gain over the views. A cubic mean lies between mean exposure (power 1) and exposure for the
+//! highlights (infinity): a scene rich in contrast is exposed lower, as a photographer does. Lamps and windows leave it
+//! unbounded, so the mean, of which 0.46 is the encoded 18 % grey, is the guard. Power and constants come from pairs of low-
+//! and normal-light photographs (LOL, LOM, `RealX3D`).
+
+use serde::Serialize;
+
+use super::histogram::LuminanceHistogram;
+use super::real::Real;
+use crate::Error;
+
+/// The black level of [`soft`].
+pub(super) const BLACK_LEVEL: f64 = 0.075;
+
+/// What the cubic mean of the luminance is brought to before the curve.
+const CUBIC_MEAN: f64 = 0.90;
+
+/// What is brighter than this fraction of the pixels counts as no brighter: hot pixels.
+const HOT: f64 = 0.999;
+
+/// The least and the greatest mean luminance of a target.
+const MEANS: [f64; 2] = [0.44, 0.54];
+
+/// The gains that may come out.
+const GAINS: [f64; 2] = [1e-3, 128.0];
+
+/// The least weight of a view's own gain.
+const LEAST_SHARE: f64 = 0.75;
+
+/// The spread of ln gain between views at which their own gains have half the weight.
+const NOISE: f64 = 0.1;
+
+/// Lifts up to the first leave the photograph as it is; from the second on the curve has its whole weight.
+const WELL_LIT: [f64; 2] = [1.5, 2.0];
+
+/// A photograph whose 99 % quantile is below this is as good as black: two code values of 8 bits.
+const BLACK: f64 = 2.0 / 255.0;
+
+/// delta + (1 - delta) (1 - exp(-k x)): the curve whose mean the rule is about.
+pub fn soft(x: f64, gain: f64) -> f64 {
+    BLACK_LEVEL + (1.0 - BLACK_LEVEL) * (gain * x).one_minus_exp()
+}
+
+/// What the rule finds for a set of photographs.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[serde(into = "Written")]
+pub struct Exposure {
+    /// The gain of all training photographs together, those that are black left out.
+    pub gain: f64,
+    /// The mean luminance of the targets at that gain.
+    pub target: f64,
+    /// The mean luminance of the photographs.
+    pub mean: f64,
+    /// sigma: the standard deviation of ln gain over the views.
+    pub spread: f64,
+    /// s: the weight of a view's own gain.
+    pub share: f64,
+    /// How many photographs are as good as black.
+    pub black: usize,
+    /// The mean luminance that was asked for in place of the rule's.
+    brightness: Option<f64>,
+}
+
+impl Exposure {
+    /// The exposure of a set, from the luminance of its training photographs. `brightness` is the mean luminance of the
+    /// targets where the rule is not to find it. None where every photograph is as good as black.
+    pub fn of<'a>(
+        views: impl IntoIterator<Item = &'a LuminanceHistogram>,
+        brightness: Option<f64>,
+    ) -> Option<Self> {
+        let (mut pool, mut gains, mut black) = (LuminanceHistogram::default(), vec![], 0);
+        for view in views {
+            if is_black(view) {
+                black += 1;
+                continue;
+            }
+            pool.add(view);
+            gains.push(gain_of(view, brightness).ln());
+        }
+        if gains.is_empty() {
+            return None;
+        }
+        let mean_gain = gains.iter().sum::<f64>() / gains.len() as f64;
+        let squares = gains.iter().map(|gain| (gain - mean_gain).powi(2));
+        let variance = squares.sum::<f64>() / gains.len() as f64;
+        let gain = gain_of(&pool, brightness);
+        Some(Self {
+            gain,
+            target: mean_of_soft(&pool, gain),
+            mean: pool.mean(),
+            spread: variance.sqrt(),
+            share: LEAST_SHARE.max(variance / (variance + NOISE * NOISE)),
+            black,
+            brightness,
+        })
+    }
+
+    /// The same with one gain for every photograph.
+    #[must_use]
+    pub fn shared(self) -> Self {
+        Self { share: 0.0, ..self }
+    }
+
+    /// k of a photograph of the scene, of training or not; one as good as black has the scene's.
+    pub fn gain_of(&self, view: &LuminanceHistogram) -> f64 {
+        if is_black(view) {
+            return self.gain;
+        }
+        let own = gain_of(view, self.brightness);
+        (self.share * own.ln() + (1.0 - self.share) * self.gain.ln()).exp()
+    }
+
+    /// How many times brighter the targets are than the photographs, on the mean.
+    pub fn lift(&self) -> f64 {
+        self.target / self.mean
+    }
+
+    /// The weight of the curve beside the photograph as it is: 0 of a well-lit set, 1 of a dark one and wherever a
+    /// brightness was asked for.
+    pub fn weight(&self) -> f64 {
+        let [none, whole] = WELL_LIT;
+        if self.brightness.is_some() {
+            1.0
+        } else {
+            ((self.lift() - none) / (whole - none)).clamp(0.0, 1.0)
+        }
+    }
+
+    /// What was found, and why, in a sentence.
+    pub fn reason(&self) -> String {
+        let Self { gain, target, mean, spread, black, .. } = self;
+        let lift = self.lift();
+        let verdict = match self.weight() {
+            0.0 => "well lit, no curve".to_owned(),
+            1.0 => format!("gain {gain:.1}"),
+            weight => format!("{:.0} % of a curve of gain {gain:.1}", 100.0 * weight),
+        };
+        let varies = match spread / std::f64::consts::LN_2 {
+            stops if stops >= 0.1 => format!(", give or take {stops:.1} stops between the views"),
+            _ => String::new(),
+        };
+        let left_out = match black {
+            0 => String::new(),
+            count => format!("; {count} as good as black, left out of the measurement"),
+        };
+        format!(
+            "mean luminance {mean:.3}, {lift:.1} times that is {target:.2}: {verdict}{varies}{left_out}"
+        )
+    }
+}
+
+/// What a picture at one gain is at another, with so much weight of the curve: the values from which others are
+/// interpolated, ascending.
+pub fn exposed_anew([from, to]: [f64; 2], weight: f64) -> Vec<[f32; 2]> {
+    const KNOTS: u32 = 1024;
+    // Evenly spaced in what the curve makes of them, up to where it is white.
+    let knot = |i: u32| {
+        let x = -(1.0 - f64::from(i) / f64::from(KNOTS + 1)).ln() / from.min(to);
+        [from, to].map(|gain| ((1.0 - weight) * x.min(1.0) + weight * soft(x, gain)) as f32)
+    };
+    (0..=KNOTS).map(knot).collect()
+}
+
+/// The exposure as JSON has it.
+#[derive(Serialize)]
+struct Written {
+    gain: f64,
+    target: f64,
+    mean: f64,
+    lift: f64,
+    weight: f64,
+    spread: f64,
+    share: f64,
+    black: usize,
+    reason: String,
+}
+
+impl From<Exposure> for Written {
+    fn from(exposure: Exposure) -> Self {
+        let (lift, weight, reason) = (exposure.lift(), exposure.weight(), exposure.reason());
+        let Exposure { gain, target, mean, spread, share, black, .. } = exposure;
+        Self { gain, target, mean, lift, weight, spread, share, black, reason }
+    }
+}
+
+/// Says that nothing can be lifted.
+pub(crate) fn all_black(path: &std::path::Path) -> Error {
+    let problem = "every photograph is as good as black (99 % of its pixels are below 2 of 255); expose longer, or name \
+                   a curve with --curve";
+    Error::input(path, problem)
+}
+
+/// Whether a photograph shows next to nothing.
+pub fn is_black(view: &LuminanceHistogram) -> bool {
+    view.quantile(0.99) < BLACK
+}
+
+/// gain(H), or the gain at which the mean luminance is `brightness`.
+fn gain_of(luminance: &LuminanceHistogram, brightness: Option<f64>) -> f64 {
+    if let Some(mean) = brightness {
+        return gain_at(luminance, mean);
+    }
+    let limit = luminance.quantile(HOT);
+    let cubic_mean = luminance.mean_of(|y| y.min(limit).powi(3)).cbrt();
+    let gain = (CUBIC_MEAN / cubic_mean).clamp(GAINS[0], GAINS[1]);
+    match mean_of_soft(luminance, gain) {
+        mean if mean < MEANS[0] => gain_at(luminance, MEANS[0]),
+        mean if mean > MEANS[1] => gain_at(luminance, MEANS[1]),
+        _ => gain,
+    }
+}
+
+fn mean_of_soft(luminance: &LuminanceHistogram, gain: f64) -> f64 {
+    luminance.mean_of(|y| soft(y, gain))
+}
+
+/// The gain at which the mean of the curve is `mean`.
+fn gain_at(luminance: &LuminanceHistogram, mean: f64) -> f64 {
+    solved(GAINS, |gain| mean_of_soft(luminance, gain) < mean)
+}
+
+/// The strength between two that is the first not to be too low, by bisection of its logarithm; an end where there is none.
+pub(super) fn solved(bounds: [f64; 2], is_low: impl Fn(f64) -> bool) -> f64 {
+    let [mut low, mut high] = bounds.map(f64::ln);
+    for _ in 0..50 {
+        let middle = 0.5 * (low + high);
+        *(if is_low(middle.exp()) { &mut low } else { &mut high }) = middle;
+    }
+    (0.5 * (low + high)).exp()
+}

@@ -1,0 +1,132 @@
+//! How often each luminance occurs in a photograph, or in several.
+
+use crate::kernels::rank_search::{BINS, DIGIT_BITS, SEARCHES};
+
+use super::statistics::{luminance, measurable};
+
+/// The bits of a luminance to the right of its bin's number: 128 bins an octave are left.
+pub(crate) const BIN_SHIFT: u32 = 16;
+
+/// The first bin's number is this and [`DIGIT_BITS`] zeros: 2^-15, a hundredth of a code value of 8 bits. The bins reach
+/// to 2^17.
+pub(crate) const FIRST_PREFIX: u32 = 14;
+
+/// How many pixels have which luminance, in bins a 128th of an octave wide; everything below 2^-15 counts as 0.
+///
+/// What is read from it is off by 0.4 % at most, where all pixels are equal, and by far less in a photograph.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct LuminanceHistogram {
+    counts: Vec<u64>,
+    black: u64,
+}
+
+impl Default for LuminanceHistogram {
+    fn default() -> Self {
+        Self { counts: vec![0; (SEARCHES * BINS) as usize], black: 0 }
+    }
+}
+
+impl LuminanceHistogram {
+    /// That of a planar (3, H, W) photograph, sRGB-encoded; NaN and negative values count as 0.
+    pub fn of(planes: &[f32]) -> Self {
+        let (red, rest) = planes.split_at(planes.len() / 3);
+        let (green, blue) = rest.split_at(red.len());
+        let mut counts = vec![0; (SEARCHES * BINS) as usize];
+        for ((&r, &g), &b) in red.iter().zip(green).zip(blue) {
+            let number = luminance([r, g, b].map(measurable)).to_bits() >> BIN_SHIFT;
+            let bin = number.checked_sub(FIRST_PREFIX << DIGIT_BITS);
+            if let Some(count) = bin.and_then(|bin| counts.get_mut(bin as usize)) {
+                *count += 1;
+            }
+        }
+        Self::from_counts(&counts, red.len() as u64)
+    }
+
+    /// What the bins of a photograph with so many pixels hold.
+    pub(crate) fn from_counts(counts: &[u32], pixel_count: u64) -> Self {
+        let counts: Vec<u64> = counts.iter().map(|&count| count.into()).collect();
+        Self { black: pixel_count - counts.iter().sum::<u64>(), counts }
+    }
+
+    /// Adds the pixels of another photograph.
+    pub fn add(&mut self, other: &Self) {
+        self.black += other.black;
+        self.counts.iter_mut().zip(&other.counts).for_each(|(count, other)| *count += other);
+    }
+
+    /// The number of pixels.
+    pub fn pixel_count(&self) -> u64 {
+        self.black + self.counts.iter().sum::<u64>()
+    }
+
+    /// The least luminance that `fraction` of the pixels do not exceed; 0 of no pixels.
+    pub fn quantile(&self, fraction: f64) -> f64 {
+        let rank = fraction * self.pixel_count().saturating_sub(1) as f64;
+        let mut below = 0;
+        let mut levels = self.levels();
+        let at_rank = levels.find(|&(_, count)| {
+            below += count;
+            below as f64 > rank
+        });
+        at_rank.map_or(0.0, |(luminance, _)| luminance)
+    }
+
+    /// The mean over the pixels of a function of their luminance; 0 of no pixels.
+    pub fn mean_of(&self, value: impl Fn(f64) -> f64) -> f64 {
+        let sum: f64 =
+            self.levels().map(|(luminance, count)| count as f64 * value(luminance)).sum();
+        sum / self.pixel_count().max(1) as f64
+    }
+
+    /// The mean luminance.
+    pub fn mean(&self) -> f64 {
+        self.mean_of(|luminance| luminance)
+    }
+
+    /// The luminances that occur, ascending, with the number of their pixels: 0 and the middles of the bins.
+    fn levels(&self) -> impl Iterator<Item = (f64, u64)> + '_ {
+        let middle = |bin: u32| {
+            let number = (FIRST_PREFIX << DIGIT_BITS) + bin;
+            f64::from(f32::from_bits((number << BIN_SHIFT) | 1 << (BIN_SHIFT - 1)))
+        };
+        let bins = (0..).zip(&self.counts).map(move |(bin, &count)| (middle(bin), count));
+        std::iter::once((0.0, self.black)).chain(bins).filter(|&(_, count)| count > 0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_luminance_finds_its_bin_within_half_a_percent() {
+        for x in [3.1e-5_f32, 1e-4, 0.0039, 0.0041, 0.5, 1.0, 1.5, 30.0, 65504.0] {
+            let histogram = LuminanceHistogram::of(&[x; 3]);
+            assert_eq!(histogram.pixel_count(), 1);
+            let found = histogram.quantile(0.5);
+            assert!((found / f64::from(x) - 1.0).abs() < 0.004, "{x}: {found}");
+            assert_eq!(histogram.mean(), found);
+        }
+        for black in [0.0, 1e-9, -1.0, f32::NAN] {
+            assert_eq!(LuminanceHistogram::of(&[black; 3]).quantile(1.0), 0.0);
+        }
+        assert_eq!(LuminanceHistogram::default().quantile(0.5), 0.0);
+        assert_eq!(LuminanceHistogram::default().mean(), 0.0);
+    }
+
+    #[test]
+    fn a_quantile_leaves_out_the_hot_pixels_and_a_sum_is_that_of_both() {
+        let mut planes = vec![0.25_f32; 3 * 1000];
+        for plane in 0..3 {
+            planes[1000 * plane] = 1.0;
+        }
+        let one = LuminanceHistogram::of(&planes);
+        assert!((one.quantile(0.999) - 0.25).abs() < 1e-3);
+        assert!((one.quantile(1.0) - 1.0).abs() < 4e-3);
+        let mut both = LuminanceHistogram::of(&[0.0; 3000]);
+        both.add(&one);
+        assert_eq!(both.pixel_count(), 2000);
+        assert!((both.mean() - 0.5 * one.mean()).abs() < 1e-12);
+        assert_eq!(both.quantile(0.4), 0.0);
+    }
+}

@@ -1,0 +1,81 @@
+//! From what was measured of a scene's photographs to the curve of each.
+
+use super::exposure::{Exposure, solved};
+use super::histogram::LuminanceHistogram;
+use super::law::{clamped, curve_at};
+use super::{Statistics, ToneCurve, ToneParameters, ToneSettings};
+
+/// The strengths that a curve may be solved for.
+const STRENGTHS: [f64; 2] = [1e-3, 1e4];
+
+/// What is measured of a photograph.
+#[derive(Clone, Debug)]
+pub struct Measured {
+    /// Percentiles and means.
+    pub statistics: Statistics,
+    /// The whole distribution of its luminance.
+    pub luminance: LuminanceHistogram,
+}
+
+/// What the curves of a scene's photographs have in common.
+#[derive(Clone, Debug, Default)]
+pub struct Scene {
+    /// The means over the training photographs, where one curve serves all.
+    statistics: Option<Statistics>,
+    /// How bright the targets are to be, where that is found.
+    pub exposure: Option<Exposure>,
+}
+
+/// How a photograph becomes a target: `weight` of its curve, and the rest of it as it is.
+#[derive(Clone, Copy, Debug)]
+pub struct Lift {
+    /// The curve.
+    pub parameters: ToneParameters,
+    /// The weight of the curve, from 0 to 1.
+    pub weight: f32,
+    /// k of soft(x; k), of whose mean luminance the target is; where it follows from the exposure.
+    pub gain: Option<f64>,
+}
+
+impl ToneSettings {
+    /// What the training photographs of a scene decide together; none where their exposure is asked for and all are as
+    /// good as black, or there are none.
+    pub fn scene(&self, training: &[Measured]) -> Option<Scene> {
+        let exposure = if self.takes_exposure() {
+            let found = Exposure::of(training.iter().map(|one| &one.luminance), self.brightness)?;
+            Some(if self.scene_statistics { found.shared() } else { found })
+        } else {
+            None
+        };
+        let statistics: Vec<_> = training.iter().map(|one| one.statistics).collect();
+        let statistics = Statistics::mean_of(&statistics).filter(|_| self.scene_statistics);
+        Some(Scene { statistics, exposure })
+    }
+
+    /// How a photograph of the scene is lifted.
+    pub fn lift(&self, scene: &Scene, photograph: &Measured) -> Lift {
+        let statistics = scene.statistics.as_ref().unwrap_or(&photograph.statistics);
+        let parameters = self.parameters(statistics);
+        let Some(exposure) = &scene.exposure else {
+            return Lift { parameters, weight: 1.0, gain: None };
+        };
+        let gain = exposure.gain_of(&photograph.luminance);
+        let strength = match self.curve {
+            ToneCurve::Auto => gain,
+            _ => self.strength(&parameters, &photograph.luminance, gain),
+        };
+        let parameters = ToneParameters { white: (1.0 / strength) as f32, gain: 1.0, ..parameters };
+        Lift { parameters, weight: exposure.weight() as f32, gain: Some(gain) }
+    }
+
+    /// The factor on x at which the curve has the mean luminance of soft(x; gain).
+    fn strength(&self, tone: &ToneParameters, luminance: &LuminanceHistogram, gain: f64) -> f64 {
+        let target = luminance.mean_of(|y| super::soft(y, gain));
+        let (curve, law) = (self.curve.constant(), [f64::from(tone.offset), 1.0]);
+        let constants = tone.constants.map(f64::from);
+        let mean = |strength: f64| {
+            luminance.mean_of(|y| clamped(curve_at(curve, strength * y, law, &constants)))
+        };
+        solved(STRENGTHS, |strength| mean(strength) < target)
+    }
+}
