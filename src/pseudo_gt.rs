@@ -162,13 +162,8 @@ impl PseudoGt {
         }
         self.pixel_count = pixel_count;
         pass.fill(&mut self.counts, 0);
-        for (tile, luminances) in tiles.iter().zip(&self.luminances) {
-            let params = histogram_params(tile, BIN_SHIFT, 0);
-            let (searches, histograms) = (&self.bins, &mut self.counts);
-            let buffers =
-                kernels::luminance_histogram::Buffers { luminances, searches, histograms };
-            pass.dispatch(&self.histogram, &params, buffers, Threads::Exactly([THREADS, 1, 1]))?;
-        }
+        let Self { histogram, luminances, bins, counts, .. } = self;
+        count_luminances(pass, histogram, tiles, luminances, [BIN_SHIFT, 0], bins, counts)?;
         pass.dispatch(
             &self.statistics,
             &kernels::tone_statistics::Params {
@@ -233,18 +228,9 @@ impl PseudoGt {
         }
         self.select_digit(pass, 11, first_search)?;
         for shift in [10, 0] {
-            for (tile, luminances) in tiles.iter().zip(&self.luminances) {
-                pass.dispatch(
-                    &self.histogram,
-                    &histogram_params(tile, shift, first_search),
-                    kernels::luminance_histogram::Buffers {
-                        luminances,
-                        searches: &self.searches,
-                        histograms: &mut self.histograms,
-                    },
-                    Threads::Exactly([THREADS, 1, 1]),
-                )?;
-            }
+            let Self { histogram, luminances, searches, histograms, .. } = self;
+            let digit = [shift, first_search];
+            count_luminances(pass, histogram, tiles, luminances, digit, searches, histograms)?;
             self.select_digit(pass, 10, first_search)?;
         }
         Ok(())
@@ -335,17 +321,31 @@ impl PseudoGt {
     }
 }
 
-fn histogram_params(
-    tile: &Buffer<f32>,
-    shift: u32,
-    first_search: u32,
-) -> kernels::luminance_histogram::Params {
-    kernels::luminance_histogram::Params {
-        pixel_count: (tile.len() / 3) as u32,
-        thread_count: THREADS,
-        shift,
-        first_search,
+/// Counts a digit of the luminances of all tiles that begin with the prefix of a search.
+fn count_luminances(
+    pass: &mut Recorder<'_>,
+    histogram: &Pipeline<kernels::luminance_histogram::Kernel>,
+    tiles: &[&Buffer<f32>],
+    luminances: &[Buffer<f32>],
+    [shift, first_search]: [u32; 2],
+    searches: &Buffer<RankSearch>,
+    histograms: &mut Buffer<u32>,
+) -> Result<()> {
+    for (tile, luminances) in tiles.iter().zip(luminances) {
+        let pixel_count = (tile.len() / 3) as u32;
+        pass.dispatch(
+            histogram,
+            &kernels::luminance_histogram::Params {
+                pixel_count,
+                thread_count: THREADS,
+                shift,
+                first_search,
+            },
+            kernels::luminance_histogram::Buffers { luminances, searches, histograms },
+            Threads::Exactly([THREADS, 1, 1]),
+        )?;
     }
+    Ok(())
 }
 
 fn in_range(parameters: &Buffer<ToneParameters>, view: u32) -> Result<()> {

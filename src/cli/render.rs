@@ -69,8 +69,8 @@ impl SplitChoice {
 /// The folder holds no finished run, its dataset is gone or has no such view, or a file cannot be written.
 pub fn run(args: &RenderArgs) -> Result<()> {
     let RenderArgs { run, split, out, layer, view_exposure, format, device } = args;
-    let exposures = if *view_exposure { Some(ViewExposures::of(run)?) } else { None };
     let FinishedRun { dataset, mut player, .. } = FinishedRun::open(run, device.as_ref())?;
+    let exposures = if *view_exposure { Some(ViewExposures::of(run)?) } else { None };
     let views: Vec<&View> = dataset.views.iter().filter(|view| split.includes(view)).collect();
     if views.is_empty() {
         let problem = "has no view of that split; try --split all";
