@@ -1,5 +1,6 @@
 //! `nightsplat render`: pictures of a finished run from the cameras of its dataset.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::Result;
@@ -8,6 +9,7 @@ use super::finished_run::FinishedRun;
 use super::{ImageFormat, progress_bar};
 use crate::dataset::{Dataset, Split, View};
 use crate::eval::Layer;
+use crate::exposure::Affine;
 use crate::gpu::DeviceChoice;
 use crate::image::Image;
 use crate::tone::exposed_anew;
@@ -95,14 +97,23 @@ pub fn run(args: &RenderArgs) -> Result<()> {
     Ok(())
 }
 
-/// The exposures of a run's targets beside the one of its model.
-struct ViewExposures(serde_json::Value);
+/// The exposures of a run's training views beside the one of its model.
+enum ViewExposures {
+    /// Gain and bias, learned.
+    Learned(BTreeMap<String, Affine>),
+    /// Of the targets.
+    OfTargets(serde_json::Value),
+}
 
 impl ViewExposures {
     fn of(run: &Path) -> crate::Result<Self> {
+        let learned = run::load_exposures(run)?;
+        if !learned.is_empty() {
+            return Ok(Self::Learned(learned));
+        }
         let exposure = run::load_metrics(run)[run::TARGET_EXPOSURE].take();
         if exposure["model_gain"].is_number() {
-            return Ok(Self(exposure));
+            return Ok(Self::OfTargets(exposure));
         }
         let problem = "has targets of no exposure of their own: its curve has a gain by its constants; leave out --view-exposure";
         Err(Error::input(run, problem))
@@ -111,7 +122,13 @@ impl ViewExposures {
     /// The model's picture of a view at the exposure of the view's target.
     fn applied(&self, view: &View, mut image: Image) -> Image {
         let number = |value: &serde_json::Value| value.as_f64();
-        let Self(exposure) = self;
+        let exposure = match self {
+            Self::Learned(exposures) => {
+                let own = exposures.get(&view.name);
+                return own.map_or(image.clone(), |own| own.applied(&image));
+            }
+            Self::OfTargets(exposure) => exposure,
+        };
         let gains = number(&exposure["model_gain"]).zip(number(&exposure["gains"][&view.name]));
         let Some((from, to)) = gains else { return image };
         let knots = exposed_anew([from, to], number(&exposure["scene"]["weight"]).unwrap_or(1.0));

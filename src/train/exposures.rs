@@ -10,10 +10,9 @@ use super::views::Views;
 use super::{TrainConfig, Trainer};
 use crate::dataset::{Dataset, LoadOptions, Photograph};
 use crate::exposure::{Affine, ExposureRates, table};
-use crate::gpu::Gpu;
 use crate::image::{Image, exposure_value, linear_from_srgb, srgb_from_linear};
 use crate::pseudo_gt::PseudoGt;
-use crate::tone::Statistics;
+use crate::tone::Scene;
 use crate::{Error, Result};
 
 /// Whether something is learned.
@@ -98,8 +97,7 @@ impl Views {
     /// The table cannot be read or names a view that there is not; the device is out of memory or lost.
     pub(super) fn exposures(
         &self,
-        gpu: &Gpu,
-        pseudo_gt: &PseudoGt,
+        pseudo_gt: &mut PseudoGt,
         dataset: &Dataset,
         config: &TrainConfig,
     ) -> Result<Option<Vec<Affine>>> {
@@ -117,8 +115,9 @@ impl Views {
         });
         let stops: Vec<f64> = stops.collect();
         let mean = stops.iter().sum::<f64>() / stops.len().max(1) as f64;
-        let lift = (!stops.is_empty()).then(|| Lift::new(gpu, pseudo_gt, dataset));
-        let affine = |name: &str| match (starts.get(name), &lift) {
+        let lift = (!stops.is_empty()).then(|| Lift::new(pseudo_gt, dataset));
+        let mut lift = lift.transpose()?;
+        let affine = |name: &str| match (starts.get(name), &mut lift) {
             (Some(Start::Affine(affine)), _) => Ok(*affine),
             (Some(Start::Stops(stops)), Some(lift)) => lift.affine_of_stops(name, stops - mean),
             _ => Ok(Affine::IDENTITY),
@@ -187,45 +186,42 @@ impl Views {
 
 /// Makes targets of photographs that are not in the dataset, as those of it are made.
 struct Lift<'a> {
-    gpu: &'a Gpu,
-    pseudo_gt: &'a PseudoGt,
+    pseudo_gt: &'a mut PseudoGt,
     dataset: &'a Dataset,
-    /// Where one curve serves all.
-    scene: Option<Statistics>,
+    scene: Option<Scene>,
 }
 
 impl<'a> Lift<'a> {
-    fn new(gpu: &'a Gpu, pseudo_gt: &'a PseudoGt, dataset: &'a Dataset) -> Self {
+    fn new(pseudo_gt: &'a mut PseudoGt, dataset: &'a Dataset) -> Result<Self> {
         let images = dataset.train_views().filter_map(|view| view.image.as_ref());
-        let statistics: Vec<Statistics> = match pseudo_gt.settings().scene_statistics {
-            true => images.map(|image| Statistics::of(&image.data)).collect(),
-            false => vec![],
-        };
-        Self { gpu, pseudo_gt, dataset, scene: Statistics::mean_of(&statistics) }
+        let measured = images.map(|image| pseudo_gt.measure(&image.data));
+        let measured = measured.collect::<Result<Vec<_>>>()?;
+        let scene = pseudo_gt.settings().scene(&measured);
+        Ok(Self { pseudo_gt, dataset, scene })
     }
 
-    fn target(&self, photograph: &Image) -> Result<Image> {
-        let statistics = self.scene.unwrap_or_else(|| Statistics::of(&photograph.data));
-        let tone = [self.pseudo_gt.settings().parameters(&statistics)];
-        let tone = self.gpu.buffer("tone", &tone)?;
-        let image = self.gpu.buffer("low", &photograph.data)?;
-        let mut target = self.gpu.uninit("target", image.len())?;
-        self.gpu.run("target", |pass| self.pseudo_gt.map(pass, &image, &tone, 0, &mut target))?;
-        Ok(Image { data: self.gpu.read(&target)?, ..*photograph })
+    fn target(&mut self, scene: &Scene, photograph: &Image) -> Result<Image> {
+        let measured = self.pseudo_gt.measure(&photograph.data)?;
+        let lift = self.pseudo_gt.settings().lift(scene, &measured);
+        self.pseudo_gt.lifted(photograph, &lift)
     }
 
     /// What `stops` of a photograph's exposure, in linear light, make of its target: the affine that brings the target of the
     /// photograph without them nearest to the target of the photograph as it is. A curve that follows from each photograph
     /// takes much of the difference away before.
-    fn affine_of_stops(&self, name: &str, stops: f64) -> Result<Affine> {
+    fn affine_of_stops(&mut self, name: &str, stops: f64) -> Result<Affine> {
         let mut views = self.dataset.train_views().filter(|view| view.name == name);
-        let Some(photograph) = views.find_map(|view| view.image.as_ref()) else {
+        let photograph = views.find_map(|view| view.image.as_ref());
+        let Some((photograph, scene)) = photograph.zip(self.scene.clone()) else {
             return Ok(Affine::IDENTITY);
         };
         let scale = (-stops).exp2() as f32;
         let without = |&x: &f32| srgb_from_linear(scale * linear_from_srgb(x));
         let neutral = Image { data: photograph.data.iter().map(without).collect(), ..*photograph };
-        let affine = Affine::least_squares(&self.target(&neutral)?, &self.target(photograph)?)?;
+        let affine = Affine::least_squares(
+            &self.target(&scene, &neutral)?,
+            &self.target(&scene, photograph)?,
+        )?;
         // Of a photograph of one colour there is no more to say than that.
         let is_exposure = affine.gain.iter().all(|&gain| gain > 0.0);
         Ok(if is_exposure { affine } else { Affine::IDENTITY })
