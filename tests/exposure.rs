@@ -1,0 +1,183 @@
+//! How bright the automatic target is: the rule against a slow one over pixels, and what comes of odd sets.
+
+use nightsplat::tone::{Exposure, LuminanceHistogram, Statistics, exposed_anew, soft};
+
+/// A reproducible photograph whose luminance crowds near black, planar; `contrast` is the power that crowds it.
+fn photograph(pixels: usize, brightness: f32, contrast: i32, seed: u64) -> Vec<f32> {
+    let mut state = seed;
+    let mut noise = move || {
+        state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+        (state >> 40) as f32 / (1u64 << 24) as f32
+    };
+    (0..3 * pixels).map(|_| (brightness * noise().powi(contrast)).min(1.0)).collect()
+}
+
+fn scaled(planes: &[f32], factor: f32) -> Vec<f32> {
+    planes.iter().map(|x| (x * factor).min(1.0)).collect()
+}
+
+fn luminances(planes: &[f32]) -> Vec<f64> {
+    let n = planes.len() / 3;
+    let of = |i| {
+        [0.299, 0.587, 0.114]
+            .iter()
+            .zip([i, n + i, 2 * n + i])
+            .map(|(w, at)| w * f64::from(planes[at]))
+    };
+    (0..n).map(|i| of(i).sum()).collect()
+}
+
+/// The rule by trying gains, a thousandth apart, on every pixel.
+fn slow_gain(luminances: &[f64]) -> f64 {
+    let mut sorted = luminances.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    let limit = sorted[(0.999 * (sorted.len() - 1) as f64) as usize];
+    let n = sorted.len() as f64;
+    let cubes: f64 = sorted.iter().map(|y| y.min(limit).powf(3.0)).sum();
+    let mut gain = 0.9 / (cubes / n).powf(1.0 / 3.0);
+    let mean =
+        |k: f64| sorted.iter().map(|y| 0.075 + 0.925 * (1.0 - (-k * y).exp())).sum::<f64>() / n;
+    while mean(gain) < 0.44 {
+        gain *= 1.001;
+    }
+    while mean(gain) > 0.54 {
+        gain /= 1.001;
+    }
+    gain.min(128.0)
+}
+
+fn exposure(views: &[Vec<f32>]) -> Option<Exposure> {
+    let views: Vec<_> = views.iter().map(|view| LuminanceHistogram::of(view)).collect();
+    Exposure::of(&views, None)
+}
+
+#[test]
+fn the_gain_is_that_of_a_search_over_all_pixels() {
+    let mut bounded = [0; 3];
+    for (seed, brightness) in [(1, 0.05), (2, 0.1), (3, 0.3), (4, 1.0)] {
+        for contrast in [1, 2, 4, 12] {
+            let planes = photograph(20_000, brightness, contrast, seed);
+            let luminances = luminances(&planes);
+            let Some(exposure) = exposure(&[planes]) else { continue };
+            let slow = slow_gain(&luminances);
+            assert!((exposure.gain / slow - 1.0).abs() < 3e-3, "{}, not {slow}", exposure.gain);
+            bounded
+                [usize::from(exposure.target > 0.4401) + usize::from(exposure.target > 0.5399)] +=
+                1;
+        }
+    }
+    assert!(bounded.iter().all(|&count| count > 0), "bounds were not met: {bounded:?}");
+}
+
+#[test]
+fn the_mean_rises_with_the_gain_and_with_the_brightness_asked_for() {
+    let views = [1, 2, 3].map(|seed| LuminanceHistogram::of(&photograph(5000, 0.2, 3, seed)));
+    let mut last = 0.0;
+    for gain in (-20..=20).map(|step| f64::from(step).exp2().powf(0.35)) {
+        let mean = views[0].mean_of(|y| soft(y, gain));
+        assert!(mean > last, "{gain}");
+        last = mean;
+    }
+    let mut last = 0.0;
+    for brightness in [0.2, 0.4, 0.5, 0.7, 0.9] {
+        let exposure = Exposure::of(&views, Some(brightness)).unwrap();
+        assert!((exposure.target - brightness).abs() < 1e-9);
+        assert_eq!(exposure.weight(), 1.0);
+        assert!(exposure.gain > last);
+        last = exposure.gain;
+    }
+}
+
+#[test]
+fn darker_views_have_a_higher_gain_and_equal_ones_the_scene_s() {
+    let view = photograph(20_000, 0.1, 2, 7);
+    let histogram = LuminanceHistogram::of(&view);
+    let equal = exposure(&vec![view.clone(); 3]).unwrap();
+    assert_eq!(equal.spread, 0.0);
+    assert!((equal.gain_of(&histogram) / equal.gain - 1.0).abs() < 1e-9);
+    let single = exposure(std::slice::from_ref(&view)).unwrap();
+    assert!((single.gain / equal.gain - 1.0).abs() < 1e-12);
+
+    let factors = [1.0, 0.5, 0.25, 2.0];
+    let views = factors.map(|factor| scaled(&view, factor));
+    let varied = exposure(&views).unwrap();
+    assert!((varied.spread / 2f64.ln() - 1.118).abs() < 0.02, "{}", varied.spread);
+    assert!(varied.share > 0.95 && varied.share < 1.0);
+    // Nearly all of the difference is taken back: the targets are as bright as one another.
+    let means = views.each_ref().map(|view| {
+        let histogram = LuminanceHistogram::of(view);
+        histogram.mean_of(|y| soft(y, varied.gain_of(&histogram)))
+    });
+    let [low, high] = [f64::min, f64::max].map(|of| means.into_iter().reduce(of).unwrap());
+    assert!(high - low < 0.03, "{means:?}");
+    let shared = varied.clone().shared();
+    assert_eq!(shared.gain_of(&histogram), varied.gain);
+}
+
+#[test]
+fn a_picture_at_one_gain_is_known_at_another() {
+    for gains in [[10.0, 14.0], [14.0, 10.0], [3.0, 60.0], [8.0, 8.0]] {
+        for weight in [1.0, 0.4] {
+            let knots = exposed_anew(gains, weight);
+            assert!(knots.is_sorted_by(|a, b| a[0] <= b[0] && a[1] <= b[1]), "{gains:?}");
+            for x in [0.0, 0.001, 0.02, 0.1, 0.3] {
+                let [from, to] =
+                    gains.map(|gain| ((1.0 - weight) * x + weight * soft(x, gain)) as f32);
+                let above = knots.partition_point(|knot| knot[0] <= from).clamp(1, knots.len() - 1);
+                let [[x0, y0], [x1, y1]] = [knots[above - 1], knots[above]];
+                let found = y0 + (from - x0) / (x1 - x0).max(f32::MIN_POSITIVE) * (y1 - y0);
+                assert!((found - to).abs() < 2e-3, "{gains:?} at {x}: {found}, not {to}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_thousandth_of_hot_pixels_moves_the_gain_by_little() {
+    let clean = photograph(40_000, 0.08, 2, 5);
+    let mut hot = clean.clone();
+    for plane in hot.chunks_mut(40_000) {
+        plane.iter_mut().step_by(1250).for_each(|x| *x = 1.0);
+    }
+    let [clean, hot] = [clean, hot].map(|planes| exposure(&[planes]).unwrap().gain);
+    assert!((hot / clean - 1.0).abs() < 0.02, "{hot}, not {clean}");
+}
+
+#[test]
+fn black_views_are_left_out_and_a_black_set_has_no_exposure() {
+    let good = photograph(20_000, 0.1, 2, 7);
+    let black = scaled(&good, 0.05);
+    let with = exposure(&[good.clone(), black.clone(), vec![0.0; 3000]]).unwrap();
+    let without = exposure(&[good]).unwrap();
+    assert_eq!((with.gain, with.black), (without.gain, 2));
+    assert_eq!(with.gain_of(&LuminanceHistogram::of(&black)), with.gain);
+    assert!(with.reason().contains("2 as good as black"), "{}", with.reason());
+    assert_eq!(exposure(&[black, vec![0.0; 3000]]), None);
+    assert_eq!(exposure(&[]), None);
+}
+
+#[test]
+fn a_well_lit_set_has_no_curve_and_one_between_a_blend() {
+    let bright = photograph(20_000, 0.8, 1, 3);
+    let [well_lit, between, dark] =
+        [1.0, 0.77, 0.2].map(|factor| exposure(&[scaled(&bright, factor)]).unwrap());
+    assert_eq!(well_lit.weight(), 0.0, "{well_lit:?}");
+    assert!(between.weight() > 0.0 && between.weight() < 1.0, "{between:?}");
+    assert_eq!(dark.weight(), 1.0, "{dark:?}");
+    for (exposure, part) in [(well_lit, "no curve"), (between, "% of a curve"), (dark, "gain")] {
+        assert!(exposure.reason().contains(part), "{}", exposure.reason());
+    }
+    // Half the views well lit: the set is dark on the mean, and every view is brought to the same brightness.
+    let half = exposure(&[bright.clone(), scaled(&bright, 0.05)]).unwrap();
+    assert!(half.weight() > 0.0 && half.share > 0.95, "{half:?}");
+}
+
+#[test]
+fn the_histogram_has_the_mean_of_the_statistics() {
+    for (brightness, contrast) in [(0.05, 2), (0.3, 4), (1.0, 1)] {
+        let planes = photograph(30_000, brightness, contrast, 11);
+        let mean = f64::from(Statistics::of(&planes).mean_luminance);
+        let found = LuminanceHistogram::of(&planes).mean();
+        assert!((found / mean - 1.0).abs() < 3e-4, "{found}, not {mean}");
+    }
+}
