@@ -368,6 +368,15 @@ fn automatic(input: &Path) -> ToneArgs {
 fn the_automatic_curve_says_how_bright_and_why_and_lends_its_brightness() {
     let dir = tempfile::tempdir().unwrap();
     let [low, _] = pairs(dir.path());
+    // Grey: the rule is about the curve of the luminance, which in colours is not the luminance of the curve.
+    for name in ["a", "b", "c"] {
+        let path = low.join(name).with_extension("png");
+        let mut image = Image::load(&path).unwrap();
+        let pixels = image.pixel_count();
+        image.data.copy_within(0..pixels, pixels);
+        image.data.copy_within(0..pixels, 2 * pixels);
+        image.save_png8(path).unwrap();
+    }
     let output = apply(&automatic(&low)).unwrap();
     let exposure = output.exposure.unwrap();
     assert!(exposure.reason().contains("gain"), "{}", exposure.reason());
@@ -388,12 +397,9 @@ fn the_automatic_curve_says_how_bright_and_why_and_lends_its_brightness() {
             let found = view.after.mean_luminance;
             assert!((found - mean).abs() < 0.006, "{curve}: {found}, not {mean}");
         }
-        // A view has a quarter of the scene's gain.
-        let brighter = ToneArgs { brightness: Some(0.6), ..lent };
-        for view in apply(&brighter).unwrap().views.values() {
-            let found = view.after.mean_luminance;
-            assert!((found - 0.6).abs() < 0.03, "{curve}: {found}");
-        }
+        let brighter = apply(&ToneArgs { brightness: Some(0.6), ..lent }).unwrap();
+        let found = brighter.scene.after.mean_luminance;
+        assert!((found - 0.6).abs() < 0.02, "{curve}: {found}");
     }
 }
 
