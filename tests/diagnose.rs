@@ -1,5 +1,6 @@
 //! What is put into a capture, the diagnosis finds, and the plan follows.
 
+#![cfg(feature = "cli")]
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
 use std::collections::BTreeSet;
