@@ -183,7 +183,7 @@ mod tests {
         let truth = [0.5, -1.0, 0.25, 0.25];
         let point = |index: usize| -> Vec<(usize, f64)> {
             let level = -3.0 - 0.1 * (index % 17) as f64;
-            let views = (0..4).filter(|view| view % 3 != index % 3 || index % 2 == 0);
+            let views = (0..4).filter(|view| view % 3 != index % 3 || index.is_multiple_of(2));
             views.map(|view| (view, level + truth[view])).collect()
         };
         let points: Vec<_> = (0..200).map(point).collect();
