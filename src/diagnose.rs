@@ -101,6 +101,8 @@ pub struct SceneDiagnosis {
     pub exposure_spread: f64,
     /// Whether shared points told the spread.
     pub spread_is_measured: bool,
+    /// How much of a view's exposure the curve takes away, of 1, where each view has its own gain.
+    pub exposure_share: f64,
     pub clipped_fraction: f64,
     pub zero_fraction: f64,
     pub code_values: f64,
@@ -269,6 +271,7 @@ impl SceneDiagnosis {
             gain: exposure.gain,
             exposure_spread: measured.unwrap_or(exposure.spread / std::f64::consts::LN_2),
             spread_is_measured: measured.is_some(),
+            exposure_share: exposure.share,
             clipped_fraction: mean(|view| view.clipped_fraction),
             zero_fraction: mean(|view| view.zero_fraction),
             code_values: mean(|view| view.code_values as f64),

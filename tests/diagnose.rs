@@ -192,8 +192,13 @@ fn each_part_comes_with_its_cause() {
     let planned = |capture: &Capture| parts(&plan_of(written(capture).path()));
     assert_eq!(planned(&Capture { darkening: 25.0, ..Capture::clean() }), ["curve"]);
     let stops = vec![0.0, -1.0, 0.6];
-    let spread = planned(&Capture { stops, darkening: 2.0, ..Capture::clean() });
-    assert!(spread.contains(&"exposure") && !spread.contains(&"denoiser"), "{spread:?}");
+    let set = written(&Capture { stops, darkening: 8.0, ..Capture::clean() });
+    // A gain for each view takes the spread away, one curve for all of them does not.
+    assert_eq!(parts(&plan_of(set.path())), ["curve"]);
+    let mut config = TrainConfig::default();
+    config.tone.scene_statistics = true;
+    let spread = parts(&Plan::new(&diagnosis_of(set.path()), &config, MEMORY));
+    assert_eq!(spread, ["curve", "exposure", "structure"]);
     let grainy = Capture { full_well: 5.0, read_noise: 0.5, darkening: 3.0, ..Capture::clean() };
     let noisy = planned(&grainy);
     assert!(noisy.contains(&"denoiser") && !noisy.contains(&"exposure"), "{noisy:?}");
@@ -380,7 +385,7 @@ fn sets_of_any_kind_have_a_plan_or_one_clear_error() {
     // Half the views well lit.
     let set = written(&Capture { stops: vec![0.0, 4.5], ..Capture::default() });
     let plan = plan_of(set.path());
-    assert!(plan.exposure.on, "{}", plan.exposure.why);
+    assert!(!plan.curve.on && plan.exposure.on, "{}", plan.exposure.why);
 
     // The same photograph and camera everywhere.
     let set = written(&Capture::default());

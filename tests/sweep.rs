@@ -186,7 +186,7 @@ fn the_paper_s_tables_and_all_curves_are_grids() {
     let gain = lines("--table gain --ssim-weight 0.3 --config /dev/null");
     assert_eq!(gain.len(), 9);
     // The options of `train` in its own order, then the point's.
-    let expected = "--sh-degree 0 --ssim-weight 0.3 --config /dev/null --curve ase --gain 0 --set tone.base_gain=1 --out";
+    let expected = "--sh-degree 0 --ssim-weight 0.3 --config /dev/null --curve ase --gain 0 --set tone.base_gain=1 --plan none --out";
     assert!(gain[0].contains(expected), "{}", gain[0]);
 }
 

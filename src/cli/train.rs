@@ -13,7 +13,7 @@ use crate::diagnose::{Diagnosis, Plan};
 use crate::eval::{self, ViewScore};
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::nn::Precision;
-use crate::run::{self, Event, HeldRun, Trained};
+use crate::run::{self, Event, HeldRun, RunDirectory, Trained};
 use crate::tone::{CurveChoice, GainChoice, ToneCurve};
 use crate::train::{Background, Learning, ModelName, Part, Preset, TrainConfig};
 
@@ -304,6 +304,9 @@ impl TrainOptions {
 /// Whatever keeps the run from its end, in one line.
 pub fn run(args: &TrainArgs) -> Result<()> {
     let config = args.options.config(args.dataset.clone())?;
+    if !args.resume {
+        RunDirectory::check(&args.out, args.overwrite)?;
+    }
     let gpu = Gpu::new(&config.device.parse::<DeviceChoice>()?)?;
     let Planned { config, plan, dataset } = planned(args, config, &gpu)?;
     let mut out = std::io::stdout().lock();

@@ -176,15 +176,17 @@ mod tests {
     use super::*;
     use crate::random::Stream;
 
+    const WIDTH: usize = 512;
+
     /// Stripes of brightness with noise, and texture in every second patch.
     fn plane(noise: Noise, textured: bool) -> Vec<f32> {
-        let (width, height) = (256, 256);
+        let (width, height) = (WIDTH, 512);
         let stream = Stream::new(4, 0);
         let value = |index: usize| {
             let (x, y) = (index % width, index / width);
-            let mut signal = 0.02 + 0.3 * (y / SIDE) as f64 / 32.0;
+            let mut signal = 0.02 + 0.3 * (y / SIDE) as f64 / 64.0;
             if textured && (x / SIDE).is_multiple_of(2) {
-                signal *= 1.0 + 0.3 * f64::from((x % 3) as u32);
+                signal *= 0.7 + 0.3 * f64::from((x % 3) as u32);
             }
             (signal + noise.deviation(signal) * stream.normal(index as u64)) as f32
         };
@@ -195,7 +197,7 @@ mod tests {
     fn gain_and_read_noise_are_found_beside_texture() {
         let injected = Noise { gain: 2e-4, read: 3e-3 };
         for textured in [false, true] {
-            let found = fit(patches(&plane(injected, textured), 256, 0.0)).unwrap();
+            let found = fit(patches(&plane(injected, textured), WIDTH, 0.0)).unwrap();
             assert!((found.gain / injected.gain - 1.0).abs() < 0.1, "{textured} {found:?}");
             assert!((found.read / injected.read - 1.0).abs() < 0.1, "{textured} {found:?}");
         }
@@ -203,7 +205,7 @@ mod tests {
 
     #[test]
     fn a_plane_without_noise_has_none_and_one_without_patches_tells_none() {
-        let found = fit(patches(&plane(Noise::default(), true), 256, 0.0)).unwrap();
+        let found = fit(patches(&plane(Noise::default(), true), WIDTH, 0.0)).unwrap();
         assert!(found.deviation(0.3) < 1e-4, "{found:?}");
         assert_eq!(fit(patches(&[0.5; 30], 6, 0.0)), None);
         assert_eq!(fit(vec![]), None);

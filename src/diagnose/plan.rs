@@ -13,7 +13,8 @@ use crate::{Error, Result};
 
 /// Targets less than this many times brighter than their photographs are the photographs: the rule of `--curve auto`.
 const LEAST_LIFT: f64 = 1.5;
-/// Views whose exposures are spread by more stops are not made equal by the curve alone.
+/// Targets whose exposures are spread by more stops are worth learning them. A chair of which the views differ by 1.2 stops,
+/// all but .02 of which the curve takes away, lost .4 dB by it.
 const LEAST_SPREAD: f64 = 0.3;
 /// More noise than this in the average over the views, of encoded values, is seen: 2.5 % is 32 dB.
 const LEAST_NOISE: f64 = 0.04;
@@ -121,15 +122,17 @@ impl Plan {
     pub fn new(diagnosis: &Diagnosis, config: &TrainConfig, memory: u64) -> Self {
         let scene = &diagnosis.scene;
         let sh_degree = sh_degree(scene, config);
-        let views = diagnosis.views.len();
+        let curve = curve(scene);
+        let follows_views = curve.on && !config.tone.scene_statistics;
+        let spread = Spread::of(scene, follows_views, diagnosis.views.len());
         Self {
             left_out: diagnosis.black_views(),
             dataset: diagnosis.fingerprint.clone(),
-            curve: curve(scene),
-            exposure: exposure(scene, views),
+            curve,
+            exposure: spread.exposure(),
             denoiser: denoiser(scene),
-            tonemapper: tonemapper(scene, views),
-            structure: structure(scene),
+            tonemapper: tonemapper(scene, spread.is_wide),
+            structure: spread.structure(scene),
             depth: depth(diagnosis),
             max_gaussians: max_gaussians(diagnosis, config, sh_degree.value, memory),
             sh_degree,
@@ -224,17 +227,39 @@ fn curve(scene: &SceneDiagnosis) -> Switch {
     Switch { on, why }
 }
 
-fn exposure(scene: &SceneDiagnosis, views: usize) -> Switch {
-    let spread = scene.exposure_spread;
-    let on = spread >= LEAST_SPREAD && views > 2;
-    let by = if scene.spread_is_measured {
-        "at shared points"
-    } else {
-        "of the gain each view asks for"
-    };
-    let why =
-        format!("exposures are spread by {spread:.2} stops {by} (learned from {LEAST_SPREAD})");
-    Switch { on, why }
+/// How far the exposures of the targets lie apart.
+struct Spread {
+    /// Enough to be worth learning them.
+    is_wide: bool,
+    found: String,
+}
+
+impl Spread {
+    /// A curve that follows each view takes most of the photographs' spread away.
+    fn of(scene: &SceneDiagnosis, follows_views: bool, views: usize) -> Self {
+        let SceneDiagnosis { exposure_spread: spread, exposure_share: share, .. } = *scene;
+        let left = if follows_views { (1.0 - share) * spread } else { spread };
+        let by = if scene.spread_is_measured {
+            "at shared points"
+        } else {
+            "of the gain each view asks for"
+        };
+        Self {
+            is_wide: left >= LEAST_SPREAD && views > 2,
+            found: format!(
+                "exposures are spread by {spread:.2} stops {by}, of which the targets keep {left:.2}"
+            ),
+        }
+    }
+
+    fn exposure(&self) -> Switch {
+        Switch { on: self.is_wide, why: format!("{} (learned from {LEAST_SPREAD})", self.found) }
+    }
+
+    fn structure(&self, scene: &SceneDiagnosis) -> Switch {
+        let on = self.is_wide && scene.target_noise < LEAST_NOISE;
+        Switch { on, why: format!("{}: edges are the same in all of them", self.found) }
+    }
 }
 
 fn denoiser(scene: &SceneDiagnosis) -> Switch {
@@ -246,22 +271,13 @@ fn denoiser(scene: &SceneDiagnosis) -> Switch {
     Switch { on, why }
 }
 
-fn tonemapper(scene: &SceneDiagnosis, views: usize) -> Switch {
+fn tonemapper(scene: &SceneDiagnosis, learns_exposures: bool) -> Switch {
     let unevenness = scene.unevenness;
     // A learned exposure does not describe the dark photographs, to which the tonemapper holds the model.
-    let on =
-        unevenness >= LEAST_UNEVENNESS && scene.lift >= LEAST_LIFT && !exposure(scene, views).on;
+    let on = unevenness >= LEAST_UNEVENNESS && scene.lift >= LEAST_LIFT && !learns_exposures;
     let why = format!(
         "light varies by {unevenness:.1} stops between large regions (an illumination of its own from {LEAST_UNEVENNESS}, in dark sets)"
     );
-    Switch { on, why }
-}
-
-fn structure(scene: &SceneDiagnosis) -> Switch {
-    let spread = scene.exposure_spread;
-    let on = spread >= LEAST_SPREAD && scene.target_noise < LEAST_NOISE;
-    let why =
-        format!("exposures are spread by {spread:.2} stops: edges are the same in all of them");
     Switch { on, why }
 }
 

@@ -63,6 +63,7 @@ const PLAN: &str = "plan.toml";
 
 /// Where `metrics.json` holds the [`crate::train::TargetExposure`].
 pub(crate) const TARGET_EXPOSURE: &str = "target_exposure";
+
 /// Gain and bias of the training views.
 const EXPOSURES: &str = "exposures.csv";
 
@@ -73,17 +74,31 @@ const NETWORKS: &str = "networks.safetensors";
 const CHECKPOINT: &str = "checkpoint.safetensors";
 
 impl RunDirectory {
-    /// Makes the directory and writes the configuration.
+    /// Refuses a place where no run can begin, before anything is loaded or written.
     ///
     /// # Errors
-    /// It holds a run already and `overwrite` is false, or it cannot be written.
-    pub fn create(path: &Path, config: &TrainConfig, overwrite: bool) -> Result<Self> {
+    /// It holds a run already and `overwrite` is false, or lies beneath a file.
+    pub fn check(path: &Path, overwrite: bool) -> Result<()> {
         let used = FILES.iter().find(|file| path.join(file).exists());
         if let Some(file) = used.filter(|_| !overwrite) {
             let problem =
                 format!("already holds a run ({file}); pass `HeldRun::Replace` to replace it");
             return Err(Error::output(path, problem));
         }
+        match path.ancestors().find(|folder| folder.exists()) {
+            Some(file) if !file.is_dir() => {
+                Err(unwritable(path, &std::io::ErrorKind::NotADirectory.into()))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Makes the directory and writes the configuration.
+    ///
+    /// # Errors
+    /// It holds a run already and `overwrite` is false, or it cannot be written.
+    pub fn create(path: &Path, config: &TrainConfig, overwrite: bool) -> Result<Self> {
+        Self::check(path, overwrite)?;
         std::fs::create_dir_all(path).map_err(|error| unwritable(path, &error))?;
         remove(path, &FILES)?;
         let mut run = Self::open(path, config, "", 0.0)?;

@@ -134,7 +134,7 @@ fn unknown(key: &str, known: &[String]) -> Error {
     let name = |key: &str| key.rsplit('.').next().unwrap_or_default().to_owned();
     // Whoever forgets the section means the key of that name.
     let far = |known: &&String| distance(key, known).min(distance(&name(key), &name(known)));
-    let nearest = known.iter().min_by_key(far);
+    let nearest = known.iter().min_by_key(|known| (far(known), known.len()));
     let hint = nearest.map(|nearest| format!("; the nearest is `{nearest}`")).unwrap_or_default();
     Error::Usage(format!("no setting is called `{key}`{hint}"))
 }
