@@ -4,6 +4,7 @@ mod directory;
 mod events;
 mod train;
 
+#[cfg(feature = "cli")]
 pub(crate) use directory::TARGET_EXPOSURE;
 pub use directory::{
     RunDirectory, is_finished, load_config, load_exposures, load_metrics, load_model,

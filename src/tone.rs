@@ -34,6 +34,7 @@ use std::fmt;
 use std::str::FromStr;
 
 pub use self::catalogue::{FAMILIES, ToneCurve};
+#[cfg(feature = "io")]
 pub(crate) use self::exposure::all_black;
 pub use self::exposure::{Exposure, exposed_anew, is_black, soft};
 pub use self::families::{Constant, Family, Law, White};

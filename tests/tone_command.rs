@@ -383,7 +383,7 @@ fn the_automatic_curve_says_how_bright_and_why_and_lends_its_brightness() {
     assert_eq!(output.curve.colour, 0.0, "single pictures keep their curve");
     let means: Vec<f64> = output.views.values().map(|view| view.after.mean_luminance).collect();
     assert!(means.iter().all(|mean| (0.43..0.55).contains(mean)), "{means:?}");
-    let json = serde_json::to_value(&apply(&automatic(&low)).unwrap()).unwrap();
+    let json = serde_json::to_value(apply(&automatic(&low)).unwrap()).unwrap();
     for key in ["gain", "target", "mean", "lift", "weight", "spread", "share", "black"] {
         assert!(json["exposure"][key].is_number(), "{key}");
     }

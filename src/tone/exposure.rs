@@ -19,7 +19,6 @@ use serde::Serialize;
 
 use super::histogram::LuminanceHistogram;
 use super::real::Real;
-use crate::Error;
 
 /// The black level of [`soft`].
 pub(super) const BLACK_LEVEL: f64 = 0.075;
@@ -196,10 +195,11 @@ impl From<Exposure> for Written {
 }
 
 /// Says that nothing can be lifted.
-pub(crate) fn all_black(path: &std::path::Path) -> Error {
+#[cfg(feature = "io")]
+pub(crate) fn all_black(path: &std::path::Path) -> crate::Error {
     let problem = "every photograph is as good as black (99 % of its pixels are below 2 of 255); expose longer, or name \
                    a curve with --curve";
-    Error::input(path, problem)
+    crate::Error::input(path, problem)
 }
 
 /// Whether a photograph shows next to nothing.
