@@ -2,7 +2,7 @@
 //!
 //! What a training view is compared with is not the render c but e = gain c + bias, an affine of the encoded values for each
 //! channel of each view. The model has one brightness: whatever is learned, the mean of gains over the training views is 1 and
-//! that of biases 0, exactly ([`center`]), so that a view shows the model as it is where its exposure is the mean.
+//! that of biases 0, exactly ([`Exposures::center`]), so that a view shows the model as it is where its exposure is the mean.
 
 mod affine;
 #[cfg(feature = "io")]
@@ -17,7 +17,6 @@ use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::exposure::{BIAS_SCALE, EXPOSURE_WIDTH};
 use crate::kernels::{expose, expose_backward, exposure_center, exposure_gradient};
 use crate::optimizer::{AdamBuffers, Learnable, Moments};
-use crate::reference::exposure_center::center;
 use crate::scene::COLOR_CHANNELS;
 use crate::{Error, Result};
 
@@ -83,9 +82,8 @@ impl Exposures {
                 "there is no view whose exposure could be learned".to_owned(),
             ));
         }
-        center(&mut parameters);
         let constants = expose_backward::Constants::default();
-        Ok(Self {
+        let mut exposures = Self {
             gpu: gpu.clone(),
             rates,
             view_count: start.len() as u32,
@@ -99,7 +97,10 @@ impl Exposures {
             parameters: gpu.buffer("exposures", &parameters)?,
             exposed: gpu.uninit("exposed", 0)?,
             partials: gpu.uninit("exposure_partials", 0)?,
-        })
+        };
+        let no_step_failed = gpu.zeros("status", 1)?;
+        gpu.run("center", |pass| exposures.center(pass, &no_step_failed))?;
+        Ok(exposures)
     }
 
     /// Memory for views of `size`, and for those reserved for before.

@@ -23,6 +23,7 @@
 //! - [`reference`](mod@reference): each kernel again, as plain loops on the CPU
 //! - [`sort`]: scan and radix sort on the device
 //! - [`image`]: float images and their files
+//! - [`metrics`]: PSNR and SSIM of a render against its reference image
 //! - [`camera`]: pinhole cameras and lens distortion
 //! - [`fit`]: the constants of a curve from pairs of photographs
 //! - [`dataset`]: photographs with their cameras and points, from disk
@@ -38,7 +39,6 @@
 //! - [`densify`]: clone, split, prune
 //! - [`train`]: one step after another
 //! - [`diagnose`]: what a capture is, and what its model needs
-//! - [`metrics`]: PSNR and SSIM of a render against its reference image
 //! - [`eval`]: scores of the test views
 //! - [`run`]: a training run, its events and its directory
 //! - [`report`]: tables and plots in one self-contained page

@@ -223,7 +223,7 @@ impl Trainer {
         }
         let sizes = views.sizes();
         say_what_parts_see(&config.model, &sizes);
-        let starts = views.exposures(&mut pseudo_gt, dataset, &config)?;
+        let starts = views.exposures(&mut pseudo_gt, dataset, &scene, &config)?;
         let gaussians = match gaussians {
             Some(gaussians) if gaussians.shape == settings.shape => gaussians.clone(),
             Some(Gaussians { shape: own, .. }) => {

@@ -99,6 +99,7 @@ impl Views {
         &self,
         pseudo_gt: &mut PseudoGt,
         dataset: &Dataset,
+        scene: &Scene,
         config: &TrainConfig,
     ) -> Result<Option<Vec<Affine>>> {
         if config.exposure.learn == Learning::Off {
@@ -115,12 +116,11 @@ impl Views {
         });
         let stops: Vec<f64> = stops.collect();
         let mean = stops.iter().sum::<f64>() / stops.len().max(1) as f64;
-        let lift = (!stops.is_empty()).then(|| Lift::new(pseudo_gt, dataset));
-        let mut lift = lift.transpose()?;
-        let affine = |name: &str| match (starts.get(name), &mut lift) {
-            (Some(Start::Affine(affine)), _) => Ok(*affine),
-            (Some(Start::Stops(stops)), Some(lift)) => lift.affine_of_stops(name, stops - mean),
-            _ => Ok(Affine::IDENTITY),
+        let mut targets = Targets { pseudo_gt, dataset, scene };
+        let affine = |name: &str| match starts.get(name) {
+            Some(Start::Affine(affine)) => Ok(*affine),
+            Some(Start::Stops(stops)) => targets.affine_of_stops(name, stops - mean),
+            None => Ok(Affine::IDENTITY),
         };
         self.names().map(affine).collect::<Result<Vec<_>>>().map(Some)
     }
@@ -185,24 +185,16 @@ impl Views {
 }
 
 /// Makes targets of photographs that are not in the dataset, as those of it are made.
-struct Lift<'a> {
+struct Targets<'a> {
     pseudo_gt: &'a mut PseudoGt,
     dataset: &'a Dataset,
-    scene: Option<Scene>,
+    scene: &'a Scene,
 }
 
-impl<'a> Lift<'a> {
-    fn new(pseudo_gt: &'a mut PseudoGt, dataset: &'a Dataset) -> Result<Self> {
-        let images = dataset.train_views().filter_map(|view| view.image.as_ref());
-        let measured = images.map(|image| pseudo_gt.measure(&image.data));
-        let measured = measured.collect::<Result<Vec<_>>>()?;
-        let scene = pseudo_gt.settings().scene(&measured);
-        Ok(Self { pseudo_gt, dataset, scene })
-    }
-
-    fn target(&mut self, scene: &Scene, photograph: &Image) -> Result<Image> {
+impl Targets<'_> {
+    fn target(&mut self, photograph: &Image) -> Result<Image> {
         let measured = self.pseudo_gt.measure(&photograph.data)?;
-        let lift = self.pseudo_gt.settings().lift(scene, &measured);
+        let lift = self.pseudo_gt.settings().lift(self.scene, &measured);
         self.pseudo_gt.lifted(photograph, &lift)
     }
 
@@ -211,17 +203,13 @@ impl<'a> Lift<'a> {
     /// takes much of the difference away before.
     fn affine_of_stops(&mut self, name: &str, stops: f64) -> Result<Affine> {
         let mut views = self.dataset.train_views().filter(|view| view.name == name);
-        let photograph = views.find_map(|view| view.image.as_ref());
-        let Some((photograph, scene)) = photograph.zip(self.scene.clone()) else {
+        let Some(photograph) = views.find_map(|view| view.image.as_ref()) else {
             return Ok(Affine::IDENTITY);
         };
         let scale = (-stops).exp2() as f32;
         let without = |&x: &f32| srgb_from_linear(scale * linear_from_srgb(x));
         let neutral = Image { data: photograph.data.iter().map(without).collect(), ..*photograph };
-        let affine = Affine::least_squares(
-            &self.target(&scene, &neutral)?,
-            &self.target(&scene, photograph)?,
-        )?;
+        let affine = Affine::least_squares(&self.target(&neutral)?, &self.target(photograph)?)?;
         // Of a photograph of one colour there is no more to say than that.
         let is_exposure = affine.gain.iter().all(|&gain| gain > 0.0);
         Ok(if is_exposure { affine } else { Affine::IDENTITY })

@@ -1,13 +1,13 @@
 //! Training views that are kept from training: how well the model shows their targets says when it has converged.
 
-use std::borrow::Cow;
-
 use serde::{Deserialize, Serialize};
 
 use super::Trainer;
+use super::views::lifted_from;
 use crate::camera::Camera;
 use crate::dataset::{Dataset, Split};
 use crate::image::Image;
+use crate::metrics::psnr;
 use crate::pseudo_gt::PseudoGt;
 use crate::tone::Scene;
 use crate::{Error, Result};
@@ -68,8 +68,7 @@ impl HeldOut {
         let mut views = vec![];
         for view in dataset.views.iter().filter(|view| view.split == Split::HeldOut) {
             let Some(image) = &view.image else { continue };
-            let original = if settings.lift_first { view.photograph()? } else { None };
-            let whole = original.unwrap_or(Cow::Borrowed(image));
+            let whole = lifted_from(view, image, settings.lift_first)?;
             let lift = settings.lift(scene, &pseudo_gt.measure(&whole.data)?);
             let target = pseudo_gt.lifted(&whole, &lift)?;
             views.push((view.camera, target.resized(image.width, image.height)));
@@ -86,8 +85,9 @@ impl Trainer {
     pub fn held_out_psnr(&mut self) -> Result<Option<f64>> {
         let views = std::mem::take(&mut self.held_out);
         let scores = views.0.iter().map(|(camera, target)| {
-            let render = self.render(camera)?;
-            Ok(psnr(&render.output().data, &target.data))
+            let mut shown = self.render(camera)?.output().clone();
+            shown.data.iter_mut().for_each(|value| *value = value.clamp(0.0, 1.0));
+            psnr(&shown, target)
         });
         let scores = scores.collect::<Result<Vec<f64>>>();
         self.held_out = views;
@@ -95,14 +95,6 @@ impl Trainer {
         let mean = scores.iter().sum::<f64>() / scores.len() as f64;
         Ok((!scores.is_empty()).then_some(mean))
     }
-}
-
-fn psnr(render: &[f32], target: &[f32]) -> f64 {
-    let pairs = render.iter().zip(target);
-    let square = |(&own, &other): (&f32, &f32)| f64::from(own.clamp(0.0, 1.0) - other).powi(2);
-    let mean = pairs.map(square).sum::<f64>() / target.len().max(1) as f64;
-    // Equal pictures: as good as 8 bits can tell apart.
-    -10.0 * mean.max(1e-10).log10()
 }
 
 #[cfg(test)]

@@ -76,9 +76,9 @@ impl Preset {
         matches!(self, Self::Draft | Self::Fast | Self::Balanced | Self::Best)
     }
 
-    /// Sets what its TOML says; of a benchmark the first Gaussians, density control, schedule and what the paper states for it and, where its
-    /// code has a file for the scene that the dataset's folder is named after, what that file states. c is that of the
-    /// configuration's curve; the automatic one gives way to AP3 there and with [`Preset::Paper`].
+    /// Sets what its TOML says; of a benchmark the first Gaussians, density control, schedule and what the paper states for
+    /// it and, where its code has a file for the scene that the dataset's folder is named after, what that file states. c is
+    /// that of the configuration's curve; the automatic one gives way to AP3 there and with [`Preset::Paper`].
     ///
     /// # Errors
     /// None for the presets that there are.

@@ -91,14 +91,9 @@ impl Views {
             .filter(|(_, view)| view.is_train())
             .filter_map(|(index, view)| view.image.as_ref().map(|image| (index, view, image)))
             .collect();
-        // What is measured, and what is lifted before it is shrunk.
-        let whole = |view: &'_ View, image: &'_ Image| -> Result<Image> {
-            let original = if settings.lift_first { view.photograph()? } else { None };
-            Ok(original.map_or_else(|| image.clone(), Cow::into_owned))
-        };
         let mut measured = vec![];
         for &(_, view, image) in &photographs {
-            measured.push(pseudo_gt.measure(&whole(view, image)?.data)?);
+            measured.push(pseudo_gt.measure(&lifted_from(view, image, settings.lift_first)?.data)?);
         }
         let scene = settings.scene(&measured).ok_or_else(|| all_black(&dataset.root))?;
         let mut views = vec![];
@@ -109,9 +104,11 @@ impl Views {
         {
             let lift = settings.lift(&scene, measured);
             gains.extend(lift.gain.map(|gain| (view.name.clone(), gain)));
-            let target = (settings.lift_first)
-                .then(|| pseudo_gt.lifted(&whole(view, image)?, &lift))
-                .transpose()?;
+            let target = if settings.lift_first {
+                Some(pseudo_gt.lifted(&*lifted_from(view, image, true)?, &lift)?)
+            } else {
+                None
+            };
             for (level, views) in views.iter_mut().enumerate() {
                 let size = shrunk(UVec2::new(image.width, image.height), level as u32);
                 let photograph = image.resized(size.x, size.y);
@@ -227,6 +224,20 @@ impl Views {
         let shape = Shape { sh_degree: config.sh_degree, features: config.model.features() };
         init::from_points(&positions, &colors, shape, &config.start, seed)
     }
+}
+
+/// What is measured of a view and becomes its target: the photograph as its camera took it where it is lifted before it is
+/// shrunk, else as it was loaded.
+///
+/// # Errors
+/// As [`View::photograph`].
+pub(super) fn lifted_from<'a>(
+    view: &'a View,
+    loaded: &'a Image,
+    lift_first: bool,
+) -> Result<Cow<'a, Image>> {
+    let original = if lift_first { view.photograph()? } else { None };
+    Ok(original.unwrap_or(Cow::Borrowed(loaded)))
 }
 
 /// A size halved as often as its level says and its shorter side allows.
