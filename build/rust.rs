@@ -153,11 +153,14 @@ impl From<Tolerances> for Vec<gpu::Tolerance> {{
 }}
 
 impl gpu::Kernel for Kernel {{
-    const NAME: &'static str = {name:?};
-    const SPIRV: &'static [u8] = include_bytes!(concat!(env!("OUT_DIR"), "/{name}.spv"));
-    const WORKGROUP_SIZE: [u32; 3] = {workgroup_size:?};
-    const SUBGROUP_SIZE_ID: Option<u32> = {subgroup_size_id:?};
-    const BINDINGS: &'static [gpu::Binding] = &[{bindings}];
+    const INTERFACE: &'static gpu::Interface = &gpu::Interface {{
+        name: {name:?},
+        spirv: include_bytes!(concat!(env!("OUT_DIR"), "/{name}.spv")),
+        workgroup_size: {workgroup_size:?},
+        subgroup_size_id: {subgroup_size_id:?},
+        bindings: &[{bindings}],
+        params_size: size_of::<Params>(),
+    }};
     type Params = Params;
     type Constants = Constants;
     type Buffers<'a> = Buffers<'a>;

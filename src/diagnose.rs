@@ -22,16 +22,13 @@ use serde::Serialize;
 
 use crate::camera::Camera;
 use crate::dataset::{Dataset, LoadOptions, View};
-use crate::image::{Image, files};
+use crate::image::{Image, MIDDLE_GREY, files};
 use crate::tone::{Exposure, LuminanceHistogram, is_black};
 use crate::{Error, Result};
 use geometry::Shared;
 pub use noise::Noise;
 use photograph::Measured;
 pub use plan::{Fingerprint, Number, Plan, Switch};
-
-/// What 18 % grey is in linear light: the mean of a photograph that is exposed as a meter has it.
-const MIDDLE_GREY: f64 = 0.18;
 
 /// A view this many times as blurred as the median is named, and at least so many pixels more.
 const BLURRED: [f64; 2] = [1.6, 0.7];
@@ -218,7 +215,6 @@ impl Photograph {
     fn diagnosis(&self, name: &str, shared: &Shared, place: usize) -> ViewDiagnosis {
         let Self { size, measured, histogram } = self;
         let [p10, p90] = measured.statistics.percentiles();
-        let hot = histogram.quantile(0.999);
         ViewDiagnosis {
             name: name.to_owned(),
             size: *size,
@@ -226,9 +222,9 @@ impl Photograph {
             p90,
             r: measured.statistics.printed_ratio(),
             mean_luminance: measured.statistics.mean_luminance.into(),
-            cubic_mean: histogram.mean_of(|y| y.min(hot).powi(3)).cbrt(),
+            cubic_mean: histogram.cubic_mean(),
             light: measured.light,
-            darkening: MIDDLE_GREY / measured.light.max(f64::MIN_POSITIVE),
+            darkening: darkening(measured.light),
             exposure: shared.exposures[place],
             clipped_fraction: measured.clipped_fraction,
             zero_fraction: measured.zero_fraction,
@@ -266,7 +262,7 @@ impl SceneDiagnosis {
             mean_luminance: mean(|view| view.mean_luminance),
             cubic_mean: mean(|view| view.cubic_mean),
             light,
-            darkening: MIDDLE_GREY / light.max(f64::MIN_POSITIVE),
+            darkening: darkening(light),
             lift: exposure.lift(),
             gain: exposure.gain,
             exposure_spread: measured.unwrap_or(exposure.spread / std::f64::consts::LN_2),
@@ -286,6 +282,11 @@ impl SceneDiagnosis {
     }
 }
 
+/// How many times more light would expose a photograph of this mean as a meter has it.
+fn darkening(light: f64) -> f64 {
+    f64::from(MIDDLE_GREY) / light.max(f64::MIN_POSITIVE)
+}
+
 /// The noise of a pixel of the mean light, in the target, averaged over the views that look at a place.
 fn target_noise(noise: Noise, light: f64, exposure: &Exposure, shared: &Shared) -> f64 {
     let encoded = f64::from(crate::image::srgb_from_linear(light as f32));
@@ -296,6 +297,11 @@ fn target_noise(noise: Noise, light: f64, exposure: &Exposure, shared: &Shared) 
     let slope = (soft(encoded + step) - soft(encoded - step)) / (2.0 * step);
     let slope = weight * slope + (1.0 - weight);
     slope * noise.deviation(light) / noise::slope(light) / shared.views_per_point.max(1.0).sqrt()
+}
+
+/// The hash FNV-1a of some bytes or words: equal ones have equal hashes, on every machine.
+fn fnv1a(words: impl Iterator<Item = u64>) -> u64 {
+    words.fold(0xcbf2_9ce4_8422_2325, |hash, word| (hash ^ word).wrapping_mul(0x0100_0000_01b3))
 }
 
 /// The standard deviation; none of fewer than two values.

@@ -34,7 +34,7 @@ pub use buffer::{Buffer, Download};
 pub use check::{CheckReport, CheckedPass, Difference, Tolerance};
 pub use cooperative::CooperativeMatrix;
 pub use device::{DeviceChoice, DeviceReport, HostDevice, RequirementReport, devices};
-pub use kernel::{Binding, Bound, Kernel, Reference};
+pub use kernel::{Binding, Bound, Interface, Kernel, Reference};
 pub use pipeline::Pipeline;
 pub use recorder::{Recorder, Threads};
 pub use requirements::{REQUIREMENTS, Requirement, required_device_features};

@@ -39,6 +39,9 @@ fn from_interleaved(width: u32, height: u32, values: &[f32]) -> Image {
     Image { width, height, data }
 }
 
+/// Middle grey in linear light: the mean of a photograph that is exposed as a meter has it.
+pub const MIDDLE_GREY: f32 = 0.18;
+
 /// The sRGB encoding of a linear-light value; inverse of [`linear_from_srgb`].
 pub fn srgb_from_linear(linear: f32) -> f32 {
     if linear <= 0.003_130_8 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }

@@ -13,7 +13,7 @@ mod frame;
 use glam::UVec2;
 
 use crate::camera::Camera;
-use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Statistic, Threads};
+use crate::gpu::{self, Buffer, Gpu, Pipeline, Recorder, Statistic, Threads};
 use crate::image::Image;
 use crate::kernels::project::DEPTH_BITS;
 use crate::kernels::splat::MAX_CHANNELS;
@@ -222,6 +222,9 @@ impl Renderer {
             let UVec2 { x, y } = self.tiles(camera);
             pixels = pixels.max(camera.width as usize * camera.height as usize);
             tiles = tiles.max(x as usize * y as usize);
+            if x as usize * y as usize > most_tiles(&self.gpu) {
+                return Err(self.too_many_tiles(camera));
+            }
         }
         self.frame.reserve(&self.gpu, [gaussian_count, capacity], pixels, tiles)
     }
@@ -350,6 +353,16 @@ impl Renderer {
         let ([width, height], device) = (self.tile, self.gpu.properties().name.clone());
         let (tile, limit) = (format!("{width}x{height}"), self.longest_run);
         Error::Crowded { view, splats, tile, device, limit }
+    }
+
+    fn too_many_tiles(&self, camera: &Camera) -> Error {
+        let (Camera { width, height, .. }, [tile_width, tile_height]) = (camera, self.tile);
+        let (count, most) = (self.tiles(camera).element_product(), most_tiles(&self.gpu));
+        let device = &self.gpu.properties().name;
+        Error::Usage(format!(
+            "a {width}x{height} view has {count} tiles of {tile_width}x{tile_height} pixels, {device} follows {most}; \
+             raise `TrainConfig::downscale` or take a larger `tile`"
+        ))
     }
 
     /// Lowers every flag of the status.
@@ -563,12 +576,22 @@ fn splats_per_turn(gpu: &Gpu) -> u32 {
     if gpu.properties().max_loop_iterations < u32::MAX { 2 } else { 1 }
 }
 
+/// Turns of a kernel's loops beside those that are counted.
+const SOME_TURNS: u32 = 64;
+
+/// How many tiles a view may have: where every Gaussian of a subgroup covers all of them, `reduce_records` makes as many
+/// turns as there are tiles, its lanes taking turns at each; `emit` makes fewer.
+fn most_tiles(gpu: &Gpu) -> usize {
+    let gpu::Properties { max_loop_iterations, subgroup_size, .. } = *gpu.properties();
+    let turns_of_owners = 2 * subgroup_size;
+    (max_loop_iterations - SOME_TURNS - turns_of_owners) as usize
+}
+
 /// How many splats of a tile the blending kernels get through: of a subgroup of splats they make one turn of the
 /// outer loop and the turns of the inner one; some more find the run, and end a loop.
 fn longest_run(gpu: &Gpu) -> u32 {
     let properties = gpu.properties();
     let lanes = properties.subgroup_size;
-    const SOME_TURNS: u32 = 64;
     let turns_per_batch = 1 + lanes.div_ceil(splats_per_turn(gpu));
     ((properties.max_loop_iterations - SOME_TURNS) / turns_per_batch).saturating_mul(lanes)
 }

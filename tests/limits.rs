@@ -207,6 +207,38 @@ fn slots_that_no_tile_fills_are_padding_and_leave_no_trace_in_the_sums() {
     }
 }
 
+#[test]
+fn a_view_has_at_most_the_tiles_that_a_subgroup_of_gaussians_that_cover_them_all_gets_through() {
+    let most = gpu().properties().max_loop_iterations;
+    if most == u32::MAX {
+        eprintln!("not run: loops of this device do not end");
+        return;
+    }
+    let mut renderer = Renderer::new(&gpu(), Setup::new(1, [32, 32], 0, 1).settings).unwrap();
+    let view = |size| Setup::new(1, size, 0, 1).camera;
+    renderer.reserve(1, [&view([8192, 16])]).unwrap();
+    renderer.reserve(1, [&view([3840, 2160])]).unwrap();
+    let message = renderer.reserve(1, [&view([8192, 8192])]).unwrap_err().to_string();
+    assert!(message.starts_with("a 8192x8192 view has 524288 tiles of 16x8 pixels"), "{message}");
+    assert!(!message.contains('\n'), "{message}");
+
+    let lanes = gpu().properties().subgroup_size;
+    let tiles = most - 64 - 2 * lanes;
+    let slots = (tiles * lanes) as usize;
+    let emitted: Vec<_> = (0..lanes).map(|i| UVec2::new(i, i + 1) * tiles).collect();
+    let records = vec![Vec3::ONE; slots * 3];
+    let d_splats = vec![Vec3::NAN; lanes as usize * 3];
+    let sums = run_kernel!(
+        reduce_records,
+        reduce_records::Constants::default(),
+        reduce_records::Params { gaussian_count: lanes },
+        Threads::Exactly([lanes, 1, 1]),
+        [emitted, records],
+        [d_splats]
+    );
+    assert!(sums.iter().all(|&sum| sum == Vec3::splat(tiles as f32)), "{sums:?}");
+}
+
 /// So many faint splats, one behind the other, on one pixel.
 fn crowd(count: usize) -> Setup {
     let mut setup = Setup::new(count, [16, 8], 0, 5);

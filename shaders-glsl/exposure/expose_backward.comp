@@ -11,6 +11,7 @@
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
+#include "subgroup_sum.glsl"
 layout(constant_id = 0) const uint CHUNK = 1024;
 
 layout(push_constant) uniform Params {
@@ -35,6 +36,6 @@ void main() {
         sums += d * vec2(render[i], 1.0);
         d_render[i] = gain * d;
     }
-    sums = subgroupAdd(sums);
+    sums = subgroup_sum(sums);
     if (subgroupElect()) partials[channel * chunk_count + gl_WorkGroupID.x] = sums;
 }

@@ -10,6 +10,7 @@
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
+#include "subgroup_sum.glsl"
 
 layout(push_constant) uniform Params {
     uint chunk_count;
@@ -28,7 +29,7 @@ void main() {
         vec2 sums = vec2(0.0);
         for (uint k = gl_SubgroupInvocationID; k < chunk_count; k += SUBGROUP_SIZE)
             sums += partials[channel * chunk_count + k];
-        sums = subgroupAdd(sums);
+        sums = subgroup_sum(sums);
         if (subgroupElect()) {
             gradients[own + channel] = sums.x;
             gradients[own + channel + 3] = BIAS_SCALE * sums.y;

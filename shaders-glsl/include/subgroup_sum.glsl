@@ -9,6 +9,8 @@ float subgroup_sum(float x) {
     return x;
 }
 
+vec2 subgroup_sum(vec2 x) { return vec2(subgroup_sum(x.x), subgroup_sum(x.y)); }
+
 vec3 subgroup_sum(vec3 x) { return vec3(subgroup_sum(x.x), subgroup_sum(x.y), subgroup_sum(x.z)); }
 
 // The sum of `x` over this lane and those before it.

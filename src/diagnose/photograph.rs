@@ -52,7 +52,7 @@ impl Measured {
             patches,
             blur: blur(image),
             unevenness: unevenness(&luminance, image.width as usize),
-            checksum: checksum(&image.data),
+            checksum: super::fnv1a(image.data.iter().map(|value| value.to_bits().into())),
         }
     }
 }
@@ -129,11 +129,4 @@ fn unevenness(luminance: &[f32], width: usize) -> f64 {
     // A black corner is no light source: what is below a thousandth of the mean counts as that.
     let logs: Vec<f64> = means.iter().map(|mean| mean.max(1e-3 * whole).log2()).collect();
     super::deviation(logs.iter().copied()).filter(|_| whole > 0.0).unwrap_or(0.0)
-}
-
-/// FNV-1a of the bits: equal photographs have equal ones.
-fn checksum(data: &[f32]) -> u64 {
-    let mix =
-        |hash: u64, value: &f32| (hash ^ u64::from(value.to_bits())).wrapping_mul(0x0100_0000_01b3);
-    data.iter().fold(0xcbf2_9ce4_8422_2325, mix)
 }

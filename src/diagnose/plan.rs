@@ -4,8 +4,8 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use super::{Diagnosis, SceneDiagnosis};
-use crate::dataset::Dataset;
+use super::{Diagnosis, SceneDiagnosis, fnv1a};
+use crate::dataset::{Dataset, View};
 use crate::scene::{Features, Shape, width};
 use crate::tone::ToneCurve;
 use crate::train::{Learning, Part, TrainConfig};
@@ -71,14 +71,10 @@ impl Fingerprint {
     /// The dataset's own.
     pub fn of(dataset: &Dataset) -> Self {
         let views: Vec<_> = dataset.views.iter().filter(|view| view.is_for_training()).collect();
-        let mut hash = 0xcbf2_9ce4_8422_2325_u64;
-        for view in &views {
-            let line = format!("{} {}x{}\n", view.name, view.camera.width, view.camera.height);
-            // FNV-1a.
-            for byte in line.bytes() {
-                hash = (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3);
-            }
-        }
+        let line =
+            |view: &&View| format!("{} {}x{}\n", view.name, view.camera.width, view.camera.height);
+        let lines: String = views.iter().map(line).collect();
+        let hash = fnv1a(lines.bytes().map(u64::from));
         let size = views.first().map_or([0; 2], |view| [view.camera.width, view.camera.height]);
         Self { views: views.len(), size, fingerprint: format!("{hash:016x}") }
     }

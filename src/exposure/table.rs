@@ -12,16 +12,13 @@ use std::path::Path;
 
 use super::Affine;
 use crate::image::files::stem;
-use crate::image::{linear_from_srgb, srgb_from_linear};
+use crate::image::{MIDDLE_GREY, linear_from_srgb, srgb_from_linear};
 use crate::output::write_whole;
 use crate::{Error, Result};
 
 /// The columns in the order in which they are written.
 const COLUMNS: [&str; 8] =
     ["name", "ev", "gain_r", "gain_g", "gain_b", "bias_r", "bias_g", "bias_b"];
-
-/// Middle grey, linear light.
-const MIDDLE_GREY: f32 = 0.18;
 
 /// What a table knows of one view.
 #[derive(Clone, Debug, PartialEq)]

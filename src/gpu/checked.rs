@@ -11,9 +11,11 @@ use std::thread::{self, ThreadId};
 use ash::vk;
 
 use super::check::Versions;
+use super::pipeline::Objects;
+use super::submission::Record;
 use super::{
-    Binding, Bound, CheckReport, CheckedPass, Difference, Download, Gpu, Kernel, Pipeline, Queue,
-    Recorder, Reference, Shared, Threads, lock, testing,
+    Binding, Bound, CheckReport, CheckedPass, Difference, Download, Gpu, Pipeline, Queue, Recorder,
+    Reference, Shared, Threads, Tolerance, lock, testing,
 };
 use crate::Result;
 
@@ -75,7 +77,7 @@ impl Shared {
         pool: vk::CommandPool,
         value: u64,
         recording: &str,
-        record: impl FnOnce(&mut Recorder<'_>) -> Result<()>,
+        record: Record<'_>,
     ) -> Result<u64> {
         let mut recorder = Recorder::new(self, self.begin(pool)?, value, None);
         let report = self.checks.take().unwrap_or_default();
@@ -91,7 +93,7 @@ impl Shared {
 }
 
 impl Recorder<'_> {
-    /// Runs what was recorded before, then the pass alone, then its reference, and compares.
+    /// Checks a pass, its kernel's types left behind.
     pub(super) fn dispatch_checked<K: Reference>(
         &mut self,
         pipeline: &Pipeline<K>,
@@ -99,27 +101,44 @@ impl Recorder<'_> {
         bound: &[Bound],
         threads: Threads<'_>,
     ) -> Result<()> {
-        let before = self.copies::<K>(bound, |_| true)?;
         let mut on_device = *params;
-        testing::plant_defect(K::NAME, bytemuck::bytes_of_mut(&mut on_device));
-        self.record_dispatch(pipeline, &on_device, bound, threads)?;
-        let device = self.copies::<K>(bound, |binding| binding.writable)?;
-        self.run_what_is_recorded(K::NAME)?;
+        testing::plant_defect(K::INTERFACE.name, bytemuck::bytes_of_mut(&mut on_device));
+        let on_device = bytemuck::bytes_of(&on_device);
+        self.run_checked(&pipeline.objects, on_device, bound, threads, &|reference, before| {
+            K::run(params, &pipeline.constants, K::slices(reference));
+            K::tolerances(params, &pipeline.constants, K::slices(before)).into()
+        })
+    }
 
-        let workgroups = self.workgroups::<K>(threads).iter().map(|&n| n as usize).product();
+    /// Runs what was recorded before, then the pass alone, then its reference, and compares. `reference` makes of the first
+    /// words what the kernel's reference does, and gives the tolerances from the second.
+    fn run_checked(
+        &mut self,
+        pipeline: &Objects,
+        params: &[u8],
+        bound: &[Bound],
+        threads: Threads<'_>,
+        reference_of: &dyn Fn(&mut [Vec<u32>], &mut [Vec<u32>]) -> Vec<Tolerance>,
+    ) -> Result<()> {
+        let (interface, kernel) = (pipeline.interface, pipeline.interface.name);
+        let before = self.copies(interface.bindings, bound, |_| true)?;
+        self.record_dispatch(pipeline, params, bound, threads)?;
+        let device = self.copies(interface.bindings, bound, |binding| binding.writable)?;
+        self.run_what_is_recorded(kernel)?;
+
+        let workgroups = self.workgroups(interface, threads).iter().map(|&n| n as usize).product();
         let Some(checked) = &mut self.checked else { return Ok(()) };
-        let (recording, kernel) = (checked.recording.to_owned(), K::NAME);
+        let recording = checked.recording.to_owned();
         let mut pass = CheckedPass { recording, kernel, error: None, difference: None };
         if !checked.has_wrong_integers {
             let mut before = wait(before)?;
             let mut reference = before.clone();
-            K::run(params, &pipeline.constants, K::slices(&mut reference));
-            let tolerances = K::tolerances(params, &pipeline.constants, K::slices(&mut before));
-            let written = K::BINDINGS.iter().zip(&before).zip(&reference);
+            let tolerances = reference_of(&mut reference, &mut before);
+            let written = interface.bindings.iter().zip(&before).zip(&reference);
             let written = written.filter(|((binding, _), _)| binding.writable);
             pass.error = Some(0.0);
             for ((((binding, before), reference), device), tolerance) in
-                written.zip(wait(device)?).zip(tolerances.into())
+                written.zip(wait(device)?).zip(tolerances)
             {
                 let versions =
                     Versions { before, device: &device, reference, is_float: binding.is_float };
@@ -144,12 +163,13 @@ impl Recorder<'_> {
     }
 
     /// Records copies of what the pass binds.
-    fn copies<K: Kernel>(
+    fn copies(
         &mut self,
+        bindings: &[Binding],
         bound: &[Bound],
         wanted: impl Fn(&Binding) -> bool,
     ) -> Result<Vec<Download<u32>>> {
-        let wanted = K::BINDINGS.iter().zip(bound).filter(|(binding, _)| wanted(binding));
+        let wanted = bindings.iter().zip(bound).filter(|(binding, _)| wanted(binding));
         wanted
             .map(|(binding, bound)| {
                 self.download_raw(binding.name, bound.raw, bound.size as usize / size_of::<u32>())

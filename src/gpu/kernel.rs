@@ -28,20 +28,29 @@ pub struct Bound {
     pub size: u64,
 }
 
+/// What Vulkan must know of a compute shader; the same for every type of kernel.
+#[derive(Debug)]
+pub struct Interface {
+    /// The shader's stem: also its label in captures, timings and errors.
+    pub name: &'static str,
+    /// The module, little-endian words.
+    pub spirv: &'static [u8],
+    /// Threads of a workgroup; zero along x stands for the device's subgroup size.
+    pub workgroup_size: [u32; 3],
+    /// The specialization constant that takes the subgroup size, where a workgroup is one subgroup.
+    pub subgroup_size_id: Option<u32>,
+    /// The storage buffers in binding order.
+    pub bindings: &'static [Binding],
+    /// Bytes of the push constants.
+    pub params_size: usize,
+}
+
 /// A compute shader and everything the host must know to launch it.
 ///
 /// Implemented by `build.rs` from the SPIR-V; never by hand.
 pub trait Kernel: 'static {
-    /// The shader's stem: also its label in captures, timings and errors.
-    const NAME: &'static str;
-    /// The module, little-endian words.
-    const SPIRV: &'static [u8];
-    /// Threads of a workgroup; zero along x stands for the device's subgroup size.
-    const WORKGROUP_SIZE: [u32; 3];
-    /// The specialization constant that takes the subgroup size, where a workgroup is one subgroup.
-    const SUBGROUP_SIZE_ID: Option<u32>;
-    /// The storage buffers in binding order.
-    const BINDINGS: &'static [Binding];
+    /// The untyped side.
+    const INTERFACE: &'static Interface;
     /// The push constants.
     type Params: bytemuck::Pod;
     /// The specialization constants.

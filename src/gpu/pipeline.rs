@@ -5,16 +5,23 @@ use std::sync::Arc;
 
 use ash::vk;
 
-use super::{Gpu, Kernel, Retired, Shared};
+use super::{Gpu, Interface, Kernel, Retired, Shared};
 use crate::Result;
 
 /// A kernel ready to be dispatched.
 #[derive(Debug)]
 pub struct Pipeline<K: Kernel> {
-    pub(super) raw: vk::Pipeline,
-    pub(super) layout: vk::PipelineLayout,
     /// What it is specialised for.
     pub(super) constants: K::Constants,
+    pub(super) objects: Objects,
+}
+
+/// The Vulkan objects of a kernel.
+#[derive(Debug)]
+pub(super) struct Objects {
+    pub(super) interface: &'static Interface,
+    pub(super) raw: vk::Pipeline,
+    pub(super) layout: vk::PipelineLayout,
     set_layout: vk::DescriptorSetLayout,
     pub(super) shared: Arc<Shared>,
 }
@@ -25,29 +32,38 @@ impl Gpu {
     /// # Errors
     /// The driver refuses the kernel.
     pub fn pipeline<K: Kernel>(&self, constants: &K::Constants) -> Result<Pipeline<K>> {
+        let objects = self.objects(K::INTERFACE, K::constants(constants))?;
+        Ok(Pipeline { constants: *constants, objects })
+    }
+
+    fn objects(
+        &self,
+        interface: &'static Interface,
+        constants: Vec<(u32, u32)>,
+    ) -> Result<Objects> {
         let shared = &self.shared;
         let fail = |call| move |result| shared.error(call, result);
         // SAFETY: every create info points at live locals, and what fails half-way is destroyed here.
         unsafe {
-            let set_layout =
-                set_layout::<K>(&shared.device).map_err(fail("vkCreateDescriptorSetLayout"))?;
-            let layout = match pipeline_layout::<K>(&shared.device, set_layout) {
+            let set_layout = set_layout(&shared.device, interface)
+                .map_err(fail("vkCreateDescriptorSetLayout"))?;
+            let layout = match pipeline_layout(&shared.device, interface, set_layout) {
                 Ok(layout) => layout,
                 Err(result) => {
                     shared.device.destroy_descriptor_set_layout(set_layout, None);
                     return Err(shared.error("vkCreatePipelineLayout", result));
                 }
             };
-            match raw_pipeline::<K>(shared, layout, constants, Default::default()) {
+            match raw_pipeline(shared, interface, layout, constants, Default::default()) {
                 Ok(raw) => {
-                    shared.name(raw, K::NAME);
+                    shared.name(raw, interface.name);
                     let shared = Arc::clone(shared);
-                    Ok(Pipeline { raw, layout, constants: *constants, set_layout, shared })
+                    Ok(Objects { interface, raw, layout, set_layout, shared })
                 }
                 Err(result) => {
                     shared.device.destroy_pipeline_layout(layout, None);
                     shared.device.destroy_descriptor_set_layout(set_layout, None);
-                    tracing::error!("kernel {} was refused", K::NAME);
+                    tracing::error!("kernel {} was refused", interface.name);
                     Err(shared.error("vkCreateComputePipelines", result))
                 }
             }
@@ -57,10 +73,12 @@ impl Gpu {
 
 /// # Safety
 /// The device is live.
-unsafe fn set_layout<K: Kernel>(
+unsafe fn set_layout(
     device: &ash::Device,
+    interface: &Interface,
 ) -> Result<vk::DescriptorSetLayout, vk::Result> {
-    let bindings: Vec<_> = K::BINDINGS
+    let bindings: Vec<_> = interface
+        .bindings
         .iter()
         .map(|binding| {
             vk::DescriptorSetLayoutBinding::default()
@@ -79,15 +97,16 @@ unsafe fn set_layout<K: Kernel>(
 
 /// # Safety
 /// The device and the set layout are live.
-unsafe fn pipeline_layout<K: Kernel>(
+unsafe fn pipeline_layout(
     device: &ash::Device,
+    interface: &Interface,
     set_layout: vk::DescriptorSetLayout,
 ) -> Result<vk::PipelineLayout, vk::Result> {
     let set_layouts = [set_layout];
     let ranges = [vk::PushConstantRange::default()
         .stage_flags(vk::ShaderStageFlags::COMPUTE)
-        .size(size_of::<K::Params>() as u32)];
-    let ranges = if size_of::<K::Params>() == 0 { &[][..] } else { &ranges[..] };
+        .size(interface.params_size as u32)];
+    let ranges = if interface.params_size == 0 { &[][..] } else { &ranges[..] };
     let info = vk::PipelineLayoutCreateInfo::default()
         .set_layouts(&set_layouts)
         .push_constant_ranges(ranges);
@@ -97,16 +116,16 @@ unsafe fn pipeline_layout<K: Kernel>(
 
 /// # Safety
 /// The device and the layout are live.
-pub(super) unsafe fn raw_pipeline<K: Kernel>(
+pub(super) unsafe fn raw_pipeline(
     shared: &Shared,
+    interface: &Interface,
     layout: vk::PipelineLayout,
-    constants: &K::Constants,
+    mut constants: Vec<(u32, u32)>,
     flags: vk::PipelineCreateFlags,
 ) -> Result<vk::Pipeline, vk::Result> {
-    let code = ash::util::read_spv(&mut Cursor::new(K::SPIRV))
+    let code = ash::util::read_spv(&mut Cursor::new(interface.spirv))
         .map_err(|_| vk::Result::ERROR_INITIALIZATION_FAILED)?;
-    let mut constants = K::constants(constants);
-    if let Some(id) = K::SUBGROUP_SIZE_ID {
+    if let Some(id) = interface.subgroup_size_id {
         constants.push((id, shared.properties.subgroup_size));
     }
     let entries: Vec<_> = (0u32..)
@@ -126,7 +145,7 @@ pub(super) unsafe fn raw_pipeline<K: Kernel>(
         .stage(vk::ShaderStageFlags::COMPUTE)
         .name(c"main")
         .specialization_info(&specialization);
-    if K::SUBGROUP_SIZE_ID.is_some() {
+    if interface.subgroup_size_id.is_some() {
         stage = stage.flags(vk::PipelineShaderStageCreateFlags::REQUIRE_FULL_SUBGROUPS);
         // Where a device cannot be told the size, its only size is the one it reports.
         if shared.properties.subgroup_size_is_selectable {
@@ -159,7 +178,7 @@ impl Shared {
     }
 }
 
-impl<K: Kernel> Drop for Pipeline<K> {
+impl Drop for Objects {
     fn drop(&mut self) {
         self.shared.retire(Retired::Pipeline(self.raw, self.layout, self.set_layout));
     }

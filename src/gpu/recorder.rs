@@ -9,7 +9,8 @@ use ash::vk;
 use ash::vk::Handle as _;
 
 use super::checked::Checked;
-use super::{Bound, Buffer, Gpu, Kernel, Pipeline, Reference, Shared};
+use super::pipeline::Objects;
+use super::{Bound, Buffer, Gpu, Interface, Pipeline, Reference, Shared};
 use crate::{Error, Result};
 
 /// How many invocations a dispatch needs; the kernel knows its workgroup size.
@@ -96,17 +97,18 @@ impl<'g> Recorder<'g> {
         if self.checked.is_some() {
             return self.dispatch_checked(pipeline, params, &bound, threads);
         }
-        self.record_dispatch(pipeline, params, &bound, threads)
+        self.record_dispatch(&pipeline.objects, bytemuck::bytes_of(params), &bound, threads)
     }
 
-    pub(super) fn record_dispatch<K: Kernel>(
+    pub(super) fn record_dispatch(
         &mut self,
-        pipeline: &Pipeline<K>,
-        params: &K::Params,
+        pipeline: &Objects,
+        params: &[u8],
         bound: &[Bound],
         threads: Threads<'_>,
     ) -> Result<()> {
-        let uses = K::BINDINGS.iter().zip(bound).map(|(b, bound)| (bound.raw, b.writable));
+        let Interface { name, bindings, .. } = *pipeline.interface;
+        let uses = bindings.iter().zip(bound).map(|(b, bound)| (bound.raw, b.writable));
         let indirect = match threads {
             Threads::Indirect(arguments) => Some((arguments.handle(), false)),
             _ => None,
@@ -114,9 +116,9 @@ impl<'g> Recorder<'g> {
         self.synchronize(uses.chain(indirect));
         let groups = match threads {
             Threads::Indirect(_) => [0; 3],
-            _ => self.fold(K::NAME, self.workgroups::<K>(threads))?,
+            _ => self.fold(name, self.workgroups(pipeline.interface, threads))?,
         };
-        self.begin_label(K::NAME);
+        self.begin_label(name);
         self.bind(pipeline, params, bound);
         let device = &self.shared.device;
         // SAFETY: recording; a retired buffer outlives this submission.
@@ -127,7 +129,7 @@ impl<'g> Recorder<'g> {
                 None => device.cmd_dispatch(self.commands, groups[0], groups[1], groups[2]),
             }
         }
-        self.end_label(K::NAME);
+        self.end_label(name);
         Ok(())
     }
 
@@ -207,12 +209,14 @@ impl<'g> Recorder<'g> {
         self.pending.clear();
     }
 
-    fn bind<K: Kernel>(&self, pipeline: &Pipeline<K>, params: &K::Params, bound: &[Bound]) {
+    fn bind(&self, pipeline: &Objects, params: &[u8], bound: &[Bound]) {
         let infos: Vec<_> = bound
             .iter()
             .map(|b| [vk::DescriptorBufferInfo::default().buffer(b.raw).range(vk::WHOLE_SIZE)])
             .collect();
-        let writes: Vec<_> = K::BINDINGS
+        let writes: Vec<_> = pipeline
+            .interface
+            .bindings
             .iter()
             .zip(&infos)
             .map(|(binding, info)| {
@@ -233,19 +237,18 @@ impl<'g> Recorder<'g> {
                 0,
                 &writes,
             );
-            let bytes = bytemuck::bytes_of(params);
-            if !bytes.is_empty() {
+            if !params.is_empty() {
                 let stage = vk::ShaderStageFlags::COMPUTE;
-                self.shared.device.cmd_push_constants(commands, pipeline.layout, stage, 0, bytes);
+                self.shared.device.cmd_push_constants(commands, pipeline.layout, stage, 0, params);
             }
         }
     }
 
     /// The workgroups of a dispatch; none where the device alone knows.
-    pub(super) fn workgroups<K: Kernel>(&self, threads: Threads<'_>) -> [u32; 3] {
+    pub(super) fn workgroups(&self, interface: &Interface, threads: Threads<'_>) -> [u32; 3] {
         match threads {
             Threads::Exactly(n) => {
-                let mut size = K::WORKGROUP_SIZE;
+                let mut size = interface.workgroup_size;
                 if size[0] == 0 {
                     size[0] = self.shared.properties.subgroup_size;
                 }

@@ -25,14 +25,20 @@ impl<K: Kernel> Pipeline<K> {
     /// # Errors
     /// The driver refuses the kernel.
     pub fn statistics(&self) -> Result<Option<Vec<Statistic>>> {
-        let shared = &self.shared;
+        let shared = &self.objects.shared;
         let Some(functions) = &shared.executables else { return Ok(None) };
         let fail = |call| move |result| shared.error(call, result);
         // SAFETY: the device and the layout are live, the infos point at live locals, the pipeline is never used.
         unsafe {
             let flags = vk::PipelineCreateFlags::CAPTURE_STATISTICS_KHR;
-            let raw = pipeline::raw_pipeline::<K>(shared, self.layout, &self.constants, flags)
-                .map_err(fail("vkCreateComputePipelines"))?;
+            let raw = pipeline::raw_pipeline(
+                shared,
+                K::INTERFACE,
+                self.objects.layout,
+                K::constants(&self.constants),
+                flags,
+            )
+            .map_err(fail("vkCreateComputePipelines"))?;
             let info = vk::PipelineInfoKHR::default().pipeline(raw);
             let told =
                 functions.get_pipeline_executable_properties(&info).and_then(|executables| {

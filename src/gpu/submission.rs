@@ -10,6 +10,9 @@ use super::recorder::MAX_TIMESTAMPS;
 use super::{Gpu, Queue, Recorder, Retired, Shared, lock};
 use crate::{Error, Result};
 
+/// What fills a command buffer.
+pub(super) type Record<'a> = Box<dyn FnOnce(&mut Recorder<'_>) -> Result<()> + 'a>;
+
 /// Work in flight.
 #[derive(Debug)]
 pub struct Submission {
@@ -75,7 +78,7 @@ impl Gpu {
         label: &str,
         record: impl FnOnce(&mut Recorder<'_>) -> Result<()>,
     ) -> Result<Submission> {
-        self.record_and_submit(label, None, record).map(|(submission, _)| submission)
+        self.record_and_submit(label, None, Box::new(record)).map(|(submission, _)| submission)
     }
 
     /// Records passes, submits them and waits.
@@ -113,7 +116,7 @@ impl Gpu {
             .map_err(|result| shared.error("vkCreateQueryPool", result))?;
         // SAFETY: the pool was just created.
         unsafe { shared.device.reset_query_pool(queries, 0, MAX_TIMESTAMPS) };
-        let times = self.record_and_submit(label, Some(queries), record).and_then(
+        let times = self.record_and_submit(label, Some(queries), Box::new(record)).and_then(
             |(submission, labels)| {
                 submission.wait()?;
                 self.pass_times(queries, &labels)
@@ -142,7 +145,7 @@ impl Gpu {
         &self,
         label: &str,
         queries: Option<vk::QueryPool>,
-        record: impl FnOnce(&mut Recorder<'_>) -> Result<()>,
+        record: Record<'_>,
     ) -> Result<(Submission, Vec<&'static str>)> {
         let shared = &self.shared;
         let recording = shared.begin_recording(label)?;
@@ -176,7 +179,7 @@ impl Gpu {
         pool: vk::CommandPool,
         value: u64,
         queries: Option<vk::QueryPool>,
-        record: impl FnOnce(&mut Recorder<'_>) -> Result<()>,
+        record: Record<'_>,
     ) -> Result<(vk::CommandBuffer, Vec<&'static str>)> {
         let shared = &self.shared;
         let mut recorder = Recorder::new(shared, shared.begin(pool)?, value, queries);

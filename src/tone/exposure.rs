@@ -26,9 +26,6 @@ pub(super) const BLACK_LEVEL: f64 = 0.075;
 /// What the cubic mean of the luminance is brought to before the curve.
 const CUBIC_MEAN: f64 = 0.90;
 
-/// What is brighter than this fraction of the pixels counts as no brighter: hot pixels.
-const HOT: f64 = 0.999;
-
 /// The least and the greatest mean luminance of a target.
 const MEANS: [f64; 2] = [0.44, 0.54];
 
@@ -212,9 +209,7 @@ fn gain_of(luminance: &LuminanceHistogram, brightness: Option<f64>) -> f64 {
     if let Some(mean) = brightness {
         return gain_at(luminance, mean);
     }
-    let limit = luminance.quantile(HOT);
-    let cubic_mean = luminance.mean_of(|y| y.min(limit).powi(3)).cbrt();
-    let gain = (CUBIC_MEAN / cubic_mean).clamp(GAINS[0], GAINS[1]);
+    let gain = (CUBIC_MEAN / luminance.cubic_mean()).clamp(GAINS[0], GAINS[1]);
     match mean_of_soft(luminance, gain) {
         mean if mean < MEANS[0] => gain_at(luminance, MEANS[0]),
         mean if mean > MEANS[1] => gain_at(luminance, MEANS[1]),

@@ -83,6 +83,13 @@ impl LuminanceHistogram {
         self.mean_of(|luminance| luminance)
     }
 
+    /// The cubic mean of the luminance, between the mean and the highlights; what exceeds the 99.9 % quantile counts as that:
+    /// hot pixels.
+    pub fn cubic_mean(&self) -> f64 {
+        let hot = self.quantile(0.999);
+        self.mean_of(|luminance| luminance.min(hot).powi(3)).cbrt()
+    }
+
     /// The luminances that occur, ascending, with the number of their pixels: 0 and the middles of the bins.
     fn levels(&self) -> impl Iterator<Item = (f64, u64)> + '_ {
         let middle = |bin: u32| {
