@@ -9,11 +9,13 @@
 //! raised, nothing is rendered or updated, and the host grows the buffers and redoes the step ([`Renderer::grow`]).
 
 mod frame;
+mod limits;
+mod settings;
 
 use glam::UVec2;
 
 use crate::camera::Camera;
-use crate::gpu::{self, Buffer, Gpu, Pipeline, Recorder, Statistic, Threads};
+use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Statistic, Threads};
 use crate::image::Image;
 use crate::kernels::project::DEPTH_BITS;
 use crate::kernels::splat::MAX_CHANNELS;
@@ -21,7 +23,6 @@ use crate::kernels::{
     self, blend_backward, blend_forward, emit, order_counts, project, project_backward,
     reduce_records,
 };
-use crate::scene::Shape;
 use crate::sort::{Count, RadixSort};
 use crate::{Error, Result};
 
@@ -29,62 +30,8 @@ use crate::{Error, Result};
 pub use frame::Frame;
 use frame::RANKS_PER_PARTITION;
 pub use frame::Status;
-
-/// What a renderer is specialised for.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct RenderSettings {
-    /// Gaussians nearer than this are not seen, in world units.
-    pub near: f32,
-    /// The largest alpha of a splat on a pixel; below 1.
-    pub max_alpha: f32,
-    /// What the Gaussians are made of.
-    pub shape: Shape,
-    /// Colours are the bare SH sum, which can be negative, as in LITA-GS, instead of max(SH + 0.5, 0).
-    pub raw_colors: bool,
-    /// The tile that one subgroup owns, in pixels; none: what is fastest on the device.
-    pub tile: Option<[u32; 2]>,
-}
-
-impl Default for RenderSettings {
-    fn default() -> Self {
-        Self { near: 0.2, max_alpha: 0.99, shape: 3.into(), raw_colors: false, tile: None }
-    }
-}
-
-/// The tile of a GPU, as in 3DGS, and that of a processor, whose subgroups are narrow: measured on lavapipe.
-const GPU_TILE: [u32; 2] = [16, 16];
-const CPU_TILE: [u32; 2] = [16, 8];
-/// More channels than these take a smaller tile on a processor: its state no longer fits the registers of larger ones.
-const CPU_TILE_CHANNELS: usize = 5;
-const CPU_SMALL_TILE: [u32; 2] = [8, 8];
-
-impl RenderSettings {
-    /// The tile on this device, in pixels: that of these settings, else the one that was measured to be the fastest
-    /// there ([`Gpu::tuned_tile`]), else what such devices are known to like.
-    ///
-    /// # Errors
-    /// The tile has no whole number of rows of lanes, or more than 32.
-    pub fn tile_on(&self, gpu: &Gpu) -> Result<[u32; 2]> {
-        let built_in = match self.channels() {
-            _ if !gpu.properties().is_cpu => GPU_TILE,
-            0..=CPU_TILE_CHANNELS => CPU_TILE,
-            _ => CPU_SMALL_TILE,
-        };
-        let tile = self.tile.or_else(|| gpu.tuned_tile(self.channels())).unwrap_or(built_in);
-        if gpu.properties().suits_tile(tile) {
-            return Ok(tile);
-        }
-        let ([width, height], lanes) = (tile, gpu.properties().subgroup_size);
-        let remedy = format!("1 to 32 times {lanes} pixels; without `tile` the device chooses");
-        let problem = format!("{width}x{height} tiles do not suit {lanes} lanes");
-        Err(Error::Usage(format!("{problem}; take a tile of {remedy}")))
-    }
-
-    /// Values per pixel of a render: RGB and the features.
-    pub fn channels(&self) -> usize {
-        self.shape.features.channels()
-    }
-}
+use limits::{longest_run, most_tiles, splats_per_turn};
+pub use settings::RenderSettings;
 
 /// What changes from render to render.
 #[derive(Clone, Copy, Debug)]
@@ -568,32 +515,6 @@ impl Renderer {
         }
         Ok(View { camera: camera.into(), tiles })
     }
-}
-
-/// How many splats the blending kernels take in one turn of their inner loop. A device that ends loops after so many turns
-/// follows a hundred thousand splats on a tile with two; one and four were measured slower there.
-fn splats_per_turn(gpu: &Gpu) -> u32 {
-    if gpu.properties().max_loop_iterations < u32::MAX { 2 } else { 1 }
-}
-
-/// Turns of a kernel's loops beside those that are counted.
-const SOME_TURNS: u32 = 64;
-
-/// How many tiles a view may have: where every Gaussian of a subgroup covers all of them, `reduce_records` makes as many
-/// turns as there are tiles, its lanes taking turns at each; `emit` makes fewer.
-fn most_tiles(gpu: &Gpu) -> usize {
-    let gpu::Properties { max_loop_iterations, subgroup_size, .. } = *gpu.properties();
-    let turns_of_owners = 2 * subgroup_size;
-    (max_loop_iterations - SOME_TURNS - turns_of_owners) as usize
-}
-
-/// How many splats of a tile the blending kernels get through: of a subgroup of splats they make one turn of the
-/// outer loop and the turns of the inner one; some more find the run, and end a loop.
-fn longest_run(gpu: &Gpu) -> u32 {
-    let properties = gpu.properties();
-    let lanes = properties.subgroup_size;
-    let turns_per_batch = 1 + lanes.div_ceil(splats_per_turn(gpu));
-    ((properties.max_loop_iterations - SOME_TURNS) / turns_per_batch).saturating_mul(lanes)
 }
 
 /// A camera as the kernels take it, and the columns and rows of tiles of its image.

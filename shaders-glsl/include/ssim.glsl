@@ -57,16 +57,17 @@ struct Strip {
     int x;         // the first column that it loads
     int y;         // the first row of outputs
     int end;       // one past the last
-    uint channel;  // 0..3; 3 and more: nothing to do
+    uint channel;  // may be past the last: nothing to do
 };
 
-Strip strip_of(uint workgroup, uint width, uint height) {
+// The strip of a workgroup, the first of which begins with channel `first`.
+Strip strip_of(uint workgroup, uint first, uint width, uint height) {
     uint across = (width + OUTPUTS - 1) / OUTPUTS;
     uint down = (height + ROWS - 1) / ROWS;
     uint y = workgroup / across;
     uint top = y % down * ROWS;
     int x = int(workgroup % across * OUTPUTS + gl_SubgroupInvocationID * COLUMNS) - RADIUS;
-    return Strip(x, int(top), int(min(top + ROWS, height)), y / down);
+    return Strip(x, int(top), int(min(top + ROWS, height)), first + y / down);
 }
 
 // Whether a lane's own `column` has an output: in the image, and not at an end of the subgroup's run.

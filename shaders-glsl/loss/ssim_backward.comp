@@ -18,6 +18,8 @@ layout(push_constant) uniform Params {
     uint  height;          // pixels
     uvec2 interior_begin;  // the first pixel
     uvec2 interior_end;    // one past the last
+    uint  channel_begin;   // the channels of this dispatch: `d_moments` holds theirs alone
+    uint  channel_end;     // one past the last
     float l1_scale;        // (1 - w) / (3hw), h x w the interior
     float ssim_scale;      // w / (3hw)
 };
@@ -25,9 +27,9 @@ layout(push_constant) uniform Params {
 layout(binding = 0) readonly  buffer Render   { vec4 render[]; };           // (3, H, W), not clamped
 layout(binding = 1) readonly  buffer Low      { vec4 low[]; };              // (3, H, W), sRGB-encoded
 layout(binding = 2) readonly  buffer Tone     { ToneParameters tone[]; };   // (1,)
-layout(binding = 3) readonly  buffer DMoments { vec3 d_moments[]; };        // (3, H, W, 3), dS/dE[a], dS/dE[aa], dS/dE[ab]
+layout(binding = 3) readonly  buffer DMoments { vec3 d_moments[]; };        // (channels, H, W, 3), dS/dE[a], dS/dE[aa], dS/dE[ab]
 layout(binding = 4) writeonly buffer DRender  { float d_render[]; };        // (3, H, W)
-layout(binding = 5) writeonly buffer Partials { float partials[]; };        // one per workgroup
+layout(binding = 5)           buffer Partials { float partials[]; };        // one per workgroup, over the channels so far
 
 #include "ssim.glsl"
 
@@ -35,9 +37,10 @@ layout(binding = 5) writeonly buffer Partials { float partials[]; };        // o
 const uint MEAN = 0, SQUARE = 1, PRODUCT = 2, DERIVATIVES = 3;
 
 void main() {
-    Strip strip = strip_of(WORKGROUP_INDEX, width, height);
-    if (strip.channel >= 3) return;
+    Strip strip = strip_of(WORKGROUP_INDEX, channel_begin, width, height);
+    if (strip.channel >= channel_end) return;
     uint plane = strip.channel * width * height;
+    uint moments = plane - channel_begin * width * height;
     float pending[DERIVATIVES][COLUMNS][PENDING];
     [[unroll]] for (uint m = 0; m < DERIVATIVES; ++m)
         [[unroll]] for (uint x = 0; x < COLUMNS; ++x)
@@ -51,7 +54,7 @@ void main() {
         [[unroll]] for (uint c = 0; c < COLUMNS; ++c) {
             uint x = uint(strip.x) + c;
             bool inside = x < width && uint(y) < height;
-            vec3 d = d_moments[inside ? plane + uint(y) * width + x : 0];
+            vec3 d = d_moments[inside ? moments + uint(y) * width + x : 0];
             [[unroll]] for (uint m = 0; m < DERIVATIVES; ++m) own[m][c] = inside ? d[m] : 0.0;
         }
         float a[COLUMNS], b[COLUMNS];
@@ -79,5 +82,8 @@ void main() {
         }
     }
     sum = subgroupAdd(sum);
-    if (subgroupElect()) partials[WORKGROUP_INDEX] = sum;
+    if (subgroupElect()) {
+        float of_channels_before = channel_begin > 0 ? partials[WORKGROUP_INDEX] : 0.0;
+        partials[WORKGROUP_INDEX] = of_channels_before + sum;
+    }
 }

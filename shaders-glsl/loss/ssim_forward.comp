@@ -20,13 +20,15 @@ layout(push_constant) uniform Params {
     uint  height;          // pixels
     uvec2 interior_begin;  // the first pixel
     uvec2 interior_end;    // one past the last
+    uint  channel_begin;   // the channels of this dispatch: `d_moments` holds theirs alone
+    uint  channel_end;     // one past the last
 };
 
 layout(binding = 0) readonly  buffer Render   { vec4 render[]; };           // (3, H, W), not clamped
 layout(binding = 1) readonly  buffer Low      { vec4 low[]; };              // (3, H, W), sRGB-encoded
 layout(binding = 2) readonly  buffer Tone     { ToneParameters tone[]; };   // (1,)
-layout(binding = 3) writeonly buffer DMoments { vec3 d_moments[]; };        // (3, H, W, 3), dS/dE[a], dS/dE[aa], dS/dE[ab]
-layout(binding = 4) writeonly buffer Partials { float partials[]; };        // one per workgroup
+layout(binding = 3) writeonly buffer DMoments { vec3 d_moments[]; };        // (channels, H, W, 3), dS/dE[a], dS/dE[aa], dS/dE[ab]
+layout(binding = 4)           buffer Partials { float partials[]; };        // one per workgroup, over the channels so far
 
 #include "ssim.glsl"
 
@@ -52,9 +54,9 @@ float ssim(float moments[MOMENTS], uint i, bool counts) {
 }
 
 void main() {
-    Strip strip = strip_of(WORKGROUP_INDEX, width, height);
-    if (strip.channel >= 3) return;
-    uint plane = strip.channel * width * height;
+    Strip strip = strip_of(WORKGROUP_INDEX, channel_begin, width, height);
+    if (strip.channel >= channel_end) return;
+    uint plane = (strip.channel - channel_begin) * width * height;
     float pending[MOMENTS][COLUMNS][PENDING];
     [[unroll]] for (uint m = 0; m < MOMENTS; ++m)
         [[unroll]] for (uint x = 0; x < COLUMNS; ++x)
@@ -92,5 +94,8 @@ void main() {
         }
     }
     sum = subgroupAdd(sum);
-    if (subgroupElect()) partials[WORKGROUP_INDEX] = sum;
+    if (subgroupElect()) {
+        float of_channels_before = channel_begin > 0 ? partials[WORKGROUP_INDEX] : 0.0;
+        partials[WORKGROUP_INDEX] = of_channels_before + sum;
+    }
 }

@@ -1,6 +1,7 @@
-//! `nightsplat bench`: check a step against the CPU references pass by pass, then time its kernels and stages, or find
-//! the fastest tiles.
+//! `nightsplat bench`: check a step against the CPU references pass by pass, then time its kernels and stages; or find the
+//! fastest tiles, or how the cost grows.
 
+mod growth;
 mod scene;
 mod stages;
 mod tune;
@@ -30,6 +31,10 @@ pub struct BenchArgs {
     /// Find the fastest tiles of the device, for 3 and 11 channels, and keep them
     #[arg(long)]
     pub tune: bool,
+    /// Show how milliseconds and memory grow with Gaussians, pixels and channels, to 25 and 40 times the scene, with fitted
+    /// exponents
+    #[arg(long, conflicts_with = "tune")]
+    pub growth: bool,
     /// The device: a part of its name or its index in `nightsplat doctor` [default: the best]
     #[arg(long, value_name = "NAME|INDEX")]
     pub device: Option<DeviceChoice>,
@@ -98,6 +103,9 @@ pub fn run(args: &BenchArgs) -> Result<()> {
         let is_sized = args.width.is_some() || args.height.is_some();
         let sizes = if is_sized { &[[width, height]][..] } else { &TUNED_SIZES };
         return tune::run(&bench, sizes, args.gaussians, args.json);
+    }
+    if args.growth {
+        return growth::run(&bench, [width, height], args.gaussians, args.json);
     }
     let scene = Scene::new(width, height, args.gaussians);
     let mut trainers = scene::trainers(&bench.gpu, &scene)?;
@@ -192,6 +200,12 @@ impl Bench {
         once()?;
         let times = (0..self.repeats).map(|_| once()).collect::<crate::Result<Vec<_>>>()?;
         Ok(median(times))
+    }
+
+    /// The least of the milliseconds that `once` reports, after a run that does not count.
+    fn least(&self, mut once: impl FnMut() -> crate::Result<f64>) -> crate::Result<f64> {
+        once()?;
+        (0..self.repeats).try_fold(f64::INFINITY, |least, _| Ok(least.min(once()?)))
     }
 }
 

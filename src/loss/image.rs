@@ -90,10 +90,10 @@ impl March {
         }
     }
 
-    /// The subgroups for all channels of a view of `size`, where one has so many lanes.
+    /// The subgroups for a channel of a view of `size`, where one has so many lanes.
     fn subgroups(self, size: UVec2, lanes: u32) -> u32 {
         let outputs = lanes * self.columns - 2 * RADIUS as u32;
-        3 * size.x.div_ceil(outputs) * size.y.div_ceil(self.rows)
+        size.x.div_ceil(outputs) * size.y.div_ceil(self.rows)
     }
 }
 
@@ -155,7 +155,8 @@ struct Ssim {
     lanes: u32,
     forward: Pipeline<ssim_forward::Kernel>,
     backward: Pipeline<ssim_backward::Kernel>,
-    /// (3, H, W), dS/dE\[a\], dS/dE\[aa\], dS/dE\[ab\].
+    /// (channels, H, W), dS/dE\[a\], dS/dE\[aa\], dS/dE\[ab\]: all three channels, or where the device cannot bind as
+    /// much, each in its turn.
     d_moments: Buffer<Vec3>,
 }
 
@@ -209,7 +210,10 @@ impl Loss {
         let (values, workgroups) = (value_count(size), self.kernels.workgroups(size) as usize);
         if values > self.max_values {
             if let Kernels::Ssim(ssim) = &mut self.kernels {
-                ssim.d_moments = self.gpu.uninit("d_moments", values as usize)?;
+                let bindable = self.gpu.properties().max_storage_buffer_range;
+                let takes_all = u64::from(values) * size_of::<Vec3>() as u64 <= bindable;
+                let channels = if takes_all { values } else { values / 3 };
+                ssim.d_moments = self.gpu.uninit("d_moments", channels as usize)?;
             }
             self.max_values = values;
         }
@@ -303,12 +307,19 @@ impl Kernels {
             Self::L1 { values_per_workgroup, .. } => {
                 value_count(size).div_ceil(*values_per_workgroup)
             }
-            Self::Ssim(ssim) => ssim.march.subgroups(size, ssim.lanes),
+            Self::Ssim(ssim) => {
+                ssim.channels_at_once(size) * ssim.march.subgroups(size, ssim.lanes)
+            }
         }
     }
 }
 
 impl Ssim {
+    /// The channels of a view whose derivatives there is room for: all three or one.
+    fn channels_at_once(&self, size: UVec2) -> u32 {
+        if self.d_moments.len() >= value_count(size) as usize { 3 } else { 1 }
+    }
+
     fn record(
         &mut self,
         pass: &mut Recorder<'_>,
@@ -319,34 +330,53 @@ impl Ssim {
     ) -> Result<()> {
         let UVec2 { x: width, y: height } = size;
         let (interior_begin, interior_end) = (interior.origin, interior.end());
-        let d_moments = &mut self.d_moments;
-        pass.dispatch(
-            &self.forward,
-            &ssim_forward::Params { width, height, interior_begin, interior_end },
-            ssim_forward::Buffers { render, low, tone, d_moments, partials: ssim_partials },
-            threads,
-        )?;
         let mean_scale = 1.0 / f64::from(interior.value_count());
-        pass.dispatch(
-            &self.backward,
-            &ssim_backward::Params {
-                width,
-                height,
-                interior_begin,
-                interior_end,
-                l1_scale: ((1.0 - self.weight) * mean_scale) as f32,
-                ssim_scale: (self.weight * mean_scale) as f32,
-            },
-            ssim_backward::Buffers {
-                render,
-                low,
-                tone,
-                d_moments,
-                d_render,
-                partials: l1_partials,
-            },
-            threads,
-        )
+        let at_once = self.channels_at_once(size);
+        for channel_begin in (0..3).step_by(at_once as usize) {
+            let channel_end = channel_begin + at_once;
+            pass.dispatch(
+                &self.forward,
+                &ssim_forward::Params {
+                    width,
+                    height,
+                    interior_begin,
+                    interior_end,
+                    channel_begin,
+                    channel_end,
+                },
+                ssim_forward::Buffers {
+                    render,
+                    low,
+                    tone,
+                    d_moments: &mut self.d_moments,
+                    partials: ssim_partials,
+                },
+                threads,
+            )?;
+            pass.dispatch(
+                &self.backward,
+                &ssim_backward::Params {
+                    width,
+                    height,
+                    interior_begin,
+                    interior_end,
+                    channel_begin,
+                    channel_end,
+                    l1_scale: ((1.0 - self.weight) * mean_scale) as f32,
+                    ssim_scale: (self.weight * mean_scale) as f32,
+                },
+                ssim_backward::Buffers {
+                    render,
+                    low,
+                    tone,
+                    d_moments: &self.d_moments,
+                    d_render,
+                    partials: l1_partials,
+                },
+                threads,
+            )?;
+        }
+        Ok(())
     }
 }
 

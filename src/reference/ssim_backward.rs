@@ -4,7 +4,7 @@ use glam::UVec2;
 
 use super::inside;
 use super::rounding::{Rounded, chain, values};
-use super::ssim_forward::{blur, rounded_blur, target};
+use super::ssim_forward::{blur, rounded_blur, sum_before, target};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::ssim_backward::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::tone::Real;
@@ -38,7 +38,7 @@ fn d_ssim<T: Real>(a: T, b: T, [mean, square, product]: [T; 3]) -> T {
     mean + T::of(2.0) * a * square + b * product
 }
 
-/// The gradient and a - b of every value of the three channels.
+/// The gradient and a - b of every value of the dispatch's channels.
 fn gradients(
     params: &Params,
     constants: &Constants,
@@ -47,11 +47,13 @@ fn gradients(
     let size = [params.width as usize, params.height as usize];
     let interior = [params.interior_begin, params.interior_end];
     let pixels = size[0] * size[1];
-    (0..3).flat_map(move |channel: usize| {
+    let channels = params.channel_begin as usize..params.channel_end as usize;
+    channels.clone().flat_map(move |channel| {
         let plane = channel * pixels..(channel + 1) * pixels;
+        let moments = (channel - channels.start) * pixels..(channel + 1 - channels.start) * pixels;
         let b = target(&slices.low[plane.clone()], &slices.tone[0], constants.tone_curve);
         let blurred = [0, 1, 2].map(|m| {
-            let derivatives = slices.d_moments[plane.clone()].iter();
+            let derivatives = slices.d_moments[moments.clone()].iter();
             rounded_blur(size, &derivatives.map(|d| Rounded::exact(d[m])).collect::<Vec<_>>())
         });
         let [l1_scale, ssim_scale] = [params.l1_scale, params.ssim_scale].map(Rounded::exact);
@@ -71,22 +73,42 @@ fn gradients(
     })
 }
 
+/// Where the dispatch's channels begin in an image.
+fn first_value(params: &Params) -> usize {
+    params.channel_begin as usize * params.width as usize * params.height as usize
+}
+
 impl Reference for Kernel {
     /// The whole sum goes into the first partial: how many there are is the device's choice.
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
         let gradients: Vec<_> = gradients(params, constants, &slices).collect();
         let d_render = values(gradients.iter().map(|of| of[0]));
-        slices.d_render.iter_mut().zip(d_render).for_each(|(to, d)| *to = d);
-        slices.partials.fill(0.0);
-        slices.partials[0] = gradients.iter().map(|of| of[1].value.abs()).sum::<f64>() as f32;
+        slices
+            .d_render
+            .iter_mut()
+            .skip(first_value(params))
+            .zip(d_render)
+            .for_each(|(to, d)| *to = d);
+        if params.channel_begin == 0 {
+            slices.partials.fill(0.0);
+        }
+        slices.partials[0] += gradients.iter().map(|of| of[1].value.abs()).sum::<f64>() as f32;
     }
 
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let gradients: Vec<_> = gradients(params, constants, &slices).collect();
         let chain = chain(0) + f64::from(constants.columns * constants.rows);
-        let sum = Rounded::sum(chain, gradients.iter().map(|of| of[1].abs()));
+        let sum = Rounded::sum(
+            chain,
+            gradients
+                .iter()
+                .map(|of| of[1].abs())
+                .chain(sum_before(params.channel_begin, slices.partials)),
+        );
         Tolerances {
-            d_render: gradients.iter().map(|of| of[0]).collect(),
+            d_render: std::iter::repeat_n(Rounded::default(), first_value(params))
+                .chain(gradients.iter().map(|of| of[0]))
+                .collect(),
             partials: Tolerance::Sum(sum.bound()),
         }
     }

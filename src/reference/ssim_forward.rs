@@ -82,7 +82,7 @@ pub(super) fn widen(values: &[f32]) -> Vec<f64> {
     values.iter().map(|&x| f64::from(x)).collect()
 }
 
-/// The index and the derivatives of every value of the three channels; zero where it does not count.
+/// The index and the derivatives of every value of the dispatch's channels; zero where it does not count.
 fn indices(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Vec<Ssim<Rounded>> {
     let size = [params.width as usize, params.height as usize];
     let interior = [params.interior_begin, params.interior_end];
@@ -107,7 +107,13 @@ fn indices(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Vec<S
             ssim_of_moments(a, b, aa, bb, ab)
         })
     };
-    (0..3).flat_map(channel).collect()
+    (params.channel_begin as usize..params.channel_end as usize).flat_map(channel).collect()
+}
+
+/// What the partial sums of the channels of earlier dispatches hold.
+pub(super) fn sum_before(channel_begin: u32, partials: &[f32]) -> impl Iterator<Item = Rounded> {
+    let before = if channel_begin > 0 { partials } else { &[] };
+    before.iter().map(|&partial| Rounded::exact(partial.abs()))
 }
 
 impl Reference for Kernel {
@@ -117,14 +123,22 @@ impl Reference for Kernel {
         for (d_moments, of) in slices.d_moments.iter_mut().zip(&indices) {
             *d_moments = Vec3::from_array(of.d_moments.map(|d| d.value as f32));
         }
-        slices.partials.fill(0.0);
-        slices.partials[0] = indices.iter().map(|of| of.value.value).sum::<f64>() as f32;
+        if params.channel_begin == 0 {
+            slices.partials.fill(0.0);
+        }
+        slices.partials[0] += indices.iter().map(|of| of.value.value).sum::<f64>() as f32;
     }
 
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let indices = indices(params, constants, &slices);
         let chain = chain(0) + f64::from(constants.columns * constants.rows);
-        let sum = Rounded::sum(chain, indices.iter().map(|of| of.value));
+        let sum = Rounded::sum(
+            chain,
+            indices
+                .iter()
+                .map(|of| of.value)
+                .chain(sum_before(params.channel_begin, slices.partials)),
+        );
         Tolerances {
             d_moments: indices.iter().flat_map(|of| of.d_moments).collect(),
             partials: Tolerance::Sum(sum.bound()),

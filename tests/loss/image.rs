@@ -72,43 +72,88 @@ fn evaluate_interior(
 }
 
 /// Runs both SSIM kernels, the second on what the first leaves, a lane taking so many columns and a
-/// subgroup so many rows.
-fn check_ssim_kernels(
+/// subgroup so many rows, all channels at once.
+fn check_ssim_kernels(tone_curve: u32, shape: [u32; 2], size: [u32; 2], interior: Interior) {
+    ssim_kernels(tone_curve, shape, size, interior, 3);
+}
+
+/// The same with so many channels at once; gives the gradient and the sums of |a - b| and SSIM.
+fn ssim_kernels(
     tone_curve: u32,
     [columns, rows]: [u32; 2],
     size: [u32; 2],
     interior: Interior,
-) {
+    at_once: u32,
+) -> (Vec<f32>, [f64; 2]) {
     let [width, height] = size;
     let (interior_begin, interior_end) = (interior.origin, interior.origin + interior.size);
     let [render, low] = images(size);
     let scale = 1.0 / render.len() as f32;
     let outputs = gpu().properties().subgroup_size * columns - 10;
-    let count = 3 * width.div_ceil(outputs) * height.div_ceil(rows);
+    let count = at_once * width.div_ceil(outputs) * height.div_ceil(rows);
     let threads = Threads::Workgroups([count, 1, 1]);
-    let (tone, d_moments) = (vec![TONE], vec![Vec3::NAN; render.len()]);
-    let (d_render, partials) = (vec![f32::NAN; render.len()], vec![0.0_f32; count as usize]);
-    let (d_moments, _) = {
-        let [render, low] = [render.clone(), low.clone()];
-        let (tone, partials) = (tone.clone(), partials.clone());
-        run_kernel!(
-            ssim_forward,
-            ssim_forward::Constants { columns, rows, tone_curve },
-            ssim_forward::Params { width, height, interior_begin, interior_end },
+    let mut d_render = vec![f32::NAN; render.len()];
+    let [mut l1_partials, mut ssim_partials] = [(); 2].map(|()| vec![f32::NAN; count as usize]);
+    for channel_begin in (0..3).step_by(at_once as usize) {
+        let channel_end = channel_begin + at_once;
+        let d_moments = vec![Vec3::NAN; render.len() / 3 * at_once as usize];
+        let ([render, low], tone) = ([render.clone(), low.clone()], vec![TONE]);
+        let d_moments = {
+            let ([render, low], tone) = ([render.clone(), low.clone()], tone.clone());
+            let partials = ssim_partials;
+            let (d_moments, partials) = run_kernel!(
+                ssim_forward,
+                ssim_forward::Constants { columns, rows, tone_curve },
+                ssim_forward::Params {
+                    width,
+                    height,
+                    interior_begin,
+                    interior_end,
+                    channel_begin,
+                    channel_end,
+                },
+                threads,
+                [render, low, tone],
+                [d_moments, partials]
+            );
+            ssim_partials = partials;
+            d_moments
+        };
+        let partials = l1_partials;
+        (d_render, l1_partials) = run_kernel!(
+            ssim_backward,
+            ssim_backward::Constants { columns, rows, tone_curve },
+            ssim_backward::Params {
+                width,
+                height,
+                interior_begin,
+                interior_end,
+                channel_begin,
+                channel_end,
+                l1_scale: 0.8 * scale,
+                ssim_scale: 0.2 * scale,
+            },
             threads,
-            [render, low, tone],
-            [d_moments, partials]
-        )
-    };
-    let (l1_scale, ssim_scale) = (0.8 * scale, 0.2 * scale);
-    run_kernel!(
-        ssim_backward,
-        ssim_backward::Constants { columns, rows, tone_curve },
-        ssim_backward::Params { width, height, interior_begin, interior_end, l1_scale, ssim_scale },
-        threads,
-        [render, low, tone, d_moments],
-        [d_render, partials]
-    );
+            [render, low, tone, d_moments],
+            [d_render, partials]
+        );
+    }
+    let sum = |partials: &[f32]| partials.iter().map(|&partial| f64::from(partial)).sum();
+    (d_render, [sum(&l1_partials), sum(&ssim_partials)])
+}
+
+#[test]
+fn channels_one_by_one_give_what_they_give_together() {
+    for size in [[37, 41], [70, 9]] {
+        let interior = Interior { origin: UVec2::new(2, 1), size: UVec2::new(31, 7) };
+        let run = |at_once| ssim_kernels(CURVE_AP3, [4, 32], size, interior, at_once);
+        let (together, sums) = run(3);
+        let (one_by_one, own_sums) = run(1);
+        assert_eq!(one_by_one, together);
+        for (own, sum) in own_sums.into_iter().zip(sums) {
+            assert!((own - sum).abs() <= 1e-6 * sum.abs(), "{own} {sum}");
+        }
+    }
 }
 
 #[test]

@@ -200,10 +200,11 @@ impl Case {
     }
 }
 
-const OPTIONS: RenderOptions = RenderOptions { sh_degree: MAX_SH_DEGREE, background: [0.0; 3] };
+pub(super) const OPTIONS: RenderOptions =
+    RenderOptions { sh_degree: MAX_SH_DEGREE, background: [0.0; 3] };
 
 /// All that a pass of the rasteriser reads and writes beside the memory of its renderer.
-struct Pass {
+pub(super) struct Pass {
     camera: Camera,
     parameters: Buffer<f32>,
     d_render: Buffer<f32>,
@@ -213,7 +214,7 @@ struct Pass {
 }
 
 impl Pass {
-    fn new(
+    pub(super) fn new(
         Bench { gpu, .. }: &Bench,
         camera: Camera,
         parameters: Buffer<f32>,
@@ -232,7 +233,11 @@ impl Pass {
     }
 
     /// Milliseconds of blending forward and backward, and of all passes.
-    fn profile(&mut self, bench: &Bench, renderer: &mut Renderer) -> crate::Result<[f64; 3]> {
+    pub(super) fn profile(
+        &mut self,
+        bench: &Bench,
+        renderer: &mut Renderer,
+    ) -> crate::Result<[f64; 3]> {
         let Self { camera, parameters, d_render, .. } = self;
         let times = bench.gpu.profile("tune", |pass| {
             renderer.forward(pass, parameters, camera, &OPTIONS)?;
