@@ -12,6 +12,7 @@ use crate::image::Image;
 use crate::metrics::Scores;
 use crate::render::{RenderOptions, RenderSettings, Renderer};
 use crate::scene::{Feature, Features, Gaussians};
+use crate::tone::ToneSettings;
 use crate::train::{Networks, Rendered};
 use crate::{Error, Result};
 
@@ -216,6 +217,23 @@ pub fn metrics(
         "gaussians": gaussians,
         "steps": steps,
     })
+}
+
+/// Where `metrics.json` says what the targets know of references, where they know any.
+pub const WITH_REFERENCE: &str = "with_reference";
+
+/// The line beside scores of targets that know references.
+pub fn with_reference(known: &str) -> String {
+    format!(
+        "with reference: the targets follow {known}; compare these scores with none that know no reference"
+    )
+}
+
+/// Says in `metrics.json` of targets that know references what they know.
+pub fn add_reference(metrics: &mut Value, tone: &ToneSettings) {
+    if let Some(known) = tone.knows_references() {
+        metrics[WITH_REFERENCE] = json!(known);
+    }
 }
 
 /// Says in `metrics.json` of a model with learned exposures at which one the test views were scored, as no photograph of

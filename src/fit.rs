@@ -20,6 +20,7 @@ mod confidence;
 mod histogram;
 mod model;
 mod pairs;
+mod profile;
 mod solve;
 mod validate;
 
@@ -29,6 +30,10 @@ pub use self::histogram::{Cell, Column, Histogram};
 use self::model::Model;
 pub use self::model::psnr;
 pub use self::pairs::{Pair, Scene};
+pub use self::profile::{
+    ColourPair, ColourScene, ProfileFold, ProfileScores, cross_validate_profile, fit_profile,
+    profile_scores,
+};
 use self::solve::{Solution, Solver, pair_residuals, parts, quantile};
 pub use self::validate::{Fold, HeldOut, cross_validate};
 use crate::tone::{Family, ToneCurve, ToneSettings};

@@ -58,11 +58,19 @@ enum Map {
     Mix(Pipeline<kernels::tone_mix::Kernel>),
     /// (3, K) knots.
     Table(Pipeline<kernels::tone_table::Kernel>, Buffer<Vec3>),
+    /// (3, `PROFILE_WIDTH`) numbers.
+    Profile(Pipeline<kernels::tone_profile::Kernel>, Buffer<f32>),
 }
 
 impl Map {
     fn new(gpu: &Gpu, settings: &ToneSettings) -> Result<Self> {
         let tone_curve = settings.curve.constant();
+        if let Some(profile) = &settings.profile {
+            return Ok(Self::Profile(
+                gpu.pipeline(&kernels::tone_profile::Constants::default())?,
+                gpu.buffer("camera profile", &profile.buffer())?,
+            ));
+        }
         Ok(match &settings.table {
             Some(table) => Self::Table(
                 gpu.pipeline(&kernels::tone_table::Constants::default())?,
@@ -287,6 +295,12 @@ impl PseudoGt {
                 pipeline,
                 &kernels::tone_mix::Params { pixel_count, view },
                 kernels::tone_mix::Buffers { image, parameters, target },
+                Threads::Exactly([pixel_count, 1, 1]),
+            ),
+            Map::Profile(pipeline, profile) => pass.dispatch(
+                pipeline,
+                &kernels::tone_profile::Params { pixel_count, view },
+                kernels::tone_profile::Buffers { image, parameters, profile, target },
                 Threads::Exactly([pixel_count, 1, 1]),
             ),
             Map::Table(pipeline, knots) => pass.dispatch(

@@ -70,6 +70,7 @@ pub mod ssim_forward;
 mod structure_l1;
 mod tone_map;
 mod tone_mix;
+mod tone_profile;
 mod tone_statistics;
 mod tone_table;
 mod window_gather;

@@ -15,7 +15,7 @@
 //! delta0 = alpha (1 - p10 / p90)^beta is high where shadows are crushed. The statistics are those of
 //! one photograph, or the means over a scene's, see [`Statistics`]. The gain k of the automatic curve, whose Y is the pixel's,
 //! follows from the luminance of all photographs, see [`Exposure`]; so may that of every other curve. [`FAMILIES`] is the table of all curves; a [`Table`]
-//! of values from a file is a curve too.
+//! of values from a file is a curve too, and so is a camera's [`Profile`].
 
 mod catalogue;
 mod exposure;
@@ -25,6 +25,7 @@ mod file;
 mod histogram;
 mod law;
 mod lift;
+mod profile;
 mod real;
 mod settings;
 mod statistics;
@@ -46,6 +47,8 @@ pub(crate) use self::histogram::{BIN_SHIFT, FIRST_PREFIX};
 pub(crate) use self::law::{Numbers, law};
 pub(crate) use self::law::{clamped, curve_at, tone_curve};
 pub use self::lift::{Lift, Measured, Scene};
+pub use self::profile::Profile;
+pub(crate) use self::profile::profiled;
 #[cfg(feature = "fit")]
 pub(crate) use self::real::Dual;
 pub use self::real::Real;
@@ -63,12 +66,15 @@ const TABLE_NAME: &str = "table";
 /// The name of the curve whose gain the photographs give.
 const AUTO_NAME: &str = "auto";
 
+/// The name of the curve that a camera profile makes.
+const PROFILE_NAME: &str = "profile";
+
 impl ToneCurve {
-    /// The curve's row in the table; of a [`Table`] that of `none`, as it has no formula, and of the automatic curve that
-    /// of `ase`, which is its formula on grey.
+    /// The curve's row in the table; of a [`Table`] or a [`Profile`] that of `none`, as it has no formula, and of the
+    /// automatic curve that of `ase`, which is its formula on grey.
     pub fn family(self) -> &'static Family {
         &FAMILIES[match self {
-            Self::Table => Self::None,
+            Self::Table | Self::Profile => Self::None,
             Self::Auto => Self::Ase,
             family => family,
         } as usize]
@@ -79,6 +85,7 @@ impl ToneCurve {
         match self {
             Self::Table => TABLE_NAME,
             Self::Auto => AUTO_NAME,
+            Self::Profile => PROFILE_NAME,
             family => family.family().name,
         }
     }
@@ -103,7 +110,10 @@ impl ToneCurve {
 
     /// Whether each value of the target depends on one value of the photograph alone, by a formula.
     pub(crate) fn is_formula(self) -> bool {
-        !matches!(self, Self::Table | Self::LumPreserve | Self::PerChannel | Self::Auto)
+        !matches!(
+            self,
+            Self::Table | Self::LumPreserve | Self::PerChannel | Self::Auto | Self::Profile
+        )
     }
 
     /// All names, for help texts and errors.
@@ -126,6 +136,7 @@ impl FromStr for ToneCurve {
         match name {
             TABLE_NAME => return Ok(Self::Table),
             AUTO_NAME => return Ok(Self::Auto),
+            PROFILE_NAME => return Ok(Self::Profile),
             _ => {}
         }
         Family::find(name).map(|family| family.curve).ok_or_else(|| {

@@ -17,6 +17,7 @@ fn args(input: &Path, out: PathBuf) -> ToneArgs {
     ToneArgs {
         input: input.to_owned(),
         curve: ToneCurve::Ap3.into(),
+        profile: None,
         out: Some(out),
         gain: None,
         brightness: None,

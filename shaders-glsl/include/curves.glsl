@@ -40,6 +40,7 @@ const uint CURVE_LUM_PRESERVE        = 35;
 const uint CURVE_PER_CHANNEL         = 36;
 const uint CURVE_TABLE               = 37;
 const uint CURVE_AUTO                = 38;
+const uint CURVE_PROFILE             = 39;
 
 const uint MAX_CONSTANTS = 8;  // of a family
 

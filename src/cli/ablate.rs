@@ -82,7 +82,7 @@ pub fn run(args: &AblateArgs) -> Result<()> {
     let table = comparison::score_table("model", &dark, &runs);
     let test_views = dataset.test_views().filter(|view| view.reference.is_some());
     let epoch = dataset.train_views().count();
-    let page = Report {
+    let mut page = Report {
         title: format!("What each part buys: {}", dataset.root.display()),
         intro: vec![format!(
             "{} steps each with seed {}, on {}. R_0 is the render of the Gaussians' colours; a model with a denoiser is \
@@ -95,11 +95,21 @@ pub fn run(args: &AblateArgs) -> Result<()> {
         comparisons: test_views.map(|view| comparison::of_view(view, &dark, &runs)).collect(),
         tables: vec![table.clone()],
     };
+    let known = config.tone.knows_references().map(|known| eval::with_reference(&known));
+    page.intro.extend(known.clone());
     let index = args.out.join("index.html");
     write_whole(&index, page.html().as_bytes())?;
-    write_whole(&args.out.join("table.md"), table.markdown().as_bytes())?;
+    write_whole(
+        &args.out.join("table.md"),
+        (table.markdown()
+            + &known.as_deref().map(|line| format!("\n{line}\n")).unwrap_or_default())
+            .as_bytes(),
+    )?;
     let mut out = std::io::stdout().lock();
     write!(out, "{}\n{}\n", table::of(&table), index.display())?;
+    if let Some(line) = known {
+        writeln!(out, "{line}")?;
+    }
     Ok(())
 }
 

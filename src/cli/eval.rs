@@ -57,6 +57,7 @@ pub fn run(args: &EvalArgs) -> Result<()> {
         let recorded = run::load_metrics(&args.run);
         let seconds = recorded["seconds"].as_f64();
         let mut metrics = eval::metrics(&scored, seconds, gaussian_count, config.steps);
+        eval::add_reference(&mut metrics, &config.tone);
         if let Some(exposure) = recorded.get(run::TARGET_EXPOSURE) {
             metrics[run::TARGET_EXPOSURE] = exposure.clone();
         }
@@ -66,6 +67,9 @@ pub fn run(args: &EvalArgs) -> Result<()> {
         writeln!(out, "{metrics:#}")?;
     } else {
         write!(out, "{}", score_table(&scored))?;
+        if let Some(known) = config.tone.knows_references() {
+            writeln!(out, "{}", eval::with_reference(&known))?;
+        }
     }
     Ok(())
 }

@@ -16,8 +16,9 @@ use crate::tone::{FAMILIES, Family, ToneCurve};
 use crate::{Error, Result};
 
 mod plot;
+pub mod profile;
 
-/// Fit the constants of a tone curve to pairs of photographs, dark and in normal light
+/// Fit the constants of a tone curve, or a camera profile, to pairs of photographs, dark and in normal light
 #[derive(Clone, Debug, clap::Args)]
 pub struct FitArgs {
     /// Folders of pairs: each with `low` and `high` (or `normal`, or `images`) inside, files of the same names
@@ -29,7 +30,7 @@ pub struct FitArgs {
     /// The curve, by a name that `nightsplat curves` lists, or `all`
     #[arg(long, value_name = "NAME|all", default_value_t = FamilyChoice::One(ToneCurve::FittedCubic))]
     pub family: FamilyChoice,
-    /// Write the curve to a file that --curve takes; of several families the best
+    /// Write the curve to a file that --curve takes, of several families the best; with --profile, the profile
     #[arg(long, value_name = "FILE.toml")]
     pub out: Option<PathBuf>,
     /// What is fitted: every channel's values, or the luminance
@@ -62,6 +63,9 @@ pub struct FitArgs {
     /// Draw the pairs and the curves
     #[arg(long, value_name = "FILE.svg")]
     pub plot: Option<PathBuf>,
+    /// Fit a camera profile in place of a curve (a 3x3 matrix, gain, bias and 16 segments a channel), which `--profile FILE` of `train` and `tone` takes
+    #[arg(long, conflicts_with_all = ["family", "channels", "weigh", "prior", "bins", "bounded", "adapt", "plot"])]
+    pub profile: bool,
     /// Print JSON
     #[arg(long)]
     pub json: bool,
@@ -86,6 +90,9 @@ impl std::str::FromStr for FamilyChoice {
         match name.parse()? {
             ToneCurve::Table => {
                 Err(Error::Usage("a table of values has no constants to fit".to_owned()))
+            }
+            ToneCurve::Profile => {
+                Err(Error::Usage("a camera profile is fitted with --profile".to_owned()))
             }
             curve => Ok(Self::One(curve)),
         }
@@ -146,15 +153,30 @@ impl Fitted {
 /// # Errors
 /// As [`apply`], or standard output cannot be written to.
 pub fn run(args: &FitArgs) -> Result<()> {
-    let fitted = apply(args)?;
-    let text = if args.json {
-        let json = serde_json::to_string_pretty(&fitted);
-        json.map_err(|error| Error::output("standard output", error.to_string()))?
+    let text = if args.profile {
+        let fitted = profile::apply(args)?;
+        if args.json { json(&fitted)? } else { profile::told(&fitted) }
     } else {
-        told(&fitted)
+        let fitted = apply(args)?;
+        if args.json { json(&fitted)? } else { told(&fitted) }
     };
     writeln!(std::io::stdout().lock(), "{}", text.trim_end())
         .map_err(|error| Error::output("standard output", error.to_string()))
+}
+
+fn json(fitted: &impl Serialize) -> Result<String> {
+    serde_json::to_string_pretty(fitted)
+        .map_err(|error| Error::output("standard output", error.to_string()))
+}
+
+/// Refuses two folders of dark photographs where one is named for those in normal light.
+fn check(args: &FitArgs) -> Result<()> {
+    if args.normal.is_some() && args.pairs.len() > 1 {
+        return Err(Error::Usage(
+            "--normal goes with one folder of dark photographs, not with several".to_owned(),
+        ));
+    }
+    Ok(())
 }
 
 /// Fits every family that `args` names, best first, and writes the files that it asks for.
@@ -163,11 +185,7 @@ pub fn run(args: &FitArgs) -> Result<()> {
 /// [`Error::Usage`] for options that make no sense; [`Error::Input`] for pairs that cannot be used; [`Error::Output`]
 /// where a file cannot be written.
 pub fn apply(args: &FitArgs) -> Result<Vec<Fitted>> {
-    if args.normal.is_some() && args.pairs.len() > 1 {
-        return Err(Error::Usage(
-            "--normal goes with one folder of dark photographs, not with several".to_owned(),
-        ));
-    }
+    check(args)?;
     let options = FitOptions {
         channels: match args.channels {
             ChannelChoice::Rgb => Channels::Rgb,

@@ -13,13 +13,15 @@ use self::page::Page;
 use self::photographs::{Listed, listed};
 use super::{ImageFormat, progress_bar, table};
 use crate::dataset::{Dataset, Split};
+use crate::eval;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::image::Image;
 use crate::metrics::Scores;
 use crate::pseudo_gt::PseudoGt;
 use crate::report::Distribution;
 use crate::tone::{
-    CurveChoice, Exposure, GainChoice, Scene, Statistics, ToneCurve, ToneSettings, all_black,
+    CurveChoice, Exposure, GainChoice, Profile, Scene, Statistics, ToneCurve, ToneSettings,
+    all_black,
 };
 use crate::{Error, Result};
 
@@ -32,6 +34,9 @@ pub struct ToneArgs {
     /// The curve: a name that `nightsplat curves` lists, or a .toml, .csv or .cube file
     #[arg(long, value_name = "NAME|FILE", default_value_t = ToneSettings::default().curve.into())]
     pub curve: CurveChoice,
+    /// A camera profile that `nightsplat fit --profile` made, in place of a curve; scores are labelled: they know its references
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["curve", "gain", "brightness", "colour", "theta"])]
+    pub profile: Option<PathBuf>,
     /// The folder to write to, names are kept; made if it does not exist. Without it nothing is written
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
@@ -114,6 +119,9 @@ pub struct ToneReport {
 pub struct ToneOutput {
     /// The curve.
     pub curve: ToneSettings,
+    /// What the results know of references, where they know any.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub with_reference: Option<String>,
     /// How bright the results are to be and why, where the photographs give it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub exposure: Option<Exposure>,
@@ -195,7 +203,9 @@ fn text_table(output: &ToneOutput) -> String {
         ]);
     }
     let reason = output.exposure.as_ref().map(|exposure| format!("{}\n", exposure.reason()));
-    reason.unwrap_or_default() + &table::aligned(&rows)
+    let label = output.with_reference.as_deref().map(eval::with_reference);
+    let label = label.map(|line| line + "\n").unwrap_or_default();
+    reason.unwrap_or_default() + &table::aligned(&rows) + &label
 }
 
 /// Maps every photograph and writes it to `args.out` under its own name.
@@ -207,7 +217,13 @@ fn text_table(output: &ToneOutput) -> String {
 /// would be written to one file, or a reference image is of another size; [`Error::Output`] where a file cannot be
 /// written or a photograph would be replaced; those of the device.
 pub fn apply(args: &ToneArgs) -> Result<ToneOutput> {
-    let settings = settings(args, &args.curve)?;
+    let settings = match &args.profile {
+        Some(file) => ToneSettings {
+            scene_statistics: args.scene_statistics,
+            ..ToneSettings::of_profile(Profile::load(file)?)
+        },
+        None => settings(args, &args.curve)?,
+    };
     let photographs = listed(args)?;
     if let Some(out) = &args.out {
         std::fs::create_dir_all(out)
@@ -249,7 +265,8 @@ pub fn apply(args: &ToneArgs) -> Result<ToneOutput> {
     };
     let views = views.into_iter().map(|(listed, report)| (listed.name.clone(), report)).collect();
     scene.gain = exposure.as_ref().map(|exposure| exposure.gain);
-    let output = ToneOutput { curve: settings, exposure, scene, views };
+    let with_reference = settings.knows_references();
+    let output = ToneOutput { curve: settings, with_reference, exposure, scene, views };
     if let (Some(page), Some(path)) = (page, &args.report) {
         page.write(path, &output)?;
     }

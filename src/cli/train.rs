@@ -14,7 +14,7 @@ use crate::eval::{self, ViewScore};
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::nn::Precision;
 use crate::run::{self, Event, HeldRun, RunDirectory, Trained};
-use crate::tone::{CurveChoice, GainChoice, ToneCurve};
+use crate::tone::{CurveChoice, GainChoice, Profile, ToneCurve, ToneSettings};
 use crate::train::{Background, Learning, ModelName, Part, Preset, TrainConfig};
 
 /// Train a 3D Gaussian Splatting model from dark photographs.
@@ -50,6 +50,9 @@ pub(crate) struct TrainOptions {
     /// The tone curve: a name that `nightsplat curves` lists, or a .toml, .csv or .cube file [default: {tone.curve}]
     #[arg(long, value_name = "NAME|FILE")]
     curve: Option<CurveChoice>,
+    /// A camera profile that `nightsplat fit --profile` made, in place of a curve; results are labelled: they know its references
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["curve", "gain", "brightness", "colour", "theta"])]
+    profile: Option<PathBuf>,
     /// c: how much a brighter photograph raises the curve's gain, or auto: the gain that the photographs ask for, as the curve auto has it [default: {tone.gain_c of ase} for ase, {tone.gain_c of ap3} for ap3, else {tone.gain_c of linear}]
     #[arg(long, value_name = "C|auto")]
     gain: Option<GainChoice>,
@@ -212,7 +215,10 @@ impl TrainOptions {
     /// Whether the command line says how photographs are lifted.
     fn names_a_curve(&self) -> bool {
         let numbers = [self.brightness, self.colour, self.theta];
-        self.curve.is_some() || self.gain.is_some() || numbers.iter().any(Option::is_some)
+        self.curve.is_some()
+            || self.profile.is_some()
+            || self.gain.is_some()
+            || numbers.iter().any(Option::is_some)
     }
 
     /// The configuration without a plan: defaults, then the file, then preset and model, then the other options.
@@ -242,6 +248,9 @@ impl TrainOptions {
             Some(CurveChoice::Named(curve)) => config.tone = config.tone.with_curve(*curve),
             Some(file) => config.tone = file.settings()?,
             None => {}
+        }
+        if let Some(file) = &self.profile {
+            config.tone = ToneSettings::of_profile(Profile::load(file)?);
         }
         self.model.apply(&mut config)?;
         if let Some(plan) = plan {
@@ -319,6 +328,9 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     let gaussians = trainer.gaussian_count();
     if let Some(line) = summary(&scored) {
         writeln!(out, "{line}")?;
+    }
+    if let Some(known) = config.tone.knows_references() {
+        writeln!(out, "{}", eval::with_reference(&known))?;
     }
     writeln!(
         out,

@@ -89,30 +89,8 @@ impl Scene {
     /// [`Error::Input`] names the folder where no pair is left, the file that cannot be read, and the pair whose sizes
     /// differ.
     pub fn load(folder: &Path, normal: Option<&Path>) -> Result<Self> {
-        let (dark, normal) = match normal {
-            Some(normal) => (folder.to_owned(), normal.to_owned()),
-            None => subfolders(folder)?,
-        };
-        let (mut darks, mut references) = (photographs(&dark)?, photographs(&normal)?);
-        let alone = darks.keys().find(|name| !references.contains_key(*name)).cloned();
-        let count = darks.len();
-        darks.retain(|name, _| references.contains_key(name));
-        references.retain(|name, _| darks.contains_key(name));
-        if darks.is_empty() {
-            let problem =
-                format!("no photograph has a partner of the same name in {}", normal.display());
-            return Err(Error::input(dark, problem));
-        }
-        if let Some(name) = alone {
-            let (left, normal) = (count - darks.len(), normal.display());
-            tracing::warn!(
-                "{}: {left} of {count} have no partner in {normal} ({name} is the first)",
-                dark.display()
-            );
-        }
-        let files: Vec<(PathBuf, PathBuf)> =
-            darks.into_values().zip(references.into_values()).collect();
-        let load = |(dark, reference): &(PathBuf, PathBuf)| {
+        let (files, dark) = files_of(folder, normal)?;
+        let load = |(dark, reference): &Files| {
             Pair::new(dark, &Image::load(dark)?, &Image::load(reference)?)
         };
         let mut pairs = files.par_iter().map(load).collect::<Result<Vec<Pair>>>()?;
@@ -128,10 +106,46 @@ impl Scene {
                 "every photograph is black (p90 is 0): there is no t = x / p90 to fit on",
             ));
         }
-        let name = folder.canonicalize().unwrap_or_else(|_| folder.to_owned());
-        let name = name.file_name().unwrap_or(name.as_os_str()).to_string_lossy().into_owned();
-        Ok(Self { name, pairs })
+        Ok(Self { name: name_of(folder), pairs })
     }
+}
+
+/// A dark photograph and its reference.
+type Files = (PathBuf, PathBuf);
+
+/// The folder's name.
+pub(super) fn name_of(folder: &Path) -> String {
+    let name = folder.canonicalize().unwrap_or_else(|_| folder.to_owned());
+    name.file_name().unwrap_or(name.as_os_str()).to_string_lossy().into_owned()
+}
+
+/// The pairs of a scene by name, never none, and the folder of the dark photographs.
+///
+/// # Errors
+/// As [`Scene::load`], but for what is in the files.
+pub(super) fn files_of(folder: &Path, normal: Option<&Path>) -> Result<(Vec<Files>, PathBuf)> {
+    let (dark, normal) = match normal {
+        Some(normal) => (folder.to_owned(), normal.to_owned()),
+        None => subfolders(folder)?,
+    };
+    let (mut darks, mut references) = (photographs(&dark)?, photographs(&normal)?);
+    let alone = darks.keys().find(|name| !references.contains_key(*name)).cloned();
+    let count = darks.len();
+    darks.retain(|name, _| references.contains_key(name));
+    references.retain(|name, _| darks.contains_key(name));
+    if darks.is_empty() {
+        let problem =
+            format!("no photograph has a partner of the same name in {}", normal.display());
+        return Err(Error::input(dark, problem));
+    }
+    if let Some(name) = alone {
+        let (left, normal) = (count - darks.len(), normal.display());
+        tracing::warn!(
+            "{}: {left} of {count} have no partner in {normal} ({name} is the first)",
+            dark.display()
+        );
+    }
+    Ok((darks.into_values().zip(references.into_values()).collect(), dark))
 }
 
 /// The dark and the normal folder of a scene.

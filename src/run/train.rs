@@ -106,6 +106,7 @@ pub fn train_planned(
     }
     let (gaussians, steps) = (trainer.gaussian_count(), trainer.steps_done());
     let mut metrics = eval::metrics(&scored, seconds, gaussians, steps);
+    eval::add_reference(&mut metrics, &config.tone);
     if let Some(exposure) = trainer.target_exposure() {
         metrics[TARGET_EXPOSURE] = serde_json::json!(exposure);
     }

@@ -68,9 +68,11 @@ macro_rules! families {
             Table = CURVE_TABLE,
             /// The curve whose gain [`super::Exposure`] finds: (1 - lambda) soft(x) + lambda x soft(Y) / Y.
             Auto = CURVE_AUTO,
+            /// What a [`super::Profile`] makes.
+            Profile = CURVE_PROFILE,
         }
 
-        /// Every family, by its number; the table of values a file gives is no family, nor is the automatic curve.
+        /// Every family, by its number; what a file gives is no family, nor is the automatic curve.
         pub static FAMILIES: [Family; ToneCurve::Table as usize] = [$(Family {
             curve: ToneCurve::$variant,
             name: $name,

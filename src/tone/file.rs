@@ -4,7 +4,7 @@ use std::fmt;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
-use super::{Table, ToneCurve, ToneSettings};
+use super::{Profile, Table, ToneCurve, ToneSettings};
 use crate::{Error, Result};
 
 /// What `--curve` names.
@@ -29,6 +29,9 @@ impl FromStr for CurveChoice {
         match text.parse() {
             Ok(ToneCurve::Table) => Err(Error::Usage(
                 "a table of values is named by its file: FILE.csv or FILE.cube".to_owned(),
+            )),
+            Ok(ToneCurve::Profile) => Err(Error::Usage(
+                "a camera profile is named by its file: --profile FILE".to_owned(),
             )),
             Ok(curve) => Ok(Self::Named(curve)),
             Err(error) => Err(Error::Usage(format!("{error}, or a .toml, .csv or .cube file"))),
@@ -84,6 +87,23 @@ impl ToneSettings {
     }
 }
 
+impl Profile {
+    /// Reads a profile that `nightsplat fit --profile` wrote.
+    ///
+    /// # Errors
+    /// [`Error::Input`] names the file and what is wrong in it.
+    pub fn load(path: &Path) -> Result<Self> {
+        let text = std::fs::read_to_string(path)
+            .map_err(|error| Error::input(path, format!("cannot be read: {error}")))?;
+        let wrong =
+            |problem: String| Error::input(path, format!("is no camera profile: {problem}"));
+        let profile: Self =
+            toml::from_str(&text).map_err(|error| wrong(error.message().replace('\n', " ")))?;
+        profile.check().map_err(wrong)?;
+        Ok(profile)
+    }
+}
+
 fn from_toml(text: &str) -> Result<ToneSettings, String> {
     let one_line = |error: &toml::de::Error| error.message().replace('\n', " ");
     let mut whole: toml::Table = text.parse().map_err(|error| one_line(&error))?;
@@ -92,7 +112,10 @@ fn from_toml(text: &str) -> Result<ToneSettings, String> {
         Some(_) => return Err("`tone` is no table".to_owned()),
         None => whole,
     };
-    if !["curve", "family", "table"].iter().any(|key| tone.contains_key(*key)) {
+    if tone.contains_key("segments") {
+        return Err("it is a camera profile; name it with --profile".to_owned());
+    }
+    if !["curve", "family", "table", "profile"].iter().any(|key| tone.contains_key(*key)) {
         return Err("it names no curve; add curve = \"NAME\"".to_owned());
     }
     tone.try_into().map_err(|error| one_line(&error))

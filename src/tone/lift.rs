@@ -61,11 +61,13 @@ impl ToneSettings {
         };
         let gain = exposure.gain_of(&photograph.luminance);
         let strength = match self.curve {
-            ToneCurve::Auto => gain,
+            ToneCurve::Auto | ToneCurve::Profile => gain,
             _ => self.strength(&parameters, &photograph.luminance, gain),
         };
         let parameters = ToneParameters { white: (1.0 / strength) as f32, gain: 1.0, ..parameters };
-        Lift { parameters, weight: exposure.weight() as f32, gain: Some(gain) }
+        // What is known of a camera holds for bright photographs too.
+        let weight = if self.profile.is_some() { 1.0 } else { exposure.weight() };
+        Lift { parameters, weight: weight as f32, gain: Some(gain) }
     }
 
     /// The factor on x at which the curve has the mean luminance of soft(x; gain).

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::exposure::BLACK_LEVEL;
 use super::families::White;
 use super::law::{Numbers, black_level, law};
-use super::{Statistics, Table, ToneCurve, ToneParameters};
+use super::{Profile, Statistics, Table, ToneCurve, ToneParameters};
 use crate::{Error, Result};
 
 /// lambda where none is given: the references of views keep more colour than single curves leave.
@@ -52,6 +52,8 @@ pub struct ToneSettings {
     pub constants: Vec<f64>,
     /// The values of [`ToneCurve::Table`].
     pub table: Option<Table>,
+    /// What [`ToneCurve::Profile`] is made of.
+    pub profile: Option<Profile>,
 }
 
 impl ToneSettings {
@@ -60,6 +62,7 @@ impl ToneSettings {
     pub fn new(curve: ToneCurve) -> Self {
         let family = curve.family();
         let is_auto = curve == ToneCurve::Auto;
+        let is_exposed = is_auto || curve == ToneCurve::Profile;
         Self {
             curve,
             gain_c: if is_auto { 0.0 } else { family.gain_c },
@@ -68,12 +71,13 @@ impl ToneSettings {
             beta: 2.5,
             base_gain: 1.0,
             scene_statistics: false,
-            auto_gain: is_auto,
+            auto_gain: is_exposed,
             brightness: None,
             colour: COLOUR,
-            lift_first: is_auto,
+            lift_first: is_exposed,
             constants: family.defaults(),
             table: None,
+            profile: None,
         }
     }
 
@@ -108,6 +112,16 @@ impl ToneSettings {
     /// The curve of a table of values.
     pub fn of_table(table: Table) -> Self {
         Self { table: Some(table), ..Self::new(ToneCurve::Table) }
+    }
+
+    /// The curve of a camera profile, which follows the exposure of the photographs as the automatic curve does.
+    pub fn of_profile(profile: Profile) -> Self {
+        Self { profile: Some(profile), ..Self::new(ToneCurve::Profile) }
+    }
+
+    /// What the targets know of reference images, where they know any: results are labelled with it.
+    pub fn knows_references(&self) -> Option<String> {
+        self.profile.as_ref().map(Profile::label)
     }
 
     /// Refuses constants that leave a curve undefined, decreasing or above white at black.
@@ -154,7 +168,15 @@ impl ToneSettings {
                 "the curve `{name}` takes no `ToneSettings::gain_c`; `ToneSettings::brightness` is its mean"
             ));
         }
-        if self.auto_gain && self.curve != ToneCurve::Auto && !has_gain {
+        if self.curve == ToneCurve::Profile
+            && (self.gain_c != 0.0 || !self.auto_gain || self.brightness.is_some())
+        {
+            return Err("a camera profile is as bright as its references: it takes no `ToneSettings::gain_c` and no \
+                        `ToneSettings::brightness`"
+                .to_owned());
+        }
+        let is_exposed = matches!(self.curve, ToneCurve::Auto | ToneCurve::Profile);
+        if self.auto_gain && !is_exposed && !has_gain {
             return Err(format!(
                 "the curve `{name}` has no gain that could be solved for; name `auto`, `ase` or `ap3`"
             ));
@@ -177,6 +199,17 @@ impl ToneSettings {
                     .to_owned());
             }
             (Some(_), _) => return Err(format!("the curve `{name}` takes no table of values")),
+            (None, _) => {}
+        }
+        match (&self.profile, self.curve) {
+            (Some(profile), ToneCurve::Profile) => profile.check()?,
+            (None, ToneCurve::Profile) => {
+                return Err(
+                    "the curve `profile` needs a camera profile; name a file with --profile"
+                        .to_owned(),
+                );
+            }
+            (Some(_), _) => return Err(format!("the curve `{name}` takes no camera profile")),
             (None, _) => {}
         }
         if self.constants.len() != family.constants.len() {
@@ -216,6 +249,9 @@ impl ToneSettings {
     /// The curve that these settings give a photograph with these statistics; where the gain follows from the exposure, it
     /// is another ([`Self::lift`]).
     pub fn parameters(&self, statistics: &Statistics) -> ToneParameters {
+        if self.curve == ToneCurve::Profile {
+            return ToneParameters { white: 1.0, offset: 0.0, gain: 1.0, constants: [0.0; _] };
+        }
         if self.curve == ToneCurve::Auto {
             let mut constants = [0.0; _];
             constants[0] = self.colour as f32;
@@ -235,12 +271,13 @@ impl ToneSettings {
     pub fn white(&self) -> White {
         match &self.table {
             Some(table) => table.input.white(),
-            None if self.curve == ToneCurve::Auto => White::One,
+            None if matches!(self.curve, ToneCurve::Auto | ToneCurve::Profile) => White::One,
             None => self.curve.family().white,
         }
     }
 
-    /// The curve at t = x / p90, in [0, 1], for a photograph with these statistics; of a table of three channels green.
+    /// The curve at t = x / p90, in [0, 1], for a photograph with these statistics; of a table of three channels, and of a
+    /// profile, green.
     /// `lum_preserve` and `per_channel` are shown as they map grey.
     pub fn value(&self, t: f64, statistics: &Statistics) -> f64 {
         let grey = Statistics { channel_means: [statistics.mean; 3], ..*statistics };
@@ -250,12 +287,13 @@ impl ToneSettings {
         }
         let t = match self.curve {
             // As it is without a scene that says k: over k x.
-            ToneCurve::Auto => t,
+            ToneCurve::Auto | ToneCurve::Profile => t,
             _ => t * f64::from(statistics.p90) / f64::from(white),
         };
-        match &self.table {
-            Some(table) => table.value(t, 1),
-            None => self.curve.value(t, offset.into(), gain.into(), &self.constants),
+        match (&self.table, &self.profile) {
+            (Some(table), _) => table.value(t, 1),
+            (None, Some(profile)) => profile.value([t; 3])[1],
+            (None, None) => self.curve.value(t, offset.into(), gain.into(), &self.constants),
         }
     }
 
@@ -328,13 +366,19 @@ struct Written {
     constants: Option<BTreeMap<String, f64>>,
     #[serde(skip_serializing_if = "Option::is_none")]
     table: Option<Table>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    profile: Option<Profile>,
 }
 
 impl TryFrom<Written> for ToneSettings {
     type Error = String;
 
     fn try_from(written: Written) -> Result<Self, String> {
-        let given = if written.table.is_some() { ToneCurve::Table } else { ToneCurve::Auto };
+        let given = match (&written.table, &written.profile) {
+            (Some(_), _) => ToneCurve::Table,
+            (None, Some(_)) => ToneCurve::Profile,
+            (None, None) => ToneCurve::Auto,
+        };
         let defaults = Self::new(written.curve.unwrap_or(given));
         let family = defaults.curve.family();
         let constants = match written.constants {
@@ -373,6 +417,7 @@ impl TryFrom<Written> for ToneSettings {
             lift_first: written.lift_first.unwrap_or(auto_gain),
             constants,
             table: written.table,
+            profile: written.profile,
         };
         settings.check_constants()?;
         Ok(settings)
@@ -398,6 +443,7 @@ impl From<ToneSettings> for Written {
             lift_first: Some(settings.lift_first),
             constants: Some(constants).filter(|constants| !constants.is_empty()),
             table: settings.table,
+            profile: settings.profile,
         }
     }
 }

@@ -138,7 +138,8 @@ impl Views {
                 });
             }
         }
-        let exposure = scene.exposure.clone();
+        // The targets of a profile are as bright as its references.
+        let exposure = scene.exposure.clone().filter(|_| settings.profile.is_none());
         let exposure = exposure.map(|scene| TargetExposure::new(scene, gains));
         Ok((Self(views), scene, exposure))
     }

@@ -24,6 +24,7 @@ fn args(pairs: &[PathBuf]) -> FitArgs {
         cross_validate: false,
         folds: 5,
         plot: None,
+        profile: false,
         json: false,
     }
 }

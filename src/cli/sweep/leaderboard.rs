@@ -8,6 +8,7 @@ use super::Run;
 use super::grid::{ADAPTIVE, OFFSET, Point, SEED};
 use super::runner::Failure;
 use crate::Result;
+use crate::eval::WITH_REFERENCE;
 use crate::output::write_whole;
 use crate::report::{Bar, Best, Column, Mark, Report, Series, Table, bars, plot_points};
 
@@ -154,7 +155,9 @@ impl Leaderboard {
             header.push(score.clone());
             header.extend(self.has_seeds.then(|| format!("{score}_sd")));
         }
+        let is_marked = self.rows.iter().any(Row::knows_references);
         header.extend(["gaussians", "runs"].map(str::to_owned));
+        header.extend(is_marked.then(|| WITH_REFERENCE.to_owned()));
         let cells = |row: &Row| {
             let values =
                 self.keys.iter().map(|key| field(row.point.value(key).unwrap_or_default()));
@@ -164,6 +167,7 @@ impl Leaderboard {
                 cells.extend(self.has_seeds.then(|| number(row.deviation(score))));
             }
             cells.extend([number(row.gaussians()), row.metrics.len().to_string()]);
+            cells.extend(is_marked.then(|| row.knows_references().to_string()));
             cells.join(",")
         };
         let lines = std::iter::once(header.join(",")).chain(self.rows.iter().map(cells));
@@ -203,6 +207,9 @@ impl Leaderboard {
             notes.push(
                 "No test view has a reference image, so there is nothing to rank.".to_owned(),
             );
+        }
+        if self.rows.iter().any(Row::knows_references) {
+            notes.push("Rows with reference have targets that know references; compare them with none that do not.".to_owned());
         }
         if let Some(offset) = self.adaptive_offset {
             notes.push(format!(
@@ -284,7 +291,9 @@ impl Leaderboard {
             Some(if speaks(key) { value.to_owned() } else { format!("{key} {value}") })
         };
         let words: Vec<String> = keys().filter_map(word).collect();
-        if words.is_empty() && except.is_none() { "all".to_owned() } else { words.join(", ") }
+        let label =
+            if words.is_empty() && except.is_none() { "all".to_owned() } else { words.join(", ") };
+        if row.knows_references() { format!("{label} (with reference)") } else { label }
     }
 
     /// The row that others are compared with; none where it is not the only one of its curve.
@@ -307,6 +316,11 @@ impl Row {
         let mean = mean(&values).filter(|_| values.len() > 1)?;
         let squares = values.iter().map(|value| (value - mean) * (value - mean));
         Some((squares.sum::<f64>() / (values.len() - 1) as f64).sqrt())
+    }
+
+    /// A run's targets knew references.
+    fn knows_references(&self) -> bool {
+        self.metrics.iter().any(|metrics| metrics.get(WITH_REFERENCE).is_some())
     }
 
     fn gaussians(&self) -> Option<f64> {

@@ -5,6 +5,7 @@ use std::path::Path;
 use super::photographs::Listed;
 use super::{CurveOnSet, Mapped, Measures, ToneArgs, ToneOutput, settings, without};
 use crate::Result;
+use crate::eval;
 use crate::gpu::Gpu;
 use crate::image::Image;
 use crate::metrics::Scores;
@@ -34,7 +35,10 @@ impl Page {
             let set = CurveOnSet::new(gpu, settings(args, curve)?, photographs, &args.input)?;
             Ok((set, Distribution::new(curve.to_string())))
         });
-        let curve = args.curve.to_string();
+        let curve = match &args.profile {
+            Some(_) => "profile".to_owned(),
+            None => args.curve.to_string(),
+        };
         Ok(Self {
             only_referenced: photographs.iter().any(|listed| listed.reference.is_some()),
             input: Distribution::new("photograph"),
@@ -91,6 +95,7 @@ impl Page {
                     .to_owned(),
             );
         }
+        intro.extend(output.with_reference.as_deref().map(eval::with_reference));
         let report = Report {
             title: format!("Tone curve {}", self.curve),
             intro,
