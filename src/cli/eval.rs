@@ -57,8 +57,10 @@ pub fn run(args: &EvalArgs) -> Result<()> {
         let recorded = run::load_metrics(&args.run);
         let seconds = recorded["seconds"].as_f64();
         let mut metrics = eval::metrics(&scored, seconds, gaussian_count, config.steps);
-        if let Some(exposure) = recorded.get(run::TARGET_EXPOSURE) {
-            metrics[run::TARGET_EXPOSURE] = exposure.clone();
+        for what in [run::SPENT, run::TARGET_EXPOSURE] {
+            if let Some(known) = recorded.get(what) {
+                metrics[what] = known.clone();
+            }
         }
         if config.exposure.learn == Learning::On {
             eval::add_exposure(&mut metrics, &scored)?;

@@ -207,7 +207,14 @@ fn text_table(output: &ToneOutput) -> String {
 /// would be written to one file, or a reference image is of another size; [`Error::Output`] where a file cannot be
 /// written or a photograph would be replaced; those of the device.
 pub fn apply(args: &ToneArgs) -> Result<ToneOutput> {
-    let settings = settings(args, &args.curve)?;
+    apply_settings(args, settings(args, &args.curve)?)
+}
+
+/// The same with a curve that no option says.
+///
+/// # Errors
+/// As there.
+pub(super) fn apply_settings(args: &ToneArgs, settings: ToneSettings) -> Result<ToneOutput> {
     let photographs = listed(args)?;
     if let Some(out) = &args.out {
         std::fs::create_dir_all(out)
