@@ -113,6 +113,9 @@ struct Comparison {
 /// A knob, an option or a dataset that makes no sense, before anything is trained; a folder that holds another comparison;
 /// points that failed, after the others are finished.
 pub fn run(args: &TradeoffArgs) -> Result<()> {
+    let claim = |writes| batch::claim(&args.out, "tradeoff", &manifest(args)?, &FILES, writes);
+    // Before the plans in the folder are read, which are for its own dataset.
+    claim(false)?;
     let mut comparison = Comparison::new(args)?;
     let mut left = vec![];
     for run in &comparison.runs {
@@ -120,7 +123,7 @@ pub fn run(args: &TradeoffArgs) -> Result<()> {
             left.push(run.clone());
         }
     }
-    batch::claim(&args.out, "tradeoff", &manifest(args)?, &FILES, !args.dry_run)?;
+    claim(!args.dry_run)?;
     let mut out = std::io::stdout().lock();
     if args.dry_run {
         write!(out, "{}", comparison.estimate(&left)?)?;
@@ -172,7 +175,8 @@ impl Comparison {
         let mut dataset = Dataset::load(&base.dataset, &diagnose::load_options(&base))?;
         let target = Target::of(&dataset)?;
         let plans = plans(&gpu, &dataset, &points, &path, &shared, &out)?;
-        for (_, plan) in plans.values() {
+        // All are of one diagnosis.
+        if let Some((_, plan)) = plans.values().next() {
             dataset.leave_out(&plan.left_out);
         }
         if target == Target::PseudoGt {
@@ -191,7 +195,9 @@ impl Comparison {
         }
         if self.target == Target::PseudoGt {
             let folder = PathBuf::from(pseudo_gt(Path::new(&absolute(&args.out)?)));
-            let Some(run) = self.runs.first() else { return Ok(()) };
+            let is_base = |run: &&Run| run.point.value(PRESET) == Some(BASE.name());
+            let base = self.runs.iter().find(is_base).or(self.runs.first());
+            let Some(run) = base else { return Ok(()) };
             let config = &run.config;
             // The mark of a folder that is whole, which a killed command does not leave.
             let done = folder.join("whole");
@@ -204,7 +210,7 @@ impl Comparison {
         Ok(())
     }
 
-    /// A line per point: its steps at most, and what they take at the speed of the base's first steps.
+    /// A line per point: its steps at most, and what they take at the speed of the first steps.
     fn estimate(&self, left: &[Run]) -> crate::Result<String> {
         const WARMUP: u64 = 4;
         const TIMED: u64 = 12;
@@ -264,7 +270,7 @@ fn config_of(preset: Preset, dataset: &str, shared: &[String]) -> crate::Result<
 }
 
 fn arguments(preset: Preset, dataset: &str, shared: &[String]) -> Vec<String> {
-    let first = ["train", dataset, "--out", "", "--preset", preset.name()].map(str::to_owned);
+    let first = ["train", dataset, "--out", "run", "--preset", preset.name()].map(str::to_owned);
     first.into_iter().chain(shared.iter().cloned()).collect()
 }
 

@@ -56,10 +56,7 @@ impl Page<'_> {
         let mut intro = vec![
             format!(
                 "Scores are means over {} test views {}. Time is that of the steps, without loading and scoring; on {}, {processors} processors. {energy}",
-                self.dataset
-                    .test_views()
-                    .filter(|view| view.image.is_some() || view.reference.is_some())
-                    .count(),
+                self.dataset.test_views().filter(|view| view.reference.is_some()).count(),
                 self.target.described(),
                 self.gpu.properties().name,
             ),
