@@ -46,7 +46,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             }
             Event::Finished(trained) => {
                 let gaussians = trained.trainer.gaussian_count();
-                println!("{gaussians} Gaussians in {:.1} s", trained.seconds);
+                println!("{gaussians} Gaussians in {:.1} s", trained.spent.seconds);
             }
             _ => {}
         },

@@ -9,6 +9,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use crate::image::Image;
 
 pub mod ablate;
+mod batch;
 pub mod bench;
 pub mod check;
 mod comparison;
@@ -26,6 +27,7 @@ pub mod sweep;
 pub mod synth;
 mod table;
 pub mod tone;
+pub mod tradeoff;
 pub mod train;
 
 /// 3D Gaussian Splatting from dark photographs, on any Vulkan device.
@@ -47,7 +49,8 @@ const EXAMPLES: &str = "Start with:
   nightsplat train photos --out run                 train from a folder of dark photographs
   nightsplat eval run --save-images                 score it where there are references
   nightsplat render run --split all --out pictures  see the model from every camera
-  nightsplat sweep photos --out sweep --curves all  train with every curve, and rank them";
+  nightsplat sweep photos --out sweep --curves all  train with every curve, and rank them
+  nightsplat tradeoff photos --out tradeoff         what time and memory buy";
 
 #[derive(Debug, Subcommand)]
 enum Command {
@@ -58,6 +61,7 @@ enum Command {
     Tone(tone::ToneArgs),
     Curves(curves::CurvesArgs),
     Sweep(Box<sweep::SweepArgs>),
+    Tradeoff(Box<tradeoff::TradeoffArgs>),
     #[cfg(feature = "fit")]
     Fit(fit::FitArgs),
     /// Fit a curve to pairs of photographs: not in this build
@@ -105,6 +109,7 @@ impl Cli {
                 Err(crate::Error::Usage(format!("this build has no `fit`; {remedy}")).into())
             }
             Command::Sweep(args) => sweep::run(&args),
+            Command::Tradeoff(args) => tradeoff::run(&args),
             Command::Synth(args) => Ok(synth::run(args)?),
             Command::Ablate(args) => ablate::run(&args),
             Command::Demo(args) => demo::run(&args),

@@ -8,6 +8,7 @@ pub use self::bars::{Bar, bars};
 pub use self::distribution::{Distribution, distributions};
 pub use self::plot::{Mark, Series, VerticalLine, plot, plot_points, plot_with_lines, svg_file};
 pub use self::table::{Best, Column, Table};
+pub use self::traces::{Trace, traces};
 
 mod axis;
 mod bars;
@@ -15,6 +16,7 @@ mod data_uri;
 mod distribution;
 mod plot;
 mod table;
+mod traces;
 
 /// A page. Every text is escaped; `plots` are SVG as [`plot`] and [`bars`] give it.
 #[derive(Clone, Debug, Default)]
@@ -62,13 +64,19 @@ impl Report {
         self.page(&(self.pictures_html() + &self.tables_html() + &self.plots_html()))
     }
 
+    /// The same with the plots first and the tables last.
+    pub fn html_plots_first(&self) -> String {
+        self.page(&(self.plots_html() + &self.pictures_html() + &self.tables_html()))
+    }
+
     fn tables_html(&self) -> String {
         self.tables.iter().map(Table::html).collect()
     }
 
     fn plots_html(&self) -> String {
         let figure = |plot: &String| format!("<figure class=\"plot\">{plot}</figure>\n");
-        self.plots.iter().map(figure).collect()
+        let plots: String = self.plots.iter().map(figure).collect();
+        if plots.is_empty() { plots } else { format!("<div class=\"plots\">\n{plots}</div>\n") }
     }
 
     fn pictures_html(&self) -> String {

@@ -2,13 +2,15 @@
 
 mod directory;
 mod events;
+mod meter;
 mod train;
 
-#[cfg(feature = "cli")]
-pub(crate) use directory::TARGET_EXPOSURE;
 pub use directory::{
-    RunDirectory, is_finished, load_config, load_exposures, load_metrics, load_model,
-    load_networks, plan_of,
+    Progress, RunDirectory, is_finished, load_config, load_exposures, load_metrics, load_model,
+    load_networks, load_progress, plan_of,
 };
+#[cfg(feature = "cli")]
+pub(crate) use directory::{SPENT, TARGET_EXPOSURE};
 pub use events::Event;
+pub use meter::{Spent, energy_counters};
 pub use train::{HeldRun, Trained, train, train_planned};

@@ -89,7 +89,7 @@ fn a_run_directory_has_its_four_files_and_metrics_their_shape() {
     }
     assert!(file_names(&run).iter().all(|name| !name.ends_with(".partial")));
     let metrics = json(run.join("metrics.json"));
-    assert_eq!(keys(&metrics), ["mean", "views", "seconds", "gaussians", "steps"]);
+    assert_eq!(keys(&metrics), ["mean", "views", "seconds", "gaussians", "steps", "spent"]);
     assert_eq!(keys(&metrics["mean"]), ["psnr", "psnr_channel_mean", "ssim"]);
     assert_eq!(keys(&metrics["views"]), ["000", "008"]);
     assert_eq!(keys(&metrics["views"]["008"]), ["psnr", "psnr_channel_mean", "ssim"]);

@@ -5,24 +5,22 @@ use crate::eval::{self, ViewScore};
 use crate::image::Image;
 use crate::metrics::Scores;
 use crate::report::{Best, Column, Comparison, Picture, Series, Table};
-use crate::run::Trained;
+use crate::run::{Spent, Trained};
 
 /// A run and what it made of the test views.
 pub(super) struct Run {
     title: String,
     scored: Vec<ViewScore>,
-    seconds: f64,
     gaussians: usize,
-    /// The most that its buffers took on the device.
-    peak_bytes: u64,
+    spent: Spent,
     /// Of every step.
     losses: Vec<f64>,
 }
 
 impl Run {
     pub(super) fn new(title: String, trained: Trained) -> Self {
-        let Trained { trainer, scored, losses, seconds, peak_bytes } = trained;
-        Self { title, scored, seconds, gaussians: trainer.gaussian_count(), peak_bytes, losses }
+        let Trained { trainer, scored, losses, spent } = trained;
+        Self { title, scored, gaussians: trainer.gaussian_count(), losses, spent }
     }
 }
 
@@ -47,8 +45,8 @@ pub(super) fn score_table(label: &str, dark: &[ViewScore], runs: &[Run]) -> Tabl
     let mut rows = vec![("dark photograph".to_owned(), scores(dark))];
     rows.extend(runs.iter().map(|run| {
         let mut values = scores(&run.scored);
-        let mebibytes = run.peak_bytes as f64 / f64::from(1 << 20);
-        values.extend([Some(run.seconds), Some(mebibytes), Some(run.gaussians as f64)]);
+        let mebibytes = run.spent.device_bytes as f64 / f64::from(1 << 20);
+        values.extend([Some(run.spent.seconds), Some(mebibytes), Some(run.gaussians as f64)]);
         (run.title.clone(), values)
     }));
     let mut columns = vec![

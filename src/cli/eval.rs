@@ -58,8 +58,10 @@ pub fn run(args: &EvalArgs) -> Result<()> {
         let seconds = recorded["seconds"].as_f64();
         let mut metrics = eval::metrics(&scored, seconds, gaussian_count, config.steps);
         eval::add_reference(&mut metrics, &config.tone);
-        if let Some(exposure) = recorded.get(run::TARGET_EXPOSURE) {
-            metrics[run::TARGET_EXPOSURE] = exposure.clone();
+        for what in [run::SPENT, run::TARGET_EXPOSURE] {
+            if let Some(known) = recorded.get(what) {
+                metrics[what] = known.clone();
+            }
         }
         if config.exposure.learn == Learning::On {
             eval::add_exposure(&mut metrics, &scored)?;

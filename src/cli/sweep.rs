@@ -12,28 +12,24 @@
 
 mod grid;
 mod leaderboard;
-mod options;
-mod runner;
 
 use std::io::Write;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::Result;
-use clap::{Args, FromArgMatches};
+use clap::Args;
 use serde::Serialize;
 
-use self::grid::{ADAPTIVE, Axis, OFFSET, PaperTable, Point};
+use self::grid::PaperTable;
 use self::leaderboard::Leaderboard;
-use self::options::Options;
+use super::batch::options::{Lists, Options};
+use super::batch::point::{ADAPTIVE, Axis, OFFSET};
+use super::batch::{self, Common, Run, absolute, runner};
 use super::progress_bar;
-use super::train::TrainArgs;
 use crate::Error;
 use crate::dataset::Dataset;
 use crate::gpu::{DeviceChoice, Gpu};
-use crate::output::write_whole;
-use crate::run::load_config;
 use crate::tone::Statistics;
-use crate::train::TrainConfig;
 
 /// Train over a grid of settings, each point in its own run directory, and rank the results.
 ///
@@ -70,7 +66,7 @@ pub struct SweepArgs {
     #[arg(long, value_name = "KEY=LIST", help_heading = "The grid")]
     grid: Vec<String>,
     #[command(flatten, next_help_heading = "What every point is trained with")]
-    options: Options,
+    options: Options<SweepLists>,
 }
 
 const EXAMPLES: &str = "A LIST is comma-separated. Examples:
@@ -78,16 +74,25 @@ const EXAMPLES: &str = "A LIST is comma-separated. Examples:
   nightsplat sweep photos --out offsets --table offset --seeds 1,2,3
   nightsplat sweep photos --out density --grid density.gradient_threshold=1e-4,2e-4 --jobs 2";
 
-/// A point with everything that training it takes.
-#[derive(Clone, Debug)]
-struct Run {
-    name: String,
-    point: Point,
-    folder: PathBuf,
-    /// Of `nightsplat`.
-    arguments: Vec<String>,
-    /// What these arguments come to.
-    config: TrainConfig,
+/// What a sweep takes as lists.
+#[derive(Clone, Copy, Debug)]
+struct SweepLists;
+
+impl Lists for SweepLists {
+    const LISTS: &'static [(&'static str, &'static str, &'static str)] = &[
+        ("curve", "curves", "Tone curves by name or file, or `all` [default: {tone.curve}]"),
+        (
+            "gain",
+            "gain",
+            "Values of c: how much a brighter photograph raises the curve's gain, or auto",
+        ),
+        ("theta", "theta", "Means that the linear curve aims at"),
+        (
+            "seed",
+            "seeds",
+            "Seeds; the leaderboard has the mean over them, and their standard deviation",
+        ),
+    ];
 }
 
 /// Trains what is left of the grid and writes the leaderboard.
@@ -108,7 +113,7 @@ pub fn run(args: &SweepArgs) -> Result<()> {
     if !args.dry_run && !left.is_empty() {
         Gpu::new(&first.device.parse::<DeviceChoice>()?)?;
     }
-    claim(&args.out, &manifest(args, &runs)?, args.dry_run)?;
+    batch::claim(&args.out, "sweep", &manifest(args, &runs)?, &leaderboard::FILES, !args.dry_run)?;
     let mut out = std::io::stdout().lock();
     if args.dry_run {
         for run in left {
@@ -146,16 +151,15 @@ fn plan(args: &SweepArgs) -> crate::Result<Vec<Run>> {
         axes.push(Axis::new(key, list)?);
     }
     for list in &args.grid {
-        let (key, list) = list
-            .split_once('=')
-            .ok_or_else(|| Error::Usage(format!("--grid {list} has no values; write KEY=V1,V2")))?;
-        axes.push(Axis::new(key, list)?);
+        axes.push(Axis::parse("grid", list)?);
     }
     let points = grid::points(&axes, args.table)?;
     let (dataset, out) = (absolute(&args.dataset)?, absolute(&args.out)?);
+    let common = Common { dataset: &dataset, shared: &args.options.shared, out: &out };
     let mut runs: Vec<Run> = vec![];
     for point in points {
-        let run = Run::new(point, &dataset, &args.options.shared, Path::new(&out))?;
+        // Points are to differ by what the grid says alone: no plan.
+        let run = Run::new(point, common, None)?;
         if let Some(other) = runs.iter().find(|other| other.config == run.config) {
             let problem =
                 format!("{} and {} are the same run; leave one out", other.name, run.name);
@@ -164,61 +168,6 @@ fn plan(args: &SweepArgs) -> crate::Result<Vec<Run>> {
         runs.push(run);
     }
     Ok(runs)
-}
-
-impl Run {
-    fn new(point: Point, dataset: &str, shared: &[String], out: &Path) -> crate::Result<Self> {
-        let name = point.name();
-        let folder = out.join(&name);
-        let mut arguments = vec!["train".to_owned(), dataset.to_owned()];
-        arguments.extend_from_slice(shared);
-        arguments.extend(point.arguments());
-        // Points are to differ by what the grid says alone.
-        arguments.extend(["--plan", "none"].map(str::to_owned));
-        arguments.extend(["--out".to_owned(), unicode(&folder)?, "--overwrite".to_owned()]);
-        let train = TrainArgs::augment_args(clap::Command::new("train"));
-        let parsed = train
-            .try_get_matches_from(&arguments)
-            .and_then(|matches| TrainArgs::from_arg_matches(&matches));
-        let args = parsed.map_err(|error| {
-            let text = error.to_string();
-            let line = text.lines().next().unwrap_or_default();
-            Error::Usage(format!("{name}: {}", line.trim_start_matches("error: ")))
-        })?;
-        let config = args.options.config(args.dataset)?;
-        Ok(Self { name, point, folder, arguments, config })
-    }
-
-    /// Whether the run directory holds this run to its end.
-    fn is_finished(&self) -> crate::Result<bool> {
-        let path = self.folder.join("config.toml");
-        if !path.exists() {
-            return Ok(false);
-        }
-        let found = load_config(&self.folder)?;
-        // A run records the tile that it took; where none is asked for, any is right.
-        let found = TrainConfig { tile: self.config.tile.and(found.tile), ..found };
-        if found != self.config {
-            let differs = difference(&found.to_toml()?, &self.config.to_toml()?);
-            let problem = format!("holds another run ({differs}); choose another --out");
-            return Err(Error::output(&self.folder, problem));
-        }
-        Ok(self.metrics().is_some())
-    }
-
-    /// What `metrics.json` says, where the run is finished.
-    fn metrics(&self) -> Option<serde_json::Value> {
-        let text = std::fs::read(self.folder.join("metrics.json")).ok()?;
-        serde_json::from_slice(&text).ok()
-    }
-
-    /// The command as a shell takes it.
-    fn command_line(&self) -> crate::Result<String> {
-        let program = std::env::current_exe()
-            .map_err(|error| Error::input("nightsplat", format!("cannot be found: {error}")))?;
-        let words = std::iter::once(unicode(&program)?).chain(self.arguments.iter().cloned());
-        Ok(words.map(|word| quoted(&word)).collect::<Vec<_>>().join(" "))
-    }
 }
 
 /// What `sweep.toml` says: the sweep without the values of its lists.
@@ -238,32 +187,6 @@ fn manifest(args: &SweepArgs, runs: &[Run]) -> crate::Result<String> {
     toml::to_string(&manifest).map_err(|error| Error::Usage(error.to_string()))
 }
 
-/// Takes a folder that is empty, holds this sweep or holds nothing that a sweep would replace.
-fn claim(folder: &Path, manifest: &str, dry_run: bool) -> crate::Result<()> {
-    const NAME: &str = "sweep.toml";
-    let path = folder.join(NAME);
-    if path.exists() {
-        let found = std::fs::read_to_string(&path)
-            .map_err(|error| Error::input(&path, format!("cannot be read: {error}")))?;
-        if found != manifest {
-            let differs = difference(&found, manifest);
-            let problem = format!("holds another sweep ({differs}); choose another --out");
-            return Err(Error::output(folder, problem));
-        }
-        return Ok(());
-    }
-    if let Some(file) = leaderboard::FILES.iter().find(|file| folder.join(file).exists()) {
-        let problem = format!("holds {file}, which no sweep wrote; choose another --out");
-        return Err(Error::output(folder, problem));
-    }
-    if dry_run {
-        return Ok(());
-    }
-    std::fs::create_dir_all(folder)
-        .map_err(|error| Error::output(folder, format!("cannot be made: {error}")))?;
-    write_whole(&path, manifest.as_bytes())
-}
-
 /// delta0, the mean over the training views, where the sweep has the adaptive black level.
 fn adaptive_offset(runs: &[Run], dataset: &Dataset) -> Option<f64> {
     let run = runs.iter().find(|run| run.point.value(OFFSET) == Some(ADAPTIVE))?;
@@ -271,47 +194,4 @@ fn adaptive_offset(runs: &[Run], dataset: &Dataset) -> Option<f64> {
     let offsets: Vec<f64> =
         images.map(|image| run.config.tone.offset(Statistics::of(&image.data).ratio())).collect();
     Some(offsets.iter().sum::<f64>() / offsets.len() as f64)
-}
-
-/// The first line in which two files differ.
-fn difference(found: &str, wanted: &str) -> String {
-    let wanted: Vec<&str> = wanted.lines().collect();
-    let is_new = |line: &&str| !wanted.contains(line);
-    let line = found.lines().find(is_new).unwrap_or("its configuration lacks a setting");
-    line.to_owned()
-}
-
-fn absolute(path: &Path) -> crate::Result<String> {
-    let path = std::path::absolute(path)
-        .map_err(|error| Error::input(path, format!("cannot be found: {error}")))?;
-    unicode(&path)
-}
-
-fn unicode(path: &Path) -> crate::Result<String> {
-    path.to_str().map(str::to_owned).ok_or_else(|| {
-        Error::Usage(format!("{} is not Unicode; move it to a path that is", path.display()))
-    })
-}
-
-/// A word that a POSIX shell reads back as it is.
-fn quoted(word: &str) -> String {
-    let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_./=,+:@%".contains(c);
-    if !word.is_empty() && word.chars().all(is_plain) {
-        return word.to_owned();
-    }
-    format!("'{}'", word.replace('\'', "'\\''"))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn words_are_quoted_where_a_shell_needs_it() {
-        assert_eq!(quoted("--set"), "--set");
-        assert_eq!(quoted("curve=ap3,seed=1"), "curve=ap3,seed=1");
-        assert_eq!(quoted("a b"), "'a b'");
-        assert_eq!(quoted("it's"), "'it'\\''s'");
-        assert_eq!(quoted(""), "''");
-    }
 }

@@ -224,6 +224,14 @@ pub fn apply(args: &ToneArgs) -> Result<ToneOutput> {
         },
         None => settings(args, &args.curve)?,
     };
+    apply_settings(args, settings)
+}
+
+/// The same with a curve that no option says.
+///
+/// # Errors
+/// As there.
+pub(super) fn apply_settings(args: &ToneArgs, settings: ToneSettings) -> Result<ToneOutput> {
     let photographs = listed(args)?;
     if let Some(out) = &args.out {
         std::fs::create_dir_all(out)

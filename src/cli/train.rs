@@ -208,7 +208,7 @@ impl TrainOptions {
     }
 
     /// Whether a diagnosis of the photographs is to decide what no option says.
-    fn wants_a_plan(&self) -> bool {
+    pub(super) fn wants_a_plan(&self) -> bool {
         self.config.is_none() && self.model.preset.is_none_or(Preset::is_planned)
     }
 
@@ -227,7 +227,11 @@ impl TrainOptions {
     }
 
     /// The same for a run that is planned, whose preset is balanced where none is named; behind that, what the plan says.
-    fn planned_config(&self, dataset: PathBuf, plan: Option<&Plan>) -> crate::Result<TrainConfig> {
+    pub(super) fn planned_config(
+        &self,
+        dataset: PathBuf,
+        plan: Option<&Plan>,
+    ) -> crate::Result<TrainConfig> {
         self.config_over(dataset, Some(Preset::Balanced), plan)
     }
 
@@ -323,7 +327,7 @@ pub fn run(args: &TrainArgs) -> Result<()> {
         say(&mut out, args, &gpu, &dataset, plan)?;
     }
     let held = if args.resume { HeldRun::Resume } else { held_unless(args.overwrite) };
-    let Trained { trainer, scored, seconds, .. } =
+    let Trained { trainer, scored, spent, .. } =
         train_with_bar(&gpu, &config, plan.as_ref(), &dataset, &args.out, held)?;
     let gaussians = trainer.gaussian_count();
     if let Some(line) = summary(&scored) {
@@ -334,8 +338,9 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     }
     writeln!(
         out,
-        "{} steps, {gaussians} Gaussians, {seconds:.0} s -> {}",
+        "{} steps, {gaussians} Gaussians, {:.0} s -> {}",
         trainer.steps_done(),
+        spent.seconds,
         args.out.display()
     )?;
     Ok(())

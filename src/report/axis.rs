@@ -4,8 +4,8 @@
 pub(super) struct Axis {
     low: f64,
     high: f64,
-    /// Between ticks; a round number.
-    step: f64,
+    /// Between ticks, a round number; none on a logarithmic axis.
+    step: Option<f64>,
     from: f64,
     to: f64,
 }
@@ -26,7 +26,21 @@ impl Axis {
         let power = 10f64.powf(rough.log10().floor());
         let step = power
             * [1.0, 2.0, 5.0].into_iter().find(|factor| factor * power >= rough).unwrap_or(10.0);
-        Self { low: (low / step).floor() * step, high: (high / step).ceil() * step, step, from, to }
+        let (low, high) = ((low / step).floor() * step, (high / step).ceil() * step);
+        Self { low, high, step: Some(step), from, to }
+    }
+
+    /// As [`Self::around`], equal ratios as far apart as each other; of values above 1e-9, 1 to 10 where there are none.
+    pub(super) fn logarithmic(values: impl Iterator<Item = f64>, from: f64, to: f64) -> Self {
+        let (low, high) = values
+            .filter(|value| *value > 1e-9)
+            .fold((f64::INFINITY, 0.0), |(low, high): (f64, f64), v| (low.min(v), high.max(v)));
+        let (low, high) = if low <= high { (low, high) } else { (1.0, 10.0) };
+        // The rounding of a tick that is the value itself must not cost a decade.
+        let below = round_values(low / 10.0).filter(|tick| *tick <= low * (1.0 + 1e-9)).last();
+        let above = round_values(low).find(|tick| *tick >= high * (1.0 - 1e-9) && *tick > low);
+        let (low, high) = (below.unwrap_or(low), above.unwrap_or(10.0 * high));
+        Self { low, high, step: None, from, to }
     }
 
     /// Whether a value lies on the axis.
@@ -34,22 +48,68 @@ impl Axis {
         (self.low..=self.high).contains(&value)
     }
 
-    pub(super) fn ticks(&self) -> impl Iterator<Item = f64> {
-        let count = ((self.high - self.low) / self.step).round() as u32;
-        (0..=count).map(|tick| self.low + f64::from(tick) * self.step)
+    pub(super) fn ticks(&self) -> Vec<f64> {
+        let Some(step) = self.step else {
+            let ticks: Vec<f64> =
+                round_values(self.low).take_while(|tick| *tick <= self.high * 1.001).collect();
+            // Decades alone where they are many.
+            let is_shown = |tick: &f64| ticks.len() <= 9 || (tick.log10().fract()).abs() < 1e-6;
+            return ticks.iter().copied().filter(is_shown).collect();
+        };
+        let count = ((self.high - self.low) / step).round() as u32;
+        (0..=count).map(|tick| self.low + f64::from(tick) * step).collect()
     }
 
     pub(super) fn place(&self, value: f64) -> f64 {
-        self.from + (value - self.low) / (self.high - self.low) * (self.to - self.from)
+        let scaled = |value: f64| if self.step.is_some() { value } else { value.max(1e-30).ln() };
+        let (low, high) = (scaled(self.low), scaled(self.high));
+        self.from + (scaled(value) - low) / (high - low) * (self.to - self.from)
     }
 
     pub(super) fn label(&self, tick: f64) -> String {
-        let digits = (-self.step.log10().floor()).clamp(0.0, 6.0) as usize;
+        let digits = self.step.map_or(-tick.log10().floor(), |step| -step.log10().floor());
+        let digits = digits.clamp(0.0, 6.0) as usize;
         let label = format!("{tick:.digits$}");
         if label.trim_start_matches('-').chars().all(|digit| matches!(digit, '0' | '.')) {
             "0".to_owned()
         } else {
             label
         }
+    }
+}
+
+/// 1, 2 and 5 times powers of ten in order, from the decade of `value`.
+fn round_values(value: f64) -> impl Iterator<Item = f64> {
+    let first = value.log10().floor() as i32;
+    (first..first + 40).flat_map(|power| [1.0, 2.0, 5.0].map(|digit| digit * 10f64.powi(power)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_logarithmic_axis_holds_its_values_between_round_ends() {
+        let of = |values: &[f64]| {
+            let axis = Axis::logarithmic(values.iter().copied(), 0.0, 100.0);
+            (axis.low, axis.high)
+        };
+        let close = |(a, b): (f64, f64), (low, high): (f64, f64)| {
+            assert!((a / low - 1.0).abs() < 1e-9 && (b / high - 1.0).abs() < 1e-9, "{a} {b}");
+        };
+        close(of(&[8.0, 94.0]), (5.0, 100.0));
+        close(of(&[10.0, 200.0]), (10.0, 200.0));
+        close(of(&[3.0]), (2.0, 5.0));
+        close(of(&[2.0]), (2.0, 5.0));
+        close(of(&[0.0, f64::NAN]), (1.0, 10.0));
+        let axis = Axis::logarithmic([5.0, 100.0].into_iter(), 0.0, 100.0);
+        let labels: Vec<String> = axis.ticks().into_iter().map(|tick| axis.label(tick)).collect();
+        assert_eq!(labels, ["5", "10", "20", "50", "100"]);
+        assert!((axis.place(5.0)).abs() < 1e-9 && (axis.place(100.0) - 100.0).abs() < 1e-9);
+        // Equal ratios, equal distances.
+        assert!(
+            (axis.place(20.0) - axis.place(10.0) - axis.place(100.0) + axis.place(50.0)).abs()
+                < 1e-9
+        );
     }
 }

@@ -7,6 +7,7 @@
 //!     networks.safetensors    the weights of the networks, where the model has any
 //!     train.csv      one line per step
 //!     held_out.csv   scores of the views that were kept from training, where there are any
+//!     progress.csv   scores of the test views on the way, with what it took, where they are asked for
 //!     exposures.csv  gain and bias of the training views, where they are learned
 //!     checkpoint.safetensors  what the run goes on from, overwritten every so many steps
 //!     metrics.json   scores of the test views
@@ -19,10 +20,12 @@ use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
+use super::meter::Spent;
 use crate::diagnose::Plan;
 use crate::exposure::{Affine, table};
 use crate::gpu::Gpu;
 use crate::loss::Term;
+use crate::metrics::Scores;
 use crate::output::write_whole;
 use crate::scene::{Features, Gaussians, ply};
 use crate::train::{ModelConfig, Networks, StepReport, TrainConfig, Trainer};
@@ -40,7 +43,7 @@ pub struct RunDirectory {
 }
 
 /// The files of a run that a new run replaces; nothing else in the directory is touched.
-const FILES: [&str; 9] = [
+const FILES: [&str; 10] = [
     "metrics.json",
     "model.ply",
     NETWORKS,
@@ -48,6 +51,7 @@ const FILES: [&str; 9] = [
     CHECKPOINT,
     LOG,
     HELD_OUT,
+    PROGRESS,
     PLAN,
     "config.toml",
 ];
@@ -58,11 +62,17 @@ const LOG: &str = "train.csv";
 /// PSNR of the views that were kept from training, against their targets.
 const HELD_OUT: &str = "held_out.csv";
 
+/// Scores of the test views on the way, and what it took.
+const PROGRESS: &str = "progress.csv";
+
 /// What was decided for the photographs, and why.
 const PLAN: &str = "plan.toml";
 
 /// Where `metrics.json` holds the [`crate::train::TargetExposure`].
 pub(crate) const TARGET_EXPOSURE: &str = "target_exposure";
+
+/// Where `metrics.json` holds what the steps took beside seconds.
+pub(crate) const SPENT: &str = "spent";
 
 /// Gain and bias of the training views.
 const EXPOSURES: &str = "exposures.csv";
@@ -162,6 +172,23 @@ impl RunDirectory {
         write_whole(&self.path.join(HELD_OUT), text.as_bytes())
     }
 
+    /// How the run came up to a step.
+    pub(super) fn progress(&self, step: u64) -> Vec<Progress> {
+        let mut progress = load_progress(&self.path);
+        progress.retain(|one| one.step <= step);
+        progress
+    }
+
+    /// Writes how the run came so far.
+    ///
+    /// # Errors
+    /// The disk is full or gone.
+    pub(super) fn save_progress(&self, progress: &[Progress]) -> Result<()> {
+        let lines: String = progress.iter().map(Progress::line).collect();
+        let text = format!("{}\n{lines}", Progress::COLUMNS);
+        write_whole(&self.path.join(PROGRESS), text.as_bytes())
+    }
+
     /// Writes the plan that the configuration follows.
     ///
     /// # Errors
@@ -237,6 +264,70 @@ impl RunDirectory {
     fn log_line(&mut self, line: &str) -> Result<()> {
         writeln!(self.log, "{line}").map_err(|error| unwritable(&self.path, &error))
     }
+}
+
+/// The scores of the test views at one step of a run, and what the steps up to it took.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Progress {
+    /// Counted from 1.
+    pub step: u64,
+    /// On the wall, without scoring.
+    pub seconds: f64,
+    /// On all processors together, without scoring; none where the system does not say.
+    pub processor_seconds: Option<f64>,
+    /// Of the whole machine; none where it has no counter.
+    pub joules: Option<f64>,
+    /// The number of Gaussians.
+    pub gaussians: u64,
+    /// The mean over the test views, dB.
+    pub psnr: f64,
+    /// The mean over the test views.
+    pub ssim: f64,
+}
+
+impl Progress {
+    const COLUMNS: &str = "step,seconds,processor_seconds,joules,gaussians,psnr,ssim";
+
+    pub(super) fn new(step: u64, gaussians: usize, scores: &Scores, spent: &Spent) -> Self {
+        Self {
+            step,
+            seconds: spent.seconds,
+            processor_seconds: spent.processor_seconds,
+            joules: spent.joules,
+            gaussians: gaussians as u64,
+            psnr: scores.psnr,
+            ssim: scores.ssim,
+        }
+    }
+
+    fn line(&self) -> String {
+        let Self { step, seconds, gaussians, psnr, ssim, .. } = self;
+        let [processor, joules] = [self.processor_seconds, self.joules]
+            .map(|value| value.map_or_else(String::new, |value| format!("{value:.2}")));
+        format!("{step},{seconds:.3},{processor},{joules},{gaussians},{psnr},{ssim}\n")
+    }
+
+    fn parse(line: &str) -> Option<Self> {
+        let fields: Vec<&str> = line.split(',').collect();
+        let [step, seconds, processor, joules, gaussians, psnr, ssim] = fields[..] else {
+            return None;
+        };
+        Some(Self {
+            step: step.parse().ok()?,
+            seconds: seconds.parse().ok()?,
+            processor_seconds: processor.parse().ok(),
+            joules: joules.parse().ok(),
+            gaussians: gaussians.parse().ok()?,
+            psnr: psnr.parse().ok()?,
+            ssim: ssim.parse().ok()?,
+        })
+    }
+}
+
+/// How a run came to where it is; nothing where its test views were scored at the end alone.
+pub fn load_progress(run: &Path) -> Vec<Progress> {
+    let text = std::fs::read_to_string(run.join(PROGRESS)).unwrap_or_default();
+    text.lines().filter_map(Progress::parse).collect()
 }
 
 /// The checkpoint of a run; none where there is none.

@@ -1,9 +1,9 @@
 //! Trains into a run directory and tells an observer.
 
 use std::path::Path;
-use std::time::{Duration, Instant};
 
-use super::directory::TARGET_EXPOSURE;
+use super::directory::{Progress, SPENT, TARGET_EXPOSURE};
+use super::meter::{Meter, Spent};
 use super::{Event, RunDirectory, directory};
 use crate::Result;
 use crate::dataset::Dataset;
@@ -33,10 +33,8 @@ pub struct Trained {
     pub scored: Vec<ViewScore>,
     /// The loss of every step of this call.
     pub losses: Vec<f64>,
-    /// Of the steps alone, without loading and scoring; those before a resumed run included.
-    pub seconds: f64,
-    /// The most that buffers took on the device while it trained.
-    pub peak_bytes: u64,
+    /// What the steps took, without loading and scoring; the seconds before a resumed run included.
+    pub spent: Spent,
 }
 
 /// Trains `config` on `dataset`, scores the test views and writes the run directory `out`.
@@ -63,7 +61,7 @@ pub struct Trained {
 ///         println!("step {}: loss {:.4}", report.step, report.loss);
 ///     }
 /// })?;
-/// println!("{} Gaussians in {:.0} s", trained.trainer.gaussian_count(), trained.seconds);
+/// println!("{} Gaussians in {:.0} s", trained.trainer.gaussian_count(), trained.spent.seconds);
 /// # Ok::<(), nightsplat::Error>(())
 /// ```
 pub fn train(
@@ -96,16 +94,17 @@ pub fn train_planned(
         directory.save_plan(plan)?;
     }
     observe(Event::Started { step: trainer.steps_done(), steps: config.steps });
-    let (losses, seconds) =
-        train_to_the_end(&mut trainer, &mut directory, config, dataset, &mut observe)?;
-    let peak_bytes = gpu.peak_memory();
-    let scored = evaluate(&mut trainer, dataset, &mut observe)?;
+    let mut course = Course::new(config, dataset, &directory, &trainer);
+    let losses = course.train_to_the_end(&mut trainer, &mut directory, &mut observe)?;
+    let spent = course.meter.spent(gpu.peak_memory());
+    let scored = course.evaluate(&mut trainer, &directory, &mut observe)?;
     directory.save_model(&trainer.gaussians()?, config.model.raw_colors)?;
     if let Some(networks) = trainer.networks() {
         directory.save_networks(networks)?;
     }
     let (gaussians, steps) = (trainer.gaussian_count(), trainer.steps_done());
-    let mut metrics = eval::metrics(&scored, seconds, gaussians, steps);
+    let mut metrics = eval::metrics(&scored, spent.seconds, gaussians, steps);
+    metrics[SPENT] = serde_json::json!(spent);
     eval::add_reference(&mut metrics, &config.tone);
     if let Some(exposure) = trainer.target_exposure() {
         metrics[TARGET_EXPOSURE] = serde_json::json!(exposure);
@@ -115,7 +114,7 @@ pub fn train_planned(
         eval::add_exposure(&mut metrics, &scored)?;
     }
     directory.save_metrics(&metrics)?;
-    let trained = Trained { trainer, scored, losses, seconds, peak_bytes };
+    let trained = Trained { trainer, scored, losses, spent };
     observe(Event::Finished(&trained));
     Ok(trained)
 }
@@ -159,53 +158,89 @@ fn with_tile(gpu: &Gpu, config: &TrainConfig, resumed: Option<&Path>) -> Result<
     Ok(config)
 }
 
-/// Logs every step, writes checkpoints and ends early where that is asked for; gives the losses, and the seconds of all
-/// steps.
-fn train_to_the_end(
-    trainer: &mut Trainer,
-    directory: &mut RunDirectory,
-    config: &TrainConfig,
-    dataset: &Dataset,
-    observe: &mut impl FnMut(Event<'_>),
-) -> Result<(Vec<f64>, f64)> {
-    let (mut losses, mut spent) = (vec![], Duration::ZERO);
-    let score_every = if config.stop.views > 0 { config.stop.every } else { 0 };
-    let mut held_out = directory.held_out_scores(trainer.steps_done());
-    while trainer.steps_done() < config.steps {
-        let next = |every| (trainer.steps_done() + 1).checked_next_multiple_of(every);
-        let until = [config.eval_every, config.checkpoint_every, score_every];
-        let until = until.into_iter().filter_map(next).min().unwrap_or(config.steps);
-        let begin = Instant::now();
-        let reports = trainer.advance(until)?;
-        spent += begin.elapsed();
-        for report in &reports {
-            losses.push(report.loss);
-            directory.log(report)?;
-            observe(Event::Step(report));
-        }
-        let Some(step) = reports.last().map(|report| report.step) else { continue };
-        let falls_on = |every: u64| every > 0 && step.is_multiple_of(every);
-        // Before the checkpoint: what goes on from there knows the score.
-        if falls_on(score_every)
-            && let Some(psnr) = trainer.held_out_psnr()?
-        {
-            held_out.push((step, psnr));
-            directory.save_held_out(&held_out)?;
-            observe(Event::HeldOut { step, psnr });
-        }
-        if falls_on(config.checkpoint_every) {
-            directory.save_checkpoint(trainer)?;
-            observe(Event::Checkpointed { step });
-        }
-        if falls_on(score_every) && has_converged(config, &held_out) && step < config.steps {
-            tracing::info!("step {step}: the held-out views have converged");
-            break;
-        }
-        if falls_on(config.eval_every) && step < config.steps {
-            evaluate(trainer, dataset, observe)?;
-        }
+/// How far a run has come, and what that took.
+struct Course<'a> {
+    config: &'a TrainConfig,
+    dataset: &'a Dataset,
+    meter: Meter,
+    progress: Vec<Progress>,
+}
+
+impl<'a> Course<'a> {
+    fn new(
+        config: &'a TrainConfig,
+        dataset: &'a Dataset,
+        directory: &RunDirectory,
+        trainer: &Trainer,
+    ) -> Self {
+        let meter = Meter::new(directory.seconds_before());
+        Self { config, dataset, meter, progress: directory.progress(trainer.steps_done()) }
     }
-    Ok((losses, directory.seconds_before() + spent.as_secs_f64()))
+
+    /// Logs every step, writes checkpoints and ends early where that is asked for; gives the losses.
+    fn train_to_the_end(
+        &mut self,
+        trainer: &mut Trainer,
+        directory: &mut RunDirectory,
+        observe: &mut impl FnMut(Event<'_>),
+    ) -> Result<Vec<f64>> {
+        let (config, mut losses) = (self.config, vec![]);
+        let score_every = if config.stop.views > 0 { config.stop.every } else { 0 };
+        let mut held_out = directory.held_out_scores(trainer.steps_done());
+        while trainer.steps_done() < config.steps {
+            let next = |every| (trainer.steps_done() + 1).checked_next_multiple_of(every);
+            let until = [config.eval_every, config.checkpoint_every, score_every];
+            let until = until.into_iter().filter_map(next).min().unwrap_or(config.steps);
+            let reports = self.meter.of(|| trainer.advance(until))?;
+            for report in &reports {
+                losses.push(report.loss);
+                directory.log(report)?;
+                observe(Event::Step(report));
+            }
+            let Some(step) = reports.last().map(|report| report.step) else { continue };
+            let falls_on = |every: u64| every > 0 && step.is_multiple_of(every);
+            // Before the checkpoint: what goes on from there knows the score.
+            if falls_on(score_every)
+                && let Some(psnr) = trainer.held_out_psnr()?
+            {
+                held_out.push((step, psnr));
+                directory.save_held_out(&held_out)?;
+                observe(Event::HeldOut { step, psnr });
+            }
+            if falls_on(config.checkpoint_every) {
+                directory.save_checkpoint(trainer)?;
+                observe(Event::Checkpointed { step });
+            }
+            if falls_on(score_every) && has_converged(config, &held_out) && step < config.steps {
+                tracing::info!("step {step}: the held-out views have converged");
+                break;
+            }
+            if falls_on(config.eval_every) && step < config.steps {
+                self.evaluate(trainer, directory, observe)?;
+            }
+        }
+        Ok(losses)
+    }
+
+    /// Scores the test views, which takes none of the run's time.
+    fn evaluate(
+        &mut self,
+        trainer: &mut Trainer,
+        directory: &RunDirectory,
+        observe: &mut impl FnMut(Event<'_>),
+    ) -> Result<Vec<ViewScore>> {
+        let scored = eval::score(self.dataset, |view| trainer.render(&view.camera))?;
+        let step = trainer.steps_done();
+        observe(Event::Evaluated { step, scored: &scored });
+        if let Some(scores) = eval::means(&scored).0.filter(|_| self.config.eval_every > 0) {
+            let (gaussians, spent) = (trainer.gaussian_count(), self.meter.spent(0));
+            // A finished run that goes on begins where it was scored last.
+            self.progress.retain(|earlier| earlier.step < step);
+            self.progress.push(Progress::new(step, gaussians, &scores, &spent));
+            directory.save_progress(&self.progress)?;
+        }
+        Ok(scored)
+    }
 }
 
 /// By the scores since the views have had their size.
@@ -214,14 +249,4 @@ fn has_converged(config: &TrainConfig, held_out: &[(u64, f64)]) -> bool {
     let scores: Vec<f64> =
         held_out.iter().filter(|(step, _)| *step >= whole).map(|&(_, psnr)| psnr).collect();
     config.stop.has_converged(&scores)
-}
-
-fn evaluate(
-    trainer: &mut Trainer,
-    dataset: &Dataset,
-    observe: &mut impl FnMut(Event<'_>),
-) -> Result<Vec<ViewScore>> {
-    let scored = eval::score(dataset, |view| trainer.render(&view.camera))?;
-    observe(Event::Evaluated { step: trainer.steps_done(), scored: &scored });
-    Ok(scored)
 }

@@ -1,160 +1,7 @@
 //! The points of a sweep: every combination of the values of its axes, and the grids of the paper's tables.
 
-use std::path::Path;
-
-use crate::tone::ToneCurve;
+use crate::cli::batch::point::{ADAPTIVE, Axis, OFFSET, Point, all_curves};
 use crate::{Error, Result};
-
-use super::options::pair;
-
-/// The axis whose points are averaged.
-pub(super) const SEED: &str = "seed";
-/// The axis of fixed black levels.
-pub(super) const OFFSET: &str = "offset";
-/// On that axis: the black level of alpha and beta.
-pub(super) const ADAPTIVE: &str = "adaptive";
-
-/// The axes with a name of their own, in the order of a point's name, and the setting behind each.
-const AXES: [(&str, &str); 8] = [
-    ("curve", "tone.curve"),
-    ("alpha", "tone.alpha"),
-    ("beta", "tone.beta"),
-    ("gain", "tone.gain_c"),
-    ("base_gain", "tone.base_gain"),
-    ("theta", "tone.theta"),
-    (OFFSET, OFFSET),
-    (SEED, SEED),
-];
-
-/// A setting and the values it takes.
-#[derive(Clone, Debug, PartialEq)]
-pub(super) struct Axis {
-    /// A name of [`AXES`], or the dotted path of any other setting.
-    pub(super) key: String,
-    pub(super) values: Vec<String>,
-}
-
-impl Axis {
-    /// The axis of a comma-separated list; commas within brackets and quotes separate nothing.
-    ///
-    /// # Errors
-    /// [`Error::Usage`] for a value that is empty or there twice.
-    pub(super) fn new(key: &str, list: &str) -> Result<Self> {
-        let key = key.trim();
-        let name = AXES.iter().find(|(_, setting)| *setting == key).map_or(key, |(name, _)| name);
-        let mut axis = Self { key: name.to_owned(), values: vec![] };
-        for value in split(list) {
-            let all = if name == "curve" && value == "all" { all_curves() } else { vec![value] };
-            for value in all {
-                let refused =
-                    |problem| Err(Error::Usage(format!("{name} takes {list}: {problem}")));
-                if value.is_empty() {
-                    return refused(
-                        "a value is empty; separate values by single commas".to_owned(),
-                    );
-                }
-                if axis.values.contains(&value) {
-                    return refused(format!("{value} is there twice"));
-                }
-                axis.values.push(value);
-            }
-        }
-        Ok(axis)
-    }
-
-    fn of(key: &str, values: &[&str]) -> Self {
-        Self { key: key.to_owned(), values: values.iter().map(|&value| value.to_owned()).collect() }
-    }
-
-    /// Where its values stand in a point's name: those of [`AXES`] first, the seed last.
-    fn order(&self) -> (usize, &str) {
-        let named = AXES.iter().position(|(name, _)| *name == self.key && *name != SEED);
-        (named.unwrap_or(AXES.len() + usize::from(self.key == SEED)), &self.key)
-    }
-}
-
-/// The parts of a list.
-fn split(list: &str) -> Vec<String> {
-    let (mut parts, mut depth, mut quote) = (vec![String::new()], 0, None);
-    for character in list.chars() {
-        match (character, quote) {
-            ('"' | '\'', None) => quote = Some(character),
-            (_, Some(open)) if character == open => quote = None,
-            ('[' | '{', None) => depth += 1,
-            (']' | '}', None) => depth -= 1,
-            (',', None) if depth == 0 => {
-                parts.push(String::new());
-                continue;
-            }
-            _ => {}
-        }
-        if let Some(part) = parts.last_mut() {
-            part.push(character);
-        }
-    }
-    parts.iter().map(|part| part.trim().to_owned()).collect()
-}
-
-/// The names of all curves.
-fn all_curves() -> Vec<String> {
-    ToneCurve::ALL.iter().map(|curve| curve.name().to_owned()).collect()
-}
-
-/// A curve as a point names it: a file from anywhere, any other by its name.
-fn curve(name: &str) -> String {
-    let is_file = name.contains(['.', '/']) && Path::new(name).is_file();
-    let path = is_file.then(|| std::path::absolute(name).ok()).flatten();
-    path.and_then(|path| path.to_str().map(str::to_owned)).unwrap_or_else(|| name.to_owned())
-}
-
-/// A run of the sweep: what distinguishes it from the others.
-#[derive(Clone, Debug, PartialEq)]
-pub(super) struct Point {
-    /// Axis and value, in the order of the name.
-    pub(super) values: Vec<(String, String)>,
-}
-
-impl Point {
-    pub(super) fn value(&self, key: &str) -> Option<&str> {
-        self.values.iter().find(|(own, _)| own == key).map(|(_, value)| value.as_str())
-    }
-
-    /// The name of its run directory, such as `curve=ap3,seed=10`: the same in every sweep that has the point, and no
-    /// other point's.
-    pub(super) fn name(&self) -> String {
-        const LONGEST: usize = 120;
-        let pairs: Vec<String> =
-            self.values.iter().map(|(key, value)| format!("{key}={value}")).collect();
-        let exact = pairs.join(",");
-        let plain =
-            |c: char| if c.is_ascii_alphanumeric() || "-_.=,+".contains(c) { c } else { '_' };
-        let name: String = exact.chars().map(plain).take(LONGEST).collect();
-        if name == exact {
-            return name;
-        }
-        // FNV-1a tells apart what the replacements made alike.
-        let hash = exact
-            .bytes()
-            .fold(0x811c_9dc5_u32, |hash, byte| (hash ^ u32::from(byte)).wrapping_mul(0x0100_0193));
-        format!("{name}-{hash:08x}")
-    }
-
-    /// What it adds to the arguments of `train`.
-    pub(super) fn arguments(&self) -> Vec<String> {
-        let set = |key: &str, value: &str| pair("set", &format!("{key}={value}"));
-        let of = |(key, value): &(String, String)| match key.as_str() {
-            "curve" => pair(key, &curve(value)),
-            "gain" | "theta" | SEED => pair(key, value),
-            OFFSET if value == ADAPTIVE => vec![],
-            OFFSET => [set("tone.alpha", value), set("tone.beta", "0")].concat(),
-            key => {
-                let setting = AXES.iter().find(|(name, _)| *name == key);
-                set(setting.map_or(key, |(_, setting)| setting), value)
-            }
-        };
-        self.values.iter().flat_map(of).collect()
-    }
-}
 
 /// The grids of the paper's tables.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -275,6 +122,7 @@ fn product(axes: &[Axis]) -> Vec<Vec<(String, String)>> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::tone::ToneCurve;
 
     fn names(given: &[(&str, &str)], table: Option<PaperTable>) -> Vec<String> {
         let axes: Vec<Axis> =
@@ -319,13 +167,6 @@ mod tests {
         assert!(names[0].starts_with("curve=a_b.toml-") && names[3].starts_with("curve=_-"));
         let long = Point { values: vec![("key".to_owned(), "x".repeat(500))] };
         assert!(long.name().len() < 200);
-    }
-
-    #[test]
-    fn a_list_is_split_outside_of_brackets_and_quotes() {
-        assert_eq!(split("[1,2], [3,4]"), ["[1,2]", "[3,4]"]);
-        assert_eq!(split("\"a,b\",'c,]',d"), ["\"a,b\"", "'c,]'", "d"]);
-        assert_eq!(split("a,,b"), ["a", "", "b"]);
     }
 
     #[test]

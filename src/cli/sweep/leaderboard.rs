@@ -4,10 +4,12 @@ use std::path::Path;
 
 use serde_json::Value;
 
-use super::Run;
-use super::grid::{ADAPTIVE, OFFSET, Point, SEED};
-use super::runner::Failure;
 use crate::Result;
+use crate::cli::batch::Run;
+use crate::cli::batch::csv::{field, number};
+use crate::cli::batch::point::{ADAPTIVE, OFFSET, Point, SEED};
+use crate::cli::batch::runner::Failure;
+use crate::cli::batch::sample::{deviation, mean};
 use crate::eval::WITH_REFERENCE;
 use crate::output::write_whole;
 use crate::report::{Bar, Best, Column, Mark, Report, Series, Table, bars, plot_points};
@@ -312,10 +314,7 @@ impl Row {
 
     /// The standard deviation of a sample of at least two.
     fn deviation(&self, score: &str) -> Option<f64> {
-        let values = self.values(score);
-        let mean = mean(&values).filter(|_| values.len() > 1)?;
-        let squares = values.iter().map(|value| (value - mean) * (value - mean));
-        Some((squares.sum::<f64>() / (values.len() - 1) as f64).sqrt())
+        deviation(&self.values(score))
     }
 
     /// A run's targets knew references.
@@ -347,10 +346,6 @@ fn differing(runs: &[Run]) -> Vec<String> {
     if differing.is_empty() { keys().collect() } else { differing }
 }
 
-fn mean(values: &[f64]) -> Option<f64> {
-    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
-}
-
 /// How a score of `metrics.json` is shown.
 fn column(score: &str) -> Column {
     let (name, digits, best) = match score {
@@ -361,18 +356,4 @@ fn column(score: &str) -> Column {
         other => (other, 4, Best::Unmarked),
     };
     Column { name: name.to_owned(), digits, best }
-}
-
-/// A field of a CSV file (RFC 4180).
-fn field(text: &str) -> String {
-    if text.contains([',', '"', '\n', '\r']) {
-        format!("\"{}\"", text.replace('"', "\"\""))
-    } else {
-        text.to_owned()
-    }
-}
-
-/// A number of a CSV file, all of its digits; empty where there is none.
-fn number(value: Option<f64>) -> String {
-    value.map(|value| value.to_string()).unwrap_or_default()
 }

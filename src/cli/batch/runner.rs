@@ -1,8 +1,8 @@
 //! Trains the points that are left, each in a process of its own.
 //!
 //! That process holds a lock on the file `lock` of its run directory, inherited as its standard input, until it ends:
-//! a sweep that is killed may leave a process at work, and the next one waits for it instead of writing beside it. Two
-//! sweeps of one folder share its points in the same way.
+//! a batch that is killed may leave a process at work, and the next one waits for it instead of writing beside it. Two
+//! batches in one folder share its points in the same way.
 
 use std::fs::{File, TryLockError};
 use std::io::Write;
@@ -18,15 +18,15 @@ use crate::{Error, Result};
 
 /// A point that did not finish, and why.
 #[derive(Clone, Debug)]
-pub(super) struct Failure {
+pub(in crate::cli) struct Failure {
     /// The point's name.
-    pub(super) name: String,
+    pub(in crate::cli) name: String,
     /// What its process said last.
-    pub(super) reason: String,
+    pub(in crate::cli) reason: String,
 }
 
 /// Trains every run that is not finished, `jobs` at once; what failed, in the order of `runs`.
-pub(super) fn train(runs: &[&Run], jobs: usize, bar: &ProgressBar) -> Vec<Failure> {
+pub(in crate::cli) fn train(runs: &[&Run], jobs: usize, bar: &ProgressBar) -> Vec<Failure> {
     bar.enable_steady_tick(Duration::from_secs(1));
     let (next, busy, failures) = (AtomicUsize::new(0), Mutex::new(vec![]), Mutex::new(vec![]));
     let finish = |index: usize, waits: bool| {
@@ -85,7 +85,7 @@ fn attempt(run: &Run, waits: bool) -> Result<bool> {
     match lock.try_lock() {
         Err(TryLockError::WouldBlock) if waits => lock.lock().map_err(unusable)?,
         Err(TryLockError::WouldBlock) => return Ok(false),
-        // A file system without locks: one sweep at a time is all that it can have.
+        // A file system without locks: one batch at a time is all that it can have.
         Err(TryLockError::Error(_)) | Ok(()) => {}
     }
     if run.is_finished()? {

@@ -1,0 +1,199 @@
+//! Many runs of one dataset, each a `nightsplat train` process with a run directory of its own: what `sweep` and
+//! `tradeoff` share.
+
+use std::path::{Path, PathBuf};
+
+use clap::{Args, FromArgMatches};
+
+use self::point::Point;
+use super::train::TrainArgs;
+use crate::diagnose::Plan;
+use crate::output::write_whole;
+use crate::run::load_config;
+use crate::train::TrainConfig;
+use crate::{Error, Result};
+
+pub(super) mod csv;
+pub(super) mod options;
+pub(super) mod point;
+pub(super) mod runner;
+pub(super) mod sample;
+
+/// A point with everything that training it takes.
+#[derive(Clone, Debug)]
+pub(super) struct Run {
+    pub(super) name: String,
+    pub(super) point: Point,
+    pub(super) folder: PathBuf,
+    /// Of `nightsplat`.
+    pub(super) arguments: Vec<String>,
+    /// What these arguments come to.
+    pub(super) config: TrainConfig,
+}
+
+/// What the points of a batch have in common.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Common<'a> {
+    /// An absolute path.
+    pub(super) dataset: &'a str,
+    /// Options of `train`, as arguments.
+    pub(super) shared: &'a [String],
+    /// The absolute path of the folder with all run directories.
+    pub(super) out: &'a str,
+}
+
+impl Run {
+    /// The run of a point, by a plan where there is one: its file, and what that says.
+    ///
+    /// # Errors
+    /// What `train` would say of these options, behind the point's name.
+    pub(super) fn new(
+        point: Point,
+        common: Common<'_>,
+        plan: Option<(&str, &Plan)>,
+    ) -> Result<Self> {
+        let name = point.name();
+        let folder = Path::new(common.out).join(&name);
+        let mut arguments = vec!["train".to_owned(), common.dataset.to_owned()];
+        arguments.extend_from_slice(common.shared);
+        arguments.extend(point.arguments());
+        let file = plan.map_or("none", |(file, _)| file);
+        arguments.extend(["--plan", file].map(str::to_owned));
+        arguments.extend(["--out".to_owned(), unicode(&folder)?, "--overwrite".to_owned()]);
+        let args = train_args(&name, &arguments)?;
+        let config = match plan {
+            Some((_, plan)) => args.options.planned_config(args.dataset, Some(plan))?,
+            None => args.options.config(args.dataset)?,
+        };
+        Ok(Self { name, point, folder, arguments, config })
+    }
+
+    /// Whether the run directory holds this run to its end.
+    pub(super) fn is_finished(&self) -> Result<bool> {
+        let path = self.folder.join("config.toml");
+        if !path.exists() {
+            return Ok(false);
+        }
+        let found = load_config(&self.folder)?;
+        // A run records the tile that it took; where none is asked for, any is right.
+        let found = TrainConfig { tile: self.config.tile.and(found.tile), ..found };
+        if found != self.config {
+            let differs = difference(&found.to_toml()?, &self.config.to_toml()?);
+            let problem = format!("holds another run ({differs}); choose another --out");
+            return Err(Error::output(&self.folder, problem));
+        }
+        Ok(self.metrics().is_some())
+    }
+
+    /// What `metrics.json` says, where the run is finished.
+    pub(super) fn metrics(&self) -> Option<serde_json::Value> {
+        let text = std::fs::read(self.folder.join("metrics.json")).ok()?;
+        serde_json::from_slice(&text).ok()
+    }
+
+    /// The command as a shell takes it.
+    pub(super) fn command_line(&self) -> Result<String> {
+        let program = std::env::current_exe()
+            .map_err(|error| Error::input("nightsplat", format!("cannot be found: {error}")))?;
+        let words = std::iter::once(unicode(&program)?).chain(self.arguments.iter().cloned());
+        Ok(words.map(|word| quoted(&word)).collect::<Vec<_>>().join(" "))
+    }
+}
+
+/// What `train` makes of its arguments, the first of which is its name.
+///
+/// # Errors
+/// What it says of them, behind the name of the run.
+pub(super) fn train_args(name: &str, arguments: &[String]) -> Result<TrainArgs> {
+    let train = TrainArgs::augment_args(clap::Command::new("train"));
+    let parsed = train
+        .try_get_matches_from(arguments)
+        .and_then(|matches| TrainArgs::from_arg_matches(&matches));
+    parsed.map_err(|error| {
+        let text = error.to_string();
+        let line = text.lines().next().unwrap_or_default();
+        Error::Usage(format!("{name}: {}", line.trim_start_matches("error: ")))
+    })
+}
+
+/// Takes a folder that is empty, holds this batch or holds nothing that a batch would replace. `what` it is
+/// called, in messages and in the file that says which one it is; `files` are those that it leaves.
+///
+/// # Errors
+/// The folder is taken, or cannot be written.
+pub(super) fn claim(
+    folder: &Path,
+    what: &str,
+    manifest: &str,
+    files: &[&str],
+    writes: bool,
+) -> Result<()> {
+    let path = folder.join(format!("{what}.toml"));
+    if path.exists() {
+        let found = std::fs::read_to_string(&path)
+            .map_err(|error| Error::input(&path, format!("cannot be read: {error}")))?;
+        if found != manifest {
+            let differs = difference(&found, manifest);
+            let problem = format!("holds another {what} ({differs}); choose another --out");
+            return Err(Error::output(folder, problem));
+        }
+        return Ok(());
+    }
+    if let Some(file) = files.iter().find(|file| folder.join(file).exists()) {
+        let problem = format!("holds {file}, which no {what} wrote; choose another --out");
+        return Err(Error::output(folder, problem));
+    }
+    if !writes {
+        return Ok(());
+    }
+    std::fs::create_dir_all(folder)
+        .map_err(|error| Error::output(folder, format!("cannot be made: {error}")))?;
+    write_whole(&path, manifest.as_bytes())
+}
+
+/// The first line in which two files differ.
+fn difference(found: &str, wanted: &str) -> String {
+    let wanted: Vec<&str> = wanted.lines().collect();
+    let is_new = |line: &&str| !wanted.contains(line);
+    let line = found.lines().find(is_new).unwrap_or("its configuration lacks a setting");
+    line.to_owned()
+}
+
+/// The path as arguments have it, from everywhere.
+///
+/// # Errors
+/// It is not Unicode.
+pub(super) fn absolute(path: &Path) -> Result<String> {
+    let path = std::path::absolute(path)
+        .map_err(|error| Error::input(path, format!("cannot be found: {error}")))?;
+    unicode(&path)
+}
+
+pub(super) fn unicode(path: &Path) -> Result<String> {
+    path.to_str().map(str::to_owned).ok_or_else(|| {
+        Error::Usage(format!("{} is not Unicode; move it to a path that is", path.display()))
+    })
+}
+
+/// A word that a POSIX shell reads back as it is.
+fn quoted(word: &str) -> String {
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_./=,+:@%".contains(c);
+    if !word.is_empty() && word.chars().all(is_plain) {
+        return word.to_owned();
+    }
+    format!("'{}'", word.replace('\'', "'\\''"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn words_are_quoted_where_a_shell_needs_it() {
+        assert_eq!(quoted("--set"), "--set");
+        assert_eq!(quoted("curve=ap3,seed=1"), "curve=ap3,seed=1");
+        assert_eq!(quoted("a b"), "'a b'");
+        assert_eq!(quoted("it's"), "'it'\\''s'");
+        assert_eq!(quoted(""), "''");
+    }
+}
