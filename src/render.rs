@@ -21,7 +21,7 @@ use crate::kernels::{
     self, blend_backward, blend_forward, emit, order_counts, project, project_backward,
     reduce_records,
 };
-use crate::scene::Shape;
+use crate::scene::{Features, Shape};
 use crate::sort::{Count, RadixSort};
 use crate::{Error, Result};
 
@@ -41,13 +41,23 @@ pub struct RenderSettings {
     pub shape: Shape,
     /// Colours are the bare SH sum, which can be negative, as in LITA-GS, instead of max(SH + 0.5, 0).
     pub raw_colors: bool,
+    /// The gradient of noise and illumination moves and shapes no Gaussian; that of depth and structure, which are there for
+    /// it, does.
+    pub observes: bool,
     /// The tile that one subgroup owns, in pixels; none: what is fastest on the device.
     pub tile: Option<[u32; 2]>,
 }
 
 impl Default for RenderSettings {
     fn default() -> Self {
-        Self { near: 0.2, max_alpha: 0.99, shape: 3.into(), raw_colors: false, tile: None }
+        Self {
+            near: 0.2,
+            max_alpha: 0.99,
+            shape: 3.into(),
+            raw_colors: false,
+            observes: false,
+            tile: None,
+        }
     }
 }
 
@@ -83,6 +93,13 @@ impl RenderSettings {
     /// Values per pixel of a render: RGB and the features.
     pub fn channels(&self) -> usize {
         self.shape.features.channels()
+    }
+
+    /// How many of them, from the first, move and shape the Gaussians.
+    fn shaping_channels(&self) -> usize {
+        let features = self.shape.features;
+        let shaping = Features { noise: false, illumination: false, ..features };
+        if self.observes { shaping.channels() } else { features.channels() }
     }
 }
 
@@ -163,6 +180,7 @@ impl Renderer {
         let channels = settings.channels() as u32;
         let (alpha_max, sh_degree) = (settings.max_alpha, settings.shape.sh_degree);
         let (raw_colors, partition_size) = (settings.raw_colors, RANKS_PER_PARTITION);
+        let shaping_channels = settings.shaping_channels() as u32;
         let (skips_groups, splats_per_turn) = (!gpu.properties().is_cpu, splats_per_turn(gpu));
         // What every kernel that includes `splat.glsl` is specialised with, and what some are beside it.
         macro_rules! constants {
@@ -185,6 +203,7 @@ impl Renderer {
             ))?,
             blend_backward: gpu.pipeline(&constants!(
                 blend_backward,
+                shaping_channels,
                 skips_groups,
                 splats_per_turn
             ))?,

@@ -12,7 +12,7 @@ use crate::pseudo_gt::PseudoGt;
 use crate::tone::Scene;
 use crate::{Error, Result};
 
-/// When a run ends before its last step. The scores are against targets, never against references.
+/// When a run, or a part of it, ends before its last step. The scores are against targets, never against references.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct StopConfig {
@@ -22,11 +22,16 @@ pub struct StopConfig {
     pub every: u64,
     /// The run ends once two scores in a row are not better than the best before by so many dB.
     pub gain: f64,
+    /// Growth ends once four rounds of density control gain less than so many dB for each doubling of the Gaussians; 0: it
+    /// goes on to its last step.
+    pub growth_gain: f64,
+    /// The SH degree rises no further, and falls back, once the one in use gains less than so many dB; 0: it rises always.
+    pub degree_gain: f64,
 }
 
 impl Default for StopConfig {
     fn default() -> Self {
-        Self { views: 0, every: 250, gain: 0.05 }
+        Self { views: 0, every: 250, gain: 0.05, growth_gain: 0.0, degree_gain: 0.0 }
     }
 }
 
@@ -44,9 +49,12 @@ impl StopConfig {
     /// # Errors
     /// [`Error::Usage`] names a value that makes no sense.
     pub(super) fn check(&self) -> Result<()> {
+        let gain = |name, gain: f64| (name, gain, gain.is_finite() && gain >= 0.0, "0 or more");
         let rules = [
             ("stop.every", self.every as f64, self.every >= 1, "at least 1"),
-            ("stop.gain", self.gain, self.gain.is_finite() && self.gain >= 0.0, "0 or more"),
+            gain("stop.gain", self.gain),
+            gain("stop.growth_gain", self.growth_gain),
+            gain("stop.degree_gain", self.degree_gain),
         ];
         match rules.into_iter().find(|(_, _, holds, _)| !holds) {
             Some((name, value, _, rule)) => {
@@ -83,9 +91,14 @@ impl Trainer {
     /// # Errors
     /// The device is out of memory or lost.
     pub fn held_out_psnr(&mut self) -> Result<Option<f64>> {
+        self.held_out_psnr_of_degree(self.sh_degree(self.step))
+    }
+
+    /// As [`Trainer::held_out_psnr`], with the colours of an SH degree.
+    pub(super) fn held_out_psnr_of_degree(&mut self, sh_degree: u32) -> Result<Option<f64>> {
         let views = std::mem::take(&mut self.held_out);
         let scores = views.0.iter().map(|(camera, target)| {
-            let mut shown = self.render(camera)?.output().clone();
+            let mut shown = self.render_of_degree(camera, sh_degree)?.output().clone();
             shown.data.iter_mut().for_each(|value| *value = value.clamp(0.0, 1.0));
             psnr(&shown, target)
         });
