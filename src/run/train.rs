@@ -99,6 +99,7 @@ pub fn train_planned(
     let (losses, seconds) =
         train_to_the_end(&mut trainer, &mut directory, config, dataset, &mut observe)?;
     let peak_bytes = gpu.peak_memory();
+    trainer.leave_out_what_gains_nothing()?;
     let scored = evaluate(&mut trainer, dataset, &mut observe)?;
     directory.save_model(&trainer.gaussians()?, config.model.raw_colors)?;
     if let Some(networks) = trainer.networks() {

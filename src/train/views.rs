@@ -188,6 +188,11 @@ impl Views {
         &views[order[place as usize]]
     }
 
+    /// The views, unshrunk.
+    pub(super) fn whole(&self) -> &[TrainView] {
+        self.0.first().map_or(&[], Vec::as_slice)
+    }
+
     pub(super) fn cameras(&self) -> impl Iterator<Item = &Camera> {
         self.0.iter().flatten().map(|view| &view.camera)
     }
@@ -335,7 +340,8 @@ impl TrainView {
         self.image(gpu, &*self.target(gpu, pseudo_gt)?)
     }
 
-    fn image(&self, gpu: &Gpu, pixels: &Buffer<f32>) -> Result<Image> {
+    /// Pixels of the view on the host.
+    pub(super) fn image(&self, gpu: &Gpu, pixels: &Buffer<f32>) -> Result<Image> {
         let data = gpu.read(pixels)?;
         let Camera { width, height, .. } = self.camera;
         Ok(Image { width, height, data })
