@@ -54,6 +54,7 @@ pub struct Exposures {
     view_count: u32,
     chunk: u32,
     expose: Pipeline<expose::Kernel>,
+    neutralize: Pipeline<expose::Kernel>,
     backward: Pipeline<expose_backward::Kernel>,
     gradient: Pipeline<exposure_gradient::Kernel>,
     center: Pipeline<exposure_center::Kernel>,
@@ -88,7 +89,8 @@ impl Exposures {
             rates,
             view_count: start.len() as u32,
             chunk: constants.chunk,
-            expose: gpu.pipeline(&expose::Constants {})?,
+            expose: gpu.pipeline(&expose::Constants { inverse: false })?,
+            neutralize: gpu.pipeline(&expose::Constants { inverse: true })?,
             backward: gpu.pipeline(&constants)?,
             gradient: gpu.pipeline(&exposure_gradient::Constants::default())?,
             center: gpu.pipeline(&exposure_center::Constants::default())?,
@@ -139,7 +141,28 @@ impl Exposures {
         )
     }
 
-    /// What was exposed last, (3, H, W).
+    /// Records the target of `view`, (3, H, W), as it would be at the neutral exposure; [`Exposures::exposed`] has it.
+    ///
+    /// # Errors
+    /// As [`Exposures::expose`].
+    pub fn neutralize(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        view: usize,
+        size: UVec2,
+        target: &Buffer<f32>,
+    ) -> Result<()> {
+        self.check(view, size, target)?;
+        let Self { neutralize, parameters, exposed, .. } = self;
+        pass.dispatch(
+            neutralize,
+            &expose::Params { pixel_count: pixels(size), view: view as u32 },
+            expose::Buffers { exposures: parameters, render: target, exposed },
+            Threads::Exactly([COLOR_CHANNELS as u32 * pixels(size), 1, 1]),
+        )
+    }
+
+    /// What was made last, (3, H, W).
     pub fn exposed(&self) -> &Buffer<f32> {
         &self.exposed
     }

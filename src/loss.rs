@@ -31,11 +31,12 @@ pub use structure::{StructureInputs, StructureLoss};
 pub const TERMS: [LossSpec; 5] =
     [image::TARGET, image::DARK, structure::SPEC, depth::SPEC, denoising::SPEC];
 
-/// What the terms weigh beside (1 - w) L1 + w (1 - SSIM). The defaults are those of LITA-GS's code.
+/// What the terms weigh beside (1 - w) L1 + w (1 - SSIM). The defaults are those of LITA-GS's code but for the total variation,
+/// which blurs what holds no noise.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Weights {
-    /// Of mean `(R_K - R_0)^2`.
+    /// Of mean `(R_K - target)^2`, in the paper's form `(R_K - R_0)^2`.
     pub denoising: f64,
     /// Of the total variation of R_K.
     pub total_variation: f64,
@@ -49,7 +50,14 @@ pub struct Weights {
 
 impl Default for Weights {
     fn default() -> Self {
-        Self { denoising: 1.0, total_variation: 1.0, low_ssim: 0.2, structure: 0.01, depth: 0.1 }
+        Self { denoising: 1.0, total_variation: 0.0, low_ssim: 0.2, structure: 0.01, depth: 0.1 }
+    }
+}
+
+impl Weights {
+    /// Those of LITA-GS.
+    pub fn paper() -> Self {
+        Self { total_variation: 1.0, ..Self::default() }
     }
 }
 

@@ -16,6 +16,7 @@ mod relu;
 mod tonemapper;
 
 use glam::UVec2;
+use serde::{Deserialize, Serialize};
 
 use crate::gpu::{Buffer, Gpu};
 use crate::{Error, Result};
@@ -28,6 +29,19 @@ pub(crate) use file::TensorFile;
 pub use file::{load, save};
 pub use parameters::{Parameters, Tensor};
 pub use tonemapper::Tonemapper;
+
+/// How a network begins and ends.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Form {
+    /// What goes in comes out until something better is learned: the network's last layer begins at zero, has nothing behind
+    /// it, and what it says is a difference.
+    #[default]
+    Identity,
+    /// LITA-GS's: the denoiser's last layer begins at random behind a sigmoid, about one half; the tonemapper says its whole
+    /// image.
+    Paper,
+}
 
 /// Red, green, blue.
 const RGB: u32 = 3;

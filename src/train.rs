@@ -2,6 +2,7 @@
 
 mod checkpoint;
 mod config;
+mod ends;
 mod exposures;
 mod held_out;
 mod model;
@@ -25,6 +26,7 @@ use crate::exposure::Exposures;
 use crate::gpu::{Buffer, CheckReport, Gpu, PassTime, Recorder};
 use crate::image::Image;
 use crate::loss::{DepthBoxes, LogSlot, LossLog, Losses, StepLosses, Term, TermInputs};
+use crate::nn::Form;
 use crate::optimizer::{Adam, AdamBuffers, Learnable};
 use crate::pseudo_gt::PseudoGt;
 use crate::random::Stream;
@@ -33,6 +35,7 @@ use crate::scene::{Gaussians, width};
 use crate::{Error, Result};
 
 pub use config::{Background, CheckConfig, DensityConfig, TrainConfig};
+use ends::Ends;
 pub use exposures::{ExposureConfig, Learning};
 use held_out::HeldOut;
 pub use held_out::StopConfig;
@@ -41,7 +44,7 @@ pub use networks::Networks;
 pub use parts::{ModelConfig, ModelName, NetworkRates, Part};
 pub use preset::Preset;
 use submission::{MOST_STEPS, Pace};
-use terms::NetworkTerms;
+use terms::{NetworkTerms, Photographs};
 pub use views::TargetExposure;
 use views::{TrainView, Views};
 
@@ -150,6 +153,7 @@ pub struct Trainer {
     extent: f64,
     target_exposure: Option<TargetExposure>,
     held_out: HeldOut,
+    ends: Ends,
     /// Steps done.
     step: u64,
     views: Views,
@@ -215,8 +219,11 @@ impl Trainer {
         let mut pseudo_gt = PseudoGt::new(gpu, &config.tone)?;
         let levels = config.schedule.resolution_levels();
         let has_networks = config.model.denoiser || config.model.tonemapper;
-        let (views, scene, target_exposure) =
+        let (mut views, scene, target_exposure) =
             Views::upload(gpu, &mut pseudo_gt, dataset, levels, has_networks)?;
+        if config.model.denoiser && config.model.network.form == Form::Identity {
+            views.keep_targets(gpu, &pseudo_gt)?;
+        }
         let held_out = HeldOut::new(&mut pseudo_gt, dataset, &scene)?;
         if let Some(TargetExposure { scene, .. }) = &target_exposure {
             tracing::info!("{}", scene.reason());
@@ -251,6 +258,7 @@ impl Trainer {
             extent: dataset.extent(),
             target_exposure,
             held_out,
+            ends: Ends::default(),
             step: 0,
             views,
             model: Model::upload(gpu, &gaussians)?,
@@ -332,7 +340,9 @@ impl Trainer {
             DensityControl::Conserving => self.config.schedule.rounds_left(self.step),
             DensityControl::Paper => 1,
         };
-        let round = Round { step: self.step, rounds_left, most: self.most_gaussians()? };
+        let grown = self.growth_limit()?.max(self.model.count());
+        let most = self.most_gaussians()?.min(grown);
+        let round = Round { step: self.step, rounds_left, most };
         let changed = self.model.densify(&gpu, &mut self.densifier, round)?;
         tracing::debug!("step {}: {changed:?}", self.step);
         self.reserve()
@@ -376,7 +386,7 @@ impl Trainer {
         let schedule = &self.config.schedule;
         let view = self.views.of_step(self.config.seed, step, schedule.resolution_level(step));
         let options = RenderOptions {
-            sh_degree: schedule.sh_degree(step, self.config.sh_degree),
+            sh_degree: self.sh_degree(step),
             background: background(&self.config, step),
         };
         let damping = Damping { weight: schedule.damping_weight(step), depth: self.extent as f32 };
@@ -406,7 +416,16 @@ impl Trainer {
             None => self.losses.record(pass, inputs, d_render, log)?,
         }
         if let Some(networks) = &mut self.networks {
-            networks.record(pass, inputs, view.photograph(), d_render, log)?;
+            // Networks see the model at the neutral exposure.
+            let target = match &mut self.exposures {
+                Some(exposures) if networks.follow_target() => {
+                    exposures.neutralize(pass, view.place, size, view.kept_target())?;
+                    exposures.exposed()
+                }
+                _ => view.kept_target(),
+            };
+            let photographs = Photographs { low: view.photograph(), target };
+            networks.record(pass, inputs, photographs, d_render, log)?;
         }
         self.renderer.backward(
             pass,
@@ -455,10 +474,11 @@ impl Trainer {
     /// # Errors
     /// The device is out of memory or lost.
     pub fn render(&mut self, camera: &Camera) -> Result<Rendered> {
-        let options = RenderOptions {
-            sh_degree: self.config.schedule.sh_degree(self.step, self.config.sh_degree),
-            background: [0.0; 3],
-        };
+        self.render_of_degree(camera, self.sh_degree(self.step))
+    }
+
+    fn render_of_degree(&mut self, camera: &Camera, sh_degree: u32) -> Result<Rendered> {
+        let options = RenderOptions { sh_degree, background: [0.0; 3] };
         self.renderer.reserve(self.model.count(), [camera])?;
         let gaussians = &self.model.gaussians.parameters;
         let networks = self.networks.as_mut().map(|terms| &mut terms.networks);

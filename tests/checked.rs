@@ -12,6 +12,7 @@ use nightsplat::dataset::synthetic::{self, SyntheticOptions};
 use nightsplat::gpu::testing::{Defect, gpu, with_defect};
 use nightsplat::gpu::{CheckReport, Gpu};
 use nightsplat::image::Image;
+use nightsplat::nn::Form;
 use nightsplat::pseudo_gt::PseudoGt;
 use nightsplat::random::Stream;
 use nightsplat::sort::{Count, RadixSort, Scan};
@@ -117,8 +118,11 @@ fn every_pass_of_the_whole_model_agrees_with_its_reference_on_a_crop() {
     config.model.denoiser_crop = 9;
     config.model.raw_colors = true;
     config.ssim_weight = 0.0;
-    let kernels = assert_steps_agree("the whole model", &config);
-    assert!(kernels.contains("window_scatter") && kernels.contains("denoising"), "{kernels:?}");
+    for form in [Form::Identity, Form::Paper] {
+        config.model.network.form = form;
+        let kernels = assert_steps_agree("the whole model", &config);
+        assert!(kernels.contains("window_scatter") && kernels.contains("denoising"), "{kernels:?}");
+    }
 }
 
 #[test]

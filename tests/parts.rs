@@ -7,10 +7,11 @@ use std::path::Path;
 use nightsplat::attributes::Attribute;
 use nightsplat::dataset::Dataset;
 use nightsplat::dataset::synthetic::{self, SyntheticOptions};
+use nightsplat::gpu::testing::gpu;
 use nightsplat::image::Image;
 use nightsplat::loss::Term;
 use nightsplat::tone::{ToneCurve, ToneSettings};
-use nightsplat::train::{Part, StepReport, TrainConfig};
+use nightsplat::train::{Part, Rendered, StepReport, TrainConfig, Trainer};
 
 mod common;
 use common::command::{refused, succeed};
@@ -67,7 +68,7 @@ fn each_part_alone_has_its_channels_and_its_terms_fall() {
         (Part::Structure, 4, &[Term::STRUCTURE][..]),
         (Part::Depth, 4, &[Term::DEPTH, Term::DEPTH_LOCAL]),
         (Part::Tonemapper, 6, &[Term::LOW_L1]),
-        (Part::Denoiser, 6, &[Term::DENOISING]),
+        (Part::Denoiser, 3, &[Term::DENOISING]),
     ] {
         let config = config(&[part]);
         let (reports, gaussians) = train(&config, &load(folder.path(), &config));
@@ -81,11 +82,83 @@ fn each_part_alone_has_its_channels_and_its_terms_fall() {
     }
 }
 
+/// As the paper has it.
+fn paper(parts: &[Part]) -> TrainConfig {
+    let mut config = config(parts);
+    config.model.follow_paper();
+    config
+}
+
+#[test]
+fn the_paper_s_denoiser_has_a_noise_map_and_its_terms_fall() {
+    let folder = tempfile::tempdir().unwrap();
+    make_set(folder.path(), false);
+    let config = paper(&[Part::Denoiser]);
+    let (reports, gaussians) = train(&config, &load(folder.path(), &config));
+    assert_eq!(gaussians.shape.features.channels(), 6);
+    for term in [Term::DENOISING, Term::L1] {
+        let [begin, end] = fall(&reports, term);
+        assert!(end < begin, "{term:?} went from {begin} to {end}");
+    }
+}
+
+/// What a model shows of the first test view before it has trained.
+fn first_render(config: &TrainConfig, dataset: &Dataset) -> Rendered {
+    // Tiles of another size add up in another order.
+    let config = TrainConfig { tile: Some([8, 8]), ..config.clone() };
+    let camera = dataset.test_views().next().unwrap().camera.clone();
+    Trainer::new(&gpu(), config, dataset).unwrap().render(&camera).unwrap()
+}
+
+#[test]
+fn with_every_part_a_model_begins_as_the_plain_one_bit_for_bit() {
+    let folder = tempfile::tempdir().unwrap();
+    make_set(folder.path(), true);
+    let dataset = load(folder.path(), &config(&Part::ALL));
+    let plain = first_render(&config(&[]), &dataset).colors;
+    for parts in Part::ALL.iter().map(std::slice::from_ref).chain([&Part::ALL[..]]) {
+        let begun = first_render(&config(parts), &dataset);
+        assert!(begun.colors == plain && *begun.output() == plain, "{parts:?}");
+    }
+    let of_paper = first_render(&paper(&Part::ALL), &dataset);
+    assert!(of_paper.colors == plain && *of_paper.output() != plain);
+}
+
+#[test]
+fn what_a_denoiser_learns_leaves_every_gaussian_as_it_would_be_without_one() {
+    let folder = tempfile::tempdir().unwrap();
+    make_set(folder.path(), false);
+    let plain = config(&[]);
+    let dataset = load(folder.path(), &plain);
+    let expected = train(&plain, &dataset).1;
+    for crop in [0, 12] {
+        let mut config = config(&[Part::Denoiser]);
+        config.model.denoiser_crop = crop;
+        let (reports, gaussians) = train(&config, &dataset);
+        assert_eq!(gaussians, expected, "crop {crop}");
+        assert!(reports.iter().all(|report| report.terms.len() == 4));
+    }
+}
+
+/// The light that the dark photographs show is where the tonemapper begins: it has little to pull at.
+#[test]
+fn the_illumination_begins_as_what_the_photographs_make_of_their_targets() {
+    let folder = tempfile::tempdir().unwrap();
+    make_set(folder.path(), false);
+    let first = |config: &TrainConfig| {
+        let config = TrainConfig { steps: 1, ..config.clone() };
+        train(&config, &load(folder.path(), &config)).0[0].term(Term::LOW_L1)
+    };
+    let parts = [Part::Tonemapper];
+    let (own, of_paper) = (first(&config(&parts)), first(&paper(&parts)));
+    assert!(own < 0.25 * of_paper, "{own} against {of_paper}");
+}
+
 #[test]
 fn the_whole_model_gives_the_same_bits_every_time_on_crops_too() {
     let folder = tempfile::tempdir().unwrap();
     make_set(folder.path(), true);
-    let mut config = TrainConfig { steps: 20, ..config(&Part::ALL) };
+    let mut config = TrainConfig { steps: 20, ..paper(&Part::ALL) };
     config.model.denoiser_crop = 12;
     let dataset = load(folder.path(), &config);
     let (reports, gaussians) = train(&config, &dataset);
@@ -220,7 +293,8 @@ fn a_run_with_networks_is_saved_scored_and_shown_layer_by_layer() {
     make_set(&set, true);
     let (set, run) = (set.display(), folder.path().join("run"));
     let at = run.display();
-    succeed(&format!("train {set} --out {at} --model lita --denoiser-crop 16 {SMALL}"));
+    let paper = "--preset lom --model lita --denoiser-crop 16";
+    succeed(&format!("train {set} --out {at} {paper} {SMALL}"));
     let header = std::fs::read_to_string(run.join("train.csv")).unwrap();
     let columns = "step,view,loss,l1,ssim,low_l1,low_ssim,structure,depth,depth_local,denoising,\
                    total_variation,gaussians,milliseconds";
@@ -269,7 +343,11 @@ fn a_layer_that_the_model_lacks_is_named_with_those_it_has() {
 
     let config = run.join("config.toml");
     let text = std::fs::read_to_string(&config).unwrap();
-    std::fs::write(&config, text.replace("denoiser = false", "denoiser = true")).unwrap();
+    let with_denoiser = text.replace("denoiser = false", "denoiser = true");
+    std::fs::write(&config, &with_denoiser).unwrap();
+    refused(&format!("eval {at}"), 1, &["networks.safetensors"]);
+    let of_paper = with_denoiser.replace("form = \"identity\"", "form = \"paper\"");
+    std::fs::write(&config, of_paper).unwrap();
     refused(&format!("eval {at}"), 2, &["no noise, which the denoiser takes"]);
 }
 

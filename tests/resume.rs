@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::time::Duration;
 
+use glam::Vec3;
 use nightsplat::dataset::Dataset;
 use nightsplat::dataset::synthetic::{self, SyntheticOptions};
 use nightsplat::gpu::testing::gpu;
@@ -74,6 +75,41 @@ fn a_restored_run_goes_on_bit_for_bit() {
             assert!(same.clone().all(|(a, b)| a.terms == b.terms && a.view == b.view));
             assert_eq!(same.len() as u64, 30 - step);
         }
+    }
+}
+
+/// What can never be gained ends both as soon as it is asked for.
+#[test]
+fn growth_and_the_sh_degree_end_where_held_out_views_gain_too_little_and_a_resumed_run_knows_it() {
+    let folder = tempfile::tempdir().unwrap();
+    make_set(folder.path());
+    let gpu = gpu();
+    let mut free = config(&[]);
+    free.schedule.densify_interval = 3;
+    free.schedule.resolution_steps = [0, 0];
+    free.stop.views = 1;
+    let mut ending = free.clone();
+    (ending.stop.growth_gain, ending.stop.degree_gain) = (1e3, 1e3);
+    let dataset = Dataset::load(folder.path(), &free.load_options()).unwrap();
+    let new = |config: &TrainConfig| Trainer::new(&gpu, config.clone(), &dataset).unwrap();
+    let [mut freely, mut ended] = [new(&free), new(&ending)];
+    finished(&mut freely, folder.path());
+    // Rounds after steps 6, 9, 12, 15 and 18; the first degree has been in use from step 8 to 15.
+    advance(&mut ended, 18);
+    let count = ended.gaussian_count();
+    let (expected, _) = finished(&mut ended, folder.path());
+    let colors = |trainer: &Trainer| trainer.gaussians().unwrap().rest().to_vec();
+    assert!(ended.gaussian_count() <= count && freely.gaussian_count() > count);
+    assert!(colors(&ended).iter().all(|rest| *rest == Vec3::ZERO));
+    assert!(colors(&freely).iter().any(|rest| *rest != Vec3::ZERO));
+    for step in [13, 16, 20] {
+        let checkpoint = folder.path().join("checkpoint.safetensors");
+        let mut interrupted = new(&ending);
+        advance(&mut interrupted, step);
+        interrupted.save_checkpoint(&checkpoint).unwrap();
+        let mut restored = new(&ending);
+        restored.restore(&checkpoint).unwrap();
+        assert!(finished(&mut restored, folder.path()).0 == expected, "from step {step}");
     }
 }
 

@@ -42,16 +42,18 @@ fn every_kernel_agrees_with_its_reference_at_every_size() {
             let render = noise(1, 4 * pixels, -0.2, 1.3);
             let d_render = noise(2, 4 * pixels, -1e-3, 1e-3);
             let exposures = noise(3, view_count * WIDTH, -0.5, 0.5);
-            let exposed = vec![7.0f32; 4 * pixels];
-            let exposed = run_kernel!(
-                expose,
-                expose::Constants {},
-                expose::Params { pixel_count, view },
-                Threads::Exactly([3 * pixel_count, 1, 1]),
-                [exposures, render],
-                [exposed]
-            );
-            assert!(exposed[3 * pixels..].iter().all(|&value| value == 7.0));
+            for inverse in [false, true] {
+                let exposed = vec![7.0f32; 4 * pixels];
+                let exposed = run_kernel!(
+                    expose,
+                    expose::Constants { inverse },
+                    expose::Params { pixel_count, view },
+                    Threads::Exactly([3 * pixel_count, 1, 1]),
+                    [exposures, render],
+                    [exposed]
+                );
+                assert!(exposed[3 * pixels..].iter().all(|&value| value == 7.0));
+            }
             let partials = vec![Vec2::NAN; 3 * chunk_count as usize];
             let expected = d_render[3 * pixels..].to_vec();
             let (d_render, partials) = run_kernel!(

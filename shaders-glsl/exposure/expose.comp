@@ -3,11 +3,12 @@
 #include "kernel.glsl"
 #include "exposure.glsl"
 
-//! Expose: what the exposure of a view makes of a render's colours, one thread per value.
+//! Expose: what the exposure of a view makes of a render's colours, or the other way round, one thread per value.
 //!
 //! Reference: `src/reference/expose.rs`.
 
 layout(local_size_x = 256) in;
+layout(constant_id = 0) const bool INVERSE = false;  // from what the view shows to what the model does
 
 layout(push_constant) uniform Params {
     uint pixel_count;  // of a channel
@@ -22,5 +23,8 @@ void main() {
     uint i = THREAD_INDEX;
     if (i >= 3 * pixel_count) return;
     uint at = view * EXPOSURE_WIDTH + i / pixel_count;
-    exposed[i] = (1.0 + exposures[at]) * render[i] + BIAS_SCALE * exposures[at + 3];
+    float gain = 1.0 + exposures[at];
+    float bias = BIAS_SCALE * exposures[at + 3];
+    if (INVERSE) exposed[i] = (render[i] - bias) / gain;
+    else exposed[i] = gain * render[i] + bias;
 }

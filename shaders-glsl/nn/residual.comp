@@ -2,11 +2,12 @@
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
 
-//! The end of a denoiser stage: N = I + u, R = clamp(R_0 - N, 0, 1), one thread per value.
+//! The end of a denoiser stage, one thread per value: N = I + u, R = clamp(R_0 - N, 0, 1), as the identity R = I - u.
 //!
 //! Reference: `src/reference/residual.rs`.
 
 layout(local_size_x = 256) in;
+layout(constant_id = 0) const bool IDENTITY = false;  // no gradient dies behind a clamp
 
 layout(push_constant) uniform Params {
     uint value_count;  // 3HW
@@ -20,6 +21,10 @@ layout(binding = 3) writeonly buffer Denoised   { float denoised[]; };     // R,
 void main() {
     uint i = THREAD_INDEX;
     if (i >= value_count) return;
+    if (IDENTITY) {
+        denoised[i] = stage_input[i] - update[i];
+        return;
+    }
     float difference = render[i] - (stage_input[i] + update[i]);
     // Phrased so that a NaN stays one.
     denoised[i] = difference < 0.0 ? 0.0 : difference > 1.0 ? 1.0 : difference;

@@ -14,6 +14,8 @@ layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 //! tile it belongs to, and the sum over a Gaussian's slots comes in a fixed order.
 
 layout(local_size_x_id = 100) in;
+// So many channels, from the first, move and shape the splats; of the others only the colours learn.
+layout(constant_id = 8) const uint SHAPING_CHANNELS = 3;
 
 layout(push_constant, scalar) uniform Params { uvec2 size; uint tile_columns; };
 
@@ -45,7 +47,7 @@ void main() {
         light[g] = 0.0;
         [[unroll]] for (uint c = 0; c < CHANNELS; c++) {
             d_pixel[g][c] = d_render[c * size.x * size.y + at];
-            light[g] += render[c * size.x * size.y + at] * d_pixel[g][c];
+            if (c < SHAPING_CHANNELS) light[g] += render[c * size.x * size.y + at] * d_pixel[g][c];
         }
     }
 
@@ -104,7 +106,7 @@ void main() {
                     float shade = 0.0;
                     [[unroll]] for (uint c = 0; c < CHANNELS; c++) {
                         d_color[c] += weight * d_pixel[g][c];
-                        shade += splat_color[c] * d_pixel[g][c];
+                        if (c < SHAPING_CHANNELS) shade += splat_color[c] * d_pixel[g][c];
                     }
                     float d_alpha = before * shade - light[g];
                     light[g] -= weight * shade;

@@ -1,4 +1,4 @@
-//! The denoising terms: the denoised image stays near the render, and smooth.
+//! The denoising terms: the denoised image stays near the target, in the paper's form near the render, and smooth.
 
 use glam::UVec2;
 
@@ -16,7 +16,7 @@ pub(super) const SPEC: LossSpec = LossSpec {
 };
 
 impl Term {
-    /// Mean squared difference of denoised and rendered image.
+    /// Mean squared difference of the denoised image and what it is held to.
     pub const DENOISING: Self = Self {
         column: "denoising",
         name: "denoising",
@@ -37,7 +37,7 @@ impl Term {
 /// The weights of the terms.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DenoisingWeights {
-    /// Of the mean squared difference of denoised and rendered image.
+    /// Of the mean squared difference of the denoised image and what it is held to.
     pub mse: f64,
     /// Of the total variation of the denoised image.
     pub total_variation: f64,
@@ -52,7 +52,7 @@ pub struct DenoisingInputs<'a> {
     pub interior: Interior,
     /// (3, H, W)
     pub denoised: &'a Buffer<f32>,
-    /// (3, H, W)
+    /// What it is held to, (3, H, W).
     pub render: &'a Buffer<f32>,
 }
 

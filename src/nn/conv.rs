@@ -27,6 +27,16 @@ pub(super) enum Activation {
     Sigmoid = conv3x3::SIGMOID,
 }
 
+/// What a convolution adds to, in place of overwriting it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Adds {
+    Nothing,
+    /// Its output.
+    Output,
+    /// The gradient of its input.
+    InputGradient,
+}
+
 /// How precise the factors of a convolution are; its sums are in single precision.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -70,7 +80,7 @@ pub(super) struct Seen<'a> {
 }
 
 impl Conv {
-    /// Where `adds`, the gradient of the input is added to what its buffer holds.
+    /// Where a buffer is said to be added to, what it holds stays in the sum.
     ///
     /// # Errors
     /// The driver refuses a kernel.
@@ -78,11 +88,14 @@ impl Conv {
         gpu: &Gpu,
         [inputs, outputs]: [u32; 2],
         activation: Activation,
-        adds: bool,
+        adds: Adds,
         precision: Precision,
     ) -> Result<Self> {
-        let forward = Form { activation, transposed: false, accumulate: false };
-        let backward = Form { activation: Activation::None, transposed: true, accumulate: adds };
+        let none = Activation::None;
+        let accumulate = adds == Adds::Output;
+        let forward = Form { activation, transposed: false, accumulate };
+        let accumulate = adds == Adds::InputGradient;
+        let backward = Form { activation: none, transposed: true, accumulate };
         let weights = conv3x3_weight_gradient::Constants {
             rows: STRIP_ROWS,
             out_block: outputs.min(OUT_BLOCK),
@@ -97,7 +110,7 @@ impl Conv {
         })
     }
 
-    /// Writes the activated convolution of `source` (in, H, W) to `target` (out, H, W).
+    /// Writes the activated convolution of `source` (in, H, W) to `target` (out, H, W), or adds it.
     pub(super) fn forward(
         &self,
         pass: &mut Recorder<'_>,

@@ -6,17 +6,20 @@
 //! R_{k+1} = clamp(R_0 - (I_k + sigmoid(conv_out(f))), 0, 1)
 //! ```
 //!
+//! That is the paper's form. In the identity form I_0 = R_0 and R_{k+1} = I_k - conv_out(f), with the last layer zero at
+//! first: R_K begins as the render, and no gradient dies behind a sigmoid or a clamp.
+//!
 //! Activations are kept for one stage at a time: the backward pass computes those of the earlier stages again, from
 //! their inputs `R_k`.
 
 use glam::UVec2;
 use serde::{Deserialize, Serialize};
 
-use super::conv::{Activation, Conv, Precision, Seen, partial_count};
+use super::conv::{Activation, Adds, Conv, Precision, Seen, partial_count};
 use super::norm::{Backward, Forward, Norm, NormMemory, Use};
 use super::parameters::{Layout, Parameters};
 use super::relu::ReluBackward;
-use super::{RGB, check_binding, check_images, float_bytes, out_of_turn, pixel_count};
+use super::{Form, RGB, check_binding, check_images, float_bytes, out_of_turn, pixel_count};
 use crate::gpu::{Buffer, Gpu, Pipeline, Properties, Recorder, Threads};
 use crate::kernels::{residual, residual_backward};
 use crate::random::Stream;
@@ -25,7 +28,7 @@ use crate::{Error, Result};
 /// The stream of random numbers that the weights are drawn from.
 const STREAM: u64 = 5;
 
-/// How large a denoiser is. The defaults are the paper's.
+/// How large a denoiser is, and what it begins as. The size by default is the paper's.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DenoiserSettings {
@@ -37,11 +40,19 @@ pub struct DenoiserSettings {
     pub channels: u32,
     /// Of the inner convolution.
     pub precision: Precision,
+    /// How the networks begin and end, the tonemapper too.
+    pub form: Form,
 }
 
 impl Default for DenoiserSettings {
     fn default() -> Self {
-        Self { stages: 3, repeats: 6, channels: 64, precision: Precision::Single }
+        Self {
+            stages: 3,
+            repeats: 6,
+            channels: 64,
+            precision: Precision::Single,
+            form: Form::default(),
+        }
     }
 }
 
@@ -145,7 +156,10 @@ impl Denoiser {
             conv_in: layout.conv(&format!("{k}.conv_in"), RGB, channels),
             conv: layout.conv(&format!("{k}.conv"), channels, channels),
             norm: layout.norm(&format!("{k}.norm"), channels),
-            conv_out: layout.conv(&format!("{k}.conv_out"), channels, RGB),
+            conv_out: match settings.form {
+                Form::Identity => layout.zero_conv(&format!("{k}.conv_out"), channels, RGB),
+                Form::Paper => layout.conv(&format!("{k}.conv_out"), channels, RGB),
+            },
         };
         let stages = (0..settings.stages).map(stage).collect();
         let reserved = Extent::default();
@@ -178,6 +192,18 @@ impl Denoiser {
     /// As [`Denoiser::parameters`], to be changed.
     pub fn parameters_mut(&mut self) -> &mut Parameters {
         &mut self.parameters
+    }
+
+    /// Makes the last layer of every stage zero: in the identity form what goes in comes out.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub fn become_identity(&mut self) -> Result<()> {
+        let mut values = self.gpu.read(&self.parameters.values)?;
+        for tensor in self.parameters.tensors().iter().filter(|of| of.name.contains("conv_out")) {
+            values[tensor.offset..][..tensor.len()].fill(0.0);
+        }
+        self.gpu.write(&mut self.parameters.values, &values)
     }
 
     /// How far a pixel's result looks, in pixels, beside the norms, which look at the whole view.
@@ -223,7 +249,8 @@ impl Denoiser {
         &self.memory.denoised[self.memory.denoised.len() - 1]
     }
 
-    /// Records the passes from the noise map and the render, each (3, H, W), to [`Denoiser::denoised`].
+    /// Records the passes from I_0, the noise map or in the identity form the render, and the render, each (3, H, W), to
+    /// [`Denoiser::denoised`].
     ///
     /// # Errors
     /// The view is empty or no memory is reserved for it, or an image is shorter than the view.
@@ -231,17 +258,17 @@ impl Denoiser {
         &mut self,
         pass: &mut Recorder<'_>,
         size: UVec2,
-        noise: &Buffer<f32>,
+        input: &Buffer<f32>,
         render: &Buffer<f32>,
     ) -> Result<()> {
         let pixels = pixel_count(size)?;
         if !Extent::of(self.settings, size).fits(self.reserved) {
             return Err(out_of_turn("denoiser", size, "reserve memory for that size first"));
         }
-        check_images(pixels, [noise, render])?;
+        check_images(pixels, [input, render])?;
         let (kernels, memory) = (&self.kernels, &mut self.memory);
         for (k, stage) in self.stages.iter().enumerate() {
-            kernels.stage_forward(pass, size, stage, &self.parameters.values, k, noise, memory)?;
+            kernels.stage_forward(pass, size, stage, &self.parameters.values, k, input, memory)?;
             let (before, from_here) = memory.denoised.split_at_mut(k);
             let value_count = RGB * pixels as u32;
             pass.dispatch(
@@ -249,7 +276,7 @@ impl Denoiser {
                 &residual::Params { value_count },
                 residual::Buffers {
                     render,
-                    stage_input: before.last().unwrap_or(noise),
+                    stage_input: before.last().unwrap_or(input),
                     update: &memory.update,
                     denoised: &mut from_here[0],
                 },
@@ -260,8 +287,8 @@ impl Denoiser {
         Ok(())
     }
 
-    /// Records the passes from `dL/dR_K` back: overwrites the gradients of the parameters, writes `d_noise` and adds to
-    /// `d_render`, each (3, H, W). Inputs and parameters are those of the forward pass before it.
+    /// Records the passes from `dL/dR_K` back: overwrites the gradients of the parameters, writes `d_input` and adds to
+    /// `d_render`, each (3, H, W), what the render says beside I_0: nothing in the identity form. Inputs and parameters are those of the forward pass before it.
     ///
     /// # Errors
     /// There is no forward pass of that size before it, or an image is shorter than the view.
@@ -270,14 +297,14 @@ impl Denoiser {
         &mut self,
         pass: &mut Recorder<'_>,
         size: UVec2,
-        noise: &Buffer<f32>,
+        input: &Buffer<f32>,
         render: &Buffer<f32>,
         d_denoised: &Buffer<f32>,
-        d_noise: &mut Buffer<f32>,
+        d_input: &mut Buffer<f32>,
         d_render: &mut Buffer<f32>,
     ) -> Result<()> {
         let pixels = pixel_count(size)?;
-        check_images(pixels, [noise, render, d_denoised, d_noise, d_render])?;
+        check_images(pixels, [input, render, d_denoised, d_input, d_render])?;
         if self.recorded.take() != Some(size) {
             let remedy = "each backward pass needs a forward pass of its own before it";
             return Err(out_of_turn("denoiser", size, remedy));
@@ -287,14 +314,14 @@ impl Denoiser {
         let last = stages.len() - 1;
         for (k, stage) in stages.iter().enumerate().rev() {
             if k < last {
-                kernels.stage_forward(pass, size, stage, &parameters.values, k, noise, memory)?;
+                kernels.stage_forward(pass, size, stage, &parameters.values, k, input, memory)?;
             }
             // The two images take turns, so that what a stage reads is never what it writes.
             let [even, odd] = &mut memory.d_denoised;
             let (own, other) = if k % 2 == 0 { (even, odd) } else { (odd, even) };
             let d_output = if k == last { d_denoised } else { &*other };
-            let d_input = if k == 0 { &mut *d_noise } else { own };
-            let stage_input = if k == 0 { noise } else { &memory.denoised[k - 1] };
+            let d_stage_input = if k == 0 { &mut *d_input } else { own };
+            let stage_input = if k == 0 { input } else { &memory.denoised[k - 1] };
             let value_count = RGB * pixels as u32;
             pass.dispatch(
                 &kernels.residual_backward,
@@ -305,7 +332,7 @@ impl Denoiser {
                     update: &memory.update,
                     d_denoised: d_output,
                     d_update: &mut memory.d_update,
-                    d_stage_input: &mut *d_input,
+                    d_stage_input: &mut *d_stage_input,
                     d_render: &mut *d_render,
                 },
                 Threads::Exactly([value_count, 1, 1]),
@@ -318,7 +345,7 @@ impl Denoiser {
                 d_convolved: &mut memory.d_convolved,
                 partials: &mut memory.partials,
             };
-            let ends = Ends { stage_input, d_update: &memory.d_update, d_stage_input: d_input };
+            let ends = Ends { stage_input, d_update: &memory.d_update, d_stage_input };
             kernels.stage_backward(pass, size, stage, parameters, maps, ends)?;
         }
         Ok(())
@@ -345,21 +372,23 @@ struct Ends<'a> {
 
 impl Kernels {
     fn new(gpu: &Gpu, settings: DenoiserSettings) -> Result<Self> {
-        let DenoiserSettings { channels, precision, .. } = settings;
+        let DenoiserSettings { channels, precision, form, .. } = settings;
         let Properties { name, cooperative_matrix, .. } = gpu.properties();
         if precision == Precision::Half && cooperative_matrix.is_none() {
             tracing::warn!("{name} offers no 16-bit matrices: the denoiser is in single precision");
         }
-        let ends = Precision::Single;
+        let (ends, adds) = (Precision::Single, Adds::InputGradient);
+        let identity = form == Form::Identity;
+        let activation = if identity { Activation::None } else { Activation::Sigmoid };
         Ok(Self {
             channels,
-            conv_in: Conv::new(gpu, [RGB, channels], Activation::Relu, true, ends)?,
-            conv: Conv::new(gpu, [channels, channels], Activation::None, true, precision)?,
-            conv_out: Conv::new(gpu, [channels, RGB], Activation::Sigmoid, false, ends)?,
+            conv_in: Conv::new(gpu, [RGB, channels], Activation::Relu, adds, ends)?,
+            conv: Conv::new(gpu, [channels, channels], Activation::None, adds, precision)?,
+            conv_out: Conv::new(gpu, [channels, RGB], activation, Adds::Nothing, ends)?,
             norm: Norm::new(gpu, channels)?,
             relu_backward: ReluBackward::new(gpu)?,
-            residual: gpu.pipeline(&residual::Constants::default())?,
-            residual_backward: gpu.pipeline(&residual_backward::Constants::default())?,
+            residual: gpu.pipeline(&residual::Constants { identity })?,
+            residual_backward: gpu.pipeline(&residual_backward::Constants { identity })?,
         })
     }
 
@@ -372,11 +401,11 @@ impl Kernels {
         stage: &Stage,
         values: &Buffer<f32>,
         k: usize,
-        noise: &Buffer<f32>,
+        first: &Buffer<f32>,
         memory: &mut Memory,
     ) -> Result<()> {
         let Memory { features, convolved, norm, update, denoised, .. } = memory;
-        let input = if k == 0 { noise } else { &denoised[k - 1] };
+        let input = if k == 0 { first } else { &denoised[k - 1] };
         self.conv_in.forward(pass, size, stage.conv_in, values, input, &mut features[0])?;
         for (repeat, convolved) in convolved.iter_mut().enumerate() {
             let (before, after) = features.split_at_mut(repeat + 1);
@@ -389,7 +418,7 @@ impl Kernels {
         self.conv_out.forward(pass, size, stage.conv_out, values, last, update)
     }
 
-    /// From the gradient of the sigmoid's input to that of the stage's input; adds those of the stage's parameters.
+    /// From the gradient of the last layer's sum to that of the stage's input; adds those of the stage's parameters.
     fn stage_backward(
         &self,
         pass: &mut Recorder<'_>,

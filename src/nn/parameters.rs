@@ -96,6 +96,14 @@ impl Layout {
         offset
     }
 
+    /// As [`Layout::conv`], all zero: a layer that gives nothing, and learns.
+    pub(super) fn zero_conv(&mut self, name: &str, inputs: u32, outputs: u32) -> u32 {
+        let (inputs, outputs) = (inputs as usize, outputs as usize);
+        let offset = self.tensor(format!("{name}.weight"), vec![outputs, inputs, 3, 3], |_| 0.0);
+        self.tensor(format!("{name}.bias"), vec![outputs], |_| 0.0);
+        offset
+    }
+
     /// gamma (1), then beta (0).
     pub(super) fn norm(&mut self, name: &str, channels: u32) -> u32 {
         let shape = vec![channels as usize];

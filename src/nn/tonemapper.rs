@@ -2,10 +2,10 @@
 
 use glam::UVec2;
 
-use super::conv::{Activation, Conv, Precision, Seen, partial_count};
+use super::conv::{Activation, Adds, Conv, Precision, Seen, partial_count};
 use super::parameters::{Layout, Parameters};
 use super::relu::ReluBackward;
-use super::{RGB, check_binding, check_images, out_of_turn, pixel_count};
+use super::{Form, RGB, check_binding, check_images, out_of_turn, pixel_count};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::{product, product_backward};
@@ -17,10 +17,12 @@ const STREAM: u64 = 6;
 /// Feature maps of both inner layers.
 const CHANNELS: u32 = 16;
 
-/// conv 3 to 16, `ReLU`, conv 16 to 16, `ReLU`, conv 16 to 3, nothing behind it; zero padding 1.
+/// conv 3 to 16, `ReLU`, conv 16 to 16, `ReLU`, conv 16 to 3, nothing behind it; zero padding 1. In the identity form what
+/// goes in is added to what comes out.
 #[derive(Debug)]
 pub struct Tonemapper {
     gpu: Gpu,
+    form: Form,
     parameters: Parameters,
     /// Where the layers lie in the parameters.
     offsets: [u32; 3],
@@ -57,21 +59,30 @@ impl Tonemapper {
     ///
     /// # Errors
     /// The driver refuses a kernel, or the device is out of memory.
-    pub fn new(gpu: &Gpu, seed: u64) -> Result<Self> {
+    pub fn new(gpu: &Gpu, form: Form, seed: u64) -> Result<Self> {
         let mut layout = Layout::new(Stream::new(seed, STREAM));
         let offsets = [
             layout.conv("conv1", RGB, CHANNELS),
             layout.conv("conv2", CHANNELS, CHANNELS),
-            layout.conv("conv3", CHANNELS, RGB),
+            match form {
+                Form::Identity => layout.zero_conv("conv3", CHANNELS, RGB),
+                Form::Paper => layout.conv("conv3", CHANNELS, RGB),
+            },
         ];
+        let (relu, none, single) = (Activation::Relu, Activation::None, Precision::Single);
+        let [adds_input, adds_output] = match form {
+            Form::Identity => [Adds::InputGradient, Adds::Output],
+            Form::Paper => [Adds::Nothing; 2],
+        };
         Ok(Self {
             gpu: gpu.clone(),
+            form,
             parameters: layout.upload(gpu, ("tonemapper", Self::LEARNING_RATE), "{}".to_owned())?,
             offsets,
             convs: [
-                Conv::new(gpu, [RGB, CHANNELS], Activation::Relu, false, Precision::Single)?,
-                Conv::new(gpu, [CHANNELS, CHANNELS], Activation::Relu, false, Precision::Single)?,
-                Conv::new(gpu, [CHANNELS, RGB], Activation::None, false, Precision::Single)?,
+                Conv::new(gpu, [RGB, CHANNELS], relu, adds_input, single)?,
+                Conv::new(gpu, [CHANNELS, CHANNELS], relu, Adds::Nothing, single)?,
+                Conv::new(gpu, [CHANNELS, RGB], none, adds_output, single)?,
             ],
             product: gpu.pipeline(&product::Constants::default())?,
             product_backward: gpu.pipeline(&product_backward::Constants::default())?,
@@ -155,6 +166,9 @@ impl Tonemapper {
         let values = &self.parameters.values;
         conv_in.forward(pass, size, at_in, values, product, first)?;
         conv.forward(pass, size, at, values, first, second)?;
+        if self.form == Form::Identity {
+            pass.copy(product, output);
+        }
         conv_out.forward(pass, size, at_out, values, second, output)?;
         self.recorded = Some(size);
         Ok(())
@@ -198,6 +212,9 @@ impl Tonemapper {
         conv.weight_gradient(pass, size, at, seen, partials, gradients)?;
         conv.data_gradient(pass, size, at, values, d_second, d_first)?;
         self.relu_backward.record(pass, value_count, first, d_first)?;
+        if self.form == Form::Identity {
+            pass.copy(d_output, d_product);
+        }
         let seen = Seen { source: product, d_target: d_first };
         conv_in.weight_gradient(pass, size, at_in, seen, partials, gradients)?;
         conv_in.data_gradient(pass, size, at_in, values, d_first, d_product)?;

@@ -11,7 +11,8 @@ use crate::kernels::blend_backward::{Constants, Kernel, Params, Slices, Toleranc
 use crate::kernels::splat::RECORD_HEAD;
 
 /// Adds to `records` (splats, record) what one pixel with the values `render` and the gradient `d_render` says:
-/// the gradients of mean2d, conic, opacity and colours.
+/// the gradients of mean2d, conic and opacity, to which the first `shaping` channels speak, and of the colours.
+#[expect(clippy::too_many_arguments, reason = "a pixel, its splats and its gradients")]
 pub fn blend_pixel_backward(
     splats: &[Splat],
     colors: &[f64],
@@ -19,6 +20,7 @@ pub fn blend_pixel_backward(
     d_render: &[f64],
     pixel: DVec2,
     alpha_max: f64,
+    shaping: usize,
     records: &mut [f64],
 ) {
     let (channels, head) = (render.len(), RECORD_HEAD as usize);
@@ -31,7 +33,9 @@ pub fn blend_pixel_backward(
         for c in 0..channels {
             let color = colors[channels * fragment.index + c];
             record[head + c] += weight * d_render[c];
-            d_alpha += (fragment.before * color - light[c]) * d_render[c];
+            if c < shaping {
+                d_alpha += (fragment.before * color - light[c]) * d_render[c];
+            }
             light[c] -= weight * color;
         }
         d_alpha /= 1.0 - fragment.alpha;
@@ -97,8 +101,9 @@ fn add_bounds(constants: &Constants, list: &TileList, pixel: &Pixel, bounds: &mu
         (constants.channels as usize, UVec2::new(constants.tile_width, constants.tile_height));
     let model = PixelModel::new(&list.splats, pixel.center, constants.alpha_max.into(), tile);
     let d = |c: usize| pixel.d_render[c].abs();
-    let d_sum: f64 = (0..channels).map(d).sum();
-    let light: f64 = (0..channels).map(|c| pixel.render[c].abs() * d(c)).sum();
+    let shaping = channels.min(constants.shaping_channels as usize);
+    let d_sum: f64 = (0..shaping).map(d).sum();
+    let light: f64 = (0..shaping).map(|c| pixel.render[c].abs() * d(c)).sum();
     let light_error = model.error * list.largest_color(&pixel.render) * d_sum;
     let head = RECORD_HEAD as usize;
     // Every sum is over the pixels of the tile.
@@ -107,7 +112,7 @@ fn add_bounds(constants: &Constants, list: &TileList, pixel: &Pixel, bounds: &mu
         let Splat { conic, .. } = list.splats[fragment.index];
         let bound = &mut bounds[(head + channels) * fragment.index..][..head + channels];
         let color = &list.colors[channels * fragment.index..][..channels];
-        let share: f64 = (0..channels).map(|c| fragment.before * color[c].abs() * d(c)).sum();
+        let share: f64 = (0..shaping).map(|c| fragment.before * color[c].abs() * d(c)).sum();
         let rounded = 2.0 * alpha_error / (1.0 - fragment.alpha) + own;
         let relative = if model.is_fragile { 1.0 } else { rounded };
         let d_alpha = (2.0 * light_error + relative * (light + share)) / (1.0 - fragment.alpha);
@@ -139,6 +144,7 @@ impl Reference for Kernel {
                 d_render,
                 *center,
                 alpha_max,
+                constants.shaping_channels as usize,
                 sums,
             );
         });

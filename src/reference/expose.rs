@@ -12,23 +12,28 @@ pub fn gain_and_bias<T: Real>(exposures: &[T], view: usize, channel: usize) -> [
     [T::of(1.0) + exposures[at], T::of(BIAS_SCALE) * exposures[at + 3]]
 }
 
-/// Every exposed value.
-fn exposed<'a>(params: &Params, slices: &'a Slices<'_>) -> impl Iterator<Item = Rounded> + 'a {
+/// Every value written.
+fn exposed<'a>(
+    params: &Params,
+    &Constants { inverse }: &Constants,
+    slices: &'a Slices<'_>,
+) -> impl Iterator<Item = Rounded> + 'a {
     let (pixels, view) = (params.pixel_count as usize, params.view as usize);
     let exposures: Vec<Rounded> = slices.exposures.iter().copied().map(Rounded::exact).collect();
     slices.render[..3 * pixels].iter().enumerate().map(move |(i, &value)| {
         let [gain, bias] = gain_and_bias(&exposures, view, i / pixels);
-        gain * Rounded::exact(value) + bias
+        let value = Rounded::exact(value);
+        if inverse { (value - bias) / gain } else { gain * value + bias }
     })
 }
 
 impl Reference for Kernel {
-    fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
-        let exposed: Vec<f32> = values(exposed(params, &slices)).collect();
+    fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
+        let exposed: Vec<f32> = values(exposed(params, constants, &slices)).collect();
         slices.exposed[..exposed.len()].copy_from_slice(&exposed);
     }
 
-    fn tolerances(params: &Params, _: &Constants, slices: Slices<'_>) -> Tolerances {
-        Tolerances { exposed: exposed(params, &slices).collect() }
+    fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
+        Tolerances { exposed: exposed(params, constants, &slices).collect() }
     }
 }

@@ -12,11 +12,15 @@ impl Reference for Kernel {
     /// In single precision, as the kernel: the clamp's gradient hangs on the bits.
     fn run(
         params: &Params,
-        _: &Constants,
+        constants: &Constants,
         Slices { render, stage_input, update, denoised }: Slices<'_>,
     ) {
         for i in 0..params.value_count as usize {
-            denoised[i] = (render[i] - (stage_input[i] + update[i])).clamp(0.0, 1.0);
+            denoised[i] = if constants.identity {
+                stage_input[i] - update[i]
+            } else {
+                (render[i] - (stage_input[i] + update[i])).clamp(0.0, 1.0)
+            };
         }
     }
 }

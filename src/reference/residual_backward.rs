@@ -12,9 +12,16 @@ pub fn behind_clamp(difference: f64, d: f64) -> f64 {
 impl Reference for Kernel {
     fn run(
         params: &Params,
-        _: &Constants,
+        constants: &Constants,
         Slices { render, stage_input, update, d_denoised, d_update, d_stage_input, d_render }: Slices<'_>,
     ) {
+        if constants.identity {
+            for i in 0..params.value_count as usize {
+                d_update[i] = -d_denoised[i];
+                d_stage_input[i] = d_denoised[i];
+            }
+            return;
+        }
         for i in 0..params.value_count as usize {
             let difference = render[i] - (stage_input[i] + update[i]);
             let d = behind_clamp(difference.into(), d_denoised[i].into());

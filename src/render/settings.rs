@@ -1,7 +1,7 @@
 //! What a renderer is made for, and the tile that suits a device.
 
 use crate::gpu::Gpu;
-use crate::scene::Shape;
+use crate::scene::{Features, Shape};
 use crate::{Error, Result};
 
 /// What a renderer is specialised for.
@@ -15,13 +15,23 @@ pub struct RenderSettings {
     pub shape: Shape,
     /// Colours are the bare SH sum, which can be negative, as in LITA-GS, instead of max(SH + 0.5, 0).
     pub raw_colors: bool,
+    /// The gradient of noise and illumination moves and shapes no Gaussian; that of depth and structure, which are there for
+    /// it, does.
+    pub observes: bool,
     /// The tile that one subgroup owns, in pixels; none: what is fastest on the device.
     pub tile: Option<[u32; 2]>,
 }
 
 impl Default for RenderSettings {
     fn default() -> Self {
-        Self { near: 0.2, max_alpha: 0.99, shape: 3.into(), raw_colors: false, tile: None }
+        Self {
+            near: 0.2,
+            max_alpha: 0.99,
+            shape: 3.into(),
+            raw_colors: false,
+            observes: false,
+            tile: None,
+        }
     }
 }
 
@@ -57,5 +67,12 @@ impl RenderSettings {
     /// Values per pixel of a render: RGB and the features.
     pub fn channels(&self) -> usize {
         self.shape.features.channels()
+    }
+
+    /// How many of them, from the first, move and shape the Gaussians.
+    pub(super) fn shaping_channels(&self) -> usize {
+        let features = self.shape.features;
+        let shaping = Features { noise: false, illumination: false, ..features };
+        if self.observes { shaping.channels() } else { features.channels() }
     }
 }

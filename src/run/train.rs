@@ -96,6 +96,7 @@ pub fn train_planned(
     observe(Event::Started { step: trainer.steps_done(), steps: config.steps });
     let mut course = Course::new(config, dataset, &directory, &trainer);
     let losses = course.train_to_the_end(&mut trainer, &mut directory, &mut observe)?;
+    trainer.leave_out_what_gains_nothing()?;
     let spent = course.meter.spent(gpu.peak_memory());
     let scored = course.evaluate(&mut trainer, &directory, &mut observe)?;
     directory.save_model(&trainer.gaussians()?, config.model.raw_colors)?;

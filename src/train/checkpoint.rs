@@ -9,6 +9,7 @@ use std::path::Path;
 use safetensors::tensor::{Dtype, TensorView};
 use serde::{Deserialize, Serialize};
 
+use super::ends::Ends;
 use super::model::Model;
 use super::{TrainConfig, Trainer, learnables};
 use crate::densify::DeviceGaussians;
@@ -33,6 +34,9 @@ struct Header {
     step: u64,
     /// The settings of the run, as TOML.
     config: String,
+    /// What the held-out views have ended.
+    #[serde(default)]
+    ends: Ends,
 }
 
 /// A tensor of the state.
@@ -49,8 +53,12 @@ impl Trainer {
     /// The file cannot be written, or the device was lost.
     pub fn save_checkpoint(&mut self, path: &Path) -> Result<()> {
         let gpu = self.gpu.clone();
-        let header =
-            Header { format: FORMAT.to_owned(), step: self.step, config: self.config.to_toml()? };
+        let header = Header {
+            format: FORMAT.to_owned(),
+            step: self.step,
+            config: self.config.to_toml()?,
+            ends: self.ends.clone(),
+        };
         let header = serde_json::json!(header).to_string();
         let metadata = HashMap::from([(HEADER.to_owned(), header)]);
         let mut downloads = vec![];
@@ -95,7 +103,7 @@ impl Trainer {
         let damaged =
             |problem: String| Error::input(path, format!("is no whole checkpoint ({problem})"));
         let file = TensorFile::of(&bytes).map_err(|error| damaged(error.to_string()))?;
-        let step = self.step_of(path, &file)?;
+        let (step, ends) = self.header_of(path, &file)?;
         let visits: Vec<u32> = values(&file, VISIT_COUNTS, Dtype::U32, None).map_err(damaged)?;
         let gpu = self.gpu.clone();
         let mut restored = Model::zeros(&gpu, visits.len(), self.model.shape())?;
@@ -105,16 +113,17 @@ impl Trainer {
             self.model = fresh;
             return Err(error);
         }
-        self.step = step;
+        (self.step, self.ends) = (step, ends);
         self.reserve()
     }
 
-    /// The step of a checkpoint that this run can go on from.
-    fn step_of(&self, path: &Path, file: &TensorFile<'_>) -> Result<u64> {
+    /// The step of a checkpoint that this run can go on from, and what had ended by then.
+    fn header_of(&self, path: &Path, file: &TensorFile<'_>) -> Result<(u64, Ends)> {
         let refused = |problem: String| Error::input(path, problem);
         let anew = "begin anew with `HeldRun::Replace`";
         let header = file.note(HEADER).and_then(|header| serde_json::from_str(header).ok());
-        let Some(Header { step, config, .. }) = header.filter(|h: &Header| h.format == FORMAT)
+        let Some(Header { step, config, ends, .. }) =
+            header.filter(|h: &Header| h.format == FORMAT)
         else {
             return Err(refused(format!("is no `{FORMAT}`; {anew}")));
         };
@@ -131,7 +140,7 @@ impl Trainer {
                 "is at step {step}, this run ends at {steps}; raise `TrainConfig::steps`"
             )));
         }
-        Ok(step)
+        Ok((step, ends))
     }
 
     /// Every tensor is read before one is changed, but for those of the model.

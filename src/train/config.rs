@@ -11,6 +11,7 @@ use super::streams;
 use crate::dataset::{Dataset, DepthOptions, LoadOptions};
 use crate::densify::DensityControl;
 use crate::loss::LossConfig;
+use crate::nn::Form;
 use crate::optimizer::Schedule;
 use crate::random::Stream;
 use crate::render::RenderSettings;
@@ -236,6 +237,7 @@ impl TrainConfig {
         RenderSettings {
             shape: Shape { sh_degree: self.sh_degree, features: self.model.features() },
             raw_colors: self.model.raw_colors,
+            observes: self.model.network.form == Form::Identity,
             tile: self.tile,
             ..RenderSettings::default()
         }

@@ -3,16 +3,18 @@
 use serde::{Deserialize, Serialize};
 
 use super::Trainer;
+use super::terms::NetworkTerms;
 use super::views::lifted_from;
 use crate::camera::Camera;
 use crate::dataset::{Dataset, Split};
+use crate::exposure::Exposures;
 use crate::image::Image;
 use crate::metrics::psnr;
 use crate::pseudo_gt::PseudoGt;
 use crate::tone::Scene;
 use crate::{Error, Result};
 
-/// When a run ends before its last step. The scores are against targets, never against references.
+/// When a run, or a part of it, ends before its last step. The scores are against targets, never against references.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct StopConfig {
@@ -22,11 +24,16 @@ pub struct StopConfig {
     pub every: u64,
     /// The run ends once two scores in a row are not better than the best before by so many dB.
     pub gain: f64,
+    /// Growth ends once four rounds of density control gain less than so many dB for each doubling of the Gaussians; 0: it
+    /// goes on to its last step.
+    pub growth_gain: f64,
+    /// The SH degree rises no further, and falls back, once the one in use gains less than so many dB; 0: it rises always.
+    pub degree_gain: f64,
 }
 
 impl Default for StopConfig {
     fn default() -> Self {
-        Self { views: 0, every: 250, gain: 0.05 }
+        Self { views: 0, every: 250, gain: 0.05, growth_gain: 0.0, degree_gain: 0.0 }
     }
 }
 
@@ -44,9 +51,12 @@ impl StopConfig {
     /// # Errors
     /// [`Error::Usage`] names a value that makes no sense.
     pub(super) fn check(&self) -> Result<()> {
+        let gain = |name, gain: f64| (name, gain, gain.is_finite() && gain >= 0.0, "0 or more");
         let rules = [
             ("stop.every", self.every as f64, self.every >= 1, "at least 1"),
-            ("stop.gain", self.gain, self.gain.is_finite() && self.gain >= 0.0, "0 or more"),
+            gain("stop.gain", self.gain),
+            gain("stop.growth_gain", self.growth_gain),
+            gain("stop.degree_gain", self.degree_gain),
         ];
         match rules.into_iter().find(|(_, _, holds, _)| !holds) {
             Some((name, value, _, rule)) => {
@@ -78,22 +88,85 @@ impl HeldOut {
 }
 
 impl Trainer {
-    /// The mean PSNR, dB, of what the model shows of the held-out views against their targets; none where there are none.
+    /// The mean PSNR, dB, of what the Gaussians show of the held-out views against their targets; none where there are none.
     ///
     /// # Errors
     /// The device is out of memory or lost.
     pub fn held_out_psnr(&mut self) -> Result<Option<f64>> {
+        self.held_out_psnr_of_degree(self.sh_degree(self.step))
+    }
+
+    /// As [`Trainer::held_out_psnr`], with the colours of an SH degree.
+    pub(super) fn held_out_psnr_of_degree(&mut self, sh_degree: u32) -> Result<Option<f64>> {
+        let [colors, _] = self.psnr_of_held_out(sh_degree)?;
+        Ok(colors)
+    }
+
+    /// The mean PSNR, dB, of R_0 and of what the model shows, R_K where it has a denoiser; none where no view is held out.
+    fn psnr_of_held_out(&mut self, sh_degree: u32) -> Result<[Option<f64>; 2]> {
         let views = std::mem::take(&mut self.held_out);
-        let scores = views.0.iter().map(|(camera, target)| {
-            let mut shown = self.render(camera)?.output().clone();
-            shown.data.iter_mut().for_each(|value| *value = value.clamp(0.0, 1.0));
-            psnr(&shown, target)
-        });
-        let scores = scores.collect::<Result<Vec<f64>>>();
+        let scores = self.scores(&views.0, sh_degree);
         self.held_out = views;
-        let scores = scores?;
-        let mean = scores.iter().sum::<f64>() / scores.len() as f64;
-        Ok((!scores.is_empty()).then_some(mean))
+        scores
+    }
+
+    fn scores(&mut self, views: &[(Camera, Image)], sh_degree: u32) -> Result<[Option<f64>; 2]> {
+        let mut sums = [0.0; 2];
+        for (camera, target) in views {
+            let shown = self.render_of_degree(camera, sh_degree)?;
+            let clamped = |image: &Image| {
+                let data = image.data.iter().map(|value| value.clamp(0.0, 1.0)).collect();
+                Image { data, ..*image }
+            };
+            sums[0] += psnr(&clamped(&shown.colors), target)?;
+            sums[1] += psnr(&clamped(shown.output()), target)?;
+        }
+        Ok(sums.map(|sum| (!views.is_empty()).then(|| sum / views.len() as f64)))
+    }
+
+    /// Leaves out what the denoiser has learned where it shows the held-out views, or without any some of the training views,
+    /// no better than R_0 does: it is the identity again. For the end of a run, not on its way; the paper's stays.
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub fn leave_out_what_gains_nothing(&mut self) -> Result<()> {
+        if !self.networks.as_ref().is_some_and(NetworkTerms::follow_target) {
+            return Ok(());
+        }
+        let sh_degree = self.sh_degree(self.step);
+        let scores = match self.psnr_of_held_out(sh_degree)? {
+            [None, _] => {
+                let views = self.some_training_views()?;
+                self.scores(&views, sh_degree)?
+            }
+            scores => scores,
+        };
+        let [Some(colors), Some(denoised)] = scores else { return Ok(()) };
+        let gain = denoised - colors;
+        if gain > 0.0 {
+            tracing::info!("the denoiser gains {gain:.2} dB on targets");
+            return Ok(());
+        }
+        tracing::info!("the denoiser gains nothing on targets ({gain:.2} dB): it is left out");
+        match self.networks.as_mut().and_then(|terms| terms.networks.denoiser.as_mut()) {
+            Some(denoiser) => denoiser.become_identity(),
+            None => Ok(()),
+        }
+    }
+
+    /// Training views, evenly spread, with their targets at the neutral exposure.
+    fn some_training_views(&self) -> Result<Vec<(Camera, Image)>> {
+        const MOST: usize = 8;
+        let affines = self.exposures.as_ref().map(Exposures::affines).transpose()?;
+        let views = self.views.whole();
+        let mut some = vec![];
+        for view in views.iter().step_by(views.len().div_ceil(MOST).max(1)) {
+            let target = view.image(&self.gpu, view.kept_target())?;
+            let exposure = affines.as_ref().and_then(|affines| affines.get(view.place));
+            let neutral = exposure.map_or(target.clone(), |own| own.inverse().applied(&target));
+            some.push((view.camera.clone(), neutral));
+        }
+        Ok(some)
     }
 }
 

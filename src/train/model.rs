@@ -1,10 +1,12 @@
 //! The Gaussians in training, on the device.
 
+use glam::Vec3;
+
 use crate::Result;
 use crate::densify::{Densifier, DensifyInputs, DensifyReport, DeviceGaussians, Round};
 use crate::gpu::{Buffer, Gpu};
 use crate::optimizer::Moments;
-use crate::scene::{Gaussians, Shape, width};
+use crate::scene::{Gaussians, Shape, rest_coefficients, width};
 
 /// Planes of every attribute with their moments and gradients, and the statistics of density control. Buffers are as long
 /// as the Gaussians need or longer.
@@ -92,6 +94,28 @@ impl Model {
             Ok(())
         })?;
         Ok(report)
+    }
+
+    /// Makes every SH coefficient above a degree zero, and what Adam keeps of them.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub(super) fn drop_degrees_above(&mut self, gpu: &Gpu, degree: u32) -> Result<()> {
+        let kept = rest_coefficients(degree);
+        let DeviceGaussians { count, parameters, moments, .. } = &mut self.gaussians;
+        let (count, shape) = (*count as usize, self.shape);
+        for buffer in [parameters, &mut moments.first, &mut moments.second] {
+            let mut values = gpu.read(buffer)?;
+            let spare = values.split_off(count * width(shape));
+            let mut gaussians = Gaussians { count, shape, parameters: values };
+            let coefficients = rest_coefficients(shape.sh_degree).max(1);
+            for own in gaussians.rest_mut().chunks_mut(coefficients) {
+                own.iter_mut().skip(kept).for_each(|rest| *rest = Vec3::ZERO);
+            }
+            gaussians.parameters.extend(spare);
+            gpu.write(buffer, &gaussians.parameters)?;
+        }
+        Ok(())
     }
 
     /// # Errors

@@ -33,7 +33,7 @@ impl Networks {
     /// The Gaussians lack what a network takes, or the device is out of memory.
     pub fn new(gpu: &Gpu, model: &ModelConfig, features: Features, seed: u64) -> Result<Self> {
         let takes = [
-            (model.denoiser, Feature::Noise, "denoiser", "noise"),
+            (model.features().noise, Feature::Noise, "denoiser", "noise"),
             (model.tonemapper, Feature::Illumination, "tonemapper", "illumination"),
         ];
         for (is_on, feature, network, name) in takes {
@@ -43,7 +43,7 @@ impl Networks {
             }
         }
         let denoiser = model.denoiser.then(|| Denoiser::new(gpu, model.network, seed));
-        let tonemapper = model.tonemapper.then(|| Tonemapper::new(gpu, seed));
+        let tonemapper = model.tonemapper.then(|| Tonemapper::new(gpu, model.network.form, seed));
         let (mut denoiser, mut tonemapper) = (denoiser.transpose()?, tonemapper.transpose()?);
         if let Some(denoiser) = &mut denoiser {
             denoiser.parameters_mut().learning_rate = model.rates.denoiser;
@@ -78,7 +78,7 @@ impl Networks {
         }
         if let Some(denoiser) = &mut self.denoiser {
             denoiser.reserve(size)?;
-            if self.noise.len() < values {
+            if self.features.noise && self.noise.len() < values {
                 self.noise = self.gpu.uninit("window_noise", values)?;
             }
         }
@@ -98,10 +98,9 @@ impl Networks {
     ) -> Result<()> {
         let planes = 0..COLOR_CHANNELS;
         self.windows.gather(pass, render, size, planes, window, &mut self.colors)?;
-        let Some((denoiser, planes)) =
-            self.denoiser.as_mut().zip(self.features.channels_of(Feature::Noise))
-        else {
-            return Ok(());
+        let Some(denoiser) = &mut self.denoiser else { return Ok(()) };
+        let Some(planes) = self.features.channels_of(Feature::Noise) else {
+            return denoiser.forward(pass, window.size, &self.colors, &self.colors);
         };
         self.windows.gather(pass, render, size, planes, window, &mut self.noise)?;
         denoiser.forward(pass, window.size, &self.noise, &self.colors)

@@ -6,7 +6,7 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 
 use crate::loss::Weights;
-use crate::nn::{Denoiser, DenoiserSettings, Tonemapper};
+use crate::nn::{Denoiser, DenoiserSettings, Form, Tonemapper};
 use crate::scene::Features;
 use crate::{Error, Result};
 
@@ -93,7 +93,7 @@ pub struct ModelConfig {
     pub depth_folder: Option<PathBuf>,
     /// The depth maps hold disparity: larger is nearer.
     pub depth_is_disparity: bool,
-    /// The size of the denoiser.
+    /// The size of the denoiser, and what the networks begin as.
     pub network: DenoiserSettings,
     /// What each term weighs beside (1 - w) L1 + w (1 - SSIM).
     pub weights: Weights,
@@ -148,6 +148,12 @@ impl ModelConfig {
         }
     }
 
+    /// Sets what of the parts' constants is LITA-GS's own: networks that begin at random, and the denoiser's smoothness.
+    pub fn follow_paper(&mut self) {
+        self.network.form = Form::Paper;
+        self.weights.total_variation = Weights::paper().total_variation;
+    }
+
     /// Switches exactly these parts on.
     pub fn set_parts(&mut self, parts: &[Part]) {
         self.denoiser = parts.contains(&Part::Denoiser);
@@ -161,7 +167,8 @@ impl ModelConfig {
         Features {
             depth: self.depth,
             structure: self.structure,
-            noise: self.denoiser,
+            // Beside the colours a noise map can say nothing: what it takes away the colours need not show.
+            noise: self.denoiser && self.network.form == Form::Paper,
             illumination: self.tonemapper,
         }
     }

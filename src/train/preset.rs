@@ -96,6 +96,7 @@ impl Preset {
     fn apply_benchmark(self, config: &mut TrainConfig) {
         (config.schedule, config.density) = (Schedule::paper(), DensityConfig::paper());
         config.start = Start::PAPER;
+        config.model.follow_paper();
         let curve = config.tone.curve;
         let of_curve = |ase: f64, ap3: f64| match curve {
             ToneCurve::Ase => ase,
@@ -163,7 +164,10 @@ mod tests {
 
     use super::*;
     use crate::densify::DensityControl;
+    use crate::loss::Weights;
+    use crate::nn::Form;
     use crate::tone::ToneSettings;
+    use crate::train::ModelConfig;
 
     fn applied(preset: Preset, scene: &str, curve: ToneCurve) -> TrainConfig {
         let tone = ToneSettings::new(curve);
@@ -185,6 +189,8 @@ mod tests {
             assert_eq!(is_paper, PAPER.contains(&preset), "{preset:?}");
             assert_eq!(is_paper, config.schedule.densify_after == 500, "{preset:?}");
             assert_eq!(is_paper, config.start == Start::PAPER, "{preset:?}");
+            assert_eq!(is_paper, config.model.network.form == Form::Paper, "{preset:?}");
+            assert_eq!(is_paper, config.model.weights == Weights::paper(), "{preset:?}");
             config.check().unwrap();
         }
     }
@@ -192,12 +198,15 @@ mod tests {
     #[test]
     fn paper_is_the_paper_and_balanced_is_what_the_library_defaults_to_but_for_its_end() {
         let paper = applied(Preset::Paper, "x", ToneCurve::Auto);
+        let mut model = ModelConfig::default();
+        model.follow_paper();
         let expected = TrainConfig {
             dataset: "data/x".into(),
             tone: ToneSettings::default().with_curve(ToneCurve::Ap3),
             start: Start::PAPER,
             schedule: Schedule::paper(),
             density: DensityConfig::paper(),
+            model,
             ..Default::default()
         };
         assert_eq!(paper, expected);

@@ -73,8 +73,9 @@ impl Trainer {
     pub(super) fn submit_steps(&mut self, until: u64) -> Result<Vec<StepReport>> {
         let (begin, mut next) = (Instant::now(), self.step + 1);
         let until = until.min(self.config.steps);
-        // Density control may change the number of Gaussians.
-        let last = (next..until).find(|&step| self.densifies_at(step)).unwrap_or(until);
+        // Density control may change the number of Gaussians, and what is decided of the SH degree the next step.
+        let changes = |&step: &u64| self.densifies_at(step) || self.decides_degree_at(step);
+        let last = (next..until).find(changes).unwrap_or(until);
         let (mut in_flight, mut reports) = (VecDeque::new(), vec![]);
         loop {
             while next <= last && in_flight.len() < self.pace.in_flight {
@@ -94,6 +95,9 @@ impl Trainer {
         }
         if !reports.is_empty() && self.densifies_at(self.step) {
             self.control_density()?;
+        }
+        if !reports.is_empty() && self.decides_degree_at(self.step) {
+            self.decide_degree()?;
         }
         Ok(reports)
     }

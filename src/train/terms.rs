@@ -12,16 +12,26 @@ use crate::loss::{
     DenoisingGradients, DenoisingInputs, DenoisingLoss, DenoisingWeights, Interior, LogSlot, Loss,
     LossInputs, LossSettings, Term, TermInputs,
 };
-use crate::nn::Denoiser;
+use crate::nn::{Denoiser, Form};
 use crate::random::Stream;
 use crate::scene::{COLOR_CHANNELS, Feature};
 use crate::tone::ToneCurve;
 use crate::window::Window;
 
+/// What the networks of a view are held to, (3, H, W) each.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Photographs<'a> {
+    /// The dark photograph.
+    pub(super) low: &'a Buffer<f32>,
+    /// Its target; the paper's networks do not look at it.
+    pub(super) target: &'a Buffer<f32>,
+}
+
 /// The networks in training, and the terms that their outputs are held to.
 #[derive(Debug)]
 pub(super) struct NetworkTerms {
     pub(super) networks: Networks,
+    form: Form,
     /// Side of the random crop in pixels; 0: the whole view.
     crop: u32,
     crops: Stream,
@@ -31,9 +41,11 @@ pub(super) struct NetworkTerms {
     no_curve: Buffer<ToneParameters>,
     /// Of the window, (3, h, w) each: inputs, then gradients.
     illumination: Buffer<f32>,
+    /// What an output is held to.
     photograph: Buffer<f32>,
     d_colors: Buffer<f32>,
     d_denoised: Buffer<f32>,
+    /// Of what the denoiser's first stage begins with.
     d_noise: Buffer<f32>,
     d_illumination: Buffer<f32>,
     d_output: Buffer<f32>,
@@ -53,6 +65,7 @@ impl NetworkTerms {
         let networks = Networks::new(gpu, &config.model, config.model.features(), seed)?;
         let empty = |name| gpu.uninit(name, 0);
         let mut terms = Self {
+            form: config.model.network.form,
             crop: *denoiser_crop,
             crops: Stream::new(config.seed, streams::CROPS),
             denoising: DenoisingLoss::new(
@@ -121,89 +134,131 @@ impl NetworkTerms {
         denoiser + tonemapper.map_or(0, |tonemapper| tonemapper.margin() + RADIUS as u32)
     }
 
+    /// Whether a network is held to the targets.
+    pub(super) fn follow_target(&self) -> bool {
+        self.form == Form::Identity && self.networks.has_denoiser()
+    }
+
     /// Records the networks' step: adds to `dL/dR_0` and writes the planes of noise and illumination in `d_render`,
-    /// (channels, H, W). `photograph` is the dark one of the view, (3, H, W).
+    /// (channels, H, W).
     pub(super) fn record(
         &mut self,
         pass: &mut Recorder<'_>,
-        &TermInputs { step, size, features, render, .. }: &TermInputs<'_>,
-        photograph: &Buffer<f32>,
+        inputs: &TermInputs<'_>,
+        photographs: Photographs<'_>,
         d_render: &mut Buffer<f32>,
         log: &mut LogSlot<'_>,
     ) -> Result<()> {
         let window = match self.crop {
-            0 => Window::whole(size),
-            crop => Window::random(size, crop, self.margin(), &self.crops, step),
+            0 => Window::whole(inputs.size),
+            crop => Window::random(inputs.size, crop, self.margin(), &self.crops, inputs.step),
         };
-        let interior = Interior { origin: window.crop_origin, size: window.crop_size };
-        self.networks.denoise(pass, render, size, &window)?;
-        if self.networks.denoiser.is_some() {
-            let denoised = self.networks.denoised();
-            self.denoising.record(
-                pass,
-                DenoisingInputs {
-                    size: window.size,
-                    interior,
-                    denoised,
-                    render: &self.networks.colors,
-                },
-                DenoisingGradients {
-                    d_denoised: &mut self.d_denoised,
-                    d_render: &mut self.d_colors,
-                },
-                log,
-            )?;
-        } else {
-            pass.fill(&mut self.d_colors, 0);
+        self.networks.denoise(pass, inputs.render, inputs.size, &window)?;
+        match self.form {
+            Form::Identity => {
+                // What the denoiser learns is its own: the render stays what it would be without it.
+                self.record_denoising(pass, &window, Some(photographs.target), inputs.size, log)?;
+                self.denoise_backward(pass, &window, inputs, d_render)?;
+                pass.fill(&mut self.d_colors, 0);
+                self.record_low(pass, &window, inputs, photographs.low, d_render, log)?;
+            }
+            Form::Paper => {
+                pass.fill(&mut self.d_colors, 0);
+                self.record_denoising(pass, &window, None, inputs.size, log)?;
+                self.record_low(pass, &window, inputs, photographs.low, d_render, log)?;
+                self.denoise_backward(pass, &window, inputs, d_render)?;
+            }
         }
-        if let Some(planes) = features.channels_of(Feature::Illumination) {
-            let windows = &self.networks.windows;
-            windows.gather(pass, render, size, planes.clone(), &window, &mut self.illumination)?;
-            let own = &mut self.photograph;
-            windows.gather(pass, photograph, size, 0..COLOR_CHANNELS, &window, own)?;
-            self.record_low(pass, &window, interior, log)?;
-            let windows = &self.networks.windows;
-            windows.scatter(pass, &self.d_illumination, &window, planes, size, d_render)?;
-        }
-        let Networks { denoiser, windows, colors, noise, .. } = &mut self.networks;
-        if let Some((denoiser, planes)) =
-            denoiser.as_mut().zip(features.channels_of(Feature::Noise))
-        {
-            denoiser.backward(
-                pass,
-                window.size,
-                noise,
-                colors,
-                &self.d_denoised,
-                &mut self.d_noise,
-                &mut self.d_colors,
-            )?;
-            windows.scatter(pass, &self.d_noise, &window, planes, size, d_render)?;
-        }
-        windows.scatter(pass, &self.d_colors, &window, 0..COLOR_CHANNELS, size, d_render)
+        let windows = &self.networks.windows;
+        windows.scatter(pass, &self.d_colors, &window, 0..COLOR_CHANNELS, inputs.size, d_render)
     }
 
-    /// The dark photograph from illumination and R_K, and back to both.
+    /// R_K against the target; without one against R_0, as in the paper.
+    fn record_denoising(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        window: &Window,
+        target: Option<&Buffer<f32>>,
+        size: UVec2,
+        log: &mut LogSlot<'_>,
+    ) -> Result<()> {
+        let Networks { denoiser: Some(denoiser), windows, colors, .. } = &self.networks else {
+            return Ok(());
+        };
+        if let Some(target) = target {
+            let own = &mut self.photograph;
+            windows.gather(pass, target, size, 0..COLOR_CHANNELS, window, own)?;
+        }
+        self.denoising.record(
+            pass,
+            DenoisingInputs {
+                size: window.size,
+                interior: interior(window),
+                denoised: denoiser.denoised(),
+                render: if target.is_some() { &self.photograph } else { colors },
+            },
+            DenoisingGradients { d_denoised: &mut self.d_denoised, d_render: &mut self.d_colors },
+            log,
+        )
+    }
+
+    /// From `dL/dR_K` to the noise map, and to R_0 in `d_colors`.
+    fn denoise_backward(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        window: &Window,
+        &TermInputs { size, features, .. }: &TermInputs<'_>,
+        d_render: &mut Buffer<f32>,
+    ) -> Result<()> {
+        let Networks { denoiser, windows, colors, noise, .. } = &mut self.networks;
+        let Some(denoiser) = denoiser else { return Ok(()) };
+        let planes = features.channels_of(Feature::Noise);
+        denoiser.backward(
+            pass,
+            window.size,
+            if planes.is_some() { noise } else { colors },
+            colors,
+            &self.d_denoised,
+            &mut self.d_noise,
+            &mut self.d_colors,
+        )?;
+        match planes {
+            Some(planes) => windows.scatter(pass, &self.d_noise, window, planes, size, d_render),
+            None => Ok(()),
+        }
+    }
+
+    /// The dark photograph from illumination and R_K, in the identity form R_0, and back to both.
     fn record_low(
         &mut self,
         pass: &mut Recorder<'_>,
         window: &Window,
-        interior: Interior,
+        &TermInputs { size: whole, features, render, .. }: &TermInputs<'_>,
+        low: &Buffer<f32>,
+        d_render: &mut Buffer<f32>,
         log: &mut LogSlot<'_>,
     ) -> Result<()> {
         let size = window.size;
-        let Networks { denoiser, tonemapper, colors, .. } = &mut self.networks;
-        let Some(tonemapper) = tonemapper else { return Ok(()) };
+        let Networks { denoiser, tonemapper, windows, colors, .. } = &mut self.networks;
+        let Some((tonemapper, planes)) =
+            tonemapper.as_mut().zip(features.channels_of(Feature::Illumination))
+        else {
+            return Ok(());
+        };
+        windows.gather(pass, render, whole, planes.clone(), window, &mut self.illumination)?;
+        windows.gather(pass, low, whole, 0..COLOR_CHANNELS, window, &mut self.photograph)?;
         let (denoised, d_denoised) = match denoiser.as_ref() {
-            Some(denoiser) => (denoiser.denoised(), &mut self.d_denoised),
-            None => (&*colors, &mut self.d_colors),
+            Some(denoiser) if self.form == Form::Paper => {
+                (denoiser.denoised(), &mut self.d_denoised)
+            }
+            _ => (&*colors, &mut self.d_colors),
         };
         tonemapper.forward(pass, size, &self.illumination, denoised)?;
         self.low.record(
             pass,
             LossInputs {
                 size,
-                interior,
+                interior: interior(window),
                 render: tonemapper.output(),
                 low: &self.photograph,
                 tone: &self.no_curve,
@@ -211,14 +266,21 @@ impl NetworkTerms {
             &mut self.d_output,
             log,
         )?;
+        let d_illumination = &mut self.d_illumination;
         tonemapper.backward(
             pass,
             size,
             &self.illumination,
             denoised,
             &self.d_output,
-            &mut self.d_illumination,
+            d_illumination,
             d_denoised,
-        )
+        )?;
+        windows.scatter(pass, d_illumination, window, planes, whole, d_render)
     }
+}
+
+/// The pixels of a window that the terms count.
+fn interior(window: &Window) -> Interior {
+    Interior { origin: window.crop_origin, size: window.crop_size }
 }

@@ -4,7 +4,7 @@ use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use glam::{DVec3, UVec2};
+use glam::{DVec3, UVec2, Vec3};
 use serde::Serialize;
 
 use super::{TrainConfig, streams};
@@ -16,9 +16,10 @@ use crate::gpu::{Buffer, Gpu};
 use crate::image::Image;
 use crate::kernels::ToneParameters;
 use crate::loss::ViewSource;
+use crate::nn::Form;
 use crate::pseudo_gt::PseudoGt;
 use crate::random::Stream;
-use crate::scene::{Gaussians, Shape, init};
+use crate::scene::{COLOR_CHANNELS, Feature, Gaussians, Shape, init};
 use crate::tone::{Exposure, Scene, Statistics, ToneCurve, ToneSettings, all_black};
 
 /// One training view.
@@ -42,6 +43,8 @@ pub(super) struct TrainView {
     pub(super) tone: Buffer<ToneParameters>,
     /// Whether the input is the target.
     is_baked: bool,
+    /// The target, where that is not the input and a network is held to it.
+    target: Option<Arc<Buffer<f32>>>,
 }
 
 /// How bright the targets are, and what a model makes of them.
@@ -135,6 +138,7 @@ impl Views {
                     photograph: kept.transpose()?,
                     tone: gpu.buffer("tone", &[if is_baked { none } else { lift.parameters }])?,
                     is_baked,
+                    target: None,
                 });
             }
         }
@@ -142,6 +146,17 @@ impl Views {
         let exposure = scene.exposure.clone().filter(|_| settings.profile.is_none());
         let exposure = exposure.map(|scene| TargetExposure::new(scene, gains));
         Ok((Self(views), scene, exposure))
+    }
+
+    /// Keeps the target of every view beside what the loss makes it of, for [`TrainView::kept_target`].
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub(super) fn keep_targets(&mut self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<()> {
+        for view in self.0.iter_mut().flatten().filter(|view| !view.is_baked) {
+            view.target = Some(view.target(gpu, pseudo_gt)?);
+        }
+        Ok(())
     }
 
     /// What the loss terms may compare the views with.
@@ -172,6 +187,11 @@ impl Views {
             order.swap(left as usize, draw as usize);
         }
         &views[order[place as usize]]
+    }
+
+    /// The views, unshrunk.
+    pub(super) fn whole(&self) -> &[TrainView] {
+        self.0.first().map_or(&[], Vec::as_slice)
     }
 
     pub(super) fn cameras(&self) -> impl Iterator<Item = &Camera> {
@@ -223,7 +243,38 @@ impl Views {
         let positions: Vec<DVec3> = kept.iter().map(|point| point.position).collect();
         let seed = Stream::new(config.seed, streams::FEATURES).bits(0);
         let shape = Shape { sh_degree: config.sh_degree, features: config.model.features() };
-        init::from_points(&positions, &colors, shape, &config.start, seed)
+        let mut gaussians = init::from_points(&positions, &colors, shape, &config.start, seed)?;
+        if config.model.network.form == Form::Identity {
+            let low = if shape.features.illumination {
+                init::colors_from_views(kept, &dataset.views, |index| {
+                    let view = self.0.iter().flatten().find(|view| view.index == index);
+                    view.map(|view| view.image(gpu, view.photograph())).transpose()
+                })?
+            } else {
+                vec![]
+            };
+            begin_as_identity(&mut gaussians, &colors, &low);
+        }
+        Ok(gaussians)
+    }
+}
+
+/// Sets the features that parts of the model begin with so that nothing changes: no structure, and the illumination that
+/// makes of each point's colour what the dark photographs show of it. Depth, which is correlated, stays as drawn.
+fn begin_as_identity(gaussians: &mut Gaussians, colors: &[Vec3], low: &[Vec3]) {
+    /// Darker targets say nothing of the light.
+    const DARKEST: f32 = 1.0 / 255.0;
+    let features = gaussians.shape.features;
+    let places = |feature| {
+        let channels = features.channels_of(feature).unwrap_or_default();
+        channels.map(|channel| channel - COLOR_CHANNELS)
+    };
+    let width = features.width();
+    for (i, own) in gaussians.features_mut().chunks_mut(width.max(1)).enumerate() {
+        places(Feature::Structure).for_each(|at| own[at] = 0.0);
+        for (channel, at) in places(Feature::Illumination).enumerate() {
+            own[at] = (low[i][channel] / colors[i][channel].max(DARKEST)).clamp(0.0, 1.0);
+        }
     }
 }
 
@@ -271,6 +322,11 @@ impl TrainView {
         self.photograph.as_ref().unwrap_or(&self.input)
     }
 
+    /// The pseudo-GT of the view, (3, H, W), where the input is that, or it was kept.
+    pub(super) fn kept_target(&self) -> &Buffer<f32> {
+        self.target.as_deref().unwrap_or(&self.input)
+    }
+
     /// The pseudo-GT of the view, (3, H, W).
     fn target(&self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<Arc<Buffer<f32>>> {
         if self.is_baked {
@@ -282,7 +338,12 @@ impl TrainView {
     }
 
     fn target_image(&self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<Image> {
-        let data = gpu.read(&*self.target(gpu, pseudo_gt)?)?;
+        self.image(gpu, &*self.target(gpu, pseudo_gt)?)
+    }
+
+    /// Pixels of the view on the host.
+    pub(super) fn image(&self, gpu: &Gpu, pixels: &Buffer<f32>) -> Result<Image> {
+        let data = gpu.read(pixels)?;
         let Camera { width, height, .. } = self.camera;
         Ok(Image { width, height, data })
     }

@@ -122,7 +122,8 @@ impl<'a> Chain<'a> {
             let (values, transmittance) =
                 blend_pixel(&splats, &colors, &background, center, alpha_max);
             let list = &mut records;
-            blend_pixel_backward(&splats, &colors, &values, &d, center, alpha_max, list);
+            let (alpha, shaping) = (alpha_max, channels);
+            blend_pixel_backward(&splats, &colors, &values, &d, center, alpha, shaping, list);
             for c in 0..channels {
                 results.render[c * pixels + at] = values[c];
                 results.d_background[c] += transmittance * d[c];

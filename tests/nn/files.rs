@@ -3,15 +3,23 @@
 use std::path::Path;
 
 use nightsplat::gpu::testing::gpu;
-use nightsplat::nn::{Denoiser, DenoiserSettings, Precision, Tonemapper, load, save};
+use nightsplat::nn::{Denoiser, DenoiserSettings, Form, Precision, Tonemapper, load, save};
 use safetensors::SafeTensors;
 
-const SMALL: DenoiserSettings =
-    DenoiserSettings { stages: 2, repeats: 1, channels: 4, precision: Precision::Single };
+const SMALL: DenoiserSettings = DenoiserSettings {
+    stages: 2,
+    repeats: 1,
+    channels: 4,
+    precision: Precision::Single,
+    form: Form::Paper,
+};
 
 fn networks(settings: DenoiserSettings, seed: u64) -> (Denoiser, Tonemapper) {
     let gpu = gpu();
-    (Denoiser::new(&gpu, settings, seed).unwrap(), Tonemapper::new(&gpu, seed).unwrap())
+    (
+        Denoiser::new(&gpu, settings, seed).unwrap(),
+        Tonemapper::new(&gpu, Form::Paper, seed).unwrap(),
+    )
 }
 
 fn save_both(path: &Path, (denoiser, tonemapper): &(Denoiser, Tonemapper)) {

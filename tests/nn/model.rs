@@ -1,6 +1,6 @@
 //! Both networks in double precision, put together from the references of their kernels.
 
-use nightsplat::nn::DenoiserSettings;
+use nightsplat::nn::{DenoiserSettings, Form};
 use nightsplat::reference::conv3x3::{activate, conv3x3, data_gradient};
 use nightsplat::reference::conv3x3_weight_gradient::weight_gradient;
 use nightsplat::reference::norm::{self, Affine, Statistics};
@@ -119,9 +119,18 @@ impl Denoiser {
                 convolved.push(z);
             }
             let v = conv_out.forward(self.size, values, features.last().unwrap());
-            let update: Vec<f64> = v.into_iter().map(|v| activate(2, v)).collect();
-            let denoised =
-                (0..3 * pixels).map(|i| residual(render[i], input[i], update[i])).collect();
+            let (update, denoised): (Vec<f64>, Vec<f64>) = match self.settings.form {
+                Form::Identity => {
+                    let denoised = input.iter().zip(&v).map(|(input, v)| input - v).collect();
+                    (v, denoised)
+                }
+                Form::Paper => {
+                    let update: Vec<f64> = v.into_iter().map(|v| activate(2, v)).collect();
+                    let end = |i: usize| residual(render[i], input[i], update[i]);
+                    let denoised = (0..3 * pixels).map(end).collect();
+                    (update, denoised)
+                }
+            };
             stages.push(Stage { input, features, convolved, update, denoised });
         }
         stages
@@ -144,12 +153,15 @@ impl Denoiser {
         let (mut d, mut d_render) = (d_denoised.to_vec(), vec![0.0; render.len()]);
         for (k, stage) in self.stages(values, noise, render).iter().enumerate().rev() {
             let ([conv_in, conv, conv_out], norm) = self.convs(k);
-            for i in 0..d.len() {
-                d[i] = behind_clamp(render[i] - (stage.input[i] + stage.update[i]), d[i]);
+            let is_paper = self.settings.form == Form::Paper;
+            if is_paper {
+                for i in 0..d.len() {
+                    d[i] = behind_clamp(render[i] - (stage.input[i] + stage.update[i]), d[i]);
+                }
+                add(&mut d_render, &d);
             }
-            add(&mut d_render, &d);
-            let d_v: Vec<f64> =
-                d.iter().zip(&stage.update).map(|(d, u)| -d * u * (1.0 - u)).collect();
+            let slope = |u: f64| if is_paper { u * (1.0 - u) } else { 1.0 };
+            let d_v: Vec<f64> = d.iter().zip(&stage.update).map(|(d, &u)| -d * slope(u)).collect();
             let last = stage.features.last().unwrap();
             let mut d_f = conv_out.backward(self.size, values, last, &d_v, &mut gradients);
             for repeat in (0..self.settings.repeats as usize).rev() {
@@ -170,7 +182,9 @@ impl Denoiser {
             }
             relu_backward(&mut d_f, &stage.features[0]);
             let d_input = conv_in.backward(self.size, values, &stage.input, &d_f, &mut gradients);
-            d.iter_mut().for_each(|d| *d = -*d);
+            if is_paper {
+                d.iter_mut().for_each(|d| *d = -*d);
+            }
             add(&mut d, &d_input);
         }
         Gradients { parameters: gradients, inputs: [d, d_render] }
@@ -180,6 +194,7 @@ impl Denoiser {
 /// The tonemapper for views of one size.
 #[derive(Clone, Copy)]
 pub(crate) struct Tonemapper {
+    pub(crate) form: Form,
     pub(crate) size: [usize; 2],
 }
 
@@ -199,7 +214,10 @@ impl Tonemapper {
         let product: Vec<f64> = illumination.iter().zip(denoised).map(|(l, r)| l * r).collect();
         let first = relu(conv1.forward(self.size, values, &product));
         let second = relu(conv2.forward(self.size, values, &first));
-        let output = conv3.forward(self.size, values, &second);
+        let mut output = conv3.forward(self.size, values, &second);
+        if self.form == Form::Identity {
+            add(&mut output, &product);
+        }
         [product, first, second, output]
     }
 
@@ -228,7 +246,10 @@ impl Tonemapper {
         relu_backward(&mut d_second, &second);
         let mut d_first = conv2.backward(self.size, values, &first, &d_second, &mut parameters);
         relu_backward(&mut d_first, &first);
-        let d_product = conv1.backward(self.size, values, &product, &d_first, &mut parameters);
+        let mut d_product = conv1.backward(self.size, values, &product, &d_first, &mut parameters);
+        if self.form == Form::Identity {
+            add(&mut d_product, d_output);
+        }
         let times = |by: &[f64]| d_product.iter().zip(by).map(|(d, by)| d * by).collect();
         Gradients { inputs: [times(denoised), times(illumination)], parameters }
     }

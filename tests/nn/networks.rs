@@ -2,7 +2,7 @@
 
 use glam::UVec2;
 use nightsplat::gpu::testing::gpu;
-use nightsplat::nn::{Denoiser, DenoiserSettings, Parameters, Precision, Tonemapper};
+use nightsplat::nn::{Denoiser, DenoiserSettings, Form, Parameters, Precision, Tonemapper};
 
 use super::common::{Random, assert_close};
 use super::model;
@@ -103,6 +103,32 @@ fn assert_outcome(
     assert_gradients(what, parameters, &actual.parameters, &narrow(&gradients.parameters));
 }
 
+/// Weights about which nothing is special: a last layer of zeros would hide all that lies before it.
+fn draw_weights(parameters: &mut Parameters, seed: u64) {
+    let mut random = Random::new(seed);
+    let drawn: Vec<f32> =
+        (0..parameters.values.len()).map(|_| random.between(-0.3, 0.3) as f32).collect();
+    gpu().write(&mut parameters.values, &drawn).unwrap();
+}
+
+#[test]
+fn in_the_identity_form_a_render_comes_out_bit_for_bit_until_something_is_learned() {
+    let (gpu, size) = (gpu(), UVec2::new(21, 9));
+    let [first, second, d] = images(size, 9);
+    for stages in [1, 2, 3] {
+        let settings = DenoiserSettings { stages, repeats: 1, channels: 8, ..Default::default() };
+        let mut denoiser = Denoiser::new(&gpu, settings, 1).unwrap();
+        let outcome = run_denoiser(&mut denoiser, size, [&second, &second, &d]);
+        assert_eq!(outcome.output, second);
+        assert!(outcome.parameters.iter().any(|d| *d != 0.0), "nothing would ever be learned");
+    }
+    let mut tonemapper = Tonemapper::new(&gpu, Form::Identity, 1).unwrap();
+    let outcome = run_tonemapper(&mut tonemapper, size, [&first, &second, &d]);
+    let product: Vec<f32> = first.iter().zip(&second).map(|(l, r)| l * r).collect();
+    assert_eq!(outcome.output, product);
+    assert!(outcome.parameters.iter().any(|d| *d != 0.0), "nothing would ever be learned");
+}
+
 #[test]
 fn the_denoiser_matches_its_reference_forward_and_backward() {
     let gpu = gpu();
@@ -120,10 +146,17 @@ fn the_denoiser_matches_its_reference_forward_and_backward() {
             vec![[5, 7]],
         ),
     ];
+    let forms = [Form::Identity, Form::Paper];
+    let all = all.into_iter().flat_map(|(settings, sizes)| {
+        forms.map(|form| (DenoiserSettings { form, ..settings }, sizes.clone()))
+    });
     for (settings, sizes) in all {
         // One network for all sizes: its memory serves smaller views too.
         let mut denoiser = Denoiser::new(&gpu, settings, 7).unwrap();
         assert_eq!(denoiser.margin(), settings.stages * (settings.repeats + 2));
+        if settings.form == Form::Identity {
+            draw_weights(denoiser.parameters_mut(), 5);
+        }
         let values = widen(&gpu.read(&denoiser.parameters().values).unwrap());
         denoiser.reserve(UVec2::new(33, 19)).unwrap();
         for size in sizes.into_iter().map(UVec2::from_array) {
@@ -141,19 +174,26 @@ fn the_denoiser_matches_its_reference_forward_and_backward() {
 
 #[test]
 fn the_tonemapper_matches_its_reference_forward_and_backward() {
-    let gpu = gpu();
-    let mut tonemapper = Tonemapper::new(&gpu, 7).unwrap();
-    assert_eq!(tonemapper.margin(), 3);
-    let values = widen(&gpu.read(&tonemapper.parameters().values).unwrap());
-    assert_eq!(values.len(), 3203, "as in the paper");
-    for size in [[33, 17], [1, 1], [3, 1], [5, 7]].map(UVec2::from_array) {
-        let [illumination, denoised, d] = images(size, 5);
-        let actual = run_tonemapper(&mut tonemapper, size, [&illumination, &denoised, &d]);
-        let model = model::Tonemapper { size: size.to_array().map(|n| n as usize) };
-        let [illumination, denoised, d] = [illumination, denoised, d].map(|image| widen(&image));
-        let output = model.forward(&values, &illumination, &denoised);
-        let gradients = model.backward(&values, &illumination, &denoised, &d);
-        assert_outcome(&format!("{size}"), tonemapper.parameters(), &actual, &output, &gradients);
+    for form in [Form::Identity, Form::Paper] {
+        let gpu = gpu();
+        let mut tonemapper = Tonemapper::new(&gpu, form, 7).unwrap();
+        assert_eq!(tonemapper.margin(), 3);
+        if form == Form::Identity {
+            draw_weights(tonemapper.parameters_mut(), 5);
+        }
+        let values = widen(&gpu.read(&tonemapper.parameters().values).unwrap());
+        assert_eq!(values.len(), 3203, "as in the paper");
+        for size in [[33, 17], [1, 1], [3, 1], [5, 7]].map(UVec2::from_array) {
+            let [illumination, denoised, d] = images(size, 5);
+            let actual = run_tonemapper(&mut tonemapper, size, [&illumination, &denoised, &d]);
+            let model = model::Tonemapper { form, size: size.to_array().map(|n| n as usize) };
+            let [illumination, denoised, d] =
+                [illumination, denoised, d].map(|image| widen(&image));
+            let output = model.forward(&values, &illumination, &denoised);
+            let gradients = model.backward(&values, &illumination, &denoised, &d);
+            let what = format!("{form:?} {size}");
+            assert_outcome(&what, tonemapper.parameters(), &actual, &output, &gradients);
+        }
     }
 }
 
@@ -168,7 +208,7 @@ fn a_value_that_is_not_a_number_reaches_the_output() {
     let mut denoiser = Denoiser::new(&gpu, settings, 1).unwrap();
     let outcome = run_denoiser(&mut denoiser, size, [&first, &second, &d]);
     assert!(outcome.output[100].is_nan());
-    let mut tonemapper = Tonemapper::new(&gpu, 1).unwrap();
+    let mut tonemapper = Tonemapper::new(&gpu, Form::Paper, 1).unwrap();
     let outcome = run_tonemapper(&mut tonemapper, size, [&first, &second, &d]);
     assert!(outcome.output[100].is_nan());
 }
@@ -184,7 +224,7 @@ fn two_runs_give_the_same_bits() {
         run_denoiser(&mut denoiser, size, [&first, &second, &d])
     };
     let tone = |_| {
-        let mut tonemapper = Tonemapper::new(&gpu, 1).unwrap();
+        let mut tonemapper = Tonemapper::new(&gpu, Form::Paper, 1).unwrap();
         run_tonemapper(&mut tonemapper, size, [&first, &second, &d])
     };
     let ([a, b], [c, d]) = ([0, 1].map(denoise), [0, 1].map(tone));
@@ -196,7 +236,9 @@ fn two_runs_give_the_same_bits() {
 #[test]
 fn half_precision_stays_near_single_at_every_magnitude() {
     let gpu = gpu();
-    let single = DenoiserSettings { stages: 2, repeats: 3, channels: 24, ..Default::default() };
+    let form = Form::Paper;
+    let single =
+        DenoiserSettings { stages: 2, repeats: 3, channels: 24, form, ..Default::default() };
     let half = DenoiserSettings { precision: Precision::Half, ..single };
     let size = UVec2::new(37, 26);
     let [first, second, d] = images(size, 4);
@@ -245,7 +287,9 @@ fn the_paper_s_denoiser_has_its_parameters_and_fits_a_gigabyte() {
 #[test]
 fn weights_begin_as_in_pytorch_and_follow_the_seed() {
     let gpu = gpu();
-    let settings = DenoiserSettings { stages: 2, repeats: 1, channels: 16, ..Default::default() };
+    let form = Form::Paper;
+    let settings =
+        DenoiserSettings { stages: 2, repeats: 1, channels: 16, form, ..Default::default() };
     let values = |seed| {
         let denoiser = Denoiser::new(&gpu, settings, seed).unwrap();
         (gpu.read(&denoiser.parameters().values).unwrap(), denoiser.parameters().tensors().to_vec())

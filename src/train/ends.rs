@@ -1,0 +1,146 @@
+//! What ends by the scores of the held-out views: growth, and the rise of the SH degree.
+//!
+//! Both are decided where the model changes anyway, at a round of density control and where the degree would rise, from what
+//! the model shows then: the same run decides the same, and a checkpoint holds what was decided and from what.
+
+use serde::{Deserialize, Serialize};
+
+use super::Trainer;
+use crate::Result;
+
+/// Rounds of density control that together gain too little before growth ends.
+const PATIENCE: usize = 4;
+
+/// A round of density control before it changed anything.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+struct Round {
+    step: u64,
+    /// The score of the held-out views, in thousandths of a dB: whole numbers survive every file.
+    score: i64,
+    gaussians: usize,
+}
+
+/// What was decided, and from what.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
+pub(super) struct Ends {
+    rounds: Vec<Round>,
+    /// As many Gaussians there were when growth ended.
+    gaussians: Option<usize>,
+    /// The highest degree that paid.
+    pub(super) sh_degree: Option<u32>,
+}
+
+impl Ends {
+    /// Whether growth has ended at the last round, where each doubling of the Gaussians has to gain so many dB.
+    fn gains_too_little(&self, growth_gain: f64) -> bool {
+        let Some(before) = self.rounds.len().checked_sub(PATIENCE) else { return false };
+        let (before, since) = self.rounds.split_at(before);
+        let best = |rounds: &[Round]| rounds.iter().max_by_key(|round| round.score).copied();
+        let (Some(before), Some(since), Some(last)) = (best(before), best(since), since.last())
+        else {
+            return false;
+        };
+        let doublings = (last.gaussians as f64 / before.gaussians.max(1) as f64).log2();
+        ((since.score - before.score) as f64) < 1e3 * growth_gain * doublings
+    }
+}
+
+impl Trainer {
+    /// The SH degree that a step trains.
+    pub(super) fn sh_degree(&self, step: u64) -> u32 {
+        let highest = self.ends.sh_degree.unwrap_or(self.config.sh_degree);
+        self.config.schedule.sh_degree(step, highest)
+    }
+
+    /// The most Gaussians that the held-out views leave room for, decided anew before a round of density control.
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub(super) fn growth_limit(&mut self) -> Result<usize> {
+        let growth_gain = self.config.stop.growth_gain;
+        let [_, whole] = self.config.schedule.resolution_steps;
+        if growth_gain > 0.0 && self.ends.gaussians.is_none() && self.step >= whole {
+            if let Some(psnr) = self.held_out_psnr()? {
+                let (step, gaussians) = (self.step, self.model.count());
+                self.ends.rounds.push(Round {
+                    step,
+                    score: (1e3 * psnr).round() as i64,
+                    gaussians,
+                });
+            }
+            if self.ends.gains_too_little(growth_gain) {
+                self.ends.gaussians = Some(self.model.count());
+                tracing::info!(
+                    "step {}: growth ends at {} Gaussians: {PATIENCE} rounds gained less on the held-out views than \
+                     {growth_gain} dB for each doubling",
+                    self.step,
+                    self.model.count()
+                );
+            }
+        }
+        Ok(self.ends.gaussians.unwrap_or(usize::MAX))
+    }
+
+    /// Whether it is decided after this step if the SH degree in use has paid: the next step would raise it, or would if
+    /// there were a higher one.
+    pub(super) fn decides_degree_at(&self, step: u64) -> bool {
+        let interval = self.config.schedule.sh_degree_interval.max(1);
+        self.config.stop.degree_gain > 0.0
+            && self.ends.sh_degree.is_none()
+            && (step + 1).is_multiple_of(interval)
+            && step < self.config.steps
+            && self.config.schedule.sh_degree(step, self.config.sh_degree) > 0
+    }
+
+    /// Compares what the held-out views show with and without the SH degree in use: one that gains too little goes, and none
+    /// comes after it.
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub(super) fn decide_degree(&mut self) -> Result<()> {
+        let (degree, least) = (self.sh_degree(self.step), self.config.stop.degree_gain);
+        let with = self.held_out_psnr_of_degree(degree)?;
+        let without = self.held_out_psnr_of_degree(degree - 1)?;
+        let Some((with, without)) = with.zip(without) else { return Ok(()) };
+        let gain = with - without;
+        if gain >= least {
+            tracing::info!("step {}: SH degree {degree} gains {gain:.2} dB", self.step);
+            return Ok(());
+        }
+        tracing::info!(
+            "step {}: SH degree {degree} gains {gain:.2} dB on the held-out views, less than {least}: it stays at {}",
+            self.step,
+            degree - 1
+        );
+        self.ends.sh_degree = Some(degree - 1);
+        self.model.drop_degrees_above(&self.gpu, degree - 1)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn ends(rounds: &[(i64, usize)]) -> Ends {
+        let round = |(i, &(score, gaussians)): (usize, &(i64, usize))| Round {
+            step: 100 * i as u64,
+            score,
+            gaussians,
+        };
+        Ends { rounds: rounds.iter().enumerate().map(round).collect(), ..Ends::default() }
+    }
+
+    #[test]
+    fn growth_ends_once_four_rounds_gain_too_little_for_what_they_add() {
+        let grown = [(20_000, 100), (20_100, 150), (20_150, 200), (20_180, 300), (20_190, 400)];
+        // .19 dB for two doublings.
+        assert!(ends(&grown).gains_too_little(0.1));
+        assert!(!ends(&grown).gains_too_little(0.09));
+        assert!(!ends(&grown[..4]).gains_too_little(0.1));
+        let fallen = [(20_000, 100), (20_900, 120), (19_000, 140), (19_000, 150), (19_500, 160)];
+        assert!(!ends(&fallen).gains_too_little(0.5), "the best round counts");
+        let full = [(20_000, 100); 5];
+        assert!(!ends(&full).gains_too_little(0.5), "what does not grow need not gain");
+    }
+}
