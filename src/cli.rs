@@ -22,6 +22,7 @@ pub mod eval;
 mod finished_run;
 #[cfg(feature = "fit")]
 pub mod fit;
+pub mod progress;
 pub mod render;
 pub mod sweep;
 pub mod synth;

@@ -9,7 +9,7 @@ use std::path::Path;
 use nightsplat::Error;
 use nightsplat::dataset::Dataset;
 use nightsplat::dataset::synthetic::{self, SyntheticOptions};
-use nightsplat::gpu::testing::{Defect, gpu, with_defect};
+use nightsplat::gpu::testing::{Defect, gpu, is_checked, with_defect};
 use nightsplat::gpu::{CheckReport, Gpu};
 use nightsplat::image::Image;
 use nightsplat::nn::Form;
@@ -238,7 +238,7 @@ fn a_wrong_wiring_is_named_where_it_arises() {
     for (kernel, word, bits, buffer) in [
         ("project", 12, 0x0040_0000, "splats"),
         ("blend_forward", 2, 1, "render"),
-        ("ssim_backward", 6, 0x0080_0000, "d_render"),
+        ("ssim_backward", 8, 0x0080_0000, "d_render"),
         ("adam", 4, 0x0080_0000, "parameters"),
         ("sort_upsweep", 2, 1, "table"),
     ] {
@@ -253,6 +253,17 @@ fn a_wrong_wiring_is_named_where_it_arises() {
         let is_index = matches!(kernel, "project" | "blend_forward" | "sort_upsweep");
         assert_eq!(report.passes.iter().any(|pass| pass.error.is_none()), is_index, "{kernel}");
     }
+}
+
+#[test]
+fn a_panic_ends_what_is_checked_and_takes_the_defect_along() {
+    let gpu = gpu();
+    let defect = Defect { kernel: "project", word: 12, bits: 0x0040_0000 };
+    let work = || gpu.checked(|| with_defect(defect, || panic!("on purpose")));
+    assert!(std::panic::catch_unwind(std::panic::AssertUnwindSafe(work)).is_err());
+    assert!(!is_checked(&gpu));
+    assert_steps_agree("behind a panic", &config(&[]));
+    assert!(!is_checked(&gpu));
 }
 
 #[test]

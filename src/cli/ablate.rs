@@ -6,8 +6,9 @@ use std::path::PathBuf;
 use anyhow::Result;
 
 use super::comparison::{self, Run};
+use super::progress;
 use super::table;
-use super::train::{TrainOptions, held_unless, train_with_bar};
+use super::train::{TrainOptions, held_unless};
 use crate::Error;
 use crate::dataset::Dataset;
 use crate::eval;
@@ -71,7 +72,7 @@ pub fn run(args: &AblateArgs) -> Result<()> {
         tracing::info!("{} of {}: {title}", i + 1, models.len());
         let out = args.out.join(folder);
         let held = held_unless(args.overwrite);
-        let trained = train_with_bar(&gpu, config, None, &dataset, &out, held)?;
+        let trained = progress::train(&gpu, config, &dataset, &out, held)?;
         runs.push(Run::new(title.clone(), trained));
     }
     let dark = eval::score(&dataset, |view| {

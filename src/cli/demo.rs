@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Result;
 
 use super::comparison::{self, Run};
-use super::{table, train};
+use super::{progress, table};
 use crate::Error;
 use crate::dataset::Dataset;
 use crate::dataset::synthetic::{self, SyntheticOptions};
@@ -104,7 +104,7 @@ fn config(curve: ToneCurve, dataset: &Dataset, gpu: &Gpu) -> TrainConfig {
 fn train_with(curve: ToneCurve, gpu: &Gpu, dataset: &Dataset, out: &Path) -> crate::Result<Run> {
     let config = config(curve, dataset, gpu);
     let folder = out.join(curve.name());
-    let trained = train::train_with_bar(gpu, &config, None, dataset, &folder, HeldRun::Replace)?;
+    let trained = progress::train(gpu, &config, dataset, &folder, HeldRun::Replace)?;
     Ok(Run::new(title(curve), trained))
 }
 

@@ -1,19 +1,19 @@
 //! `nightsplat train`: dark photographs in, a run directory out.
 
-use std::io::{IsTerminal, Write};
+use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use anyhow::Result;
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use super::diagnose;
+use super::progress::{Progress, ProgressForm, summary};
 use crate::dataset::Dataset;
 use crate::densify::DensityControl;
 use crate::diagnose::{Diagnosis, Plan};
-use crate::eval::{self, ViewScore};
+use crate::eval;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::nn::Precision;
-use crate::run::{self, Event, HeldRun, RunDirectory, Trained};
+use crate::run::{self, HeldRun, RunDirectory, Trained};
 use crate::tone::{CurveChoice, GainChoice, Profile, ToneCurve, ToneSettings};
 use crate::train::{Background, Learning, ModelName, Part, Preset, TrainConfig};
 
@@ -39,6 +39,9 @@ pub struct TrainArgs {
     /// The plan that `nightsplat diagnose --plan` wrote, in place of a diagnosis now; none: no plan, the defaults
     #[arg(long, value_name = "FILE|none")]
     pub plan: Option<PathBuf>,
+    /// How to say what the run does [default: a bar on a terminal, else plain]
+    #[arg(long, value_enum, value_name = "FORM")]
+    pub progress: Option<ProgressForm>,
     #[command(flatten)]
     pub(crate) options: TrainOptions,
 }
@@ -322,13 +325,21 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     }
     let gpu = Gpu::new(&config.device.parse::<DeviceChoice>()?)?;
     let Planned { config, plan, dataset } = planned(args, config, &gpu)?;
-    let mut out = std::io::stdout().lock();
-    if let Some(plan) = &plan {
+    let form = args.progress.unwrap_or_else(ProgressForm::of_terminal);
+    let is_text = form != ProgressForm::Json;
+    let mut out = std::io::stdout();
+    if let Some(plan) = plan.as_ref().filter(|_| is_text) {
         say(&mut out, args, &gpu, &dataset, plan)?;
     }
     let held = if args.resume { HeldRun::Resume } else { held_unless(args.overwrite) };
+    let mut progress = Progress::new(form);
     let Trained { trainer, scored, spent, .. } =
-        train_with_bar(&gpu, &config, plan.as_ref(), &dataset, &args.out, held)?;
+        run::train_planned(&gpu, &config, plan.as_ref(), &dataset, &args.out, held, |event| {
+            progress.observe(event);
+        })?;
+    if !is_text {
+        return Ok(());
+    }
     let gaussians = trainer.gaussian_count();
     if let Some(line) = summary(&scored) {
         writeln!(out, "{line}")?;
@@ -407,58 +418,4 @@ fn say(
 /// What `--overwrite` says.
 pub(crate) fn held_unless(overwrite: bool) -> HeldRun {
     if overwrite { HeldRun::Replace } else { HeldRun::Refuse }
-}
-
-/// Trains behind a progress bar; scores on the way go to the log.
-pub(crate) fn train_with_bar(
-    gpu: &Gpu,
-    config: &TrainConfig,
-    plan: Option<&Plan>,
-    dataset: &Dataset,
-    out: &Path,
-    held: HeldRun,
-) -> crate::Result<Trained> {
-    let mut bar = ProgressBar::hidden();
-    run::train_planned(gpu, config, plan, dataset, out, held, |event| match event {
-        Event::Started { step, steps } => bar = progress_bar(steps).with_position(step),
-        Event::Step(report) => {
-            bar.set_position(report.step);
-            bar.set_message(format!("loss {:.4}  {} Gaussians", report.loss, report.gaussians));
-        }
-        Event::Evaluated { step, scored } if step < config.steps => {
-            if let Some(line) = summary(scored) {
-                bar.suspend(|| tracing::info!("step {step}: {line}"));
-            }
-        }
-        Event::Evaluated { .. } => bar.finish_and_clear(),
-        _ => {}
-    })
-}
-
-/// The mean scores in a line; none where nothing was scored.
-fn summary(scored: &[ViewScore]) -> Option<String> {
-    let (mean, r0) = eval::means(scored);
-    let mean = mean?;
-    let before = r0.map(|r0| format!("; before the denoiser {:.2} dB, {:.3}", r0.psnr, r0.ssim));
-    Some(format!(
-        "{} test views: PSNR {:.2} dB (channel mean {:.2}), SSIM {:.3}{}",
-        scored.len(),
-        mean.psnr,
-        mean.psnr_channel_mean,
-        mean.ssim,
-        before.unwrap_or_default()
-    ))
-}
-
-/// Step, loss, Gaussians, steps per second and time left; nothing where stderr is no terminal.
-fn progress_bar(steps: u64) -> ProgressBar {
-    let bar = ProgressBar::new(steps);
-    if !std::io::stderr().is_terminal() {
-        bar.set_draw_target(ProgressDrawTarget::hidden());
-    }
-    let template = "{bar:32} {pos}/{len}  {msg}  {per_sec}  {eta} left";
-    if let Ok(style) = ProgressStyle::with_template(template) {
-        bar.set_style(style);
-    }
-    bar
 }

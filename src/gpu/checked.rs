@@ -56,15 +56,36 @@ impl Gpu {
     /// done comes out as it would unchecked, bit for bit. What a host records itself ([`Gpu::record_into`]) and what is
     /// profiled is not checked.
     pub fn checked<R>(&self, work: impl FnOnce() -> R) -> (R, CheckReport) {
-        let outer = self.shared.checks.take();
-        self.shared.checks.put(CheckReport::default());
+        let scope = CheckedScope { checks: &self.shared.checks, outer: self.shared.checks.take() };
+        scope.checks.put(CheckReport::default());
         let result = work();
-        let report = self.shared.checks.take().unwrap_or_default();
-        if let Some(mut outer) = outer {
+        (result, scope.end())
+    }
+}
+
+/// While it lives, this thread's submissions are checked; also where the work panics, checking ends with it.
+struct CheckedScope<'a> {
+    checks: &'a Checks,
+    /// The report of the work around it.
+    outer: Option<CheckReport>,
+}
+
+impl CheckedScope<'_> {
+    fn end(mut self) -> CheckReport {
+        let report = self.checks.take().unwrap_or_default();
+        if let Some(outer) = &mut self.outer {
             outer.extend(report.clone());
-            self.shared.checks.put(outer);
         }
-        (result, report)
+        report
+    }
+}
+
+impl Drop for CheckedScope<'_> {
+    fn drop(&mut self) {
+        match self.outer.take() {
+            Some(outer) => self.checks.put(outer),
+            None => drop(self.checks.take()),
+        }
     }
 }
 

@@ -44,6 +44,11 @@ pub fn recorded(gpu: &Gpu) -> [u64; 2] {
     [dispatches, barriers].map(|count| count.load(Ordering::Relaxed))
 }
 
+/// Whether what this thread submits is checked.
+pub fn is_checked(gpu: &Gpu) -> bool {
+    gpu.shared.checks.are_on()
+}
+
 /// A wrong wiring: of the pass's parameters, `bits` of 32-bit number `word` reach the device flipped.
 #[derive(Clone, Copy, Debug)]
 pub struct Defect {
@@ -61,10 +66,16 @@ thread_local! {
 
 /// Does `work` on a device that has the defect, as far as it is checked.
 pub fn with_defect<R>(defect: Defect, work: impl FnOnce() -> R) -> R {
+    struct Planted;
+    impl Drop for Planted {
+        fn drop(&mut self) {
+            DEFECT.set(None);
+        }
+    }
     DEFECT.set(Some(defect));
-    let result = work();
-    DEFECT.set(None);
-    result
+    // Out again also where the work panics.
+    let _planted = Planted;
+    work()
 }
 
 /// Alters the parameters of the defective kernel.

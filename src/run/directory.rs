@@ -222,12 +222,20 @@ impl RunDirectory {
         self.log_line(&format!("{step},{view},{loss:.6},{terms}{gaussians},{milliseconds:.2}"))
     }
 
+    /// What was logged is in the file, for whoever watches.
+    ///
+    /// # Errors
+    /// The disk is full or gone.
+    pub fn flush_log(&mut self) -> Result<()> {
+        self.log.flush().map_err(|error| unwritable(&self.path, &error))
+    }
+
     /// Writes `model.ply`, in the colours that viewers show.
     ///
     /// # Errors
     /// The disk is full or gone.
     pub fn save_model(&mut self, gaussians: &Gaussians, raw_colors: bool) -> Result<()> {
-        self.log.flush().map_err(|error| unwritable(&self.path, &error))?;
+        self.flush_log()?;
         let path = self.path.join("model.ply");
         if !raw_colors {
             return ply::save(gaussians, path);

@@ -198,6 +198,7 @@ impl<'a> Course<'a> {
                 directory.log(report)?;
                 observe(Event::Step(report));
             }
+            directory.flush_log()?;
             let Some(step) = reports.last().map(|report| report.step) else { continue };
             let falls_on = |every: u64| every > 0 && step.is_multiple_of(every);
             // Before the checkpoint: what goes on from there knows the score.

@@ -1,0 +1,241 @@
+//! What a run says while it trains.
+
+use std::io::{IsTerminal, Write};
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use indicatif::{ProgressBar, ProgressStyle};
+use serde_json::{Value, json};
+
+use crate::dataset::Dataset;
+use crate::eval::{self, ViewScore};
+use crate::gpu::Gpu;
+use crate::run::{self, Event, HeldRun, Trained};
+use crate::train::{StepReport, TrainConfig};
+
+/// How a run says what it does.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum ProgressForm {
+    /// A bar on standard error
+    Bar,
+    /// A line on standard error every ten seconds
+    Plain,
+    /// A line of JSON on standard output for each event, steps every ten seconds, and nothing else there
+    Json,
+    /// Nothing
+    None,
+}
+
+impl ProgressForm {
+    /// What suits whoever reads standard error.
+    pub(crate) fn of_terminal() -> Self {
+        if std::io::stderr().is_terminal() { Self::Bar } else { Self::Plain }
+    }
+}
+
+/// How long a run is silent.
+const SILENCE: Duration = Duration::from_secs(10);
+
+/// Trains, and says so as suits whoever reads standard error.
+///
+/// # Errors
+/// Those of [`run::train`].
+pub(crate) fn train(
+    gpu: &Gpu,
+    config: &TrainConfig,
+    dataset: &Dataset,
+    out: &Path,
+    held: HeldRun,
+) -> crate::Result<Trained> {
+    let mut progress = Progress::new(ProgressForm::of_terminal());
+    run::train(gpu, config, dataset, out, held, |event| progress.observe(event))
+}
+
+/// Says what a run does, event by event.
+#[derive(Debug)]
+pub(crate) struct Progress {
+    form: ProgressForm,
+    bar: ProgressBar,
+    /// The last step.
+    steps: u64,
+    /// When the run began, and behind which step.
+    begin: (Instant, u64),
+    spoke: Instant,
+}
+
+impl Progress {
+    pub(crate) fn new(form: ProgressForm) -> Self {
+        let now = Instant::now();
+        Self { form, bar: ProgressBar::hidden(), steps: 0, begin: (now, 0), spoke: now }
+    }
+
+    /// Says it.
+    pub(crate) fn observe(&mut self, event: Event<'_>) {
+        match self.form {
+            ProgressForm::Bar => self.draw(event),
+            ProgressForm::Plain => self.write(event),
+            ProgressForm::Json => self.print(event),
+            ProgressForm::None => {}
+        }
+    }
+
+    fn draw(&mut self, event: Event<'_>) {
+        match event {
+            Event::Started { step, steps } => {
+                self.start(step, steps);
+                self.bar = bar(steps).with_position(step);
+            }
+            Event::Step(report) => {
+                self.bar.set_position(report.step);
+                let StepReport { loss, gaussians, .. } = report;
+                self.bar.set_message(format!("loss {loss:.4}  {gaussians} Gaussians"));
+            }
+            Event::Evaluated { step, scored } => {
+                if let Some(line) = summary(scored).filter(|_| step < self.steps) {
+                    self.bar.suspend(|| say(&format!("step {step}: {line}")));
+                }
+            }
+            Event::Finished(_) => self.bar.finish_and_clear(),
+            _ => {}
+        }
+    }
+
+    fn write(&mut self, event: Event<'_>) {
+        match event {
+            Event::Started { step, steps } => self.start(step, steps),
+            Event::Step(report) if self.is_due(report.step) => {
+                let StepReport { step, loss, gaussians, .. } = report;
+                let (each, left) = self.pace(*step);
+                say(&format!(
+                    "step {step} of {}: loss {loss:.4}, {gaussians} Gaussians, {each:.0} ms a step, {} left",
+                    self.steps,
+                    duration(left)
+                ));
+            }
+            Event::HeldOut { step, psnr } => {
+                say(&format!("step {step}: held-out views {psnr:.2} dB against their targets"));
+            }
+            Event::Evaluated { step, scored } => {
+                if let Some(line) = summary(scored).filter(|_| step < self.steps) {
+                    say(&format!("step {step}: {line}"));
+                }
+            }
+            _ => {}
+        }
+    }
+
+    fn print(&mut self, event: Event<'_>) {
+        let line = match event {
+            Event::Started { step, steps } => {
+                self.start(step, steps);
+                json!({ "event": "started", "step": step, "steps": steps })
+            }
+            Event::Step(report) if self.is_due(report.step) => {
+                let StepReport { step, view, loss, gaussians, .. } = report;
+                let (each, left) = self.pace(*step);
+                json!({
+                    "event": "step", "step": step, "steps": self.steps, "view": view, "loss": loss,
+                    "gaussians": gaussians, "ms_per_step": each, "seconds_left": left,
+                })
+            }
+            Event::Checkpointed { step } => json!({ "event": "checkpointed", "step": step }),
+            Event::HeldOut { step, psnr } => {
+                json!({ "event": "held_out", "step": step, "psnr": psnr })
+            }
+            Event::Evaluated { step, scored } => {
+                json!({ "event": "evaluated", "step": step, "mean": scores(scored) })
+            }
+            Event::Finished(trained) => json!({
+                "event": "finished",
+                "step": trained.trainer.steps_done(),
+                "gaussians": trained.trainer.gaussian_count(),
+                "seconds": trained.spent.seconds,
+                "mean": scores(&trained.scored),
+            }),
+            _ => return,
+        };
+        // Nobody reads on: the run is worth more than its report.
+        let _ = writeln!(std::io::stdout(), "{line}");
+    }
+
+    fn start(&mut self, step: u64, steps: u64) {
+        let now = Instant::now();
+        (self.steps, self.begin, self.spoke) = (steps, (now, step), now);
+    }
+
+    /// The last step is always due.
+    fn is_due(&mut self, step: u64) -> bool {
+        let is_due = step == self.steps || self.spoke.elapsed() >= SILENCE;
+        if is_due {
+            self.spoke = Instant::now();
+        }
+        is_due
+    }
+
+    /// Milliseconds of a step so far, and the seconds left at that speed.
+    fn pace(&self, step: u64) -> (f64, f64) {
+        let (begin, before) = self.begin;
+        let each = begin.elapsed().as_secs_f64() / (step - before).max(1) as f64;
+        (1e3 * each, each * (self.steps - step) as f64)
+    }
+}
+
+/// The mean scores in a line; none where nothing was scored.
+pub(crate) fn summary(scored: &[ViewScore]) -> Option<String> {
+    let (mean, r0) = eval::means(scored);
+    let mean = mean?;
+    let before = r0.map(|r0| format!("; before the denoiser {:.2} dB, {:.3}", r0.psnr, r0.ssim));
+    Some(format!(
+        "{} test views: PSNR {:.2} dB (channel mean {:.2}), SSIM {:.3}{}",
+        scored.len(),
+        mean.psnr,
+        mean.psnr_channel_mean,
+        mean.ssim,
+        before.unwrap_or_default()
+    ))
+}
+
+/// The means as JSON; null where nothing was scored.
+fn scores(scored: &[ViewScore]) -> Value {
+    let means = eval::means(scored).0;
+    means.map_or(Value::Null, |mean| {
+        json!({
+            "psnr": mean.psnr,
+            "psnr_channel_mean": mean.psnr_channel_mean,
+            "ssim": mean.ssim,
+            "views": scored.len(),
+        })
+    })
+}
+
+/// Seconds as people say them.
+fn duration(seconds: f64) -> String {
+    match seconds.round() as u64 {
+        seconds @ 0..60 => format!("{seconds} s"),
+        seconds @ 60..3600 => format!("{} min {} s", seconds / 60, seconds % 60),
+        seconds => format!("{} h {} min", seconds / 3600, seconds % 3600 / 60),
+    }
+}
+
+fn say(line: &str) {
+    // Where standard error is closed there is nobody to tell.
+    let _ = writeln!(std::io::stderr(), "{line}");
+}
+
+/// Step, loss, Gaussians, steps per second and time left.
+fn bar(steps: u64) -> ProgressBar {
+    let template = "{bar:32} {pos}/{len}  {msg}  {per_sec}  {eta} left";
+    let style = ProgressStyle::with_template(template);
+    ProgressBar::new(steps).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::duration;
+
+    #[test]
+    fn a_duration_has_two_units_at_most() {
+        let said = [0.4, 59.4, 60.0, 156.0, 3600.0, 9000.0].map(duration);
+        assert_eq!(said, ["0 s", "59 s", "1 min 0 s", "2 min 36 s", "1 h 0 min", "2 h 30 min"]);
+    }
+}
