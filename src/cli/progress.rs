@@ -103,15 +103,7 @@ impl Progress {
     fn write(&mut self, event: Event<'_>) {
         match event {
             Event::Started { step, steps } => self.start(step, steps),
-            Event::Step(report) if self.is_due(report.step) => {
-                let StepReport { step, loss, gaussians, .. } = report;
-                let (each, left) = self.pace(*step);
-                say(&format!(
-                    "step {step} of {}: loss {loss:.4}, {gaussians} Gaussians, {each:.0} ms a step, {} left",
-                    self.steps,
-                    duration(left)
-                ));
-            }
+            Event::Step(report) if self.is_due() => say(&self.line(report)),
             Event::HeldOut { step, psnr } => {
                 say(&format!("step {step}: held-out views {psnr:.2} dB against their targets"));
             }
@@ -130,7 +122,7 @@ impl Progress {
                 self.start(step, steps);
                 json!({ "event": "started", "step": step, "steps": steps })
             }
-            Event::Step(report) if self.is_due(report.step) => {
+            Event::Step(report) if self.is_due() || report.step == self.steps => {
                 let StepReport { step, view, loss, gaussians, .. } = report;
                 let (each, left) = self.pace(*step);
                 json!({
@@ -163,13 +155,20 @@ impl Progress {
         (self.steps, self.begin, self.spoke) = (steps, (now, step), now);
     }
 
-    /// The last step is always due.
-    fn is_due(&mut self, step: u64) -> bool {
-        let is_due = step == self.steps || self.spoke.elapsed() >= SILENCE;
+    fn is_due(&mut self) -> bool {
+        let is_due = self.spoke.elapsed() >= SILENCE;
         if is_due {
             self.spoke = Instant::now();
         }
         is_due
+    }
+
+    fn line(&self, StepReport { step, loss, gaussians, .. }: &StepReport) -> String {
+        let (each, left) = self.pace(*step);
+        let (steps, left) = (self.steps, duration(left));
+        format!(
+            "step {step} of {steps}: loss {loss:.4}, {gaussians} Gaussians, {each:.0} ms a step, {left} left"
+        )
     }
 
     /// Milliseconds of a step so far, and the seconds left at that speed.
@@ -231,7 +230,27 @@ fn bar(steps: u64) -> ProgressBar {
 
 #[cfg(test)]
 mod tests {
-    use super::duration;
+    use super::*;
+
+    #[test]
+    fn a_line_says_how_far_a_run_is_and_how_long_it_will_take() {
+        let mut progress = Progress::new(ProgressForm::Plain);
+        progress.start(100, 400);
+        progress.begin.0 -= Duration::from_secs(50);
+        let report = StepReport {
+            step: 200,
+            view: "a".to_owned(),
+            loss: 0.04321,
+            terms: vec![],
+            gaussians: 2400,
+            milliseconds: 480.0,
+        };
+        let said = "step 200 of 400: loss 0.0432, 2400 Gaussians, 500 ms a step, 1 min 40 s left";
+        assert_eq!(progress.line(&report), said);
+        assert!(!progress.is_due());
+        progress.spoke -= SILENCE;
+        assert!(progress.is_due() && !progress.is_due());
+    }
 
     #[test]
     fn a_duration_has_two_units_at_most() {
