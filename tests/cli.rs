@@ -499,6 +499,7 @@ fn misuse_is_said_in_one_line_with_exit_code_2() {
     refused("evaluate x", 2, &["evaluate"]);
     refused("render x --split none --out y", 2, &["none", "train, test, all"]);
     refused("bench --repeats 0", 2, &["--repeats"]);
+    refused("train photos --out run --steps -3", 2, &["--steps", "-3"]);
 }
 
 #[test]

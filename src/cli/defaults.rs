@@ -6,11 +6,15 @@ use toml::{Table, Value};
 use crate::train::TrainConfig;
 
 /// The command with `{tone.theta}` in an option's help replaced by the default of that setting, and `{tone.gain_c of
-/// ase}` by the one that comes with that curve.
+/// ase}` by the one that comes with that curve. A negative number is a value, so that what refuses it names its option.
 pub(super) fn shown(command: Command) -> Command {
-    command.mut_args(|arg| match arg.get_help().map(ToString::to_string) {
-        Some(help) if help.contains('{') => arg.help(filled(&help)),
-        _ => arg,
+    command.mut_args(|arg| {
+        let takes_values = arg.get_action().takes_values();
+        let arg = arg.allow_negative_numbers(takes_values);
+        match arg.get_help().map(ToString::to_string) {
+            Some(help) if help.contains('{') => arg.help(filled(&help)),
+            _ => arg,
+        }
     })
 }
 

@@ -32,21 +32,39 @@ struct ListedFrame {
 
 #[derive(Clone, Default, Deserialize)]
 struct Intrinsics {
+    #[serde(default, deserialize_with = "number")]
     w: Option<f64>,
+    #[serde(default, deserialize_with = "number")]
     h: Option<f64>,
+    #[serde(default, deserialize_with = "number")]
     fl_x: Option<f64>,
+    #[serde(default, deserialize_with = "number")]
     fl_y: Option<f64>,
+    #[serde(default, deserialize_with = "number")]
     camera_angle_x: Option<f64>,
+    #[serde(default, deserialize_with = "number")]
     cx: Option<f64>,
+    #[serde(default, deserialize_with = "number")]
     cy: Option<f64>,
+    #[serde(default, deserialize_with = "number")]
     k1: Option<f64>,
+    #[serde(default, deserialize_with = "number")]
     k2: Option<f64>,
+    #[serde(default, deserialize_with = "number")]
     k3: Option<f64>,
+    #[serde(default, deserialize_with = "number")]
     k4: Option<f64>,
+    #[serde(default, deserialize_with = "number")]
     p1: Option<f64>,
+    #[serde(default, deserialize_with = "number")]
     p2: Option<f64>,
     camera_model: Option<String>,
     is_fisheye: Option<bool>,
+}
+
+/// A number that is there; null stands for NaN, which is not the same as leaving it out.
+fn number<'de, D: serde::Deserializer<'de>>(value: D) -> Result<Option<f64>, D::Error> {
+    Option::<f64>::deserialize(value).map(|number| number.or(Some(f64::NAN)))
 }
 
 /// The files that make up a listing below `root`, with the split each stands for; empty where there is none.

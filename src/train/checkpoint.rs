@@ -83,8 +83,11 @@ impl Trainer {
             for (name, shape, values) in &downloads {
                 views.push(view(name, shape, Dtype::F32, bytemuck::cast_slice(values))?);
             }
+            // It is read by whoever may read the run: safetensors gives what it writes to its owner alone.
+            let permissions = std::fs::File::create(path)?.metadata()?.permissions();
             safetensors::serialize_to_file(views, Some(metadata), path)
                 .map_err(std::io::Error::other)?;
+            std::fs::set_permissions(path, permissions)?;
             // A checkpoint is for the day the power fails.
             std::fs::File::open(path)?.sync_all()
         })

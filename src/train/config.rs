@@ -271,6 +271,11 @@ impl TrainConfig {
                 exposures a gain on their lifted targets does not describe; leave one of them out";
             return Err(Error::Usage(problem.to_owned()));
         }
+        if i64::try_from(self.seed).is_err() {
+            let (seed, most) = (self.seed, i64::MAX);
+            let problem = format!("`TrainConfig::seed` is {seed}; it must be at most {most}");
+            return Err(Error::Usage(problem));
+        }
         let density = &self.density;
         let rules = [
             ("`TrainConfig::steps`", self.steps as f64, self.steps >= 1, "at least 1"),

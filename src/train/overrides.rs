@@ -56,8 +56,13 @@ impl TrainConfig {
             "stop.every",
             "stop.gain",
         ];
-        let [own, others] =
-            [self, other].map(|config| settings("", &Table::try_from(config).unwrap_or_default()));
+        let tables = [self, other].map(Table::try_from);
+        let [own, others] = match &tables {
+            [Ok(own), Ok(others)] => [own, others].map(|table| settings("", table)),
+            [Err(error), _] | [_, Err(error)] => {
+                return Some(format!("a setting that cannot be compared ({error})"));
+            }
+        };
         let value = |settings: &BTreeMap<String, Value>, key: &str| {
             settings.get(key).map_or_else(|| "nothing".to_owned(), Value::to_string)
         };
@@ -182,6 +187,15 @@ mod tests {
             ..TrainConfig::default()
         };
         assert_eq!(config.difference(&other).unwrap(), "model.depth_folder = nothing, not \"d\"");
+    }
+
+    #[test]
+    fn what_toml_cannot_hold_is_a_difference() {
+        let huge = TrainConfig { seed: u64::MAX, ..TrainConfig::default() };
+        assert!(huge.difference(&TrainConfig::default()).is_some());
+        assert!(TrainConfig::default().difference(&huge).is_some());
+        let message = huge.check().unwrap_err().to_string();
+        assert!(message.contains("`TrainConfig::seed` is 18446744073709551615"), "{message}");
     }
 
     fn with(assignments: &[&str]) -> Result<TrainConfig> {

@@ -268,6 +268,22 @@ fn a_pose_that_is_not_finite_or_no_rotation_is_named_and_left_out() {
 }
 
 #[test]
+fn a_focal_length_that_is_no_number_is_not_taken_for_one_left_out() {
+    for key in ["fl_x", "cx", "k1"] {
+        let folder = tempfile::tempdir().unwrap();
+        single(folder.path(), 4);
+        let path = folder.path().join("transforms.json");
+        edit_json(&path, |json| {
+            json["camera_angle_x"] = json!(0.9);
+            json[key] = json!("HERE");
+        });
+        let text = fs::read_to_string(&path).unwrap().replace("\"HERE\"", "NaN");
+        fs::write(&path, text).unwrap();
+        refused(folder.path(), &["v00", "mend the intrinsics"]);
+    }
+}
+
+#[test]
 fn a_photograph_whose_size_contradicts_its_camera_is_refused() {
     let folder = tempfile::tempdir().unwrap();
     single(folder.path(), 4);
