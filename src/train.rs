@@ -8,6 +8,7 @@ mod model;
 mod networks;
 mod overrides;
 mod parts;
+mod precision;
 mod preset;
 mod submission;
 mod terms;
@@ -39,6 +40,7 @@ pub use held_out::StopConfig;
 use model::Model;
 pub use networks::Networks;
 pub use parts::{ModelConfig, ModelName, NetworkRates, Part};
+pub use precision::{PhotographBits, PrecisionConfig};
 pub use preset::Preset;
 use submission::{MOST_STEPS, Pace};
 use terms::NetworkTerms;
@@ -160,6 +162,8 @@ pub struct Trainer {
     exposures: Option<Exposures>,
     adam: Adam,
     densifier: Densifier,
+    /// Of a step's view, what is kept in fewer bits: the loss's input, and the photograph where a network sees it besides.
+    decoded: [Buffer<f32>; 2],
     d_render: Buffer<f32>,
     log: LossLog,
     pace: Pace,
@@ -215,8 +219,9 @@ impl Trainer {
         let mut pseudo_gt = PseudoGt::new(gpu, &config.tone)?;
         let levels = config.schedule.resolution_levels();
         let has_networks = config.model.denoiser || config.model.tonemapper;
+        let bits = config.precision.photographs;
         let (views, scene, target_exposure) =
-            Views::upload(gpu, &mut pseudo_gt, dataset, levels, has_networks)?;
+            Views::upload(gpu, &mut pseudo_gt, dataset, levels, has_networks, bits)?;
         let held_out = HeldOut::new(&mut pseudo_gt, dataset, &scene)?;
         if let Some(TargetExposure { scene, .. }) = &target_exposure {
             tracing::info!("{}", scene.reason());
@@ -246,6 +251,7 @@ impl Trainer {
         }
         let Kernels { renderer, adam, densifier } =
             kernels.join().unwrap_or_else(|panic| resume_unwind(panic))?;
+        let [inputs, photographs] = views.decoded_lens();
         let mut trainer = Self {
             gpu: gpu.clone(),
             extent: dataset.extent(),
@@ -260,6 +266,7 @@ impl Trainer {
             exposures,
             adam,
             densifier,
+            decoded: [gpu.uninit("decoded", inputs)?, gpu.uninit("decoded low", photographs)?],
             d_render: gpu.uninit("d_render", values)?,
             log: LossLog::new(gpu, MOST_STEPS as usize)?,
             pace: Pace::default(),
@@ -381,10 +388,12 @@ impl Trainer {
         };
         let damping = Damping { weight: schedule.damping_weight(step), depth: self.extent as f32 };
         let model = &mut self.model;
+        let [decoded, decoded_photograph] = &mut self.decoded;
 
         self.renderer.forward(pass, &model.gaussians.parameters, &view.camera, &options)?;
         let (render, status) = self.renderer.render_and_status();
         let (d_render, size) = (&mut self.d_render, view.size());
+        let input = view.input.decoded(pass, decoded)?;
         let log = &mut LogSlot { log: &mut self.log, slot, status };
         let inputs = &TermInputs {
             step,
@@ -393,7 +402,7 @@ impl Trainer {
             features: model.shape().features,
             render,
             colors: render,
-            low: view.loss_input(),
+            low: input,
             tone: &view.tone,
         };
         match &mut self.exposures {
@@ -406,7 +415,11 @@ impl Trainer {
             None => self.losses.record(pass, inputs, d_render, log)?,
         }
         if let Some(networks) = &mut self.networks {
-            networks.record(pass, inputs, view.photograph(), d_render, log)?;
+            let photograph = match &view.photograph {
+                Some(photograph) => photograph.decoded(pass, decoded_photograph)?,
+                None => input,
+            };
+            networks.record(pass, inputs, photograph, d_render, log)?;
         }
         self.renderer.backward(
             pass,

@@ -7,6 +7,7 @@ use std::sync::Arc;
 use glam::{DVec3, UVec2};
 use serde::Serialize;
 
+use super::precision::{Darkroom, Photograph, PhotographBits};
 use super::{TrainConfig, streams};
 use crate::Result;
 use crate::camera::Camera;
@@ -35,9 +36,9 @@ pub(super) struct TrainView {
     /// Depth from elsewhere, (H, W), where the dataset's is of another size.
     depth: Option<Vec<f32>>,
     /// What the loss applies `tone` to, planar (3, H, W), sRGB-encoded: the dark photograph, or the target itself.
-    input: Arc<Buffer<f32>>,
+    pub(super) input: Photograph,
     /// The dark photograph, where that is not the input and a network sees it.
-    photograph: Option<Buffer<f32>>,
+    pub(super) photograph: Option<Photograph>,
     /// The curve that the photograph gets; one element. Where the input is the target already, none.
     pub(super) tone: Buffer<ToneParameters>,
     /// Whether the input is the target.
@@ -85,6 +86,7 @@ impl Views {
         dataset: &Dataset,
         levels: usize,
         keeps_photographs: bool,
+        bits: PhotographBits,
     ) -> Result<(Self, Scene, Option<TargetExposure>)> {
         let settings = pseudo_gt.settings().clone();
         let photographs: Vec<(usize, &View, &Image)> = (dataset.views.iter().enumerate())
@@ -96,6 +98,7 @@ impl Views {
             measured.push(pseudo_gt.measure(&lifted_from(view, image, settings.lift_first)?.data)?);
         }
         let scene = settings.scene(&measured).ok_or_else(|| all_black(&dataset.root))?;
+        let mut darkroom = Darkroom::new(gpu, bits);
         let mut views = vec![];
         views.resize_with(levels, Vec::<TrainView>::new);
         let mut gains = BTreeMap::new();
@@ -118,10 +121,10 @@ impl Views {
                     None => None,
                 };
                 let is_baked = target.is_some();
-                let kept =
-                    (is_baked && keeps_photographs).then(|| gpu.buffer("low", &photograph.data));
+                let kept = (is_baked && keeps_photographs)
+                    .then(|| darkroom.upload("low", &photograph.data));
                 let name = if is_baked { "target" } else { "low" };
-                let input = gpu.buffer(name, &target.as_ref().unwrap_or(&photograph).data)?;
+                let input = darkroom.upload(name, &target.as_ref().unwrap_or(&photograph).data)?;
                 let none = ToneSettings::new(ToneCurve::None).parameters(&Statistics::default());
                 let depth = view.depth.as_ref().filter(|_| level > 0);
                 views.push(TrainView {
@@ -131,7 +134,7 @@ impl Views {
                     index,
                     camera: view.camera.resized(size.x, size.y),
                     depth: depth.map(|depth| resized_plane(depth, image, size)),
-                    input: Arc::new(input),
+                    input,
                     photograph: kept.transpose()?,
                     tone: gpu.buffer("tone", &[if is_baked { none } else { lift.parameters }])?,
                     is_baked,
@@ -172,6 +175,15 @@ impl Views {
             order.swap(left as usize, draw as usize);
         }
         &views[order[place as usize]]
+    }
+
+    /// How many floats the largest input, and the largest photograph beside one, have to be decoded to.
+    pub(super) fn decoded_lens(&self) -> [usize; 2] {
+        let views = || self.0.iter().flatten();
+        let inputs = views().map(|view| view.input.decoded_len()).max();
+        let photographs = views().filter_map(|view| view.photograph.as_ref());
+        let photographs = photographs.map(Photograph::decoded_len).max();
+        [inputs, photographs].map(Option::unwrap_or_default)
     }
 
     pub(super) fn cameras(&self) -> impl Iterator<Item = &Camera> {
@@ -261,23 +273,14 @@ impl TrainView {
         UVec2::new(self.camera.width, self.camera.height)
     }
 
-    /// What the loss applies its curve to.
-    pub(super) fn loss_input(&self) -> &Buffer<f32> {
-        &self.input
-    }
-
-    /// The dark photograph, planar (3, H, W); only there where it is the input, or was kept.
-    pub(super) fn photograph(&self) -> &Buffer<f32> {
-        self.photograph.as_ref().unwrap_or(&self.input)
-    }
-
     /// The pseudo-GT of the view, (3, H, W).
     fn target(&self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<Arc<Buffer<f32>>> {
         if self.is_baked {
-            return Ok(Arc::clone(&self.input));
+            return self.input.whole(gpu);
         }
+        let input = self.input.whole(gpu)?;
         let mut target = gpu.uninit("target", self.input.len())?;
-        gpu.run("target", |pass| pseudo_gt.map(pass, &self.input, &self.tone, 0, &mut target))?;
+        gpu.run("target", |pass| pseudo_gt.map(pass, &input, &self.tone, 0, &mut target))?;
         Ok(Arc::new(target))
     }
 
