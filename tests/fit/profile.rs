@@ -11,7 +11,7 @@ use super::*;
 
 /// Mixes channels, and bends each in its own way.
 fn truth() -> Profile {
-    let bent = |power: f64| (0..=16).map(|i| 0.05 + 0.9 * (f64::from(i) / 16.0).powf(power));
+    let bent = |power: f64| (0..=16).map(move |i| 0.05 + 0.9 * (f64::from(i) / 16.0).powf(power));
     Profile {
         reference: "truth".to_owned(),
         pairs: 1,
