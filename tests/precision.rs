@@ -70,7 +70,7 @@ fn a_step_on_coded_photographs_agrees_with_the_references() {
     let (reports, checks) = trainer.check_step();
     assert_eq!(reports.unwrap().len(), 1);
     checks.agree().unwrap();
-    assert!(checks.passes.iter().any(|pass| pass.label == "decode"), "nothing was decoded");
+    assert!(checks.passes.iter().any(|pass| pass.kernel == "decode"), "nothing was decoded");
 }
 
 #[test]
