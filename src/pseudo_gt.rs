@@ -68,7 +68,7 @@ impl Map {
         if let Some(profile) = &settings.profile {
             return Ok(Self::Profile(
                 gpu.pipeline(&kernels::tone_profile::Constants::default())?,
-                gpu.buffer("camera profile", &profile.buffer())?,
+                gpu.buffer("camera profile", &profile.rows())?,
             ));
         }
         Ok(match &settings.table {

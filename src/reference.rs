@@ -19,6 +19,7 @@ mod compensated_sum;
 pub mod conv3x3;
 mod conv3x3_half;
 pub mod conv3x3_weight_gradient;
+mod decode;
 mod denoising;
 mod densify_decide;
 mod densify_moments;

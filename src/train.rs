@@ -9,6 +9,7 @@ mod model;
 mod networks;
 mod overrides;
 mod parts;
+mod precision;
 mod preset;
 mod submission;
 mod terms;
@@ -42,6 +43,7 @@ pub use held_out::StopConfig;
 use model::Model;
 pub use networks::Networks;
 pub use parts::{ModelConfig, ModelName, NetworkRates, Part};
+pub use precision::{PhotographBits, PrecisionConfig};
 pub use preset::Preset;
 use submission::{MOST_STEPS, Pace};
 use terms::{NetworkTerms, Photographs};
@@ -164,6 +166,8 @@ pub struct Trainer {
     exposures: Option<Exposures>,
     adam: Adam,
     densifier: Densifier,
+    /// Of a step's view, what is kept in fewer bits: the loss's input, and the photograph where a network sees it besides.
+    decoded: [Buffer<f32>; 2],
     d_render: Buffer<f32>,
     log: LossLog,
     pace: Pace,
@@ -219,8 +223,9 @@ impl Trainer {
         let mut pseudo_gt = PseudoGt::new(gpu, &config.tone)?;
         let levels = config.schedule.resolution_levels();
         let has_networks = config.model.denoiser || config.model.tonemapper;
+        let bits = config.precision.photographs;
         let (mut views, scene, target_exposure) =
-            Views::upload(gpu, &mut pseudo_gt, dataset, levels, has_networks)?;
+            Views::upload(gpu, &mut pseudo_gt, dataset, levels, has_networks, bits)?;
         if config.model.denoiser && config.model.network.form == Form::Identity {
             views.keep_targets(gpu, &pseudo_gt)?;
         }
@@ -253,6 +258,7 @@ impl Trainer {
         }
         let Kernels { renderer, adam, densifier } =
             kernels.join().unwrap_or_else(|panic| resume_unwind(panic))?;
+        let [inputs, photographs] = views.decoded_lens();
         let mut trainer = Self {
             gpu: gpu.clone(),
             extent: dataset.extent(),
@@ -268,6 +274,7 @@ impl Trainer {
             exposures,
             adam,
             densifier,
+            decoded: [gpu.uninit("decoded", inputs)?, gpu.uninit("decoded low", photographs)?],
             d_render: gpu.uninit("d_render", values)?,
             log: LossLog::new(gpu, MOST_STEPS as usize)?,
             pace: Pace::default(),
@@ -391,10 +398,12 @@ impl Trainer {
         };
         let damping = Damping { weight: schedule.damping_weight(step), depth: self.extent as f32 };
         let model = &mut self.model;
+        let [decoded, decoded_photograph] = &mut self.decoded;
 
         self.renderer.forward(pass, &model.gaussians.parameters, &view.camera, &options)?;
         let (render, status) = self.renderer.render_and_status();
         let (d_render, size) = (&mut self.d_render, view.size());
+        let input = view.input.decoded(pass, decoded)?;
         let log = &mut LogSlot { log: &mut self.log, slot, status };
         let inputs = &TermInputs {
             step,
@@ -403,7 +412,7 @@ impl Trainer {
             features: model.shape().features,
             render,
             colors: render,
-            low: view.loss_input(),
+            low: input,
             tone: &view.tone,
         };
         match &mut self.exposures {
@@ -416,16 +425,20 @@ impl Trainer {
             None => self.losses.record(pass, inputs, d_render, log)?,
         }
         if let Some(networks) = &mut self.networks {
+            let low = match &view.photograph {
+                Some(photograph) => photograph.decoded(pass, decoded_photograph)?,
+                None => input,
+            };
             // Networks see the model at the neutral exposure.
+            let target = view.target.as_deref().unwrap_or(input);
             let target = match &mut self.exposures {
                 Some(exposures) if networks.follow_target() => {
-                    exposures.neutralize(pass, view.place, size, view.kept_target())?;
+                    exposures.neutralize(pass, view.place, size, target)?;
                     exposures.exposed()
                 }
-                _ => view.kept_target(),
+                _ => target,
             };
-            let photographs = Photographs { low: view.photograph(), target };
-            networks.record(pass, inputs, photographs, d_render, log)?;
+            networks.record(pass, inputs, Photographs { low, target }, d_render, log)?;
         }
         self.renderer.backward(
             pass,

@@ -161,8 +161,10 @@ fn dark(pixels: u64) -> Vec<f32> {
 #[test]
 fn every_pass_of_the_pseudo_gt_agrees_with_its_reference_for_every_curve() {
     let gpu = gpu();
-    for curve in ToneCurve::ALL.into_iter().chain([ToneCurve::Auto]) {
-        let settings = ToneSettings::new(curve);
+    let profile = ToneSettings::of_profile(common::setup::profile());
+    let named = ToneCurve::ALL.into_iter().chain([ToneCurve::Auto]).map(ToneSettings::new);
+    for settings in named.chain([profile]) {
+        let curve = settings.curve;
         if settings.check().is_err() {
             continue;
         }

@@ -45,6 +45,7 @@ fn every_kind_of_curve_trains_and_a_recorded_configuration_repeats_it() {
         ToneSettings::new(ToneCurve::Ap3).with_gain(GainChoice::Auto),
         ToneSettings { lift_first: true, ..ToneSettings::new(ToneCurve::Ap3) },
         ToneSettings::of_table(dense_table(ToneCurve::Rational)),
+        ToneSettings::of_profile(common::setup::profile()),
     ];
     for tone in kinds {
         let config = config(tone);

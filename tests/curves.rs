@@ -4,8 +4,11 @@
 
 use nightsplat::gpu::testing::gpu;
 use nightsplat::gpu::{Gpu, Reference, Threads};
-use nightsplat::kernels::{ToneParameters, tone_map, tone_mix, tone_table};
+use nightsplat::kernels::{ToneParameters, tone_map, tone_mix, tone_profile, tone_table};
 use nightsplat::tone::{FAMILIES, Family, Table, TableInput, ToneCurve, ToneSettings, White};
+
+#[macro_use]
+mod common;
 
 /// The method's values after the clamp, as printed.
 const T: [f64; 8] = [0.05, 0.10, 0.25, 0.50, 1.00, 1.50, 2.00, 3.00];
@@ -312,6 +315,38 @@ fn tone_table_matches_its_reference_and_double_precision() {
         let exact = table.value(f64::from(image[i]) / 0.4, i / pixels);
         assert!((found - expected[i]).abs() <= 1e-6, "{i}: {found}, not {}", expected[i]);
         assert!((f64::from(found) - exact).abs() <= 1e-6, "{i}: {found}, not {exact}");
+    }
+}
+
+#[test]
+fn tone_profile_matches_its_reference_and_double_precision() {
+    let made = common::setup::profile();
+    made.check().unwrap();
+    for pixels in [1, 255, 256, 257, 1001] {
+        let mut photograph = photograph(pixels);
+        photograph[0] = f32::NAN;
+        photograph[pixels] = f32::INFINITY;
+        photograph[2 * pixels] = -1.0;
+        let white = 0.07;
+        let tone = ToneParameters { white, offset: 0.0, gain: 1.0, constants: [0.0; 8] };
+        let (image, parameters, profile) = (photograph.clone(), vec![tone], made.rows());
+        let target = vec![0.0_f32; 3 * pixels];
+        let found = run_kernel!(
+            tone_profile,
+            tone_profile::Constants::default(),
+            tone_profile::Params { pixel_count: pixels as u32, view: 0 },
+            Threads::Exactly([pixels as u32, 1, 1]),
+            [image, parameters, profile],
+            [target]
+        );
+        for (i, found) in found.into_iter().enumerate() {
+            let t = [0, 1, 2].map(|channel| match photograph[channel * pixels + i % pixels] {
+                x if x > 0.0 => f64::from(x.min(65504.0)) / f64::from(white),
+                _ => 0.0,
+            });
+            let exact = made.value(t)[i / pixels];
+            assert!((f64::from(found) - exact).abs() <= 3e-6, "{i}: {found}, not {exact}");
+        }
     }
 }
 

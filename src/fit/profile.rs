@@ -346,7 +346,9 @@ pub fn profile_scores(profile: &Profile, pairs: &[&ColourPair]) -> ProfileScores
             });
             -10.0 * (squares.sum::<f64>() / (3 * pair.colours.len()) as f64).log10()
         };
-        pairs.par_iter().map(psnr).sum::<f64>() / pairs.len() as f64
+        // In order: a sum of floats depends on it.
+        let scores: Vec<f64> = pairs.par_iter().map(psnr).collect();
+        scores.iter().sum::<f64>() / pairs.len() as f64
     };
     ProfileScores { profile: mean(&|t| profile.value(t)), auto: mean(&|t| t.map(|t| soft(t, 1.0))) }
 }

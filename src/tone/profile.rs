@@ -95,8 +95,8 @@ impl Profile {
         profiled(t, &self.numbers())
     }
 
-    /// (3, `PROFILE_WIDTH`), as the kernel takes them.
-    pub(crate) fn buffer(&self) -> Vec<f32> {
+    /// (3, `PROFILE_WIDTH`) numbers as the kernel takes them.
+    pub fn rows(&self) -> Vec<f32> {
         self.numbers().into_iter().map(|number| number as f32).collect()
     }
 
@@ -129,11 +129,11 @@ pub(crate) fn profiled<T: Real>(t: [T; 3], profile: &[T]) -> [T; 3] {
 }
 
 #[cfg(test)]
-pub(crate) mod tests {
+mod tests {
     use super::*;
 
     /// Mixes channels a little, and bends each in its own way.
-    pub(crate) fn bent() -> Profile {
+    fn bent() -> Profile {
         let segments = [0.8, 1.0, 1.3]
             .map(|power: f64| (0..=16).map(|i| (f64::from(i) / 16.0).powf(power)).collect());
         Profile {

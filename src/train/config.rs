@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::exposures::{ExposureConfig, Learning};
 use super::held_out::StopConfig;
 use super::parts::ModelConfig;
+use super::precision::PrecisionConfig;
 use super::streams;
 use crate::dataset::{Dataset, DepthOptions, LoadOptions};
 use crate::densify::DensityControl;
@@ -94,6 +95,8 @@ pub struct TrainConfig {
     pub stop: StopConfig,
     /// Gain and bias of each training view.
     pub exposure: ExposureConfig,
+    /// In how many bits things are kept.
+    pub precision: PrecisionConfig,
 }
 
 /// Steps whose every pass is compared with its CPU reference.
@@ -145,6 +148,7 @@ impl Default for TrainConfig {
             model: ModelConfig::default(),
             stop: StopConfig::default(),
             exposure: ExposureConfig::default(),
+            precision: PrecisionConfig::default(),
         }
     }
 }

@@ -161,7 +161,7 @@ impl Trainer {
         let views = self.views.whole();
         let mut some = vec![];
         for view in views.iter().step_by(views.len().div_ceil(MOST).max(1)) {
-            let target = view.image(&self.gpu, view.kept_target())?;
+            let target = view.image(&self.gpu, &*view.kept_target(&self.gpu)?)?;
             let exposure = affines.as_ref().and_then(|affines| affines.get(view.place));
             let neutral = exposure.map_or(target.clone(), |own| own.inverse().applied(&target));
             some.push((view.camera.clone(), neutral));

@@ -7,6 +7,7 @@ use std::sync::Arc;
 use glam::{DVec3, UVec2, Vec3};
 use serde::Serialize;
 
+use super::precision::{Darkroom, Photograph, PhotographBits};
 use super::{TrainConfig, streams};
 use crate::Result;
 use crate::camera::Camera;
@@ -36,15 +37,15 @@ pub(super) struct TrainView {
     /// Depth from elsewhere, (H, W), where the dataset's is of another size.
     depth: Option<Vec<f32>>,
     /// What the loss applies `tone` to, planar (3, H, W), sRGB-encoded: the dark photograph, or the target itself.
-    input: Arc<Buffer<f32>>,
+    pub(super) input: Photograph,
     /// The dark photograph, where that is not the input and a network sees it.
-    photograph: Option<Buffer<f32>>,
+    pub(super) photograph: Option<Photograph>,
     /// The curve that the photograph gets; one element. Where the input is the target already, none.
     pub(super) tone: Buffer<ToneParameters>,
     /// Whether the input is the target.
     is_baked: bool,
     /// The target, where that is not the input and a network is held to it.
-    target: Option<Arc<Buffer<f32>>>,
+    pub(super) target: Option<Arc<Buffer<f32>>>,
 }
 
 /// How bright the targets are, and what a model makes of them.
@@ -88,6 +89,7 @@ impl Views {
         dataset: &Dataset,
         levels: usize,
         keeps_photographs: bool,
+        bits: PhotographBits,
     ) -> Result<(Self, Scene, Option<TargetExposure>)> {
         let settings = pseudo_gt.settings().clone();
         let photographs: Vec<(usize, &View, &Image)> = (dataset.views.iter().enumerate())
@@ -99,6 +101,7 @@ impl Views {
             measured.push(pseudo_gt.measure(&lifted_from(view, image, settings.lift_first)?.data)?);
         }
         let scene = settings.scene(&measured).ok_or_else(|| all_black(&dataset.root))?;
+        let mut darkroom = Darkroom::new(gpu, bits);
         let mut views = vec![];
         views.resize_with(levels, Vec::<TrainView>::new);
         let mut gains = BTreeMap::new();
@@ -121,10 +124,10 @@ impl Views {
                     None => None,
                 };
                 let is_baked = target.is_some();
-                let kept =
-                    (is_baked && keeps_photographs).then(|| gpu.buffer("low", &photograph.data));
+                let kept = (is_baked && keeps_photographs)
+                    .then(|| darkroom.upload("low", &photograph.data));
                 let name = if is_baked { "target" } else { "low" };
-                let input = gpu.buffer(name, &target.as_ref().unwrap_or(&photograph).data)?;
+                let input = darkroom.upload(name, &target.as_ref().unwrap_or(&photograph).data)?;
                 let none = ToneSettings::new(ToneCurve::None).parameters(&Statistics::default());
                 let depth = view.depth.as_ref().filter(|_| level > 0);
                 views.push(TrainView {
@@ -134,7 +137,7 @@ impl Views {
                     index,
                     camera: view.camera.resized(size.x, size.y),
                     depth: depth.map(|depth| resized_plane(depth, image, size)),
-                    input: Arc::new(input),
+                    input,
                     photograph: kept.transpose()?,
                     tone: gpu.buffer("tone", &[if is_baked { none } else { lift.parameters }])?,
                     is_baked,
@@ -194,6 +197,15 @@ impl Views {
         self.0.first().map_or(&[], Vec::as_slice)
     }
 
+    /// How many floats the largest input, and the largest photograph beside one, have to be decoded to.
+    pub(super) fn decoded_lens(&self) -> [usize; 2] {
+        let views = || self.0.iter().flatten();
+        let inputs = views().map(|view| view.input.decoded_len()).max();
+        let photographs = views().filter_map(|view| view.photograph.as_ref());
+        let photographs = photographs.map(Photograph::decoded_len).max();
+        [inputs, photographs].map(Option::unwrap_or_default)
+    }
+
     pub(super) fn cameras(&self) -> impl Iterator<Item = &Camera> {
         self.0.iter().flatten().map(|view| &view.camera)
     }
@@ -248,7 +260,7 @@ impl Views {
             let low = if shape.features.illumination {
                 init::colors_from_views(kept, &dataset.views, |index| {
                     let view = self.0.iter().flatten().find(|view| view.index == index);
-                    view.map(|view| view.image(gpu, view.photograph())).transpose()
+                    view.map(|view| view.image(gpu, &*view.whole_photograph(gpu)?)).transpose()
                 })?
             } else {
                 vec![]
@@ -312,28 +324,24 @@ impl TrainView {
         UVec2::new(self.camera.width, self.camera.height)
     }
 
-    /// What the loss applies its curve to.
-    pub(super) fn loss_input(&self) -> &Buffer<f32> {
-        &self.input
-    }
-
     /// The dark photograph, planar (3, H, W); only there where it is the input, or was kept.
-    pub(super) fn photograph(&self) -> &Buffer<f32> {
-        self.photograph.as_ref().unwrap_or(&self.input)
+    fn whole_photograph(&self, gpu: &Gpu) -> Result<Arc<Buffer<f32>>> {
+        self.photograph.as_ref().unwrap_or(&self.input).whole(gpu)
     }
 
     /// The pseudo-GT of the view, (3, H, W), where the input is that, or it was kept.
-    pub(super) fn kept_target(&self) -> &Buffer<f32> {
-        self.target.as_deref().unwrap_or(&self.input)
+    pub(super) fn kept_target(&self, gpu: &Gpu) -> Result<Arc<Buffer<f32>>> {
+        self.target.as_ref().map_or_else(|| self.input.whole(gpu), |target| Ok(Arc::clone(target)))
     }
 
     /// The pseudo-GT of the view, (3, H, W).
     fn target(&self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<Arc<Buffer<f32>>> {
         if self.is_baked {
-            return Ok(Arc::clone(&self.input));
+            return self.input.whole(gpu);
         }
+        let input = self.input.whole(gpu)?;
         let mut target = gpu.uninit("target", self.input.len())?;
-        gpu.run("target", |pass| pseudo_gt.map(pass, &self.input, &self.tone, 0, &mut target))?;
+        gpu.run("target", |pass| pseudo_gt.map(pass, &input, &self.tone, 0, &mut target))?;
         Ok(Arc::new(target))
     }
 

@@ -9,8 +9,22 @@ use nightsplat::reference::gaussian::{Gaussian, Planes};
 use nightsplat::reference::sh::sh_count;
 use nightsplat::render::{self, Damping, RenderOptions, RenderSettings, Renderer, Status};
 use nightsplat::scene::{Features, Shape};
+use nightsplat::tone::Profile;
 
 use super::Random;
+
+/// A camera profile that mixes channels, and bends each in its own way.
+pub(crate) fn profile() -> Profile {
+    let bent = |power: f64| (0..=16).map(|i| (f64::from(i) / 16.0).powf(power)).collect();
+    Profile {
+        reference: "a scene".to_owned(),
+        pairs: 2,
+        matrix: [[0.8, 0.25, -0.05], [-0.1, 1.2, -0.1], [0.0, 0.3, 0.7]],
+        gain: [1.3, 0.9, 1.1],
+        bias: [-0.1, 0.0, 0.05],
+        segments: [0.6, 1.0, 1.7].map(bent),
+    }
+}
 
 /// Gaussians, a view of them, and what the renderer is specialised for.
 #[derive(Clone)]

@@ -7,6 +7,7 @@
 mod command;
 #[path = "../common/mod.rs"]
 mod common;
+mod profile;
 
 use nightsplat::Error;
 use nightsplat::fit::{

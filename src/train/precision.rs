@@ -1,0 +1,296 @@
+//! In how many bits things are kept on the device; what is computed is always computed in 32.
+
+use std::sync::Arc;
+
+use rayon::slice::ParallelSliceMut;
+use serde::{Deserialize, Serialize};
+
+use crate::Result;
+use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
+use crate::kernels::decode;
+
+/// In how many bits a run keeps what it could keep in fewer.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct PrecisionConfig {
+    /// The training photographs, or the targets that are made of them once.
+    pub photographs: PhotographBits,
+}
+
+/// In how many bits a photograph, or a target, is kept on the device.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub enum PhotographBits {
+    /// As few as give every value back bit for bit: 8 or 16 where a photograph holds few different values, as those from
+    /// 8-bit files do, else 32.
+    #[default]
+    #[serde(rename = "exact")]
+    Exact,
+    /// 32.
+    #[serde(rename = "32")]
+    Single,
+    /// 16 at most: where that cannot be exact, multiples of 1/65535.
+    #[serde(rename = "16")]
+    Sixteen,
+    /// 8: where that cannot be exact, multiples of 1/255.
+    #[serde(rename = "8")]
+    Eight,
+}
+
+/// A planar (3, H, W) photograph or target on the device.
+#[derive(Debug)]
+pub(super) enum Photograph {
+    /// Its values.
+    Plain(Arc<Buffer<f32>>),
+    /// Codes, and what they stand for.
+    Coded(Coded),
+}
+
+#[derive(Debug)]
+pub(super) struct Coded {
+    decoder: Arc<Decoder>,
+    value_count: usize,
+    /// Four or two in a word.
+    codes: Buffer<u32>,
+    /// One per code.
+    values: Arc<Buffer<f32>>,
+}
+
+type Decoder = Pipeline<decode::Kernel>;
+
+/// Brings photographs to the device in the bits that are asked for.
+#[derive(Debug)]
+pub(super) struct Darkroom {
+    gpu: Gpu,
+    bits: PhotographBits,
+    /// Of 8 and of 16 bits, once there is something to decode.
+    decoders: [Option<Arc<Decoder>>; 2],
+    /// The multiples of 1/255 and of 1/65535, once they are needed.
+    grids: [Option<Arc<Buffer<f32>>>; 2],
+}
+
+/// The bits that a code may have.
+const CODE_BITS: [u32; 2] = [8, 16];
+
+/// Codes are worth decoding where they and what they stand for take at most this much of the values' memory.
+const WORTH: f64 = 0.75;
+
+impl Darkroom {
+    pub(super) fn new(gpu: &Gpu, bits: PhotographBits) -> Self {
+        Self { gpu: gpu.clone(), bits, decoders: [None, None], grids: [None, None] }
+    }
+
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub(super) fn upload(&mut self, name: &str, values: &[f32]) -> Result<Photograph> {
+        let plain = |gpu: &Gpu| Ok(Photograph::Plain(Arc::new(gpu.buffer(name, values)?)));
+        if self.bits == PhotographBits::Single {
+            return plain(&self.gpu);
+        }
+        if let Some(palette) = palette(values, self.bits) {
+            let which = usize::from(palette.len() > 1 << CODE_BITS[0]);
+            let code = |value: f32| palette.partition_point(|&own| own < value.to_bits());
+            let palette: Vec<f32> = palette.iter().map(|&bits| f32::from_bits(bits)).collect();
+            let palette = Arc::new(self.gpu.buffer("palette", &palette)?);
+            return self.coded(name, values, which, palette, code);
+        }
+        let which = match self.bits {
+            PhotographBits::Eight => 0,
+            PhotographBits::Sixteen => 1,
+            _ => return plain(&self.gpu),
+        };
+        // A grid from 0 to 1 has no place for what lies beyond, nor for a NaN.
+        if !values.iter().all(|value| (0.0..=1.0).contains(value)) {
+            return plain(&self.gpu);
+        }
+        let last = ((1_u32 << CODE_BITS[which]) - 1) as f32;
+        if self.grids[which].is_none() {
+            let grid: Vec<f32> =
+                (0..1 << CODE_BITS[which]).map(|code| code as f32 / last).collect();
+            self.grids[which] = Some(Arc::new(self.gpu.buffer("grid", &grid)?));
+        }
+        match self.grids[which].clone() {
+            Some(grid) => {
+                self.coded(name, values, which, grid, |value| (value * last).round() as usize)
+            }
+            None => plain(&self.gpu),
+        }
+    }
+
+    fn coded(
+        &mut self,
+        name: &str,
+        values: &[f32],
+        which: usize,
+        palette: Arc<Buffer<f32>>,
+        code: impl Fn(f32) -> usize,
+    ) -> Result<Photograph> {
+        let code_bits = CODE_BITS[which];
+        let decoder = match &self.decoders[which] {
+            Some(decoder) => Arc::clone(decoder),
+            None => Arc::new(self.gpu.pipeline(&decode::Constants { code_bits })?),
+        };
+        self.decoders[which] = Some(Arc::clone(&decoder));
+        let word = |values: &[f32]| {
+            let codes = values.iter().zip((0..).step_by(code_bits as usize));
+            codes.fold(0, |word, (&value, shift)| word | (code(value) as u32) << shift)
+        };
+        let words: Vec<u32> = values.chunks(32 / code_bits as usize).map(word).collect();
+        Ok(Photograph::Coded(Coded {
+            decoder,
+            value_count: values.len(),
+            codes: self.gpu.buffer(name, &words)?,
+            values: palette,
+        }))
+    }
+}
+
+/// The bits of all different values, ascending, where codes for them are worth it.
+fn palette(values: &[f32], bits: PhotographBits) -> Option<Vec<u32>> {
+    let most = 1 << if bits == PhotographBits::Eight { CODE_BITS[0] } else { CODE_BITS[1] };
+    // Where a sample holds too many, sorting the rest can be saved.
+    let sample = different(values.iter().step_by(16));
+    if sample.len() > most {
+        return None;
+    }
+    let palette = different(values.iter());
+    let code_bytes = if palette.len() > 1 << CODE_BITS[0] { 2 } else { 1 };
+    let bytes = values.len() * code_bytes + size_of_val(palette.as_slice());
+    let is_worth_it = bytes as f64 <= WORTH * size_of_val(values) as f64;
+    (palette.len() <= most && is_worth_it).then_some(palette)
+}
+
+fn different<'a>(values: impl Iterator<Item = &'a f32>) -> Vec<u32> {
+    let mut bits: Vec<u32> = values.map(|value| value.to_bits()).collect();
+    bits.par_sort_unstable();
+    bits.dedup();
+    bits
+}
+
+impl Photograph {
+    /// How many values it has.
+    pub(super) fn len(&self) -> usize {
+        match self {
+            Self::Plain(buffer) => buffer.len(),
+            Self::Coded(coded) => coded.value_count,
+        }
+    }
+
+    /// How many floats have to be there to decode it to.
+    pub(super) fn decoded_len(&self) -> usize {
+        match self {
+            Self::Plain(_) => 0,
+            Self::Coded(coded) => coded.value_count,
+        }
+    }
+
+    /// Its values: as they are, or decoded into `scratch`, which is as long or longer.
+    ///
+    /// # Errors
+    /// `scratch` is shorter.
+    pub(super) fn decoded<'a>(
+        &'a self,
+        pass: &mut Recorder<'_>,
+        scratch: &'a mut Buffer<f32>,
+    ) -> Result<&'a Buffer<f32>> {
+        let coded = match self {
+            Self::Plain(buffer) => return Ok(buffer),
+            Self::Coded(coded) => coded,
+        };
+        if scratch.len() < coded.value_count {
+            let (name, len) = (scratch.name(), scratch.len());
+            let needed = coded.value_count;
+            let problem = format!("buffer `{name}` holds {len} values, not {needed}");
+            return Err(crate::Error::Usage(problem));
+        }
+        pass.dispatch(
+            &coded.decoder,
+            &decode::Params { value_count: coded.value_count as u32 },
+            decode::Buffers { codes: &coded.codes, values: &coded.values, decoded: scratch },
+            Threads::Exactly([coded.codes.len() as u32, 1, 1]),
+        )?;
+        Ok(scratch)
+    }
+
+    /// Its values in a buffer of their own, or in the one that it is.
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub(super) fn whole(&self, gpu: &Gpu) -> Result<Arc<Buffer<f32>>> {
+        if let Self::Plain(buffer) = self {
+            return Ok(Arc::clone(buffer));
+        }
+        let mut whole = gpu.uninit("target", self.len())?;
+        gpu.run("decode", |pass| self.decoded(pass, &mut whole).map(|_| ()))?;
+        Ok(Arc::new(whole))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::testing::gpu;
+    use crate::random::Stream;
+
+    /// What comes back of values, and in how many bits they were kept.
+    fn kept(bits: PhotographBits, values: &[f32]) -> (Vec<f32>, u32) {
+        let gpu = gpu();
+        let photograph = Darkroom::new(&gpu, bits).upload("photograph", values).unwrap();
+        let kept = match &photograph {
+            Photograph::Plain(_) => 32,
+            Photograph::Coded(coded) => (32 * coded.codes.len() / values.len()).next_power_of_two(),
+        };
+        (gpu.read(&*photograph.whole(&gpu).unwrap()).unwrap(), kept as u32)
+    }
+
+    fn bits(values: &[f32]) -> Vec<u32> {
+        values.iter().map(|value| value.to_bits()).collect()
+    }
+
+    /// Of so many different values, with those that are no numbers or no values of a file among them.
+    fn photograph(len: usize, different: u64) -> Vec<f32> {
+        let stream = Stream::new(7, 1);
+        let value = |i| (stream.bits(i) % different) as f32 / (different - 1) as f32;
+        let mut values: Vec<f32> = (0..len as u64).map(value).collect();
+        let odd = [-0.0, f32::INFINITY, f32::from_bits(0x7fc1_2345), 1e-40, -3.5];
+        values[..odd.len()].copy_from_slice(&odd);
+        values
+    }
+
+    #[test]
+    fn exact_gives_every_bit_back_in_as_few_bits_as_it_can() {
+        for len in [64, 1023, 1024, 1025, 2051] {
+            let values = photograph(len, 2);
+            let (back, kept) = kept(PhotographBits::Exact, &values);
+            assert_eq!((bits(&back), kept), (bits(&values), 8), "{len} values");
+        }
+        for (different, expected) in [(251, 8), (252, 16), (5_000, 16), (70_000, 32)] {
+            let values = photograph(60_003, different);
+            let (back, kept) = kept(PhotographBits::Exact, &values);
+            assert_eq!((bits(&back), kept), (bits(&values), expected), "{different} different");
+        }
+        let values = photograph(60_003, 251);
+        let (back, kept) = kept(PhotographBits::Single, &values);
+        assert_eq!((bits(&back), kept), (bits(&values), 32));
+    }
+
+    #[test]
+    fn a_grid_is_off_by_half_a_step_at_most_and_leaves_alone_what_lies_beyond() {
+        let stream = Stream::new(7, 2);
+        let values: Vec<f32> = (0..60_001).map(|i| stream.uniform(i) as f32).collect();
+        for (asked, expected, step) in
+            [(PhotographBits::Sixteen, 16, 1.0 / 65535.0), (PhotographBits::Eight, 8, 1.0 / 255.0)]
+        {
+            let (back, kept) = kept(asked, &values);
+            assert_eq!(kept, expected);
+            let worst = back.iter().zip(&values).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            assert!(worst < 0.51 * step && worst > 0.49 * step, "{worst} of {step}");
+            let beyond = [&values[..], &[1.5]].concat();
+            assert_eq!(self::kept(asked, &beyond), (beyond, 32));
+        }
+        // An 8-bit photograph is its own grid, and 16 bits hold what 8 cannot.
+        let codes = photograph(60_003, 200)[5..].to_vec();
+        assert_eq!(kept(PhotographBits::Eight, &codes), (codes, 8));
+        let fine = photograph(60_003, 5_000);
+        assert_eq!(bits(&kept(PhotographBits::Sixteen, &fine).0), bits(&fine));
+    }
+}
