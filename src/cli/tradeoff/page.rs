@@ -15,7 +15,7 @@ use crate::report::{Comparison, Picture, Report, Trace, traces};
 use crate::run::{self, Progress, energy_counters};
 
 /// Points on the way this much worse than the best are left out: they would flatten all others.
-const SHOWN_DECIBELS: f64 = 6.0;
+const SHOWN_DECIBELS: f64 = 3.0;
 
 /// What the page is made of.
 pub(super) struct Page<'a> {
@@ -80,18 +80,19 @@ impl Page<'_> {
     }
 
     fn plots(&self) -> Vec<String> {
-        let costs = [
-            Measure::Seconds,
-            Measure::ProcessorSeconds,
-            Measure::Joules,
-            Measure::DeviceBytes,
-            Measure::HostBytes,
+        let (psnr, ssim) = (Measure::Psnr, Measure::Ssim);
+        let fronts = [
+            (Measure::Seconds, psnr),
+            (Measure::Seconds, ssim),
+            (Measure::ProcessorSeconds, psnr),
+            (Measure::ProcessorSeconds, ssim),
+            (Measure::Joules, psnr),
+            (Measure::Joules, ssim),
+            (Measure::DeviceBytes, psnr),
+            (Measure::HostBytes, psnr),
         ];
-        let mut plots: Vec<String> = costs
-            .iter()
-            .flat_map(|&cost| [self.front(cost, Measure::Psnr), self.front(cost, Measure::Ssim)])
-            .flatten()
-            .collect();
+        let mut plots: Vec<String> =
+            fronts.into_iter().filter_map(|(cost, gain)| self.front(cost, gain)).collect();
         let presets = |outcome: &Outcome| outcome.knob().is_none();
         plots.extend(self.anytime("presets", presets));
         let mut keys: Vec<&str> = vec![];
