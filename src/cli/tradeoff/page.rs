@@ -53,18 +53,20 @@ impl Page<'_> {
         } else {
             format!("Energy is that of {}, idling included.", counters.join(", "))
         };
-        let mut intro = vec![
-            format!(
-                "Scores are means over {} test views {}. Time is that of the steps, without loading and scoring; on {}, {processors} processors. {energy}",
-                self.dataset.test_views().filter(|view| view.reference.is_some()).count(),
-                self.target.described(),
-                self.gpu.properties().name,
-            ),
-            format!(
-                "A disc is a preset, a ring with its number in the table is one change of {}. The dotted line is the front: the most that can be had for so much.",
-                BASE.name()
-            ),
-        ];
+        let mut intro = vec![format!(
+            "Scores are means over {} test views {}. Time is that of the steps, without loading and scoring; on {}, {processors} processors. {energy}",
+            self.dataset.test_views().filter(|view| view.reference.is_some()).count(),
+            self.target.described(),
+            self.gpu.properties().name,
+        )];
+        intro
+            .push("The dotted line is the front: the most that can be had for so much.".to_owned());
+        if self.outcomes.iter().any(|outcome| outcome.knob().is_some()) {
+            let base = BASE.name();
+            intro.push(format!(
+                "A disc is a preset, a ring with its number in the table is one change of {base}."
+            ));
+        }
         let on_front = outcome::front_of(self.outcomes, Measure::Seconds, Measure::Psnr);
         let names: Vec<String> =
             on_front.into_iter().map(|index| self.outcomes[index].name()).collect();
