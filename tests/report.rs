@@ -2,8 +2,8 @@
 
 use nightsplat::image::Image;
 use nightsplat::report::{
-    Bar, Best, Column, Comparison, Distribution, Mark, Picture, Report, Series, Table, bars,
-    distributions, plot, plot_points, svg_file,
+    Bar, Best, Column, Comparison, Distribution, Mark, Picture, Report, Series, Table, Trace, bars,
+    distributions, plot, plot_points, svg_file, traces,
 };
 
 fn column(name: &str, digits: usize, best: Best) -> Column {
@@ -212,4 +212,36 @@ fn bars_begin_at_zero_and_are_as_long_as_their_values() {
         assert!(svg.contains(text), "{text} is missing in {svg}");
     }
     assert!(!bars("PSNR", 2, &[]).contains("NaN"));
+}
+
+#[test]
+fn a_run_has_one_colour_in_every_drawing_and_its_name_beside_its_last_point() {
+    let trace = |name: &str, color, points: &[(f64, f64)]| Trace {
+        name: name.into(),
+        title: format!("the run <{name}>"),
+        color,
+        is_minor: color > 0,
+        points: points.to_vec(),
+    };
+    let of = [
+        trace("fast", 0, &[(10.0, 24.0)]),
+        trace("2", 1, &[(10.0, 24.0)]),
+        trace("lost", 2, &[(f64::NAN, 1.0)]),
+    ];
+    let svg = traces("time, s", "PSNR, dB", &of, &[(10.0, 24.0)]);
+    assert_eq!((svg.matches("<circle").count(), svg.matches("<path").count()), (2, 1));
+    assert!(svg.contains("--series-0") && svg.contains("--series-1") && !svg.contains("lost"));
+    assert!(svg.contains("the run &lt;fast&gt;") && !svg.contains("NaN"), "{svg}");
+    // Two names of one place do not stand on each other.
+    let place = |name: &str| {
+        let before = svg.split(&format!(">{name}</text>")).next().unwrap();
+        before.rsplit("<text ").next().unwrap().to_owned()
+    };
+    assert_ne!(place("fast").split(" fill").next(), place("2").split(" fill").next());
+    let curve = traces("s", "dB", &[trace("a", 0, &[(1.0, 20.0), (9.0, 25.0)])], &[]);
+    assert_eq!((curve.matches("<polyline").count(), curve.matches("<path").count()), (1, 0));
+    for points in [&[][..], &[(0.0, 1.0)], &[(-1.0, 2.0)], &[(1e-300, 1e300)]] {
+        let svg = traces("s", "dB", &[trace("a", 0, points)], points);
+        assert!(!svg.contains("NaN") && !svg.contains("inf"), "{svg}");
+    }
 }

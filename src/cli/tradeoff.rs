@@ -52,6 +52,7 @@ use crate::train::{Preset, TrainConfig, Trainer};
 ///   nightsplat tradeoff photos --out tradeoff --downscale 4
 ///   nightsplat tradeoff photos --out presets --no-knobs --seeds 1,2,3
 ///   nightsplat tradeoff photos --out own --no-knobs --knob density.min_opacity=0.005,0.02
+#[expect(clippy::doc_markdown, reason = "help shows settings as they are written")]
 #[derive(Clone, Debug, Args)]
 #[command(verbatim_doc_comment)]
 pub struct TradeoffArgs {

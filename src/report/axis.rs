@@ -50,8 +50,10 @@ impl Axis {
 
     pub(super) fn ticks(&self) -> Vec<f64> {
         let Some(step) = self.step else {
-            let ticks: Vec<f64> =
-                round_values(self.low).take_while(|tick| *tick <= self.high * 1.001).collect();
+            let ticks: Vec<f64> = round_values(self.low)
+                .skip_while(|tick| *tick < self.low * 0.999)
+                .take_while(|tick| *tick <= self.high * 1.001)
+                .collect();
             // Decades alone where they are many.
             let is_shown = |tick: &f64| ticks.len() <= 9 || (tick.log10().fract()).abs() < 1e-6;
             return ticks.iter().copied().filter(is_shown).collect();

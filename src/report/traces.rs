@@ -26,7 +26,7 @@ pub struct Trace {
 const WIDTH: f64 = 420.0;
 const HEIGHT: f64 = 290.0;
 const LEFT: f64 = 44.0;
-const RIGHT: f64 = 10.0;
+const RIGHT: f64 = 14.0;
 const TOP: f64 = 30.0;
 const BOTTOM: f64 = 34.0;
 
@@ -115,12 +115,12 @@ fn draw(svg: &mut String, trace: &Trace, line: &[(f64, f64)], labels: &mut Label
             points.join(" ")
         );
     }
-    let (label_x, label_y) = labels.place(x, y, &trace.name);
+    let (label_x, label_y) = labels.place(x, y, &trace.name, line.len() > 1);
     let weight = if trace.is_minor { "" } else { " font-weight=\"600\"" };
     let _ = writeln!(
         svg,
         "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"{radius}\" fill=\"{fill}\" stroke=\"{color}\" stroke-width=\"1.5\"/>\
-         <text x=\"{label_x:.1}\" y=\"{label_y:.1}\" fill=\"{color}\"{weight}>{}</text></g>",
+         <text x=\"{label_x:.1}\" y=\"{label_y:.1}\" fill=\"{color}\" class=\"label\"{weight}>{}</text></g>",
         escape(&trace.name)
     );
 }
@@ -134,9 +134,14 @@ impl Labels {
     }
 
     /// The left end of the base line of a name beside (x, y), where nothing else stands if there is such a place.
-    fn place(&mut self, x: f64, y: f64, name: &str) -> (f64, f64) {
+    fn place(&mut self, x: f64, y: f64, name: &str, ends_line: bool) -> (f64, f64) {
         let width = 6.8 * name.chars().count() as f64;
-        let sides = |down: f64| [(x + 8.0, y + down), (x - 8.0 - width, y + down)];
+        // A line comes from the left; a front leaves to the right.
+        let mut order = [x + 8.0, x - 8.0 - width];
+        if !ends_line {
+            order.reverse();
+        }
+        let sides = |down: f64| order.map(|left| (left, y + down));
         let middle = |down: f64| [(x - width / 2.0, y + down)];
         let mut places: Vec<(f64, f64)> = sides(4.0).to_vec();
         for down in [-9.0, 18.0] {

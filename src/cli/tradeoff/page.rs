@@ -15,7 +15,7 @@ use crate::report::{Comparison, Picture, Report, Trace, traces};
 use crate::run::{self, Progress, energy_counters};
 
 /// Points on the way this much worse than the best are left out: they would flatten all others.
-const SHOWN_DECIBELS: f64 = 6.0;
+const SHOWN_DECIBELS: f64 = 3.0;
 
 /// What the page is made of.
 pub(super) struct Page<'a> {
@@ -53,18 +53,20 @@ impl Page<'_> {
         } else {
             format!("Energy is that of {}, idling included.", counters.join(", "))
         };
-        let mut intro = vec![
-            format!(
-                "Scores are means over {} test views {}. Time is that of the steps, without loading and scoring; on {}, {processors} processors. {energy}",
-                self.dataset.test_views().filter(|view| view.reference.is_some()).count(),
-                self.target.described(),
-                self.gpu.properties().name,
-            ),
-            format!(
-                "A disc is a preset, a ring with its number in the table is one change of {}. The dotted line is the front: the most that can be had for so much.",
-                BASE.name()
-            ),
-        ];
+        let mut intro = vec![format!(
+            "Scores are means over {} test views {}. Time is that of the steps, without loading and scoring; on {}, {processors} processors. {energy}",
+            self.dataset.test_views().filter(|view| view.reference.is_some()).count(),
+            self.target.described(),
+            self.gpu.properties().name,
+        )];
+        intro
+            .push("The dotted line is the front: the most that can be had for so much.".to_owned());
+        if self.outcomes.iter().any(|outcome| outcome.knob().is_some()) {
+            let base = BASE.name();
+            intro.push(format!(
+                "A disc is a preset, a ring with its number in the table is one change of {base}."
+            ));
+        }
         let on_front = outcome::front_of(self.outcomes, Measure::Seconds, Measure::Psnr);
         let names: Vec<String> =
             on_front.into_iter().map(|index| self.outcomes[index].name()).collect();
@@ -80,18 +82,19 @@ impl Page<'_> {
     }
 
     fn plots(&self) -> Vec<String> {
-        let costs = [
-            Measure::Seconds,
-            Measure::ProcessorSeconds,
-            Measure::Joules,
-            Measure::DeviceBytes,
-            Measure::HostBytes,
+        let (psnr, ssim) = (Measure::Psnr, Measure::Ssim);
+        let fronts = [
+            (Measure::Seconds, psnr),
+            (Measure::Seconds, ssim),
+            (Measure::ProcessorSeconds, psnr),
+            (Measure::ProcessorSeconds, ssim),
+            (Measure::Joules, psnr),
+            (Measure::Joules, ssim),
+            (Measure::DeviceBytes, psnr),
+            (Measure::HostBytes, psnr),
         ];
-        let mut plots: Vec<String> = costs
-            .iter()
-            .flat_map(|&cost| [self.front(cost, Measure::Psnr), self.front(cost, Measure::Ssim)])
-            .flatten()
-            .collect();
+        let mut plots: Vec<String> =
+            fronts.into_iter().filter_map(|(cost, gain)| self.front(cost, gain)).collect();
         let presets = |outcome: &Outcome| outcome.knob().is_none();
         plots.extend(self.anytime("presets", presets));
         let mut keys: Vec<&str> = vec![];
