@@ -110,11 +110,7 @@ impl Trainer {
         scores
     }
 
-    fn scores(
-        &mut self,
-        views: &[(Camera, Image)],
-        sh_degree: u32,
-    ) -> Result<[Option<f64>; 2]> {
+    fn scores(&mut self, views: &[(Camera, Image)], sh_degree: u32) -> Result<[Option<f64>; 2]> {
         let mut sums = [0.0; 2];
         for (camera, target) in views {
             let shown = self.render_of_degree(camera, sh_degree)?;
