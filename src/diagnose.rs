@@ -172,13 +172,18 @@ impl Diagnosis {
         };
         let own: Vec<ViewDiagnosis> = photographs.iter().enumerate().map(of_view).collect();
         let without_pose = without_pose(&paths, dataset)?;
+        let remarks = remarks(&own, &photographs, &views, &without_pose);
+        let mut scene =
+            SceneDiagnosis::of(&own, photographs, &shared, &exposure, dataset.points.len());
+        // A pixel of a shrunk target is the mean of so many, each way.
+        scene.target_noise /= options.downscale.max(1.0);
         Ok(Self {
             dataset: dataset.root.clone(),
             test_views: dataset.test_views().count(),
             pixels: views.iter().map(|(_, view)| pixels(&view.camera)).sum(),
-            remarks: remarks(&own, &photographs, &views, &without_pose),
+            remarks,
             without_pose,
-            scene: SceneDiagnosis::of(&own, photographs, &shared, &exposure, dataset.points.len()),
+            scene,
             views: own,
             depth_maps: views.iter().filter(|(_, view)| view.depth.is_some()).count(),
             fingerprint: Fingerprint::of(dataset),

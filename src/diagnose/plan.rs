@@ -16,8 +16,8 @@ const LEAST_LIFT: f64 = 1.5;
 /// Targets whose exposures are spread by more stops are worth learning them. A chair of which the views differ by 1.2 stops,
 /// all but .02 of which the curve takes away, lost .4 dB by it.
 const LEAST_SPREAD: f64 = 0.3;
-/// More noise than this in the average over the views, of encoded values, is seen: 2.5 % is 32 dB.
-const LEAST_NOISE: f64 = 0.04;
+/// From this much noise in the average over the views, of encoded values, a denoiser pays (docs/benchmarks.md).
+const LEAST_NOISE: f64 = 0.01;
 /// Light that varies by more stops between large regions is worth an illumination of its own. A hall with one bright window
 /// has 2.6; up to 1 the network bought .2 dB at most for two to four times the time.
 const LEAST_UNEVENNESS: f64 = 3.0;

@@ -28,7 +28,8 @@ use crate::{Error, Result};
 /// The stream of random numbers that the weights are drawn from.
 const STREAM: u64 = 5;
 
-/// How large a denoiser is, and what it begins as. The size by default is the paper's.
+/// How large a denoiser is, and what it begins as. By default it is as small as pays on noisy photographs
+/// (docs/benchmarks.md).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DenoiserSettings {
@@ -47,9 +48,9 @@ pub struct DenoiserSettings {
 impl Default for DenoiserSettings {
     fn default() -> Self {
         Self {
-            stages: 3,
-            repeats: 6,
-            channels: 64,
+            stages: 1,
+            repeats: 2,
+            channels: 8,
             precision: Precision::Single,
             form: Form::default(),
         }
@@ -57,6 +58,17 @@ impl Default for DenoiserSettings {
 }
 
 impl DenoiserSettings {
+    /// LITA-GS's.
+    pub fn paper() -> Self {
+        Self {
+            stages: 3,
+            repeats: 6,
+            channels: 64,
+            precision: Precision::Single,
+            form: Form::Paper,
+        }
+    }
+
     /// # Errors
     /// A number is out of its range.
     pub fn check(&self) -> Result<()> {

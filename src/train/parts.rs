@@ -130,9 +130,16 @@ impl Default for ModelConfig {
     }
 }
 
-/// Those of the paper's code.
+/// A denoiser that begins as the identity learns in hundreds of steps at ten times the paper's rate.
 impl Default for NetworkRates {
     fn default() -> Self {
+        Self { denoiser: 5e-4, ..Self::paper() }
+    }
+}
+
+impl NetworkRates {
+    /// Those of LITA-GS.
+    pub fn paper() -> Self {
         Self { denoiser: Denoiser::LEARNING_RATE, tonemapper: Tonemapper::LEARNING_RATE }
     }
 }
@@ -148,9 +155,12 @@ impl ModelConfig {
         }
     }
 
-    /// Sets what of the parts' constants is LITA-GS's own: networks that begin at random, and the denoiser's smoothness.
+    /// Sets what of the parts' constants is LITA-GS's own: how large the networks are, that they begin at random, how fast
+    /// they learn, and the denoiser's smoothness.
     pub fn follow_paper(&mut self) {
-        self.network.form = Form::Paper;
+        let precision = self.network.precision;
+        self.network = DenoiserSettings { precision, ..DenoiserSettings::paper() };
+        self.rates = NetworkRates::paper();
         self.weights.total_variation = Weights::paper().total_variation;
     }
 

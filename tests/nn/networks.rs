@@ -275,7 +275,7 @@ fn half_precision_stays_near_single_at_every_magnitude() {
 
 #[test]
 fn the_paper_s_denoiser_has_its_parameters_and_fits_a_gigabyte() {
-    let settings = DenoiserSettings::default();
+    let settings = DenoiserSettings::paper();
     let denoiser = Denoiser::new(&gpu(), settings, 0).unwrap();
     assert_eq!(denoiser.settings(), settings);
     assert_eq!(denoiser.parameters().values.len(), 121_737);

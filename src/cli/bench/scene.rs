@@ -101,6 +101,7 @@ pub(super) fn plain(gpu: &Gpu, scene: &Scene, curve: ToneCurve) -> Result<Traine
 /// Every part on a small scene, density control in every step.
 fn lita(gpu: &Gpu) -> Result<Trainer> {
     let mut config = config(ToneCurve::Ap3);
+    config.model.follow_paper();
     config.model.set_parts(&Part::ALL);
     config.ssim_weight = 0.0;
     config.model.denoiser_crop = 24;
