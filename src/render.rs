@@ -50,14 +50,8 @@ pub struct RenderSettings {
 
 impl Default for RenderSettings {
     fn default() -> Self {
-        Self {
-            near: 0.2,
-            max_alpha: 0.99,
-            shape: 3.into(),
-            raw_colors: false,
-            observes: false,
-            tile: None,
-        }
+        let [raw_colors, observes] = [false; 2];
+        Self { near: 0.2, max_alpha: 0.99, shape: 3.into(), raw_colors, observes, tile: None }
     }
 }
 
@@ -96,10 +90,11 @@ impl RenderSettings {
     }
 
     /// How many of them, from the first, move and shape the Gaussians.
-    fn shaping_channels(&self) -> usize {
-        let features = self.shape.features;
-        let shaping = Features { noise: false, illumination: false, ..features };
-        if self.observes { shaping.channels() } else { features.channels() }
+    fn shaping_channels(&self) -> u32 {
+        let Features { noise, illumination, .. } = self.shape.features;
+        let observing =
+            if self.observes { 3 * (u32::from(noise) + u32::from(illumination)) } else { 0 };
+        self.channels() as u32 - observing
     }
 }
 
@@ -180,7 +175,7 @@ impl Renderer {
         let channels = settings.channels() as u32;
         let (alpha_max, sh_degree) = (settings.max_alpha, settings.shape.sh_degree);
         let (raw_colors, partition_size) = (settings.raw_colors, RANKS_PER_PARTITION);
-        let shaping_channels = settings.shaping_channels() as u32;
+        let shaping_channels = settings.shaping_channels();
         let (skips_groups, splats_per_turn) = (!gpu.properties().is_cpu, splats_per_turn(gpu));
         // What every kernel that includes `splat.glsl` is specialised with, and what some are beside it.
         macro_rules! constants {
