@@ -132,13 +132,7 @@ impl Exposures {
         size: UVec2,
         render: &Buffer<f32>,
     ) -> Result<()> {
-        self.check(view, size, render)?;
-        pass.dispatch(
-            &self.expose,
-            &expose::Params { pixel_count: pixels(size), view: view as u32 },
-            expose::Buffers { exposures: &self.parameters, render, exposed: &mut self.exposed },
-            Threads::Exactly([COLOR_CHANNELS as u32 * pixels(size), 1, 1]),
-        )
+        self.dispatch(pass, false, view, size, render)
     }
 
     /// Records the target of `view`, (3, H, W), as it would be at the neutral exposure; [`Exposures::exposed`] has it.
@@ -152,12 +146,22 @@ impl Exposures {
         size: UVec2,
         target: &Buffer<f32>,
     ) -> Result<()> {
-        self.check(view, size, target)?;
-        let Self { neutralize, parameters, exposed, .. } = self;
+        self.dispatch(pass, true, view, size, target)
+    }
+
+    fn dispatch(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        inverse: bool,
+        view: usize,
+        size: UVec2,
+        render: &Buffer<f32>,
+    ) -> Result<()> {
+        self.check(view, size, render)?;
         pass.dispatch(
-            neutralize,
+            if inverse { &self.neutralize } else { &self.expose },
             &expose::Params { pixel_count: pixels(size), view: view as u32 },
-            expose::Buffers { exposures: parameters, render: target, exposed },
+            expose::Buffers { exposures: &self.parameters, render, exposed: &mut self.exposed },
             Threads::Exactly([COLOR_CHANNELS as u32 * pixels(size), 1, 1]),
         )
     }

@@ -110,7 +110,7 @@ impl Renderer {
         let channels = settings.channels() as u32;
         let (alpha_max, sh_degree) = (settings.max_alpha, settings.shape.sh_degree);
         let (raw_colors, partition_size) = (settings.raw_colors, RANKS_PER_PARTITION);
-        let shaping_channels = settings.shaping_channels() as u32;
+        let shaping_channels = settings.shaping_channels();
         let (skips_groups, splats_per_turn) = (!gpu.properties().is_cpu, splats_per_turn(gpu));
         // What every kernel that includes `splat.glsl` is specialised with, and what some are beside it.
         macro_rules! constants {

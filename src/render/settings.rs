@@ -24,14 +24,8 @@ pub struct RenderSettings {
 
 impl Default for RenderSettings {
     fn default() -> Self {
-        Self {
-            near: 0.2,
-            max_alpha: 0.99,
-            shape: 3.into(),
-            raw_colors: false,
-            observes: false,
-            tile: None,
-        }
+        let [raw_colors, observes] = [false; 2];
+        Self { near: 0.2, max_alpha: 0.99, shape: 3.into(), raw_colors, observes, tile: None }
     }
 }
 
@@ -70,9 +64,10 @@ impl RenderSettings {
     }
 
     /// How many of them, from the first, move and shape the Gaussians.
-    pub(super) fn shaping_channels(&self) -> usize {
-        let features = self.shape.features;
-        let shaping = Features { noise: false, illumination: false, ..features };
-        if self.observes { shaping.channels() } else { features.channels() }
+    pub(super) fn shaping_channels(&self) -> u32 {
+        let Features { noise, illumination, .. } = self.shape.features;
+        let observing =
+            if self.observes { 3 * (u32::from(noise) + u32::from(illumination)) } else { 0 };
+        self.channels() as u32 - observing
     }
 }

@@ -209,9 +209,12 @@ mod tests {
     #[test]
     fn each_part_brings_its_channels() {
         let mut model = ModelConfig::default();
-        assert_eq!(model.features().channels(), 3);
+        model.set_parts(&Part::ALL);
+        assert_eq!(model.features().channels(), 8, "no noise map");
+        model.follow_paper();
         for (parts, channels) in [
-            (&[Part::Depth][..], 4),
+            (&[][..], 3),
+            (&[Part::Depth], 4),
             (&[Part::Depth, Part::Structure], 5),
             (&[Part::Denoiser], 6),
             (&[Part::Structure, Part::Tonemapper], 7),

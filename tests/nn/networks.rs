@@ -331,7 +331,7 @@ fn misuse_is_told_in_one_line() {
     }
     let settings = DenoiserSettings { stages: 1, repeats: 1, channels: 4, ..Default::default() };
     let mut denoiser = Denoiser::new(&gpu, settings, 0).unwrap();
-    let mut tonemapper = Tonemapper::new(&gpu, 0).unwrap();
+    let mut tonemapper = Tonemapper::new(&gpu, Form::Identity, 0).unwrap();
     let size = UVec2::new(6, 5);
     let (image, short) = (gpu.zeros("image", 90).unwrap(), gpu.zeros("short", 89).unwrap());
     let [mut d_first, mut d_second] = [(); 2].map(|()| gpu.zeros("d", 90).unwrap());
