@@ -4,6 +4,7 @@ mod checkpoint;
 mod config;
 mod ends;
 mod exposures;
+mod growth;
 mod held_out;
 mod model;
 mod networks;
@@ -22,7 +23,7 @@ use glam::UVec2;
 
 use crate::camera::Camera;
 use crate::dataset::Dataset;
-use crate::densify::{Densifier, DensifySettings, DensityControl, Round};
+use crate::densify::{Densifier, DensifySettings};
 use crate::exposure::Exposures;
 use crate::gpu::{Buffer, CheckReport, Gpu, PassTime, Recorder};
 use crate::image::Image;
@@ -204,7 +205,7 @@ impl Trainer {
         config.check()?;
         config.leave_out_what_is_missing(dataset);
         let settings = config.render_settings();
-        let density = density(&config, dataset.extent());
+        let density = growth::settings(&config, dataset.extent());
         thread::scope(|scope| {
             // The driver compiles on another thread while the views are uploaded and looked at.
             let kernels = scope.spawn(move || Kernels::new(gpu, settings, density));
@@ -340,33 +341,6 @@ impl Trainer {
         }
     }
 
-    /// Density control, behind the last step that was submitted.
-    fn control_density(&mut self) -> Result<()> {
-        let gpu = self.gpu.clone();
-        let rounds_left = match self.config.density.control {
-            DensityControl::Conserving => self.config.schedule.rounds_left(self.step),
-            DensityControl::Paper => 1,
-        };
-        let grown = self.growth_limit()?.max(self.model.count());
-        let most = self.most_gaussians()?.min(grown);
-        let round = Round { step: self.step, rounds_left, most };
-        let changed = self.model.densify(&gpu, &mut self.densifier, round)?;
-        tracing::debug!("step {}: {changed:?}", self.step);
-        self.reserve()
-    }
-
-    /// How many Gaussians leave the device able to bind the intersections of a view, should it have twice as many of them for
-    /// each Gaussian as the last one has; at least as many as there are.
-    fn most_gaussians(&self) -> Result<usize> {
-        let pixels = |size: UVec2| f64::from(size.x) * f64::from(size.y);
-        let largest = self.views.sizes().into_iter().map(pixels).fold(0.0, f64::max);
-        let shrunk = largest / pixels(self.view_of(self.step).size());
-        let met = 2.0 * shrunk * f64::from(self.renderer.intersections()?.max(1));
-        let count = self.model.count();
-        let growth = f64::from(self.renderer.most_intersections()) / met;
-        Ok(((count as f64 * growth) as usize).max(count))
-    }
-
     /// Trains one step with every pass checked ([`Gpu::checked`]), density control included, and reports on them. The
     /// model is what [`Trainer::advance`] would have made of it, bit for bit; no step is reported where it has to be done
     /// again with more memory.
@@ -498,12 +472,6 @@ impl Trainer {
         Rendered::new(&mut self.renderer, gaussians, camera, &options, networks)
     }
 
-    /// Density control acts after this step. Never so late that the run ends before what it added has settled.
-    fn densifies_at(&self, step: u64) -> bool {
-        let schedule = &self.config.schedule;
-        schedule.densifies_at(step) && step + schedule.densify_interval <= self.config.steps
-    }
-
     fn view_of(&self, step: u64) -> &TrainView {
         self.views.of_step(self.config.seed, step, self.config.schedule.resolution_level(step))
     }
@@ -568,18 +536,6 @@ fn say_what_parts_see(model: &ModelConfig, sizes: &[UVec2]) {
     if (model.denoiser || model.tonemapper) && model.denoiser_crop > longest {
         let crop = model.denoiser_crop;
         tracing::warn!("a crop of {crop} pixels exceeds every view: the networks see whole views");
-    }
-}
-
-/// Density control in world units.
-fn density(config: &TrainConfig, extent: f64) -> DensifySettings {
-    DensifySettings {
-        control: config.density.control,
-        gradient_threshold: config.density.gradient_threshold,
-        split_scale: config.density.split_scale * extent,
-        min_opacity: config.density.min_opacity,
-        max_gaussians: config.max_gaussians,
-        seed: Stream::new(config.seed, streams::DENSITY).bits(0),
     }
 }
 
