@@ -457,6 +457,20 @@ mod tests {
     }
 
     #[test]
+    fn a_run_that_goes_on_keeps_its_progress_up_to_there() {
+        let folder = tempfile::tempdir().unwrap();
+        let run = RunDirectory::create(folder.path(), &TrainConfig::default(), false).unwrap();
+        assert!(run.progress(9).is_empty());
+        let scores = Scores { psnr: 24.5, psnr_channel_mean: 25.0, ssim: 0.75 };
+        let spent = |seconds, joules| Spent { seconds, joules, ..Spent::default() };
+        let progress = [(2, spent(0.5, None)), (4, spent(1.25, Some(30.5)))]
+            .map(|(step, spent)| Progress::new(step, 7, &scores, &spent));
+        run.save_progress(&progress).unwrap();
+        assert_eq!(load_progress(folder.path()), progress);
+        assert_eq!(run.progress(3), progress[..1]);
+    }
+
+    #[test]
     fn a_directory_that_cannot_be_made_is_named() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("file");
