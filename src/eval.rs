@@ -225,7 +225,7 @@ pub const WITH_REFERENCE: &str = "with_reference";
 /// The line beside scores of targets that know references.
 pub fn with_reference(known: &str) -> String {
     format!(
-        "with reference: the targets follow {known}; compare these scores with none that know no reference"
+        "with reference: the targets follow {known}; not comparable with scores that know no reference"
     )
 }
 

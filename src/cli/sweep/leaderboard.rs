@@ -211,7 +211,7 @@ impl Leaderboard {
             );
         }
         if self.rows.iter().any(Row::knows_references) {
-            notes.push("Rows with reference have targets that know references; compare them with none that do not.".to_owned());
+            notes.push("Rows with reference have targets that know references and are not comparable with the others.".to_owned());
         }
         if let Some(offset) = self.adaptive_offset {
             notes.push(format!(
