@@ -82,7 +82,9 @@ fn a_restored_run_goes_on_bit_for_bit() {
 #[test]
 fn growth_and_the_sh_degree_end_where_held_out_views_gain_too_little_and_a_resumed_run_knows_it() {
     let folder = tempfile::tempdir().unwrap();
-    make_set(folder.path());
+    // So many that one can be held out.
+    let options = SyntheticOptions { views: 12, width: 40, height: 30, seed: 2 };
+    synthetic::write(folder.path(), &options).unwrap();
     let gpu = gpu();
     let mut free = config(&[]);
     free.schedule.densify_interval = 3;
@@ -98,6 +100,7 @@ fn growth_and_the_sh_degree_end_where_held_out_views_gain_too_little_and_a_resum
     advance(&mut ended, 18);
     let count = ended.gaussian_count();
     let (expected, _) = finished(&mut ended, folder.path());
+    assert!(ended.held_out_psnr().unwrap().is_some());
     let colors = |trainer: &Trainer| trainer.gaussians().unwrap().rest().to_vec();
     assert!(ended.gaussian_count() <= count && freely.gaussian_count() > count);
     assert!(colors(&ended).iter().all(|rest| *rest == Vec3::ZERO));

@@ -125,11 +125,13 @@ impl Trainer {
     }
 
     /// Leaves out what the denoiser has learned where it shows the held-out views, or without any some of the training views,
-    /// no better than R_0 does: it is the identity again. For the end of a run, not on its way; the paper's stays.
+    /// hardly better than R_0 does: it is the identity again. For the end of a run, not on its way; the paper's stays.
     ///
     /// # Errors
     /// The device is out of memory or lost.
     pub fn leave_out_what_gains_nothing(&mut self) -> Result<()> {
+        /// Less on few views, dB, is chance.
+        const LEAST_GAIN: f64 = 0.05;
         if !self.networks.as_ref().is_some_and(NetworkTerms::follow_target) {
             return Ok(());
         }
@@ -143,7 +145,7 @@ impl Trainer {
         };
         let [Some(colors), Some(denoised)] = scores else { return Ok(()) };
         let gain = denoised - colors;
-        if gain > 0.0 {
+        if gain >= LEAST_GAIN {
             tracing::info!("the denoiser gains {gain:.2} dB on targets");
             return Ok(());
         }
