@@ -17,7 +17,7 @@ use crate::optimizer::Schedule;
 use crate::random::Stream;
 use crate::render::RenderSettings;
 use crate::scene::init::Start;
-use crate::scene::{MAX_SH_DEGREE, Shape};
+use crate::scene::{Features, MAX_SH_DEGREE, Shape};
 use crate::tone::ToneSettings;
 use crate::{Error, Result};
 
@@ -255,7 +255,8 @@ impl TrainConfig {
             weights: self.model.weights,
             depth_box: self.model.depth_box,
             boxes: Stream::new(self.seed, streams::BOXES),
-            features: self.model.features(),
+            // The denoiser's terms are there without a noise map, too.
+            features: Features { noise: self.model.denoiser, ..self.model.features() },
         }
     }
 
