@@ -18,7 +18,7 @@ struct Fixture {
     folder: tempfile::TempDir,
 }
 
-const TRAIN: &str = "--steps 40 --seed 3 --sh-degree 1 --curve ap3";
+const TRAIN: &str = "--steps 40 --seed 3 --sh-degree 1 --curve ap3 --model plain";
 
 fn fixture() -> &'static Fixture {
     static FIXTURE: OnceLock<Fixture> = OnceLock::new();

@@ -131,7 +131,7 @@ pub(crate) struct TrainOptions {
 #[derive(Clone, Debug, Default, clap::Args)]
 #[command(next_help_heading = "Model")]
 pub(crate) struct ModelOptions {
-    /// plain: colour alone, as 3DGS; lita: every part of LITA-GS and L1 alone on R_0, the paper's model [default: plain]
+    /// plain: colour alone, as 3DGS; lita: every part of LITA-GS and L1 alone on R_0, which with a preset of the paper's is its model, else each begins as the identity [default: plain]
     #[arg(long)]
     model: Option<ModelName>,
     /// Exactly these parts, parted by commas: denoiser, tonemapper, structure, depth

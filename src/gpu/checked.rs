@@ -19,6 +19,9 @@ use super::{
 };
 use crate::Result;
 
+/// Makes of the words of a pass's buffers what its reference does, and gives the tolerances from other such words.
+type ReferenceOf<'a> = dyn Fn(&mut [Vec<u32>], &mut [Vec<u32>]) -> Vec<Tolerance> + 'a;
+
 /// The reports of the threads whose submissions are checked.
 #[derive(Debug, Default)]
 pub(super) struct Checks(Mutex<HashMap<ThreadId, CheckReport>>);
@@ -131,15 +134,14 @@ impl Recorder<'_> {
         })
     }
 
-    /// Runs what was recorded before, then the pass alone, then its reference, and compares. `reference` makes of the first
-    /// words what the kernel's reference does, and gives the tolerances from the second.
+    /// Runs what was recorded before, then the pass alone, then its reference, and compares.
     fn run_checked(
         &mut self,
         pipeline: &Objects,
         params: &[u8],
         bound: &[Bound],
         threads: Threads<'_>,
-        reference_of: &dyn Fn(&mut [Vec<u32>], &mut [Vec<u32>]) -> Vec<Tolerance>,
+        reference_of: &ReferenceOf<'_>,
     ) -> Result<()> {
         let (interface, kernel) = (pipeline.interface, pipeline.interface.name);
         let before = self.copies(interface.bindings, bound, |_| true)?;

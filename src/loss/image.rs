@@ -207,7 +207,7 @@ impl Loss {
     /// # Errors
     /// The device is out of memory.
     pub fn reserve(&mut self, size: UVec2) -> Result<()> {
-        let (values, workgroups) = (value_count(size), self.kernels.workgroups(size) as usize);
+        let values = value_count(size);
         if values > self.max_values {
             if let Kernels::Ssim(ssim) = &mut self.kernels {
                 let bindable = self.gpu.properties().max_storage_buffer_range;
@@ -217,6 +217,8 @@ impl Loss {
             }
             self.max_values = values;
         }
+        // How many channels are taken at once follows from what there is room for now.
+        let workgroups = self.kernels.workgroups(size) as usize;
         if workgroups > self.l1_partials.len() {
             self.l1_partials = self.gpu.uninit("l1_partials", workgroups)?;
             self.ssim_partials = self.gpu.uninit("ssim_partials", workgroups)?;

@@ -6,7 +6,7 @@
 //! R_{k+1} = clamp(R_0 - (I_k + sigmoid(conv_out(f))), 0, 1)
 //! ```
 //!
-//! That is the paper's form. In the identity form I_0 = R_0 and R_{k+1} = I_k - conv_out(f), with the last layer zero at
+//! That is the paper's form. In the identity form `I_0 = R_0` and `R_{k+1} = I_k - conv_out(f)`, with the last layer zero at
 //! first: R_K begins as the render, and no gradient dies behind a sigmoid or a clamp.
 //!
 //! Activations are kept for one stage at a time: the backward pass computes those of the earlier stages again, from
@@ -261,7 +261,7 @@ impl Denoiser {
         &self.memory.denoised[self.memory.denoised.len() - 1]
     }
 
-    /// Records the passes from I_0, the noise map or in the identity form the render, and the render, each (3, H, W), to
+    /// Records the passes from `I_0`, the noise map or in the identity form the render, and the render, each (3, H, W), to
     /// [`Denoiser::denoised`].
     ///
     /// # Errors
@@ -300,7 +300,7 @@ impl Denoiser {
     }
 
     /// Records the passes from `dL/dR_K` back: overwrites the gradients of the parameters, writes `d_input` and adds to
-    /// `d_render`, each (3, H, W), what the render says beside I_0: nothing in the identity form. Inputs and parameters are those of the forward pass before it.
+    /// `d_render`, each (3, H, W), what the render says beside `I_0`: nothing in the identity form. Inputs and parameters are those of the forward pass before it.
     ///
     /// # Errors
     /// There is no forward pass of that size before it, or an image is shorter than the view.

@@ -41,9 +41,9 @@ fn scene(folder: &Path, exposures: &[f64], noise: f64) {
         for i in 0..n {
             let t = [0, 1, 2].map(|channel| gain * f64::from(first.data[channel * n + i]));
             let y = truth().value(t);
-            for channel in 0..3 {
+            for (channel, y) in y.into_iter().enumerate() {
                 let error = noise * stream.normal((channel * n + i) as u64);
-                high.data[channel * n + i] = (y[channel] + error).clamp(0.0, 1.0) as f32;
+                high.data[channel * n + i] = (y + error).clamp(0.0, 1.0) as f32;
             }
         }
         high.save_png16(folder.join(format!("high/{index}.png"))).unwrap();
