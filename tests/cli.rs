@@ -298,11 +298,13 @@ fn bench_checks_and_times_every_kernel_of_a_step_and_names_the_others() {
     let everywhere: Vec<&str> = everywhere.collect();
     let elsewhere = [
         "conv3x3_half",
+        "decode",
         "expose",
         "expose_backward",
         "exposure_center",
         "exposure_gradient",
         "tone_mix",
+        "tone_profile",
         "tone_table",
     ];
     assert_eq!(everywhere, elsewhere);

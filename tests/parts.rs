@@ -10,6 +10,7 @@ use nightsplat::dataset::synthetic::{self, SyntheticOptions};
 use nightsplat::gpu::testing::gpu;
 use nightsplat::image::Image;
 use nightsplat::loss::Term;
+use nightsplat::nn::{DenoiserSettings, Form};
 use nightsplat::tone::{ToneCurve, ToneSettings};
 use nightsplat::train::{Part, Rendered, StepReport, TrainConfig, Trainer};
 
@@ -82,10 +83,13 @@ fn each_part_alone_has_its_channels_and_its_terms_fall() {
     }
 }
 
-/// As the paper has it.
+/// As the paper has it, but for the size of the networks and how fast they learn.
 fn paper(parts: &[Part]) -> TrainConfig {
     let mut config = config(parts);
+    let (network, rates) = (config.model.network, config.model.rates);
     config.model.follow_paper();
+    config.model.rates = rates;
+    config.model.network = DenoiserSettings { form: Form::Paper, ..network };
     config
 }
 
