@@ -211,10 +211,13 @@ impl Shared {
         lock(&self.retired).push((self.last_use.load(Ordering::Acquire), retired));
     }
 
-    /// Frees every retired object whose last submission is `reached` or earlier.
+    /// Frees every retired object whose last submission is `reached` or earlier; commands first, then what they name. One
+    /// thread at a time: validation layers have been seen to crash where two free what belongs together.
     fn collect(&self, reached: u64) {
-        let done: Vec<_> =
-            lock(&self.retired).extract_if(.., |(last_use, _)| *last_use <= reached).collect();
+        let mut retired = lock(&self.retired);
+        let mut done: Vec<_> =
+            retired.extract_if(.., |(last_use, _)| *last_use <= reached).collect();
+        done.sort_by_key(|(_, retired)| !matches!(retired, Retired::Commands(_)));
         for (_, retired) in done {
             // SAFETY: the timeline has passed the object's last use, and its owner is gone.
             unsafe { self.destroy(retired) };
