@@ -166,7 +166,7 @@ impl Exposures {
         )
     }
 
-    /// What was made last, (3, H, W).
+    /// What was exposed or neutralised last, (3, H, W).
     pub fn exposed(&self) -> &Buffer<f32> {
         &self.exposed
     }

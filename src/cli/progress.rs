@@ -47,13 +47,13 @@ pub(crate) fn train(
     out: &Path,
     held: HeldRun,
 ) -> crate::Result<Trained> {
-    let mut progress = Progress::new(ProgressForm::of_terminal());
+    let mut progress = Reporter::new(ProgressForm::of_terminal());
     run::train(gpu, config, dataset, out, held, |event| progress.observe(event))
 }
 
 /// Says what a run does, event by event.
 #[derive(Debug)]
-pub(crate) struct Progress {
+pub(crate) struct Reporter {
     form: ProgressForm,
     bar: ProgressBar,
     /// The last step.
@@ -63,7 +63,7 @@ pub(crate) struct Progress {
     spoke: Instant,
 }
 
-impl Progress {
+impl Reporter {
     pub(crate) fn new(form: ProgressForm) -> Self {
         let now = Instant::now();
         Self { form, bar: ProgressBar::hidden(), steps: 0, begin: (now, 0), spoke: now }
@@ -234,7 +234,7 @@ mod tests {
 
     #[test]
     fn a_line_says_how_far_a_run_is_and_how_long_it_will_take() {
-        let mut progress = Progress::new(ProgressForm::Plain);
+        let mut progress = Reporter::new(ProgressForm::Plain);
         progress.start(100, 400);
         progress.begin.0 -= Duration::from_secs(50);
         let report = StepReport {

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Result;
 
 use super::diagnose;
-use super::progress::{Progress, ProgressForm, summary};
+use super::progress::{ProgressForm, Reporter, summary};
 use crate::dataset::Dataset;
 use crate::densify::DensityControl;
 use crate::diagnose::{Diagnosis, Plan};
@@ -332,7 +332,7 @@ pub fn run(args: &TrainArgs) -> Result<()> {
         say(&mut out, args, &gpu, &dataset, plan)?;
     }
     let held = if args.resume { HeldRun::Resume } else { held_unless(args.overwrite) };
-    let mut progress = Progress::new(form);
+    let mut progress = Reporter::new(form);
     let Trained { trainer, scored, spent, .. } =
         run::train_planned(&gpu, &config, plan.as_ref(), &dataset, &args.out, held, |event| {
             progress.observe(event);

@@ -300,7 +300,8 @@ impl Denoiser {
     }
 
     /// Records the passes from `dL/dR_K` back: overwrites the gradients of the parameters, writes `d_input` and adds to
-    /// `d_render`, each (3, H, W), what the render says beside `I_0`: nothing in the identity form. Inputs and parameters are those of the forward pass before it.
+    /// `d_render`, each (3, H, W), what the render says beside `I_0`: nothing in the identity form. Inputs and parameters are
+    /// those of the forward pass before it.
     ///
     /// # Errors
     /// There is no forward pass of that size before it, or an image is shorter than the view.
