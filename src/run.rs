@@ -1,8 +1,12 @@
 //! A training run from its first step to its last file: what the command does, without its progress bar.
 
+mod aside;
 mod directory;
 mod events;
+mod ledger;
+mod lock;
 mod meter;
+mod requests;
 mod train;
 
 pub use directory::{
@@ -13,4 +17,5 @@ pub use directory::{
 pub(crate) use directory::{SPENT, TARGET_EXPOSURE};
 pub use events::Event;
 pub use meter::{Spent, energy_counters};
-pub use train::{HeldRun, Trained, train, train_planned};
+pub use requests::Requests;
+pub use train::{HeldRun, Session, Trained, train, train_in};

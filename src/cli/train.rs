@@ -7,13 +7,14 @@ use anyhow::Result;
 
 use super::diagnose;
 use super::progress::{ProgressForm, Reporter, summary};
+use super::signals;
 use crate::dataset::Dataset;
 use crate::densify::DensityControl;
 use crate::diagnose::{Diagnosis, Plan};
 use crate::eval;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::nn::Precision;
-use crate::run::{self, HeldRun, RunDirectory, Trained};
+use crate::run::{self, HeldRun, RunDirectory, Session, Trained};
 use crate::tone::{CurveChoice, GainChoice, Profile, ToneCurve, ToneSettings};
 use crate::train::{Background, Learning, ModelName, Part, Preset, TrainConfig};
 
@@ -115,6 +116,15 @@ pub(crate) struct TrainOptions {
     /// Write what --resume goes on from every N steps; 0: never [default: {checkpoint_every}]
     #[arg(long, value_name = "N")]
     checkpoint_every: Option<u64>,
+    /// Write it whenever the last is so many minutes old, too; 0: never [default: {checkpoint_minutes}]
+    #[arg(long, value_name = "MINUTES")]
+    checkpoint_minutes: Option<f64>,
+    /// Save and stop after so many minutes, with exit code 75; --resume goes on; 0: train to the end [default: {max_minutes}]
+    #[arg(long, value_name = "MINUTES")]
+    max_minutes: Option<f64>,
+    /// Log a checksum of every plane of the parameters to hashes.csv every N steps; 0: never [default: {hash_every}]
+    #[arg(long, value_name = "N")]
+    hash_every: Option<u64>,
     /// Compare every pass of every Nth step with its CPU reference, and warn of what differs; 0: never [default: {check.every}]
     #[arg(long, value_name = "N")]
     check_every: Option<u64>,
@@ -299,6 +309,9 @@ impl TrainOptions {
         set(&mut config.device, &self.device);
         set(&mut config.eval_every, &self.eval_every);
         set(&mut config.checkpoint_every, &self.checkpoint_every);
+        set(&mut config.checkpoint_minutes, &self.checkpoint_minutes);
+        set(&mut config.max_minutes, &self.max_minutes);
+        set(&mut config.hash_every, &self.hash_every);
         set(&mut config.check.every, &self.check_every);
         config.check.stops |= self.check_stops;
         if self.exposures.is_some() {
@@ -320,8 +333,9 @@ impl TrainOptions {
 /// Whatever keeps the run from its end, in one line.
 pub fn run(args: &TrainArgs) -> Result<()> {
     let config = args.options.config(args.dataset.clone())?;
-    if !args.resume {
-        RunDirectory::check(&args.out, args.overwrite)?;
+    match args.resume {
+        true => RunDirectory::check_resumed(&args.out)?,
+        false => RunDirectory::check(&args.out, args.overwrite)?,
     }
     let gpu = Gpu::new(&config.device.parse::<DeviceChoice>()?)?;
     let Planned { config, plan, dataset } = planned(args, config, &gpu)?;
@@ -333,8 +347,9 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     }
     let held = if args.resume { HeldRun::Resume } else { held_unless(args.overwrite) };
     let mut progress = Reporter::new(form);
+    let session = Session { plan: plan.as_ref(), held, requests: signals::requests()? };
     let Trained { trainer, scored, spent, .. } =
-        run::train_planned(&gpu, &config, plan.as_ref(), &dataset, &args.out, held, |event| {
+        run::train_in(&gpu, &config, &dataset, &args.out, &session, |event| {
             progress.observe(event);
         })?;
     if !is_text {
