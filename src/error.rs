@@ -119,15 +119,15 @@ pub enum Error {
     },
     /// A parameter became NaN or infinite.
     #[error(
-        "step {step}: {plane} of Gaussian {gaussian} are not finite; lower their learning rate, or go on from the last \
-         checkpoint with another view order: `TrainConfig::seed`"
+        "step {step}: number {gaussian} of {plane} is not finite; lower its learning rate, or begin with another \
+         `TrainConfig::seed`"
     )]
     ParameterNotFinite {
         /// The last step, from 1.
         step: u64,
         /// The attribute, by its name in the table.
         plane: String,
-        /// Its index.
+        /// The Gaussian's index, or that of a number of what else is learned.
         gaussian: usize,
     },
     /// A run that was asked to stop did so, and saved what it goes on from.

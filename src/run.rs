@@ -2,6 +2,7 @@
 
 mod aside;
 mod directory;
+mod done;
 mod events;
 mod ledger;
 mod lock;
@@ -15,6 +16,7 @@ pub use directory::{
 };
 #[cfg(feature = "cli")]
 pub(crate) use directory::{SPENT, TARGET_EXPOSURE};
+pub use done::done_steps;
 pub use events::Event;
 pub use meter::{Spent, energy_counters};
 pub use requests::Requests;

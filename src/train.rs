@@ -30,7 +30,7 @@ use crate::gpu::{Buffer, CheckReport, Gpu, PassTime, Recorder};
 use crate::image::Image;
 use crate::loss::{DepthBoxes, LogSlot, LossLog, Losses, StepLosses, Term, TermInputs};
 use crate::nn::Form;
-use crate::optimizer::{Adam, AdamBuffers, Learnable};
+use crate::optimizer::{Adam, AdamBuffers, FiniteCheck, Learnable};
 use crate::pseudo_gt::PseudoGt;
 use crate::random::Stream;
 use crate::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer};
@@ -173,6 +173,9 @@ pub struct Trainer {
     networks: Option<NetworkTerms>,
     exposures: Option<Exposures>,
     adam: Adam,
+    finite: FiniteCheck,
+    /// After this step the parameters were looked at last.
+    checked: u64,
     densifier: Densifier,
     /// Of a step's view, what is kept in fewer bits: the loss's input, and the photograph where a network sees it besides.
     decoded: [Buffer<f32>; 2],
@@ -270,7 +273,7 @@ impl Trainer {
         if let Some(exposures) = &mut exposures {
             sizes.iter().try_for_each(|&size| exposures.reserve(size))?;
         }
-        let Kernels { renderer, adam, densifier } =
+        let Kernels { renderer, adam, finite, densifier } =
             kernels.join().unwrap_or_else(|panic| resume_unwind(panic))?;
         let [inputs, photographs] = views.decoded_lens();
         let mut trainer = Self {
@@ -289,6 +292,8 @@ impl Trainer {
             networks: NetworkTerms::new(gpu, &config, &sizes)?,
             exposures,
             adam,
+            finite,
+            checked: 0,
             densifier,
             decoded: [gpu.uninit("decoded", inputs)?, gpu.uninit("decoded low", photographs)?],
             d_render: gpu.uninit("d_render", values)?,
@@ -333,6 +338,11 @@ impl Trainer {
     /// The device was lost.
     pub fn gaussians_in_frame(&self) -> Result<Gaussians> {
         self.model.download(&self.gpu)
+    }
+
+    /// What is trained on.
+    pub fn fingerprint(&self) -> &Fingerprint {
+        &self.fingerprint
     }
 
     /// Where the Gaussians are trained.
@@ -533,6 +543,7 @@ impl Trainer {
 struct Kernels {
     renderer: Renderer,
     adam: Adam,
+    finite: FiniteCheck,
     densifier: Densifier,
 }
 
@@ -541,6 +552,7 @@ impl Kernels {
         Ok(Self {
             renderer: Renderer::new(gpu, settings)?,
             adam: Adam::new(gpu)?,
+            finite: FiniteCheck::new(gpu)?,
             densifier: Densifier::new(gpu, density)?,
         })
     }

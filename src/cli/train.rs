@@ -14,6 +14,7 @@ use crate::diagnose::{Diagnosis, Plan};
 use crate::eval;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::nn::Precision;
+use crate::output::printable;
 use crate::run::{self, HeldRun, RunDirectory, Session, Trained};
 use crate::tone::{CurveChoice, GainChoice, Profile, ToneCurve, ToneSettings};
 use crate::train::{Background, Learning, ModelName, Part, Preset, TrainConfig};
@@ -339,6 +340,11 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     }
     let gpu = Gpu::new(&config.device.parse::<DeviceChoice>()?)?;
     let Planned { config, plan, dataset } = planned(args, config, &gpu)?;
+    let finished = if args.resume { run::done_steps(&args.out, &config, &dataset)? } else { None };
+    if let Some(steps) = finished {
+        let done = format!("{} is done: {steps} steps", args.out.display());
+        return Ok(writeln!(std::io::stdout(), "{}", printable(&done))?);
+    }
     let form = args.progress.unwrap_or_else(ProgressForm::of_terminal);
     let is_text = form != ProgressForm::Json;
     let mut out = std::io::stdout();

@@ -30,6 +30,16 @@ impl Fingerprint {
         Self { views: views.collect(), points: hash::text(points.finish()) }
     }
 
+    /// All of it in one checksum.
+    pub fn checksum(&self) -> String {
+        let mut hasher = Hasher::default();
+        for (name, [camera, pixels]) in &self.views {
+            [name, camera, pixels].into_iter().for_each(|text| hasher.write(text.as_bytes()));
+        }
+        hasher.write(self.points.as_bytes());
+        hash::text(hasher.finish())
+    }
+
     /// The first thing in which the dataset that `self` was taken of differs from another.
     pub fn difference(&self, other: &Self) -> Option<String> {
         let missing =

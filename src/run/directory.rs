@@ -107,7 +107,7 @@ const CHECKPOINT: &str = "checkpoint.safetensors";
 const CHECKPOINT_BEFORE: &str = "checkpoint.before.safetensors";
 
 /// The sign that the run is whole, and what it is of.
-const DONE: &str = "done.json";
+pub(super) const DONE: &str = "done.json";
 
 impl RunDirectory {
     /// Refuses a place where no run can begin, before anything is loaded or written.

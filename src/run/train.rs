@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use super::directory::{Progress, SPENT, TARGET_EXPOSURE};
 use super::meter::{Meter, Spent};
-use super::{Event, Requests, RunDirectory, directory};
+use super::{Event, Requests, RunDirectory, directory, done};
 use crate::dataset::Dataset;
 use crate::diagnose::Plan;
 use crate::eval::{self, ViewScore};
@@ -127,6 +127,7 @@ pub fn train_in(
         eval::add_exposure(&mut metrics, &scored)?;
     }
     directory.save_metrics(&metrics)?;
+    done::save(out, config, trainer.fingerprint(), steps)?;
     let trained = Trained { trainer, scored, losses, spent };
     observe(Event::Finished(&trained));
     Ok(trained)

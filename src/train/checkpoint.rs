@@ -225,14 +225,19 @@ impl Trainer {
     }
 
     fn refuse_values(&self, name: &str, values: &[f32]) -> Result<()> {
-        let Some(at) = values.par_iter().position_first(|value| !value.is_finite()) else {
-            return Ok(());
-        };
+        match values.par_iter().position_first(|value| !value.is_finite()) {
+            Some(at) => Err(self.not_finite(name, at)),
+            None => Ok(()),
+        }
+    }
+
+    /// What to say of a value of the state, by its tensor's name.
+    pub(super) fn not_finite(&self, name: &str, at: usize) -> Error {
         let (plane, gaussian) = match name.strip_prefix("gaussians.") {
             Some(_) => self.model.place_of(at),
             None => (name.to_owned(), at),
         };
-        Err(Error::ParameterNotFinite { step: self.step, plane, gaussian })
+        Error::ParameterNotFinite { step: self.step, plane, gaussian }
     }
 
     /// Every tensor is read before one is changed, but for those of the model.

@@ -200,7 +200,9 @@ impl TrainConfig {
     pub fn load(path: &Path) -> Result<Self> {
         let text = std::fs::read_to_string(path)
             .map_err(|error| Error::input(path, format!("cannot be read: {error}")))?;
-        Self::from_toml(&text).map_err(|problem| Error::input(path, problem.to_string()))
+        let config =
+            Self::from_toml(&text).and_then(|config| config.check_finite().map(|()| config));
+        config.map_err(|problem| Error::input(path, problem.to_string()))
     }
 
     /// Reads TOML; what it leaves out keeps its default.

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use toml::{Table, Value};
 
 use super::TrainConfig;
+use crate::hash::{self, Hasher};
 use crate::{Error, Result};
 
 impl TrainConfig {
@@ -74,6 +75,38 @@ impl TrainConfig {
         let mut keys = own.keys().chain(others.keys()).filter(|key| !FREE.contains(&key.as_str()));
         keys.find(|&key| own.get(key) != others.get(key))
             .map(|key| format!("{key} = {}, not {}", value(&own, key), value(&others, key)))
+    }
+
+    /// A checksum of every setting that a result depends on: all but where the dataset lies, when the run is saved and
+    /// checked, how long it may take, and what it finds for itself.
+    ///
+    /// # Errors
+    /// None for a configuration that [`TrainConfig::check`] accepts.
+    pub fn checksum(&self) -> Result<String> {
+        const FREE: [&str; 12] = [
+            "dataset",
+            "device",
+            "tile",
+            "frame.center",
+            "frame.scale",
+            "eval_every",
+            "checkpoint_every",
+            "checkpoint_minutes",
+            "max_minutes",
+            "hash_every",
+            "check.every",
+            "check.stops",
+        ];
+        let own = self.clone().with_absolute_paths();
+        let table = Table::try_from(own).map_err(|error| Error::Usage(error.to_string()))?;
+        let mut hasher = Hasher::default();
+        for (key, value) in settings("", &table) {
+            if !FREE.contains(&key.as_str()) {
+                hasher.write(key.as_bytes());
+                hasher.write(value.to_string().as_bytes());
+            }
+        }
+        Ok(hash::text(hasher.finish()))
     }
 
     /// Refuses numbers that are none, wherever they stand.
