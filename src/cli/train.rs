@@ -105,6 +105,9 @@ pub(crate) struct TrainOptions {
     reference: Option<PathBuf>,
     #[command(flatten)]
     model: ModelOptions,
+    /// Nothing nearer to a camera is seen, in units of the scene's extent: of how far the cameras stand from their middle [default: {near}]
+    #[arg(long, value_name = "N")]
+    near: Option<f64>,
     /// The device: a part of its name or its index in `nightsplat doctor` [default: the best]
     #[arg(long, value_name = "NAME|INDEX")]
     device: Option<String>,
@@ -307,6 +310,7 @@ impl TrainOptions {
         set(&mut config.max_gaussians, &self.max_gaussians);
         set(&mut config.density.control, &self.density);
         set(&mut config.background, &self.background);
+        set(&mut config.near, &self.near);
         set(&mut config.device, &self.device);
         set(&mut config.eval_every, &self.eval_every);
         set(&mut config.checkpoint_every, &self.checkpoint_every);
