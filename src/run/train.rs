@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use super::directory::{Progress, SPENT, TARGET_EXPOSURE};
 use super::meter::{Meter, Spent};
-use super::{Event, Requests, RunDirectory, directory, done};
+use super::{Event, Requests, RunDirectory, directory, done, generations};
 use crate::dataset::Dataset;
 use crate::diagnose::Plan;
 use crate::eval::{self, ViewScore};
@@ -148,7 +148,7 @@ fn begin(
     }
     let lock = RunDirectory::lock(out)?;
     let resumes = held == HeldRun::Resume;
-    let checkpoint = if resumes { directory::checkpoint(out) } else { None };
+    let checkpoint = if resumes { generations::newest(out) } else { None };
     let config = &with_tile_and_frame(gpu, config, dataset, checkpoint.is_some().then_some(out))?;
     let mut trainer = Trainer::new(gpu, config.clone(), dataset)?;
     if let Some(checkpoint) = checkpoint {
