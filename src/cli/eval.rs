@@ -10,6 +10,7 @@ use super::{progress_bar, table};
 use crate::eval::{self, ViewScore};
 use crate::gpu::DeviceChoice;
 use crate::metrics::Scores;
+use crate::output::printable;
 use crate::run;
 use crate::train::Learning;
 
@@ -41,7 +42,7 @@ pub fn run(args: &EvalArgs) -> Result<()> {
         FinishedRun::open(&args.run, args.device.as_ref())?;
     let bar = progress_bar(dataset.test_views().filter(|view| view.reference.is_some()).count());
     let scored = eval::score(&dataset, |view| {
-        bar.set_message(view.name.clone());
+        bar.set_message(printable(&view.name).into_owned());
         player.render(view).inspect(|_| bar.inc(1))
     })?;
     bar.finish_and_clear();

@@ -12,6 +12,7 @@ use crate::eval::Layer;
 use crate::exposure::Affine;
 use crate::gpu::DeviceChoice;
 use crate::image::Image;
+use crate::output::printable;
 use crate::tone::exposed_anew;
 use crate::{Error, run};
 
@@ -79,7 +80,7 @@ pub fn run(args: &RenderArgs) -> Result<()> {
     make_folder(out, &dataset, run)?;
     let bar = progress_bar(views.len());
     for view in &views {
-        bar.set_message(view.name.clone());
+        bar.set_message(printable(&view.name).into_owned());
         let path = out.join(format!("{}.{}", view.name, format.extension()));
         let color = |image: Image| match &exposures {
             Some(exposures) => format.save(&exposures.applied(view, image), &path),

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use super::Trainer;
 use super::terms::NetworkTerms;
 use super::views::lifted_from;
-use crate::camera::Camera;
+use crate::camera::{Camera, Frame};
 use crate::dataset::{Dataset, Split};
 use crate::exposure::Exposures;
 use crate::image::Image;
@@ -67,13 +67,18 @@ impl StopConfig {
     }
 }
 
-/// Cameras, and what they are to show.
+/// Cameras in the frame, and what they are to show.
 #[derive(Debug, Default)]
 pub(super) struct HeldOut(Vec<(Camera, Image)>);
 
 impl HeldOut {
     /// The held-out views of a dataset with their targets, made as those of its training views.
-    pub(super) fn new(pseudo_gt: &mut PseudoGt, dataset: &Dataset, scene: &Scene) -> Result<Self> {
+    pub(super) fn new(
+        pseudo_gt: &mut PseudoGt,
+        dataset: &Dataset,
+        frame: &Frame,
+        scene: &Scene,
+    ) -> Result<Self> {
         let settings = pseudo_gt.settings().clone();
         let mut views = vec![];
         for view in dataset.views.iter().filter(|view| view.split == Split::HeldOut) {
@@ -81,7 +86,7 @@ impl HeldOut {
             let whole = lifted_from(view, image, settings.lift_first)?;
             let lift = settings.lift(scene, &pseudo_gt.measure(&whole.data)?);
             let target = pseudo_gt.lifted(&whole, &lift)?;
-            views.push((view.camera, target.resized(image.width, image.height)));
+            views.push((frame.camera(&view.camera), target.resized(image.width, image.height)));
         }
         Ok(Self(views))
     }
