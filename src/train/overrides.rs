@@ -41,9 +41,12 @@ impl TrainConfig {
 
     /// The first setting in which a run of `self` differs from one of `other`, with both values: `tone.alpha = 0.1, not
     /// 0.12`. Left out is what changes no step beyond its rounding: how long the run is, where the photographs lie, when it
-    /// is scored and saved, on which device and by which tiles.
+    /// is scored and saved, on which device and by which tiles. A lower limit of the Gaussians is no difference either: a
+    /// run that outgrows its machine goes on with what it has.
     pub fn difference(&self, other: &Self) -> Option<String> {
-        const FREE: [&str; 11] = [
+        const FREE: [&str; 13] = [
+            "cache",
+            "tensorboard",
             "steps",
             "dataset",
             "reference",
@@ -66,7 +69,10 @@ impl TrainConfig {
         let value = |settings: &BTreeMap<String, Value>, key: &str| {
             settings.get(key).map_or_else(|| "nothing".to_owned(), Value::to_string)
         };
-        let mut keys = own.keys().chain(others.keys()).filter(|key| !FREE.contains(&key.as_str()));
+        let is_lower_limit =
+            |key: &String| key == "max_gaussians" && other.max_gaussians <= self.max_gaussians;
+        let keys = own.keys().chain(others.keys());
+        let mut keys = keys.filter(|key| !FREE.contains(&key.as_str()) && !is_lower_limit(key));
         keys.find(|&key| own.get(key) != others.get(key))
             .map(|key| format!("{key} = {}, not {}", value(&own, key), value(&others, key)))
     }
