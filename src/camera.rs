@@ -3,11 +3,13 @@
 //! Axes are those of `OpenCV` (x right, y down, z forward); pixel units, the image's corner at (0, 0), pixel centres at +0.5.
 
 pub mod frame;
+mod path;
 
 use glam::{DAffine3, DVec2, DVec3, UVec2};
 
 use crate::kernels;
 pub use frame::Frame;
+pub use path::CameraPath;
 
 /// An undistorted pinhole camera with its pose.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -51,9 +51,10 @@ pub struct View {
     pub split: Split,
     /// Undistorted, at the loaded resolution.
     pub camera: Camera,
-    /// The photograph to train on; every training view has one.
+    /// The photograph to train on; of every training view it is here, or is read anew whenever it is looked at
+    /// ([`View::loaded`]).
     pub image: Option<Image>,
-    /// Where it is read from at its own size, if that is larger.
+    /// Where it is read from, if its own size is larger or it is not kept.
     pub original: Option<Original>,
     /// The normal-light photograph to score against, of the camera's size; test views only.
     pub reference: Option<Image>,
@@ -71,6 +72,24 @@ impl View {
     /// Whether it is for training, be it that it is kept from it to tell when it has converged.
     pub fn is_for_training(&self) -> bool {
         self.split != Split::Test
+    }
+
+    /// Whether there is a photograph, kept or to be read anew.
+    pub fn has_photograph(&self) -> bool {
+        self.image.is_some() || self.original.is_some()
+    }
+
+    /// The photograph at the size of the view's camera; none where the view has none.
+    ///
+    /// # Errors
+    /// [`Error::Input`] where it was not kept and its file can no longer be read.
+    pub fn loaded(&self) -> Result<Option<Cow<'_, Image>>> {
+        let size = (self.camera.width, self.camera.height);
+        match (&self.image, &self.original) {
+            (Some(image), _) => Ok(Some(Cow::Borrowed(image))),
+            (None, Some(original)) => original.load_at(size).map(Cow::Owned).map(Some),
+            (None, None) => Ok(None),
+        }
     }
 
     /// The photograph as its camera took it, undistorted and not shrunk; none where the view has none.
@@ -178,7 +197,8 @@ impl Dataset {
         let Listing { mut frames, mut skipped } = list(root, &files)?;
         refuse_two_of_one_name(root, &frames)?;
         frames.sort_by(|a, b| a.name.cmp(&b.name));
-        split(root, &mut frames)?;
+        say_whose_split_gives_way(root, &frames, options);
+        split(root, &mut frames, options.test_every, &files)?;
 
         let sources = sources(root, &frames, options, &files, &mut skipped);
         let views = pixels::load(sources, options, &mut skipped)?;
@@ -205,6 +225,33 @@ impl Dataset {
         dataset.leave_out_far_points();
         dataset.say_what_stands_elsewhere();
         Ok(dataset)
+    }
+
+    /// Width and height at which each photograph to train on would be loaded, by name, without reading a pixel.
+    ///
+    /// # Errors
+    /// As [`Dataset::load`], but for what is wrong with pixels.
+    pub fn sizes(root: &Path, options: &LoadOptions) -> Result<Vec<(String, [u32; 2])>> {
+        options.check()?;
+        let files = Files::default();
+        let Listing { mut frames, mut skipped } = list(root, &files)?;
+        frames.sort_by(|a, b| a.name.cmp(&b.name));
+        split(root, &mut frames, options.test_every, &files)?;
+        let sources = sources(root, &frames, options, &files, &mut skipped);
+        let training = sources.iter().filter(|source| source.split == Split::Train);
+        training.map(|source| pixels::loaded_size(source, options)).collect()
+    }
+
+    /// What says which views are held out, in words.
+    pub fn split_rule(root: &Path, options: &LoadOptions) -> String {
+        let has_test = transforms::find(root).iter().any(|(_, split)| *split == Some(Split::Test));
+        match options.test_every {
+            Some(0) => "none, as asked for".to_owned(),
+            Some(every) => format!("every {every}th by name, as asked for"),
+            None if has_test => "as the transforms files say".to_owned(),
+            None if root.join("test.txt").is_file() => "as test.txt says".to_owned(),
+            None => format!("every {TEST_EVERY}th by name"),
+        }
     }
 
     /// Whether `root` is a folder that [`Dataset::load`] finds cameras in.
@@ -234,7 +281,7 @@ impl Dataset {
         let Listing { mut frames, mut skipped } = list(root, &files)?;
         refuse_two_of_one_name(root, &frames)?;
         frames.sort_by(|a, b| a.name.cmp(&b.name));
-        split(root, &mut frames)?;
+        split(root, &mut frames, options.test_every, &files)?;
         let sources = sources(root, &frames, options, &files, &mut skipped);
         let photograph = |source: Source| {
             let Source { name, split, input, reference, .. } = source;
@@ -390,8 +437,18 @@ fn refuse_two_of_one_name(root: &Path, frames: &[ListedView]) -> Result<()> {
     Ok(())
 }
 
-/// Frames that the listing did not assign: by `test.txt` (a name a line), else every eighth. Sorted by name already.
-fn split(root: &Path, frames: &mut [ListedView]) -> Result<()> {
+/// Frames that the listing did not assign: by `test.txt` (a name a line), else every eighth. Sorted by name already. Where
+/// it is asked for, every so many instead, whatever else says; 0: none.
+fn split(
+    root: &Path,
+    frames: &mut [ListedView],
+    test_every: Option<usize>,
+    files: &Files,
+) -> Result<()> {
+    if let Some(every) = test_every {
+        split_anew(root, frames, every, files);
+        return Ok(());
+    }
     let path = root.join("test.txt");
     let mut undecided: Vec<&mut ListedView> =
         frames.iter_mut().filter(|frame| frame.split.is_none()).collect();
@@ -417,6 +474,42 @@ fn split(root: &Path, frames: &mut [ListedView]) -> Result<()> {
         );
     }
     Ok(())
+}
+
+/// Says where the dataset has a split that is asked to give way to another.
+fn say_whose_split_gives_way(root: &Path, frames: &[ListedView], options: &LoadOptions) {
+    let own = if frames.iter().any(|frame| frame.split.is_some()) {
+        Some("its transforms files")
+    } else {
+        Some("its test.txt").filter(|_| root.join("test.txt").is_file())
+    };
+    if let Some((own, every)) = own.zip(options.test_every) {
+        tracing::warn!(
+            "{}: {own} split the views, which gives way to `LoadOptions::test_every` {every}; scores do not compare with \
+             those of its own split",
+            root.display()
+        );
+    }
+}
+
+/// Holds out every so many views by name in place of the dataset's own split. A listed test view of which there is no dark
+/// photograph cannot be trained on: it stays a pose.
+fn split_anew(root: &Path, frames: &mut [ListedView], every: usize, files: &Files) {
+    let training = frames.iter().filter(|frame| frame.split == Some(Split::Train));
+    let training_folders: BTreeSet<String> =
+        training.map(|frame| frame.folder().to_owned()).collect();
+    let mut place = 0;
+    for frame in frames {
+        let lists_input =
+            frame.split != Some(Split::Test) || training_folders.contains(frame.folder());
+        let is_posed_only =
+            frame.split == Some(Split::Test) && frame.input(root, lists_input, files).is_none();
+        if !is_posed_only {
+            let is_test = every > 0 && place % every == 0;
+            frame.split = Some(if is_test { Split::Test } else { Split::Train });
+            place += 1;
+        }
+    }
 }
 
 /// Which files each view reads. A training view without its photograph is left out, a test view stays as a pose.

@@ -158,9 +158,14 @@ impl Diagnosis {
             })
         };
         let paths = views.iter().map(|(_, view)| path(view)).collect::<Result<Vec<_>>>()?;
-        let shared = Shared::of(dataset, &views);
-        let photographs = paths.par_iter().map(|path| Photograph::load(path));
-        let photographs = photographs.collect::<Result<Vec<_>>>()?;
+        let shared = Shared::of(dataset, &views)?;
+        let area = |path: &&Path| Image::size_of(path).map(|(w, h)| u64::from(w) * u64::from(h));
+        let largest = paths.iter().filter_map(|path| area(path).ok()).max().unwrap_or_default();
+        let mut photographs = vec![];
+        for paths in paths.chunks(Image::decoded_at_once(largest)) {
+            let loaded = paths.par_iter().map(|path| Photograph::load(path));
+            photographs.extend(loaded.collect::<Result<Vec<_>>>()?);
+        }
         let exposure = Exposure::of(photographs.iter().map(|one| &one.histogram), None);
         let Some(exposure) = exposure else {
             let problem = "every training photograph is as good as black (99 % of its pixels are below 2 of 255); \

@@ -46,7 +46,8 @@ pub enum Error {
     },
     /// A buffer did not fit into device memory.
     #[error(
-        "out of device memory: buffer `{buffer}` needs {bytes} bytes; lower `TrainConfig::max_gaussians` or raise `TrainConfig::downscale`"
+        "out of device memory: buffer `{buffer}` needs {bytes} bytes; lower `TrainConfig::max_gaussians`, \
+         `TrainConfig::max_resolution` or `TrainConfig::cache`"
     )]
     OutOfMemory {
         /// The buffer's name.
@@ -58,7 +59,8 @@ pub enum Error {
     },
     /// A buffer exceeds what one binding may hold on this device.
     #[error(
-        "buffer `{buffer}` needs {bytes} bytes, {device} binds {limit} at most; lower `TrainConfig::max_gaussians` or raise `TrainConfig::downscale`"
+        "buffer `{buffer}` needs {bytes} bytes, {device} binds {limit} at most; lower `TrainConfig::max_gaussians` or \
+         `TrainConfig::max_resolution`"
     )]
     BufferTooLarge {
         /// The buffer's name.

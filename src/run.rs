@@ -8,12 +8,14 @@ mod generations;
 mod ledger;
 mod lock;
 mod meter;
+mod progress;
 mod requests;
+mod tensorboard;
 mod train;
 
 pub use directory::{
     Progress, RunDirectory, is_finished, load_config, load_exposures, load_metrics, load_model,
-    load_networks, load_progress, plan_of,
+    load_networks, load_progress, other_views, plan_of, stopped_at,
 };
 #[cfg(feature = "cli")]
 pub(crate) use directory::{SPENT, TARGET_EXPOSURE};

@@ -1,5 +1,6 @@
 //! Training: one view a step, its pseudo-GT the target, the Gaussians what is learned.
 
+mod cache;
 mod checkpoint;
 mod config;
 mod ends;
@@ -37,12 +38,13 @@ use crate::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer}
 use crate::scene::{Gaussians, width};
 use crate::{Error, Result};
 
+pub use cache::CacheSize;
 pub(crate) use checkpoint::check_checkpoint;
 pub use config::{Background, CheckConfig, DensityConfig, TrainConfig};
 use ends::Ends;
 pub use exposures::{ExposureConfig, Learning};
 use held_out::HeldOut;
-pub use held_out::StopConfig;
+pub use held_out::{StopConfig, targets_of_test_views};
 use model::Model;
 pub use networks::Networks;
 pub use parts::{ModelConfig, ModelName, NetworkRates, Part};
@@ -233,12 +235,9 @@ impl Trainer {
         kernels: ScopedJoinHandle<'_, Result<Kernels>>,
     ) -> Result<Self> {
         let mut pseudo_gt = PseudoGt::new(gpu, &config.tone)?;
-        let levels = config.schedule.resolution_levels();
         let frame = config.frame.unwrap_or_default();
-        let has_networks = config.model.denoiser || config.model.tonemapper;
-        let bits = config.precision.photographs;
         let (mut views, scene, target_exposure) =
-            Views::upload(gpu, &mut pseudo_gt, dataset, &frame, levels, has_networks, bits)?;
+            Views::upload(gpu, &mut pseudo_gt, dataset, &frame, &config)?;
         if config.model.denoiser && config.model.network.form == Form::Identity {
             views.keep_targets(gpu, &pseudo_gt)?;
         }
@@ -397,6 +396,7 @@ impl Trainer {
     /// As [`Trainer::advance`]; a step that overflows its memory is not counted, the next [`Trainer::advance`] redoes it.
     pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
         let step = self.step + 1;
+        self.views.bring(&self.config, step..=step)?;
         let times = self.gpu.clone().profile("step", |pass| self.record_step(pass, step, 0))?;
         if self.gpu.read(self.renderer.status())?.first() == Some(&0) {
             self.step = step;

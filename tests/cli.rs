@@ -180,17 +180,19 @@ fn eval_agrees_with_train_and_saves_what_it_scored() {
 }
 
 #[test]
-fn a_set_without_references_trains_and_scores_nothing() {
+fn a_set_without_references_and_photographs_of_test_views_scores_nothing() {
     let set = copied_set();
     fs::remove_dir_all(set.path().join("high")).unwrap();
-    // The test poses' photographs lie in low/, so they are what is listed.
+    for name in ["000", "008"] {
+        fs::remove_file(set.path().join("low").join(name).with_extension("png")).unwrap();
+    }
     let (root, run) = (set.path().display(), set.path().join("run"));
     succeed(&format!("train {root} --out {} --steps 2", run.display()));
     assert_eq!(json(run.join("metrics.json"))["mean"], Value::Null);
     let (printed, said) = common::command::run(&format!("eval {} --json", run.display()), 0);
     let printed: Value = serde_json::from_str(&printed).unwrap();
     assert_eq!((&printed["mean"], keys(&printed["views"]).len()), (&Value::Null, 0));
-    assert!(said.contains("no test view has a reference image"), "{said}");
+    assert!(said.contains("no test view has a reference image or a photograph"), "{said}");
     assert_eq!(succeed(&format!("eval {}", run.display())).lines().count(), 1);
 }
 
@@ -565,7 +567,7 @@ fn what_is_no_finished_run_is_refused_by_eval_and_render() {
     refused(&format!("eval {run}"), 3, &["model.ply", "did not finish"]);
     let model = fs::read(fixture().path("run/model.ply")).unwrap();
     fs::write(folder.path().join("model.ply"), &model).unwrap();
-    refused(&format!("eval {run}"), 3, &["config.toml", "moved", "correct `dataset`"]);
+    refused(&format!("eval {run}"), 3, &["config.toml", "moved", "--dataset"]);
     fs::write(folder.path().join("config.toml"), config).unwrap();
     fs::write(folder.path().join("model.ply"), &model[..model.len() / 2]).unwrap();
     refused(&format!("eval {run}"), 3, &["model.ply"]);

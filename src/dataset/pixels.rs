@@ -14,6 +14,9 @@ use crate::{Error, Result};
 /// The shortest side that leaves something to train on, pixels.
 const MIN_SIDE: u32 = 16;
 
+/// Of a decoded photograph.
+const BYTES_PER_PIXEL: u64 = 12;
+
 /// What a view is made of.
 #[derive(Clone, Debug)]
 pub(super) struct Source {
@@ -41,9 +44,15 @@ pub(super) fn load(
             None => groups.push((source.lens, vec![source])),
         }
     }
-    let loaded = groups.into_par_iter().map(|(lens, group)| load_group(&lens, group, options));
-    let loaded = loaded.collect::<Result<Vec<_>>>()?;
-    let mut loaded: Vec<Loaded> = loaded.into_iter().flatten().collect();
+    let options = &resolved(&groups, options);
+    let largest = groups.iter().map(|(lens, _)| pixels(lens.width, lens.height)).max();
+    let at_once = Image::decoded_at_once(largest.unwrap_or_default());
+    let mut loaded: Vec<Loaded> = vec![];
+    for groups in groups.chunks(at_once) {
+        let groups =
+            groups.par_iter().map(|(lens, group)| load_group(lens, group, options, at_once));
+        loaded.extend(groups.collect::<Result<Vec<_>>>()?.into_iter().flatten());
+    }
     loaded.sort_by(|a, b| a.name.cmp(&b.name));
     let mut views = Vec::with_capacity(loaded.len());
     for Loaded { view, problems, .. } in loaded {
@@ -53,7 +62,43 @@ pub(super) fn load(
     Ok(views)
 }
 
-/// A photograph that was shrunk on loading.
+fn pixels(width: u32, height: u32) -> u64 {
+    u64::from(width) * u64::from(height)
+}
+
+/// The options with `keep` decided: none where every photograph is kept. Says where `max_resolution` acts.
+fn resolved(groups: &[(Lens, Vec<Source>)], options: &LoadOptions) -> LoadOptions {
+    let mut bytes = 0;
+    let mut shrunk: Vec<&Lens> = vec![];
+    for (lens, group) in groups {
+        let (width, height) = options.loaded_size(lens.width, lens.height);
+        let photographs = group.iter().filter(|source| source.input.is_some()).count() as u64;
+        bytes += photographs * pixels(width, height) * BYTES_PER_PIXEL;
+        let free = LoadOptions { max_resolution: 0, ..options.clone() };
+        if free.loaded_size(lens.width, lens.height) != (width, height) {
+            shrunk.push(lens);
+        }
+    }
+    if let Some(lens) = shrunk.first() {
+        let (width, height) = options.loaded_size(lens.width, lens.height);
+        let (w, h, limit) = (lens.width, lens.height, options.max_resolution);
+        let more = if shrunk.len() > 1 { ", and others alike" } else { "" };
+        tracing::warn!(
+            "photographs of {w}x{h} are trained on at {width}x{height}{more}: `LoadOptions::max_resolution` is {limit}; 0 \
+             takes them as they are"
+        );
+    }
+    let keep = options.keep.filter(|&most| bytes > most);
+    if let Some(most) = keep {
+        let [bytes, most] = [bytes, most].map(|bytes| bytes as f64 / f64::from(1 << 30));
+        tracing::info!(
+            "the photographs take {bytes:.1} GiB decoded, the cache has {most:.1}: they are read anew when they are looked at"
+        );
+    }
+    LoadOptions { keep, ..options.clone() }
+}
+
+/// A photograph that was shrunk on loading, or is not kept.
 #[derive(Clone, Debug)]
 pub struct Original {
     path: PathBuf,
@@ -64,9 +109,14 @@ pub struct Original {
 impl Original {
     /// Reads it anew, undistorted, at its own size.
     pub(super) fn load(&self) -> Result<Image> {
+        self.load_at((self.lens.width, self.lens.height))
+    }
+
+    /// The same, shrunk.
+    pub(super) fn load_at(&self, size: (u32, u32)) -> Result<Image> {
         let Self { path, lens } = self;
         let undistortion = undistortion(lens, &path.to_string_lossy())?;
-        prepared(Image::load(path)?, path, lens, undistortion.as_ref(), (lens.width, lens.height))
+        prepared(Image::load(path)?, path, lens, undistortion.as_ref(), size)
     }
 }
 
@@ -123,6 +173,12 @@ fn check_excess(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Result
     Ok(())
 }
 
+/// A view's name, and the size at which it is loaded.
+pub(super) fn loaded_size(source: &Source, options: &LoadOptions) -> Result<(String, [u32; 2])> {
+    let lens = fitted_lens(source)?;
+    Ok((source.name.clone(), options.loaded_size(lens.width, lens.height).into()))
+}
+
 fn disagreement(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Error {
     let (w, h) = (lens.width, lens.height);
     let problem = format!(
@@ -132,22 +188,29 @@ fn disagreement(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Error 
 }
 
 /// Views of one lens share its undistortion map.
-fn load_group(lens: &Lens, group: Vec<Source>, options: &LoadOptions) -> Result<Vec<Loaded>> {
-    let downscale = options.downscale;
-    let side = |pixels: u32| (f64::from(pixels) / downscale).round() as u32;
-    let size = (side(lens.width), side(lens.height));
+fn load_group(
+    lens: &Lens,
+    group: &[Source],
+    options: &LoadOptions,
+    at_once: usize,
+) -> Result<Vec<Loaded>> {
+    let size = options.loaded_size(lens.width, lens.height);
     let name = group.first().map_or("", |source| source.name.as_str());
     if size.0.min(size.1) < MIN_SIDE {
         return Err(Error::Usage(format!(
-            "downscale {downscale} leaves {}x{} pixels of view {name}, at least {MIN_SIDE} are needed; lower it",
-            size.0, size.1
+            "downscale {} leaves {}x{} pixels of view {name}, at least {MIN_SIDE} are needed; lower it",
+            options.downscale, size.0, size.1
         )));
     }
     let undistortion = undistortion(lens, name)?;
-    group
-        .into_par_iter()
-        .map(|source| load_view(source, lens, undistortion.as_ref(), size, options))
-        .collect()
+    let mut loaded = vec![];
+    for sources in group.chunks(at_once) {
+        let views = sources.par_iter().cloned();
+        let views =
+            views.map(|source| load_view(source, lens, undistortion.as_ref(), size, options));
+        loaded.extend(views.collect::<Result<Vec<_>>>()?);
+    }
+    Ok(loaded)
 }
 
 /// What makes a pinhole of the lens; none where it is one.
@@ -182,7 +245,9 @@ fn load_view(
         }
     };
     let is_shrunk = size != (lens.width, lens.height);
-    let original = input.clone().filter(|_| is_shrunk).map(|path| Original { path, lens: *lens });
+    let is_kept = options.keep.is_none();
+    let original = input.clone().filter(|_| is_shrunk || !is_kept);
+    let original = original.map(|path| Original { path, lens: *lens });
     let (image, reference) = (image(input)?, image(reference)?);
     let depth = depth.and_then(|path| {
         depth_map(&path, lens, undistortion, size, options.depth.is_disparity)
@@ -198,8 +263,9 @@ fn load_view(
     };
     let camera = camera.resized(size.0, size.1);
     let original = original.filter(|_| image.is_some());
+    let image = image.filter(|_| is_kept);
     let view = View { name: name.clone(), split, camera, image, original, reference, depth };
-    let view = (split == Split::Test || view.image.is_some()).then_some(view);
+    let view = (split == Split::Test || view.has_photograph()).then_some(view);
     Ok(Loaded { name, view, problems })
 }
 
@@ -248,7 +314,9 @@ fn prepared(
     } else {
         image.resized(lens.width, lens.height)
     };
-    let image =
-        undistortion.map_or_else(|| image.clone(), |undistortion| undistortion.apply(&image));
-    Ok(image.resized(size.0, size.1))
+    let image = match undistortion {
+        Some(undistortion) => undistortion.apply(&image),
+        None => image,
+    };
+    Ok(if (image.width, image.height) == size { image } else { image.resized(size.0, size.1) })
 }

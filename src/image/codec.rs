@@ -91,9 +91,24 @@ impl Image {
     /// # Errors
     /// [`Error::Output`] names the file; nothing half-written is left under its name.
     pub fn save_png8(&self, path: impl AsRef<Path>) -> Result<()> {
-        let bytes: Vec<u8> =
-            self.interleaved().map(|value| (value.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
-        self.save_png(path.as_ref(), &bytes, ExtendedColorType::Rgb8)
+        self.save_png(path.as_ref(), &self.to_rgb8(), ExtendedColorType::Rgb8)
+    }
+
+    /// The file that [`Image::save_png8`] writes.
+    ///
+    /// # Errors
+    /// None but for what no memory is left for.
+    pub fn to_png8(&self) -> Result<Vec<u8>> {
+        let mut file = Vec::new();
+        PngEncoder::new(&mut file)
+            .write_image(&self.to_rgb8(), self.width, self.height, ExtendedColorType::Rgb8)
+            .map_err(|error| Error::output("a picture", format!("cannot be encoded: {error}")))?;
+        Ok(file)
+    }
+
+    /// Red, green and blue of every pixel in 8 bits: values clamped to [0, 1], rounded to nearest.
+    pub fn to_rgb8(&self) -> Vec<u8> {
+        self.interleaved().map(|value| (value.clamp(0.0, 1.0) * 255.0).round() as u8).collect()
     }
 
     /// Writes a 16-bit RGB PNG: values clamped to [0, 1], rounded to nearest.

@@ -7,7 +7,9 @@
 //!     networks.safetensors    the weights of the networks, where the model has any
 //!     train.csv      one line per step
 //!     held_out.csv   scores of the views that were kept from training, where there are any
-//!     progress.csv   scores of the test views on the way, with what it took, where they are asked for
+//!     evals.csv      scores of the test views on the way, with what it took, where they are asked for
+//!     views.csv      every view, what it is for and how large it is
+//!     tensorboard/   the same for TensorBoard, where that is asked for
 //!     exposures.csv  gain and bias of the training views, where they are learned
 //!     hashes.csv     checksums of the parameters on the way, where they are asked for
 //!     checkpoint.safetensors  what the run goes on from, overwritten every so many steps
@@ -17,11 +19,12 @@
 //! ```
 //!
 //! A file appears under its name only once it is complete, `metrics.json` and `done.json` last: a directory that has them is
-//! whole. While a process trains in it, it holds `.lock`.
+//! whole. The model is written with every checkpoint, too: a run that was stopped can be looked at. While a process trains
+//! in it, it holds `.lock`.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
-use std::io::{BufWriter, Write};
+use std::io::{BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
 
 use glam::DVec3;
@@ -30,13 +33,14 @@ use super::aside::{self, Aside, unwritable};
 use super::generations::{self, CHECKPOINT, CHECKPOINT_BEFORE};
 use super::ledger;
 use super::lock::RunLock;
-use super::meter::Spent;
+pub use super::progress::Progress;
+use super::tensorboard::EventFile;
 use crate::camera::Frame;
+use crate::dataset::{Dataset, Split, View};
 use crate::diagnose::Plan;
 use crate::exposure::{Affine, table};
 use crate::gpu::Gpu;
 use crate::loss::Term;
-use crate::metrics::Scores;
 use crate::output::{csv_field, write_whole};
 use crate::scene::{Features, Gaussians, ply};
 use crate::train::{ModelConfig, Networks, StepReport, TrainConfig, Trainer};
@@ -51,6 +55,7 @@ pub struct RunDirectory {
     terms: Vec<Term>,
     /// What the steps took that the log held already.
     seconds_before: f64,
+    raw_colors: bool,
     /// The run that was here before; back in its place if this is dropped before [`RunDirectory::settle`].
     aside: Aside,
     /// Behind `aside`: nobody else begins before that is in order.
@@ -58,7 +63,7 @@ pub struct RunDirectory {
 }
 
 /// The files of a run that a new run replaces; nothing else in the directory is touched.
-pub(super) const FILES: [&str; 13] = [
+pub(super) const FILES: [&str; 14] = [
     DONE,
     "metrics.json",
     "model.ply",
@@ -70,6 +75,7 @@ pub(super) const FILES: [&str; 13] = [
     HELD_OUT,
     PROGRESS,
     HASHES,
+    VIEWS,
     PLAN,
     "config.toml",
 ];
@@ -81,7 +87,13 @@ const LOG: &str = "train.csv";
 const HELD_OUT: &str = "held_out.csv";
 
 /// Scores of the test views on the way, and what it took.
-const PROGRESS: &str = "progress.csv";
+const PROGRESS: &str = "evals.csv";
+
+/// Name, split and size of every view.
+const VIEWS: &str = "views.csv";
+
+/// The folder of event files.
+const TENSORBOARD: &str = "tensorboard";
 
 /// Checksums of the parameters on the way.
 const HASHES: &str = "hashes.csv";
@@ -172,6 +184,7 @@ impl RunDirectory {
             return Err(held(path, file));
         }
         let aside = Aside::set(path)?;
+        remove_events(path)?;
         let mut run = Self::open(path, config, "", 0.0, aside, lock)?;
         let columns: String = run.terms.iter().map(|term| format!("{},", term.column)).collect();
         run.log_line(&format!("step,view,loss,{columns}gaussians,milliseconds"))?;
@@ -231,7 +244,16 @@ impl RunDirectory {
         let log = File::options().append(true).open(&log_path);
         let log = BufWriter::new(log.map_err(|error| unwritable(&log_path, &error))?);
         let terms = config.loss().terms();
-        Ok(Self { path: path.to_owned(), log, terms, seconds_before, aside, _lock: lock })
+        let raw_colors = config.model.raw_colors;
+        Ok(Self {
+            path: path.to_owned(),
+            log,
+            terms,
+            seconds_before,
+            raw_colors,
+            aside,
+            _lock: lock,
+        })
     }
 
     /// The scores of the held-out views up to a step, in order: step, PSNR in dB.
@@ -280,20 +302,51 @@ impl RunDirectory {
         write_whole(&self.path.join(PLAN), plan.to_toml()?.as_bytes())
     }
 
+    /// Writes which views there are, for whoever opens the run with another copy of them.
+    ///
+    /// # Errors
+    /// The disk is full or gone.
+    pub fn save_views(&self, dataset: &Dataset) -> Result<()> {
+        let lines: String = view_lines(dataset).into_iter().map(|line| line + "\n").collect();
+        let text = format!("name,split,width,height\n{lines}");
+        write_whole(&self.path.join(VIEWS), text.as_bytes())
+    }
+
+    /// Begins event files for TensorBoard, behind a step.
+    pub(super) fn events(&self, step: u64) -> Result<EventFile> {
+        EventFile::create(&self.path.join(TENSORBOARD), step)
+    }
+
     /// What the steps took that a resumed run had behind it, in seconds.
     pub fn seconds_before(&self) -> f64 {
         self.seconds_before
     }
 
-    /// Writes what the run can go on from, behind a log that reaches as far. The one before stays; while this is written it
-    /// is the only one.
+    /// Writes what the run can go on from, behind a log that reaches as far, and the model as it is now. The checkpoint
+    /// before stays; while this is written it is the only one.
     ///
     /// # Errors
     /// The disk is full or gone, the device was lost, or a parameter is not finite.
     pub fn save_checkpoint(&mut self, trainer: &mut Trainer) -> Result<()> {
         self.log.flush().map_err(|error| unwritable(&self.path, &error))?;
         let newest = generations::make_room(&self.path)?;
-        trainer.save_checkpoint(&newest)
+        trainer.save_checkpoint(&newest)?;
+        self.save_trained(trainer)
+    }
+
+    /// Writes the model and what belongs to it, as it is now.
+    ///
+    /// # Errors
+    /// The disk is full or gone, the device was lost, or a parameter is not finite.
+    pub(super) fn save_trained(&mut self, trainer: &mut Trainer) -> Result<()> {
+        self.save_model(trainer)?;
+        if let Some(networks) = trainer.networks() {
+            self.save_networks(networks)?;
+        }
+        match trainer.exposures()? {
+            Some(exposures) => self.save_exposures(&exposures),
+            None => Ok(()),
+        }
     }
 
     /// Where it is.
@@ -337,7 +390,7 @@ impl RunDirectory {
     ///
     /// # Errors
     /// The disk is full or gone, or a parameter is not finite.
-    pub fn save_model(&mut self, trainer: &Trainer, raw_colors: bool) -> Result<()> {
+    pub fn save_model(&mut self, trainer: &Trainer) -> Result<()> {
         self.flush_log()?;
         let (mut gaussians, frame) = (trainer.gaussians_in_frame()?, trainer.frame());
         trainer.refuse_not_finite(&gaussians)?;
@@ -345,7 +398,7 @@ impl RunDirectory {
         if *frame != Frame::WORLD {
             gaussians = gaussians.to_world(frame, origin);
         }
-        if raw_colors {
+        if self.raw_colors {
             gaussians.shift_colors(-0.5);
         }
         let [x, y, z] = origin.to_array();
@@ -383,68 +436,60 @@ impl RunDirectory {
     }
 }
 
-/// The scores of the test views at one step of a run, and what the steps up to it took.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Progress {
-    /// Counted from 1.
-    pub step: u64,
-    /// On the wall, without scoring.
-    pub seconds: f64,
-    /// On all processors together, without scoring; none where the system does not say.
-    pub processor_seconds: Option<f64>,
-    /// Of the whole machine; none where it has no counter.
-    pub joules: Option<f64>,
-    /// The number of Gaussians.
-    pub gaussians: u64,
-    /// The mean over the test views, dB.
-    pub psnr: f64,
-    /// The mean over the test views.
-    pub ssim: f64,
-}
-
-impl Progress {
-    const COLUMNS: &str = "step,seconds,processor_seconds,joules,gaussians,psnr,ssim";
-
-    pub(super) fn new(step: u64, gaussians: usize, scores: &Scores, spent: &Spent) -> Self {
-        Self {
-            step,
-            seconds: spent.seconds,
-            processor_seconds: spent.processor_seconds,
-            joules: spent.joules,
-            gaussians: gaussians as u64,
-            psnr: scores.psnr,
-            ssim: scores.ssim,
-        }
-    }
-
-    fn line(&self) -> String {
-        let Self { step, seconds, gaussians, psnr, ssim, .. } = self;
-        let [processor, joules] = [self.processor_seconds, self.joules]
-            .map(|value| value.map_or_else(String::new, |value| format!("{value:.2}")));
-        format!("{step},{seconds:.3},{processor},{joules},{gaussians},{psnr},{ssim}\n")
-    }
-
-    fn parse(line: &str) -> Option<Self> {
-        let fields: Vec<&str> = line.split(',').collect();
-        let [step, seconds, processor, joules, gaussians, psnr, ssim] = fields[..] else {
-            return None;
-        };
-        Some(Self {
-            step: step.parse().ok()?,
-            seconds: seconds.parse().ok()?,
-            processor_seconds: processor.parse().ok(),
-            joules: joules.parse().ok(),
-            gaussians: gaussians.parse().ok()?,
-            psnr: psnr.parse().ok()?,
-            ssim: ssim.parse().ok()?,
-        })
-    }
-}
-
 /// How a run came to where it is; nothing where its test views were scored at the end alone.
 pub fn load_progress(run: &Path) -> Vec<Progress> {
     let text = std::fs::read_to_string(run.join(PROGRESS)).unwrap_or_default();
     text.lines().filter_map(Progress::parse).collect()
+}
+
+/// How the views of a dataset differ from those that a run was trained and scored on, in words; none where they are the
+/// same, or the run does not say which those were.
+pub fn other_views(run: &Path, dataset: &Dataset) -> Option<String> {
+    let text = std::fs::read_to_string(run.join(VIEWS)).ok()?;
+    let own: BTreeSet<&str> = text.lines().skip(1).collect();
+    let lines = view_lines(dataset);
+    let others: BTreeSet<&str> = lines.iter().map(String::as_str).collect();
+    let [gone, new] = [own.difference(&others), others.difference(&own)].map(|lines| {
+        let lines: Vec<&str> = lines.copied().collect();
+        lines.first().map(|first| format!("{} (the first: {first})", lines.len()))
+    });
+    match (gone, new) {
+        (None, None) => None,
+        (Some(gone), Some(new)) => {
+            Some(format!("{gone} views of the run are not in it, {new} are new"))
+        }
+        (Some(gone), None) => Some(format!("{gone} views of the run are not in it")),
+        (None, Some(new)) => Some(format!("{new} views are new")),
+    }
+}
+
+/// A line for every view.
+fn view_lines(dataset: &Dataset) -> Vec<String> {
+    let line = |view: &View| {
+        let split = match view.split {
+            Split::Train => "train",
+            Split::Test => "test",
+            Split::HeldOut => "held_out",
+        };
+        format!("{},{split},{},{}", view.name, view.camera.width, view.camera.height)
+    };
+    dataset.views.iter().map(line).collect()
+}
+
+/// The step of the model of a run that did not come to its end; none of a finished one, and where none is known.
+pub fn stopped_at(run: &Path) -> Option<u64> {
+    if is_finished(run) {
+        return None;
+    }
+    // The header of a safetensors file, length first, is JSON with a note in which the checkpoint says what it is.
+    let mut file = File::open(generations::newest(run)?).ok()?;
+    let mut length = [0; 8];
+    file.read_exact(&mut length).ok()?;
+    let mut header = String::new();
+    file.take(u64::from_le_bytes(length)).read_to_string(&mut header).ok()?;
+    let header: serde_json::Value = serde_json::from_str(&header).ok()?;
+    let note = header["__metadata__"]["checkpoint"].as_str()?;
+    serde_json::from_str::<serde_json::Value>(note).ok()?["step"].as_u64()
 }
 
 /// Whether a directory holds a run, be it of another version: a configuration with what every one has.
@@ -492,11 +537,13 @@ pub fn plan_of(run: &Path) -> Option<PathBuf> {
 /// The trained Gaussians of a run.
 ///
 /// # Errors
-/// The run has not been trained to its end, or the file is cut short.
+/// The run has not been trained to its end or a checkpoint, or the file is cut short.
 pub fn load_model(run: &Path, raw_colors: bool) -> Result<Gaussians> {
     let path = run.join("model.ply");
     if !path.is_file() {
-        return Err(Error::input(run, "has no model.ply: the run did not finish; train it again"));
+        let problem = "has no model.ply: the run did not finish, nor come to a checkpoint; train it again, or go on with \
+                       --resume";
+        return Err(Error::input(run, problem));
     }
     let mut gaussians = ply::load(path)?;
     if raw_colors {
@@ -541,6 +588,18 @@ fn remove(run: &Path, files: &[&str]) -> Result<()> {
     Ok(())
 }
 
+fn remove_events(run: &Path) -> Result<()> {
+    let folder = run.join(TENSORBOARD);
+    let Ok(entries) = std::fs::read_dir(&folder) else { return Ok(()) };
+    for file in entries.flatten().map(|entry| entry.path()) {
+        let name = file.file_name().unwrap_or_default().to_string_lossy();
+        if name.starts_with("events.out.tfevents.") && name.ends_with(".nightsplat") {
+            std::fs::remove_file(&file).map_err(|error| unwritable(&file, &error))?;
+        }
+    }
+    Ok(())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -573,10 +632,18 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let run = RunDirectory::create(folder.path(), &TrainConfig::default(), false).unwrap();
         assert!(run.progress(9).is_empty());
-        let scores = Scores { psnr: 24.5, psnr_channel_mean: 25.0, ssim: 0.75 };
-        let spent = |seconds, joules| Spent { seconds, joules, ..Spent::default() };
-        let progress = [(2, spent(0.5, None)), (4, spent(1.25, Some(30.5)))]
-            .map(|(step, spent)| Progress::new(step, 7, &scores, &spent));
+        let progress = |step, seconds, joules| Progress {
+            step,
+            views: 2,
+            psnr: 24.5,
+            psnr_channel_mean: 25.0,
+            ssim: 0.75,
+            seconds,
+            processor_seconds: None,
+            joules,
+            gaussians: 7,
+        };
+        let progress = [progress(2, 0.5, None), progress(4, 1.25, Some(30.5))];
         run.save_progress(&progress).unwrap();
         assert_eq!(load_progress(folder.path()), progress);
         assert_eq!(run.progress(3), progress[..1]);

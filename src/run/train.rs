@@ -1,16 +1,18 @@
 //! Trains into a run directory and tells an observer.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use super::directory::{Progress, SPENT, TARGET_EXPOSURE};
 use super::meter::{Meter, Spent};
+use super::tensorboard::EventFile;
 use super::{Event, Requests, RunDirectory, directory, done, generations};
-use crate::dataset::Dataset;
+use crate::dataset::{Dataset, View};
 use crate::diagnose::Plan;
-use crate::eval::{self, ViewScore};
+use crate::eval::{self, ViewScore, Yardstick};
 use crate::gpu::Gpu;
-use crate::train::{TrainConfig, Trainer};
+use crate::scene::ATTRIBUTES;
+use crate::train::{Learning, StepReport, TrainConfig, Trainer};
 use crate::{Error, Result, Stop};
 
 /// What becomes of a run that the directory already holds.
@@ -104,17 +106,15 @@ pub fn train_in(
     if let Some(plan) = session.plan {
         directory.save_plan(plan)?;
     }
+    directory.save_views(dataset)?;
     observe(Event::Started { step: trainer.steps_done(), steps: config.steps });
-    let mut course = Course::new(config, dataset, &directory, &trainer);
+    let mut course = Course::new(gpu, config, dataset, &directory, &trainer)?;
     let requests = &session.requests;
     let losses = course.train_to_the_end(&mut trainer, &mut directory, requests, &mut observe)?;
     trainer.leave_out_what_gains_nothing()?;
     let spent = course.meter.spent(gpu.peak_memory());
     let scored = course.evaluate(&mut trainer, &directory, &mut observe)?;
-    directory.save_model(&trainer, config.model.raw_colors)?;
-    if let Some(networks) = trainer.networks() {
-        directory.save_networks(networks)?;
-    }
+    directory.save_trained(&mut trainer)?;
     let (gaussians, steps) = (trainer.gaussian_count(), trainer.steps_done());
     let mut metrics = eval::metrics(&scored, spent.seconds, gaussians, steps);
     metrics[SPENT] = serde_json::json!(spent);
@@ -122,8 +122,7 @@ pub fn train_in(
     if let Some(exposure) = trainer.target_exposure() {
         metrics[TARGET_EXPOSURE] = serde_json::json!(exposure);
     }
-    if let Some(exposures) = trainer.exposures()? {
-        directory.save_exposures(&exposures)?;
+    if config.exposure.learn == Learning::On {
         eval::add_exposure(&mut metrics, &scored)?;
     }
     directory.save_metrics(&metrics)?;
@@ -149,13 +148,19 @@ fn begin(
     let lock = RunDirectory::lock(out)?;
     let resumes = held == HeldRun::Resume;
     let checkpoint = if resumes { generations::newest(out) } else { None };
-    let config = &with_tile_and_frame(gpu, config, dataset, checkpoint.is_some().then_some(out))?;
+    let mut config =
+        with_tile_and_frame(gpu, config, dataset, checkpoint.is_some().then_some(out))?;
+    config.spool = config.spool.or_else(|| existing(out));
+    let config = &config;
     let mut trainer = Trainer::new(gpu, config.clone(), dataset)?;
     if let Some(checkpoint) = checkpoint {
         trainer.restore(&checkpoint)?;
         let step = trainer.steps_done();
         tracing::info!("{} goes on after step {step}", out.display());
-        return Ok((RunDirectory::resume(out, lock, config, step)?, trainer));
+        let mut directory = RunDirectory::resume(out, lock, config, step)?;
+        // What it had of a later step is gone: the model is that of the checkpoint again.
+        directory.save_trained(&mut trainer)?;
+        return Ok((directory, trainer));
     }
     // Without a checkpoint, an unfinished run is nothing to lose.
     let replaces = match held {
@@ -164,6 +169,12 @@ fn begin(
         HeldRun::Resume => !directory::is_finished(out),
     };
     Ok((RunDirectory::create_locked(out, lock, config, replaces)?, trainer))
+}
+
+/// The run directory, or the folder that it will lie in: a disk of that size has room for photographs.
+fn existing(out: &Path) -> Option<PathBuf> {
+    let folders = out.ancestors().filter(|folder| !folder.as_os_str().is_empty());
+    folders.map(Path::to_owned).find(|folder| folder.is_dir())
 }
 
 /// The configuration with the tile and the frame that are to be recorded: the same ones give the same bits, whatever is
@@ -189,21 +200,29 @@ fn with_tile_and_frame(
 
 /// How far a run has come, and what that took.
 struct Course<'a> {
+    gpu: &'a Gpu,
     config: &'a TrainConfig,
     dataset: &'a Dataset,
     meter: Meter,
     progress: Vec<Progress>,
+    /// Once something was scored.
+    yardstick: Option<Yardstick>,
+    /// For TensorBoard.
+    events: Option<EventFile>,
 }
 
 impl<'a> Course<'a> {
     fn new(
+        gpu: &'a Gpu,
         config: &'a TrainConfig,
         dataset: &'a Dataset,
         directory: &RunDirectory,
         trainer: &Trainer,
-    ) -> Self {
-        let meter = Meter::new(directory.seconds_before());
-        Self { config, dataset, meter, progress: directory.progress(trainer.steps_done()) }
+    ) -> Result<Self> {
+        let (meter, step) = (Meter::new(directory.seconds_before()), trainer.steps_done());
+        let progress = directory.progress(step);
+        let events = config.tensorboard.then(|| directory.events(step)).transpose()?;
+        Ok(Self { gpu, config, dataset, meter, progress, yardstick: None, events })
     }
 
     /// Logs every step, writes checkpoints and ends early where that is asked for; gives the losses.
@@ -230,6 +249,7 @@ impl<'a> Course<'a> {
             for report in &reports {
                 losses.push(report.loss);
                 directory.log(report)?;
+                self.tell_events(report)?;
                 observe(Event::Step(report));
             }
             directory.flush_log()?;
@@ -279,17 +299,66 @@ impl<'a> Course<'a> {
         directory: &RunDirectory,
         observe: &mut impl FnMut(Event<'_>),
     ) -> Result<Vec<ViewScore>> {
-        let scored = eval::score(self.dataset, |view| trainer.render(&view.camera))?;
+        let yardstick = match self.yardstick.take() {
+            Some(known) => known,
+            None => Yardstick::of(self.gpu, &self.config.tone, self.dataset)?,
+        };
+        let render = |view: &View| trainer.render(&view.camera);
+        let scored = eval::score_by(&yardstick, self.dataset, render)?;
+        self.yardstick = Some(yardstick);
         let step = trainer.steps_done();
         observe(Event::Evaluated { step, scored: &scored });
+        self.tell_events_scores(step, &scored)?;
         if let Some(scores) = eval::means(&scored).0.filter(|_| self.config.eval_every > 0) {
             let (gaussians, spent) = (trainer.gaussian_count(), self.meter.spent(0));
             // A finished run that goes on begins where it was scored last.
             self.progress.retain(|earlier| earlier.step < step);
-            self.progress.push(Progress::new(step, gaussians, &scores, &spent));
+            self.progress.push(Progress::new(step, gaussians, scored.len(), &scores, &spent));
             directory.save_progress(&self.progress)?;
         }
         Ok(scored)
+    }
+}
+
+impl Course<'_> {
+    /// Writes what TensorBoard draws over the steps, of every tenth.
+    fn tell_events(&mut self, report: &StepReport) -> Result<()> {
+        const EVERY: u64 = 10;
+        let Some(events) = &mut self.events else { return Ok(()) };
+        let step = report.step;
+        if !step.is_multiple_of(EVERY) && step < self.config.steps {
+            return Ok(());
+        }
+        let named = |group: &str, name: &str, value| (format!("{group}/{name}"), value);
+        let mut values = vec![("loss/all".to_owned(), report.loss)];
+        values.extend(report.terms.iter().map(|(term, value)| named("loss", term.column, *value)));
+        values.push(("model/Gaussians".to_owned(), report.gaussians as f64));
+        values.push(("model/milliseconds a step".to_owned(), report.milliseconds));
+        let rates = self.config.schedule.learning_rates(step, self.dataset.extent());
+        values.extend(ATTRIBUTES.iter().map(|own| named("rates", own.name, rates[own.attribute])));
+        events.scalars(step, &values)?;
+        events.flush()
+    }
+
+    /// Writes scores and the first test view.
+    fn tell_events_scores(&mut self, step: u64, scored: &[ViewScore]) -> Result<()> {
+        let (Some(events), Some(first)) = (&mut self.events, scored.first()) else { return Ok(()) };
+        let group = format!("test views against {}", first.against.name());
+        if let Some(mean) = eval::means(scored).0 {
+            let values = [
+                ("PSNR", mean.psnr),
+                ("channel-mean PSNR", mean.psnr_channel_mean),
+                ("SSIM", mean.ssim),
+            ];
+            events
+                .scalars(step, &values.map(|(name, value)| (format!("{group}/{name}"), value)))?;
+        }
+        let pictures = [("render", &first.render), (first.against.name(), &first.reference)];
+        for (name, image) in pictures {
+            let tag = format!("view {}/{name}", first.name);
+            events.picture(step, &tag, [image.width, image.height], &image.to_png8()?)?;
+        }
+        events.flush()
     }
 }
 

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
+use super::cache::CacheSize;
 use super::exposures::{ExposureConfig, Learning};
 use super::held_out::StopConfig;
 use super::parts::ModelConfig;
@@ -12,6 +13,7 @@ use super::streams;
 use crate::camera::frame::{FRAME_EXTENT, Frame};
 use crate::dataset::{Dataset, DepthOptions, LoadOptions};
 use crate::densify::DensityControl;
+use crate::gpu::Gpu;
 use crate::loss::LossConfig;
 use crate::nn::Form;
 use crate::optimizer::Schedule;
@@ -62,6 +64,18 @@ pub struct TrainConfig {
     pub steps: u64,
     /// Factor by which photographs shrink.
     pub downscale: f64,
+    /// The longest side of a view, pixels; photographs beyond it shrink to it. 0: no limit.
+    pub max_resolution: u32,
+    /// Every so many views by name are held out in place of the dataset's own split; 0: none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub test_every: Option<usize>,
+    /// What the photographs may take, on the device and decoded on the host; what does not fit waits on disk, and no bit
+    /// changes. Left out: a quarter of the memory of each.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub cache: Option<CacheSize>,
+    /// The folder for what exceeds the cache; none: that of the system's temporary files.
+    #[serde(skip)]
+    pub spool: Option<PathBuf>,
     /// Everything random follows from it.
     pub seed: u64,
     /// Highest degree of the spherical harmonics.
@@ -82,6 +96,9 @@ pub struct TrainConfig {
     pub max_minutes: f64,
     /// Logs a checksum of every plane of the parameters every so many steps; 0: never.
     pub hash_every: u64,
+    /// Leaves event files for TensorBoard.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub tensorboard: bool,
     /// Steps whose every pass is compared with its CPU reference.
     pub check: CheckConfig,
     /// The device: a part of its name or its index; empty: the best.
@@ -146,6 +163,10 @@ impl Default for TrainConfig {
             reference: None,
             steps: 5000,
             downscale: 1.0,
+            max_resolution: 1600,
+            test_every: None,
+            cache: None,
+            spool: None,
             seed: 10,
             sh_degree: MAX_SH_DEGREE,
             ssim_weight: 0.2,
@@ -156,6 +177,7 @@ impl Default for TrainConfig {
             checkpoint_minutes: 10.0,
             max_minutes: 0.0,
             hash_every: 0,
+            tensorboard: false,
             check: CheckConfig::default(),
             device: String::new(),
             tile: None,
@@ -229,6 +251,9 @@ impl TrainConfig {
     pub fn load_options(&self) -> LoadOptions {
         LoadOptions {
             downscale: self.downscale,
+            max_resolution: self.max_resolution,
+            test_every: self.test_every,
+            keep: CacheSize::on_host(self.cache),
             reference: self.reference.clone(),
             hold_out: self.stop.views,
             depth: DepthOptions {
@@ -256,6 +281,28 @@ impl TrainConfig {
                 "{count} of {} training views have a depth map",
                 dataset.train_views().count()
             );
+        }
+    }
+
+    /// Refuses photographs that the device could not train on at the size that is asked for. Only their headers are read.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] names the first such view and the option that helps; [`Error::Input`] is what is wrong with the
+    /// dataset's listing.
+    pub fn check_sizes(&self, gpu: &Gpu) -> Result<()> {
+        let settings = self.render_settings();
+        let sizes = Dataset::sizes(&self.dataset, &self.load_options())?;
+        sizes.into_iter().try_for_each(|(view, size)| settings.check_size(gpu, &view, size))
+    }
+
+    /// The same run of another copy of its dataset; what lay in its folder lies there, too.
+    pub fn move_dataset(&mut self, dataset: &Path) {
+        let from = std::mem::replace(&mut self.dataset, dataset.to_owned());
+        let inside = [&mut self.reference, &mut self.model.depth_folder, &mut self.exposure.start];
+        for folder in inside.into_iter().flatten() {
+            if let Ok(place) = folder.strip_prefix(&from) {
+                *folder = dataset.join(place);
+            }
         }
     }
 

@@ -4,14 +4,15 @@ use serde::{Deserialize, Serialize};
 
 use super::Trainer;
 use super::terms::NetworkTerms;
-use super::views::lifted_from;
+use super::views::{lifted_from, measured};
 use crate::camera::{Camera, Frame};
-use crate::dataset::{Dataset, Split};
+use crate::dataset::{Dataset, Split, View};
 use crate::exposure::Exposures;
+use crate::gpu::Gpu;
 use crate::image::Image;
 use crate::metrics::psnr;
 use crate::pseudo_gt::PseudoGt;
-use crate::tone::Scene;
+use crate::tone::{Scene, ToneSettings};
 use crate::{Error, Result};
 
 /// When a run, or a part of it, ends before its last step. The scores are against targets, never against references.
@@ -79,17 +80,40 @@ impl HeldOut {
         frame: &Frame,
         scene: &Scene,
     ) -> Result<Self> {
-        let settings = pseudo_gt.settings().clone();
-        let mut views = vec![];
-        for view in dataset.views.iter().filter(|view| view.split == Split::HeldOut) {
-            let Some(image) = &view.image else { continue };
-            let whole = lifted_from(view, image, settings.lift_first)?;
-            let lift = settings.lift(scene, &pseudo_gt.measure(&whole.data)?);
-            let target = pseudo_gt.lifted(&whole, &lift)?;
-            views.push((frame.camera(&view.camera), target.resized(image.width, image.height)));
-        }
-        Ok(Self(views))
+        let held_out = dataset.views.iter().filter(|view| view.split == Split::HeldOut);
+        let targets =
+            held_out.map(|view| Ok((frame.camera(&view.camera), target(pseudo_gt, view, scene)?)));
+        let targets = targets.collect::<Result<Vec<_>>>()?;
+        Ok(Self(targets.into_iter().filter_map(|(camera, own)| Some((camera, own?))).collect()))
     }
+}
+
+/// The target of a view, made as those of the training views are; none without a photograph.
+fn target(pseudo_gt: &mut PseudoGt, view: &View, scene: &Scene) -> Result<Option<Image>> {
+    let settings = pseudo_gt.settings().clone();
+    let Some(photograph) = lifted_from(view, settings.lift_first)? else { return Ok(None) };
+    let lift = settings.lift(scene, &pseudo_gt.measure(&photograph.data)?);
+    let target = pseudo_gt.lifted(&photograph, &lift)?;
+    Ok(Some(target.resized(view.camera.width, view.camera.height)))
+}
+
+/// What `tone` makes of the test views' photographs in the scene of the training photographs, by name: the targets that
+/// they would have were they trained on.
+///
+/// # Errors
+/// Every training photograph is as good as black where their exposure is asked for; a photograph can no longer be read;
+/// the device is out of memory or lost.
+pub fn targets_of_test_views(
+    gpu: &Gpu,
+    tone: &ToneSettings,
+    dataset: &Dataset,
+) -> Result<Vec<(String, Image)>> {
+    let mut pseudo_gt = PseudoGt::new(gpu, tone)?;
+    let (scene, _) = measured(&mut pseudo_gt, dataset)?;
+    let targets = dataset.test_views().map(|view| {
+        Ok(target(&mut pseudo_gt, view, &scene)?.map(|target| (view.name.clone(), target)))
+    });
+    Ok(targets.collect::<Result<Vec<_>>>()?.into_iter().flatten().collect())
 }
 
 impl Trainer {

@@ -86,8 +86,9 @@ impl Trainer {
                     break;
                 }
                 let steps = next..=last.min(next + self.pace.steps() - 1);
-                next = steps.end() + 1;
-                in_flight.push_back(self.submit(steps)?);
+                let fitting = self.views.bring(&self.config, steps)?;
+                in_flight.push_back(self.submit(next..=fitting)?);
+                next = fitting + 1;
             }
             let Some(oldest) = in_flight.pop_front() else { break };
             // What is in flight behind a step that failed changes nothing.

@@ -274,7 +274,7 @@ const FRONTS: [(&str, Measure); 2] =
 pub(super) fn anytime_csv(outcomes: &[Outcome]) -> String {
     let mut text = "point,step,seconds,processor_seconds,joules,gaussians,psnr,ssim\n".to_owned();
     for outcome in outcomes {
-        for Progress { step, seconds, processor_seconds, joules, gaussians, psnr, ssim } in
+        for Progress { step, seconds, processor_seconds, joules, gaussians, psnr, ssim, .. } in
             &outcome.progress
         {
             let (name, processor, joules) =

@@ -175,7 +175,8 @@ impl Page<'_> {
             image: image.clone(),
         };
         let mut pictures: Vec<Picture> = vec![];
-        pictures.extend(view.image.as_ref().map(|dark| picture("photograph", String::new(), dark)));
+        let dark = view.loaded()?;
+        pictures.extend(dark.map(|dark| picture("photograph", String::new(), &dark)));
         for outcome in self.outcomes.iter().filter(|outcome| outcome.knob().is_none()) {
             let is_its = |run: &&Run| {
                 let mut point = run.point.clone();
