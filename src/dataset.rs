@@ -6,8 +6,10 @@
 
 mod colmap;
 mod fingerprint;
+mod members;
 mod options;
 mod pixels;
+mod place;
 mod similarity;
 pub mod synthetic;
 mod transforms;
@@ -19,11 +21,12 @@ use std::path::{Path, PathBuf};
 
 use glam::{DAffine3, DVec3};
 
-use crate::camera::{Camera, Frame, Lens, frame};
+use crate::camera::{Camera, Lens};
 use crate::image::Image;
 use crate::image::files::{self, Files};
 use crate::{Error, Result};
 pub use fingerprint::Fingerprint;
+use members::with_held_out;
 pub use options::{DepthOptions, LoadOptions};
 pub use pixels::Original;
 use pixels::Source;
@@ -290,19 +293,6 @@ impl Dataset {
         Ok((sources.into_iter().filter_map(photograph).collect(), skipped))
     }
 
-    /// Leaves out views by name; points forget them.
-    pub fn leave_out(&mut self, names: &[String]) {
-        let stays: Vec<bool> = self.views.iter().map(|view| !names.contains(&view.name)).collect();
-        let place = |view: u32| {
-            let stays_before = stays[..view as usize].iter().filter(|&&stays| stays).count();
-            stays[view as usize].then_some(stays_before as u32)
-        };
-        for point in &mut self.points {
-            point.views = point.views.iter().filter_map(|&view| place(view)).collect();
-        }
-        self.views.retain(|view| !names.contains(&view.name));
-    }
-
     /// The training views.
     pub fn train_views(&self) -> impl Iterator<Item = &View> {
         self.views.iter().filter(|view| view.split == Split::Train)
@@ -311,67 +301,6 @@ impl Dataset {
     /// The held-out views.
     pub fn test_views(&self) -> impl Iterator<Item = &View> {
         self.views.iter().filter(|view| view.split == Split::Test)
-    }
-
-    /// The scene's size as 3DGS takes it: 1.1 times the largest distance of a training camera to their mean, world units.
-    /// Where all stand in one spot, half of the points are within it; without points it is 1.
-    pub fn extent(&self) -> f64 {
-        self.place().1
-    }
-
-    /// Where the scene is trained.
-    pub fn frame(&self) -> Frame {
-        let (center, extent) = self.place();
-        Frame::new(center, extent)
-    }
-
-    /// The middle of the training cameras, and the extent.
-    fn place(&self) -> (DVec3, f64) {
-        let centers = self.train_views().map(|view| view.camera.center());
-        let (center, spread) = frame::spread(&centers.collect::<Vec<DVec3>>());
-        if spread > 0.0 {
-            return (center, spread);
-        }
-        let mut away: Vec<f64> =
-            self.points.iter().map(|point| point.position.distance(center)).collect();
-        let half = away.len() / 2;
-        let typical = (!away.is_empty())
-            .then(|| *away.select_nth_unstable_by(half, f64::total_cmp).1)
-            .filter(|&distance| distance > 0.0);
-        (center, typical.unwrap_or(1.0))
-    }
-
-    /// Leaves out the points that no number of the device holds or that lie a million extents away: they are of no use, and
-    /// what they are made of would not stay finite.
-    fn leave_out_far_points(&mut self) {
-        const MOST_EXTENTS: f64 = 1e6;
-        let (center, extent) = self.place();
-        let before = self.points.len();
-        // Positive phrasing: a NaN fails the test too.
-        self.points.retain(|point| point.position.distance(center) <= MOST_EXTENTS * extent);
-        let gone = before - self.points.len();
-        if gone > 0 {
-            tracing::warn!(
-                "{}: {gone} of {before} points lie more than a million times the cameras' extent away, or nowhere; they are \
-                 left out",
-                self.root.display()
-            );
-        }
-    }
-
-    /// Says which training cameras stand far from all others.
-    fn say_what_stands_elsewhere(&self) {
-        let (center, extent) = self.place();
-        for view in self.train_views() {
-            let own = view.camera.center();
-            if frame::stands_elsewhere(own, (center, extent)) {
-                tracing::warn!(
-                    "view {} stands {:.0e} extents of the other cameras away from them; check its pose",
-                    view.name,
-                    own.distance(center) / extent
-                );
-            }
-        }
     }
 }
 
@@ -596,17 +525,6 @@ impl ListedView {
             NORMAL_FOLDERS.iter().filter_map(|folder| self.find(&root.join(folder), files));
         self.file.clone().into_iter().chain(beside).find(|file| Some(file) != input)
     }
-}
-
-/// Keeps so many training views from training, an eighth of them at most, spread evenly.
-fn with_held_out(mut views: Vec<View>, count: usize) -> Vec<View> {
-    const MOST: usize = 8;
-    let mut training: Vec<&mut View> = views.iter_mut().filter(|view| view.is_train()).collect();
-    let (of, count) = (training.len(), count.min(training.len() / MOST));
-    for place in 0..count {
-        training[(2 * place + 1) * of / (2 * count)].split = Split::HeldOut;
-    }
-    views
 }
 
 /// The points of the dataset's COLMAP model, brought into the views' world.

@@ -322,3 +322,17 @@ fn the_exit_code_says_who_can_do_something_about_it() {
     refused(&place.train("new", "--steps 1 --device voodoo"), 4, &["voodoo"]);
     assert!(!place.path("new").exists());
 }
+
+#[test]
+fn too_little_address_space_is_said_before_a_driver_faults() {
+    let place = Place::new();
+    let program = env!("CARGO_BIN_EXE_nightsplat");
+    for kilobytes in [300_000, 600_000] {
+        let line =
+            format!("ulimit -v {kilobytes}; exec {program} {}", place.train("run", "--steps 1"));
+        let output = Command::new("sh").args(["-c", &line]).output().unwrap();
+        let stderr = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(4), "{stderr}");
+        assert!(stderr.contains("`ulimit -v`") && stderr.lines().count() == 1, "{stderr}");
+    }
+}
