@@ -326,7 +326,7 @@ fn the_exit_code_says_who_can_do_something_about_it() {
 #[test]
 fn too_little_address_space_is_said_before_a_driver_faults() {
     let place = Place::new();
-    let program = env!("CARGO_BIN_EXE_nightsplat");
+    let program = command("").get_program().to_str().unwrap().to_owned();
     for kilobytes in [300_000, 600_000] {
         let line =
             format!("ulimit -v {kilobytes}; exec {program} {}", place.train("run", "--steps 1"));
