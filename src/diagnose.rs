@@ -150,7 +150,7 @@ impl Diagnosis {
     pub fn of(dataset: &Dataset, options: &LoadOptions) -> Result<Self> {
         let views: Vec<(usize, &View)> =
             dataset.views.iter().enumerate().filter(|(_, view)| view.is_for_training()).collect();
-        let (files, _) = Dataset::listed(&dataset.root, options)?;
+        let (files, ..) = Dataset::listed(&dataset.root, options)?;
         let path = |view: &View| {
             let file = files.iter().find(|file| file.name == view.name);
             file.map(|file| file.input.as_path()).ok_or_else(|| {

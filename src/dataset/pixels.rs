@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use glam::DAffine3;
 use rayon::prelude::*;
 
-use super::undistort::Undistortion;
+use super::undistort::{Undistortion, WIDEST};
 use super::{LoadOptions, Split, View};
 use crate::camera::{Camera, Lens};
 use crate::image::Image;
@@ -120,6 +120,12 @@ fn load_group(lens: &Lens, group: Vec<Source>, options: &LoadOptions) -> Result<
         )));
     }
     let undistortion = undistortion(lens, name)?;
+    if undistortion.as_ref().is_some_and(|undistortion| undistortion.is_cropped) {
+        tracing::warn!(
+            "view {name} and {} more are of a fisheye that sees farther off its axis than the {WIDEST} degrees at the corners of what is trained on; the rest is cropped",
+            group.len() - 1
+        );
+    }
     group
         .into_par_iter()
         .map(|source| load_view(source, lens, undistortion.as_ref(), size, options))
