@@ -215,6 +215,17 @@ impl Dataset {
         !transforms::find(root).is_empty() || !colmap::find(root, &["cameras", "images"]).is_empty()
     }
 
+    /// Of the models that COLMAP left in the folders of `folder` the one that places the most photographs, with their names.
+    ///
+    /// # Errors
+    /// [`Error::Input`] where a model is damaged.
+    pub fn largest_model(folder: &Path) -> Result<Option<(PathBuf, Vec<String>)>> {
+        let models = colmap::models_in(folder, &["cameras", "images", "points3D"]);
+        let Some((model, _)) = colmap::largest(&models, |_| true)? else { return Ok(None) };
+        let names = colmap::read_images(model)?.into_iter().map(|image| image.name);
+        Ok(Some((model.to_owned(), names.collect())))
+    }
+
     /// The files of the views below `root`, sorted by name, without reading a pixel.
     ///
     /// # Errors

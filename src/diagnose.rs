@@ -21,7 +21,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use crate::camera::Camera;
-use crate::dataset::{Dataset, LoadOptions, View};
+use crate::dataset::{self, Dataset, LoadOptions, View};
 use crate::image::{Image, MIDDLE_GREY, files};
 use crate::tone::{Exposure, LuminanceHistogram, is_black};
 use crate::{Error, Result};
@@ -171,7 +171,7 @@ impl Diagnosis {
             photograph.diagnosis(&views[place].1.name, &shared, place)
         };
         let own: Vec<ViewDiagnosis> = photographs.iter().enumerate().map(of_view).collect();
-        let without_pose = without_pose(&paths, dataset)?;
+        let without_pose = without_pose(&paths, &files, dataset)?;
         let remarks = remarks(&own, &photographs, &views, &without_pose);
         let mut scene =
             SceneDiagnosis::of(&own, photographs, &shared, &exposure, dataset.points.len());
@@ -319,12 +319,18 @@ fn deviation(values: impl Iterator<Item = f64>) -> Option<f64> {
 }
 
 /// The photographs beside those of the training views that are no view's.
-fn without_pose(paths: &[&Path], dataset: &Dataset) -> Result<Vec<String>> {
+fn without_pose(
+    paths: &[&Path],
+    files: &[dataset::Photograph],
+    dataset: &Dataset,
+) -> Result<Vec<String>> {
     let folders: BTreeSet<&Path> = paths.iter().filter_map(|path| path.parent()).collect();
     let mut names = vec![];
     for folder in folders {
         let photographs = files::photographs_in(folder)?;
-        let stems = photographs.iter().filter_map(|path| path.file_stem()?.to_str());
+        let is_a_views = |path: &&PathBuf| files.iter().any(|file| file.input == **path);
+        let others = photographs.iter().filter(|path| !is_a_views(path));
+        let stems = others.filter_map(|path| path.file_stem()?.to_str());
         let is_posed = |name: &&str| dataset.views.iter().any(|view| view.name == **name);
         names.extend(stems.filter(|name| !is_posed(name)).map(str::to_owned));
     }

@@ -29,7 +29,7 @@ use crate::{Error, Result};
 #[expect(clippy::doc_markdown, reason = "in help, {setting} stands for its default")]
 #[derive(Clone, Debug, clap::Args)]
 pub struct ToneArgs {
-    /// A photograph (PNG, JPEG or EXR), a folder of them, or a dataset; taken as stored, not undistorted
+    /// A photograph (PNG, JPEG, WebP, TIFF or EXR) or a folder of them, turned upright, or a dataset's, as stored and not undistorted
     pub input: PathBuf,
     /// The curve: a name that `nightsplat curves` lists, or a .toml, .csv or .cube file
     #[arg(long, value_name = "NAME|FILE", default_value_t = ToneSettings::default().curve.into())]
@@ -349,6 +349,7 @@ impl CurveOnSet {
 /// A photograph with those of its pixels that are no numbers.
 fn loaded(listed: &Listed) -> Result<(Image, Vec<usize>)> {
     let (photograph, gaps) = Image::load_with_gaps(&listed.input)?;
+    let (photograph, gaps) = listed.turned(photograph, gaps);
     if gaps.len() == photograph.pixel_count() {
         return Err(Error::input(&listed.input, "has no pixel that is a number; export it anew"));
     }
@@ -367,7 +368,8 @@ struct Mapped {
 
 fn mapped(set: &mut CurveOnSet, listed: &Listed) -> Result<Mapped> {
     let (photograph, gaps) = loaded(listed)?;
-    let reference = listed.reference.as_ref().map(Image::load).transpose()?;
+    let load = if listed.split.is_none() { Image::load_upright } else { Image::load };
+    let reference = listed.reference.as_ref().map(load).transpose()?;
     let (statistics, image, gain) = set.result(&photograph, &gaps)?;
     Ok(Mapped { photograph, gaps, statistics, image, gain, reference })
 }

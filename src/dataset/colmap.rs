@@ -38,15 +38,20 @@ const FOLDERS: [&str; 5] =
 
 /// The models below `root` with what `needed` lists, of the first place that has any, by name.
 pub(super) fn find(root: &Path, needed: &[&str]) -> Vec<PathBuf> {
+    let mut models = FOLDERS.iter().map(|place| models_in(&root.join(place), needed));
+    models.find(|models| !models.is_empty()).unwrap_or_default()
+}
+
+/// The models in the folders of a place, or itself where they hold none.
+pub(super) fn models_in(place: &Path, needed: &[&str]) -> Vec<PathBuf> {
     let complete = |folder: &PathBuf| needed.iter().all(|stem| file(folder, stem).is_some());
-    let models = FOLDERS.iter().map(|place| {
-        let place = root.join(place);
-        let entries = std::fs::read_dir(&place).into_iter().flatten().flatten();
-        let mut models: Vec<PathBuf> = entries.map(|entry| entry.path()).filter(complete).collect();
-        models.sort();
-        if models.is_empty() { Some(place).filter(complete).into_iter().collect() } else { models }
-    });
-    models.into_iter().find(|models| !models.is_empty()).unwrap_or_default()
+    let entries = std::fs::read_dir(place).into_iter().flatten().flatten();
+    let mut models: Vec<PathBuf> = entries.map(|entry| entry.path()).filter(complete).collect();
+    models.sort();
+    if models.is_empty() {
+        models.extend(Some(place.to_owned()).filter(complete));
+    }
+    models
 }
 
 /// The model that places the most photographs that exist, and how many each of several places; none of none.

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use super::undistort::{Undistortion, WIDEST};
 use super::{LoadOptions, Split, View};
 use crate::camera::{Camera, Lens};
-use crate::image::Image;
+use crate::image::{Image, Orientation};
 use crate::{Error, Result};
 
 /// The shortest side that leaves something to train on, pixels.
@@ -66,7 +66,8 @@ impl Original {
     pub(super) fn load(&self) -> Result<Image> {
         let Self { path, lens } = self;
         let undistortion = undistortion(lens, &path.to_string_lossy())?;
-        prepared(Image::load(path)?, path, lens, undistortion.as_ref(), (lens.width, lens.height))
+        let image = loaded(path, lens)?;
+        prepared(image, path, lens, undistortion.as_ref(), (lens.width, lens.height))
     }
 }
 
@@ -82,7 +83,10 @@ fn fitted_lens(source: &Source) -> Result<Lens> {
     let lens = source.lens;
     // What has no readable header is named when it is decoded.
     let sized = [&source.input, &source.reference].into_iter().flatten();
-    let sized = sized.filter_map(|path| Some((path, Image::size_of(path).ok()?)));
+    let sized = sized.filter_map(|path| {
+        let size = Image::size_of(path).ok()?;
+        Some((path, turn(path, size, &lens).size(size)))
+    });
     let Some((path, (width, height))) = sized.clone().next() else {
         return Ok(lens);
     };
@@ -99,10 +103,34 @@ fn fitted_lens(source: &Source) -> Result<Lens> {
     Ok(fitted)
 }
 
+/// How a photograph is turned to be what its camera took. Poses are of what is stored, as COLMAP reads it; where the
+/// camera's size is that of what is seen, and not of what is stored, they are of that.
+fn turn(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Orientation {
+    if lens.fitted(width, height).is_some() {
+        return Orientation::UPRIGHT;
+    }
+    let said = Orientation::of(path);
+    let (width, height) = said.size((width, height));
+    if lens.fitted(width, height).is_some() { said } else { Orientation::UPRIGHT }
+}
+
+/// A photograph as its camera took it.
+fn loaded(path: &Path, lens: &Lens) -> Result<Image> {
+    let image = Image::load(path)?;
+    let orientation = turn(path, (image.width, image.height), lens);
+    Ok(image.turned(orientation))
+}
+
 fn disagreement(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Error {
     let (w, h) = (lens.width, lens.height);
+    let (seen_width, seen_height) = Orientation::of(path).size((width, height));
+    let seen = if seen_width == width {
+        String::new()
+    } else {
+        format!(" (upright {seen_width}x{seen_height})")
+    };
     let problem = format!(
-        "is {width}x{height} but its camera is {w}x{h}; use the photographs that the cameras were made with"
+        "is {width}x{height}{seen} but its camera is {w}x{h}; use the photographs that the cameras were made with"
     );
     Error::input(path, problem)
 }
@@ -154,7 +182,7 @@ fn load_view(
     let mut problems = Vec::new();
     let mut image = |path: Option<PathBuf>| -> Result<Option<Image>> {
         let Some(path) = path else { return Ok(None) };
-        match Image::load(&path) {
+        match loaded(&path, lens) {
             Ok(image) => prepared(image, &path, lens, undistortion, size).map(Some),
             Err(error) => {
                 problems.push(error.to_string());

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use super::ListedView;
 use crate::image::files::{photographs_in, unread_in};
 
-/// A line for photographs without a pose, and one for each folder with pictures that are not read.
+/// A line where most photographs have no pose, and one for each folder with pictures that are not read.
 pub(super) fn remarks(root: &Path, frames: &[ListedView]) -> Vec<String> {
     let used: BTreeSet<&Path> = frames.iter().filter_map(|frame| frame.file.as_deref()).collect();
     let images = root.join("images");
@@ -27,13 +27,11 @@ pub(super) fn remarks(root: &Path, frames: &[ListedView]) -> Vec<String> {
         folders.iter().flat_map(|folder| photographs_in(folder).unwrap_or_default()).collect();
     let without_pose: Vec<&PathBuf> = photographs.iter().filter(|file| !is_used(file)).collect();
     let mut remarks = vec![];
-    if let Some(first) = without_pose.first() {
-        let (count, of) = (without_pose.len(), photographs.len());
-        let remedy =
-            if 2 * count > of { "; `nightsplat pose` finds those of dark photographs" } else { "" };
+    let (count, of) = (without_pose.len(), photographs.len());
+    if let Some(first) = without_pose.first().filter(|_| 2 * count > of) {
         let first = first.strip_prefix(root).unwrap_or(first).display();
         remarks.push(format!(
-            "{}: {count} of {of} photographs have no pose and are not used, {first} the first{remedy}",
+            "{}: {count} of {of} photographs have no pose and are not used, {first} the first; `nightsplat pose` finds those of dark photographs",
             root.display()
         ));
     }

@@ -7,11 +7,11 @@ use std::path::{Path, PathBuf};
 use crate::{Error, Result};
 
 /// Endings of the files that [`super::Image::load`] reads.
-const READABLE: [&str; 4] = ["png", "jpg", "jpeg", "exr"];
+const READABLE: [&str; 7] = ["png", "jpg", "jpeg", "exr", "tif", "tiff", "webp"];
 /// Endings of other pictures and clips: no part of a name either. What follows another dot is.
-const UNREADABLE: [&str; 22] = [
-    "tif", "tiff", "webp", "bmp", "hdr", "gif", "avif", "jxl", "heic", "heif", "dng", "cr2", "cr3",
-    "nef", "arw", "raf", "rw2", "orf", "pef", "mp4", "mov", "mkv",
+const UNREADABLE: [&str; 19] = [
+    "bmp", "hdr", "gif", "avif", "jxl", "heic", "heif", "dng", "cr2", "cr3", "nef", "arw", "raf",
+    "rw2", "orf", "pef", "mp4", "mov", "mkv",
 ];
 /// Those of them that a phone writes and other programs convert.
 const HEIC: [&str; 2] = ["heic", "heif"];

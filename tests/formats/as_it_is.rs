@@ -6,7 +6,7 @@ use std::path::Path;
 use nightsplat::dataset::Split;
 use serde_json::json;
 
-use crate::command::run;
+use crate::common::command::run;
 use crate::synthetic::*;
 use crate::{load, names, view};
 
@@ -97,12 +97,18 @@ fn a_byte_order_mark_changes_nothing() {
         ["sparse/0/cameras.txt", "sparse/0/images.txt", "sparse/0/points3D.txt", "test.txt"];
     let texts = files.map(|file| fs::read_to_string(root.join(file)).unwrap());
     let utf8 = |text: &str| [b"\xEF\xBB\xBF", text.as_bytes()].concat();
-    let little =
-        |text: &str| format!("\u{feff}{text}").encode_utf16().flat_map(u16::to_le_bytes).collect();
-    let big =
-        |text: &str| format!("\u{feff}{text}").encode_utf16().flat_map(u16::to_be_bytes).collect();
-    let encodings: [&dyn Fn(&str) -> Vec<u8>; 3] = [&utf8, &little, &big];
-    for encode in encodings {
+    let little = |text: &str| {
+        format!("\u{feff}{text}").encode_utf16().flat_map(u16::to_le_bytes).collect::<Vec<u8>>()
+    };
+    let big = |text: &str| {
+        format!("\u{feff}{text}").encode_utf16().flat_map(u16::to_be_bytes).collect::<Vec<u8>>()
+    };
+    for encoding in 0..3 {
+        let encode = |text: &str| match encoding {
+            0 => utf8(text),
+            1 => little(text),
+            _ => big(text),
+        };
         for (file, text) in files.iter().zip(&texts) {
             fs::write(root.join(file), encode(text)).unwrap();
         }

@@ -4,8 +4,6 @@
 
 mod as_it_is;
 mod bad_input;
-#[path = "../common/command.rs"]
-mod command;
 #[path = "../common/mod.rs"]
 mod common;
 mod real;

@@ -6,7 +6,8 @@ use std::path::{Path, PathBuf};
 use super::{ToneArgs, is_same_file};
 use crate::cli::ImageFormat;
 use crate::dataset::{Dataset, LoadOptions, Photograph, Split};
-use crate::image::files::photographs_in;
+use crate::image::files::{photographs_in, unread_in};
+use crate::image::{Image, Orientation};
 use crate::{Error, Result};
 
 /// A photograph to map.
@@ -19,6 +20,26 @@ pub(super) struct Listed {
     pub(super) split: Option<Split>,
     /// The file to write.
     pub(super) target: Option<PathBuf>,
+}
+
+impl Listed {
+    /// Turned upright, as its pixels that are no numbers are, unless cameras may say how it is stored.
+    pub(super) fn turned(&self, image: Image, gaps: Vec<usize>) -> (Image, Vec<usize>) {
+        let orientation = match self.split {
+            None => Orientation::of(&self.input),
+            Some(_) => Orientation::UPRIGHT,
+        };
+        let is_gap = |value: &f32| *value > 0.0;
+        let gaps = if gaps.is_empty() || orientation == Orientation::UPRIGHT {
+            gaps
+        } else {
+            let mut marked = Image::filled(image.width, image.height, [0.0; 3]);
+            gaps.iter().for_each(|&gap| marked.data[gap] = 1.0);
+            let marked = marked.turned(orientation).data;
+            (0..image.pixel_count()).filter(|&pixel| is_gap(&marked[pixel])).collect()
+        };
+        (image.turned(orientation), gaps)
+    }
 }
 
 /// The photographs of the input: itself, those of a folder by name, or a dataset's.
@@ -41,10 +62,13 @@ pub(super) fn listed(args: &ToneArgs) -> Result<Vec<Listed>> {
         Dataset::photographs(input, &options)?.into_iter().map(of_view).collect()
     } else {
         let files = photographs_in(input)?;
+        if let Some(line) = unread_in(input) {
+            tracing::warn!("{line}");
+        }
         files.iter().map(|file| plain(file, args.reference.as_deref())).collect::<Result<_>>()?
     };
     if photographs.is_empty() {
-        return Err(Error::input(input, "holds no PNG, JPEG or EXR image"));
+        return Err(Error::input(input, "holds no PNG, JPEG, WebP, TIFF or EXR image"));
     }
     if let Some(out) = &args.out {
         set_targets(&mut photographs, out, args.format)?;
