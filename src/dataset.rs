@@ -5,6 +5,7 @@
 //! same name is a test view's reference image (`View::reference`), used for scores only and loaded for test views only.
 
 mod colmap;
+mod masks;
 mod names;
 mod options;
 mod pixels;
@@ -22,8 +23,8 @@ use std::path::{Path, PathBuf};
 use glam::{DAffine3, DVec3};
 
 use crate::camera::{Camera, Lens};
-use crate::image::Image;
 use crate::image::files::{self, Files};
+use crate::image::{Image, Mask};
 use crate::{Error, Result};
 pub use options::{DepthOptions, LoadOptions};
 pub use pixels::Original;
@@ -60,6 +61,8 @@ pub struct View {
     pub original: Option<Original>,
     /// The normal-light photograph to score against, of the camera's size; test views only.
     pub reference: Option<Image>,
+    /// Which of its pixels count, of the camera's size; none where all do.
+    pub mask: Option<Mask>,
     /// Depth from elsewhere, (H, W) of the camera's size, in units and with an offset of its own; larger is farther.
     /// Training views only, and none where it says nothing, being the same everywhere.
     pub depth: Option<Vec<f32>>,
@@ -74,6 +77,22 @@ impl View {
     /// Whether it is for training, be it that it is kept from it to tell when it has converged.
     pub fn is_for_training(&self) -> bool {
         self.split != Split::Test
+    }
+
+    /// The planes of one of its images, of any size, without the pixels that do not count.
+    pub fn counted<'a>(&self, image: &'a Image) -> Cow<'a, [f32]> {
+        match &self.mask {
+            Some(mask) => mask.counted(image).into(),
+            None => (&image.data).into(),
+        }
+    }
+
+    /// One of its images, of any size, of which the pixels that do not count are black.
+    pub fn blacked_out(&self, image: Image) -> Image {
+        match &self.mask {
+            Some(mask) => mask.blacked_out(image),
+            None => image,
+        }
     }
 
     /// The photograph as its camera took it, undistorted and not shrunk; none where the view has none.
@@ -110,6 +129,8 @@ pub struct Photograph {
     pub input: PathBuf,
     /// The normal-light photograph to score against; test views only.
     pub reference: Option<PathBuf>,
+    /// The mask, whose black pixels do not count.
+    pub mask: Option<PathBuf>,
 }
 
 /// A triangulated point of the scene.
@@ -250,8 +271,8 @@ impl Dataset {
         split(root, &mut frames)?;
         let sources = sources(root, &frames, options, &files, &mut skipped);
         let photograph = |source: Source| {
-            let Source { name, split, input, reference, .. } = source;
-            Some(Photograph { name, split, input: input?, reference })
+            let Source { name, split, input, reference, mask, .. } = source;
+            Some(Photograph { name, split, input: input?, reference, mask })
         };
         Ok((sources.into_iter().filter_map(photograph).collect(), skipped, remarks))
     }
@@ -451,8 +472,10 @@ fn sources(
             let depth = (options.depth.load && split == Split::Train)
                 .then(|| frame.depth(root, options.depth.folder.as_deref(), files))
                 .flatten();
+            let mask = masks::find(root, frame, files);
             let ListedView { name, lens, view_from_world, .. } = frame.clone();
-            sources.push(Source { name, split, lens, view_from_world, input, reference, depth });
+            let camera = (lens, view_from_world);
+            sources.push(Source::new((name, split), camera, [input, reference, mask, depth]));
         }
     }
     if let Some(folder) = &options.reference

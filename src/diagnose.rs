@@ -22,7 +22,7 @@ use serde::Serialize;
 
 use crate::camera::Camera;
 use crate::dataset::{self, Dataset, LoadOptions, View};
-use crate::image::{Image, MIDDLE_GREY, files};
+use crate::image::{Image, MIDDLE_GREY, Mask, files};
 use crate::tone::{Exposure, LuminanceHistogram, is_black};
 use crate::{Error, Result};
 use geometry::Shared;
@@ -153,13 +153,14 @@ impl Diagnosis {
         let (files, ..) = Dataset::listed(&dataset.root, options)?;
         let path = |view: &View| {
             let file = files.iter().find(|file| file.name == view.name);
-            file.map(|file| file.input.as_path()).ok_or_else(|| {
+            file.ok_or_else(|| {
                 Error::input(&dataset.root, format!("no longer has photograph {}", view.name))
             })
         };
         let paths = views.iter().map(|(_, view)| path(view)).collect::<Result<Vec<_>>>()?;
         let shared = Shared::of(dataset, &views);
-        let photographs = paths.par_iter().map(|path| Photograph::load(path));
+        let invert = options.invert_masks;
+        let photographs = paths.par_iter().map(|file| Photograph::load(file, invert));
         let photographs = photographs.collect::<Result<Vec<_>>>()?;
         let exposure = Exposure::of(photographs.iter().map(|one| &one.histogram), None);
         let Some(exposure) = exposure else {
@@ -208,12 +209,15 @@ struct Photograph {
 }
 
 impl Photograph {
-    fn load(path: &Path) -> Result<Self> {
-        let image = Image::load(path)?;
+    fn load(file: &dataset::Photograph, invert_masks: bool) -> Result<Self> {
+        let image = Image::load(&file.input)?;
+        let mask = Mask::load(&file.input, file.mask.as_deref(), invert_masks)?;
+        let counted = mask.map(|mask| mask.counted(&image));
+        let counted = counted.as_deref().unwrap_or(&image.data);
         Ok(Self {
             size: [image.width, image.height],
-            measured: Measured::of(&image),
-            histogram: LuminanceHistogram::of(&image.data),
+            measured: Measured::of(&image, counted),
+            histogram: LuminanceHistogram::of(counted),
         })
     }
 
@@ -320,11 +324,11 @@ fn deviation(values: impl Iterator<Item = f64>) -> Option<f64> {
 
 /// The photographs beside those of the training views that are no view's.
 fn without_pose(
-    paths: &[&Path],
+    paths: &[&dataset::Photograph],
     files: &[dataset::Photograph],
     dataset: &Dataset,
 ) -> Result<Vec<String>> {
-    let folders: BTreeSet<&Path> = paths.iter().filter_map(|path| path.parent()).collect();
+    let folders: BTreeSet<&Path> = paths.iter().filter_map(|file| file.input.parent()).collect();
     let mut names = vec![];
     for folder in folders {
         let photographs = files::photographs_in(folder)?;

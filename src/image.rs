@@ -14,6 +14,7 @@ mod exr_file;
 pub(crate) mod files;
 #[cfg(feature = "io")]
 mod jpeg;
+mod mask;
 #[cfg(feature = "io")]
 mod orientation;
 
@@ -21,6 +22,7 @@ mod orientation;
 pub use exif::exposure_value;
 #[cfg(feature = "cli")]
 pub(crate) use jpeg::exif_segment;
+pub use mask::Mask;
 #[cfg(feature = "io")]
 pub use orientation::Orientation;
 use rayon::prelude::*;

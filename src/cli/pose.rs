@@ -130,6 +130,7 @@ pub fn run(args: &PoseArgs) -> Result<()> {
         let Some(path) = by_name.get(stem(name)) else { continue };
         link_or_copy(path, &images.join(path.file_name().unwrap_or_default()))?;
     }
+    keep_masks(&args.photos.join("masks"), &out.folder.join("masks"))?;
     let sparse = out.folder.join("sparse/0");
     create(&sparse)?;
     for file in ["cameras.bin", "images.bin", "points3D.bin"] {
@@ -225,6 +226,18 @@ fn reconstructed(
     }
     say(begin, "cameras placed")?;
     Ok(models)
+}
+
+/// The masks beside the photographs go with them.
+fn keep_masks(masks: &Path, to: &Path) -> Result<()> {
+    if !masks.is_dir() {
+        return Ok(());
+    }
+    create(to)?;
+    for mask in photographs_in(masks)? {
+        link_or_copy(&mask, &to.join(mask.file_name().unwrap_or_default()))?;
+    }
+    Ok(())
 }
 
 /// The photographs of a folder, of different names.

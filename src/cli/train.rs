@@ -101,6 +101,9 @@ pub(crate) struct TrainOptions {
     /// A folder of reference images by name, for scores only
     #[arg(long, value_name = "DIR")]
     reference: Option<PathBuf>,
+    /// Masks (masks/NAME.png or masks/NAME.jpg.png of the dataset) hide what is white, not what is black
+    #[arg(long)]
+    invert_masks: bool,
     #[command(flatten)]
     model: ModelOptions,
     /// The device: a part of its name or its index in `nightsplat doctor` [default: the best]
@@ -301,6 +304,7 @@ impl TrainOptions {
         set(&mut config.checkpoint_every, &self.checkpoint_every);
         set(&mut config.check.every, &self.check_every);
         config.check.stops |= self.check_stops;
+        config.invert_masks |= self.invert_masks;
         if self.exposures.is_some() {
             (config.exposure.learn, config.exposure.start) = (Learning::On, self.exposures.clone());
         }

@@ -6,9 +6,9 @@ use glam::DAffine3;
 use rayon::prelude::*;
 
 use super::undistort::{Undistortion, WIDEST};
-use super::{LoadOptions, Split, View};
+use super::{LoadOptions, Split, View, masks};
 use crate::camera::{Camera, Lens};
-use crate::image::{Image, Orientation};
+use crate::image::{Image, Mask, Orientation};
 use crate::{Error, Result};
 
 /// The shortest side that leaves something to train on, pixels.
@@ -24,7 +24,19 @@ pub(super) struct Source {
     pub(super) view_from_world: DAffine3,
     pub(super) input: Option<PathBuf>,
     pub(super) reference: Option<PathBuf>,
+    pub(super) mask: Option<PathBuf>,
     pub(super) depth: Option<PathBuf>,
+}
+
+impl Source {
+    /// Of the files of the photograph, its reference image, its mask and its depth.
+    pub(super) fn new(
+        (name, split): (String, Split),
+        (lens, view_from_world): (Lens, DAffine3),
+        [input, reference, mask, depth]: [Option<PathBuf>; 4],
+    ) -> Self {
+        Self { name, split, lens, view_from_world, input, reference, mask, depth }
+    }
 }
 
 /// The views in order of name. Files that do not decode are named in `skipped`.
@@ -105,7 +117,7 @@ fn fitted_lens(source: &Source) -> Result<Lens> {
 
 /// How a photograph is turned to be what its camera took. Poses are of what is stored, as COLMAP reads it; where the
 /// camera's size is that of what is seen, and not of what is stored, they are of that.
-fn turn(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Orientation {
+pub(super) fn turn(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Orientation {
     if lens.fitted(width, height).is_some() {
         return Orientation::UPRIGHT;
     }
@@ -178,7 +190,7 @@ fn load_view(
     size: (u32, u32),
     options: &LoadOptions,
 ) -> Result<Loaded> {
-    let Source { name, split, view_from_world, input, reference, depth, .. } = source;
+    let Source { name, split, view_from_world, input, reference, mask, depth, .. } = source;
     let mut problems = Vec::new();
     let mut image = |path: Option<PathBuf>| -> Result<Option<Image>> {
         let Some(path) = path else { return Ok(None) };
@@ -192,7 +204,22 @@ fn load_view(
     };
     let is_shrunk = size != (lens.width, lens.height);
     let original = input.clone().filter(|_| is_shrunk).map(|path| Original { path, lens: *lens });
-    let (image, reference) = (image(input)?, image(reference)?);
+    let paths = [input.clone(), reference.clone()];
+    let (mut image, mut reference) = (image(input)?, image(reference)?);
+    // Of what was read: a file that does not decode is named once.
+    let [of_input, of_reference] = paths;
+    let hidden = of_input
+        .filter(|_| image.is_some())
+        .or(of_reference.filter(|_| reference.is_some()))
+        .map(|path| {
+            let files = (path.as_path(), mask.as_deref());
+            masks::load(files, lens, undistortion, size, options.invert_masks)
+        });
+    let mask = hidden.transpose()?.flatten();
+    if mask.as_ref().is_some_and(Mask::hides_all) {
+        problems.push(format!("{name}: its mask hides every pixel"));
+        (image, reference) = (None, None);
+    }
     let depth = depth.and_then(|path| {
         depth_map(&path, lens, undistortion, size, options.depth.is_disparity)
             .map_err(|problem| tracing::warn!("the depth of view {name} is not used: {problem}"))
@@ -207,7 +234,7 @@ fn load_view(
     };
     let camera = camera.resized(size.0, size.1);
     let original = original.filter(|_| image.is_some());
-    let view = View { name: name.clone(), split, camera, image, original, reference, depth };
+    let view = View { name: name.clone(), split, camera, image, original, reference, mask, depth };
     let view = (split == Split::Test || view.image.is_some()).then_some(view);
     Ok(Loaded { name, view, problems })
 }
@@ -239,7 +266,7 @@ fn depth_map(
     Ok(depth)
 }
 
-fn prepared(
+pub(super) fn prepared(
     image: Image,
     path: &Path,
     lens: &Lens,

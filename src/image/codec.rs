@@ -4,7 +4,7 @@ use std::io::Cursor;
 use std::path::Path;
 
 use ::image::{
-    DynamicImage, ExtendedColorType, ImageEncoder, ImageFormat, ImageReader,
+    DynamicImage, ExtendedColorType, ImageDecoder, ImageEncoder, ImageFormat, ImageReader,
     codecs::{jpeg::JpegEncoder, png::PngEncoder},
 };
 
@@ -67,6 +67,31 @@ impl Image {
         let reader = ImageReader::new(Cursor::new(bytes)).with_guessed_format();
         let decoded = reader.map_err(::image::ImageError::from).and_then(ImageReader::decode);
         Ok((from_decoded(decoded.map_err(|error| not_an_image(path, &error))?), vec![]))
+    }
+
+    /// The alpha of a PNG, WebP or TIFF file, in all three planes; none of a file that hides nothing.
+    ///
+    /// # Errors
+    /// [`Error::Input`] names the file when it cannot be read.
+    pub(super) fn load_alpha(path: &Path) -> Result<Option<Self>> {
+        let reader = ImageReader::open(path).and_then(ImageReader::with_guessed_format);
+        let reader =
+            reader.map_err(|error| Error::input(path, format!("cannot be read: {error}")))?;
+        let with_alpha = [ImageFormat::Png, ImageFormat::WebP, ImageFormat::Tiff];
+        if !reader.format().is_some_and(|format| with_alpha.contains(&format)) {
+            return Ok(None);
+        }
+        let decoder = reader.into_decoder().map_err(|error| not_an_image(path, &error))?;
+        if !decoder.color_type().has_alpha() {
+            return Ok(None);
+        }
+        let decoded =
+            DynamicImage::from_decoder(decoder).map_err(|error| not_an_image(path, &error))?;
+        let (width, height) = (decoded.width(), decoded.height());
+        let values = decoded.into_rgba32f().into_raw();
+        let alpha: Vec<f32> = values.into_iter().skip(3).step_by(4).collect();
+        let hides = alpha.iter().any(|&value| value < 1.0);
+        Ok(hides.then(|| Self { width, height, data: alpha.repeat(3) }))
     }
 
     /// Width and height of an image file, from its header alone.

@@ -8,8 +8,8 @@ use super::views::lifted_from;
 use crate::camera::Camera;
 use crate::dataset::{Dataset, Split};
 use crate::exposure::Exposures;
-use crate::image::Image;
-use crate::metrics::psnr;
+use crate::image::{Image, Mask};
+use crate::metrics::psnr_of_counted;
 use crate::pseudo_gt::PseudoGt;
 use crate::tone::Scene;
 use crate::{Error, Result};
@@ -69,7 +69,15 @@ impl StopConfig {
 
 /// Cameras, and what they are to show.
 #[derive(Debug, Default)]
-pub(super) struct HeldOut(Vec<(Camera, Image)>);
+pub(super) struct HeldOut(Vec<Shown>);
+
+/// What a camera is to show, where it counts.
+#[derive(Debug)]
+struct Shown {
+    camera: Camera,
+    target: Image,
+    mask: Option<Mask>,
+}
 
 impl HeldOut {
     /// The held-out views of a dataset with their targets, made as those of its training views.
@@ -79,9 +87,10 @@ impl HeldOut {
         for view in dataset.views.iter().filter(|view| view.split == Split::HeldOut) {
             let Some(image) = &view.image else { continue };
             let whole = lifted_from(view, image, settings.lift_first)?;
-            let lift = settings.lift(scene, &pseudo_gt.measure(&whole.data)?);
+            let lift = settings.lift(scene, &pseudo_gt.measure(&view.counted(&whole))?);
             let target = pseudo_gt.lifted(&whole, &lift)?;
-            views.push((view.camera, target.resized(image.width, image.height)));
+            let target = target.resized(image.width, image.height);
+            views.push(Shown { camera: view.camera, target, mask: view.mask.clone() });
         }
         Ok(Self(views))
     }
@@ -110,16 +119,17 @@ impl Trainer {
         scores
     }
 
-    fn scores(&mut self, views: &[(Camera, Image)], sh_degree: u32) -> Result<[Option<f64>; 2]> {
+    fn scores(&mut self, views: &[Shown], sh_degree: u32) -> Result<[Option<f64>; 2]> {
         let mut sums = [0.0; 2];
-        for (camera, target) in views {
+        for Shown { camera, target, mask } in views {
             let shown = self.render_of_degree(camera, sh_degree)?;
             let clamped = |image: &Image| {
                 let data = image.data.iter().map(|value| value.clamp(0.0, 1.0)).collect();
                 Image { data, ..*image }
             };
-            sums[0] += psnr(&clamped(&shown.colors), target)?;
-            sums[1] += psnr(&clamped(shown.output()), target)?;
+            let psnr = |image: &Image| psnr_of_counted(&clamped(image), target, mask.as_ref());
+            sums[0] += psnr(&shown.colors)?;
+            sums[1] += psnr(shown.output())?;
         }
         Ok(sums.map(|sum| (!views.is_empty()).then(|| sum / views.len() as f64)))
     }
@@ -157,7 +167,7 @@ impl Trainer {
     }
 
     /// Training views, evenly spread, with their targets at the neutral exposure.
-    fn some_training_views(&self) -> Result<Vec<(Camera, Image)>> {
+    fn some_training_views(&self) -> Result<Vec<Shown>> {
         const MOST: usize = 8;
         let affines = self.exposures.as_ref().map(Exposures::affines).transpose()?;
         let views = self.views.whole();
@@ -166,7 +176,7 @@ impl Trainer {
             let target = view.image(&self.gpu, &*view.kept_target(&self.gpu)?)?;
             let exposure = affines.as_ref().and_then(|affines| affines.get(view.place));
             let neutral = exposure.map_or(target.clone(), |own| own.inverse().applied(&target));
-            some.push((view.camera, neutral));
+            some.push(Shown { camera: view.camera, target: neutral, mask: None });
         }
         Ok(some)
     }

@@ -98,7 +98,8 @@ impl Views {
             .collect();
         let mut measured = vec![];
         for &(_, view, image) in &photographs {
-            measured.push(pseudo_gt.measure(&lifted_from(view, image, settings.lift_first)?.data)?);
+            let whole = lifted_from(view, image, settings.lift_first)?;
+            measured.push(pseudo_gt.measure(&view.counted(&whole))?);
         }
         let scene = settings.scene(&measured).ok_or_else(|| all_black(&dataset.root))?;
         let mut darkroom = Darkroom::new(gpu, bits);
@@ -117,9 +118,9 @@ impl Views {
             };
             for (level, views) in views.iter_mut().enumerate() {
                 let size = shrunk(UVec2::new(image.width, image.height), level as u32);
-                let photograph = image.resized(size.x, size.y);
+                let photograph = view.blacked_out(image.resized(size.x, size.y));
                 let target = match &target {
-                    Some(target) => Some(target.resized(size.x, size.y)),
+                    Some(target) => Some(view.blacked_out(target.resized(size.x, size.y))),
                     None if settings.needs_baking() => Some(pseudo_gt.lifted(&photograph, &lift)?),
                     None => None,
                 };
@@ -190,6 +191,13 @@ impl Views {
             order.swap(left as usize, draw as usize);
         }
         &views[order[place as usize]]
+    }
+
+    /// The views of all levels, by number.
+    pub(super) fn all(&self) -> Vec<&TrainView> {
+        let mut views: Vec<&TrainView> = self.0.iter().flatten().collect();
+        views.sort_by_key(|view| view.number);
+        views
     }
 
     /// The views, unshrunk.

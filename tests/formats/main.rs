@@ -6,6 +6,9 @@ mod as_it_is;
 mod bad_input;
 #[path = "../common/mod.rs"]
 mod common;
+mod photographs;
+#[cfg(feature = "cli")]
+mod pose;
 mod real;
 mod synthetic;
 
