@@ -117,6 +117,9 @@ pub(crate) struct TrainOptions {
     /// A folder of reference images by name, for scores only
     #[arg(long, value_name = "DIR")]
     reference: Option<PathBuf>,
+    /// Masks (masks/NAME.png or masks/NAME.jpg.png of the dataset) hide what is white, not what is black
+    #[arg(long)]
+    invert_masks: bool,
     #[command(flatten)]
     model: ModelOptions,
     /// Nothing nearer to a camera is seen, in units of the scene's extent: of how far the cameras stand from their middle [default: {near}]
@@ -369,6 +372,7 @@ impl TrainOptions {
         set(&mut config.hash_every, &self.hash_every);
         set(&mut config.check.every, &self.check_every);
         config.check.stops |= self.check_stops;
+        config.invert_masks |= self.invert_masks;
         if self.exposures.is_some() {
             (config.exposure.learn, config.exposure.start) = (Learning::On, self.exposures.clone());
         }

@@ -7,9 +7,16 @@ use std::path::{Path, PathBuf};
 use crate::{Error, Result};
 
 /// Endings of the files that [`super::Image::load`] reads.
-const READABLE: [&str; 4] = ["png", "jpg", "jpeg", "exr"];
-/// Endings of other image files: no part of a name either. What follows another dot is.
-const UNREADABLE: [&str; 5] = ["tif", "tiff", "webp", "bmp", "hdr"];
+const READABLE: [&str; 7] = ["png", "jpg", "jpeg", "exr", "tif", "tiff", "webp"];
+/// Endings of other pictures and clips: no part of a name either. What follows another dot is.
+const UNREADABLE: [&str; 19] = [
+    "bmp", "hdr", "gif", "avif", "jxl", "heic", "heif", "dng", "cr2", "cr3", "nef", "arw", "raf",
+    "rw2", "orf", "pef", "mp4", "mov", "mkv",
+];
+/// Those of them that a phone writes and other programs convert.
+const HEIC: [&str; 2] = ["heic", "heif"];
+/// How they are converted.
+pub(super) const HEIC_REMEDY: &str = "convert it first, `heif-convert IN.heic OUT.png` of libheif, or on macOS `sips -s format png IN.heic --out OUT.png`";
 
 /// A photograph's name: the file name without an image's extension.
 pub(crate) fn stem(listed: &str) -> &str {
@@ -34,6 +41,23 @@ pub(crate) fn photographs_in(folder: &Path) -> Result<Vec<PathBuf>> {
         is_one_of(&READABLE, &ending.to_string_lossy())
     });
     Ok(paths)
+}
+
+/// The pictures and clips of a folder that are not read, by ending, in a line; none where there are none.
+pub(crate) fn unread_in(folder: &Path) -> Option<String> {
+    let mut counts: BTreeMap<String, usize> = BTreeMap::new();
+    for path in files_in(folder).unwrap_or_default() {
+        let ending = path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
+        if is_one_of(&UNREADABLE, &ending) {
+            *counts.entry(ending).or_default() += 1;
+        }
+    }
+    let listed: Vec<String> =
+        counts.iter().map(|(ending, count)| format!("{count} .{ending}")).collect();
+    let is_heic = counts.keys().any(|ending| is_one_of(&HEIC, ending));
+    let remedy = if is_heic { format!("; HEIC: {HEIC_REMEDY}") } else { String::new() };
+    let folder = folder.display();
+    (!listed.is_empty()).then(|| format!("{folder}: not read: {}{remedy}", listed.join(", ")))
 }
 
 /// Looks photographs up and remembers what the folders hold.
