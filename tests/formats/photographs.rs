@@ -156,7 +156,7 @@ fn masks_are_found_by_both_names_may_be_inverted_and_alpha_is_one() {
     half_mask(&root.join("masks/v00.png"), SIZE);
     half_mask(&root.join("masks/v01.png.png"), SIZE);
     half_mask(&root.join("masks/v02.png"), (80, 60));
-    let alpha = |x: u32, y: u32| Rgba([20, 20, 20, if x < 20 && y < 40 { 255 } else { 0 }]);
+    let alpha = |x: u32, y: u32| Rgba([20, 20, 20, if x < 20 && y < 40 { 255u8 } else { 0 }]);
     ImageBuffer::from_fn(40, 30, alpha).save(root.join("low/v03.png")).unwrap();
     let dataset = load(root);
     for index in 0..4 {
