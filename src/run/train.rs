@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use super::directory::{Progress, SPENT, TARGET_EXPOSURE};
 use super::meter::{Meter, Spent};
 use super::tensorboard::EventFile;
-use super::{Event, Requests, RunDirectory, directory, done};
+use super::{Event, Requests, RunDirectory, directory, done, generations};
 use crate::dataset::{Dataset, View};
 use crate::diagnose::Plan;
 use crate::eval::{self, ViewScore, Yardstick};
@@ -147,7 +147,7 @@ fn begin(
     }
     let lock = RunDirectory::lock(out)?;
     let resumes = held == HeldRun::Resume;
-    let checkpoint = if resumes { directory::checkpoint(out) } else { None };
+    let checkpoint = if resumes { generations::newest(out) } else { None };
     let mut config =
         with_tile_and_frame(gpu, config, dataset, checkpoint.is_some().then_some(out))?;
     config.spool = config.spool.or_else(|| existing(out));
