@@ -462,7 +462,7 @@ fn as_begun(args: &TrainArgs, config: TrainConfig) -> crate::Result<TrainConfig>
 }
 
 /// What `--max-resolution` says.
-fn max_resolution(text: &str) -> Result<u32, String> {
+pub(super) fn max_resolution(text: &str) -> Result<u32, String> {
     match text {
         "none" => Ok(0),
         _ => text.parse().map_err(|_| "a number of pixels, or none".to_owned()),

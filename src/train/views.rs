@@ -284,7 +284,7 @@ impl Views {
         if kept.len() > fitting {
             let (of, device) = (kept.len(), &gpu.properties().name);
             tracing::warn!(
-                "{fitting} of {of} points begin as Gaussians: {device} binds no more; `TrainConfig::max_gaussians` asks for fewer"
+                "{fitting} of {of} points begin as Gaussians: {device} binds no more"
             );
         }
         let kept = &kept[..kept.len().min(fitting)];
