@@ -1,13 +1,14 @@
 //! Scores a model on the test views of its dataset: against their reference images, or where there are none against what
 //! the model was trained to show of them.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::str::FromStr;
 
 use serde_json::{Map, Value, json};
 
-use crate::camera::Camera;
+use crate::camera::{Camera, Frame};
 use crate::dataset::{Dataset, View};
 use crate::exposure::Affine;
 use crate::gpu::{Buffer, Gpu};
@@ -16,7 +17,7 @@ use crate::metrics::Scores;
 use crate::render::{RenderOptions, RenderSettings, Renderer};
 use crate::scene::{Feature, Features, Gaussians};
 use crate::tone::{ToneCurve, ToneSettings};
-use crate::train::{Networks, Rendered, targets_of_test_views};
+use crate::train::{Networks, Rendered, TrainConfig, targets_of_test_views};
 use crate::{Error, Result};
 
 /// What test views are scored against.
@@ -130,25 +131,34 @@ pub struct Player {
     features: Features,
     renderer: Renderer,
     networks: Option<Networks>,
+    /// Where the Gaussians lie.
+    frame: Frame,
 }
 
 impl Player {
-    /// Uploads `gaussians`, whose colours are `raw_colors` or as viewers show them; `networks` belong to them. Their run's
-    /// `tile` is taken where it suits the device.
+    /// Uploads the `gaussians` of a run of `config`, as its `model.ply` has them but for the colours, which are the model's;
+    /// `networks` belong to them. The run's tile is taken where it suits the device.
     ///
     /// # Errors
     /// The device is out of memory or lost.
     pub fn new(
         gpu: &Gpu,
         gaussians: &Gaussians,
-        raw_colors: bool,
-        tile: Option<[u32; 2]>,
+        config: &TrainConfig,
         networks: Option<Networks>,
     ) -> Result<Self> {
         let shape = gaussians.shape;
+        let RenderSettings { raw_colors, near, tile, .. } = config.render_settings();
         let tile = tile.filter(|&tile| gpu.properties().suits_tile(tile));
-        let settings = RenderSettings { shape, raw_colors, tile, ..RenderSettings::default() };
+        let settings =
+            RenderSettings { shape, raw_colors, near, tile, ..RenderSettings::default() };
+        let frame = config.frame.unwrap_or_default();
+        let gaussians = match frame {
+            Frame::WORLD => Cow::Borrowed(gaussians),
+            _ => Cow::Owned(gaussians.from_world(&frame, frame.file_origin())),
+        };
         Ok(Self {
+            frame,
             parameters: gpu.buffer("parameters", &gaussians.parameters)?,
             count: gaussians.count,
             sh_degree: shape.sh_degree,
@@ -166,12 +176,12 @@ impl Player {
         self.render_camera(&view.camera)
     }
 
-    /// What any camera sees, before a black background.
+    /// What any camera of the dataset's world sees, before a black background.
     ///
     /// # Errors
     /// The device is out of memory or lost.
     pub fn render_camera(&mut self, camera: &Camera) -> Result<Rendered> {
-        let options = self.options();
+        let (camera, options) = (&self.frame.camera(camera), self.options());
         self.renderer.reserve(self.count, [camera])?;
         let networks = self.networks.as_mut();
         Rendered::new(&mut self.renderer, &self.parameters, camera, &options, networks)
@@ -198,8 +208,8 @@ impl Player {
         let planes = self.features.channels_of(feature).ok_or_else(lacks)?;
         let Camera { width, height, .. } = *camera;
         let pixels = width as usize * height as usize;
+        let (camera, options) = (&self.frame.camera(camera), self.options());
         self.renderer.reserve(self.count, [camera])?;
-        let options = self.options();
         let channels = self.renderer.render_channels(&self.parameters, camera, &options)?;
         let plane = |c: usize| {
             let plane = planes.start + c.min(planes.len() - 1);

@@ -5,6 +5,8 @@
 //! the power law continued above 1).
 
 #[cfg(feature = "io")]
+mod budget;
+#[cfg(feature = "io")]
 mod codec;
 #[cfg(feature = "io")]
 mod exif;

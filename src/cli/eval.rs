@@ -10,6 +10,7 @@ use super::{progress_bar, table};
 use crate::eval::{self, ViewScore, Yardstick};
 use crate::gpu::DeviceChoice;
 use crate::metrics::Scores;
+use crate::output::printable;
 use crate::run;
 use crate::train::Learning;
 
@@ -48,7 +49,7 @@ pub fn run(args: &EvalArgs) -> Result<()> {
     let yardstick = Yardstick::of(&gpu, &config.tone, &dataset)?;
     let bar = progress_bar(yardstick.view_count(&dataset));
     let scored = eval::score_by(&yardstick, &dataset, |view| {
-        bar.set_message(view.name.clone());
+        bar.set_message(printable(&view.name).into_owned());
         player.render(view).inspect(|_| bar.inc(1))
     })?;
     bar.finish_and_clear();

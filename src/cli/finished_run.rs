@@ -59,8 +59,7 @@ impl FinishedRun {
             player: Player::new(
                 &gpu,
                 &gaussians,
-                raw_colors,
-                config.tile,
+                &config,
                 run::load_networks(&gpu, folder, &config.model, gaussians.shape.features)?,
             )?,
             config,

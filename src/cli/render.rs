@@ -15,6 +15,7 @@ use crate::eval::Layer;
 use crate::exposure::Affine;
 use crate::gpu::DeviceChoice;
 use crate::image::Image;
+use crate::output::printable;
 use crate::tone::exposed_anew;
 use crate::{Error, run};
 
@@ -134,7 +135,7 @@ pub fn run(args: &RenderArgs) -> Result<()> {
     make_folder(out, &dataset, run)?;
     let bar = progress_bar(shots.len());
     for Shot { name, camera } in &shots {
-        bar.set_message(name.clone());
+        bar.set_message(printable(name).into_owned());
         let path = file(out, name, *format);
         let color = |image: Image| match &exposures {
             Some(exposures) => format.save(&exposures.applied(name, image), &path),

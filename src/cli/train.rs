@@ -10,13 +10,15 @@ use anyhow::Result;
 use self::facts::Facts;
 use super::diagnose;
 use super::progress::{ProgressForm, Reporter, summary};
+use super::signals;
 use crate::dataset::Dataset;
 use crate::densify::DensityControl;
 use crate::diagnose::{Diagnosis, Plan};
 use crate::eval;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::nn::Precision;
-use crate::run::{self, HeldRun, RunDirectory, Trained};
+use crate::output::printable;
+use crate::run::{self, HeldRun, RunDirectory, Session, Trained};
 use crate::tone::{CurveChoice, GainChoice, Profile, ToneCurve, ToneSettings};
 use crate::train::{Background, CacheSize, Learning, ModelName, Part, Preset, StopConfig, TrainConfig};
 
@@ -115,6 +117,9 @@ pub(crate) struct TrainOptions {
     reference: Option<PathBuf>,
     #[command(flatten)]
     model: ModelOptions,
+    /// Nothing nearer to a camera is seen, in units of the scene's extent: of how far the cameras stand from their middle [default: {near}]
+    #[arg(long, value_name = "N")]
+    near: Option<f64>,
     /// The device: a part of its name or its index in `nightsplat doctor` [default: the best]
     #[arg(long, value_name = "NAME|INDEX")]
     device: Option<String>,
@@ -130,6 +135,15 @@ pub(crate) struct TrainOptions {
     /// Write what --resume goes on from, and the model, every N steps; 0: never [default: {checkpoint_every}]
     #[arg(long, value_name = "N")]
     checkpoint_every: Option<u64>,
+    /// Write it whenever the last is so many minutes old, too; 0: never [default: {checkpoint_minutes}]
+    #[arg(long, value_name = "MINUTES")]
+    checkpoint_minutes: Option<f64>,
+    /// Save and stop after so many minutes, with exit code 75; --resume goes on; 0: train to the end [default: {max_minutes}]
+    #[arg(long, value_name = "MINUTES")]
+    max_minutes: Option<f64>,
+    /// Log a checksum of every plane of the parameters to hashes.csv every N steps; 0: never [default: {hash_every}]
+    #[arg(long, value_name = "N")]
+    hash_every: Option<u64>,
     /// Compare every pass of every Nth step with its CPU reference, and warn of what differs; 0: never [default: {check.every}]
     #[arg(long, value_name = "N")]
     check_every: Option<u64>,
@@ -344,9 +358,13 @@ impl TrainOptions {
         set(&mut config.max_gaussians, &self.max_gaussians);
         set(&mut config.density.control, &self.density);
         set(&mut config.background, &self.background);
+        set(&mut config.near, &self.near);
         set(&mut config.device, &self.device);
         set(&mut config.eval_every, &self.eval_every);
         set(&mut config.checkpoint_every, &self.checkpoint_every);
+        set(&mut config.checkpoint_minutes, &self.checkpoint_minutes);
+        set(&mut config.max_minutes, &self.max_minutes);
+        set(&mut config.hash_every, &self.hash_every);
         set(&mut config.check.every, &self.check_every);
         config.check.stops |= self.check_stops;
         if self.exposures.is_some() {
@@ -368,13 +386,19 @@ impl TrainOptions {
 /// Whatever keeps the run from its end, in one line.
 pub fn run(args: &TrainArgs) -> Result<()> {
     let config = args.options.config(args.dataset.clone())?;
-    if !args.resume {
-        RunDirectory::check(&args.out, args.overwrite)?;
+    match args.resume {
+        true => RunDirectory::check_resumed(&args.out)?,
+        false => RunDirectory::check(&args.out, args.overwrite)?,
     }
     let gpu = Gpu::new(&config.device.parse::<DeviceChoice>()?)?;
     let Planned { config, plan, dataset } = planned(args, config, &gpu)?;
     for line in args.options.idle(&config) {
         tracing::warn!("{line}");
+    }
+    let finished = if args.resume { run::done_steps(&args.out, &config, &dataset)? } else { None };
+    if let Some(steps) = finished {
+        let done = format!("{} is done: {steps} steps", args.out.display());
+        return Ok(writeln!(std::io::stdout(), "{}", printable(&done))?);
     }
     let form = args.progress.unwrap_or_else(ProgressForm::of_terminal);
     let is_text = form != ProgressForm::Json;
@@ -385,8 +409,9 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     }
     let held = if args.resume { HeldRun::Resume } else { held_unless(args.overwrite) };
     let mut progress = Reporter::new(form).with_facts(serde_json::json!(facts));
+    let session = Session { plan: plan.as_ref(), held, requests: signals::requests()? };
     let Trained { trainer, scored, spent, .. } =
-        run::train_planned(&gpu, &config, plan.as_ref(), &dataset, &args.out, held, |event| {
+        run::train_in(&gpu, &config, &dataset, &args.out, &session, |event| {
             progress.observe(event);
         })?;
     if !is_text {

@@ -154,6 +154,30 @@ pub(super) fn loaded_size(source: &Source, options: &LoadOptions) -> Result<(Str
     Ok((source.name.clone(), options.loaded_size(lens.width, lens.height).into()))
 }
 
+/// Refuses a file by the size that it declares, before that costs memory: a picture of another shape than its camera's, or
+/// of far more pixels.
+fn check_size(path: &Path, lens: &Lens) -> Result<()> {
+    // What has no readable header is named when it is decoded.
+    let Ok((width, height)) = Image::size_of(path) else { return Ok(()) };
+    if lens.fitted(width, height).is_none() {
+        return Err(disagreement(path, (width, height), lens));
+    }
+    check_excess(path, (width, height), lens)
+}
+
+fn check_excess(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Result<()> {
+    const MOST_TIMES: u64 = 64;
+    let pixels = |width: u32, height: u32| u64::from(width) * u64::from(height);
+    if pixels(width, height) > MOST_TIMES * pixels(lens.width, lens.height) {
+        let (w, h) = (lens.width, lens.height);
+        let problem = format!(
+            "is {width}x{height}, over {MOST_TIMES} times the pixels of its view's {w}x{h}; shrink it"
+        );
+        return Err(Error::input(path, problem));
+    }
+    Ok(())
+}
+
 fn disagreement(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Error {
     let (w, h) = (lens.width, lens.height);
     let problem = format!(
@@ -210,6 +234,7 @@ fn load_view(
     let mut problems = Vec::new();
     let mut image = |path: Option<PathBuf>| -> Result<Option<Image>> {
         let Some(path) = path else { return Ok(None) };
+        check_size(&path, lens)?;
         match Image::load(&path) {
             Ok(image) => prepared(image, &path, lens, undistortion, size).map(Some),
             Err(error) => {
@@ -251,6 +276,7 @@ fn depth_map(
     size: (u32, u32),
     is_disparity: bool,
 ) -> Result<Vec<f32>> {
+    check_excess(path, Image::size_of(path)?, lens)?;
     let mut map = Image::load_as_stored(path)?;
     if (map.width, map.height) != (lens.width, lens.height) {
         let (w, h) = (lens.width, lens.height);

@@ -8,7 +8,7 @@ use ::image::{
     codecs::png::PngEncoder,
 };
 
-use super::{Image, exr_file, from_interleaved, jpeg, linear_from_srgb, srgb_from_linear};
+use super::{Image, budget, exr_file, from_interleaved, jpeg, linear_from_srgb, srgb_from_linear};
 use crate::output::write_whole;
 use crate::{Error, Result};
 
@@ -53,6 +53,7 @@ impl Image {
         bytes: Vec<u8>,
         from_exr_value: exr_file::FromExrValue,
     ) -> Result<(Self, Vec<usize>)> {
+        budget::check(path, &bytes)?;
         if bytes.starts_with(&exr_file::MAGIC) {
             return exr_file::load(path, bytes, from_exr_value);
         }

@@ -11,28 +11,38 @@
 //!     views.csv      every view, what it is for and how large it is
 //!     tensorboard/   the same for TensorBoard, where that is asked for
 //!     exposures.csv  gain and bias of the training views, where they are learned
+//!     hashes.csv     checksums of the parameters on the way, where they are asked for
 //!     checkpoint.safetensors  what the run goes on from, overwritten every so many steps
+//!     checkpoint.before.safetensors    the one before, for where that is damaged
 //!     metrics.json   scores of the test views
+//!     done.json      that the run is whole, and of which configuration and dataset it is
 //! ```
 //!
-//! A file appears under its name only once it is complete, `metrics.json` last: a directory that has it is whole. The model
-//! is written with every checkpoint, too: a run that was stopped can be looked at.
+//! A file appears under its name only once it is complete, `metrics.json` and `done.json` last: a directory that has them is
+//! whole. While a process trains in it, it holds `.lock`. The model is written with every checkpoint, too: a run that was
+//! stopped can be looked at.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::{BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
 
+use glam::DVec3;
+
+use super::aside::{self, Aside, unwritable};
+use super::ledger;
+use super::lock::RunLock;
 pub use super::progress::Progress;
 use super::tensorboard::EventFile;
+use crate::camera::Frame;
 use crate::dataset::{Dataset, Split, View};
 use crate::diagnose::Plan;
 use crate::exposure::{Affine, table};
 use crate::gpu::Gpu;
 use crate::loss::Term;
-use crate::output::write_whole;
+use crate::output::{csv_field, write_whole};
 use crate::scene::{Features, Gaussians, ply};
-use crate::train::{ModelConfig, Networks, StepReport, TrainConfig, Trainer};
+use crate::train::{ModelConfig, Networks, StepReport, TrainConfig, Trainer, check_checkpoint};
 use crate::{Error, Result};
 
 /// A run directory and the log that grows in it.
@@ -45,19 +55,28 @@ pub struct RunDirectory {
     /// What the steps took that the log held already.
     seconds_before: f64,
     raw_colors: bool,
+    /// Whether what it replaces is still there.
+    is_new: bool,
+    /// The run that was here before; back in its place if this is dropped before [`RunDirectory::settle`].
+    aside: Aside,
+    /// Behind `aside`: nobody else begins before that is in order.
+    _lock: RunLock,
 }
 
 /// The files of a run that a new run replaces; nothing else in the directory is touched.
-const FILES: [&str; 11] = [
+pub(super) const FILES: [&str; 14] = [
+    DONE,
     "metrics.json",
     "model.ply",
     NETWORKS,
     EXPOSURES,
     CHECKPOINT,
+    CHECKPOINT_BEFORE,
     LOG,
     HELD_OUT,
     PROGRESS,
     VIEWS,
+    HASHES,
     PLAN,
     "config.toml",
 ];
@@ -77,6 +96,9 @@ const VIEWS: &str = "views.csv";
 /// The folder of event files.
 const TENSORBOARD: &str = "tensorboard";
 
+/// Checksums of the parameters on the way.
+const HASHES: &str = "hashes.csv";
+
 /// What was decided for the photographs, and why.
 const PLAN: &str = "plan.toml";
 
@@ -95,16 +117,38 @@ const NETWORKS: &str = "networks.safetensors";
 /// The state of an unfinished run, or of a finished one that may be made longer.
 const CHECKPOINT: &str = "checkpoint.safetensors";
 
+/// The one before.
+const CHECKPOINT_BEFORE: &str = "checkpoint.before.safetensors";
+
+/// The sign that the run is whole, and what it is of.
+pub(super) const DONE: &str = "done.json";
+
 impl RunDirectory {
     /// Refuses a place where no run can begin, before anything is loaded or written.
     ///
     /// # Errors
-    /// It holds a run already and `overwrite` is false, or lies beneath a file.
+    /// Another process trains there; it holds a run already and `overwrite` is false; it holds files of a run's names that
+    /// are no run's; or it lies beneath a file.
     pub fn check(path: &Path, overwrite: bool) -> Result<()> {
         let used = FILES.iter().find(|file| path.join(file).exists());
-        if let Some(file) = used.filter(|_| !overwrite) {
-            let problem =
-                format!("already holds a run ({file}); pass `HeldRun::Replace` to replace it");
+        match used.filter(|_| !overwrite) {
+            Some(file) => RunLock::check(path).and(Err(held(path, file))),
+            None => Self::check_resumed(path),
+        }
+    }
+
+    /// Refuses a place where no run can begin or go on.
+    ///
+    /// # Errors
+    /// Another process trains there, or it holds files of a run's names that are no run's, or lies beneath a file.
+    pub fn check_resumed(path: &Path) -> Result<()> {
+        RunLock::check(path)?;
+        if let Some(file) = FILES.iter().find(|file| path.join(file).exists())
+            && !is_run(path)
+        {
+            let problem = format!(
+                "holds {file}, but no config.toml of a run: it is somebody else's; name another folder"
+            );
             return Err(Error::output(path, problem));
         }
         match path.ancestors().find(|folder| folder.exists()) {
@@ -115,26 +159,63 @@ impl RunDirectory {
         }
     }
 
-    /// Makes the directory and writes the configuration.
+    /// Locks the directory, which comes to be where it is not there, and puts it in order.
     ///
     /// # Errors
-    /// It holds a run already and `overwrite` is false, or it cannot be written.
+    /// Another process trains there, or it cannot be written.
+    pub(super) fn lock(path: &Path) -> Result<RunLock> {
+        std::fs::create_dir_all(path).map_err(|error| unwritable(path, &error))?;
+        let lock = RunLock::take(path)?;
+        aside::recover(path)?;
+        Ok(lock)
+    }
+
+    /// Makes the directory and writes the configuration. A run that was there before stays until [`RunDirectory::settle`].
+    ///
+    /// # Errors
+    /// It holds a run already and `overwrite` is false, or somebody else's files; another process trains there; or it cannot
+    /// be written.
     pub fn create(path: &Path, config: &TrainConfig, overwrite: bool) -> Result<Self> {
         Self::check(path, overwrite)?;
-        std::fs::create_dir_all(path).map_err(|error| unwritable(path, &error))?;
-        remove(path, &FILES)?;
-        remove_events(path)?;
-        let mut run = Self::open(path, config, "", 0.0)?;
+        Self::create_locked(path, Self::lock(path)?, config, overwrite)
+    }
+
+    pub(super) fn create_locked(
+        path: &Path,
+        lock: RunLock,
+        config: &TrainConfig,
+        overwrite: bool,
+    ) -> Result<Self> {
+        // What was recovered is a run, too.
+        if let Some(file) = FILES.iter().find(|file| path.join(file).exists() && !overwrite) {
+            return Err(held(path, file));
+        }
+        let aside = Aside::set(path)?;
+        let mut run = Self::open(path, config, "", 0.0, aside, lock)?;
         let columns: String = run.terms.iter().map(|term| format!("{},", term.column)).collect();
         run.log_line(&format!("step,view,loss,{columns}gaussians,milliseconds"))?;
         Ok(run)
+    }
+
+    /// The run has come to be: what was there before goes.
+    ///
+    /// # Errors
+    /// The directory cannot be written.
+    pub fn settle(&mut self) -> Result<()> {
+        self.aside.give_up()?;
+        if std::mem::take(&mut self.is_new) { remove_events(&self.path) } else { Ok(()) }
     }
 
     /// Takes up a run again after `step`: its log is cut there, and it is unfinished.
     ///
     /// # Errors
     /// The directory cannot be written, or its log does not reach `step`.
-    pub fn resume(path: &Path, config: &TrainConfig, step: u64) -> Result<Self> {
+    pub(super) fn resume(
+        path: &Path,
+        lock: RunLock,
+        config: &TrainConfig,
+        step: u64,
+    ) -> Result<Self> {
         let log_path = path.join(LOG);
         let text = std::fs::read_to_string(&log_path)
             .map_err(|error| Error::input(&log_path, format!("cannot be read ({error})")))?;
@@ -149,20 +230,29 @@ impl RunDirectory {
         }
         let milliseconds = |line: &&str| line.trim_end().rsplit(',').next()?.parse::<f64>().ok();
         let seconds_before = lines.iter().filter_map(milliseconds).sum::<f64>() / 1e3;
-        remove(path, &["metrics.json", "model.ply", NETWORKS, EXPOSURES])?;
-        Self::open(path, config, &lines.concat(), seconds_before)
+        remove(path, &[DONE, "metrics.json", "model.ply", NETWORKS, EXPOSURES])?;
+        Self::open(path, config, &lines.concat(), seconds_before, Aside::default(), lock)
     }
 
     /// Writes the configuration and what the log begins with.
-    fn open(path: &Path, config: &TrainConfig, log: &str, seconds_before: f64) -> Result<Self> {
-        write_whole(&path.join("config.toml"), config.to_toml()?.as_bytes())?;
+    fn open(
+        path: &Path,
+        config: &TrainConfig,
+        log: &str,
+        seconds_before: f64,
+        aside: Aside,
+        lock: RunLock,
+    ) -> Result<Self> {
+        let recorded = config.clone().with_absolute_paths();
+        write_whole(&path.join("config.toml"), recorded.to_toml()?.as_bytes())?;
         let log_path = path.join(LOG);
         write_whole(&log_path, log.as_bytes())?;
-        let log = File::options().append(true).open(&log_path);
-        let log = BufWriter::new(log.map_err(|error| unwritable(&log_path, &error))?);
+        let file = File::options().append(true).open(&log_path);
+        let file = BufWriter::new(file.map_err(|error| unwritable(&log_path, &error))?);
         let terms = config.loss().terms();
-        let raw_colors = config.model.raw_colors;
-        Ok(Self { path: path.to_owned(), log, terms, seconds_before, raw_colors })
+        let (raw_colors, is_new) = (config.model.raw_colors, log.is_empty());
+        let path = path.to_owned();
+        Ok(Self { path, log: file, terms, seconds_before, raw_colors, is_new, aside, _lock: lock })
     }
 
     /// The scores of the held-out views up to a step, in order: step, PSNR in dB.
@@ -231,22 +321,27 @@ impl RunDirectory {
         self.seconds_before
     }
 
-    /// Writes what the run can go on from, behind a log that reaches as far, and the model as it is now.
+    /// Writes what the run can go on from, behind a log that reaches as far, and the model as it is now. The checkpoint before
+    /// stays; while this is written it is the only one.
     ///
     /// # Errors
-    /// The disk is full or gone, or the device was lost.
+    /// The disk is full or gone, the device was lost, or a parameter is not finite.
     pub fn save_checkpoint(&mut self, trainer: &mut Trainer) -> Result<()> {
         self.log.flush().map_err(|error| unwritable(&self.path, &error))?;
-        trainer.save_checkpoint(&self.path.join(CHECKPOINT))?;
+        let [newest, before] = [CHECKPOINT, CHECKPOINT_BEFORE].map(|file| self.path.join(file));
+        if newest.exists() {
+            std::fs::rename(&newest, before).map_err(|error| unwritable(&newest, &error))?;
+        }
+        trainer.save_checkpoint(&newest)?;
         self.save_trained(trainer)
     }
 
     /// Writes the model and what belongs to it, as it is now.
     ///
     /// # Errors
-    /// The disk is full or gone, or the device was lost.
+    /// The disk is full or gone, the device was lost, or a parameter is not finite.
     pub(super) fn save_trained(&mut self, trainer: &mut Trainer) -> Result<()> {
-        self.save_model(&trainer.gaussians()?, self.raw_colors)?;
+        self.save_model(trainer, self.raw_colors)?;
         if let Some(networks) = trainer.networks() {
             self.save_networks(networks)?;
         }
@@ -254,6 +349,22 @@ impl RunDirectory {
             Some(exposures) => self.save_exposures(&exposures),
             None => Ok(()),
         }
+    }
+
+    /// Where it is.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Appends the checksum of every plane of the parameters to `hashes.csv`.
+    ///
+    /// # Errors
+    /// The disk is full or gone.
+    pub(super) fn log_hashes(&self, step: u64, gaussians: &Gaussians) -> Result<()> {
+        let path = self.path.join(HASHES);
+        let known = std::fs::read_to_string(&path).unwrap_or_default();
+        let text = ledger::extended(&known, step, gaussians);
+        write_whole(&path, text.as_bytes())
     }
 
     /// Appends a step to `train.csv`.
@@ -264,6 +375,7 @@ impl RunDirectory {
         let StepReport { step, view, loss, gaussians, milliseconds, .. } = report;
         let terms: String =
             self.terms.iter().map(|&term| format!("{:.6},", report.term(term))).collect();
+        let view = csv_field(view);
         self.log_line(&format!("{step},{view},{loss:.6},{terms}{gaussians},{milliseconds:.2}"))
     }
 
@@ -275,19 +387,26 @@ impl RunDirectory {
         self.log.flush().map_err(|error| unwritable(&self.path, &error))
     }
 
-    /// Writes `model.ply`, in the colours that viewers show.
+    /// Writes `model.ply`, in the colours that viewers show and in the dataset's world: relative to
+    /// [`Frame::file_origin`], which a comment says where it is not the world's own.
     ///
     /// # Errors
-    /// The disk is full or gone.
-    pub fn save_model(&mut self, gaussians: &Gaussians, raw_colors: bool) -> Result<()> {
+    /// The disk is full or gone, or a parameter is not finite.
+    pub fn save_model(&mut self, trainer: &Trainer, raw_colors: bool) -> Result<()> {
         self.flush_log()?;
-        let path = self.path.join("model.ply");
-        if !raw_colors {
-            return ply::save(gaussians, path);
+        let (mut gaussians, frame) = (trainer.gaussians_in_frame()?, trainer.frame());
+        trainer.refuse_not_finite(&gaussians)?;
+        let origin = frame.file_origin();
+        if *frame != Frame::WORLD {
+            gaussians = gaussians.to_world(frame, origin);
         }
-        let mut gaussians = gaussians.clone();
-        gaussians.shift_colors(-0.5);
-        ply::save(&gaussians, path)
+        if raw_colors {
+            gaussians.shift_colors(-0.5);
+        }
+        let [x, y, z] = origin.to_array();
+        let comment = format!("world = position + {x} {y} {z}");
+        let comments = if origin == DVec3::ZERO { &[][..] } else { &[comment.as_str()] };
+        ply::save_with_comments(&gaussians, self.path.join("model.ply"), comments)
     }
 
     /// Writes the weights of the networks.
@@ -373,9 +492,34 @@ pub fn stopped_at(run: &Path) -> Option<u64> {
     serde_json::from_str::<serde_json::Value>(note).ok()?["step"].as_u64()
 }
 
-/// The checkpoint of a run; none where there is none.
+/// The checkpoint that a run goes on from: the newest that is whole, else the newest, to say what is wrong with it; none
+/// where there is none.
 pub(super) fn checkpoint(run: &Path) -> Option<PathBuf> {
-    Some(run.join(CHECKPOINT)).filter(|path| path.is_file())
+    let [newest, before] = [CHECKPOINT, CHECKPOINT_BEFORE].map(|file| run.join(file));
+    let problem = match newest.is_file().then(|| check_checkpoint(&newest)) {
+        Some(Ok(())) => return Some(newest),
+        Some(Err(problem)) => Some(problem),
+        None => None,
+    };
+    if before.is_file() && check_checkpoint(&before).is_ok() {
+        if let Some(problem) = problem {
+            tracing::warn!("{problem}: the run goes on from the checkpoint before");
+        }
+        return Some(before);
+    }
+    [newest, before].into_iter().find(|path| path.is_file())
+}
+
+/// Whether a directory holds a run, be it of another version: a configuration with what every one has.
+fn is_run(path: &Path) -> bool {
+    let text = std::fs::read_to_string(path.join("config.toml")).unwrap_or_default();
+    let table = text.parse::<toml::Table>().unwrap_or_default();
+    ["dataset", "steps", "seed", "tone"].iter().all(|key| table.contains_key(*key))
+}
+
+fn held(path: &Path, file: &str) -> Error {
+    let problem = format!("already holds a run ({file}); pass `HeldRun::Replace` to replace it");
+    Error::output(path, problem)
 }
 
 /// Whether a directory holds a run that reached its end.
@@ -400,7 +544,7 @@ pub fn load_config(run: &Path) -> Result<TrainConfig> {
             "is no run directory: it has no config.toml; name what `nightsplat train` wrote";
         return Err(Error::input(run, problem));
     }
-    TrainConfig::load(&path)
+    Ok(TrainConfig::load(&path)?.with_paths_from(run))
 }
 
 /// The plan that a run keeps to; none where it keeps to none.
@@ -472,10 +616,6 @@ fn remove_events(run: &Path) -> Result<()> {
         }
     }
     Ok(())
-}
-
-fn unwritable(path: &Path, error: &std::io::Error) -> Error {
-    Error::output(path, format!("cannot be written ({error}); check the folder and the disk"))
 }
 
 #[cfg(test)]

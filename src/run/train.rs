@@ -1,18 +1,19 @@
 //! Trains into a run directory and tells an observer.
 
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
 use super::directory::{Progress, SPENT, TARGET_EXPOSURE};
 use super::tensorboard::EventFile;
 use super::meter::{Meter, Spent};
-use super::{Event, RunDirectory, directory};
-use crate::Result;
+use super::{Event, Requests, RunDirectory, directory, done};
 use crate::dataset::{Dataset, View};
 use crate::diagnose::Plan;
 use crate::eval::{self, ViewScore, Yardstick};
 use crate::gpu::Gpu;
-use crate::scene::ATTRIBUTES;
+use crate::attributes::{ATTRIBUTES, AttributeSpec};
 use crate::train::{Learning, StepReport, TrainConfig, Trainer};
+use crate::{Error, Result, Stop};
 
 /// What becomes of a run that the directory already holds.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -24,6 +25,17 @@ pub enum HeldRun {
     Replace,
     /// It goes on from its checkpoint, to the bits that it would have had in one go; without one it begins anew.
     Resume,
+}
+
+/// How a run comes to be, and what may be asked of it.
+#[derive(Clone, Debug, Default)]
+pub struct Session<'a> {
+    /// The plan that its configuration and dataset follow already; it is kept in the run directory.
+    pub plan: Option<&'a Plan>,
+    /// What becomes of a run that is there.
+    pub held: HeldRun,
+    /// What is asked of it on the way.
+    pub requests: Requests,
 }
 
 /// What a run made.
@@ -74,31 +86,31 @@ pub fn train(
     held: HeldRun,
     observe: impl FnMut(Event<'_>),
 ) -> Result<Trained> {
-    train_planned(gpu, config, None, dataset, out, held, observe)
+    train_in(gpu, config, dataset, out, &Session { held, ..Session::default() }, observe)
 }
 
-/// As [`train`], by a plan that `config` and `dataset` follow already, which is kept in the run directory.
+/// As [`train`], in a [`Session`].
 ///
 /// # Errors
-/// As there.
-pub fn train_planned(
+/// As there, and [`Error::Stopped`] where the run was asked to stop or has taken `TrainConfig::max_minutes`.
+pub fn train_in(
     gpu: &Gpu,
     config: &TrainConfig,
-    plan: Option<&Plan>,
     dataset: &Dataset,
     out: &Path,
-    held: HeldRun,
+    session: &Session<'_>,
     mut observe: impl FnMut(Event<'_>),
 ) -> Result<Trained> {
     gpu.reset_peak_memory();
-    let (mut directory, mut trainer) = begin(gpu, config, dataset, out, held)?;
-    if let Some(plan) = plan {
+    let (mut directory, mut trainer) = begin(gpu, config, dataset, out, session.held)?;
+    if let Some(plan) = session.plan {
         directory.save_plan(plan)?;
     }
     directory.save_views(dataset)?;
     observe(Event::Started { step: trainer.steps_done(), steps: config.steps });
-    let mut course = Course::new(gpu, config, dataset, &directory, &trainer)?;
-    let losses = course.train_to_the_end(&mut trainer, &mut directory, &mut observe)?;
+    let mut course = Course::new(gpu, config, dataset, &directory, &trainer);
+    let requests = &session.requests;
+    let losses = course.train_to_the_end(&mut trainer, &mut directory, requests, &mut observe)?;
     trainer.leave_out_what_gains_nothing()?;
     let spent = course.meter.spent(gpu.peak_memory());
     let scored = course.evaluate(&mut trainer, &directory, &mut observe)?;
@@ -114,6 +126,7 @@ pub fn train_planned(
         eval::add_exposure(&mut metrics, &scored)?;
     }
     directory.save_metrics(&metrics)?;
+    done::save(out, config, trainer.fingerprint(), steps)?;
     let trained = Trained { trainer, scored, losses, spent };
     observe(Event::Finished(&trained));
     Ok(trained)
@@ -127,16 +140,24 @@ fn begin(
     out: &Path,
     held: HeldRun,
 ) -> Result<(RunDirectory, Trainer)> {
-    let checkpoint = directory::checkpoint(out).filter(|_| held == HeldRun::Resume);
-    let mut config = with_tile(gpu, config, checkpoint.is_some().then_some(out))?;
-    config.spool = config.spool.or_else(|| existing(out));
+    match held {
+        HeldRun::Refuse => RunDirectory::check(out, false)?,
+        HeldRun::Replace => RunDirectory::check(out, true)?,
+        HeldRun::Resume => RunDirectory::check_resumed(out)?,
+    }
+    let lock = RunDirectory::lock(out)?;
+    let resumes = held == HeldRun::Resume;
+    let checkpoint = if resumes { directory::checkpoint(out) } else { None };
+    let mut config = with_tile_and_frame(gpu, config, dataset, checkpoint.is_some().then_some(out))?;
+    // A disk that has room for the run has it for photographs.
+    config.spool.get_or_insert_with(|| out.to_owned());
     let config = &config;
+    let mut trainer = Trainer::new(gpu, config.clone(), dataset)?;
     if let Some(checkpoint) = checkpoint {
-        let mut trainer = Trainer::new(gpu, config.clone(), dataset)?;
         trainer.restore(&checkpoint)?;
         let step = trainer.steps_done();
         tracing::info!("{} goes on after step {step}", out.display());
-        let mut directory = RunDirectory::resume(out, config, step)?;
+        let mut directory = RunDirectory::resume(out, lock, config, step)?;
         // What it had of a later step is gone: the model is that of the checkpoint again.
         directory.save_trained(&mut trainer)?;
         return Ok((directory, trainer));
@@ -147,25 +168,27 @@ fn begin(
         HeldRun::Replace => true,
         HeldRun::Resume => !directory::is_finished(out),
     };
-    let directory = RunDirectory::create(out, config, replaces)?;
-    Ok((directory, Trainer::new(gpu, config.clone(), dataset)?))
+    Ok((RunDirectory::create_locked(out, lock, config, replaces)?, trainer))
 }
 
-/// The run directory, or the folder that it will lie in: a disk of that size has room for photographs.
-fn existing(out: &Path) -> Option<PathBuf> {
-    let folders = out.ancestors().filter(|folder| !folder.as_os_str().is_empty());
-    folders.map(Path::to_owned).find(|folder| folder.is_dir())
-}
-
-/// The configuration with the tile that is to be recorded: the same tiles give the same bits, whatever is measured later.
-/// It is the configuration's own, else that of the run that is `resumed`, else the fastest known on the device.
-fn with_tile(gpu: &Gpu, config: &TrainConfig, resumed: Option<&Path>) -> Result<TrainConfig> {
+/// The configuration with the tile and the frame that are to be recorded: the same ones give the same bits, whatever is
+/// measured later. Each is the configuration's own, else that of the run that is `resumed`, else the fastest known on the
+/// device and that of the dataset. A run that records no frame was trained in the world.
+fn with_tile_and_frame(
+    gpu: &Gpu,
+    config: &TrainConfig,
+    dataset: &Dataset,
+    resumed: Option<&Path>,
+) -> Result<TrainConfig> {
     let mut config = config.clone();
-    if let Some(run) = resumed.filter(|_| config.tile.is_none()) {
-        let recorded = directory::load_config(run)?.tile;
-        config.tile = recorded.filter(|&tile| gpu.properties().suits_tile(tile));
+    if let Some(run) = resumed {
+        let recorded = directory::load_config(run)?;
+        let tile = recorded.tile.filter(|&tile| gpu.properties().suits_tile(tile));
+        config.tile = config.tile.or(tile);
+        config.frame = Some(recorded.frame.unwrap_or_default());
     }
     config.tile = Some(config.render_settings().tile_on(gpu)?);
+    config.frame.get_or_insert_with(|| dataset.frame());
     Ok(config)
 }
 
@@ -175,10 +198,12 @@ struct Course<'a> {
     config: &'a TrainConfig,
     dataset: &'a Dataset,
     meter: Meter,
+    /// Steps that were done before.
+    begin: u64,
     progress: Vec<Progress>,
     /// Once something was scored.
     yardstick: Option<Yardstick>,
-    /// For TensorBoard.
+    /// For TensorBoard, once there is something to tell.
     events: Option<EventFile>,
 }
 
@@ -189,11 +214,10 @@ impl<'a> Course<'a> {
         dataset: &'a Dataset,
         directory: &RunDirectory,
         trainer: &Trainer,
-    ) -> Result<Self> {
-        let (meter, step) = (Meter::new(directory.seconds_before()), trainer.steps_done());
-        let progress = directory.progress(step);
-        let events = config.tensorboard.then(|| directory.events(step)).transpose()?;
-        Ok(Self { gpu, config, dataset, meter, progress, yardstick: None, events })
+    ) -> Self {
+        let (meter, begin) = (Meter::new(directory.seconds_before()), trainer.steps_done());
+        let progress = directory.progress(begin);
+        Self { gpu, config, dataset, meter, begin, progress, yardstick: None, events: None }
     }
 
     /// Logs every step, writes checkpoints and ends early where that is asked for; gives the losses.
@@ -201,23 +225,34 @@ impl<'a> Course<'a> {
         &mut self,
         trainer: &mut Trainer,
         directory: &mut RunDirectory,
+        requests: &Requests,
         observe: &mut impl FnMut(Event<'_>),
     ) -> Result<Vec<f64>> {
         let (config, mut losses) = (self.config, vec![]);
+        let (begin, mut saved) = (Instant::now(), Instant::now());
+        let is_over = |since: Instant, minutes: f64| {
+            minutes > 0.0 && since.elapsed() >= Duration::from_secs_f64(60.0 * minutes)
+        };
         let score_every = if config.stop.views > 0 { config.stop.every } else { 0 };
         let mut held_out = directory.held_out_scores(trainer.steps_done());
         while trainer.steps_done() < config.steps {
             let next = |every| (trainer.steps_done() + 1).checked_next_multiple_of(every);
-            let until = [config.eval_every, config.checkpoint_every, score_every];
+            let until =
+                [config.eval_every, config.checkpoint_every, score_every, config.hash_every];
             let until = until.into_iter().filter_map(next).min().unwrap_or(config.steps);
             let reports = self.meter.of(|| trainer.advance(until))?;
             for report in &reports {
                 losses.push(report.loss);
                 directory.log(report)?;
-                self.tell_events(report)?;
                 observe(Event::Step(report));
             }
             directory.flush_log()?;
+            if !reports.is_empty() {
+                directory.settle()?;
+            }
+            if config.tensorboard {
+                self.tell_events(directory, &reports)?;
+            }
             let Some(step) = reports.last().map(|report| report.step) else { continue };
             let falls_on = |every: u64| every > 0 && step.is_multiple_of(every);
             // Before the checkpoint: what goes on from there knows the score.
@@ -228,9 +263,20 @@ impl<'a> Course<'a> {
                 directory.save_held_out(&held_out)?;
                 observe(Event::HeldOut { step, psnr });
             }
-            if falls_on(config.checkpoint_every) {
+            if falls_on(config.hash_every) {
+                directory.log_hashes(step, &trainer.gaussians_in_frame()?)?;
+            }
+            let stop =
+                requests.stops().or(is_over(begin, config.max_minutes).then_some(Stop::TimeUp));
+            let stop = stop.filter(|_| step < config.steps);
+            let saves = requests.takes_save() || is_over(saved, config.checkpoint_minutes);
+            if falls_on(config.checkpoint_every) || saves || stop.is_some() {
                 directory.save_checkpoint(trainer)?;
+                saved = Instant::now();
                 observe(Event::Checkpointed { step });
+            }
+            if let Some(cause) = stop {
+                return Err(Error::Stopped { run: directory.path().to_owned(), step, cause });
             }
             if falls_on(score_every) && has_converged(config, &held_out) && step < config.steps {
                 tracing::info!("step {step}: the held-out views have converged");
@@ -273,21 +319,26 @@ impl<'a> Course<'a> {
 
 impl Course<'_> {
     /// Writes what TensorBoard draws over the steps, of every tenth.
-    fn tell_events(&mut self, report: &StepReport) -> Result<()> {
+    fn tell_events(&mut self, directory: &RunDirectory, reports: &[StepReport]) -> Result<()> {
         const EVERY: u64 = 10;
-        let Some(events) = &mut self.events else { return Ok(()) };
-        let step = report.step;
-        if !step.is_multiple_of(EVERY) && step < self.config.steps {
-            return Ok(());
-        }
+        let events = match &mut self.events {
+            Some(events) => events,
+            None => self.events.insert(directory.events(self.begin)?),
+        };
         let named = |group: &str, name: &str, value| (format!("{group}/{name}"), value);
-        let mut values = vec![("loss/all".to_owned(), report.loss)];
-        values.extend(report.terms.iter().map(|(term, value)| named("loss", term.column, *value)));
-        values.push(("model/Gaussians".to_owned(), report.gaussians as f64));
-        values.push(("model/milliseconds a step".to_owned(), report.milliseconds));
-        let rates = self.config.schedule.learning_rates(step, self.dataset.extent());
-        values.extend(ATTRIBUTES.iter().map(|own| named("rates", own.name, rates[own.attribute])));
-        events.scalars(step, &values)?;
+        for StepReport { step, loss, terms, gaussians, milliseconds, .. } in reports {
+            if !step.is_multiple_of(EVERY) && *step < self.config.steps {
+                continue;
+            }
+            let mut values = vec![("loss/all".to_owned(), *loss)];
+            values.extend(terms.iter().map(|(term, value)| named("loss", term.column, *value)));
+            values.push(("model/Gaussians".to_owned(), *gaussians as f64));
+            values.push(("model/milliseconds a step".to_owned(), *milliseconds));
+            let rates = self.config.schedule.learning_rates(*step, self.dataset.extent());
+            let rate = |own: &AttributeSpec| named("rates", own.name, rates[own.attribute]);
+            values.extend(ATTRIBUTES.iter().map(rate));
+            events.scalars(*step, &values)?;
+        }
         events.flush()
     }
 

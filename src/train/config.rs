@@ -10,6 +10,7 @@ use super::held_out::StopConfig;
 use super::parts::ModelConfig;
 use super::precision::PrecisionConfig;
 use super::streams;
+use crate::camera::frame::{FRAME_EXTENT, Frame};
 use crate::dataset::{Dataset, DepthOptions, LoadOptions};
 use crate::densify::DensityControl;
 use crate::gpu::Gpu;
@@ -19,9 +20,12 @@ use crate::optimizer::Schedule;
 use crate::random::Stream;
 use crate::render::RenderSettings;
 use crate::scene::init::Start;
-use crate::scene::{Features, MAX_SH_DEGREE, Shape};
+use crate::scene::{ATTRIBUTES, Attribute, Features, MAX_SH_DEGREE, Shape};
 use crate::tone::ToneSettings;
 use crate::{Error, Result};
+
+/// No rate of use is near it, and a step of it overflows nothing.
+const MOST_RATE: f64 = 100.0;
 
 /// What is seen where no splat is.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -89,6 +93,12 @@ pub struct TrainConfig {
     /// Leaves event files for TensorBoard.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub tensorboard: bool,
+    /// Writes one whenever the last is so many minutes old, too; 0: never.
+    pub checkpoint_minutes: f64,
+    /// Saves and stops after so many minutes, to go on another time; 0: trains to the end.
+    pub max_minutes: f64,
+    /// Logs a checksum of every plane of the parameters every so many steps; 0: never.
+    pub hash_every: u64,
     /// Steps whose every pass is compared with its CPU reference.
     pub check: CheckConfig,
     /// The device: a part of its name or its index; empty: the best.
@@ -96,6 +106,12 @@ pub struct TrainConfig {
     /// The tile that one subgroup renders, in pixels; left out, it is the fastest known on the device, and recorded.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tile: Option<[u32; 2]>,
+    /// Nothing nearer to a camera is seen, in units of the extent, which is taken as the power of two of which it is 0.75 to
+    /// 1.5 times.
+    pub near: f64,
+    /// Where the model is trained; left out, it is found from the cameras, and recorded.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub frame: Option<Frame>,
     /// Random points to begin with where the dataset has none.
     pub random_points: usize,
     /// The curve that lifts each photograph.
@@ -159,9 +175,14 @@ impl Default for TrainConfig {
             eval_every: 0,
             checkpoint_every: 1000,
             tensorboard: false,
+            checkpoint_minutes: 10.0,
+            max_minutes: 0.0,
+            hash_every: 0,
             check: CheckConfig::default(),
             device: String::new(),
             tile: None,
+            near: 0.1,
+            frame: None,
             random_points: 20_000,
             tone: ToneSettings::default(),
             start: Start::default(),
@@ -201,7 +222,9 @@ impl TrainConfig {
     pub fn load(path: &Path) -> Result<Self> {
         let text = std::fs::read_to_string(path)
             .map_err(|error| Error::input(path, format!("cannot be read: {error}")))?;
-        Self::from_toml(&text).map_err(|problem| Error::input(path, problem.to_string()))
+        let config =
+            Self::from_toml(&text).and_then(|config| config.check_finite().map(|()| config));
+        config.map_err(|problem| Error::input(path, problem.to_string()))
     }
 
     /// Reads TOML; what it leaves out keeps its default.
@@ -290,6 +313,7 @@ impl TrainConfig {
             raw_colors: self.model.raw_colors,
             observes: self.model.network.form == Form::Identity,
             tile: self.tile,
+            near: (self.near * FRAME_EXTENT) as f32,
             ..RenderSettings::default()
         }
     }
@@ -328,8 +352,37 @@ impl TrainConfig {
             let problem = format!("`TrainConfig::seed` is {seed}; it must be at most {most}");
             return Err(Error::Usage(problem));
         }
-        let density = &self.density;
+        self.check_finite()?;
+        let (density, schedule) = (&self.density, &self.schedule);
+        let minutes = |minutes: f64| (0.0..=1e9).contains(&minutes);
         let rules = [
+            ("density.split_scale", density.split_scale, density.split_scale >= 0.0, "0 or more"),
+            (
+                "density.min_opacity",
+                density.min_opacity,
+                (0.0..1.0).contains(&density.min_opacity),
+                "0 or more and below 1",
+            ),
+            ("`TrainConfig::near`", self.near, (1e-6..=1.0).contains(&self.near), "0.000001 to 1"),
+            (
+                "frame.scale",
+                self.frame.unwrap_or_default().scale,
+                self.frame.unwrap_or_default().is_sound(),
+                "above 0, and the centre finite",
+            ),
+            (
+                "schedule.final_means_rate",
+                schedule.final_means_rate,
+                schedule.final_means_rate > 0.0 && schedule.final_means_rate <= MOST_RATE,
+                "above 0 and at most 100",
+            ),
+            (
+                "`TrainConfig::checkpoint_minutes`",
+                self.checkpoint_minutes,
+                minutes(self.checkpoint_minutes),
+                "0 to 1e9",
+            ),
+            ("`TrainConfig::max_minutes`", self.max_minutes, minutes(self.max_minutes), "0 to 1e9"),
             ("`TrainConfig::steps`", self.steps as f64, self.steps >= 1, "at least 1"),
             (
                 "`TrainConfig::sh_degree`",
@@ -357,6 +410,17 @@ impl TrainConfig {
                 "0.001 to 1000",
             ),
         ];
+        for (spec, rate) in ATTRIBUTES.iter().zip(schedule.initial_rates.0) {
+            // The decay of the means' rate divides by it.
+            let least = if spec.attribute == Attribute::Means { f64::MIN_POSITIVE } else { 0.0 };
+            if !(least..=MOST_RATE).contains(&rate) {
+                let (name, rule) = (spec.name, if least > 0.0 { "above 0" } else { "0 or more" });
+                let problem = format!(
+                    "schedule.initial_rates.{name} is {rate}; it must be {rule} and at most {MOST_RATE}"
+                );
+                return Err(Error::Usage(problem));
+            }
+        }
         for (name, value, holds, rule) in rules {
             if !(holds && value.is_finite()) {
                 return Err(Error::Usage(format!("{name} is {value}; it must be {rule}")));
@@ -399,6 +463,11 @@ mod tests {
         assert!(
             refused(TrainConfig { sh_degree: 4, ..Default::default() }).contains("::sh_degree`")
         );
+        for rate in [f64::NAN, f64::INFINITY, -1e-3, 0.0, 1e9] {
+            let mut config = TrainConfig::default();
+            config.schedule.initial_rates[Attribute::Means] = rate;
+            assert!(refused(config).contains("schedule.initial_rates.means"), "{rate}");
+        }
         let mut config = TrainConfig::default();
         config.model.weights.low_ssim = 1.5;
         assert!(refused(config).contains("low_ssim"));

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use super::Trainer;
 use super::terms::NetworkTerms;
 use super::views::{lifted_from, measured};
-use crate::camera::Camera;
+use crate::camera::{Camera, Frame};
 use crate::dataset::{Dataset, Split, View};
 use crate::exposure::Exposures;
 use crate::gpu::Gpu;
@@ -68,15 +68,21 @@ impl StopConfig {
     }
 }
 
-/// Cameras, and what they are to show.
+/// Cameras in the frame, and what they are to show.
 #[derive(Debug, Default)]
 pub(super) struct HeldOut(Vec<(Camera, Image)>);
 
 impl HeldOut {
     /// The held-out views of a dataset with their targets, made as those of its training views.
-    pub(super) fn new(pseudo_gt: &mut PseudoGt, dataset: &Dataset, scene: &Scene) -> Result<Self> {
+    pub(super) fn new(
+        pseudo_gt: &mut PseudoGt,
+        dataset: &Dataset,
+        frame: &Frame,
+        scene: &Scene,
+    ) -> Result<Self> {
         let held_out = dataset.views.iter().filter(|view| view.split == Split::HeldOut);
-        let targets = held_out.map(|view| Ok((view.camera, target(pseudo_gt, view, scene)?)));
+        let targets =
+            held_out.map(|view| Ok((frame.camera(&view.camera), target(pseudo_gt, view, scene)?)));
         let targets = targets.collect::<Result<Vec<_>>>()?;
         Ok(Self(targets.into_iter().filter_map(|(camera, own)| Some((camera, own?))).collect()))
     }

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use toml::{Table, Value};
 
 use super::TrainConfig;
+use crate::hash::{self, Hasher};
 use crate::{Error, Result};
 
 impl TrainConfig {
@@ -44,7 +45,7 @@ impl TrainConfig {
     /// is scored and saved, on which device and by which tiles. A lower limit of the Gaussians is no difference either: a
     /// run that outgrows its machine goes on with what it has.
     pub fn difference(&self, other: &Self) -> Option<String> {
-        const FREE: [&str; 13] = [
+        const FREE: [&str; 18] = [
             "cache",
             "tensorboard",
             "steps",
@@ -52,8 +53,13 @@ impl TrainConfig {
             "reference",
             "device",
             "tile",
+            "frame.center",
+            "frame.scale",
             "eval_every",
             "checkpoint_every",
+            "checkpoint_minutes",
+            "max_minutes",
+            "hash_every",
             "check.every",
             "check.stops",
             "stop.every",
@@ -75,6 +81,51 @@ impl TrainConfig {
         let mut keys = keys.filter(|key| !FREE.contains(&key.as_str()) && !is_lower_limit(key));
         keys.find(|&key| own.get(key) != others.get(key))
             .map(|key| format!("{key} = {}, not {}", value(&own, key), value(&others, key)))
+    }
+
+    /// A checksum of every setting that a result depends on: all but where the dataset lies, when the run is saved and
+    /// checked, how long it may take, and what it finds for itself.
+    ///
+    /// # Errors
+    /// None for a configuration that [`TrainConfig::check`] accepts.
+    pub fn checksum(&self) -> Result<String> {
+        const FREE: [&str; 14] = [
+            "cache",
+            "tensorboard",
+            "dataset",
+            "device",
+            "tile",
+            "frame.center",
+            "frame.scale",
+            "eval_every",
+            "checkpoint_every",
+            "checkpoint_minutes",
+            "max_minutes",
+            "hash_every",
+            "check.every",
+            "check.stops",
+        ];
+        let own = self.clone().with_absolute_paths();
+        let table = Table::try_from(own).map_err(|error| Error::Usage(error.to_string()))?;
+        let mut hasher = Hasher::default();
+        for (key, value) in settings("", &table) {
+            if !FREE.contains(&key.as_str()) {
+                hasher.write(key.as_bytes());
+                hasher.write(value.to_string().as_bytes());
+            }
+        }
+        Ok(hash::text(hasher.finish()))
+    }
+
+    /// Refuses numbers that are none, wherever they stand.
+    pub(super) fn check_finite(&self) -> Result<()> {
+        let table = Table::try_from(self).map_err(|error| Error::Usage(error.to_string()))?;
+        match settings("", &table).iter().find_map(|(key, value)| Some((key, not_finite(value)?))) {
+            Some((key, number)) => {
+                Err(Error::Usage(format!("{key} is {number}; it must be finite")))
+            }
+            None => Ok(()),
+        }
     }
 
     fn with_one(&self, key: &str, text: &str) -> Result<Self> {
@@ -101,6 +152,15 @@ impl TrainConfig {
             let is_known = known.iter().any(|known| known == key);
             if is_known { refused(error.message().trim()) } else { unknown(key, &known) }
         })
+    }
+}
+
+/// The first number of a value that is NaN or infinite.
+fn not_finite(value: &Value) -> Option<f64> {
+    match value {
+        Value::Float(number) => Some(*number).filter(|number| !number.is_finite()),
+        Value::Array(values) => values.iter().find_map(not_finite),
+        _ => None,
     }
 }
 
@@ -193,6 +253,26 @@ mod tests {
             ..TrainConfig::default()
         };
         assert_eq!(config.difference(&other).unwrap(), "model.depth_folder = nothing, not \"d\"");
+    }
+
+    #[test]
+    fn no_setting_is_nan_or_infinite_unnoticed() {
+        let table = Table::try_from(TrainConfig::default()).unwrap();
+        let all = settings("", &table);
+        let numbers = all.iter().filter(|(_, value)| value.is_float());
+        let mut count = 0;
+        for (key, _) in numbers {
+            for wrong in ["nan", "inf", "-inf"] {
+                let config = with(&[&format!("{key}={wrong}")]).unwrap();
+                let checked = config.check();
+                let message = checked.expect_err(key).to_string();
+                let name = key.rsplit('.').next().unwrap();
+                let is_named = message.contains(name) || message.contains(&name.replace("_c", ""));
+                assert!(is_named, "{key}={wrong}: {message}");
+            }
+            count += 1;
+        }
+        assert!(count > 30, "{count}");
     }
 
     #[test]

@@ -12,7 +12,7 @@ use super::cache::{Cache, CacheSize, Kept};
 use super::precision::Darkroom;
 use super::{TrainConfig, streams};
 use crate::Result;
-use crate::camera::Camera;
+use crate::camera::{Camera, Frame};
 use crate::dataset::{Dataset, Point, View};
 use crate::exposure::Affine;
 use crate::gpu::{Buffer, Gpu};
@@ -35,6 +35,7 @@ pub(super) struct TrainView {
     pub(super) place: usize,
     /// Index into the dataset's views.
     index: usize,
+    /// In the frame.
     pub(super) camera: Camera,
     /// Depth from elsewhere, (H, W), where the dataset's is of another size.
     depth: Option<Vec<f32>>,
@@ -92,6 +93,7 @@ impl Views {
         gpu: &Gpu,
         pseudo_gt: &mut PseudoGt,
         dataset: &Dataset,
+        frame: &Frame,
         config: &TrainConfig,
     ) -> Result<(Self, Scene, Option<TargetExposure>)> {
         let settings = pseudo_gt.settings().clone();
@@ -132,7 +134,7 @@ impl Views {
                     number: level * count + place,
                     place,
                     index,
-                    camera: view.camera.resized(size.x, size.y),
+                    camera: frame.camera(&view.camera).resized(size.x, size.y),
                     depth: depth.map(|depth| resized_plane(depth, &image, size)),
                     input,
                     photograph: kept.transpose()?,
@@ -245,6 +247,19 @@ impl Views {
         self.levels.iter().flatten().map(|view| &view.camera)
     }
 
+    /// Warns of every view in which none of the first Gaussians, given in the frame, has its mean: most often its pose is wrong.
+    pub(super) fn say_what_shows_nothing(&self, gaussians: &Gaussians) {
+        let means: Vec<DVec3> = gaussians.means().iter().map(|mean| mean.as_dvec3()).collect();
+        for TrainView { name, camera, .. } in self.whole() {
+            if !means.iter().any(|&mean| camera.sees(mean).is_some()) {
+                tracing::warn!(
+                    "view {name} shows nothing: none of the {} first Gaussians lies in it; check its pose",
+                    means.len()
+                );
+            }
+        }
+    }
+
     /// The names of the training photographs.
     pub(super) fn names(&self) -> impl Iterator<Item = &str> {
         self.levels.first().into_iter().flatten().map(|view| view.name.as_str())
@@ -265,13 +280,14 @@ impl Views {
         config: &TrainConfig,
         exposures: Option<&[Affine]>,
     ) -> Result<Gaussians> {
+        let frame = config.frame.unwrap_or_default();
         let random;
         let points = if dataset.points.is_empty() {
             let cameras: Vec<Camera> = self.cameras().cloned().collect();
             let count = config.random_points.min(config.max_gaussians);
             let seed = Stream::new(config.seed, streams::POINTS).bits(0);
             tracing::info!("no points in the dataset: {count} random ones");
-            let point = |position| Point { position, views: vec![] };
+            let point = |position| Point { position: frame.to_world(position), views: vec![] };
             random = init::random(&cameras, count, seed).into_iter().map(point).collect();
             &random
         } else {
@@ -297,7 +313,8 @@ impl Views {
             });
             target.transpose()
         })?;
-        let positions: Vec<DVec3> = kept.iter().map(|point| point.position).collect();
+        let positions: Vec<DVec3> =
+            kept.iter().map(|point| frame.from_world(point.position)).collect();
         let seed = Stream::new(config.seed, streams::FEATURES).bits(0);
         let shape = Shape { sh_degree: config.sh_degree, features: config.model.features() };
         let mut gaussians = init::from_points(&positions, &colors, shape, &config.start, seed)?;

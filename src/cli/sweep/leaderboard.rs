@@ -6,12 +6,12 @@ use serde_json::Value;
 
 use crate::Result;
 use crate::cli::batch::Run;
-use crate::cli::batch::csv::{field, number};
+use crate::cli::batch::csv::number;
 use crate::cli::batch::point::{ADAPTIVE, OFFSET, Point, SEED};
 use crate::cli::batch::runner::Failure;
 use crate::cli::batch::sample::{deviation, mean};
 use crate::eval::{AGAINST, WITH_REFERENCE};
-use crate::output::write_whole;
+use crate::output::{csv_field, write_whole};
 use crate::report::{Bar, Best, Column, Mark, Report, Series, Table, bars, plot_points};
 
 /// The files of a leaderboard.
@@ -101,7 +101,7 @@ impl Leaderboard {
         write_whole(&html, self.html(failures).as_bytes())?;
         let mut text = "point,seconds\n".to_owned();
         for (name, seconds) in &self.timings {
-            text += &format!("{},{}\n", field(name), number(*seconds));
+            text += &format!("{},{}\n", csv_field(name), number(*seconds));
         }
         write_whole(&timings, text.as_bytes())
     }
@@ -164,7 +164,7 @@ impl Leaderboard {
         header.extend(against.then(|| AGAINST.to_owned()));
         let cells = |row: &Row| {
             let values =
-                self.keys.iter().map(|key| field(row.point.value(key).unwrap_or_default()));
+                self.keys.iter().map(|key| csv_field(row.point.value(key).unwrap_or_default()));
             let mut cells: Vec<String> = values.collect();
             for score in &self.scores {
                 cells.push(number(row.mean(score)));
@@ -172,7 +172,7 @@ impl Leaderboard {
             }
             cells.extend([number(row.gaussians()), row.metrics.len().to_string()]);
             cells.extend(is_marked.then(|| row.knows_references().to_string()));
-            cells.extend(against.then(|| field(row.yardstick().unwrap_or_default())));
+            cells.extend(against.then(|| csv_field(row.yardstick().unwrap_or_default())));
             cells.join(",")
         };
         let lines = std::iter::once(header.join(",")).chain(self.rows.iter().map(cells));

@@ -203,7 +203,7 @@ impl Page<'_> {
         let gaussians = run::load_model(&run.folder, raw_colors)?;
         let networks =
             run::load_networks(self.gpu, &run.folder, &config.model, gaussians.shape.features)?;
-        let mut player = Player::new(self.gpu, &gaussians, raw_colors, config.tile, networks)?;
+        let mut player = Player::new(self.gpu, &gaussians, &config, networks)?;
         Ok(player.render(view)?.output().clone())
     }
 }
