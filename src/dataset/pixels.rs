@@ -96,7 +96,7 @@ fn resolved(groups: &[(Lens, Vec<Source>)], options: &LoadOptions) -> LoadOption
         let (w, h, limit) = (lens.width, lens.height, options.max_resolution);
         let more = if shrunk.len() > 1 { ", and others alike" } else { "" };
         tracing::warn!(
-            "photographs of {w}x{h} are trained on at {width}x{height}{more}: `LoadOptions::max_resolution` is {limit}; 0 \
+            "photographs of {w}x{h} are trained on at {width}x{height}{more}: max_resolution is {limit}, 0 \
              takes them as they are"
         );
     }
@@ -164,6 +164,12 @@ fn fitted_lens(source: &Source) -> Result<Lens> {
     Ok(fitted)
 }
 
+/// A view's name, and the size at which it is loaded.
+pub(super) fn loaded_size(source: &Source, options: &LoadOptions) -> Result<(String, [u32; 2])> {
+    let lens = fitted_lens(source)?;
+    Ok((source.name.clone(), options.loaded_size(lens.width, lens.height).into()))
+}
+
 /// Refuses a file by the size that it declares, before that costs memory: a picture of another shape than its camera's, or
 /// of far more pixels.
 fn check_size(path: &Path, lens: &Lens) -> Result<()> {
@@ -187,12 +193,6 @@ fn check_excess(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Result
         return Err(Error::input(path, problem));
     }
     Ok(())
-}
-
-/// A view's name, and the size at which it is loaded.
-pub(super) fn loaded_size(source: &Source, options: &LoadOptions) -> Result<(String, [u32; 2])> {
-    let lens = fitted_lens(source)?;
-    Ok((source.name.clone(), options.loaded_size(lens.width, lens.height).into()))
 }
 
 /// How a photograph is turned to be what its camera took. Poses are of what is stored, as COLMAP reads it; where the
