@@ -19,6 +19,8 @@ mod jpeg;
 mod mask;
 #[cfg(feature = "io")]
 mod orientation;
+#[cfg(feature = "raw")]
+mod raw;
 
 #[cfg(feature = "io")]
 pub use exif::exposure_value;

@@ -32,7 +32,7 @@ use crate::train::{
 /// (paper, or a benchmark's), nothing is decided.
 #[derive(Clone, Debug, clap::Args)]
 pub struct TrainArgs {
-    /// The dataset: a folder with transforms*.json (LOM, RealX3D, NeRF) or a COLMAP model in sparse/
+    /// The dataset: a folder with transforms*.json (LOM, RealX3D, NeRF) or a COLMAP model in sparse/, as `nightsplat pose` makes one
     pub dataset: PathBuf,
     /// The run directory to write: config.toml, model.ply, the networks, train.csv, evals.csv, a checkpoint, metrics.json
     #[arg(long, value_name = "RUN")]

@@ -8,7 +8,9 @@ use ::image::{
     codecs::{jpeg::JpegEncoder, png::PngEncoder},
 };
 
-use super::files::HEIC_REMEDY;
+#[cfg(not(feature = "raw"))]
+use super::files::RAW_REMEDY;
+use super::files::{HEIC_REMEDY, is_raw};
 use super::{Image, budget, exr_file, from_interleaved, jpeg, linear_from_srgb, srgb_from_linear};
 use crate::output::write_whole;
 use crate::{Error, Result};
@@ -17,7 +19,7 @@ impl Image {
     /// Reads an 8- or 16-bit PNG or TIFF, a JPEG, a WebP or an EXR file as it is stored ([`Image::load_upright`] turns it);
     /// the content decides, not the file's name.
     ///
-    /// Alpha is dropped, grey is repeated, a float TIFF is linear light. Of an EXR file the first layer's R, G and B (or Y) are taken as linear
+    /// Alpha is dropped, grey is repeated, camera RAW (feature `raw`) is linear light. Of an EXR file the first layer's R, G and B (or Y) are taken as linear
     /// light; values that are negative or not finite become 0, with a warning that counts them.
     ///
     /// # Errors
@@ -65,6 +67,9 @@ impl Image {
             return Ok((image, vec![]));
         }
         refuse_heic(path, &bytes)?;
+        if is_raw(path) {
+            return Ok((load_raw(path, bytes)?, vec![]));
+        }
         let reader = ImageReader::new(Cursor::new(bytes)).with_guessed_format();
         let decoded = reader.map_err(::image::ImageError::from).and_then(ImageReader::decode);
         Ok((from_decoded(decoded.map_err(|error| not_an_image(path, &error))?), vec![]))
@@ -75,6 +80,9 @@ impl Image {
     /// # Errors
     /// [`Error::Input`] names the file when it cannot be read.
     pub(super) fn load_alpha(path: &Path) -> Result<Option<Self>> {
+        if is_raw(path) {
+            return Ok(None);
+        }
         let reader = ImageReader::open(path).and_then(ImageReader::with_guessed_format);
         let reader =
             reader.map_err(|error| Error::input(path, format!("cannot be read: {error}")))?;
@@ -101,6 +109,9 @@ impl Image {
     /// [`Error::Input`] names the file when it is no image.
     pub fn size_of(path: impl AsRef<Path>) -> Result<(u32, u32)> {
         let path = path.as_ref();
+        if is_raw(path) {
+            return raw_size(path);
+        }
         let reader = ImageReader::open(path).and_then(ImageReader::with_guessed_format);
         let reader =
             reader.map_err(|error| Error::input(path, format!("cannot be read: {error}")))?;
@@ -212,14 +223,21 @@ fn refuse_heic(path: &Path, bytes: &[u8]) -> Result<()> {
     if is_heic { Err(Error::input(path, format!("is HEIC; {HEIC_REMEDY}"))) } else { Ok(()) }
 }
 
+#[cfg(feature = "raw")]
+use super::raw::{load as load_raw, size_of as raw_size};
+
+#[cfg(not(feature = "raw"))]
+fn load_raw(path: &Path, _: Vec<u8>) -> Result<Image> {
+    Err(Error::input(path, format!("is camera RAW, which this build does not read; {RAW_REMEDY}")))
+}
+
+#[cfg(not(feature = "raw"))]
+fn raw_size(path: &Path) -> Result<(u32, u32)> {
+    load_raw(path, vec![]).map(|image| (image.width, image.height))
+}
+
 fn from_decoded(decoded: DynamicImage) -> Image {
     let (width, height) = (decoded.width(), decoded.height());
-    if matches!(decoded, DynamicImage::ImageRgb32F(_) | DynamicImage::ImageRgba32F(_)) {
-        // Linear light, as EXR is; positive phrasing: a NaN is black.
-        let values = decoded.into_rgb32f().into_raw().into_iter();
-        let encode = |value: f32| if value > 0.0 { srgb_from_linear(value) } else { 0.0 };
-        return from_interleaved(width, height, &values.map(encode).collect::<Vec<_>>());
-    }
     let wide = decoded.color().bytes_per_pixel() > decoded.color().channel_count();
     let interleaved: Vec<f32> = if wide {
         decoded

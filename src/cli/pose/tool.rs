@@ -37,9 +37,8 @@ impl<'a> Tool<'a> {
         };
         let besides = if besides.is_empty() { String::new() } else { format!("; {besides}") };
         Err(Error::Usage(format!(
-            "{problem}; install it (Debian, Ubuntu: apt install {name}; Fedora: dnf install {name}; Arch: pacman -S {name}, \
-             or the AUR; macOS: brew install {name}; Windows: winget install {name}, or {}) or name it with --{name} PATH{besides}",
-            home_page(name)
+            "{problem}; install it ({}) or name it with --{name} PATH{besides}",
+            sources(name)
         )))
     }
 
@@ -97,9 +96,16 @@ impl<'a> Tool<'a> {
     }
 }
 
-fn home_page(name: &str) -> &'static str {
+/// Where a program comes from on each system.
+fn sources(name: &str) -> &'static str {
     match name {
-        "colmap" => "https://github.com/colmap/colmap/releases",
-        _ => "https://ffmpeg.org/download.html",
+        "colmap" => {
+            "Debian, Ubuntu: apt install colmap; Fedora: dnf install colmap; Arch: colmap of the AUR; macOS: brew install \
+             colmap; Windows and others: https://github.com/colmap/colmap/releases"
+        }
+        _ => {
+            "Debian, Ubuntu: apt install ffmpeg; Fedora: dnf install ffmpeg-free; Arch: pacman -S ffmpeg; macOS: brew \
+             install ffmpeg; Windows: winget install ffmpeg; others: https://ffmpeg.org/download.html"
+        }
     }
 }
