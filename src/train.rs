@@ -7,6 +7,7 @@ mod ends;
 mod exposures;
 mod growth;
 mod held_out;
+mod masks;
 mod model;
 mod networks;
 mod overrides;
@@ -29,13 +30,13 @@ use crate::densify::{Densifier, DensifySettings};
 use crate::exposure::Exposures;
 use crate::gpu::{Buffer, CheckReport, Gpu, PassTime, Recorder};
 use crate::image::Image;
-use crate::loss::{DepthBoxes, LogSlot, LossLog, Losses, StepLosses, Term, TermInputs};
+use crate::loss::{LogSlot, LossLog, Losses, StepLosses, Term, TermInputs};
 use crate::nn::Form;
 use crate::optimizer::{Adam, AdamBuffers, FiniteCheck, Learnable};
 use crate::pseudo_gt::PseudoGt;
 use crate::random::Stream;
 use crate::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer};
-use crate::scene::{Gaussians, width};
+use crate::scene::{COLOR_CHANNELS, Gaussians, width};
 use crate::{Error, Result};
 
 pub use cache::CacheSize;
@@ -45,8 +46,10 @@ use ends::Ends;
 pub use exposures::{ExposureConfig, Learning};
 use held_out::HeldOut;
 pub use held_out::{StopConfig, targets_of_test_views};
+use masks::Masks;
 use model::Model;
 pub use networks::Networks;
+use parts::say_what_parts_see;
 pub use parts::{ModelConfig, ModelName, NetworkRates, Part};
 pub use precision::{PhotographBits, PrecisionConfig};
 pub use preset::Preset;
@@ -172,6 +175,7 @@ pub struct Trainer {
     model: Model,
     renderer: Renderer,
     losses: Losses,
+    masks: Masks,
     networks: Option<NetworkTerms>,
     exposures: Option<Exposures>,
     adam: Adam,
@@ -267,6 +271,7 @@ impl Trainer {
         let sources = views.sources(gpu, &pseudo_gt, dataset);
         let losses = Losses::new(gpu, &config.loss(), &sources)?;
         drop(sources);
+        let masks = Masks::new(gpu, dataset, &views, config.loss().tone_curve)?;
         let exposures = starts.map(|starts| Exposures::new(gpu, config.exposure.rates, &starts));
         let mut exposures = exposures.transpose()?;
         if let Some(exposures) = &mut exposures {
@@ -288,6 +293,7 @@ impl Trainer {
             model: Model::upload(gpu, &gaussians)?,
             renderer,
             losses,
+            masks,
             networks: NetworkTerms::new(gpu, &config, &sizes)?,
             exposures,
             adam,
@@ -421,6 +427,8 @@ impl Trainer {
         let (d_render, size) = (&mut self.d_render, view.size());
         let input = view.input.decoded(pass, decoded)?;
         let log = &mut LogSlot { log: &mut self.log, slot, status };
+        let channels = COLOR_CHANNELS + model.shape().features.width();
+        let masks = &mut self.masks;
         let inputs = &TermInputs {
             step,
             view: view.number,
@@ -434,11 +442,18 @@ impl Trainer {
         match &mut self.exposures {
             Some(exposures) => {
                 exposures.expose(pass, view.place, size, render)?;
-                let inputs = &TermInputs { colors: exposures.exposed(), ..*inputs };
+                let exposed = exposures.exposed();
+                let colors = masks.shown(pass, view.number, size, exposed, (input, &view.tone))?;
+                let inputs = &TermInputs { colors, ..*inputs };
                 self.losses.record(pass, inputs, d_render, log)?;
+                masks.hide(pass, view.number, (size, channels), d_render)?;
                 exposures.backward(pass, view.place, size, render, d_render)?;
             }
-            None => self.losses.record(pass, inputs, d_render, log)?,
+            None => {
+                let colors = masks.shown(pass, view.number, size, render, (input, &view.tone))?;
+                self.losses.record(pass, &TermInputs { colors, ..*inputs }, d_render, log)?;
+                masks.hide(pass, view.number, (size, channels), d_render)?;
+            }
         }
         if let Some(networks) = &mut self.networks {
             let low = match &view.photograph {
@@ -455,6 +470,7 @@ impl Trainer {
                 _ => target,
             };
             networks.record(pass, inputs, Photographs { low, target }, d_render, log)?;
+            masks.hide(pass, view.number, (size, channels), d_render)?;
         }
         self.renderer.backward(
             pass,
@@ -566,23 +582,6 @@ fn learnables<'a>(
     let networks = networks.iter_mut().flat_map(|terms| terms.networks.parameters_mut());
     let networks = networks.map(|parameters| parameters as &mut dyn Learnable);
     networks.chain(exposures.iter_mut().map(|exposures| exposures as &mut dyn Learnable))
-}
-
-/// Says where the parts of a model see less than they are set to.
-fn say_what_parts_see(model: &ModelConfig, sizes: &[UVec2]) {
-    let shortest = sizes.iter().map(|size| size.min_element()).min().unwrap_or_default();
-    let boxes = DepthBoxes::new(UVec2::splat(shortest), model.depth_box);
-    if model.depth && boxes.side < model.depth_box {
-        let (wanted, side) = (model.depth_box, boxes.side);
-        tracing::warn!(
-            "depth boxes of {wanted} pixels exceed the views: {side} pixels in the smallest"
-        );
-    }
-    let longest = sizes.iter().map(|size| size.max_element()).max().unwrap_or_default();
-    if (model.denoiser || model.tonemapper) && model.denoiser_crop > longest {
-        let crop = model.denoiser_crop;
-        tracing::warn!("a crop of {crop} pixels exceeds every view: the networks see whole views");
-    }
 }
 
 /// The background of a step.

@@ -339,7 +339,8 @@ fn help_teaches_every_command_in_lines_that_fit() {
     assert!(commands.iter().all(|command| help.contains(command)), "{help}");
     let train = succeed("train --help");
     for option in "--curve --gain --theta --steps --downscale --seed --sh-degree --ssim-weight --max-gaussians \
-                   --background --reference --device --config --eval-every --out --overwrite"
+                   --background --reference --device --config --eval-every --out --overwrite --max-resolution --cache \
+                   --test-every --tensorboard"
         .split_whitespace()
     {
         assert!(train.contains(option), "{option}");

@@ -35,7 +35,7 @@ use crate::train::{
 /// goes on. --resume goes on from there to the same bits; where the run is done it does nothing and succeeds.
 #[derive(Clone, Debug, clap::Args)]
 pub struct TrainArgs {
-    /// The dataset: a folder with transforms*.json (LOM, RealX3D, NeRF) or a COLMAP model in sparse/
+    /// The dataset: a folder with transforms*.json (LOM, RealX3D, NeRF) or a COLMAP model in sparse/, as `nightsplat pose` makes one
     pub dataset: PathBuf,
     /// The run directory to write: config.toml, model.ply, the networks, train.csv, evals.csv, a checkpoint, metrics.json
     #[arg(long, value_name = "RUN")]
@@ -120,6 +120,9 @@ pub(crate) struct TrainOptions {
     /// A folder of reference images by name, for scores only
     #[arg(long, value_name = "DIR")]
     reference: Option<PathBuf>,
+    /// Masks (masks/NAME.png or masks/NAME.jpg.png of the dataset) hide what is white, not what is black
+    #[arg(long)]
+    invert_masks: bool,
     #[command(flatten)]
     model: ModelOptions,
     /// Nothing nearer to a camera is seen, in units of the scene's extent: of how far the cameras stand from their middle [default: {near}]
@@ -372,6 +375,7 @@ impl TrainOptions {
         set(&mut config.hash_every, &self.hash_every);
         set(&mut config.check.every, &self.check_every);
         config.check.stops |= self.check_stops;
+        config.invert_masks |= self.invert_masks;
         if self.exposures.is_some() {
             (config.exposure.learn, config.exposure.start) = (Learning::On, self.exposures.clone());
         }
@@ -397,13 +401,13 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     }
     let gpu = Gpu::new(&config.device.parse::<DeviceChoice>()?)?;
     let Planned { config, plan, dataset } = planned(args, config, &gpu)?;
+    for line in args.options.idle(&config) {
+        tracing::warn!("{line}");
+    }
     let finished = if args.resume { run::done_steps(&args.out, &config, &dataset)? } else { None };
     if let Some(steps) = finished {
         let done = format!("{} is done: {steps} steps", args.out.display());
         return Ok(writeln!(std::io::stdout(), "{}", printable(&done))?);
-    }
-    for line in args.options.idle(&config) {
-        tracing::warn!("{line}");
     }
     let form = args.progress.unwrap_or_else(ProgressForm::of_terminal);
     let is_text = form != ProgressForm::Json;
@@ -497,7 +501,7 @@ fn as_begun(args: &TrainArgs, config: TrainConfig) -> crate::Result<TrainConfig>
 }
 
 /// What `--max-resolution` says.
-fn max_resolution(text: &str) -> Result<u32, String> {
+pub(super) fn max_resolution(text: &str) -> Result<u32, String> {
     match text {
         "none" => Ok(0),
         _ => text.parse().map_err(|_| "a number of pixels, or none".to_owned()),

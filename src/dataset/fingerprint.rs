@@ -22,19 +22,16 @@ impl Fingerprint {
     /// Reads every pixel once.
     ///
     /// # Errors
-    /// A photograph that is not kept in memory can no longer be read.
+    /// A photograph that was not kept can no longer be read.
     pub fn of(dataset: &Dataset) -> Result<Self> {
         let views = dataset.views.par_iter().filter(|view| view.is_for_training());
-        let views = views.map(|view| {
-            let own = [camera(view), pixels(view)?].map(hash::text);
-            Ok((view.name.clone(), own))
-        });
-        let views = views.collect::<Result<BTreeMap<_, _>>>()?;
+        let views = views
+            .map(|view| Ok((view.name.clone(), [camera(view), pixels(view)?].map(hash::text))));
         let mut points = Hasher::default();
         for point in &dataset.points {
             points.write_numbers(&point.position.to_array());
         }
-        Ok(Self { views, points: hash::text(points.finish()) })
+        Ok(Self { views: views.collect::<Result<_>>()?, points: hash::text(points.finish()) })
     }
 
     /// All of it in one checksum.

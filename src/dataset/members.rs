@@ -3,6 +3,16 @@
 use super::{Dataset, Split, View};
 
 impl Dataset {
+    /// The training views.
+    pub fn train_views(&self) -> impl Iterator<Item = &View> {
+        self.views.iter().filter(|view| view.split == Split::Train)
+    }
+
+    /// The held-out views.
+    pub fn test_views(&self) -> impl Iterator<Item = &View> {
+        self.views.iter().filter(|view| view.split == Split::Test)
+    }
+
     /// Leaves out views by name; points forget them.
     pub fn leave_out(&mut self, names: &[String]) {
         let stays: Vec<bool> = self.views.iter().map(|view| !names.contains(&view.name)).collect();

@@ -23,6 +23,8 @@ pub struct LoadOptions {
     pub load_low_test: bool,
     /// How many training views are kept from training, an eighth of them at most, to tell when it has converged.
     pub hold_out: usize,
+    /// Masks hide what is white, not what is black.
+    pub invert_masks: bool,
     /// What is looked for as the training views' depth.
     pub depth: DepthOptions,
 }
@@ -48,6 +50,7 @@ impl Default for LoadOptions {
             reference: None,
             load_low_test: true,
             hold_out: 0,
+            invert_masks: false,
             depth: DepthOptions::default(),
         }
     }
@@ -56,11 +59,21 @@ impl Default for LoadOptions {
 impl LoadOptions {
     /// The size at which a photograph of this size is loaded.
     pub fn loaded_size(&self, width: u32, height: u32) -> (u32, u32) {
-        let longest = f64::from(width.max(height)) / self.downscale;
-        let limit = f64::from(self.max_resolution);
-        let beyond = if self.max_resolution > 0 { (longest / limit).max(1.0) } else { 1.0 };
+        let beyond = self.beyond(width, height);
         let side = |pixels: u32| (f64::from(pixels) / self.downscale / beyond).round() as u32;
         (side(width), side(height))
+    }
+
+    /// Pixels of a photograph of this size to a pixel of it as loaded, each way.
+    pub fn shrink(&self, width: u32, height: u32) -> f64 {
+        self.downscale * self.beyond(width, height)
+    }
+
+    /// How many times the longest side exceeds `max_resolution` behind `downscale`.
+    fn beyond(&self, width: u32, height: u32) -> f64 {
+        let longest = f64::from(width.max(height)) / self.downscale;
+        let limit = f64::from(self.max_resolution);
+        if self.max_resolution > 0 { (longest / limit).max(1.0) } else { 1.0 }
     }
 
     /// Refuses options that make no sense.

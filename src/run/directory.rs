@@ -54,6 +54,8 @@ pub struct RunDirectory {
     /// What the steps took that the log held already.
     seconds_before: f64,
     raw_colors: bool,
+    /// Whether what it replaces is still there.
+    is_new: bool,
     /// The run that was here before; back in its place if this is dropped before [`RunDirectory::settle`].
     aside: Aside,
     /// Behind `aside`: nobody else begins before that is in order.
@@ -182,7 +184,6 @@ impl RunDirectory {
             return Err(held(path, file));
         }
         let aside = Aside::set(path)?;
-        remove_events(path)?;
         let mut run = Self::open(path, config, "", 0.0, aside, lock)?;
         let columns: String = run.terms.iter().map(|term| format!("{},", term.column)).collect();
         run.log_line(&format!("step,view,loss,{columns}gaussians,milliseconds"))?;
@@ -194,7 +195,8 @@ impl RunDirectory {
     /// # Errors
     /// The directory cannot be written.
     pub fn settle(&mut self) -> Result<()> {
-        self.aside.give_up()
+        self.aside.give_up()?;
+        if std::mem::take(&mut self.is_new) { remove_events(&self.path) } else { Ok(()) }
     }
 
     /// Takes up a run again after `step`: its log is cut there, and it is unfinished.
@@ -239,19 +241,12 @@ impl RunDirectory {
         write_whole(&path.join("config.toml"), recorded.to_toml()?.as_bytes())?;
         let log_path = path.join(LOG);
         write_whole(&log_path, log.as_bytes())?;
-        let log = File::options().append(true).open(&log_path);
-        let log = BufWriter::new(log.map_err(|error| unwritable(&log_path, &error))?);
+        let file = File::options().append(true).open(&log_path);
+        let file = BufWriter::new(file.map_err(|error| unwritable(&log_path, &error))?);
         let terms = config.loss().terms();
-        let raw_colors = config.model.raw_colors;
-        Ok(Self {
-            path: path.to_owned(),
-            log,
-            terms,
-            seconds_before,
-            raw_colors,
-            aside,
-            _lock: lock,
-        })
+        let (raw_colors, is_new) = (config.model.raw_colors, log.is_empty());
+        let path = path.to_owned();
+        Ok(Self { path, log: file, terms, seconds_before, raw_colors, is_new, aside, _lock: lock })
     }
 
     /// The scores of the held-out views up to a step, in order: step, PSNR in dB.

@@ -60,6 +60,9 @@ pub struct TrainConfig {
     /// A folder of reference images by name, in place of what lies beside the input.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub reference: Option<PathBuf>,
+    /// Masks hide what is white, not what is black.
+    #[serde(skip_serializing_if = "is_off")]
+    pub invert_masks: bool,
     /// Steps; each renders one training view.
     pub steps: u64,
     /// Factor by which photographs shrink.
@@ -156,11 +159,17 @@ pub struct DensityConfig {
     pub min_opacity: f64,
 }
 
+/// What a configuration need not say.
+fn is_off(flag: &bool) -> bool {
+    !flag
+}
+
 impl Default for TrainConfig {
     fn default() -> Self {
         Self {
             dataset: PathBuf::new(),
             reference: None,
+            invert_masks: false,
             steps: 5000,
             downscale: 1.0,
             max_resolution: 1600,
@@ -255,6 +264,7 @@ impl TrainConfig {
             test_every: self.test_every,
             keep: CacheSize::on_host(self.cache),
             reference: self.reference.clone(),
+            invert_masks: self.invert_masks,
             hold_out: self.stop.views,
             depth: DepthOptions {
                 load: self.model.depth,

@@ -47,6 +47,7 @@ impl Scene {
             image: Some(self.low.clone()),
             original: None,
             reference: None,
+            mask: None,
             depth: Some(depth.collect()),
         };
         let point = |mean: &Vec3| Point { position: mean.as_dvec3(), views: vec![0] };
