@@ -222,9 +222,6 @@ impl Dataset {
     pub fn load(root: impl AsRef<Path>, options: &LoadOptions) -> Result<Self> {
         let root = root.as_ref();
         options.check()?;
-        if !root.is_dir() {
-            return Err(Error::input(root, "is not a folder; name the dataset's folder"));
-        }
         let files = Files::default();
         let Listing { mut frames, mut skipped, remarks } = list(root, &files)?;
         warn(&remarks);
@@ -333,6 +330,9 @@ impl Dataset {
 
 /// The views by name, all different.
 fn list(root: &Path, files: &Files) -> Result<Listing> {
+    if !root.is_dir() {
+        return Err(Error::input(root, "is not a folder; name the dataset's folder"));
+    }
     let mut listing = Listing::default();
     let listings = transforms::find(root);
     for (path, split) in &listings {
