@@ -20,7 +20,7 @@ impl Place {
     fn new() -> Self {
         let place = Self(tempfile::tempdir().unwrap());
         let options = SyntheticOptions { views: 9, width: 40, height: 30, seed: 2 };
-        synthetic::write(&place.path("set"), &options).unwrap();
+        synthetic::write(place.path("set"), &options).unwrap();
         place
     }
 

@@ -274,7 +274,7 @@ fn a_parameter_that_is_not_finite_ends_the_run_with_step_and_plane_and_reaches_n
     let error = loop {
         match trainer.advance(60) {
             Ok(reports) => {
-                assert!(reports.iter().all(|report| report.step < 60), "it went unnoticed")
+                assert!(reports.iter().all(|report| report.step < 60), "it went unnoticed");
             }
             Err(error) => break error,
         }
