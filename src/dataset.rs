@@ -190,9 +190,6 @@ impl Dataset {
     pub fn load(root: impl AsRef<Path>, options: &LoadOptions) -> Result<Self> {
         let root = root.as_ref();
         options.check()?;
-        if !root.is_dir() {
-            return Err(Error::input(root, "is not a folder; name the dataset's folder"));
-        }
         let files = Files::default();
         let Listing { mut frames, mut skipped } = list(root, &files)?;
         refuse_two_of_one_name(root, &frames)?;
@@ -376,6 +373,9 @@ impl Dataset {
 }
 
 fn list(root: &Path, files: &Files) -> Result<Listing> {
+    if !root.is_dir() {
+        return Err(Error::input(root, "is not a folder; name the dataset's folder"));
+    }
     let mut listing = Listing::default();
     let listings = transforms::find(root);
     for (path, split) in &listings {

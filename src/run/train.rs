@@ -1,6 +1,6 @@
 //! Trains into a run directory and tells an observer.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::time::{Duration, Instant};
 
 use super::directory::{Progress, SPENT, TARGET_EXPOSURE};
@@ -187,7 +187,8 @@ fn with_tile_and_frame(
         config.tile = config.tile.or(tile);
         config.frame = Some(recorded.frame.unwrap_or_default());
     }
-    config.tile = Some(config.render_settings().tile_on(gpu)?);
+    let sizes = dataset.views.iter().map(|view| [view.camera.width, view.camera.height]);
+    config.tile = Some(config.render_settings().tile_for(gpu, sizes)?);
     config.frame.get_or_insert_with(|| dataset.frame());
     Ok(config)
 }

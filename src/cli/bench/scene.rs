@@ -80,7 +80,8 @@ fn config(curve: ToneCurve) -> TrainConfig {
     let mut config = TrainConfig { tone: ToneSettings::new(curve), ..TrainConfig::default() };
     config.schedule.sh_degree_interval = 1;
     config.schedule.boost = 1.0;
-    config.schedule.densify_after = u64::MAX;
+    // As far as TOML counts.
+    config.schedule.densify_after = i64::MAX.cast_unsigned();
     config.schedule.resolution_steps = [0, 0];
     config
 }
