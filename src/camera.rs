@@ -74,26 +74,43 @@ impl From<&Camera> for kernels::Camera {
     }
 }
 
-/// Radial and tangential distortion as `OpenCV` and COLMAP's `OPENCV` model define it.
+/// Where a lens puts what a pinhole would see elsewhere, as COLMAP's camera models define it; the default is no distortion.
 ///
-/// COLMAP's `SIMPLE_RADIAL` (`k1`) and `RADIAL` (`k1`, `k2`) are the same formula with zeros; the default is none.
+/// With `(x, y)` at unit depth and r its length, a perspective lens (COLMAP's `SIMPLE_RADIAL`, `RADIAL`, `OPENCV` and
+/// `FULL_OPENCV`, which differ in what is zero) scales by `(1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)`
+/// and shifts by p1 and p2. A fisheye (`SIMPLE_RADIAL_FISHEYE`, `RADIAL_FISHEYE`, `OPENCV_FISHEYE`) puts what it sees
+/// at the angle t off its axis, t = atan r, at `t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8)`.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Distortion {
-    /// Radial coefficient of r^2.
+    /// Radial coefficient of r^2, or of a fisheye's t^2.
     pub k1: f64,
-    /// Radial coefficient of r^4.
+    /// Radial coefficient of r^4 or t^4.
     pub k2: f64,
-    /// Tangential coefficient.
+    /// Radial coefficient of r^6 or t^6.
+    pub k3: f64,
+    /// Of r^2 in the denominator, or of a fisheye's t^8.
+    pub k4: f64,
+    /// Of r^4 in the denominator; a fisheye has none.
+    pub k5: f64,
+    /// Of r^6 in the denominator; a fisheye has none.
+    pub k6: f64,
+    /// Tangential coefficient; a fisheye has none.
     pub p1: f64,
-    /// Tangential coefficient.
+    /// Tangential coefficient; a fisheye has none.
     pub p2: f64,
+    /// Whether angles, not their tangents, make the picture.
+    pub is_fisheye: bool,
 }
 
 impl Distortion {
     /// The distorted position of an undistorted one; both at unit depth, relative to the optical axis.
-    pub fn distort(&self, DVec2 { x, y }: DVec2) -> DVec2 {
+    pub fn distort(&self, at: DVec2) -> DVec2 {
+        let DVec2 { x, y } = at;
         let r2 = x * x + y * y;
-        let radial = 1.0 + self.k1 * r2 + self.k2 * r2 * r2;
+        if self.is_fisheye {
+            return at * self.fisheye(r2.sqrt())[0];
+        }
+        let [radial, _] = self.radial(r2);
         DVec2::new(
             x * radial + 2.0 * self.p1 * x * y + self.p2 * (r2 + 2.0 * x * x),
             y * radial + 2.0 * self.p2 * x * y + self.p1 * (r2 + 2.0 * y * y),
@@ -103,12 +120,45 @@ impl Distortion {
     /// The determinant of [`Distortion::distort`]'s derivative: not positive where the model folds over itself.
     pub fn determinant(&self, DVec2 { x, y }: DVec2) -> f64 {
         let r2 = x * x + y * y;
-        let radial = 1.0 + self.k1 * r2 + self.k2 * r2 * r2;
-        let slope = 2.0 * self.k1 + 4.0 * self.k2 * r2; // d radial / d r2, times 2
+        if self.is_fisheye {
+            let [scale, slope] = self.fisheye(r2.sqrt());
+            return scale * slope;
+        }
+        let [radial, slope] = self.radial(r2);
+        let slope = 2.0 * slope;
         let xx = radial + x * x * slope + 2.0 * self.p1 * y + 6.0 * self.p2 * x;
         let yy = radial + y * y * slope + 2.0 * self.p2 * x + 6.0 * self.p1 * y;
         let xy = x * y * slope + 2.0 * self.p1 * x + 2.0 * self.p2 * y;
         xx * yy - xy * xy
+    }
+
+    /// The factor of a perspective lens, and its derivative with respect to r^2.
+    fn radial(&self, r2: f64) -> [f64; 2] {
+        let Self { k1, k2, k3, k4, k5, k6, .. } = *self;
+        let polynomial = |a: f64, b: f64, c: f64| 1.0 + a * r2 + b * r2 * r2 + c * r2 * r2 * r2;
+        let slope = |a: f64, b: f64, c: f64| a + 2.0 * b * r2 + 3.0 * c * r2 * r2;
+        let (above, below) = (polynomial(k1, k2, k3), polynomial(k4, k5, k6));
+        let slope = (slope(k1, k2, k3) * below - above * slope(k4, k5, k6)) / (below * below);
+        // Behind a pole the lens would see itself through.
+        [if below > 0.0 { above / below } else { f64::NAN }, slope]
+    }
+
+    /// The factor of a fisheye, and the derivative of the distorted distance with respect to r.
+    fn fisheye(&self, r: f64) -> [f64; 2] {
+        let Self { k1, k2, k3, k4, .. } = *self;
+        let angle = r.atan();
+        let t2 = angle * angle;
+        let factor = 1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)));
+        let slope = 1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)));
+        // atan(r) / r, which is 1 on the axis.
+        let ratio = if r > 1e-8 { angle / r } else { 1.0 };
+        [ratio * factor, slope / (1.0 + r * r)]
+    }
+
+    /// Every coefficient.
+    fn coefficients(&self) -> [f64; 8] {
+        let Self { k1, k2, k3, k4, k5, k6, p1, p2, .. } = *self;
+        [k1, k2, k3, k4, k5, k6, p1, p2]
     }
 }
 
@@ -139,14 +189,13 @@ impl Lens {
     /// What makes the numbers unusable, if anything.
     pub fn problem(&self) -> Option<String> {
         let sides = 1..=Self::MAX_SIDE;
-        let Distortion { k1, k2, p1, p2 } = self.distortion;
         if !sides.contains(&self.width) || !sides.contains(&self.height) {
             Some(format!("its size is {}x{}", self.width, self.height))
         } else if !(self.focal.is_finite() && self.focal.min_element() > 0.0) {
             Some(format!("its focal length is {}", self.focal))
         } else if !self.principal_point.is_finite() {
             Some(format!("its principal point is {}", self.principal_point))
-        } else if ![k1, k2, p1, p2].iter().all(|coefficient| coefficient.is_finite()) {
+        } else if !self.distortion.coefficients().iter().all(|value| value.is_finite()) {
             Some("its distortion is not finite".into())
         } else {
             None
@@ -216,16 +265,136 @@ mod tests {
         assert!(other.distance(full * DVec2::new(0.25, 0.5)) < 1e-9);
     }
 
+    const NONE: Distortion = Distortion {
+        k1: 0.0,
+        k2: 0.0,
+        k3: 0.0,
+        k4: 0.0,
+        k5: 0.0,
+        k6: 0.0,
+        p1: 0.0,
+        p2: 0.0,
+        is_fisheye: false,
+    };
+    const MODELS: [(&str, Distortion); 5] = [
+        ("OPENCV", Distortion { k1: -0.2, k2: 0.07, p1: 0.01, p2: -0.02, ..NONE }),
+        (
+            "FULL_OPENCV",
+            Distortion {
+                k1: 0.3,
+                k2: -0.06,
+                k3: 0.011,
+                k4: 0.41,
+                k5: 0.02,
+                k6: -0.004,
+                p1: 0.003,
+                p2: -0.002,
+                is_fisheye: false,
+            },
+        ),
+        ("SIMPLE_RADIAL_FISHEYE", Distortion { k1: -0.03, is_fisheye: true, ..NONE }),
+        ("RADIAL_FISHEYE", Distortion { k1: 0.04, k2: -0.013, is_fisheye: true, ..NONE }),
+        (
+            "OPENCV_FISHEYE",
+            Distortion { k1: 0.05, k2: -0.02, k3: 0.006, k4: -0.001, is_fisheye: true, ..NONE },
+        ),
+    ];
+
+    /// Where COLMAP's documentation and header (sensor/models.h) put a direction, formula by formula.
+    fn published(model: &str, d: Distortion, u: f64, v: f64) -> DVec2 {
+        let (u2, v2, uv) = (u.powi(2), v.powi(2), u * v);
+        let r = (u2 + v2).sqrt();
+        let theta = r.atan2(1.0);
+        let along = |thetad: f64| DVec2::new(u * thetad / r, v * thetad / r);
+        let tangential = DVec2::new(
+            2.0 * d.p1 * uv + d.p2 * (r * r + 2.0 * u2),
+            2.0 * d.p2 * uv + d.p1 * (r * r + 2.0 * v2),
+        );
+        match model {
+            "OPENCV" => {
+                let radial = d.k1 * r.powi(2) + d.k2 * r.powi(4);
+                DVec2::new(u + u * radial, v + v * radial) + tangential
+            }
+            "FULL_OPENCV" => {
+                let radial = (1.0 + d.k1 * r.powi(2) + d.k2 * r.powi(4) + d.k3 * r.powi(6))
+                    / (1.0 + d.k4 * r.powi(2) + d.k5 * r.powi(4) + d.k6 * r.powi(6));
+                DVec2::new(u * radial, v * radial) + tangential
+            }
+            "SIMPLE_RADIAL_FISHEYE" => along(theta * (1.0 + d.k1 * theta.powi(2))),
+            "RADIAL_FISHEYE" => along(theta * (1.0 + d.k1 * theta.powi(2) + d.k2 * theta.powi(4))),
+            _ => along(
+                theta
+                    * (1.0
+                        + d.k1 * theta.powi(2)
+                        + d.k2 * theta.powi(4)
+                        + d.k3 * theta.powi(6)
+                        + d.k4 * theta.powi(8)),
+            ),
+        }
+    }
+
+    /// The undistorted position by Newton's method, from the steps of central differences: shares nothing with what is tested.
+    fn unprojected(model: &str, distortion: Distortion, target: DVec2) -> DVec2 {
+        let forward = |at: DVec2| published(model, distortion, at.x, at.y);
+        // Along the ray first: a fisheye's tangents grow without bound.
+        let mut at = target * 1.0001;
+        let (mut low, mut high) = (0.0_f64, 400.0_f64);
+        for _ in 0..100 {
+            let middle = 0.5 * (low + high);
+            let reaches = forward(middle * target.normalize()).length() < target.length();
+            *(if reaches { &mut low } else { &mut high }) = middle;
+            at = middle * target.normalize();
+        }
+        for _ in 0..20 {
+            let step = 1e-6 * at.length().max(1e-3);
+            let slope = |axis: DVec2| {
+                (forward(at + step * axis) - forward(at - step * axis)) / (2.0 * step)
+            };
+            let jacobian = glam::DMat2::from_cols(slope(DVec2::X), slope(DVec2::Y));
+            at -= jacobian.inverse() * (forward(at) - target);
+        }
+        at
+    }
+
+    #[test]
+    fn every_model_projects_as_colmap_publishes_it_and_comes_back() {
+        for (model, distortion) in MODELS {
+            // A fisheye to 85 degrees off the axis, the others as far as their polynomials rise.
+            let angles: &[f64] = if distortion.is_fisheye {
+                &[0.5, 10.0, 30.0, 45.0, 60.0, 75.0, 85.0]
+            } else {
+                &[0.5, 10.0, 20.0, 30.0, 38.0]
+            };
+            for (angle, turn) in angles.iter().flat_map(|a| [0.0, 0.7, 2.5, 4.0].map(|t| (a, t))) {
+                let at = angle.to_radians().tan() * DVec2::from_angle(turn);
+                let shown = distortion.distort(at);
+                let expected = published(model, distortion, at.x, at.y);
+                assert!(
+                    shown.distance(expected) < 1e-12,
+                    "{model} at {angle}: {shown}, {expected}"
+                );
+                let back = unprojected(model, distortion, shown);
+                let off = back.distance(at) / at.length();
+                assert!(off < 1e-9, "{model} at {angle} degrees comes back off by {off}");
+                assert!(distortion.determinant(at) > 0.0, "{model} folds at {angle} degrees");
+            }
+        }
+    }
+
     #[test]
     fn the_determinant_is_that_of_the_distortions_derivative() {
-        let distortion = Distortion { k1: -0.2, k2: 0.07, p1: 0.01, p2: -0.02 };
-        let (at, step) = (DVec2::new(0.4, -0.3), 1e-6);
-        let slope = |axis: DVec2| {
-            (distortion.distort(at + step * axis) - distortion.distort(at - step * axis))
-                / (2.0 * step)
-        };
-        let numeric = slope(DVec2::X).perp_dot(slope(DVec2::Y));
-        assert!((distortion.determinant(at) - numeric).abs() < 1e-8);
+        let step = 1e-6;
+        for (name, distortion) in MODELS {
+            for at in [DVec2::new(0.4, -0.3), DVec2::new(0.0, 0.9), DVec2::new(1e-9, 0.0)] {
+                let slope = |axis: DVec2| {
+                    (distortion.distort(at + step * axis) - distortion.distort(at - step * axis))
+                        / (2.0 * step)
+                };
+                let numeric = slope(DVec2::X).perp_dot(slope(DVec2::Y));
+                let own = distortion.determinant(at);
+                assert!((own - numeric).abs() < 1e-8, "{name} at {at}: {own}, not {numeric}");
+            }
+        }
     }
 
     #[test]

@@ -22,6 +22,7 @@ pub mod eval;
 mod finished_run;
 #[cfg(feature = "fit")]
 pub mod fit;
+pub mod pose;
 pub mod progress;
 pub mod render;
 mod signals;
@@ -47,6 +48,7 @@ pub struct Cli {
 const EXAMPLES: &str = "Start with:
   nightsplat demo                                   see it work, without any data
   nightsplat doctor                                 which devices there are
+  nightsplat pose photos --out scene                find the cameras of photographs that have none
   nightsplat diagnose photos                        what they are, and what their model needs
   nightsplat train photos --out run                 train from a folder of dark photographs
   nightsplat eval run --save-images                 score it where there are references
@@ -58,6 +60,7 @@ const EXAMPLES: &str = "Start with:
 enum Command {
     Train(Box<train::TrainArgs>),
     Diagnose(diagnose::DiagnoseArgs),
+    Pose(pose::PoseArgs),
     Eval(eval::EvalArgs),
     Render(render::RenderArgs),
     Tone(tone::ToneArgs),
@@ -99,6 +102,7 @@ impl Cli {
         match self.command {
             Command::Train(args) => train::run(&args),
             Command::Diagnose(args) => diagnose::run(&args),
+            Command::Pose(args) => pose::run(&args),
             Command::Eval(args) => eval::run(&args),
             Command::Render(args) => render::run(&args),
             Command::Tone(args) => Ok(tone::run(&args)?),

@@ -6,12 +6,16 @@
 
 mod colmap;
 mod fingerprint;
+mod masks;
+mod names;
 mod options;
 mod pixels;
 mod similarity;
 pub mod synthetic;
+mod text_file;
 mod transforms;
 mod undistort;
+mod unused;
 
 use std::borrow::Cow;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
@@ -20,14 +24,15 @@ use std::path::{Path, PathBuf};
 use glam::{DAffine3, DVec3};
 
 use crate::camera::{Camera, Frame, Lens, frame};
-use crate::image::Image;
 use crate::image::files::{self, Files};
+use crate::image::{Image, Mask};
 use crate::{Error, Result};
 pub use fingerprint::Fingerprint;
 pub use options::{DepthOptions, LoadOptions};
 pub use pixels::Original;
 use pixels::Source;
 use similarity::Similarity;
+use text_file::read_text;
 
 /// Photographs with cameras, and points of the scene they show.
 #[derive(Clone, Debug)]
@@ -45,7 +50,8 @@ pub struct Dataset {
 /// A photograph's place in the dataset.
 #[derive(Clone, Debug)]
 pub struct View {
-    /// The photograph's file name without extension; unique.
+    /// The photograph's file name without extension, behind that of its folder where several folders have such a file
+    /// (`a_001`); unique.
     pub name: String,
     /// Whether it is trained on or scored.
     pub split: Split,
@@ -58,6 +64,8 @@ pub struct View {
     pub original: Option<Original>,
     /// The normal-light photograph to score against, of the camera's size; test views only.
     pub reference: Option<Image>,
+    /// Which of its pixels count, of the camera's size; none where all do.
+    pub mask: Option<Mask>,
     /// Depth from elsewhere, (H, W) of the camera's size, in units and with an offset of its own; larger is farther.
     /// Training views only, and none where it says nothing, being the same everywhere.
     pub depth: Option<Vec<f32>>,
@@ -89,6 +97,22 @@ impl View {
             (Some(image), _) => Ok(Some(Cow::Borrowed(image))),
             (None, Some(original)) => original.load_at(size).map(Cow::Owned).map(Some),
             (None, None) => Ok(None),
+        }
+    }
+
+    /// The planes of one of its images, of any size, without the pixels that do not count.
+    pub fn counted<'a>(&self, image: &'a Image) -> Cow<'a, [f32]> {
+        match &self.mask {
+            Some(mask) => mask.counted(image).into(),
+            None => (&image.data).into(),
+        }
+    }
+
+    /// One of its images, of any size, of which the pixels that do not count are black.
+    pub fn blacked_out(&self, image: Image) -> Image {
+        match &self.mask {
+            Some(mask) => mask.blacked_out(image),
+            None => image,
         }
     }
 
@@ -126,6 +150,8 @@ pub struct Photograph {
     pub input: PathBuf,
     /// The normal-light photograph to score against; test views only.
     pub reference: Option<PathBuf>,
+    /// The mask, whose black pixels do not count.
+    pub mask: Option<PathBuf>,
 }
 
 /// A triangulated point of the scene.
@@ -143,6 +169,8 @@ struct ListedView {
     name: String,
     /// Path as listed, relative to the root.
     listed: String,
+    /// Path below the folder of all photographs.
+    below: String,
     /// `None`: the split rule decides.
     split: Option<Split>,
     /// The listed file, where it exists.
@@ -156,6 +184,8 @@ struct ListedView {
 struct Listing {
     frames: Vec<ListedView>,
     skipped: Vec<String>,
+    /// What was chosen, and what lies there unused; a line each.
+    remarks: Vec<String>,
 }
 
 /// Folders that hold the dark input where a normal-light twin lies beside them.
@@ -191,9 +221,8 @@ impl Dataset {
         let root = root.as_ref();
         options.check()?;
         let files = Files::default();
-        let Listing { mut frames, mut skipped } = list(root, &files)?;
-        refuse_two_of_one_name(root, &frames)?;
-        frames.sort_by(|a, b| a.name.cmp(&b.name));
+        let Listing { mut frames, mut skipped, remarks } = list(root, &files)?;
+        warn(&remarks);
         say_whose_split_gives_way(root, &frames, options);
         split(root, &mut frames, options.test_every, &files)?;
 
@@ -231,8 +260,7 @@ impl Dataset {
     pub fn sizes(root: &Path, options: &LoadOptions) -> Result<Vec<(String, [u32; 2])>> {
         options.check()?;
         let files = Files::default();
-        let Listing { mut frames, mut skipped } = list(root, &files)?;
-        frames.sort_by(|a, b| a.name.cmp(&b.name));
+        let Listing { mut frames, mut skipped, .. } = list(root, &files)?;
         split(root, &mut frames, options.test_every, &files)?;
         let sources = sources(root, &frames, options, &files, &mut skipped);
         let training = sources.iter().filter(|source| source.split == Split::Train);
@@ -253,7 +281,18 @@ impl Dataset {
 
     /// Whether `root` is a folder that [`Dataset::load`] finds cameras in.
     pub fn is_at(root: &Path) -> bool {
-        !transforms::find(root).is_empty() || colmap::find(root, &["cameras", "images"]).is_some()
+        !transforms::find(root).is_empty() || !colmap::find(root, &["cameras", "images"]).is_empty()
+    }
+
+    /// Of the models that COLMAP left in the folders of `folder` the one that places the most photographs, with their names.
+    ///
+    /// # Errors
+    /// [`Error::Input`] where a model is damaged.
+    pub fn largest_model(folder: &Path) -> Result<Option<(PathBuf, Vec<String>)>> {
+        let models = colmap::models_in(folder, &["cameras", "images", "points3D"]);
+        let Some((model, _)) = colmap::largest(&models, |_| true)? else { return Ok(None) };
+        let names = colmap::read_images(model)?.into_iter().map(|image| image.name);
+        Ok(Some((model.to_owned(), names.collect())))
     }
 
     /// The files of the views below `root`, sorted by name, without reading a pixel.
@@ -261,30 +300,29 @@ impl Dataset {
     /// # Errors
     /// As [`Dataset::load`], but for what is wrong with pixels.
     pub fn photographs(root: &Path, options: &LoadOptions) -> Result<Vec<Photograph>> {
-        let (photographs, skipped) = Self::listed(root, options)?;
+        let (photographs, skipped, remarks) = Self::listed(root, options)?;
+        warn(&remarks);
         for line in &skipped {
             tracing::warn!("skipped {line}");
         }
         Ok(photographs)
     }
 
-    /// The same, and what was left out.
+    /// The same, what was left out, and what is to be said of the folder.
     pub(crate) fn listed(
         root: &Path,
         options: &LoadOptions,
-    ) -> Result<(Vec<Photograph>, Vec<String>)> {
+    ) -> Result<(Vec<Photograph>, Vec<String>, Vec<String>)> {
         options.check()?;
         let files = Files::default();
-        let Listing { mut frames, mut skipped } = list(root, &files)?;
-        refuse_two_of_one_name(root, &frames)?;
-        frames.sort_by(|a, b| a.name.cmp(&b.name));
+        let Listing { mut frames, mut skipped, remarks } = list(root, &files)?;
         split(root, &mut frames, options.test_every, &files)?;
         let sources = sources(root, &frames, options, &files, &mut skipped);
         let photograph = |source: Source| {
-            let Source { name, split, input, reference, .. } = source;
-            Some(Photograph { name, split, input: input?, reference })
+            let Source { name, split, input, reference, mask, .. } = source;
+            Some(Photograph { name, split, input: input?, reference, mask })
         };
-        Ok((sources.into_iter().filter_map(photograph).collect(), skipped))
+        Ok((sources.into_iter().filter_map(photograph).collect(), skipped, remarks))
     }
 
     /// Leaves out views by name; points forget them.
@@ -372,6 +410,7 @@ impl Dataset {
     }
 }
 
+/// The views by name, all different.
 fn list(root: &Path, files: &Files) -> Result<Listing> {
     if !root.is_dir() {
         return Err(Error::input(root, "is not a folder; name the dataset's folder"));
@@ -382,13 +421,7 @@ fn list(root: &Path, files: &Files) -> Result<Listing> {
         transforms::read(root, path, *split, files, &mut listing)?;
     }
     if listings.is_empty() {
-        let folder = colmap::find(root, &["cameras", "images"]).ok_or_else(|| {
-            Error::input(
-                root,
-                "holds no dataset; expected transforms_train.json, transforms.json or a COLMAP model in sparse/0",
-            )
-        })?;
-        list_colmap(root, &folder, files, &mut listing)?;
+        list_colmap(root, files, &mut listing)?;
     }
     if listing.frames.is_empty() {
         let first = listing.skipped.first().map_or("its listing is empty", String::as_str);
@@ -397,10 +430,38 @@ fn list(root: &Path, files: &Files) -> Result<Listing> {
             format!("has no usable view ({first}); export the cameras anew"),
         ));
     }
+    names::tell_apart(&mut listing.frames);
+    refuse_two_of_one_name(root, &listing.frames)?;
+    listing.frames.sort_by(|a, b| a.name.cmp(&b.name));
+    listing.remarks.extend(unused::remarks(root, &listing.frames));
     Ok(listing)
 }
 
-fn list_colmap(root: &Path, folder: &Path, files: &Files, listing: &mut Listing) -> Result<()> {
+fn warn(remarks: &[String]) {
+    for remark in remarks {
+        tracing::warn!("{remark}");
+    }
+}
+
+fn list_colmap(root: &Path, files: &Files, listing: &mut Listing) -> Result<()> {
+    let models = colmap::find(root, &["cameras", "images"]);
+    let file_of =
+        |name: &str| files.find(root, name).or_else(|| files.find(&root.join("images"), name));
+    let chosen = colmap::largest(&models, |name| file_of(&name.replace('\\', "/")).is_some())?;
+    let Some((folder, counts)) = chosen else {
+        return Err(Error::input(root, no_dataset(root)));
+    };
+    if counts.len() > 1 {
+        let (taken, all) =
+            (folder.strip_prefix(root).unwrap_or(folder).display(), counts.iter().sum::<usize>());
+        let counts: Vec<String> = counts.iter().map(usize::to_string).collect();
+        listing.remarks.push(format!(
+            "{}: COLMAP left {} models, of {} photographs; {taken}, the largest, is taken, and what the others place of these {all} is not",
+            root.display(),
+            models.len(),
+            counts.join(", "),
+        ));
+    }
     let lenses = colmap::read_cameras(folder)?;
     for image in colmap::read_images(folder)? {
         let name = image.name.replace('\\', "/");
@@ -417,10 +478,23 @@ fn list_colmap(root: &Path, folder: &Path, files: &Files, listing: &mut Listing)
         let beside_root = files.find(root, &name);
         let listed = if beside_root.is_some() { name.clone() } else { format!("images/{name}") };
         let file = beside_root.or_else(|| files.find(&root.join("images"), &name));
-        let name = files::stem(&name).to_owned();
-        listing.frames.push(ListedView { name, listed, split: None, file, lens, view_from_world });
+        let (name, below) = (files::stem(&name).to_owned(), name);
+        let split = None;
+        listing.frames.push(ListedView { name, listed, below, split, file, lens, view_from_world });
     }
     Ok(())
+}
+
+/// What there is in place of a dataset, and the remedy.
+fn no_dataset(root: &Path) -> String {
+    let expected = "transforms_train.json, transforms.json or a COLMAP model in sparse/0";
+    match files::photographs_in(root).map_or(0, |photographs| photographs.len()) {
+        0 => format!("holds no dataset; expected {expected}"),
+        count => format!(
+            "holds no dataset but {count} photographs, whose poses are not known; find them with `nightsplat pose {} --out DATASET` (expected {expected})",
+            root.display()
+        ),
+    }
 }
 
 fn refuse_two_of_one_name(root: &Path, frames: &[ListedView]) -> Result<()> {
@@ -458,19 +532,24 @@ fn split(
         }
         return Ok(());
     }
-    let text = std::fs::read_to_string(&path)
-        .map_err(|error| Error::input(&path, format!("cannot be read: {error}")))?;
-    let mut held_out: BTreeSet<&str> =
-        text.lines().map(str::trim).filter(|line| !line.is_empty()).map(files::stem).collect();
-    for frame in &mut undecided {
-        frame.split =
-            Some(if held_out.remove(frame.name.as_str()) { Split::Test } else { Split::Train });
+    let text = read_text(&path)?;
+    let known: BTreeSet<String> = undecided.iter().map(|frame| frame.name.clone()).collect();
+    let lines = text.lines().map(str::trim).filter(|line| !line.is_empty());
+    let (mut held_out, mut unknown) = (BTreeSet::new(), BTreeSet::new());
+    for line in lines {
+        match names::possible(line).into_iter().find(|name| known.contains(name)) {
+            Some(name) => held_out.insert(name),
+            None => unknown.insert(line.to_owned()),
+        };
     }
-    if let Some(name) = held_out.first() {
+    for frame in &mut undecided {
+        frame.split = Some(if held_out.contains(&frame.name) { Split::Test } else { Split::Train });
+    }
+    if let Some(name) = unknown.first() {
         tracing::warn!(
             "{}: {} names match no view, the first is {name}",
             path.display(),
-            held_out.len()
+            unknown.len()
         );
     }
     Ok(())
@@ -542,8 +621,10 @@ fn sources(
             let depth = (options.depth.load && split == Split::Train)
                 .then(|| frame.depth(root, options.depth.folder.as_deref(), files))
                 .flatten();
+            let mask = masks::find(root, frame, files);
             let ListedView { name, lens, view_from_world, .. } = frame.clone();
-            sources.push(Source { name, split, lens, view_from_world, input, reference, depth });
+            let camera = (lens, view_from_world);
+            sources.push(Source::new((name, split), camera, [input, reference, mask, depth]));
         }
     }
     if let Some(folder) = &options.reference
@@ -565,9 +646,9 @@ impl ListedView {
 
     /// The photograph of the same name in another folder: at the same place below it, or directly in it.
     fn find(&self, folder: &Path, files: &Files) -> Option<PathBuf> {
-        let below_first =
-            self.listed.split_once('/').map_or(self.listed.as_str(), |(_, below)| below);
-        files.find(folder, below_first).or_else(|| files.find(folder, &self.name))
+        files
+            .find(folder, names::below_first(&self.listed))
+            .or_else(|| files.find(folder, &self.name))
     }
 
     /// The dark photograph; the listed file counts as that where nothing darker lies beside it.
@@ -611,15 +692,20 @@ fn with_held_out(mut views: Vec<View>, count: usize) -> Vec<View> {
 
 /// The points of the dataset's COLMAP model, brought into the views' world.
 fn points(root: &Path, views: &[View]) -> Result<Vec<Point>> {
-    let Some(folder) = colmap::find(root, &["images", "points3D"]) else {
-        return Ok(Vec::new());
-    };
-    let images = colmap::read_images(&folder)?;
-    let points = colmap::read_points(&folder)?;
     let by_name: BTreeMap<&str, u32> =
         views.iter().zip(0..).map(|(view, index)| (view.name.as_str(), index)).collect();
+    let view_named = |image: &str| {
+        let names = names::possible(&image.replace('\\', "/"));
+        names.iter().find_map(|name| by_name.get(name.as_str()).copied())
+    };
+    let models = colmap::find(root, &["images", "points3D"]);
+    let Some((folder, _)) = colmap::largest(&models, |name| view_named(name).is_some())? else {
+        return Ok(Vec::new());
+    };
+    let images = colmap::read_images(folder)?;
+    let points = colmap::read_points(folder)?;
     let shared = images.iter().filter_map(|image| {
-        let view = *by_name.get(files::stem(&image.name))?;
+        let view = view_named(&image.name)?;
         Some((image.id, view, image.view_from_world?.inverse().translation))
     });
     let shared: Vec<(u32, u32, DVec3)> = shared.collect();
@@ -627,7 +713,7 @@ fn points(root: &Path, views: &[View]) -> Result<Vec<Point>> {
         .iter()
         .map(|(_, view, center)| (*center, views[*view as usize].camera.center()))
         .collect();
-    let Some(to_views) = same_world(&folder, &pairs) else {
+    let Some(to_views) = same_world(folder, &pairs) else {
         return Ok(Vec::new());
     };
     let view_of: HashMap<u32, u32> =

@@ -21,8 +21,8 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use crate::camera::Camera;
-use crate::dataset::{Dataset, LoadOptions, View};
-use crate::image::{Image, MIDDLE_GREY, files};
+use crate::dataset::{self, Dataset, LoadOptions, View};
+use crate::image::{Image, MIDDLE_GREY, Mask, files};
 use crate::tone::{Exposure, LuminanceHistogram, is_black};
 use crate::{Error, Result};
 use geometry::Shared;
@@ -150,20 +150,22 @@ impl Diagnosis {
     pub fn of(dataset: &Dataset, options: &LoadOptions) -> Result<Self> {
         let views: Vec<(usize, &View)> =
             dataset.views.iter().enumerate().filter(|(_, view)| view.is_for_training()).collect();
-        let (files, _) = Dataset::listed(&dataset.root, options)?;
+        let (files, ..) = Dataset::listed(&dataset.root, options)?;
         let path = |view: &View| {
             let file = files.iter().find(|file| file.name == view.name);
-            file.map(|file| file.input.as_path()).ok_or_else(|| {
+            file.ok_or_else(|| {
                 Error::input(&dataset.root, format!("no longer has photograph {}", view.name))
             })
         };
         let paths = views.iter().map(|(_, view)| path(view)).collect::<Result<Vec<_>>>()?;
         let shared = Shared::of(dataset, &views)?;
-        let area = |path: &&Path| Image::size_of(path).map(|(w, h)| u64::from(w) * u64::from(h));
-        let largest = paths.iter().filter_map(|path| area(path).ok()).max().unwrap_or_default();
+        let area =
+            |path: &Path| Image::size_of(path).map(|(w, h)| u64::from(w) * u64::from(h)).ok();
+        let largest = paths.iter().filter_map(|file| area(&file.input)).max().unwrap_or_default();
+        let invert = options.invert_masks;
         let mut photographs = vec![];
         for paths in paths.chunks(Image::decoded_at_once(largest)) {
-            let loaded = paths.par_iter().map(|path| Photograph::load(path));
+            let loaded = paths.par_iter().map(|file| Photograph::load(file, invert));
             photographs.extend(loaded.collect::<Result<Vec<_>>>()?);
         }
         let exposure = Exposure::of(photographs.iter().map(|one| &one.histogram), None);
@@ -176,7 +178,7 @@ impl Diagnosis {
             photograph.diagnosis(&views[place].1.name, &shared, place)
         };
         let own: Vec<ViewDiagnosis> = photographs.iter().enumerate().map(of_view).collect();
-        let without_pose = without_pose(&paths, dataset)?;
+        let without_pose = without_pose(&paths, &files, dataset)?;
         let remarks = remarks(&own, &photographs, &views, &without_pose);
         let mut scene =
             SceneDiagnosis::of(&own, photographs, &shared, &exposure, dataset.points.len());
@@ -214,12 +216,15 @@ struct Photograph {
 }
 
 impl Photograph {
-    fn load(path: &Path) -> Result<Self> {
-        let image = Image::load(path)?;
+    fn load(file: &dataset::Photograph, invert_masks: bool) -> Result<Self> {
+        let image = Image::load(&file.input)?;
+        let mask = Mask::load(&file.input, file.mask.as_deref(), invert_masks)?;
+        let counted = mask.map(|mask| mask.counted(&image));
+        let counted = counted.as_deref().unwrap_or(&image.data);
         Ok(Self {
             size: [image.width, image.height],
-            measured: Measured::of(&image),
-            histogram: LuminanceHistogram::of(&image.data),
+            measured: Measured::of(&image, counted),
+            histogram: LuminanceHistogram::of(counted),
         })
     }
 
@@ -325,12 +330,18 @@ fn deviation(values: impl Iterator<Item = f64>) -> Option<f64> {
 }
 
 /// The photographs beside those of the training views that are no view's.
-fn without_pose(paths: &[&Path], dataset: &Dataset) -> Result<Vec<String>> {
-    let folders: BTreeSet<&Path> = paths.iter().filter_map(|path| path.parent()).collect();
+fn without_pose(
+    paths: &[&dataset::Photograph],
+    files: &[dataset::Photograph],
+    dataset: &Dataset,
+) -> Result<Vec<String>> {
+    let folders: BTreeSet<&Path> = paths.iter().filter_map(|file| file.input.parent()).collect();
     let mut names = vec![];
     for folder in folders {
         let photographs = files::photographs_in(folder)?;
-        let stems = photographs.iter().filter_map(|path| path.file_stem()?.to_str());
+        let is_a_views = |path: &&PathBuf| files.iter().any(|file| file.input == **path);
+        let others = photographs.iter().filter(|path| !is_a_views(path));
+        let stems = others.filter_map(|path| path.file_stem()?.to_str());
         let is_posed = |name: &&str| dataset.views.iter().any(|view| view.name == **name);
         names.extend(stems.filter(|name| !is_posed(name)).map(str::to_owned));
     }

@@ -41,9 +41,9 @@ impl Against {
                 "against their own pseudo-GT, as there are no reference images: how well the model shows its targets, not how \
                  right these are; runs of different curves do not compare",
             ),
-            Self::Photographs => {
-                Some("against the photographs themselves, as there are no reference images and no curve")
-            }
+            Self::Photographs => Some(
+                "against the photographs themselves, as there are no reference images and no curve",
+            ),
         }
     }
 
@@ -309,9 +309,11 @@ pub fn score_by(
         let Some(reference) = yardstick.target(view) else { continue };
         let (rendered, reference) = (render(view)?, quantized(reference));
         let render = quantized(rendered.output());
-        let scores = Scores::of(&render, &reference)?;
+        let mask = view.mask.as_ref();
+        let scores = Scores::of_counted(&render, &reference, mask)?;
         let r0 = rendered.denoised.is_some();
-        let r0 = r0.then(|| Scores::of(&quantized(&rendered.colors), &reference)).transpose()?;
+        let of_r0 = || Scores::of_counted(&quantized(&rendered.colors), &reference, mask);
+        let r0 = r0.then(of_r0).transpose()?;
         let name = view.name.clone();
         scored.push(ViewScore { name, scores, r0, render, reference, against });
     }

@@ -16,9 +16,19 @@ mod exr_file;
 pub(crate) mod files;
 #[cfg(feature = "io")]
 mod jpeg;
+mod mask;
+#[cfg(feature = "io")]
+mod orientation;
+#[cfg(feature = "raw")]
+mod raw;
 
 #[cfg(feature = "io")]
 pub use exif::exposure_value;
+#[cfg(feature = "cli")]
+pub(crate) use jpeg::exif_segment;
+pub use mask::Mask;
+#[cfg(feature = "io")]
+pub use orientation::Orientation;
 use rayon::prelude::*;
 
 /// A colour image: planes of red, green and blue, sRGB-encoded, [0, 1] but for EXR input, which may exceed 1.

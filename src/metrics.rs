@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use crate::image::Image;
+use crate::image::{Image, Mask};
 use crate::{Error, Result};
 
 /// What one render scores, or the mean over several.
@@ -29,6 +29,29 @@ impl Scores {
         })
     }
 
+    /// Every score over the pixels that count alone. What is hidden of the render is taken for the reference: SSIM sees no
+    /// difference there from where it counts.
+    ///
+    /// # Errors
+    /// As [`Scores::of`]; no pixel counts.
+    pub fn of_counted(render: &Image, reference: &Image, mask: Option<&Mask>) -> Result<Self> {
+        let Some(mask) = mask else { return Self::of(render, reference) };
+        let mask = mask.resized(render.width, render.height);
+        let errors = weighted_errors(render, reference, &mask)?;
+        let width = render.width as usize;
+        let ssim = channels(render, reference)?.into_par_iter().map(|(a, b)| {
+            let shown = a.iter().zip(b).zip(&mask.weights);
+            let shown: Vec<f32> = shown.map(|((&a, &b), &w)| w * a + (1.0 - w) * b).collect();
+            weighted_mean(ssim_map(&shown, b, width), &mask)
+        });
+        let ssim: Vec<f64> = ssim.collect();
+        Ok(Self {
+            psnr: decibels(mean(&errors)),
+            psnr_channel_mean: mean(&errors.map(decibels)),
+            ssim: mean(&ssim),
+        })
+    }
+
     /// The mean of each score; none of nothing.
     pub fn mean(scores: &[Self]) -> Option<Self> {
         let mean =
@@ -48,6 +71,19 @@ impl Scores {
 pub fn psnr(render: &Image, reference: &Image) -> Result<f64> {
     let errors = channel_mean_squared_errors(render, reference)?;
     Ok(decibels(mean(&errors)))
+}
+
+/// As [`psnr`], over the pixels that count alone.
+///
+/// # Errors
+/// As there.
+pub fn psnr_of_counted(render: &Image, reference: &Image, mask: Option<&Mask>) -> Result<f64> {
+    let Some(mask) = mask else { return psnr(render, reference) };
+    Ok(decibels(mean(&weighted_errors(
+        render,
+        reference,
+        &mask.resized(render.width, render.height),
+    )?)))
 }
 
 /// The mean of the PSNRs of the three channels, dB: what the paper's code computes, never below [`psnr`].
@@ -96,6 +132,24 @@ fn channel_mean_squared_errors(render: &Image, reference: &Image) -> Result<[f64
     Ok(channels(render, reference)?.map(mean_squared_error))
 }
 
+/// The mean squared error of each channel, of the pixels that count.
+fn weighted_errors(render: &Image, reference: &Image, mask: &Mask) -> Result<[f64; 3]> {
+    if mask.hides_all() {
+        return Err(Error::Usage(
+            "a mask that hides every pixel leaves none to compare".to_owned(),
+        ));
+    }
+    let squared = |(&a, &b): (&f32, &f32)| (f64::from(a) - f64::from(b)).powi(2);
+    let of_channel = |(a, b): (&[f32], &[f32])| weighted_mean(a.iter().zip(b).map(squared), mask);
+    Ok(channels(render, reference)?.map(of_channel))
+}
+
+fn weighted_mean(values: impl IntoIterator<Item = f64>, mask: &Mask) -> f64 {
+    let weights = || mask.weights.iter().copied().map(f64::from);
+    let pairs = values.into_iter().zip(weights());
+    pairs.map(|(value, weight)| value * weight).sum::<f64>() / weights().sum::<f64>()
+}
+
 fn decibels(mean_squared_error: f64) -> f64 {
     -10.0 * mean_squared_error.log10()
 }
@@ -105,6 +159,11 @@ fn mean(values: &[f64]) -> f64 {
 }
 
 fn ssim_of_channel(a: &[f32], b: &[f32], width: usize) -> f64 {
+    ssim_map(a, b, width).iter().sum::<f64>() / a.len() as f64
+}
+
+/// SSIM of every pixel.
+fn ssim_map(a: &[f32], b: &[f32], width: usize) -> Vec<f64> {
     const C1: f64 = 0.01 * 0.01;
     const C2: f64 = 0.03 * 0.03;
     let blurred = |value: fn(f64, f64) -> f64| {
@@ -120,7 +179,7 @@ fn ssim_of_channel(a: &[f32], b: &[f32], width: usize) -> f64 {
         let luminance = (2.0 * mean_a * mean_b + C1) / (mean_a * mean_a + mean_b * mean_b + C1);
         luminance * (2.0 * cov + C2) / (var_a + var_b + C2)
     };
-    (0..a.len()).map(ssim).sum::<f64>() / a.len() as f64
+    (0..a.len()).map(ssim).collect()
 }
 
 /// Taps of the window to either side of the centre.

@@ -40,6 +40,8 @@ mod l1;
 mod loss_log;
 mod luminance;
 mod luminance_histogram;
+mod mask_gradient;
+mod mask_render;
 pub mod norm;
 mod norm_backward;
 mod norm_backward_merge;

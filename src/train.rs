@@ -7,6 +7,7 @@ mod ends;
 mod exposures;
 mod growth;
 mod held_out;
+mod masks;
 mod model;
 mod networks;
 mod overrides;
@@ -35,7 +36,7 @@ use crate::optimizer::{Adam, AdamBuffers, FiniteCheck, Learnable};
 use crate::pseudo_gt::PseudoGt;
 use crate::random::Stream;
 use crate::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer};
-use crate::scene::{Gaussians, width};
+use crate::scene::{COLOR_CHANNELS, Gaussians, width};
 use crate::{Error, Result};
 
 pub use cache::CacheSize;
@@ -45,6 +46,7 @@ use ends::Ends;
 pub use exposures::{ExposureConfig, Learning};
 use held_out::HeldOut;
 pub use held_out::{StopConfig, targets_of_test_views};
+use masks::Masks;
 use model::Model;
 pub use networks::Networks;
 pub use parts::{ModelConfig, ModelName, NetworkRates, Part};
@@ -172,6 +174,7 @@ pub struct Trainer {
     model: Model,
     renderer: Renderer,
     losses: Losses,
+    masks: Masks,
     networks: Option<NetworkTerms>,
     exposures: Option<Exposures>,
     adam: Adam,
@@ -267,6 +270,7 @@ impl Trainer {
         let sources = views.sources(gpu, &pseudo_gt, dataset);
         let losses = Losses::new(gpu, &config.loss(), &sources)?;
         drop(sources);
+        let masks = Masks::new(gpu, dataset, &views, config.loss().tone_curve)?;
         let exposures = starts.map(|starts| Exposures::new(gpu, config.exposure.rates, &starts));
         let mut exposures = exposures.transpose()?;
         if let Some(exposures) = &mut exposures {
@@ -277,7 +281,7 @@ impl Trainer {
         let [inputs, photographs] = views.decoded_lens();
         let mut trainer = Self {
             gpu: gpu.clone(),
-            fingerprint: Fingerprint::of(dataset),
+            fingerprint: Fingerprint::of(dataset)?,
             frame,
             extent: dataset.extent() * frame.scale,
             target_exposure,
@@ -288,6 +292,7 @@ impl Trainer {
             model: Model::upload(gpu, &gaussians)?,
             renderer,
             losses,
+            masks,
             networks: NetworkTerms::new(gpu, &config, &sizes)?,
             exposures,
             adam,
@@ -421,6 +426,8 @@ impl Trainer {
         let (d_render, size) = (&mut self.d_render, view.size());
         let input = view.input.decoded(pass, decoded)?;
         let log = &mut LogSlot { log: &mut self.log, slot, status };
+        let channels = COLOR_CHANNELS + model.shape().features.width();
+        let masks = &mut self.masks;
         let inputs = &TermInputs {
             step,
             view: view.number,
@@ -434,11 +441,18 @@ impl Trainer {
         match &mut self.exposures {
             Some(exposures) => {
                 exposures.expose(pass, view.place, size, render)?;
-                let inputs = &TermInputs { colors: exposures.exposed(), ..*inputs };
+                let exposed = exposures.exposed();
+                let colors = masks.shown(pass, view.number, size, exposed, (input, &view.tone))?;
+                let inputs = &TermInputs { colors, ..*inputs };
                 self.losses.record(pass, inputs, d_render, log)?;
+                masks.hide(pass, view.number, (size, channels), d_render)?;
                 exposures.backward(pass, view.place, size, render, d_render)?;
             }
-            None => self.losses.record(pass, inputs, d_render, log)?,
+            None => {
+                let colors = masks.shown(pass, view.number, size, render, (input, &view.tone))?;
+                self.losses.record(pass, &TermInputs { colors, ..*inputs }, d_render, log)?;
+                masks.hide(pass, view.number, (size, channels), d_render)?;
+            }
         }
         if let Some(networks) = &mut self.networks {
             let low = match &view.photograph {
@@ -455,6 +469,7 @@ impl Trainer {
                 _ => target,
             };
             networks.record(pass, inputs, Photographs { low, target }, d_render, log)?;
+            masks.hide(pass, view.number, (size, channels), d_render)?;
         }
         self.renderer.backward(
             pass,

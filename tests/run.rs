@@ -53,7 +53,8 @@ fn without_references_test_views_are_scored_against_what_they_would_be_trained_o
         assert!(metrics["against"].as_str().unwrap().starts_with(label), "{metrics}");
         assert!(metrics["mean"]["psnr"].as_f64().unwrap() > 5.0);
         let printed: Value =
-            serde_json::from_str(&succeed(&format!("eval {} --json", path(out).display()))).unwrap();
+            serde_json::from_str(&succeed(&format!("eval {} --json", path(out).display())))
+                .unwrap();
         assert_eq!(printed, metrics);
         let table = succeed(&format!("eval {} --save-images", path(out).display()));
         assert!(table.contains(label), "{table}");
@@ -78,7 +79,8 @@ fn scores_on_the_way_are_rows_and_a_resumed_run_has_each_once() {
     let path = |name: &str| folder.path().join(name);
     let options = "--eval-every 3 --checkpoint-every 4 --progress none";
     succeed(&train(folder.path(), "run", &format!("--steps 6 {options}")));
-    let steps = |run: &Path| -> Vec<u64> { load_progress(run).iter().map(|row| row.step).collect() };
+    let steps =
+        |run: &Path| -> Vec<u64> { load_progress(run).iter().map(|row| row.step).collect() };
     assert_eq!(steps(&path("run")), [3, 6]);
     succeed(&train(folder.path(), "run", &format!("--steps 9 --resume {options}")));
     assert_eq!(steps(&path("run")), [3, 6, 9]);
@@ -88,11 +90,9 @@ fn scores_on_the_way_are_rows_and_a_resumed_run_has_each_once() {
     let last = load_progress(&path("run"))[2];
     let metrics = json(path("run/metrics.json"));
     assert_eq!(last.views, 2);
-    for (name, value) in [
-        ("psnr", last.psnr),
-        ("psnr_channel_mean", last.psnr_channel_mean),
-        ("ssim", last.ssim),
-    ] {
+    for (name, value) in
+        [("psnr", last.psnr), ("psnr_channel_mean", last.psnr_channel_mean), ("ssim", last.ssim)]
+    {
         assert_eq!(metrics["mean"][name].as_f64().unwrap(), value, "{name}");
     }
 }
@@ -228,7 +228,8 @@ fn a_run_is_opened_with_another_copy_of_its_dataset_and_what_differs_is_said() {
     succeed(&train(folder.path(), "run", "--steps 2"));
     copy(&path("set"), &path("copy"));
     fs::remove_dir_all(path("set")).unwrap();
-    let [run_folder, copied, shown] = ["run", "copy", "shown"].map(|name| path(name).display().to_string());
+    let [run_folder, copied, shown] =
+        ["run", "copy", "shown"].map(|name| path(name).display().to_string());
     refused(&format!("eval {run_folder}"), 3, &["set", "--dataset"]);
     let (printed, said) = run(&format!("eval {run_folder} --json --dataset {copied}"), 0);
     let printed: Value = serde_json::from_str(&printed).unwrap();
@@ -276,7 +277,8 @@ fn a_camera_flies_and_the_pictures_become_a_video() {
 
     let [run_folder, out] = ["run", "frames"].map(|name| path(name).display().to_string());
     let render = format!("render {run_folder} --out {out}");
-    let video = format!("{render} --path orbit --frames 2 --video {}/orbit.mp4", folder.path().display());
+    let video =
+        format!("{render} --path orbit --frames 2 --video {}/orbit.mp4", folder.path().display());
     let nowhere = [("PATH", "/nonexistent")];
     let parts = ["orbit.mp4", "there is no ffmpeg", "ffmpeg -y", "-framerate 30", "%05d.png"];
     refused_with(&video, &nowhere, 1, &parts);
@@ -306,7 +308,9 @@ fn tensorboard_gets_its_events_and_changes_no_bit() {
     assert_eq!(events.len(), 1);
     let bytes = fs::read(&events[0]).unwrap();
     let has = |text: &str| bytes.windows(text.len()).any(|window| window == text.as_bytes());
-    for tag in ["loss/all", "loss/ssim", "model/Gaussians", "rates/means", "/PSNR", "view 000/render"] {
+    for tag in
+        ["loss/all", "loss/ssim", "model/Gaussians", "rates/means", "/PSNR", "view 000/render"]
+    {
         assert!(has(tag), "{tag}");
     }
     assert!(!path("plain/tensorboard").exists());
@@ -317,7 +321,13 @@ fn a_parts_option_without_the_part_is_said_with_both_names() {
     let folder = folder();
     let said = |out: &str, options: &str| run(&train(folder.path(), out, options), 0).1;
     let plain = said("a", "--steps 1 --model plain --denoiser-channels 8 --depth-is-disparity");
-    for part in ["--denoiser-channels", "no denoiser", "--parts denoiser", "--depth-is-disparity", "no depth"] {
+    for part in [
+        "--denoiser-channels",
+        "no denoiser",
+        "--parts denoiser",
+        "--depth-is-disparity",
+        "no depth",
+    ] {
         assert!(plain.contains(part), "no `{part}` in: {plain}");
     }
     let with = said("b", "--steps 1 --parts denoiser --denoiser-channels 4 --denoiser-crop 16");

@@ -290,6 +290,7 @@ mod colors {
             original: None,
             reference: None,
             depth: None,
+            mask: None,
         }
     }
 

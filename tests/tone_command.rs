@@ -15,6 +15,7 @@ mod common;
 
 fn args(input: &Path, out: PathBuf) -> ToneArgs {
     ToneArgs {
+        invert_masks: false,
         input: input.to_owned(),
         curve: ToneCurve::Ap3.into(),
         profile: None,
@@ -119,7 +120,7 @@ fn bad_input_is_named_in_one_line() {
     fails(args(&path("absent"), out.clone()), "absent", 1);
 
     std::fs::create_dir(path("empty")).unwrap();
-    fails(args(&path("empty"), out.clone()), "no PNG, JPEG or EXR", 1);
+    fails(args(&path("empty"), out.clone()), "no PNG, JPEG, WebP, TIFF or EXR", 1);
 
     std::fs::write(path("broken.png"), b"no image").unwrap();
     fails(args(&path("broken.png"), out.clone()), "broken.png", 1);

@@ -104,8 +104,7 @@ fn spiral(poses: &[Camera], frames: usize) -> Vec<DAffine3> {
     let forward = mean(poses.iter().map(forward)).normalize_or(DVec3::Z);
     let up = upwards(poses);
     let middle = looking(center, center + forward, up);
-    let from_middle =
-        |pose: &Camera| middle.transform_point3(pose.center()).abs();
+    let from_middle = |pose: &Camera| middle.transform_point3(pose.center()).abs();
     let radii = [0, 1, 2].map(|axis| {
         let mut away: Vec<f64> = poses.iter().map(|pose| from_middle(pose)[axis]).collect();
         away.sort_by(f64::total_cmp);
@@ -218,7 +217,10 @@ mod tests {
         assert_eq!(frames.len(), 41);
         for (pose, frame) in poses.iter().zip(frames.iter().step_by(10)) {
             assert!(frame.center().distance(pose.center()) < 1e-9);
-            assert!(forward(frame).dot(forward(pose)) > 1.0 - 1e-9 && up(frame).dot(up(pose)) > 1.0 - 1e-9);
+            assert!(
+                forward(frame).dot(forward(pose)) > 1.0 - 1e-9
+                    && up(frame).dot(up(pose)) > 1.0 - 1e-9
+            );
         }
         let step = frames.windows(2).map(|two| two[0].center().distance(two[1].center()));
         assert!(step.fold(0.0, f64::max) < 0.25);

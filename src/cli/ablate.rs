@@ -106,8 +106,7 @@ pub fn run(args: &AblateArgs) -> Result<()> {
     write_whole(&index, page.html().as_bytes())?;
     write_whole(
         &args.out.join("table.md"),
-        (table.markdown()
-            + &notes.iter().map(|line| format!("\n{line}\n")).collect::<String>())
+        (table.markdown() + &notes.iter().map(|line| format!("\n{line}\n")).collect::<String>())
             .as_bytes(),
     )?;
     let mut out = std::io::stdout().lock();

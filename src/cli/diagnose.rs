@@ -33,7 +33,7 @@ use crate::train::{Preset, TrainConfig};
 #[derive(Clone, Debug, clap::Args)]
 #[command(verbatim_doc_comment)]
 pub struct DiagnoseArgs {
-    /// The dataset: a folder with transforms*.json (LOM, RealX3D, NeRF) or a COLMAP model in sparse/
+    /// The dataset: a folder with transforms*.json (LOM, RealX3D, NeRF) or a COLMAP model in sparse/, as `nightsplat pose` makes one
     pub dataset: PathBuf,
     /// Print everything as JSON
     #[arg(long)]

@@ -68,7 +68,14 @@ pub(crate) struct Reporter {
 impl Reporter {
     pub(crate) fn new(form: ProgressForm) -> Self {
         let now = Instant::now();
-        Self { form, facts: json!({}), bar: ProgressBar::hidden(), steps: 0, begin: (now, 0), spoke: now }
+        Self {
+            form,
+            facts: json!({}),
+            bar: ProgressBar::hidden(),
+            steps: 0,
+            begin: (now, 0),
+            spoke: now,
+        }
     }
 
     /// The same, which says so much more of a run at its start where it says JSON.

@@ -177,7 +177,10 @@ fn shots(args: &RenderArgs, dataset: &Dataset) -> crate::Result<Vec<Shot>> {
     let poses: Vec<Camera> = dataset.train_views().map(|view| view.camera).collect();
     let cameras = CameraPath::from(path).cameras(&poses, args.frames as usize)?.into_iter();
     // As ffmpeg counts them.
-    Ok(cameras.zip(0..).map(|(camera, index)| Shot { name: format!("{index:05}"), camera }).collect())
+    Ok(cameras
+        .zip(0..)
+        .map(|(camera, index)| Shot { name: format!("{index:05}"), camera })
+        .collect())
 }
 
 /// The exposures of a run's training views beside the one of its model.

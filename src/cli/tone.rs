@@ -15,7 +15,7 @@ use super::{ImageFormat, progress_bar, table};
 use crate::dataset::{Dataset, Split};
 use crate::eval;
 use crate::gpu::{DeviceChoice, Gpu};
-use crate::image::Image;
+use crate::image::{Image, Mask};
 use crate::metrics::Scores;
 use crate::output::printable;
 use crate::pseudo_gt::PseudoGt;
@@ -30,7 +30,7 @@ use crate::{Error, Result};
 #[expect(clippy::doc_markdown, reason = "in help, {setting} stands for its default")]
 #[derive(Clone, Debug, clap::Args)]
 pub struct ToneArgs {
-    /// A photograph (PNG, JPEG or EXR), a folder of them, or a dataset; taken as stored, not undistorted
+    /// A photograph (PNG, JPEG, WebP, TIFF or EXR) or a folder of them, turned upright, or a dataset's, as stored and not undistorted
     pub input: PathBuf,
     /// The curve: a name that `nightsplat curves` lists, or a .toml, .csv or .cube file
     #[arg(long, value_name = "NAME|FILE", default_value_t = ToneSettings::default().curve.into())]
@@ -59,6 +59,9 @@ pub struct ToneArgs {
     /// Normal-light photographs to score against: a folder with the same names, or a file for one photograph
     #[arg(long, value_name = "DIR|FILE")]
     pub reference: Option<PathBuf>,
+    /// Masks (masks/NAME.png or masks/NAME.jpg.png beside the photographs) hide what is white, not what is black
+    #[arg(long)]
+    pub invert_masks: bool,
     /// Print what was measured as JSON
     #[arg(long)]
     pub json: bool,
@@ -103,7 +106,7 @@ pub struct ToneReport {
     pub before: Measures,
     /// The black level that the settings' alpha and beta give this r; the paper's alpha where the curve has none.
     pub delta0: f64,
-    /// Pixels with a value that is NaN or infinite: black in the result, and in no measure.
+    /// Pixels with a value that is NaN or infinite, which are black in the result, and hidden ones: they are in no measure.
     pub unusable_pixels: usize,
     /// Of the result.
     pub after: Measures,
@@ -239,7 +242,8 @@ pub(super) fn apply_settings(args: &ToneArgs, settings: ToneSettings) -> Result<
             .map_err(|error| Error::output(out, format!("cannot be made: {error}")))?;
     }
     let gpu = Gpu::new(&args.device.clone().unwrap_or_default())?;
-    let mut set = CurveOnSet::new(&gpu, settings.clone(), &photographs, &args.input)?;
+    let mut set =
+        CurveOnSet::new(&gpu, settings.clone(), &photographs, (&args.input, args.invert_masks))?;
     let mut page = args.report.as_ref().map(|_| Page::new(&gpu, args, &photographs)).transpose()?;
 
     let progress = progress_bar(photographs.len());
@@ -304,6 +308,8 @@ fn settings(args: &ToneArgs, curve: &CurveChoice) -> Result<ToneSettings> {
 struct CurveOnSet {
     pseudo_gt: PseudoGt,
     scene: Scene,
+    /// Masks hide what is white.
+    inverted: bool,
 }
 
 impl CurveOnSet {
@@ -312,14 +318,14 @@ impl CurveOnSet {
         gpu: &Gpu,
         settings: ToneSettings,
         photographs: &[Listed],
-        input: &Path,
+        (input, inverted): (&Path, bool),
     ) -> Result<Self> {
         let mut pseudo_gt = PseudoGt::new(gpu, &settings)?;
         let mut measured = vec![];
         if settings.scene_statistics || settings.takes_exposure() {
             for listed in photographs.iter().filter(|listed| listed.split != Some(Split::Test)) {
                 // What cannot be used is named where it would be mapped.
-                let Ok((photograph, gaps)) = loaded(listed) else { continue };
+                let Ok((photograph, gaps)) = loaded(listed, inverted) else { continue };
                 measured.push(pseudo_gt.measure(&without(&photograph, &gaps))?);
             }
             if measured.is_empty() && settings.scene_statistics {
@@ -332,7 +338,7 @@ impl CurveOnSet {
             None if measured.is_empty() => Scene::default(),
             None => return Err(all_black(input)),
         };
-        Ok(Self { pseudo_gt, scene })
+        Ok(Self { pseudo_gt, scene, inverted })
     }
 
     /// What was measured of a photograph, what the curve makes of it, and at which gain.
@@ -348,10 +354,14 @@ impl CurveOnSet {
 }
 
 /// A photograph with those of its pixels that are no numbers.
-fn loaded(listed: &Listed) -> Result<(Image, Vec<usize>)> {
+fn loaded(listed: &Listed, inverted: bool) -> Result<(Image, Vec<usize>)> {
     let (photograph, gaps) = Image::load_with_gaps(&listed.input)?;
+    let (photograph, gaps) = listed.turned(photograph, listed.hidden(gaps, inverted)?);
     if gaps.len() == photograph.pixel_count() {
-        return Err(Error::input(&listed.input, "has no pixel that is a number; export it anew"));
+        return Err(Error::input(
+            &listed.input,
+            "has no pixel that is a number and not hidden; export it anew",
+        ));
     }
     Ok((photograph, gaps))
 }
@@ -367,8 +377,9 @@ struct Mapped {
 }
 
 fn mapped(set: &mut CurveOnSet, listed: &Listed) -> Result<Mapped> {
-    let (photograph, gaps) = loaded(listed)?;
-    let reference = listed.reference.as_ref().map(Image::load).transpose()?;
+    let (photograph, gaps) = loaded(listed, set.inverted)?;
+    let load = if listed.split.is_none() { Image::load_upright } else { Image::load };
+    let reference = listed.reference.as_ref().map(load).transpose()?;
     let (statistics, image, gain) = set.result(&photograph, &gaps)?;
     Ok(Mapped { photograph, gaps, statistics, image, gain, reference })
 }
@@ -389,7 +400,7 @@ impl Mapped {
                     listed.input.display()
                 )));
             }
-            Scores::of(image, reference)
+            Scores::of_counted(image, reference, Mask::hiding(image, gaps).as_ref())
         });
         let paper = ToneSettings::new(ToneCurve::Ap3);
         let alpha = if settings.alpha > 0.0 { settings.alpha } else { paper.alpha };

@@ -20,7 +20,9 @@ use crate::nn::Precision;
 use crate::output::printable;
 use crate::run::{self, HeldRun, RunDirectory, Session, Trained};
 use crate::tone::{CurveChoice, GainChoice, Profile, ToneCurve, ToneSettings};
-use crate::train::{Background, CacheSize, Learning, ModelName, Part, Preset, StopConfig, TrainConfig};
+use crate::train::{
+    Background, CacheSize, Learning, ModelName, Part, Preset, StopConfig, TrainConfig,
+};
 
 /// Train a 3D Gaussian Splatting model from dark photographs.
 ///
@@ -30,7 +32,7 @@ use crate::train::{Background, CacheSize, Learning, ModelName, Part, Preset, Sto
 /// (paper, or a benchmark's), nothing is decided.
 #[derive(Clone, Debug, clap::Args)]
 pub struct TrainArgs {
-    /// The dataset: a folder with transforms*.json (LOM, RealX3D, NeRF) or a COLMAP model in sparse/
+    /// The dataset: a folder with transforms*.json (LOM, RealX3D, NeRF) or a COLMAP model in sparse/, as `nightsplat pose` makes one
     pub dataset: PathBuf,
     /// The run directory to write: config.toml, model.ply, the networks, train.csv, evals.csv, a checkpoint, metrics.json
     #[arg(long, value_name = "RUN")]
@@ -115,6 +117,9 @@ pub(crate) struct TrainOptions {
     /// A folder of reference images by name, for scores only
     #[arg(long, value_name = "DIR")]
     reference: Option<PathBuf>,
+    /// Masks (masks/NAME.png or masks/NAME.jpg.png of the dataset) hide what is white, not what is black
+    #[arg(long)]
+    invert_masks: bool,
     #[command(flatten)]
     model: ModelOptions,
     /// Nothing nearer to a camera is seen, in units of the scene's extent: of how far the cameras stand from their middle [default: {near}]
@@ -367,6 +372,7 @@ impl TrainOptions {
         set(&mut config.hash_every, &self.hash_every);
         set(&mut config.check.every, &self.check_every);
         config.check.stops |= self.check_stops;
+        config.invert_masks |= self.invert_masks;
         if self.exposures.is_some() {
             (config.exposure.learn, config.exposure.start) = (Learning::On, self.exposures.clone());
         }
@@ -405,7 +411,12 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     let mut out = std::io::stdout();
     let facts = Facts::of(&gpu, &config, plan.as_ref(), &dataset);
     if is_text {
-        write!(out, "{}{}", facts.text(), plan.as_ref().map(diagnose::decisions).unwrap_or_default())?;
+        write!(
+            out,
+            "{}{}",
+            facts.text(),
+            plan.as_ref().map(diagnose::decisions).unwrap_or_default()
+        )?;
     }
     let held = if args.resume { HeldRun::Resume } else { held_unless(args.overwrite) };
     let mut progress = Reporter::new(form).with_facts(serde_json::json!(facts));

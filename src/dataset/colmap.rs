@@ -32,22 +32,44 @@ pub(super) struct ModelPoint {
     pub(super) images: Vec<u32>,
 }
 
-/// The model folders that COLMAP and its users write, below a dataset's root, most likely first.
-const FOLDERS: [&str; 8] = [
-    "sparse/0",
-    "sparse",
-    "colmap_sparse/0",
-    "colmap_sparse",
-    "derived_colmap/sparse/0",
-    "colmap/sparse/0",
-    "colmap/sparse",
-    "colmap_text",
-];
+/// Where COLMAP and its users put models below a dataset's root, most likely first; a folder may hold several in folders.
+const FOLDERS: [&str; 5] =
+    ["sparse", "colmap_sparse", "derived_colmap/sparse", "colmap/sparse", "colmap_text"];
 
-/// The first folder below `root` with a model's images (and with what else `needed` lists).
-pub(super) fn find(root: &Path, needed: &[&str]) -> Option<PathBuf> {
+/// The models below `root` with what `needed` lists, of the first place that has any, by name.
+pub(super) fn find(root: &Path, needed: &[&str]) -> Vec<PathBuf> {
+    let mut models = FOLDERS.iter().map(|place| models_in(&root.join(place), needed));
+    models.find(|models| !models.is_empty()).unwrap_or_default()
+}
+
+/// The models in the folders of a place, or itself where they hold none.
+pub(super) fn models_in(place: &Path, needed: &[&str]) -> Vec<PathBuf> {
     let complete = |folder: &PathBuf| needed.iter().all(|stem| file(folder, stem).is_some());
-    FOLDERS.iter().map(|folder| root.join(folder)).find(complete)
+    let entries = std::fs::read_dir(place).into_iter().flatten().flatten();
+    let mut models: Vec<PathBuf> = entries.map(|entry| entry.path()).filter(complete).collect();
+    models.sort();
+    if models.is_empty() {
+        models.extend(Some(place.to_owned()).filter(complete));
+    }
+    models
+}
+
+/// The model that places the most photographs that exist, and how many each of several places; none of none.
+pub(super) fn largest(
+    models: &[PathBuf],
+    exists: impl Fn(&str) -> bool,
+) -> Result<Option<(&Path, Vec<usize>)>> {
+    if let [only] = models {
+        return Ok(Some((only, vec![])));
+    }
+    let count = |folder: &PathBuf| {
+        let images = read_images(folder)?;
+        Ok(images.iter().filter(|image| exists(&image.name)).count())
+    };
+    let counts = models.iter().map(count).collect::<Result<Vec<_>>>()?;
+    // The first of the largest.
+    let place = (0..counts.len()).rev().max_by_key(|&place| counts[place]);
+    Ok(place.map(|place| (models[place].as_path(), counts)))
 }
 
 /// The lenses by camera id.
@@ -107,25 +129,45 @@ const MODELS: [(&str, usize); 12] = [
     ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
 ];
 
+/// Those of them that are undistorted on load.
+pub(super) const SUPPORTED: [&str; 9] = [
+    "SIMPLE_PINHOLE",
+    "PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "OPENCV",
+    "FULL_OPENCV",
+    "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE",
+    "OPENCV_FISHEYE",
+];
+
 /// A camera of a model by name; the error is what to tell the user.
 fn lens(model: &str, width: u64, height: u64, parameters: &[f64]) -> Result<Lens, String> {
+    let none = Distortion::default();
+    let fisheye = Distortion { is_fisheye: true, ..none };
     let (focal, principal_point, distortion) = match (model, parameters) {
-        ("SIMPLE_PINHOLE", &[f, cx, cy]) => {
-            (DVec2::splat(f), DVec2::new(cx, cy), Distortion::default())
-        }
-        ("PINHOLE", &[fx, fy, cx, cy]) => {
-            (DVec2::new(fx, fy), DVec2::new(cx, cy), Distortion::default())
-        }
-        ("SIMPLE_RADIAL", &[f, cx, cy, k1]) => {
-            (DVec2::splat(f), DVec2::new(cx, cy), Distortion { k1, ..Distortion::default() })
-        }
-        ("RADIAL", &[f, cx, cy, k1, k2]) => {
-            (DVec2::splat(f), DVec2::new(cx, cy), Distortion { k1, k2, ..Distortion::default() })
-        }
+        ("SIMPLE_PINHOLE", &[f, cx, cy]) => ([f, f], [cx, cy], none),
+        ("PINHOLE", &[fx, fy, cx, cy]) => ([fx, fy], [cx, cy], none),
+        ("SIMPLE_RADIAL", &[f, cx, cy, k1]) => ([f, f], [cx, cy], Distortion { k1, ..none }),
+        ("RADIAL", &[f, cx, cy, k1, k2]) => ([f, f], [cx, cy], Distortion { k1, k2, ..none }),
         ("OPENCV", &[fx, fy, cx, cy, k1, k2, p1, p2]) => {
-            (DVec2::new(fx, fy), DVec2::new(cx, cy), Distortion { k1, k2, p1, p2 })
+            ([fx, fy], [cx, cy], Distortion { k1, k2, p1, p2, ..none })
         }
-        ("SIMPLE_PINHOLE" | "PINHOLE" | "SIMPLE_RADIAL" | "RADIAL" | "OPENCV", _) => {
+        ("FULL_OPENCV", &[fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6]) => {
+            let is_fisheye = false;
+            ([fx, fy], [cx, cy], Distortion { k1, k2, k3, k4, k5, k6, p1, p2, is_fisheye })
+        }
+        ("SIMPLE_RADIAL_FISHEYE", &[f, cx, cy, k1]) => {
+            ([f, f], [cx, cy], Distortion { k1, ..fisheye })
+        }
+        ("RADIAL_FISHEYE", &[f, cx, cy, k1, k2]) => {
+            ([f, f], [cx, cy], Distortion { k1, k2, ..fisheye })
+        }
+        ("OPENCV_FISHEYE", &[fx, fy, cx, cy, k1, k2, k3, k4]) => {
+            ([fx, fy], [cx, cy], Distortion { k1, k2, k3, k4, ..fisheye })
+        }
+        _ if SUPPORTED.contains(&model) => {
             return Err(format!(
                 "has {} parameters, {model} takes another number",
                 parameters.len()
@@ -137,6 +179,7 @@ fn lens(model: &str, width: u64, height: u64, parameters: &[f64]) -> Result<Lens
             ));
         }
     };
+    let [focal, principal_point] = [focal, principal_point].map(DVec2::from_array);
     let side = |pixels: u64| u32::try_from(pixels).unwrap_or(u32::MAX);
     let lens =
         Lens { width: side(width), height: side(height), focal, principal_point, distortion };

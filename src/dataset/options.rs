@@ -23,6 +23,8 @@ pub struct LoadOptions {
     pub load_low_test: bool,
     /// How many training views are kept from training, an eighth of them at most, to tell when it has converged.
     pub hold_out: usize,
+    /// Masks hide what is white, not what is black.
+    pub invert_masks: bool,
     /// What is looked for as the training views' depth.
     pub depth: DepthOptions,
 }
@@ -48,6 +50,7 @@ impl Default for LoadOptions {
             reference: None,
             load_low_test: true,
             hold_out: 0,
+            invert_masks: false,
             depth: DepthOptions::default(),
         }
     }

@@ -5,10 +5,10 @@ use std::path::{Path, PathBuf};
 use glam::DAffine3;
 use rayon::prelude::*;
 
-use super::undistort::Undistortion;
-use super::{LoadOptions, Split, View};
+use super::undistort::{Undistortion, WIDEST};
+use super::{LoadOptions, Split, View, masks};
 use crate::camera::{Camera, Lens};
-use crate::image::Image;
+use crate::image::{Image, Mask, Orientation};
 use crate::{Error, Result};
 
 /// The shortest side that leaves something to train on, pixels.
@@ -27,7 +27,19 @@ pub(super) struct Source {
     pub(super) view_from_world: DAffine3,
     pub(super) input: Option<PathBuf>,
     pub(super) reference: Option<PathBuf>,
+    pub(super) mask: Option<PathBuf>,
     pub(super) depth: Option<PathBuf>,
+}
+
+impl Source {
+    /// Of the files of the photograph, its reference image, its mask and its depth.
+    pub(super) fn new(
+        (name, split): (String, Split),
+        (lens, view_from_world): (Lens, DAffine3),
+        [input, reference, mask, depth]: [Option<PathBuf>; 4],
+    ) -> Self {
+        Self { name, split, lens, view_from_world, input, reference, mask, depth }
+    }
 }
 
 /// The views in order of name. Files that do not decode are named in `skipped`.
@@ -49,7 +61,8 @@ pub(super) fn load(
     let at_once = Image::decoded_at_once(largest.unwrap_or_default());
     let mut loaded: Vec<Loaded> = vec![];
     for groups in groups.chunks(at_once) {
-        let groups = groups.par_iter().map(|(lens, group)| load_group(lens, group, options, at_once));
+        let groups =
+            groups.par_iter().map(|(lens, group)| load_group(lens, group, options, at_once));
         loaded.extend(groups.collect::<Result<Vec<_>>>()?.into_iter().flatten());
     }
     loaded.sort_by(|a, b| a.name.cmp(&b.name));
@@ -115,7 +128,7 @@ impl Original {
     pub(super) fn load_at(&self, size: (u32, u32)) -> Result<Image> {
         let Self { path, lens } = self;
         let undistortion = undistortion(lens, &path.to_string_lossy())?;
-        prepared(Image::load(path)?, path, lens, undistortion.as_ref(), size)
+        prepared(loaded(path, lens)?, path, lens, undistortion.as_ref(), size)
     }
 }
 
@@ -131,7 +144,10 @@ fn fitted_lens(source: &Source) -> Result<Lens> {
     let lens = source.lens;
     // What has no readable header is named when it is decoded.
     let sized = [&source.input, &source.reference].into_iter().flatten();
-    let sized = sized.filter_map(|path| Some((path, Image::size_of(path).ok()?)));
+    let sized = sized.filter_map(|path| {
+        let size = Image::size_of(path).ok()?;
+        Some((path, turn(path, size, &lens).size(size)))
+    });
     let Some((path, (width, height))) = sized.clone().next() else {
         return Ok(lens);
     };
@@ -159,6 +175,7 @@ pub(super) fn loaded_size(source: &Source, options: &LoadOptions) -> Result<(Str
 fn check_size(path: &Path, lens: &Lens) -> Result<()> {
     // What has no readable header is named when it is decoded.
     let Ok((width, height)) = Image::size_of(path) else { return Ok(()) };
+    let (width, height) = turn(path, (width, height), lens).size((width, height));
     if lens.fitted(width, height).is_none() {
         return Err(disagreement(path, (width, height), lens));
     }
@@ -178,10 +195,34 @@ fn check_excess(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Result
     Ok(())
 }
 
+/// How a photograph is turned to be what its camera took. Poses are of what is stored, as COLMAP reads it; where the
+/// camera's size is that of what is seen, and not of what is stored, they are of that.
+pub(super) fn turn(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Orientation {
+    if lens.fitted(width, height).is_some() {
+        return Orientation::UPRIGHT;
+    }
+    let said = Orientation::of(path);
+    let (width, height) = said.size((width, height));
+    if lens.fitted(width, height).is_some() { said } else { Orientation::UPRIGHT }
+}
+
+/// A photograph as its camera took it.
+fn loaded(path: &Path, lens: &Lens) -> Result<Image> {
+    let image = Image::load(path)?;
+    let orientation = turn(path, (image.width, image.height), lens);
+    Ok(image.turned(orientation))
+}
+
 fn disagreement(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Error {
     let (w, h) = (lens.width, lens.height);
+    let (seen_width, seen_height) = Orientation::of(path).size((width, height));
+    let seen = if seen_width == width {
+        String::new()
+    } else {
+        format!(" (upright {seen_width}x{seen_height})")
+    };
     let problem = format!(
-        "is {width}x{height} but its camera is {w}x{h}; use the photographs that the cameras were made with"
+        "is {width}x{height}{seen} but its camera is {w}x{h}; use the photographs that the cameras were made with"
     );
     Error::input(path, problem)
 }
@@ -198,15 +239,21 @@ fn load_group(
     if size.0.min(size.1) < MIN_SIDE {
         return Err(Error::Usage(format!(
             "downscale {} leaves {}x{} pixels of view {name}, at least {MIN_SIDE} are needed; lower it",
-            options.downscale,
-            size.0, size.1
+            options.downscale, size.0, size.1
         )));
     }
     let undistortion = undistortion(lens, name)?;
+    if undistortion.as_ref().is_some_and(|undistortion| undistortion.is_cropped) {
+        tracing::warn!(
+            "view {name} and {} more are of a fisheye that sees farther off its axis than the {WIDEST} degrees at the corners of what is trained on; the rest is cropped",
+            group.len() - 1
+        );
+    }
     let mut loaded = vec![];
     for sources in group.chunks(at_once) {
         let views = sources.par_iter().cloned();
-        let views = views.map(|source| load_view(source, lens, undistortion.as_ref(), size, options));
+        let views =
+            views.map(|source| load_view(source, lens, undistortion.as_ref(), size, options));
         loaded.extend(views.collect::<Result<Vec<_>>>()?);
     }
     Ok(loaded)
@@ -230,12 +277,12 @@ fn load_view(
     size: (u32, u32),
     options: &LoadOptions,
 ) -> Result<Loaded> {
-    let Source { name, split, view_from_world, input, reference, depth, .. } = source;
+    let Source { name, split, view_from_world, input, reference, mask, depth, .. } = source;
     let mut problems = Vec::new();
     let mut image = |path: Option<PathBuf>| -> Result<Option<Image>> {
         let Some(path) = path else { return Ok(None) };
         check_size(&path, lens)?;
-        match Image::load(&path) {
+        match loaded(&path, lens) {
             Ok(image) => prepared(image, &path, lens, undistortion, size).map(Some),
             Err(error) => {
                 problems.push(error.to_string());
@@ -247,7 +294,22 @@ fn load_view(
     let is_kept = options.keep.is_none();
     let original = input.clone().filter(|_| is_shrunk || !is_kept);
     let original = original.map(|path| Original { path, lens: *lens });
-    let (image, reference) = (image(input)?, image(reference)?);
+    let paths = [input.clone(), reference.clone()];
+    let (mut image, mut reference) = (image(input)?, image(reference)?);
+    // Of what was read: a file that does not decode is named once.
+    let [of_input, of_reference] = paths;
+    let hidden = of_input
+        .filter(|_| image.is_some())
+        .or(of_reference.filter(|_| reference.is_some()))
+        .map(|path| {
+            let files = (path.as_path(), mask.as_deref());
+            masks::load(files, lens, undistortion, size, options.invert_masks)
+        });
+    let mask = hidden.transpose()?.flatten();
+    if mask.as_ref().is_some_and(Mask::hides_all) {
+        problems.push(format!("{name}: its mask hides every pixel"));
+        (image, reference) = (None, None);
+    }
     let depth = depth.and_then(|path| {
         depth_map(&path, lens, undistortion, size, options.depth.is_disparity)
             .map_err(|problem| tracing::warn!("the depth of view {name} is not used: {problem}"))
@@ -263,7 +325,7 @@ fn load_view(
     let camera = camera.resized(size.0, size.1);
     let original = original.filter(|_| image.is_some());
     let image = image.filter(|_| is_kept);
-    let view = View { name: name.clone(), split, camera, image, original, reference, depth };
+    let view = View { name: name.clone(), split, camera, image, original, reference, mask, depth };
     let view = (split == Split::Test || view.has_photograph()).then_some(view);
     Ok(Loaded { name, view, problems })
 }
@@ -296,7 +358,7 @@ fn depth_map(
     Ok(depth)
 }
 
-fn prepared(
+pub(super) fn prepared(
     image: Image,
     path: &Path,
     lens: &Lens,

@@ -8,6 +8,9 @@ use std::path::{Path, PathBuf};
 use glam::{DAffine3, DMat3, DVec2, DVec3};
 use serde::Deserialize;
 
+use super::colmap::SUPPORTED;
+use super::names::below_first;
+use super::text_file::read_text;
 use super::{ListedView, Listing, Split};
 use crate::camera::{Distortion, Lens};
 use crate::image::Image;
@@ -88,8 +91,7 @@ pub(super) fn read(
     files: &Files,
     listing: &mut Listing,
 ) -> Result<()> {
-    let text = std::fs::read_to_string(path)
-        .map_err(|error| Error::input(path, format!("cannot be read: {error}")))?;
+    let text = read_text(path)?;
     let transforms: Transforms = serde_json::from_str(&nan_as_null(&text)).map_err(|error| {
         let remedy = if error.is_eof() {
             "it is cut short, copy it again"
@@ -118,8 +120,8 @@ pub(super) fn read(
         let lens = intrinsics
             .lens(size)
             .map_err(|problem| Error::input(path, format!("{listed}: {problem}")))?;
-        let name = stem(&listed).to_owned();
-        listing.frames.push(ListedView { name, listed, split, file, lens, view_from_world });
+        let (name, below) = (stem(&listed).to_owned(), below_first(&listed).to_owned());
+        listing.frames.push(ListedView { name, listed, below, split, file, lens, view_from_world });
     }
     Ok(())
 }
@@ -191,14 +193,17 @@ impl Intrinsics {
     fn lens(&self, size: DVec2) -> Result<Lens, String> {
         let undistort = "run COLMAP's image_undistorter and export its PINHOLE model";
         let model = self.camera_model.as_deref().unwrap_or("OPENCV");
-        if !["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"]
-            .contains(&model)
-        {
+        if model != "PERSPECTIVE" && !SUPPORTED.contains(&model) {
             return Err(format!("the camera model {model} is not supported; {undistort}"));
         }
+        let is_fisheye = self.is_fisheye == Some(true) || model.ends_with("FISHEYE");
         let nonzero = |value: Option<f64>| value.unwrap_or(0.0) != 0.0;
-        if self.is_fisheye == Some(true) || nonzero(self.k3) || nonzero(self.k4) {
-            return Err(format!("fisheye lenses, k3 and k4 are not supported; {undistort}"));
+        if !is_fisheye && nonzero(self.k4) {
+            // Of r^8 in some exports, in OpenCV's a denominator.
+            return Err(format!("k4 of a lens that is no fisheye is not supported; {undistort}"));
+        }
+        if is_fisheye && (nonzero(self.p1) || nonzero(self.p2)) {
+            return Err(format!("p1 and p2 of a fisheye are not supported; {undistort}"));
         }
         let from_angle = self.camera_angle_x.map(|angle| 0.5 * size.x / (0.5 * angle).tan());
         let fl_x =
@@ -216,8 +221,12 @@ impl Intrinsics {
             distortion: Distortion {
                 k1: coefficient(self.k1),
                 k2: coefficient(self.k2),
+                k3: coefficient(self.k3),
+                k4: coefficient(self.k4),
                 p1: coefficient(self.p1),
                 p2: coefficient(self.p2),
+                is_fisheye,
+                ..Distortion::default()
             },
         };
         lens.problem().map_or(Ok(lens), |problem| Err(format!("{problem}; mend the intrinsics")))

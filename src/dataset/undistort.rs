@@ -2,7 +2,8 @@
 //!
 //! The pinhole keeps the image's size and the principal point; its focal lengths are scaled by one factor, the
 //! smallest at which every output pixel still lies inside the input (`OpenCV`'s alpha = 0): no blank pixels, and no
-//! more of the picture lost than that needs.
+//! more of the picture lost than that needs. Of a fisheye it shows [`WIDEST`] off the axis at most: a pinhole spends ever
+//! more of its pixels on what lies beyond, and has none for what lies at 90 degrees.
 
 use glam::DVec2;
 use rayon::prelude::*;
@@ -10,11 +11,16 @@ use rayon::prelude::*;
 use crate::camera::Lens;
 use crate::image::Image;
 
+/// What the corner of a pinhole sees off the axis, degrees: 120 across the picture, where a pixel of a fisheye covers four.
+pub(super) const WIDEST: f64 = 60.0;
+
 /// Where each pixel of the pinhole image lies in the photograph; made once per lens.
 #[derive(Debug)]
 pub(super) struct Undistortion {
     /// The pinhole's focal lengths, pixels.
     pub(super) focal: DVec2,
+    /// Whether the photograph shows more than [`WIDEST`], which is lost.
+    pub(super) is_cropped: bool,
     /// Positions in the photograph, pixels, (height, width).
     positions: Vec<[f32; 2]>,
 }
@@ -22,14 +28,20 @@ pub(super) struct Undistortion {
 impl Undistortion {
     /// `None` where no pinhole sees inside the photograph only: the coefficients make no lens.
     pub(super) fn new(lens: &Lens) -> Option<Self> {
-        let focal = lens.focal * zoom(lens)?;
+        let zoom = zoom(lens)?;
+        let focal = lens.focal * zoom;
+        let is_cropped = fits(lens, zoom * 0.999, f64::INFINITY);
         let position = |index: u32| {
             let pixel =
                 DVec2::new(f64::from(index % lens.width), f64::from(index / lens.width)) + 0.5;
             in_photograph(lens, focal, pixel).as_vec2().to_array()
         };
         let pixels = lens.width.checked_mul(lens.height)?;
-        Some(Self { focal, positions: (0..pixels).into_par_iter().map(position).collect() })
+        Some(Self {
+            focal,
+            is_cropped,
+            positions: (0..pixels).into_par_iter().map(position).collect(),
+        })
     }
 
     /// The pinhole's image of a photograph of the lens's size, by bicubic interpolation in float.
@@ -83,12 +95,20 @@ fn zoom(lens: &Lens) -> Option<f64> {
 }
 
 fn sees_only_the_photograph(lens: &Lens, zoom: f64) -> bool {
+    let widest = if lens.distortion.is_fisheye { WIDEST.to_radians().tan() } else { f64::INFINITY };
+    fits(lens, zoom, widest)
+}
+
+/// Whether the pinhole sees only the photograph, and nothing farther off the axis than `widest` at unit depth.
+fn fits(lens: &Lens, zoom: f64, widest: f64) -> bool {
     let focal = lens.focal * zoom;
     let last = DVec2::new(f64::from(lens.width), f64::from(lens.height)) - 0.5;
     let inside = |pixel: DVec2| {
         let position = in_photograph(lens, focal, pixel);
-        let unfolded = lens.distortion.determinant((pixel - lens.principal_point) / focal) > 0.0;
+        let direction = (pixel - lens.principal_point) / focal;
+        let unfolded = lens.distortion.determinant(direction) > 0.0;
         unfolded
+            && direction.length() <= widest
             && position.cmpge(DVec2::splat(0.5 - 1e-9)).all()
             && position.cmple(last + 1e-9).all()
     };
@@ -155,12 +175,25 @@ mod tests {
     use super::*;
     use crate::camera::Distortion;
 
-    const LENSES: [Distortion; 4] = [
-        Distortion { k1: 0.018, k2: -0.051, p1: 0.0087, p2: 0.0025 },
-        Distortion { k1: -0.25, k2: 0.06, p1: 0.0, p2: 0.0 },
-        Distortion { k1: 0.2, k2: 0.0, p1: -0.002, p2: 0.004 },
-        Distortion { k1: 0.0, k2: 0.0, p1: 0.0, p2: 0.0 },
+    const LENSES: [Distortion; 6] = [
+        Distortion { k1: 0.018, k2: -0.051, p1: 0.0087, p2: 0.0025, ..NONE },
+        Distortion { k1: -0.25, k2: 0.06, ..NONE },
+        Distortion { k1: 0.2, p1: -0.002, p2: 0.004, ..NONE },
+        Distortion { k1: 0.1, k3: 0.02, k4: 0.15, k5: -0.02, p1: 0.001, ..NONE },
+        Distortion { k1: 0.05, k2: -0.02, k3: 0.006, k4: -0.001, is_fisheye: true, ..NONE },
+        NONE,
     ];
+    const NONE: Distortion = Distortion {
+        k1: 0.0,
+        k2: 0.0,
+        k3: 0.0,
+        k4: 0.0,
+        k5: 0.0,
+        k6: 0.0,
+        p1: 0.0,
+        p2: 0.0,
+        is_fisheye: false,
+    };
 
     fn lens(distortion: Distortion) -> Lens {
         let (focal, principal_point) = (DVec2::new(105.0, 108.0), DVec2::new(52.0, 44.0));
@@ -223,6 +256,34 @@ mod tests {
             zoom(&lens(Distortion::default())).map(|factor| (factor * 1e6).round()),
             Some(1e6)
         );
+    }
+
+    #[test]
+    fn of_a_fisheye_the_pinhole_shows_the_middle_and_that_is_known() {
+        let distortion = Distortion { k1: 0.02, is_fisheye: true, ..NONE };
+        // 85 degrees at the corners, and 40.
+        for (focal, is_cropped) in [(40.0, true), (90.0, false)] {
+            let lens = Lens {
+                focal: DVec2::splat(focal),
+                principal_point: DVec2::new(50.0, 37.5),
+                ..lens(distortion)
+            };
+            let map = Undistortion::new(&lens).unwrap();
+            assert_eq!(map.is_cropped, is_cropped);
+            let corner = (DVec2::new(0.5, 0.5) - lens.principal_point) / map.focal;
+            let degrees = corner.length().atan().to_degrees();
+            assert!(
+                (degrees - WIDEST).abs() < 1e-3 || (!is_cropped && degrees < WIDEST),
+                "{degrees}"
+            );
+            let ours = map.apply(&image_of(&lens, lens.focal, distortion));
+            let pinhole = image_of(&lens, map.focal, NONE);
+            // The waves beyond 50 degrees are shorter than the pixels of the fisheye.
+            let middle = |image: &Image| image.pixel(50, 37);
+            for (a, b) in middle(&ours).into_iter().zip(middle(&pinhole)) {
+                assert!((a - b).abs() < 1e-2, "{a} {b}");
+            }
+        }
     }
 
     #[test]

@@ -30,10 +30,11 @@ pub(super) struct Measured {
 }
 
 impl Measured {
-    pub(super) fn of(image: &Image) -> Self {
-        let values = image.data.len().max(1) as f64;
+    /// `counted` are the values of the pixels that count.
+    pub(super) fn of(image: &Image, counted: &[f32]) -> Self {
+        let values = counted.len().max(1) as f64;
         let fraction = |is: fn(f32) -> bool| {
-            image.data.iter().filter(|&&value| is(value)).count() as f64 / values
+            counted.iter().filter(|&&value| is(value)).count() as f64 / values
         };
         let linear = Linear::of(image);
         let mut patches = vec![];
@@ -42,12 +43,12 @@ impl Measured {
         }
         let luminance = luminances(&linear.planes);
         Self {
-            statistics: Statistics::of(&image.data),
+            statistics: Statistics::of(counted),
             light: mean(&luminance),
             // Positive phrasing: a NaN is neither.
             clipped_fraction: fraction(|value| value >= 1.0),
             zero_fraction: fraction(|value| value <= 0.0),
-            code_values: code_values(&image.data),
+            code_values: code_values(counted),
             noise: noise::fit(patches.clone()),
             patches,
             blur: blur(image),

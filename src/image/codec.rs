@@ -1,21 +1,25 @@
-//! Photographs from and to files: PNG, JPEG and EXR in, PNG and EXR out.
+//! Photographs from and to files: PNG, JPEG, WebP, TIFF and EXR in, PNG and EXR out.
 
 use std::io::Cursor;
 use std::path::Path;
 
 use ::image::{
-    DynamicImage, ExtendedColorType, ImageEncoder, ImageFormat, ImageReader,
-    codecs::png::PngEncoder,
+    DynamicImage, ExtendedColorType, ImageDecoder, ImageEncoder, ImageFormat, ImageReader,
+    codecs::{jpeg::JpegEncoder, png::PngEncoder},
 };
 
+#[cfg(not(feature = "raw"))]
+use super::files::RAW_REMEDY;
+use super::files::{HEIC_REMEDY, is_raw};
 use super::{Image, budget, exr_file, from_interleaved, jpeg, linear_from_srgb, srgb_from_linear};
 use crate::output::write_whole;
 use crate::{Error, Result};
 
 impl Image {
-    /// Reads an 8- or 16-bit PNG, a JPEG or an EXR file; the content decides, not the file's name.
+    /// Reads an 8- or 16-bit PNG or TIFF, a JPEG, a WebP or an EXR file as it is stored ([`Image::load_upright`] turns it);
+    /// the content decides, not the file's name.
     ///
-    /// Alpha is dropped, grey is repeated. Of an EXR file the first layer's R, G and B (or Y) are taken as linear
+    /// Alpha is dropped, grey is repeated, camera RAW (feature `raw`) is linear light. Of an EXR file the first layer's R, G and B (or Y) are taken as linear
     /// light; values that are negative or not finite become 0, with a warning that counts them.
     ///
     /// # Errors
@@ -62,9 +66,41 @@ impl Image {
         {
             return Ok((image, vec![]));
         }
+        refuse_heic(path, &bytes)?;
+        if is_raw(path) {
+            return Ok((load_raw(path, bytes)?, vec![]));
+        }
         let reader = ImageReader::new(Cursor::new(bytes)).with_guessed_format();
         let decoded = reader.map_err(::image::ImageError::from).and_then(ImageReader::decode);
         Ok((from_decoded(decoded.map_err(|error| not_an_image(path, &error))?), vec![]))
+    }
+
+    /// The alpha of a PNG, WebP or TIFF file, in all three planes; none of a file that hides nothing.
+    ///
+    /// # Errors
+    /// [`Error::Input`] names the file when it cannot be read.
+    pub(super) fn load_alpha(path: &Path) -> Result<Option<Self>> {
+        if is_raw(path) {
+            return Ok(None);
+        }
+        let reader = ImageReader::open(path).and_then(ImageReader::with_guessed_format);
+        let reader =
+            reader.map_err(|error| Error::input(path, format!("cannot be read: {error}")))?;
+        let with_alpha = [ImageFormat::Png, ImageFormat::WebP, ImageFormat::Tiff];
+        if !reader.format().is_some_and(|format| with_alpha.contains(&format)) {
+            return Ok(None);
+        }
+        let decoder = reader.into_decoder().map_err(|error| not_an_image(path, &error))?;
+        if !decoder.color_type().has_alpha() {
+            return Ok(None);
+        }
+        let decoded =
+            DynamicImage::from_decoder(decoder).map_err(|error| not_an_image(path, &error))?;
+        let (width, height) = (decoded.width(), decoded.height());
+        let values = decoded.into_rgba32f().into_raw();
+        let alpha: Vec<f32> = values.into_iter().skip(3).step_by(4).collect();
+        let hides = alpha.iter().any(|&value| value < 1.0);
+        Ok(hides.then(|| Self { width, height, data: alpha.repeat(3) }))
     }
 
     /// Width and height of an image file, from its header alone.
@@ -73,6 +109,9 @@ impl Image {
     /// [`Error::Input`] names the file when it is no image.
     pub fn size_of(path: impl AsRef<Path>) -> Result<(u32, u32)> {
         let path = path.as_ref();
+        if is_raw(path) {
+            return raw_size(path);
+        }
         let reader = ImageReader::open(path).and_then(ImageReader::with_guessed_format);
         let reader =
             reader.map_err(|error| Error::input(path, format!("cannot be read: {error}")))?;
@@ -109,6 +148,21 @@ impl Image {
     /// Red, green and blue of every pixel in 8 bits: values clamped to [0, 1], rounded to nearest.
     pub fn to_rgb8(&self) -> Vec<u8> {
         self.interleaved().map(|value| (value.clamp(0.0, 1.0) * 255.0).round() as u8).collect()
+    }
+
+    /// Writes a JPEG of little loss, values clamped to [0, 1], with an Exif segment, where there is one, behind its start.
+    ///
+    /// # Errors
+    /// [`Error::Output`] names the file; nothing half-written is left under its name.
+    pub(crate) fn save_jpeg(&self, path: impl AsRef<Path>, exif: Option<&[u8]>) -> Result<()> {
+        const QUALITY: u8 = 97;
+        let path = path.as_ref();
+        let mut file = Vec::new();
+        JpegEncoder::new_with_quality(&mut file, QUALITY)
+            .write_image(&self.to_rgb8(), self.width, self.height, ExtendedColorType::Rgb8)
+            .map_err(|error| Error::output(path, format!("cannot be encoded: {error}")))?;
+        let (start, rest) = file.split_at(jpeg::MAGIC.len());
+        write_whole(path, &[start, exif.unwrap_or_default(), rest].concat())
     }
 
     /// Writes a 16-bit RGB PNG: values clamped to [0, 1], rounded to nearest.
@@ -155,8 +209,31 @@ impl Image {
 pub(super) fn not_an_image(path: &Path, error: &dyn std::error::Error) -> Error {
     Error::input(
         path,
-        format!("is not a readable PNG, JPEG or EXR image ({error}); replace or remove it"),
+        format!(
+            "is not a readable PNG, JPEG, WebP, TIFF or EXR image ({error}); replace or remove it"
+        ),
     )
+}
+
+/// What phones write has no free decoder: the message says what converts it.
+fn refuse_heic(path: &Path, bytes: &[u8]) -> Result<()> {
+    let brands: [&[u8]; 6] = [b"heic", b"heix", b"hevc", b"heim", b"mif1", b"msf1"];
+    let is_heic = bytes.get(4..8) == Some(b"ftyp")
+        && bytes.get(8..12).is_some_and(|brand| brands.contains(&brand));
+    if is_heic { Err(Error::input(path, format!("is HEIC; {HEIC_REMEDY}"))) } else { Ok(()) }
+}
+
+#[cfg(feature = "raw")]
+use super::raw::{load as load_raw, size_of as raw_size};
+
+#[cfg(not(feature = "raw"))]
+fn load_raw(path: &Path, _: Vec<u8>) -> Result<Image> {
+    Err(Error::input(path, format!("is camera RAW, which this build does not read; {RAW_REMEDY}")))
+}
+
+#[cfg(not(feature = "raw"))]
+fn raw_size(path: &Path) -> Result<(u32, u32)> {
+    load_raw(path, vec![]).map(|image| (image.width, image.height))
 }
 
 fn from_decoded(decoded: DynamicImage) -> Image {

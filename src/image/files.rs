@@ -7,15 +7,33 @@ use std::path::{Path, PathBuf};
 use crate::{Error, Result};
 
 /// Endings of the files that [`super::Image::load`] reads.
-const READABLE: [&str; 4] = ["png", "jpg", "jpeg", "exr"];
-/// Endings of other image files: no part of a name either. What follows another dot is.
-const UNREADABLE: [&str; 5] = ["tif", "tiff", "webp", "bmp", "hdr"];
+const READABLE: [&str; 7] = ["png", "jpg", "jpeg", "exr", "tif", "tiff", "webp"];
+/// Endings of other pictures and clips: no part of a name either. What follows another dot is.
+const UNREADABLE: [&str; 10] =
+    ["bmp", "hdr", "gif", "avif", "jxl", "heic", "heif", "mp4", "mov", "mkv"];
+/// Those of camera RAW, which are read with the feature `raw`.
+const RAW: [&str; 10] = ["dng", "cr2", "cr3", "nef", "arw", "raf", "rw2", "orf", "pef", "srw"];
+/// Whether camera RAW is read.
+pub(super) const READS_RAW: bool = cfg!(feature = "raw");
+/// What becomes of camera RAW where it is not.
+pub(super) const RAW_REMEDY: &str =
+    "install nightsplat with `--features raw`, or convert it to 16-bit TIFF or EXR";
+
+/// Whether a file is camera RAW, by its name: its content begins as that of a TIFF.
+pub(super) fn is_raw(path: &Path) -> bool {
+    is_one_of(&RAW, &path.extension().unwrap_or_default().to_string_lossy())
+}
+
+/// Those of them that a phone writes and other programs convert.
+const HEIC: [&str; 2] = ["heic", "heif"];
+/// How they are converted.
+pub(super) const HEIC_REMEDY: &str = "convert it first, `heif-convert IN.heic OUT.png` of libheif, or on macOS `sips -s format png IN.heic --out OUT.png`";
 
 /// A photograph's name: the file name without an image's extension.
 pub(crate) fn stem(listed: &str) -> &str {
     let name = listed.rsplit('/').next().unwrap_or(listed);
     match name.rsplit_once('.') {
-        Some((stem, ending)) if is_one_of(&READABLE, ending) || is_one_of(&UNREADABLE, ending) => {
+        Some((stem, ending)) if is_one_of(&[&READABLE[..], &UNREADABLE, &RAW].concat(), ending) => {
             stem
         }
         _ => name,
@@ -31,9 +49,33 @@ pub(crate) fn photographs_in(folder: &Path) -> Result<Vec<PathBuf>> {
     let mut paths = files_in(folder).map_err(unreadable)?;
     paths.retain(|path| {
         let ending = path.extension().unwrap_or_default();
-        is_one_of(&READABLE, &ending.to_string_lossy())
+        is_one_of(&READABLE, &ending.to_string_lossy()) || READS_RAW && is_raw(path)
     });
     Ok(paths)
+}
+
+/// The pictures and clips of a folder that are not read, by ending, in a line; none where there are none.
+pub(crate) fn unread_in(folder: &Path) -> Option<String> {
+    let mut counts: BTreeMap<String, usize> = BTreeMap::new();
+    for path in files_in(folder).unwrap_or_default() {
+        let ending = path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
+        if is_one_of(&UNREADABLE, &ending) || !READS_RAW && is_raw(&path) {
+            *counts.entry(ending).or_default() += 1;
+        }
+    }
+    let listed: Vec<String> =
+        counts.iter().map(|(ending, count)| format!("{count} .{ending}")).collect();
+    let is_heic = counts.keys().any(|ending| is_one_of(&HEIC, ending));
+    let is_raw = counts.keys().any(|ending| is_one_of(&RAW, ending));
+    let mut remedy = String::new();
+    if is_heic {
+        remedy += &format!("; HEIC: {HEIC_REMEDY}");
+    }
+    if is_raw {
+        remedy += &format!("; RAW: {RAW_REMEDY}");
+    }
+    let folder = folder.display();
+    (!listed.is_empty()).then(|| format!("{folder}: not read: {}{remedy}", listed.join(", ")))
 }
 
 /// Looks photographs up and remembers what the folders hold.

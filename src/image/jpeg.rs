@@ -30,6 +30,48 @@ pub(super) fn load(path: &Path, bytes: &[u8]) -> Result<Option<Image>> {
     })
 }
 
+/// The Exif segment of a JPEG file, marker and length before it, said to be stored upright; none where it has none.
+pub(crate) fn exif_segment(bytes: &[u8]) -> Option<Vec<u8>> {
+    const EXIF: u8 = 0xE1;
+    let mut at = MAGIC.len();
+    loop {
+        let head = bytes.get(at..at + 4)?;
+        let length = usize::from(u16::from_be_bytes([head[2], head[3]]));
+        // What comes before the picture has a length; what does not is the picture.
+        if head[0] != 0xFF || !(0xC0..=0xFE).contains(&head[1]) || head[1] == 0xDA || length < 2 {
+            return None;
+        }
+        let segment = bytes.get(at..at + 2 + length)?;
+        if head[1] == EXIF && segment.get(4..10) == Some(b"Exif\0\0") {
+            let mut segment = segment.to_vec();
+            set_upright(&mut segment[10..]);
+            return Some(segment);
+        }
+        at += 2 + length;
+    }
+}
+
+/// Sets the orientation that the first directory of Exif data names to 1, as stored.
+fn set_upright(tiff: &mut [u8]) -> Option<()> {
+    const ORIENTATION: u16 = 0x0112;
+    let is_little = tiff.starts_with(b"II");
+    let short = |bytes: &[u8]| -> Option<u16> {
+        let pair = bytes.get(..2)?.try_into().ok()?;
+        Some(if is_little { u16::from_le_bytes(pair) } else { u16::from_be_bytes(pair) })
+    };
+    let word: [u8; 4] = tiff.get(4..8)?.try_into().ok()?;
+    let first =
+        if is_little { u32::from_le_bytes(word) } else { u32::from_be_bytes(word) } as usize;
+    for entry in 0..usize::from(short(tiff.get(first..)?)?) {
+        let at = first + 2 + 12 * entry;
+        if short(tiff.get(at..)?)? == ORIENTATION {
+            let upright = if is_little { [1, 0] } else { [0, 1] };
+            tiff.get_mut(at + 8..at + 10)?.copy_from_slice(&upright);
+        }
+    }
+    Some(())
+}
+
 /// The image of a file of sound structure.
 fn decode(bytes: &[u8]) -> std::io::Result<Option<Image>> {
     let file = Decompress::new_mem(bytes)?;

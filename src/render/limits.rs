@@ -26,7 +26,9 @@ impl RenderSettings {
             let what = format!("its render takes {bytes} bytes, {device} binds {bindable} at most");
             (bytes as f64 / *bindable as f64, what)
         } else if tiles > most {
-            let what = format!("it has {tiles} tiles of {tile_width}x{tile_height} pixels, {device} follows {most}");
+            let what = format!(
+                "it has {tiles} tiles of {tile_width}x{tile_height} pixels, {device} follows {most}"
+            );
             (tiles as f64 / most as f64, what)
         } else {
             return Ok(());

@@ -19,8 +19,8 @@
 //! ```
 //!
 //! A file appears under its name only once it is complete, `metrics.json` and `done.json` last: a directory that has them is
-//! whole. While a process trains in it, it holds `.lock`. The model is written with every checkpoint, too: a run that was
-//! stopped can be looked at.
+//! whole. The model is written with every checkpoint, too: a run that was stopped can be looked at. While a process trains
+//! in it, it holds `.lock`.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
@@ -30,6 +30,7 @@ use std::path::{Path, PathBuf};
 use glam::DVec3;
 
 use super::aside::{self, Aside, unwritable};
+use super::generations::{self, CHECKPOINT, CHECKPOINT_BEFORE};
 use super::ledger;
 use super::lock::RunLock;
 pub use super::progress::Progress;
@@ -42,7 +43,7 @@ use crate::gpu::Gpu;
 use crate::loss::Term;
 use crate::output::{csv_field, write_whole};
 use crate::scene::{Features, Gaussians, ply};
-use crate::train::{ModelConfig, Networks, StepReport, TrainConfig, Trainer, check_checkpoint};
+use crate::train::{ModelConfig, Networks, StepReport, TrainConfig, Trainer};
 use crate::{Error, Result};
 
 /// A run directory and the log that grows in it.
@@ -75,8 +76,8 @@ pub(super) const FILES: [&str; 14] = [
     LOG,
     HELD_OUT,
     PROGRESS,
-    VIEWS,
     HASHES,
+    VIEWS,
     PLAN,
     "config.toml",
 ];
@@ -113,12 +114,6 @@ const EXPOSURES: &str = "exposures.csv";
 
 /// The weights of the networks.
 const NETWORKS: &str = "networks.safetensors";
-
-/// The state of an unfinished run, or of a finished one that may be made longer.
-const CHECKPOINT: &str = "checkpoint.safetensors";
-
-/// The one before.
-const CHECKPOINT_BEFORE: &str = "checkpoint.before.safetensors";
 
 /// The sign that the run is whole, and what it is of.
 pub(super) const DONE: &str = "done.json";
@@ -216,6 +211,7 @@ impl RunDirectory {
         config: &TrainConfig,
         step: u64,
     ) -> Result<Self> {
+        generations::keep_whole(path)?;
         let log_path = path.join(LOG);
         let text = std::fs::read_to_string(&log_path)
             .map_err(|error| Error::input(&log_path, format!("cannot be read ({error})")))?;
@@ -321,17 +317,14 @@ impl RunDirectory {
         self.seconds_before
     }
 
-    /// Writes what the run can go on from, behind a log that reaches as far, and the model as it is now. The checkpoint before
-    /// stays; while this is written it is the only one.
+    /// Writes what the run can go on from, behind a log that reaches as far, and the model as it is now. The checkpoint
+    /// before stays; while this is written it is the only one.
     ///
     /// # Errors
     /// The disk is full or gone, the device was lost, or a parameter is not finite.
     pub fn save_checkpoint(&mut self, trainer: &mut Trainer) -> Result<()> {
         self.log.flush().map_err(|error| unwritable(&self.path, &error))?;
-        let [newest, before] = [CHECKPOINT, CHECKPOINT_BEFORE].map(|file| self.path.join(file));
-        if newest.exists() {
-            std::fs::rename(&newest, before).map_err(|error| unwritable(&newest, &error))?;
-        }
+        let newest = generations::make_room(&self.path)?;
         trainer.save_checkpoint(&newest)?;
         self.save_trained(trainer)
     }
@@ -341,7 +334,7 @@ impl RunDirectory {
     /// # Errors
     /// The disk is full or gone, the device was lost, or a parameter is not finite.
     pub(super) fn save_trained(&mut self, trainer: &mut Trainer) -> Result<()> {
-        self.save_model(trainer, self.raw_colors)?;
+        self.save_model(trainer)?;
         if let Some(networks) = trainer.networks() {
             self.save_networks(networks)?;
         }
@@ -392,7 +385,7 @@ impl RunDirectory {
     ///
     /// # Errors
     /// The disk is full or gone, or a parameter is not finite.
-    pub fn save_model(&mut self, trainer: &Trainer, raw_colors: bool) -> Result<()> {
+    pub fn save_model(&mut self, trainer: &Trainer) -> Result<()> {
         self.flush_log()?;
         let (mut gaussians, frame) = (trainer.gaussians_in_frame()?, trainer.frame());
         trainer.refuse_not_finite(&gaussians)?;
@@ -400,7 +393,7 @@ impl RunDirectory {
         if *frame != Frame::WORLD {
             gaussians = gaussians.to_world(frame, origin);
         }
-        if raw_colors {
+        if self.raw_colors {
             gaussians.shift_colors(-0.5);
         }
         let [x, y, z] = origin.to_array();
@@ -457,7 +450,9 @@ pub fn other_views(run: &Path, dataset: &Dataset) -> Option<String> {
     });
     match (gone, new) {
         (None, None) => None,
-        (Some(gone), Some(new)) => Some(format!("{gone} views of the run are not in it, {new} are new")),
+        (Some(gone), Some(new)) => {
+            Some(format!("{gone} views of the run are not in it, {new} are new"))
+        }
         (Some(gone), None) => Some(format!("{gone} views of the run are not in it")),
         (None, Some(new)) => Some(format!("{new} views are new")),
     }
@@ -482,7 +477,7 @@ pub fn stopped_at(run: &Path) -> Option<u64> {
         return None;
     }
     // The header of a safetensors file, length first, is JSON with a note in which the checkpoint says what it is.
-    let mut file = File::open(checkpoint(run)?).ok()?;
+    let mut file = File::open(generations::newest(run)?).ok()?;
     let mut length = [0; 8];
     file.read_exact(&mut length).ok()?;
     let mut header = String::new();
@@ -490,24 +485,6 @@ pub fn stopped_at(run: &Path) -> Option<u64> {
     let header: serde_json::Value = serde_json::from_str(&header).ok()?;
     let note = header["__metadata__"]["checkpoint"].as_str()?;
     serde_json::from_str::<serde_json::Value>(note).ok()?["step"].as_u64()
-}
-
-/// The checkpoint that a run goes on from: the newest that is whole, else the newest, to say what is wrong with it; none
-/// where there is none.
-pub(super) fn checkpoint(run: &Path) -> Option<PathBuf> {
-    let [newest, before] = [CHECKPOINT, CHECKPOINT_BEFORE].map(|file| run.join(file));
-    let problem = match newest.is_file().then(|| check_checkpoint(&newest)) {
-        Some(Ok(())) => return Some(newest),
-        Some(Err(problem)) => Some(problem),
-        None => None,
-    };
-    if before.is_file() && check_checkpoint(&before).is_ok() {
-        if let Some(problem) = problem {
-            tracing::warn!("{problem}: the run goes on from the checkpoint before");
-        }
-        return Some(before);
-    }
-    [newest, before].into_iter().find(|path| path.is_file())
 }
 
 /// Whether a directory holds a run, be it of another version: a configuration with what every one has.

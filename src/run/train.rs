@@ -4,14 +4,14 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use super::directory::{Progress, SPENT, TARGET_EXPOSURE};
-use super::tensorboard::EventFile;
 use super::meter::{Meter, Spent};
-use super::{Event, Requests, RunDirectory, directory, done};
+use super::tensorboard::EventFile;
+use super::{Event, Requests, RunDirectory, directory, done, generations};
+use crate::attributes::{ATTRIBUTES, AttributeSpec};
 use crate::dataset::{Dataset, View};
 use crate::diagnose::Plan;
 use crate::eval::{self, ViewScore, Yardstick};
 use crate::gpu::Gpu;
-use crate::attributes::{ATTRIBUTES, AttributeSpec};
 use crate::train::{Learning, StepReport, TrainConfig, Trainer};
 use crate::{Error, Result, Stop};
 
@@ -147,8 +147,9 @@ fn begin(
     }
     let lock = RunDirectory::lock(out)?;
     let resumes = held == HeldRun::Resume;
-    let checkpoint = if resumes { directory::checkpoint(out) } else { None };
-    let mut config = with_tile_and_frame(gpu, config, dataset, checkpoint.is_some().then_some(out))?;
+    let checkpoint = if resumes { generations::newest(out) } else { None };
+    let mut config =
+        with_tile_and_frame(gpu, config, dataset, checkpoint.is_some().then_some(out))?;
     // A disk that has room for the run has it for photographs.
     config.spool.get_or_insert_with(|| out.to_owned());
     let config = &config;
@@ -353,7 +354,8 @@ impl Course<'_> {
                 ("channel-mean PSNR", mean.psnr_channel_mean),
                 ("SSIM", mean.ssim),
             ];
-            events.scalars(step, &values.map(|(name, value)| (format!("{group}/{name}"), value)))?;
+            events
+                .scalars(step, &values.map(|(name, value)| (format!("{group}/{name}"), value)))?;
         }
         let pictures = [("render", &first.render), (first.against.name(), &first.reference)];
         for (name, image) in pictures {

@@ -247,9 +247,12 @@ pub fn colors_from_views<I: Borrow<Image>>(
     for (index, view) in views.iter().enumerate().filter(|(_, view)| view.split == Split::Train) {
         let Some(target) = target(index)? else { continue };
         let target = target.borrow();
-        grey.add(mean_grey(target));
+        grey.add(mean_grey(&view.counted(target)));
         seen.par_iter_mut().zip(points).for_each(|([tracked, inside], point)| {
             let Some(pixel) = view.camera.sees(point.position) else { return };
+            if view.mask.as_ref().is_some_and(|mask| mask.hides_around(pixel)) {
+                return;
+            }
             let color = bilinear(target, pixel);
             inside.add(color);
             if point.views.contains(&(index as u32)) {
@@ -280,9 +283,9 @@ impl Mean {
     }
 }
 
-fn mean_grey(image: &Image) -> Vec3 {
-    let sum: f64 = image.data.iter().copied().map(f64::from).sum();
-    Vec3::splat((sum / image.data.len().max(1) as f64) as f32)
+fn mean_grey(values: &[f32]) -> Vec3 {
+    let sum: f64 = values.iter().copied().map(f64::from).sum();
+    Vec3::splat((sum / values.len().max(1) as f64) as f32)
 }
 
 /// The image's value at a place in pixels (pixel centres at +0.5), RGB; beyond the outermost centres the edge goes on.

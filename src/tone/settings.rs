@@ -400,9 +400,14 @@ impl TryFrom<Written> for ToneSettings {
         };
         if written.family.is_some() {
             static SAID: std::sync::Once = std::sync::Once::new();
-            SAID.call_once(|| tracing::warn!("`family` of a curve is called `curve` now; the old name is read"));
+            SAID.call_once(|| {
+                tracing::warn!("`family` of a curve is called `curve` now; the old name is read")
+            });
             if written.curve.is_some() {
-                return Err("it names its family twice, as `curve` and as `family`; leave `family` out".to_owned());
+                return Err(
+                    "it names its family twice, as `curve` and as `family`; leave `family` out"
+                        .to_owned(),
+                );
             }
         }
         let defaults = Self::new(written.curve.or(written.family).unwrap_or(given));

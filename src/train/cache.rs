@@ -33,9 +33,9 @@ impl std::str::FromStr for CacheSize {
         let plain = upper.trim_end_matches('B').trim_end_matches('I');
         let unit = UNITS.iter().find(|(letter, _)| plain.ends_with(*letter));
         let number = unit.map_or(plain, |(letter, _)| plain.trim_end_matches(*letter)).trim();
-        let bytes = number.parse::<f64>().map(|number| {
-            number * 2.0_f64.powi(unit.map_or(0, |(_, power)| *power).cast_signed())
-        });
+        let bytes = number
+            .parse::<f64>()
+            .map(|number| number * 2.0_f64.powi(unit.map_or(0, |(_, power)| *power).cast_signed()));
         // Positive phrasing: a NaN fails the test too.
         match bytes {
             Ok(bytes) if (0.0..1e18).contains(&bytes) => Ok(Self(bytes as u64)),
@@ -230,7 +230,8 @@ impl Kept {
         pass: &mut Recorder<'_>,
         scratch: &'a mut Buffer<f32>,
     ) -> Result<&'a Buffer<f32>> {
-        let absent = || Error::Usage("a photograph is trained on that is not on the device".to_owned());
+        let absent =
+            || Error::Usage("a photograph is trained on that is not on the device".to_owned());
         self.on_device.as_ref().ok_or_else(absent)?.decoded(pass, scratch)
     }
 
@@ -273,7 +274,8 @@ impl InFile {
                 (coded.codes.name(), words, palette, Some(Arc::clone(&coded.decoder)))
             }
         };
-        let offset = spool.append(&[bytemuck::cast_slice(&words), bytemuck::cast_slice(&palette)])?;
+        let offset =
+            spool.append(&[bytemuck::cast_slice(&words), bytemuck::cast_slice(&palette)])?;
         Ok(Self {
             spool: Arc::clone(spool),
             name: name.to_owned(),

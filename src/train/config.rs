@@ -60,6 +60,9 @@ pub struct TrainConfig {
     /// A folder of reference images by name, in place of what lies beside the input.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub reference: Option<PathBuf>,
+    /// Masks hide what is white, not what is black.
+    #[serde(skip_serializing_if = "is_off")]
+    pub invert_masks: bool,
     /// Steps; each renders one training view.
     pub steps: u64,
     /// Factor by which photographs shrink.
@@ -90,15 +93,15 @@ pub struct TrainConfig {
     pub eval_every: u64,
     /// Writes a checkpoint every so many steps; 0: never.
     pub checkpoint_every: u64,
-    /// Leaves event files for TensorBoard.
-    #[serde(skip_serializing_if = "std::ops::Not::not")]
-    pub tensorboard: bool,
     /// Writes one whenever the last is so many minutes old, too; 0: never.
     pub checkpoint_minutes: f64,
     /// Saves and stops after so many minutes, to go on another time; 0: trains to the end.
     pub max_minutes: f64,
     /// Logs a checksum of every plane of the parameters every so many steps; 0: never.
     pub hash_every: u64,
+    /// Leaves event files for TensorBoard.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub tensorboard: bool,
     /// Steps whose every pass is compared with its CPU reference.
     pub check: CheckConfig,
     /// The device: a part of its name or its index; empty: the best.
@@ -156,11 +159,17 @@ pub struct DensityConfig {
     pub min_opacity: f64,
 }
 
+/// What a configuration need not say.
+fn is_off(flag: &bool) -> bool {
+    !flag
+}
+
 impl Default for TrainConfig {
     fn default() -> Self {
         Self {
             dataset: PathBuf::new(),
             reference: None,
+            invert_masks: false,
             steps: 5000,
             downscale: 1.0,
             max_resolution: 1600,
@@ -174,10 +183,10 @@ impl Default for TrainConfig {
             background: Background::Black,
             eval_every: 0,
             checkpoint_every: 1000,
-            tensorboard: false,
             checkpoint_minutes: 10.0,
             max_minutes: 0.0,
             hash_every: 0,
+            tensorboard: false,
             check: CheckConfig::default(),
             device: String::new(),
             tile: None,
@@ -255,6 +264,7 @@ impl TrainConfig {
             test_every: self.test_every,
             keep: CacheSize::on_host(self.cache),
             reference: self.reference.clone(),
+            invert_masks: self.invert_masks,
             hold_out: self.stop.views,
             depth: DepthOptions {
                 load: self.model.depth,

@@ -208,7 +208,8 @@ impl Targets<'_> {
         };
         let scale = (-stops).exp2() as f32;
         let without = |&x: &f32| srgb_from_linear(scale * linear_from_srgb(x));
-        let neutral = Image { data: photograph.data.iter().map(without).collect(), ..*photograph.as_ref() };
+        let neutral =
+            Image { data: photograph.data.iter().map(without).collect(), ..*photograph.as_ref() };
         let affine = Affine::least_squares(&self.target(&neutral)?, &self.target(&photograph)?)?;
         // Of a photograph of one colour there is no more to say than that.
         let is_exposure = affine.gain.iter().all(|&gain| gain > 0.0);

@@ -9,8 +9,8 @@ use crate::camera::{Camera, Frame};
 use crate::dataset::{Dataset, Split, View};
 use crate::exposure::Exposures;
 use crate::gpu::Gpu;
-use crate::image::Image;
-use crate::metrics::psnr;
+use crate::image::{Image, Mask};
+use crate::metrics::psnr_of_counted;
 use crate::pseudo_gt::PseudoGt;
 use crate::tone::{Scene, ToneSettings};
 use crate::{Error, Result};
@@ -70,7 +70,15 @@ impl StopConfig {
 
 /// Cameras in the frame, and what they are to show.
 #[derive(Debug, Default)]
-pub(super) struct HeldOut(Vec<(Camera, Image)>);
+pub(super) struct HeldOut(Vec<Shown>);
+
+/// What a camera is to show, where it counts.
+#[derive(Debug)]
+struct Shown {
+    camera: Camera,
+    target: Image,
+    mask: Option<Mask>,
+}
 
 impl HeldOut {
     /// The held-out views of a dataset with their targets, made as those of its training views.
@@ -80,11 +88,13 @@ impl HeldOut {
         frame: &Frame,
         scene: &Scene,
     ) -> Result<Self> {
-        let held_out = dataset.views.iter().filter(|view| view.split == Split::HeldOut);
-        let targets =
-            held_out.map(|view| Ok((frame.camera(&view.camera), target(pseudo_gt, view, scene)?)));
-        let targets = targets.collect::<Result<Vec<_>>>()?;
-        Ok(Self(targets.into_iter().filter_map(|(camera, own)| Some((camera, own?))).collect()))
+        let mut views = vec![];
+        for view in dataset.views.iter().filter(|view| view.split == Split::HeldOut) {
+            let Some(target) = target(pseudo_gt, view, scene)? else { continue };
+            let (camera, mask) = (frame.camera(&view.camera), view.mask.clone());
+            views.push(Shown { camera, target, mask });
+        }
+        Ok(Self(views))
     }
 }
 
@@ -92,7 +102,7 @@ impl HeldOut {
 fn target(pseudo_gt: &mut PseudoGt, view: &View, scene: &Scene) -> Result<Option<Image>> {
     let settings = pseudo_gt.settings().clone();
     let Some(photograph) = lifted_from(view, settings.lift_first)? else { return Ok(None) };
-    let lift = settings.lift(scene, &pseudo_gt.measure(&photograph.data)?);
+    let lift = settings.lift(scene, &pseudo_gt.measure(&view.counted(&photograph))?);
     let target = pseudo_gt.lifted(&photograph, &lift)?;
     Ok(Some(target.resized(view.camera.width, view.camera.height)))
 }
@@ -139,16 +149,17 @@ impl Trainer {
         scores
     }
 
-    fn scores(&mut self, views: &[(Camera, Image)], sh_degree: u32) -> Result<[Option<f64>; 2]> {
+    fn scores(&mut self, views: &[Shown], sh_degree: u32) -> Result<[Option<f64>; 2]> {
         let mut sums = [0.0; 2];
-        for (camera, target) in views {
+        for Shown { camera, target, mask } in views {
             let shown = self.render_of_degree(camera, sh_degree)?;
             let clamped = |image: &Image| {
                 let data = image.data.iter().map(|value| value.clamp(0.0, 1.0)).collect();
                 Image { data, ..*image }
             };
-            sums[0] += psnr(&clamped(&shown.colors), target)?;
-            sums[1] += psnr(&clamped(shown.output()), target)?;
+            let psnr = |image: &Image| psnr_of_counted(&clamped(image), target, mask.as_ref());
+            sums[0] += psnr(&shown.colors)?;
+            sums[1] += psnr(shown.output())?;
         }
         Ok(sums.map(|sum| (!views.is_empty()).then(|| sum / views.len() as f64)))
     }
@@ -186,7 +197,7 @@ impl Trainer {
     }
 
     /// Training views, evenly spread, with their targets at the neutral exposure.
-    fn some_training_views(&self) -> Result<Vec<(Camera, Image)>> {
+    fn some_training_views(&self) -> Result<Vec<Shown>> {
         const MOST: usize = 8;
         let affines = self.exposures.as_ref().map(Exposures::affines).transpose()?;
         let views = self.views.whole();
@@ -195,7 +206,7 @@ impl Trainer {
             let target = view.image(&self.gpu, &*view.kept_target(&self.gpu)?)?;
             let exposure = affines.as_ref().and_then(|affines| affines.get(view.place));
             let neutral = exposure.map_or(target.clone(), |own| own.inverse().applied(&target));
-            some.push((view.camera, neutral));
+            some.push(Shown { camera: view.camera, target: neutral, mask: None });
         }
         Ok(some)
     }

@@ -8,6 +8,25 @@ use super::TrainConfig;
 use crate::hash::{self, Hasher};
 use crate::{Error, Result};
 
+/// The settings that no result depends on beyond its rounding: where the dataset lies, what is kept and logged and when,
+/// how long the run may take, and what it finds for itself.
+const FREE: [&str; 14] = [
+    "dataset",
+    "device",
+    "tile",
+    "frame.center",
+    "frame.scale",
+    "cache",
+    "tensorboard",
+    "eval_every",
+    "checkpoint_every",
+    "checkpoint_minutes",
+    "max_minutes",
+    "hash_every",
+    "check.every",
+    "check.stops",
+];
+
 impl TrainConfig {
     /// The configuration with each `KEY=VALUE` of `assignments` in turn, such as `tone.alpha=0.1`. A value is TOML, or
     /// else a string; nothing is checked but its type.
@@ -45,26 +64,7 @@ impl TrainConfig {
     /// is scored and saved, on which device and by which tiles. A lower limit of the Gaussians is no difference either: a
     /// run that outgrows its machine goes on with what it has.
     pub fn difference(&self, other: &Self) -> Option<String> {
-        const FREE: [&str; 18] = [
-            "cache",
-            "tensorboard",
-            "steps",
-            "dataset",
-            "reference",
-            "device",
-            "tile",
-            "frame.center",
-            "frame.scale",
-            "eval_every",
-            "checkpoint_every",
-            "checkpoint_minutes",
-            "max_minutes",
-            "hash_every",
-            "check.every",
-            "check.stops",
-            "stop.every",
-            "stop.gain",
-        ];
+        const ALSO: [&str; 4] = ["steps", "reference", "stop.every", "stop.gain"];
         let tables = [self, other].map(Table::try_from);
         let [own, others] = match &tables {
             [Ok(own), Ok(others)] => [own, others].map(|table| settings("", table)),
@@ -78,7 +78,8 @@ impl TrainConfig {
         let is_lower_limit =
             |key: &String| key == "max_gaussians" && other.max_gaussians <= self.max_gaussians;
         let keys = own.keys().chain(others.keys());
-        let mut keys = keys.filter(|key| !FREE.contains(&key.as_str()) && !is_lower_limit(key));
+        let is_free = |key: &str| FREE.contains(&key) || ALSO.contains(&key);
+        let mut keys = keys.filter(|key| !is_free(key) && !is_lower_limit(key));
         keys.find(|&key| own.get(key) != others.get(key))
             .map(|key| format!("{key} = {}, not {}", value(&own, key), value(&others, key)))
     }
@@ -89,22 +90,6 @@ impl TrainConfig {
     /// # Errors
     /// None for a configuration that [`TrainConfig::check`] accepts.
     pub fn checksum(&self) -> Result<String> {
-        const FREE: [&str; 14] = [
-            "cache",
-            "tensorboard",
-            "dataset",
-            "device",
-            "tile",
-            "frame.center",
-            "frame.scale",
-            "eval_every",
-            "checkpoint_every",
-            "checkpoint_minutes",
-            "max_minutes",
-            "hash_every",
-            "check.every",
-            "check.stops",
-        ];
         let own = self.clone().with_absolute_paths();
         let table = Table::try_from(own).map_err(|error| Error::Usage(error.to_string()))?;
         let mut hasher = Hasher::default();

@@ -105,9 +105,7 @@ impl Views {
         let mut views = vec![];
         views.resize_with(config.schedule.resolution_levels(), Vec::<TrainView>::new);
         let (count, mut gains) = (measured.len(), BTreeMap::new());
-        for (place, ((index, view), measured)) in
-            photographs(dataset).zip(&measured).enumerate()
-        {
+        for (place, ((index, view), measured)) in photographs(dataset).zip(&measured).enumerate() {
             let lift = settings.lift(&scene, measured);
             gains.extend(lift.gain.map(|gain| (view.name.clone(), gain)));
             let original = if settings.lift_first { view.photograph()? } else { None };
@@ -115,16 +113,15 @@ impl Views {
             let Some(image) = view.loaded()? else { continue };
             for (level, views) in views.iter_mut().enumerate() {
                 let size = shrunk(UVec2::new(image.width, image.height), level as u32);
-                let photograph = image.resized(size.x, size.y);
+                let photograph = view.blacked_out(image.resized(size.x, size.y));
                 let target = match &target {
-                    Some(target) => Some(target.resized(size.x, size.y)),
+                    Some(target) => Some(view.blacked_out(target.resized(size.x, size.y))),
                     None if settings.needs_baking() => Some(pseudo_gt.lifted(&photograph, &lift)?),
                     None => None,
                 };
                 let is_baked = target.is_some();
                 let mut upload = |name, data| cache.keep(darkroom.upload(name, data)?);
-                let kept =
-                    (is_baked && keeps_photographs).then(|| upload("low", &photograph.data));
+                let kept = (is_baked && keeps_photographs).then(|| upload("low", &photograph.data));
                 let name = if is_baked { "target" } else { "low" };
                 let input = upload(name, &target.as_ref().unwrap_or(&photograph).data)?;
                 let none = ToneSettings::new(ToneCurve::None).parameters(&Statistics::default());
@@ -229,6 +226,13 @@ impl Views {
         &views[order[place as usize]]
     }
 
+    /// The views of all levels, by number.
+    pub(super) fn all(&self) -> Vec<&TrainView> {
+        let mut views: Vec<&TrainView> = self.levels.iter().flatten().collect();
+        views.sort_by_key(|view| view.number);
+        views
+    }
+
     /// The views, unshrunk.
     pub(super) fn whole(&self) -> &[TrainView] {
         self.levels.first().map_or(&[], Vec::as_slice)
@@ -295,13 +299,12 @@ impl Views {
         };
         let kept = &points[..points.len().min(config.max_gaussians)];
         let columns = width(config.render_settings().shape);
-        let bindable = gpu.properties().max_storage_buffer_range / (columns * size_of::<f32>()) as u64;
+        let bindable =
+            gpu.properties().max_storage_buffer_range / (columns * size_of::<f32>()) as u64;
         let fitting = usize::try_from(bindable).unwrap_or(usize::MAX);
         if kept.len() > fitting {
             let (of, device) = (kept.len(), &gpu.properties().name);
-            tracing::warn!(
-                "{fitting} of {of} points begin as Gaussians: {device} binds no more"
-            );
+            tracing::warn!("{fitting} of {of} points begin as Gaussians: {device} binds no more");
         }
         let kept = &kept[..kept.len().min(fitting)];
         let colors = init::colors_from_views(kept, &dataset.views, |index| {
@@ -371,7 +374,7 @@ pub(super) fn measured(
     let mut measured = vec![];
     for (_, view) in photographs(dataset) {
         let Some(photograph) = lifted_from(view, lift_first)? else { continue };
-        measured.push(pseudo_gt.measure(&photograph.data)?);
+        measured.push(pseudo_gt.measure(&view.counted(&photograph))?);
     }
     let scene = pseudo_gt.settings().scene(&measured).ok_or_else(|| all_black(&dataset.root))?;
     Ok((scene, measured))

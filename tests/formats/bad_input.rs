@@ -131,7 +131,7 @@ fn two_views_of_one_name_are_refused() {
 
     let folder = tempfile::tempdir().unwrap();
     let mut model = model(9);
-    model.images[3].3 = "again/v00.png".into();
+    model.images[3].3 = "v00.png".into();
     colmap(folder.path(), &model);
     refused(folder.path(), &["two views are named v00"]);
 }
@@ -139,7 +139,7 @@ fn two_views_of_one_name_are_refused() {
 #[test]
 fn an_unsupported_camera_model_is_named() {
     for (model_name, number, parameters) in
-        [("OPENCV_FISHEYE", 5, 8), ("FOV", 7, 5), ("FULL_OPENCV", 6, 12)]
+        [("FOV", 7, 5), ("THIN_PRISM_FISHEYE", 10, 12), ("RAD_TAN_THIN_PRISM_FISHEYE", 11, 16)]
     {
         let folder = tempfile::tempdir().unwrap();
         let cameras = vec![(3, model_name, number, vec![20.0; parameters])];
@@ -154,15 +154,19 @@ fn an_unsupported_camera_model_is_named() {
     colmap(folder.path(), &Model { cameras: vec![(3, "?", 99, vec![20.0; 4])], ..model(9) });
     refused(folder.path(), &["cameras.bin", "unknown model 99"]);
 
-    let fisheye = [
-        ("camera_model", json!("OPENCV_FISHEYE")),
-        ("is_fisheye", json!(true)),
-        ("k3", json!(0.1)),
+    let unsupported = [
+        json!({"camera_model": "FOV"}),
+        json!({"is_fisheye": true, "p1": 0.1}),
+        json!({"k4": 0.1}),
     ];
-    for (key, value) in fisheye {
+    for settings in unsupported {
         let folder = tempfile::tempdir().unwrap();
         single(folder.path(), 3);
-        edit_json(&folder.path().join("transforms.json"), |json| json[key] = value);
+        edit_json(&folder.path().join("transforms.json"), |json| {
+            for (key, value) in settings.as_object().unwrap() {
+                json[key] = value.clone();
+            }
+        });
         refused(folder.path(), &["transforms.json", "not supported", "image_undistorter"]);
     }
 }

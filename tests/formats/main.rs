@@ -2,9 +2,13 @@
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
+mod as_it_is;
 mod bad_input;
 #[path = "../common/mod.rs"]
 mod common;
+mod photographs;
+#[cfg(feature = "cli")]
+mod pose;
 mod real;
 mod synthetic;
 

@@ -47,6 +47,7 @@ impl Scene {
             image: Some(self.low.clone()),
             original: None,
             reference: None,
+            mask: None,
             depth: Some(depth.collect()),
         };
         let point = |mean: &Vec3| Point { position: mean.as_dvec3(), views: vec![0] };
@@ -80,9 +81,7 @@ fn config(curve: ToneCurve) -> TrainConfig {
     let mut config = TrainConfig { tone: ToneSettings::new(curve), ..TrainConfig::default() };
     config.schedule.sh_degree_interval = 1;
     config.schedule.boost = 1.0;
-    // As far as TOML counts.
-    config.schedule.densify_after = i64::MAX.cast_unsigned();
-    config.schedule.resolution_steps = [0, 0];
+theirs    config.schedule.resolution_steps = [0, 0];
     config
 }
 

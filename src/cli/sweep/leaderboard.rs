@@ -210,7 +210,8 @@ impl Leaderboard {
         }
         if self.scores.is_empty() {
             notes.push(
-                "No test view has a reference image or a photograph, so there is nothing to rank.".to_owned(),
+                "No test view has a reference image or a photograph, so there is nothing to rank."
+                    .to_owned(),
             );
         }
         if self.rows.iter().any(Row::knows_references) {

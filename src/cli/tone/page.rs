@@ -32,7 +32,12 @@ pub(super) struct Page {
 impl Page {
     pub(super) fn new(gpu: &Gpu, args: &ToneArgs, photographs: &[Listed]) -> Result<Self> {
         let compared = args.compare.iter().map(|curve| {
-            let set = CurveOnSet::new(gpu, settings(args, curve)?, photographs, &args.input)?;
+            let set = CurveOnSet::new(
+                gpu,
+                settings(args, curve)?,
+                photographs,
+                (&args.input, args.invert_masks),
+            )?;
             Ok((set, Distribution::new(curve.to_string())))
         });
         let curve = match &args.profile {

@@ -1,12 +1,13 @@
 //! Which photographs `tone` reads, and where each goes.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use super::{ToneArgs, is_same_file};
 use crate::cli::ImageFormat;
 use crate::dataset::{Dataset, LoadOptions, Photograph, Split};
-use crate::image::files::photographs_in;
+use crate::image::files::{photographs_in, unread_in};
+use crate::image::{Image, Mask, Orientation};
 use crate::{Error, Result};
 
 /// A photograph to map.
@@ -17,8 +18,39 @@ pub(super) struct Listed {
     pub(super) reference: Option<PathBuf>,
     /// Of a dataset's view.
     pub(super) split: Option<Split>,
+    /// Its mask.
+    pub(super) mask: Option<PathBuf>,
     /// The file to write.
     pub(super) target: Option<PathBuf>,
+}
+
+impl Listed {
+    /// Its pixels that do not count: gaps, and what alpha or mask hides.
+    pub(super) fn hidden(&self, gaps: Vec<usize>, inverted: bool) -> Result<Vec<usize>> {
+        let Some(mask) = Mask::load(&self.input, self.mask.as_deref(), inverted)? else {
+            return Ok(gaps);
+        };
+        let all: BTreeSet<usize> = gaps.into_iter().chain(mask.hidden()).collect();
+        Ok(all.into_iter().collect())
+    }
+
+    /// Turned upright, as its pixels that are no numbers are, unless cameras may say how it is stored.
+    pub(super) fn turned(&self, image: Image, gaps: Vec<usize>) -> (Image, Vec<usize>) {
+        let orientation = match self.split {
+            None => Orientation::of(&self.input),
+            Some(_) => Orientation::UPRIGHT,
+        };
+        let is_gap = |value: &f32| *value > 0.0;
+        let gaps = if gaps.is_empty() || orientation == Orientation::UPRIGHT {
+            gaps
+        } else {
+            let mut marked = Image::filled(image.width, image.height, [0.0; 3]);
+            gaps.iter().for_each(|&gap| marked.data[gap] = 1.0);
+            let marked = marked.turned(orientation).data;
+            (0..image.pixel_count()).filter(|&pixel| is_gap(&marked[pixel])).collect()
+        };
+        (image.turned(orientation), gaps)
+    }
 }
 
 /// The photographs of the input: itself, those of a folder by name, or a dataset's.
@@ -31,20 +63,24 @@ pub(super) fn listed(args: &ToneArgs) -> Result<Vec<Listed>> {
         vec![plain(input, args.reference.as_deref())?]
     } else if Dataset::is_at(input) {
         let options = LoadOptions { reference: args.reference.clone(), ..LoadOptions::default() };
-        let of_view = |Photograph { name, split, input, reference }| Listed {
+        let of_view = |Photograph { name, split, input, reference, mask }| Listed {
             name,
             input,
             reference,
+            mask,
             split: Some(split),
             target: None,
         };
         Dataset::photographs(input, &options)?.into_iter().map(of_view).collect()
     } else {
         let files = photographs_in(input)?;
+        if let Some(line) = unread_in(input) {
+            tracing::warn!("{line}");
+        }
         files.iter().map(|file| plain(file, args.reference.as_deref())).collect::<Result<_>>()?
     };
     if photographs.is_empty() {
-        return Err(Error::input(input, "holds no PNG, JPEG or EXR image"));
+        return Err(Error::input(input, "holds no PNG, JPEG, WebP, TIFF or EXR image"));
     }
     if let Some(out) = &args.out {
         set_targets(&mut photographs, out, args.format)?;
@@ -64,7 +100,11 @@ fn plain(input: &Path, reference: Option<&Path>) -> Result<Listed> {
         None => None,
     };
     let name = stem.to_string_lossy().into_owned();
-    Ok(Listed { name, input: input.to_owned(), reference, split: None, target: None })
+    let masks = input.with_file_name("masks");
+    let file = input.file_name().unwrap_or_default().to_string_lossy();
+    let candidates = [format!("{name}.png"), format!("{file}.png")].map(|mask| masks.join(mask));
+    let mask = candidates.into_iter().find(|mask| mask.is_file());
+    Ok(Listed { name, input: input.to_owned(), reference, split: None, mask, target: None })
 }
 
 /// The file that each is written to, all different and none of them a photograph.

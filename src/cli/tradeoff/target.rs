@@ -70,6 +70,7 @@ pub(super) fn write_pseudo_gt(
     folder: &Path,
 ) -> Result<()> {
     let args = ToneArgs {
+        invert_masks: false,
         profile: None,
         input: dataset.to_owned(),
         curve: settings.curve.into(),

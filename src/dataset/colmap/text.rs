@@ -6,12 +6,13 @@ use std::str::FromStr;
 
 use glam::DVec3;
 
+use super::super::text_file::read_text;
 use super::{ModelImage, ModelPoint, lens, pose};
 use crate::camera::Lens;
 use crate::{Error, Result};
 
 pub(super) fn cameras(path: &Path) -> Result<BTreeMap<u32, Lens>> {
-    let text = text(path)?;
+    let text = read_text(path)?;
     let camera = |(number, line)| {
         let mut fields = Fields::new(path, number, line);
         let (id, model): (u32, String) = (fields.next("camera id")?, fields.next("model")?);
@@ -24,7 +25,7 @@ pub(super) fn cameras(path: &Path) -> Result<BTreeMap<u32, Lens>> {
 }
 
 pub(super) fn images(path: &Path) -> Result<Vec<ModelImage>> {
-    let text = text(path)?;
+    let text = read_text(path)?;
     let mut lines = lines(&text);
     let mut images = Vec::new();
     while let Some((number, line)) = lines.next() {
@@ -56,7 +57,7 @@ pub(super) fn images(path: &Path) -> Result<Vec<ModelImage>> {
 }
 
 pub(super) fn points(path: &Path) -> Result<BTreeMap<u64, ModelPoint>> {
-    let text = text(path)?;
+    let text = read_text(path)?;
     let point = |(number, line)| {
         let mut fields = Fields::new(path, number, line);
         let id: u64 = fields.next("point id")?;
@@ -70,11 +71,6 @@ pub(super) fn points(path: &Path) -> Result<BTreeMap<u64, ModelPoint>> {
         Ok((id, ModelPoint { position, images: track.into_iter().step_by(2).collect() }))
     };
     records(&text).map(point).collect()
-}
-
-fn text(path: &Path) -> Result<String> {
-    std::fs::read_to_string(path)
-        .map_err(|error| Error::input(path, format!("cannot be read: {error}")))
 }
 
 /// Numbered from 1, without comments, trimmed.

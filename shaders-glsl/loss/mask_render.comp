@@ -1,0 +1,31 @@
+#version 460
+#extension GL_GOOGLE_include_directive : require
+#include "kernel.glsl"
+#include "tone.glsl"
+
+//! Mask: what the loss sees of a render, w a + (1 - w) b with the weights w of the pixels, a the render and b the pseudo-GT,
+//! one thread per value.
+//!
+//! A pixel that is hidden equals its target. `mask_gradient` goes back. Reference: `src/reference/mask_render.rs`.
+
+layout(local_size_x = 256) in;
+
+layout(push_constant) uniform Params {
+    uint value_count;  // 3HW
+    uint pixel_count;  // HW
+};
+
+layout(binding = 0) readonly  buffer Weights { float weights[]; };        // (H, W), within 0 and 1
+layout(binding = 1) readonly  buffer Render  { float render[]; };         // (3, H, W) and more, not clamped
+layout(binding = 2) readonly  buffer Low     { float low[]; };            // (3, H, W), sRGB-encoded
+layout(binding = 3) readonly  buffer Tone    { ToneParameters tone[]; };  // (1,)
+layout(binding = 4) writeonly buffer Shown   { float shown[]; };          // (3, H, W)
+
+void main() {
+    uint i = THREAD_INDEX;
+    if (i >= value_count) return;
+    float weight = weights[i % pixel_count];
+    float a = render[i];
+    // What counts in full stays as it is, to the bit.
+    shown[i] = weight < 1.0 ? weight * a + (1.0 - weight) * tone_curve(low[i], tone[0]) : a;
+}

@@ -1,0 +1,95 @@
+//! The frames of a clip that are worth a camera: of each window of time the sharpest.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use rayon::prelude::*;
+
+use super::create;
+use super::tool::Tool;
+use crate::image::Image;
+use crate::image::files::photographs_in;
+use crate::{Error, Result};
+
+/// Frames of a window, of which one stays.
+const CANDIDATES: usize = 4;
+
+/// Takes `fps` frames a second of a clip, as PNG files in `folder`.
+///
+/// # Errors
+/// [`Error::Input`] where ffmpeg fails or the clip has no picture.
+pub(super) fn frames(
+    ffmpeg: &Tool<'_>,
+    clip: &Path,
+    fps: f64,
+    folder: &Path,
+) -> Result<Vec<PathBuf>> {
+    create(folder)?;
+    let filter = format!("fps={}", fps * CANDIDATES as f64);
+    let pattern = folder.join("frame_%06d.png");
+    ffmpeg.run(
+        "",
+        &[
+            "-hide_banner".as_ref(),
+            "-nostdin".as_ref(),
+            "-i".as_ref(),
+            clip.as_os_str(),
+            "-vf".as_ref(),
+            filter.as_ref(),
+            pattern.as_os_str(),
+        ],
+    )?;
+    let frames = photographs_in(folder)?;
+    if frames.is_empty() {
+        return Err(Error::input(clip, "holds no frame that ffmpeg can decode"));
+    }
+    let sharpness = frames.par_iter().map(|frame| Ok(sharpness(&Image::load(frame)?)));
+    let sharpness = sharpness.collect::<Result<Vec<f64>>>()?;
+    let mut kept = vec![];
+    for (window, sharpness) in frames.chunks(CANDIDATES).zip(sharpness.chunks(CANDIDATES)) {
+        let place = (0..window.len()).rev().max_by(|&a, &b| sharpness[a].total_cmp(&sharpness[b]));
+        for (at, frame) in window.iter().enumerate() {
+            if place == Some(at) {
+                kept.push(frame.clone());
+            } else {
+                fs::remove_file(frame)
+                    .map_err(|error| Error::output(frame, format!("cannot be removed: {error}")))?;
+            }
+        }
+    }
+    Ok(kept)
+}
+
+/// How much detail a frame has for its brightness: the mean absolute second difference over the mean. Of frames of
+/// one moment, noise is alike and motion is not.
+fn sharpness(frame: &Image) -> f64 {
+    let (width, pixels) = (frame.width as usize, frame.pixel_count());
+    let plane = &frame.data[pixels..2 * pixels];
+    let (mut detail, mut light) = (0.0, f64::EPSILON);
+    for row in plane.chunks_exact(width) {
+        for near in row.windows(5) {
+            // Two pixels apart: neighbours differ by noise and by what the codec makes of it.
+            detail += f64::from((2.0 * near[2] - near[0] - near[4]).abs());
+            light += f64::from(near[2]);
+        }
+    }
+    detail / light
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_frame_that_moved_is_less_sharp_than_one_that_did_not() {
+        let frame = |reach: i32| {
+            let value = |x: i32, y: u32| 0.05 + 0.04 * f32::from((x / 5 + y as i32 / 5) % 2 == 0);
+            Image::from_fn(60, 40, |x, y| {
+                let sum: f32 = (-reach..=reach).map(|by| value(x as i32 + by + 20, y)).sum();
+                [sum / (2 * reach + 1) as f32; 3]
+            })
+        };
+        assert!(sharpness(&frame(0)) > 1.2 * sharpness(&frame(1)));
+        assert!(sharpness(&frame(1)) > 1.2 * sharpness(&frame(4)));
+    }
+}

@@ -1,0 +1,169 @@
+//! Which pixels of a photograph count: those that its alpha channel and its mask show.
+
+use std::borrow::Cow;
+#[cfg(feature = "io")]
+use std::path::Path;
+
+use super::Image;
+#[cfg(feature = "io")]
+use super::Orientation;
+#[cfg(feature = "io")]
+use crate::{Error, Result};
+
+/// A weight for every pixel of an image: 1 where it counts, 0 where it is hidden. A pixel that shows something hidden, be it
+/// in part, is hidden.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Mask {
+    /// Pixels per row.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+    /// `(height, width)`, not all 1.
+    pub weights: Vec<f32>,
+}
+
+impl Mask {
+    /// The weights of an image's first plane; none where every pixel counts.
+    #[cfg(any(feature = "io", test))]
+    pub(crate) fn of_plane(image: &Image) -> Option<Self> {
+        let weights: Vec<f32> = image.data[..image.pixel_count()].iter().map(whole).collect();
+        let Image { width, height, .. } = *image;
+        weights.iter().any(|&weight| weight < 1.0).then_some(Self { width, height, weights })
+    }
+
+    /// The same as an image, whose planes are alike.
+    pub(crate) fn to_image(&self) -> Image {
+        Image { width: self.width, height: self.height, data: self.weights.repeat(3) }
+    }
+
+    /// What hides pixels of a photograph, as it is stored: its own alpha, and the file of a mask, which hides what is black, or
+    /// where it is inverted what is white. None where nothing does.
+    ///
+    /// # Errors
+    /// [`Error::Input`] names a file that cannot be read, or a mask of another shape than its photograph.
+    #[cfg(feature = "io")]
+    pub fn load(photograph: &Path, file: Option<&Path>, inverted: bool) -> Result<Option<Self>> {
+        let alpha = Image::load_alpha(photograph)?;
+        let Some(file) = file else { return Ok(alpha.as_ref().and_then(Self::of_plane)) };
+        let mut mask = Image::load(file)?;
+        let size = Image::size_of(photograph)?;
+        let (own, upright) = ((mask.width, mask.height), Orientation::of(photograph).size(size));
+        let is_of_shape = |(width, height): (u32, u32)| {
+            let [a, b] = [own.0 * height, own.1 * width].map(f64::from);
+            (a - b).abs() <= f64::from(width.max(height).max(own.0).max(own.1))
+        };
+        if !is_of_shape(size) {
+            let ((w, h), (width, height)) = (own, size);
+            let problem = if upright != size && is_of_shape(upright) {
+                format!(
+                    "is {w}x{h}, its photograph {width}x{height} as stored; save the mask as the photograph is stored"
+                )
+            } else {
+                format!(
+                    "is {w}x{h}, its photograph {width}x{height}; a mask is of its photograph's shape"
+                )
+            };
+            return Err(Error::input(file, problem));
+        }
+        mask = mask.resized(size.0, size.1);
+        let pixels = mask.pixel_count();
+        for pixel in 0..pixels {
+            let shown = (mask.data[pixel] >= 0.5) != inverted;
+            let alpha = alpha.as_ref().map_or(1.0, |alpha| alpha.data[pixel]);
+            mask.data[pixel] = if shown { alpha } else { 0.0 };
+        }
+        Ok(Self::of_plane(&mask))
+    }
+
+    /// The mask that hides some pixels of an image; none of none.
+    pub fn hiding(image: &Image, pixels: &[usize]) -> Option<Self> {
+        let mut weights = vec![1.0; image.pixel_count()];
+        pixels.iter().for_each(|&pixel| weights[pixel] = 0.0);
+        let Image { width, height, .. } = *image;
+        (!pixels.is_empty()).then_some(Self { width, height, weights })
+    }
+
+    /// The mask of an image of another size.
+    pub fn resized(&self, width: u32, height: u32) -> Cow<'_, Self> {
+        if (width, height) == (self.width, self.height) {
+            return Cow::Borrowed(self);
+        }
+        let Image { width, height, mut data } = self.to_image().resized(width, height);
+        data.truncate(width as usize * height as usize);
+        Cow::Owned(Self { width, height, weights: data.iter().map(whole).collect() })
+    }
+
+    /// Whether no pixel counts.
+    pub fn hides_all(&self) -> bool {
+        self.hidden().len() == self.weights.len()
+    }
+
+    /// The pixels that do not count: indices into a plane, ascending.
+    pub fn hidden(&self) -> Vec<usize> {
+        let hides = |&(_, &weight): &(usize, &f32)| weight < 0.5;
+        self.weights.iter().enumerate().filter(hides).map(|(pixel, _)| pixel).collect()
+    }
+
+    /// An image whose hidden pixels are black: of what they showed nothing is left, not even where windows reach.
+    pub fn blacked_out(&self, mut image: Image) -> Image {
+        let pixels = image.pixel_count();
+        for pixel in self.resized(image.width, image.height).hidden() {
+            (0..3).for_each(|plane| image.data[plane * pixels + pixel] = 0.0);
+        }
+        image
+    }
+
+    /// Whether one of the four pixels around a place, in pixels, is hidden in part.
+    pub fn hides_around(&self, place: glam::DVec2) -> bool {
+        let [column, row] = (place - 0.5).floor().to_array();
+        let at = |value: f64, side: u32| (value.max(0.0) as u32).min(side - 1) as usize;
+        [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)].into_iter().any(|(x, y)| {
+            let (x, y) = (at(column + x, self.width), at(row + y, self.height));
+            self.weights[y * self.width as usize + x] < 1.0
+        })
+    }
+
+    /// The planes of an image without the pixels that do not count.
+    pub fn counted(&self, image: &Image) -> Vec<f32> {
+        let own = self.resized(image.width, image.height);
+        let pixels = image.pixel_count().max(1);
+        let values = image.data.iter().enumerate();
+        values.filter(|(at, _)| own.weights[at % pixels] >= 0.5).map(|(_, &value)| value).collect()
+    }
+}
+
+/// The weight of what counts to this part; interpolation rounds.
+fn whole(part: &f32) -> f32 {
+    f32::from(*part > 0.999)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn half() -> Mask {
+        let weights = (0..12).map(|pixel| f32::from(pixel % 4 < 2)).collect();
+        Mask { width: 4, height: 3, weights }
+    }
+
+    #[test]
+    fn hidden_pixels_are_not_counted_at_any_size() {
+        let image = Image::from_fn(4, 3, |x, y| [x as f32, y as f32, 9.0]);
+        let counted = half().counted(&image);
+        assert_eq!(counted[..6], [0.0, 1.0, 0.0, 1.0, 0.0, 1.0]);
+        assert_eq!(counted.len(), 18);
+        assert_eq!(half().hidden(), [2, 3, 6, 7, 10, 11]);
+        let large = Image::from_fn(8, 6, |x, _| [x as f32; 3]);
+        assert!(half().counted(&large).iter().all(|&value| value < 4.0));
+        assert_eq!(half().resized(2, 3).weights, [1.0, 0.0, 1.0, 0.0, 1.0, 0.0]);
+        assert!(!half().hides_all());
+        let hides = |x: f64| half().hides_around(glam::DVec2::new(x, 1.5));
+        assert_eq!([0.0, 1.4, 1.6, 3.9].map(hides), [false, false, true, true]);
+    }
+
+    #[test]
+    fn an_image_that_hides_nothing_has_no_mask() {
+        assert_eq!(Mask::of_plane(&Image::filled(3, 2, [1.0; 3])), None);
+        assert_eq!(Mask::of_plane(&half().to_image()), Some(half()));
+    }
+}

@@ -1,0 +1,118 @@
+//! How a photograph is turned: cameras store what the sensor saw, and say in Exif which way is up.
+
+use std::fs::File;
+use std::io::BufReader;
+use std::path::Path;
+
+use ::exif::{In, Reader, Tag};
+use rayon::prelude::*;
+
+use super::Image;
+use crate::Result;
+
+/// The orientation of Exif, 1 to 8: where the first row and column of what is stored lie in what is seen.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Orientation(u8);
+
+impl Orientation {
+    /// As it is stored.
+    pub const UPRIGHT: Self = Self(1);
+
+    /// What a file says; upright where it says nothing.
+    pub fn of(path: &Path) -> Self {
+        let said = || {
+            let file = File::open(path).ok()?;
+            let exif = Reader::new().read_from_container(&mut BufReader::new(file)).ok()?;
+            let value = exif.get_field(Tag::Orientation, In::PRIMARY)?.value.get_uint(0)?;
+            u8::try_from(value).ok().filter(|value| (1..=8).contains(value))
+        };
+        said().map_or(Self::UPRIGHT, Self)
+    }
+
+    /// Width and height behind turning.
+    pub fn size(self, (width, height): (u32, u32)) -> (u32, u32) {
+        if self.0 >= 5 { (height, width) } else { (width, height) }
+    }
+
+    /// Column and row of what is stored that lie at `x` and `y` of what is seen; `width` and `height` are the stored.
+    fn stored(self, (x, y): (usize, usize), (width, height): (usize, usize)) -> (usize, usize) {
+        match self.0 {
+            2 => (width - 1 - x, y),
+            3 => (width - 1 - x, height - 1 - y),
+            4 => (x, height - 1 - y),
+            5 => (y, x),
+            6 => (y, height - 1 - x),
+            7 => (width - 1 - y, height - 1 - x),
+            8 => (width - 1 - y, x),
+            _ => (x, y),
+        }
+    }
+}
+
+impl Image {
+    /// As [`Image::load`], turned upright as the file's Exif says.
+    ///
+    /// # Errors
+    /// As there.
+    pub fn load_upright(path: impl AsRef<Path>) -> Result<Self> {
+        let path = path.as_ref();
+        Ok(Self::load(path)?.turned(Orientation::of(path)))
+    }
+
+    /// The image as it is seen.
+    pub fn turned(self, orientation: Orientation) -> Self {
+        if orientation == Orientation::UPRIGHT {
+            return self;
+        }
+        let (width, height) = orientation.size((self.width, self.height));
+        let size = (self.width as usize, self.height as usize);
+        let pixels = self.pixel_count();
+        let value = |index: usize| {
+            let (plane, pixel) = (index / pixels, index % pixels);
+            let at = (pixel % width as usize, pixel / width as usize);
+            let (column, row) = orientation.stored(at, size);
+            self.data[plane * pixels + row * size.0 + column]
+        };
+        let data = (0..3 * pixels).into_par_iter().map(value).collect();
+        Self { width, height, data }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A letter F, as people hold it up: bright where it is inked.
+    const UPRIGHT: [&str; 4] = ["###", "#..", "##.", "#.."];
+    /// As a camera that is held in each of the eight ways stores it (Exif 2.32, 4.6.4, Orientation).
+    const STORED: [&[&str]; 8] = [
+        &["###", "#..", "##.", "#.."],
+        &["###", "..#", ".##", "..#"],
+        &["..#", ".##", "..#", "###"],
+        &["#..", "##.", "#..", "###"],
+        &["####", "#.#.", "#..."],
+        &["#...", "#.#.", "####"],
+        &["...#", ".#.#", "####"],
+        &["####", ".#.#", "...#"],
+    ];
+
+    fn drawn(rows: &[&str]) -> Image {
+        let ink = |x: u32, y: u32| f32::from(rows[y as usize].as_bytes()[x as usize] == b'#');
+        Image::from_fn(rows[0].len() as u32, rows.len() as u32, |x, y| {
+            [ink(x, y), 0.5 * ink(x, y), x as f32]
+        })
+    }
+
+    #[test]
+    fn every_orientation_is_turned_upright() {
+        let upright = drawn(&UPRIGHT);
+        for (index, rows) in STORED.iter().enumerate() {
+            let orientation = Orientation(index as u8 + 1);
+            let stored = drawn(rows);
+            assert_eq!(orientation.size((stored.width, stored.height)), (3, 4));
+            let turned = stored.turned(orientation);
+            assert_eq!((turned.width, turned.height), (3, 4), "{orientation:?}");
+            assert_eq!(turned.data[..24], upright.data[..24], "{orientation:?}");
+        }
+    }
+}
