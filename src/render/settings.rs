@@ -64,7 +64,11 @@ impl RenderSettings {
     ///
     /// # Errors
     /// As there.
-    pub fn tile_for(&self, gpu: &Gpu, sizes: impl Iterator<Item = [u32; 2]> + Clone) -> Result<[u32; 2]> {
+    pub fn tile_for(
+        &self,
+        gpu: &Gpu,
+        sizes: impl Iterator<Item = [u32; 2]> + Clone,
+    ) -> Result<[u32; 2]> {
         let mut tile = self.tile_on(gpu)?;
         let count = |[width, height]: [u32; 2], tile: [u32; 2]| {
             width.div_ceil(tile[0]) as usize * height.div_ceil(tile[1]) as usize
