@@ -2,9 +2,14 @@
 //!
 //! Axes are those of `OpenCV` (x right, y down, z forward); pixel units, the image's corner at (0, 0), pixel centres at +0.5.
 
+pub mod frame;
+mod path;
+
 use glam::{DAffine3, DVec2, DVec3, UVec2};
 
 use crate::kernels;
+pub use frame::Frame;
+pub use path::CameraPath;
 
 /// An undistorted pinhole camera with its pose.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -32,6 +37,13 @@ impl Camera {
         let in_view = self.view_from_world.transform_point3(point);
         (in_view.z > 0.0)
             .then(|| self.focal * in_view.truncate() / in_view.z + self.principal_point)
+    }
+
+    /// As [`Camera::project`], inside the image alone.
+    pub fn sees(&self, point: DVec3) -> Option<DVec2> {
+        let size = DVec2::new(self.width.into(), self.height.into());
+        self.project(point)
+            .filter(|pixel| pixel.cmpge(DVec2::ZERO).all() && pixel.cmplt(size).all())
     }
 
     /// The same camera over an image of another size.

@@ -25,6 +25,7 @@ pub mod fit;
 pub mod pose;
 pub mod progress;
 pub mod render;
+mod signals;
 pub mod sweep;
 pub mod synth;
 mod table;
@@ -105,7 +106,7 @@ impl Cli {
             Command::Eval(args) => eval::run(&args),
             Command::Render(args) => render::run(&args),
             Command::Tone(args) => Ok(tone::run(&args)?),
-            Command::Curves(args) => Ok(curves::run(&args)?),
+            Command::Curves(args) => curves::run(&args),
             #[cfg(feature = "fit")]
             Command::Fit(args) => Ok(fit::run(&args)?),
             #[cfg(not(feature = "fit"))]
@@ -133,6 +134,7 @@ pub fn in_options(message: &str) -> String {
         let long = match quoted.rsplit_once("::")?.1 {
             "gain_c" => "gain".to_owned(),
             "Replace" => "overwrite".to_owned(),
+            "Resume" => "resume".to_owned(),
             "Name" => "device".to_owned(),
             field => field.replace('_', "-"),
         };

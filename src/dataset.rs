@@ -5,6 +5,7 @@
 //! same name is a test view's reference image (`View::reference`), used for scores only and loaded for test views only.
 
 mod colmap;
+mod fingerprint;
 mod masks;
 mod names;
 mod options;
@@ -22,10 +23,11 @@ use std::path::{Path, PathBuf};
 
 use glam::{DAffine3, DVec3};
 
-use crate::camera::{Camera, Lens};
+use crate::camera::{Camera, Frame, Lens, frame};
 use crate::image::files::{self, Files};
 use crate::image::{Image, Mask};
 use crate::{Error, Result};
+pub use fingerprint::Fingerprint;
 pub use options::{DepthOptions, LoadOptions};
 pub use pixels::Original;
 use pixels::Source;
@@ -55,9 +57,10 @@ pub struct View {
     pub split: Split,
     /// Undistorted, at the loaded resolution.
     pub camera: Camera,
-    /// The photograph to train on; every training view has one.
+    /// The photograph to train on; of every training view it is here, or is read anew whenever it is looked at
+    /// ([`View::loaded`]).
     pub image: Option<Image>,
-    /// Where it is read from at its own size, if that is larger.
+    /// Where it is read from, if its own size is larger or it is not kept.
     pub original: Option<Original>,
     /// The normal-light photograph to score against, of the camera's size; test views only.
     pub reference: Option<Image>,
@@ -92,6 +95,24 @@ impl View {
         match &self.mask {
             Some(mask) => mask.blacked_out(image),
             None => image,
+        }
+    }
+
+    /// Whether there is a photograph, kept or to be read anew.
+    pub fn has_photograph(&self) -> bool {
+        self.image.is_some() || self.original.is_some()
+    }
+
+    /// The photograph at the size of the view's camera; none where the view has none.
+    ///
+    /// # Errors
+    /// [`Error::Input`] where it was not kept and its file can no longer be read.
+    pub fn loaded(&self) -> Result<Option<Cow<'_, Image>>> {
+        let size = (self.camera.width, self.camera.height);
+        match (&self.image, &self.original) {
+            (Some(image), _) => Ok(Some(Cow::Borrowed(image))),
+            (None, Some(original)) => original.load_at(size).map(Cow::Owned).map(Some),
+            (None, None) => Ok(None),
         }
     }
 
@@ -205,7 +226,8 @@ impl Dataset {
         let files = Files::default();
         let Listing { mut frames, mut skipped, remarks } = list(root, &files)?;
         warn(&remarks);
-        split(root, &mut frames)?;
+        say_whose_split_gives_way(root, &frames, options);
+        split(root, &mut frames, options.test_every, &files)?;
 
         let sources = sources(root, &frames, options, &files, &mut skipped);
         let views = pixels::load(sources, options, &mut skipped)?;
@@ -228,7 +250,36 @@ impl Dataset {
             points.len(),
             skipped.len()
         );
-        Ok(Self { root: root.to_owned(), views, points, skipped })
+        let mut dataset = Self { root: root.to_owned(), views, points, skipped };
+        dataset.leave_out_far_points();
+        dataset.say_what_stands_elsewhere();
+        Ok(dataset)
+    }
+
+    /// Width and height at which each photograph to train on would be loaded, by name, without reading a pixel.
+    ///
+    /// # Errors
+    /// As [`Dataset::load`], but for what is wrong with pixels.
+    pub fn sizes(root: &Path, options: &LoadOptions) -> Result<Vec<(String, [u32; 2])>> {
+        options.check()?;
+        let files = Files::default();
+        let Listing { mut frames, mut skipped, .. } = list(root, &files)?;
+        split(root, &mut frames, options.test_every, &files)?;
+        let sources = sources(root, &frames, options, &files, &mut skipped);
+        let training = sources.iter().filter(|source| source.split == Split::Train);
+        training.map(|source| pixels::loaded_size(source, options)).collect()
+    }
+
+    /// What says which views are held out, in words.
+    pub fn split_rule(root: &Path, options: &LoadOptions) -> String {
+        let has_test = transforms::find(root).iter().any(|(_, split)| *split == Some(Split::Test));
+        match options.test_every {
+            Some(0) => "none, as asked for".to_owned(),
+            Some(every) => format!("every {every}th by name, as asked for"),
+            None if has_test => "as the transforms files say".to_owned(),
+            None if root.join("test.txt").is_file() => "as test.txt says".to_owned(),
+            None => format!("every {TEST_EVERY}th by name"),
+        }
     }
 
     /// Whether `root` is a folder that [`Dataset::load`] finds cameras in.
@@ -268,7 +319,7 @@ impl Dataset {
         options.check()?;
         let files = Files::default();
         let Listing { mut frames, mut skipped, remarks } = list(root, &files)?;
-        split(root, &mut frames)?;
+        split(root, &mut frames, options.test_every, &files)?;
         let sources = sources(root, &frames, options, &files, &mut skipped);
         let photograph = |source: Source| {
             let Source { name, split, input, reference, mask, .. } = source;
@@ -300,13 +351,65 @@ impl Dataset {
         self.views.iter().filter(|view| view.split == Split::Test)
     }
 
-    /// The scene's size as 3DGS takes it: 1.1 times the largest distance of a training camera to their mean, world
-    /// units; 1 where all stand in one spot.
+    /// The scene's size as 3DGS takes it: 1.1 times the largest distance of a training camera to their mean, world units.
+    /// Where all stand in one spot, half of the points are within it; without points it is 1.
     pub fn extent(&self) -> f64 {
-        let centers: Vec<DVec3> = self.train_views().map(|view| view.camera.center()).collect();
-        let mean = centers.iter().sum::<DVec3>() / centers.len() as f64;
-        let radius = centers.iter().map(|center| center.distance(mean)).fold(0.0, f64::max);
-        if radius > 0.0 { 1.1 * radius } else { 1.0 }
+        self.place().1
+    }
+
+    /// Where the scene is trained.
+    pub fn frame(&self) -> Frame {
+        let (center, extent) = self.place();
+        Frame::new(center, extent)
+    }
+
+    /// The middle of the training cameras, and the extent.
+    fn place(&self) -> (DVec3, f64) {
+        let centers = self.train_views().map(|view| view.camera.center());
+        let (center, spread) = frame::spread(&centers.collect::<Vec<DVec3>>());
+        if spread > 0.0 {
+            return (center, spread);
+        }
+        let mut away: Vec<f64> =
+            self.points.iter().map(|point| point.position.distance(center)).collect();
+        let half = away.len() / 2;
+        let typical = (!away.is_empty())
+            .then(|| *away.select_nth_unstable_by(half, f64::total_cmp).1)
+            .filter(|&distance| distance > 0.0);
+        (center, typical.unwrap_or(1.0))
+    }
+
+    /// Leaves out the points that no number of the device holds or that lie a million extents away: they are of no use, and
+    /// what they are made of would not stay finite.
+    fn leave_out_far_points(&mut self) {
+        const MOST_EXTENTS: f64 = 1e6;
+        let (center, extent) = self.place();
+        let before = self.points.len();
+        // Positive phrasing: a NaN fails the test too.
+        self.points.retain(|point| point.position.distance(center) <= MOST_EXTENTS * extent);
+        let gone = before - self.points.len();
+        if gone > 0 {
+            tracing::warn!(
+                "{}: {gone} of {before} points lie more than a million times the cameras' extent away, or nowhere; they are \
+                 left out",
+                self.root.display()
+            );
+        }
+    }
+
+    /// Says which training cameras stand far from all others.
+    fn say_what_stands_elsewhere(&self) {
+        let (center, extent) = self.place();
+        for view in self.train_views() {
+            let own = view.camera.center();
+            if frame::stands_elsewhere(own, (center, extent)) {
+                tracing::warn!(
+                    "view {} stands {:.0e} extents of the other cameras away from them; check its pose",
+                    view.name,
+                    own.distance(center) / extent
+                );
+            }
+        }
     }
 }
 
@@ -408,8 +511,18 @@ fn refuse_two_of_one_name(root: &Path, frames: &[ListedView]) -> Result<()> {
     Ok(())
 }
 
-/// Frames that the listing did not assign: by `test.txt` (a name a line), else every eighth. Sorted by name already.
-fn split(root: &Path, frames: &mut [ListedView]) -> Result<()> {
+/// Frames that the listing did not assign: by `test.txt` (a name a line), else every eighth. Sorted by name already. Where
+/// it is asked for, every so many instead, whatever else says; 0: none.
+fn split(
+    root: &Path,
+    frames: &mut [ListedView],
+    test_every: Option<usize>,
+    files: &Files,
+) -> Result<()> {
+    if let Some(every) = test_every {
+        split_anew(root, frames, every, files);
+        return Ok(());
+    }
     let path = root.join("test.txt");
     let mut undecided: Vec<&mut ListedView> =
         frames.iter_mut().filter(|frame| frame.split.is_none()).collect();
@@ -440,6 +553,42 @@ fn split(root: &Path, frames: &mut [ListedView]) -> Result<()> {
         );
     }
     Ok(())
+}
+
+/// Says where the dataset has a split that is asked to give way to another.
+fn say_whose_split_gives_way(root: &Path, frames: &[ListedView], options: &LoadOptions) {
+    let own = if frames.iter().any(|frame| frame.split.is_some()) {
+        Some("its transforms files")
+    } else {
+        Some("its test.txt").filter(|_| root.join("test.txt").is_file())
+    };
+    if let Some((own, every)) = own.zip(options.test_every) {
+        tracing::warn!(
+            "{}: {own} split the views, which gives way to `LoadOptions::test_every` {every}; scores do not compare with \
+             those of its own split",
+            root.display()
+        );
+    }
+}
+
+/// Holds out every so many views by name in place of the dataset's own split. A listed test view of which there is no dark
+/// photograph cannot be trained on: it stays a pose.
+fn split_anew(root: &Path, frames: &mut [ListedView], every: usize, files: &Files) {
+    let training = frames.iter().filter(|frame| frame.split == Some(Split::Train));
+    let training_folders: BTreeSet<String> =
+        training.map(|frame| frame.folder().to_owned()).collect();
+    let mut place = 0;
+    for frame in frames {
+        let lists_input =
+            frame.split != Some(Split::Test) || training_folders.contains(frame.folder());
+        let is_posed_only =
+            frame.split == Some(Split::Test) && frame.input(root, lists_input, files).is_none();
+        if !is_posed_only {
+            let is_test = every > 0 && place % every == 0;
+            frame.split = Some(if is_test { Split::Test } else { Split::Train });
+            place += 1;
+        }
+    }
 }
 
 /// Which files each view reads. A training view without its photograph is left out, a test view stays as a pose.

@@ -158,10 +158,16 @@ impl Diagnosis {
             })
         };
         let paths = views.iter().map(|(_, view)| path(view)).collect::<Result<Vec<_>>>()?;
-        let shared = Shared::of(dataset, &views);
-        let invert = options.invert_masks;
-        let photographs = paths.par_iter().map(|file| Photograph::load(file, invert));
-        let photographs = photographs.collect::<Result<Vec<_>>>()?;
+        let shared = Shared::of(dataset, &views)?;
+        let area = |file: &&dataset::Photograph| {
+            Image::size_of(&file.input).map(|(w, h)| u64::from(w) * u64::from(h))
+        };
+        let largest = paths.iter().filter_map(|file| area(file).ok()).max().unwrap_or_default();
+        let (mut photographs, invert) = (vec![], options.invert_masks);
+        for files in paths.chunks(Image::decoded_at_once(largest)) {
+            let loaded = files.par_iter().map(|file| Photograph::load(file, invert));
+            photographs.extend(loaded.collect::<Result<Vec<_>>>()?);
+        }
         let exposure = Exposure::of(photographs.iter().map(|one| &one.histogram), None);
         let Some(exposure) = exposure else {
             let problem = "every training photograph is as good as black (99 % of its pixels are below 2 of 255); \

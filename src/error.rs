@@ -46,7 +46,8 @@ pub enum Error {
     },
     /// A buffer did not fit into device memory.
     #[error(
-        "out of device memory: buffer `{buffer}` needs {bytes} bytes; lower `TrainConfig::max_gaussians` or raise `TrainConfig::downscale`"
+        "out of device memory: buffer `{buffer}` needs {bytes} bytes; lower `TrainConfig::max_gaussians`, \
+         `TrainConfig::max_resolution` or `TrainConfig::cache`"
     )]
     OutOfMemory {
         /// The buffer's name.
@@ -58,7 +59,8 @@ pub enum Error {
     },
     /// A buffer exceeds what one binding may hold on this device.
     #[error(
-        "buffer `{buffer}` needs {bytes} bytes, {device} binds {limit} at most; lower `TrainConfig::max_gaussians` or raise `TrainConfig::downscale`"
+        "buffer `{buffer}` needs {bytes} bytes, {device} binds {limit} at most; lower `TrainConfig::max_gaussians` or \
+         `TrainConfig::max_resolution`"
     )]
     BufferTooLarge {
         /// The buffer's name.
@@ -117,6 +119,29 @@ pub enum Error {
         /// How many it follows.
         limit: u32,
     },
+    /// A parameter became NaN or infinite.
+    #[error(
+        "step {step}: number {gaussian} of {plane} is not finite; lower its learning rate, or begin with another \
+         `TrainConfig::seed`"
+    )]
+    ParameterNotFinite {
+        /// The last step, from 1.
+        step: u64,
+        /// The attribute, by its name in the table.
+        plane: String,
+        /// The Gaussian's index, or that of a number of what else is learned.
+        gaussian: usize,
+    },
+    /// A run that was asked to stop did so, and saved what it goes on from.
+    #[error("{}: {cause} after step {step}, and saved; go on with `HeldRun::Resume`", run.display())]
+    Stopped {
+        /// The run directory.
+        run: PathBuf,
+        /// Steps done.
+        step: u64,
+        /// Who asked.
+        cause: Stop,
+    },
     /// A checked pass left other numbers than its CPU reference.
     #[error(
         "the device disagrees with the CPU references: {what}; update the driver, or report this with the output of \
@@ -139,8 +164,56 @@ impl Error {
         Self::Output { path: path.as_ref().to_owned(), problem: problem.into() }
     }
 
-    /// The process's exit code: 2 for misuse, 1 for everything else.
+    /// The process's exit code, by what a scheduler can do about it: 2 for misuse, 3 for data that cannot be used, 4 for the
+    /// device and its memory, those of [`Stop`] for a run that can go on, 1 for everything else.
     pub fn exit_code(&self) -> u8 {
-        if matches!(self, Self::Usage(_)) { 2 } else { 1 }
+        match self {
+            Self::Usage(_) => 2,
+            Self::Input { .. } => 3,
+            Self::NoDevice(_)
+            | Self::MissingFeature { .. }
+            | Self::OutOfMemory { .. }
+            | Self::BufferTooLarge { .. }
+            | Self::DeviceLost { .. }
+            | Self::Vulkan { .. }
+            | Self::Crowded { .. } => 4,
+            Self::Stopped { cause, .. } => cause.exit_code(),
+            Self::Output { .. }
+            | Self::NotFinite { .. }
+            | Self::ParameterNotFinite { .. }
+            | Self::Disagrees { .. } => 1,
+        }
+    }
+}
+
+/// Why a run stops before its end, with what it goes on from saved.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Stop {
+    /// Somebody at the terminal: SIGINT; the exit code is 130.
+    Interrupted,
+    /// The system or a scheduler: SIGTERM; the exit code is 143.
+    Terminated,
+    /// It has taken as long as it may; the exit code is 75, by which schedulers know to run it again.
+    TimeUp,
+}
+
+impl Stop {
+    /// What a shell sees of it.
+    pub fn exit_code(self) -> u8 {
+        match self {
+            Self::Interrupted => 130,
+            Self::Terminated => 143,
+            Self::TimeUp => 75,
+        }
+    }
+}
+
+impl std::fmt::Display for Stop {
+    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        formatter.write_str(match self {
+            Self::Interrupted => "interrupted",
+            Self::Terminated => "told to end",
+            Self::TimeUp => "its time was up",
+        })
     }
 }

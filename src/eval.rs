@@ -1,10 +1,14 @@
-//! Scores a model on the test views of its dataset.
+//! Scores a model on the test views of its dataset: against their reference images, or where there are none against what
+//! the model was trained to show of them.
 
+use std::borrow::Cow;
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::str::FromStr;
 
 use serde_json::{Map, Value, json};
 
+use crate::camera::{Camera, Frame};
 use crate::dataset::{Dataset, View};
 use crate::exposure::Affine;
 use crate::gpu::{Buffer, Gpu};
@@ -12,9 +16,94 @@ use crate::image::Image;
 use crate::metrics::Scores;
 use crate::render::{RenderOptions, RenderSettings, Renderer};
 use crate::scene::{Feature, Features, Gaussians};
-use crate::tone::ToneSettings;
-use crate::train::{Networks, Rendered};
+use crate::tone::{ToneCurve, ToneSettings};
+use crate::train::{Networks, Rendered, TrainConfig, targets_of_test_views};
 use crate::{Error, Result};
+
+/// What test views are scored against.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Against {
+    /// Normal-light photographs.
+    #[default]
+    References,
+    /// What the run's own curve makes of the test views' photographs.
+    PseudoGt,
+    /// The test views' photographs: there is no curve, they are the targets.
+    Photographs,
+}
+
+impl Against {
+    /// What a score is to be read with; none against references, as scores are understood.
+    pub fn label(self) -> Option<&'static str> {
+        match self {
+            Self::References => None,
+            Self::PseudoGt => Some(
+                "against their own pseudo-GT, as there are no reference images: how well the model shows its targets, not how \
+                 right these are; runs of different curves do not compare",
+            ),
+            Self::Photographs => Some(
+                "against the photographs themselves, as there are no reference images and no curve",
+            ),
+        }
+    }
+
+    /// In a word or two, within a line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::References => "reference images",
+            Self::PseudoGt => "pseudo-GT",
+            Self::Photographs => "photographs",
+        }
+    }
+}
+
+/// What the test views of a dataset are scored against.
+#[derive(Clone, Debug, Default)]
+pub struct Yardstick {
+    /// Which kind that is.
+    pub against: Against,
+    /// By the view's name, where it is no reference image.
+    targets: BTreeMap<String, Image>,
+}
+
+impl Yardstick {
+    /// The reference images where a test view has one; without any, the targets that `tone` gives the test views in the
+    /// scene of the training photographs.
+    ///
+    /// # Errors
+    /// Every photograph is as good as black, one can no longer be read, or the device is out of memory or lost.
+    pub fn of(gpu: &Gpu, tone: &ToneSettings, dataset: &Dataset) -> Result<Self> {
+        let against = Self::kind(tone, dataset);
+        let targets = match against {
+            Against::References => BTreeMap::new(),
+            _ => targets_of_test_views(gpu, tone, dataset)?.into_iter().collect(),
+        };
+        Ok(Self { against, targets })
+    }
+
+    /// Which kind it will be.
+    pub fn kind(tone: &ToneSettings, dataset: &Dataset) -> Against {
+        let has_references = dataset.test_views().any(|view| view.reference.is_some());
+        let has_photographs = dataset.test_views().any(View::has_photograph);
+        match tone.curve {
+            _ if has_references || !has_photographs => Against::References,
+            ToneCurve::None => Against::Photographs,
+            _ => Against::PseudoGt,
+        }
+    }
+
+    /// How many of the dataset's test views it has something for.
+    pub fn view_count(&self, dataset: &Dataset) -> usize {
+        dataset.test_views().filter(|view| self.target(view).is_some()).count()
+    }
+
+    fn target<'a>(&'a self, view: &'a View) -> Option<&'a Image> {
+        match self.against {
+            Against::References => view.reference.as_ref(),
+            _ => self.targets.get(&view.name),
+        }
+    }
+}
 
 /// What a test view scores, and the pictures behind it.
 #[derive(Clone, Debug)]
@@ -29,6 +118,8 @@ pub struct ViewScore {
     pub render: Image,
     /// What it was scored against, in 8 bits as it is saved.
     pub reference: Image,
+    /// What that is.
+    pub against: Against,
 }
 
 /// A finished model on the device, ready to be rendered.
@@ -40,25 +131,34 @@ pub struct Player {
     features: Features,
     renderer: Renderer,
     networks: Option<Networks>,
+    /// Where the Gaussians lie.
+    frame: Frame,
 }
 
 impl Player {
-    /// Uploads `gaussians`, whose colours are `raw_colors` or as viewers show them; `networks` belong to them. Their run's
-    /// `tile` is taken where it suits the device.
+    /// Uploads the `gaussians` of a run of `config`, as its `model.ply` has them but for the colours, which are the model's;
+    /// `networks` belong to them. The run's tile is taken where it suits the device.
     ///
     /// # Errors
     /// The device is out of memory or lost.
     pub fn new(
         gpu: &Gpu,
         gaussians: &Gaussians,
-        raw_colors: bool,
-        tile: Option<[u32; 2]>,
+        config: &TrainConfig,
         networks: Option<Networks>,
     ) -> Result<Self> {
         let shape = gaussians.shape;
+        let RenderSettings { raw_colors, near, tile, .. } = config.render_settings();
         let tile = tile.filter(|&tile| gpu.properties().suits_tile(tile));
-        let settings = RenderSettings { shape, raw_colors, tile, ..RenderSettings::default() };
+        let settings =
+            RenderSettings { shape, raw_colors, near, tile, ..RenderSettings::default() };
+        let frame = config.frame.unwrap_or_default();
+        let gaussians = match frame {
+            Frame::WORLD => Cow::Borrowed(gaussians),
+            _ => Cow::Owned(gaussians.from_world(&frame, frame.file_origin())),
+        };
         Ok(Self {
+            frame,
             parameters: gpu.buffer("parameters", &gaussians.parameters)?,
             count: gaussians.count,
             sh_degree: shape.sh_degree,
@@ -73,24 +173,32 @@ impl Player {
     /// # Errors
     /// The device is out of memory or lost.
     pub fn render(&mut self, view: &View) -> Result<Rendered> {
-        let (camera, options) = (&view.camera, self.options());
+        self.render_camera(&view.camera)
+    }
+
+    /// What any camera of the dataset's world sees, before a black background.
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub fn render_camera(&mut self, camera: &Camera) -> Result<Rendered> {
+        let (camera, options) = (&self.frame.camera(camera), self.options());
         self.renderer.reserve(self.count, [camera])?;
         let networks = self.networks.as_mut();
         Rendered::new(&mut self.renderer, &self.parameters, camera, &options, networks)
     }
 
-    /// One layer of what the view's camera sees; a feature of one channel is repeated.
+    /// One layer of what a camera sees; a feature of one channel is repeated.
     ///
     /// # Errors
     /// The model has no such layer, or the device is out of memory or lost.
-    pub fn layer(&mut self, view: &View, layer: Layer) -> Result<Image> {
+    pub fn layer(&mut self, camera: &Camera, layer: Layer) -> Result<Image> {
         let lacks =
             || Error::Usage(format!("the model has no {}; {}", layer.name(), self.layers()));
         let feature = match layer {
-            Layer::Rgb => return Ok(self.render(view)?.colors),
+            Layer::Rgb => return Ok(self.render_camera(camera)?.colors),
             Layer::Denoised => {
                 let lacks = lacks();
-                return self.render(view)?.denoised.ok_or(lacks);
+                return self.render_camera(camera)?.denoised.ok_or(lacks);
             }
             Layer::Depth => Feature::Depth,
             Layer::Structure => Feature::Structure,
@@ -98,11 +206,11 @@ impl Player {
             Layer::Noise => Feature::Noise,
         };
         let planes = self.features.channels_of(feature).ok_or_else(lacks)?;
-        let (width, height) = (view.camera.width, view.camera.height);
+        let Camera { width, height, .. } = *camera;
         let pixels = width as usize * height as usize;
-        self.renderer.reserve(self.count, [&view.camera])?;
-        let options = self.options();
-        let channels = self.renderer.render_channels(&self.parameters, &view.camera, &options)?;
+        let (camera, options) = (&self.frame.camera(camera), self.options());
+        self.renderer.reserve(self.count, [camera])?;
+        let channels = self.renderer.render_channels(&self.parameters, camera, &options)?;
         let plane = |c: usize| {
             let plane = planes.start + c.min(planes.len() - 1);
             channels[plane * pixels..][..pixels].iter().copied()
@@ -182,11 +290,23 @@ impl FromStr for Layer {
 /// Those of `render`.
 pub fn score(
     dataset: &Dataset,
+    render: impl FnMut(&View) -> Result<Rendered>,
+) -> Result<Vec<ViewScore>> {
+    score_by(&Yardstick::default(), dataset, render)
+}
+
+/// As [`score`], by any yardstick.
+///
+/// # Errors
+/// As there.
+pub fn score_by(
+    yardstick: &Yardstick,
+    dataset: &Dataset,
     mut render: impl FnMut(&View) -> Result<Rendered>,
 ) -> Result<Vec<ViewScore>> {
-    let mut scored = vec![];
+    let (mut scored, against) = (vec![], yardstick.against);
     for view in dataset.test_views() {
-        let Some(reference) = &view.reference else { continue };
+        let Some(reference) = yardstick.target(view) else { continue };
         let (rendered, reference) = (render(view)?, quantized(reference));
         let render = quantized(rendered.output());
         let mask = view.mask.as_ref();
@@ -194,7 +314,8 @@ pub fn score(
         let r0 = rendered.denoised.is_some();
         let of_r0 = || Scores::of_counted(&quantized(&rendered.colors), &reference, mask);
         let r0 = r0.then(of_r0).transpose()?;
-        scored.push(ViewScore { name: view.name.clone(), scores, r0, render, reference });
+        let name = view.name.clone();
+        scored.push(ViewScore { name, scores, r0, render, reference, against });
     }
     Ok(scored)
 }
@@ -212,13 +333,25 @@ pub fn metrics(
         .iter()
         .map(|view| (view.name.clone(), entry(&view.scores, view.r0.as_ref())))
         .collect();
-    json!({
+    let mut metrics = json!({
         "mean": mean,
         "views": views,
         "seconds": seconds.into(),
         "gaussians": gaussians,
         "steps": steps,
-    })
+    });
+    if let Some(label) = label(scored) {
+        metrics[AGAINST] = json!(label);
+    }
+    metrics
+}
+
+/// Where `metrics.json` says what the scores are against, where that is no reference image.
+pub const AGAINST: &str = "against";
+
+/// What the scores are to be read with, where they are against no reference images.
+pub fn label(scored: &[ViewScore]) -> Option<&'static str> {
+    scored.first().and_then(|view| view.against.label())
 }
 
 /// Where `metrics.json` says what the targets know of references, where they know any.
@@ -271,14 +404,18 @@ pub fn means(scored: &[ViewScore]) -> (Option<Scores>, Option<Scores>) {
     (Scores::mean(&all), Scores::mean(&r0))
 }
 
-/// Writes `renders/NAME.png` and `references/NAME.png` below `folder`.
+/// Writes `renders/NAME.png` and `references/NAME.png` below `folder`; what is no reference image, to `targets`.
 ///
 /// # Errors
 /// The folder cannot be written.
 pub fn save_images(folder: &Path, scored: &[ViewScore]) -> Result<()> {
+    let against = match scored.first().map(|view| view.against) {
+        None | Some(Against::References) => "references",
+        Some(_) => "targets",
+    };
     for (name, image) in [
         ("renders", (|view| &view.render) as fn(&ViewScore) -> &Image),
-        ("references", |view| &view.reference),
+        (against, |view| &view.reference),
     ] {
         let folder = folder.join(name);
         std::fs::create_dir_all(&folder)

@@ -5,6 +5,8 @@
 //! the power law continued above 1).
 
 #[cfg(feature = "io")]
+mod budget;
+#[cfg(feature = "io")]
 mod codec;
 #[cfg(feature = "io")]
 mod exif;
@@ -79,6 +81,17 @@ impl Image {
             }
         }
         Self { width, height, data }
+    }
+
+    /// How many photographs of so many pixels are to be decoded and looked at side by side: as many as leave memory for
+    /// other things.
+    #[cfg(feature = "io")]
+    pub(crate) fn decoded_at_once(pixels: u64) -> usize {
+        /// Of what is at work at once.
+        const MOST: u64 = 1 << 30;
+        /// Pixels as a file has them, as floats, and once more in another order.
+        const BYTES_PER_PIXEL: u64 = 40;
+        usize::try_from(MOST / (BYTES_PER_PIXEL * pixels.max(1))).unwrap_or(usize::MAX).max(1)
     }
 
     /// Pixels per plane.

@@ -15,6 +15,7 @@
 //!
 //! - [`error`]: what can go wrong, sorted by what the user can do about it
 //! - [`output`]: files that are never seen half-written
+//! - [`hash`]: whether numbers and bytes are what they were
 //! - [`random`]: counter-based random numbers
 //! - [`attributes`]: the one table of what every Gaussian has
 //! - [`gpu`]: device, buffers, passes; the only module that speaks Vulkan, and the only one with `unsafe`
@@ -61,6 +62,7 @@ pub mod exposure;
 pub mod fit;
 #[expect(unsafe_code, reason = "the only module that speaks Vulkan")]
 pub mod gpu;
+pub mod hash;
 pub mod image;
 pub mod kernels;
 pub mod loss;
@@ -84,4 +86,4 @@ pub mod tone;
 pub mod train;
 pub mod window;
 
-pub use error::{Error, Result};
+pub use error::{Error, Result, Stop};

@@ -6,6 +6,7 @@ use std::process::ExitCode;
 use clap::Parser;
 use nightsplat::Error;
 use nightsplat::cli::{Cli, in_options};
+use nightsplat::output::printable;
 use tracing_subscriber::filter::LevelFilter;
 
 fn main() -> ExitCode {
@@ -30,7 +31,8 @@ fn main() -> ExitCode {
         return ExitCode::SUCCESS;
     }
     // A closed stderr leaves nobody to tell.
-    let _ = writeln!(std::io::stderr(), "error: {}", in_options(&format!("{error:#}")));
+    let message = in_options(&format!("{error:#}"));
+    let _ = writeln!(std::io::stderr(), "error: {}", in_one_line(&message));
     ExitCode::from(error.downcast_ref::<Error>().map_or(1, Error::exit_code))
 }
 
@@ -51,12 +53,17 @@ fn misuse(error: &clap::Error) -> ExitCode {
         lines.take_while(|line| !line.starts_with("Usage:") && !line.starts_with("For more"));
     let line = told.collect::<Vec<_>>().join(" ").replace(" tip: ", "; ");
     // A closed stderr leaves nobody to tell.
-    let _ = writeln!(std::io::stderr(), "{line}; --help says more");
+    let _ = writeln!(std::io::stderr(), "{}; --help says more", in_one_line(&line));
     ExitCode::from(2)
+}
+
+/// A message as it is printed, whatever the names in it hold.
+fn in_one_line(message: &str) -> String {
+    printable(&message.replace('\n', "\\n")).into_owned()
 }
 
 /// Whoever reads our output has seen enough, as in `nightsplat doctor | head`.
 fn is_broken_pipe(error: &anyhow::Error) -> bool {
-    let io = error.downcast_ref::<std::io::Error>();
-    io.is_some_and(|io| io.kind() == std::io::ErrorKind::BrokenPipe)
+    let is_broken = |io: &std::io::Error| io.kind() == std::io::ErrorKind::BrokenPipe;
+    error.chain().any(|cause| cause.downcast_ref().is_some_and(is_broken))
 }

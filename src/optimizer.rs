@@ -1,8 +1,10 @@
 //! Adam over the Gaussians' planes and over what else is learned, and the schedules of its learning rates.
 
+mod finite;
 mod learnable;
 mod schedule;
 
+pub use finite::FiniteCheck;
 pub use learnable::Learnable;
 pub use schedule::{LearningRates, Schedule};
 

@@ -34,6 +34,7 @@ pub mod expose;
 mod expose_backward;
 pub mod exposure_center;
 mod exposure_gradient;
+mod first_not_finite;
 pub mod gaussian;
 mod l1;
 mod loss_log;

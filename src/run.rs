@@ -1,16 +1,25 @@
 //! A training run from its first step to its last file: what the command does, without its progress bar.
 
+mod aside;
 mod directory;
+mod done;
 mod events;
+mod ledger;
+mod lock;
 mod meter;
+mod progress;
+mod requests;
+mod tensorboard;
 mod train;
 
 pub use directory::{
     Progress, RunDirectory, is_finished, load_config, load_exposures, load_metrics, load_model,
-    load_networks, load_progress, plan_of,
+    load_networks, load_progress, other_views, plan_of, stopped_at,
 };
 #[cfg(feature = "cli")]
 pub(crate) use directory::{SPENT, TARGET_EXPOSURE};
+pub use done::done_steps;
 pub use events::Event;
 pub use meter::{Spent, energy_counters};
-pub use train::{HeldRun, Trained, train, train_planned};
+pub use requests::Requests;
+pub use train::{HeldRun, Session, Trained, train, train_in};

@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use glam::Vec3;
+use glam::{DVec3, Vec3};
 
 mod features;
 #[cfg(feature = "io")]
@@ -13,6 +13,7 @@ pub mod ply;
 
 pub use crate::attributes::{ATTRIBUTES, Attribute, rest_coefficients};
 use crate::attributes::{column_count, planes};
+use crate::camera::Frame;
 pub use features::{COLOR_CHANNELS, FEATURES, Feature, FeatureSpec, Features};
 
 pub use crate::kernels::sh::MAX_SH_DEGREE;
@@ -69,6 +70,30 @@ impl Gaussians {
     /// First column and width of an attribute.
     fn columns(&self, attribute: Attribute) -> (usize, usize) {
         planes(self.shape.features.width(), width(self.shape))[attribute as usize]
+    }
+
+    /// The same Gaussians out of a frame, relative to an origin in the world: [`Frame::file_origin`] where f32 is to hold
+    /// them.
+    pub fn to_world(&self, frame: &Frame, origin: DVec3) -> Self {
+        let offset = DVec3::from_array(frame.center) - origin;
+        self.moved(|mean| (mean / frame.scale + offset).as_vec3(), -frame.scale.ln())
+    }
+
+    /// Back into the frame: what [`Gaussians::to_world`] gave.
+    pub fn from_world(&self, frame: &Frame, origin: DVec3) -> Self {
+        let offset = DVec3::from_array(frame.center) - origin;
+        self.moved(|mean| ((mean - offset) * frame.scale).as_vec3(), frame.scale.ln())
+    }
+
+    fn moved(&self, position: impl Fn(DVec3) -> Vec3, log_scale: f64) -> Self {
+        let mut moved = self.clone();
+        for mean in moved.means_mut() {
+            *mean = position(mean.as_dvec3());
+        }
+        for scale in moved.log_scales_mut() {
+            *scale = (scale.as_dvec3() + log_scale).as_vec3();
+        }
+        moved
     }
 
     /// Adds a constant to the colour from every direction.

@@ -133,13 +133,15 @@ impl FromStr for ToneCurve {
     type Err = Error;
 
     fn from_str(name: &str) -> Result<Self> {
-        match name {
+        // Every name is in small letters; papers write AP3.
+        let small = name.to_ascii_lowercase();
+        match small.as_str() {
             TABLE_NAME => return Ok(Self::Table),
             AUTO_NAME => return Ok(Self::Auto),
             PROFILE_NAME => return Ok(Self::Profile),
             _ => {}
         }
-        Family::find(name).map(|family| family.curve).ok_or_else(|| {
+        Family::find(&small).map(|family| family.curve).ok_or_else(|| {
             Error::Usage(format!("unknown curve `{name}`; the curves are {}", Self::names()))
         })
     }

@@ -1,5 +1,6 @@
 //! Training: one view a step, its pseudo-GT the target, the Gaussians what is learned.
 
+mod cache;
 mod checkpoint;
 mod config;
 mod ends;
@@ -11,6 +12,7 @@ mod model;
 mod networks;
 mod overrides;
 mod parts;
+mod paths;
 mod precision;
 mod preset;
 mod submission;
@@ -20,28 +22,30 @@ mod views;
 use std::panic::resume_unwind;
 use std::thread::{self, ScopedJoinHandle};
 
-use glam::UVec2;
+use glam::{DVec3, UVec2};
 
-use crate::camera::Camera;
-use crate::dataset::Dataset;
+use crate::camera::{Camera, Frame};
+use crate::dataset::{Dataset, Fingerprint};
 use crate::densify::{Densifier, DensifySettings};
 use crate::exposure::Exposures;
 use crate::gpu::{Buffer, CheckReport, Gpu, PassTime, Recorder};
 use crate::image::Image;
 use crate::loss::{DepthBoxes, LogSlot, LossLog, Losses, StepLosses, Term, TermInputs};
 use crate::nn::Form;
-use crate::optimizer::{Adam, AdamBuffers, Learnable};
+use crate::optimizer::{Adam, AdamBuffers, FiniteCheck, Learnable};
 use crate::pseudo_gt::PseudoGt;
 use crate::random::Stream;
 use crate::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer};
 use crate::scene::{COLOR_CHANNELS, Gaussians, width};
 use crate::{Error, Result};
 
+pub use cache::CacheSize;
+pub(crate) use checkpoint::check_checkpoint;
 pub use config::{Background, CheckConfig, DensityConfig, TrainConfig};
 use ends::Ends;
 pub use exposures::{ExposureConfig, Learning};
 use held_out::HeldOut;
-pub use held_out::StopConfig;
+pub use held_out::{StopConfig, targets_of_test_views};
 use masks::Masks;
 use model::Model;
 pub use networks::Networks;
@@ -155,6 +159,11 @@ impl StepReport {
 pub struct Trainer {
     gpu: Gpu,
     config: TrainConfig,
+    /// What is trained on.
+    fingerprint: Fingerprint,
+    /// Where everything on the device lies.
+    frame: Frame,
+    /// In units of the frame.
     extent: f64,
     target_exposure: Option<TargetExposure>,
     held_out: HeldOut,
@@ -169,6 +178,9 @@ pub struct Trainer {
     networks: Option<NetworkTerms>,
     exposures: Option<Exposures>,
     adam: Adam,
+    finite: FiniteCheck,
+    /// After this step the parameters were looked at last.
+    checked: u64,
     densifier: Densifier,
     /// Of a step's view, what is kept in fewer bits: the loss's input, and the photograph where a network sees it besides.
     decoded: [Buffer<f32>; 2],
@@ -208,7 +220,8 @@ impl Trainer {
         config.check()?;
         config.leave_out_what_is_missing(dataset);
         let settings = config.render_settings();
-        let density = growth::settings(&config, dataset.extent());
+        let frame = *config.frame.get_or_insert_with(|| dataset.frame());
+        let density = growth::settings(&config, dataset.extent() * frame.scale);
         thread::scope(|scope| {
             // The driver compiles on another thread while the views are uploaded and looked at.
             let kernels = scope.spawn(move || Kernels::new(gpu, settings, density));
@@ -225,15 +238,13 @@ impl Trainer {
         kernels: ScopedJoinHandle<'_, Result<Kernels>>,
     ) -> Result<Self> {
         let mut pseudo_gt = PseudoGt::new(gpu, &config.tone)?;
-        let levels = config.schedule.resolution_levels();
-        let has_networks = config.model.denoiser || config.model.tonemapper;
-        let bits = config.precision.photographs;
+        let frame = config.frame.unwrap_or_default();
         let (mut views, scene, target_exposure) =
-            Views::upload(gpu, &mut pseudo_gt, dataset, levels, has_networks, bits)?;
+            Views::upload(gpu, &mut pseudo_gt, dataset, &frame, &config)?;
         if config.model.denoiser && config.model.network.form == Form::Identity {
             views.keep_targets(gpu, &pseudo_gt)?;
         }
-        let held_out = HeldOut::new(&mut pseudo_gt, dataset, &scene)?;
+        let held_out = HeldOut::new(&mut pseudo_gt, dataset, &frame, &scene)?;
         if let Some(TargetExposure { scene, .. }) = &target_exposure {
             tracing::info!("{}", scene.reason());
         }
@@ -241,7 +252,10 @@ impl Trainer {
         say_what_parts_see(&config.model, &sizes);
         let starts = views.exposures(&mut pseudo_gt, dataset, &scene, &config)?;
         let gaussians = match gaussians {
-            Some(gaussians) if gaussians.shape == settings.shape => gaussians.clone(),
+            Some(gaussians) if gaussians.shape == settings.shape => match frame {
+                Frame::WORLD => gaussians.clone(),
+                _ => gaussians.from_world(&frame, DVec3::ZERO),
+            },
             Some(Gaussians { shape: own, .. }) => {
                 let problem = format!("Gaussians of {own:?} make no model of {:?}", settings.shape);
                 return Err(Error::Usage(problem));
@@ -250,6 +264,7 @@ impl Trainer {
                 views.initial_gaussians(gpu, &pseudo_gt, dataset, &config, starts.as_deref())?
             }
         };
+        views.say_what_shows_nothing(&gaussians);
         let pixels = sizes.iter().map(|size| size.x as usize * size.y as usize).max();
         let values = settings.channels() * pixels.unwrap_or_default();
         let sources = views.sources(gpu, &pseudo_gt, dataset);
@@ -261,12 +276,14 @@ impl Trainer {
         if let Some(exposures) = &mut exposures {
             sizes.iter().try_for_each(|&size| exposures.reserve(size))?;
         }
-        let Kernels { renderer, adam, densifier } =
+        let Kernels { renderer, adam, finite, densifier } =
             kernels.join().unwrap_or_else(|panic| resume_unwind(panic))?;
         let [inputs, photographs] = views.decoded_lens();
         let mut trainer = Self {
             gpu: gpu.clone(),
-            extent: dataset.extent(),
+            fingerprint: Fingerprint::of(dataset),
+            frame,
+            extent: dataset.extent() * frame.scale,
             target_exposure,
             held_out,
             ends: Ends::default(),
@@ -279,6 +296,8 @@ impl Trainer {
             networks: NetworkTerms::new(gpu, &config, &sizes)?,
             exposures,
             adam,
+            finite,
+            checked: 0,
             densifier,
             decoded: [gpu.uninit("decoded", inputs)?, gpu.uninit("decoded low", photographs)?],
             d_render: gpu.uninit("d_render", values)?,
@@ -305,12 +324,34 @@ impl Trainer {
         self.model.count()
     }
 
-    /// The Gaussians as they are now, on the host.
+    /// The Gaussians as they are now, on the host, in the dataset's world as far as f32 holds it.
     ///
     /// # Errors
     /// The device was lost.
     pub fn gaussians(&self) -> Result<Gaussians> {
+        let gaussians = self.gaussians_in_frame()?;
+        Ok(match self.frame {
+            Frame::WORLD => gaussians,
+            frame => gaussians.to_world(&frame, DVec3::ZERO),
+        })
+    }
+
+    /// The same in [`Trainer::frame`], to the bit as they are trained.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub fn gaussians_in_frame(&self) -> Result<Gaussians> {
         self.model.download(&self.gpu)
+    }
+
+    /// What is trained on.
+    pub fn fingerprint(&self) -> &Fingerprint {
+        &self.fingerprint
+    }
+
+    /// Where the Gaussians are trained.
+    pub fn frame(&self) -> &Frame {
+        &self.frame
     }
 
     /// Sets how many intersections a view may have before memory has to grow, where that is known better than guessed.
@@ -360,6 +401,7 @@ impl Trainer {
     /// As [`Trainer::advance`]; a step that overflows its memory is not counted, the next [`Trainer::advance`] redoes it.
     pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
         let step = self.step + 1;
+        self.views.bring(&self.config, step..=step)?;
         let times = self.gpu.clone().profile("step", |pass| self.record_step(pass, step, 0))?;
         if self.gpu.read(self.renderer.status())?.first() == Some(&0) {
             self.step = step;
@@ -476,9 +518,11 @@ impl Trainer {
     /// # Errors
     /// The device is out of memory or lost.
     pub fn render(&mut self, camera: &Camera) -> Result<Rendered> {
-        self.render_of_degree(camera, self.sh_degree(self.step))
+        let camera = self.frame.camera(camera);
+        self.render_of_degree(&camera, self.sh_degree(self.step))
     }
 
+    /// As [`Trainer::render`], of a camera in the frame.
     fn render_of_degree(&mut self, camera: &Camera, sh_degree: u32) -> Result<Rendered> {
         let options = RenderOptions { sh_degree, background: [0.0; 3] };
         self.renderer.reserve(self.model.count(), [camera])?;
@@ -514,6 +558,7 @@ impl Trainer {
 struct Kernels {
     renderer: Renderer,
     adam: Adam,
+    finite: FiniteCheck,
     densifier: Densifier,
 }
 
@@ -522,6 +567,7 @@ impl Kernels {
         Ok(Self {
             renderer: Renderer::new(gpu, settings)?,
             adam: Adam::new(gpu)?,
+            finite: FiniteCheck::new(gpu)?,
             densifier: Densifier::new(gpu, density)?,
         })
     }

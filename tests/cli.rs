@@ -180,17 +180,19 @@ fn eval_agrees_with_train_and_saves_what_it_scored() {
 }
 
 #[test]
-fn a_set_without_references_trains_and_scores_nothing() {
+fn a_set_without_references_and_photographs_of_test_views_scores_nothing() {
     let set = copied_set();
     fs::remove_dir_all(set.path().join("high")).unwrap();
-    // The test poses' photographs lie in low/, so they are what is listed.
+    for name in ["000", "008"] {
+        fs::remove_file(set.path().join("low").join(name).with_extension("png")).unwrap();
+    }
     let (root, run) = (set.path().display(), set.path().join("run"));
     succeed(&format!("train {root} --out {} --steps 2", run.display()));
     assert_eq!(json(run.join("metrics.json"))["mean"], Value::Null);
     let (printed, said) = common::command::run(&format!("eval {} --json", run.display()), 0);
     let printed: Value = serde_json::from_str(&printed).unwrap();
     assert_eq!((&printed["mean"], keys(&printed["views"]).len()), (&Value::Null, 0));
-    assert!(said.contains("no test view has a reference image"), "{said}");
+    assert!(said.contains("no test view has a reference image or a photograph"), "{said}");
     assert_eq!(succeed(&format!("eval {}", run.display())).lines().count(), 1);
 }
 
@@ -378,21 +380,21 @@ fn a_set_that_is_not_there_or_has_no_photographs_is_named() {
     let run = folder.path().join("run");
     refused(
         &format!("train {} --out {}", nowhere.display(), run.display()),
-        1,
+        3,
         &["nowhere", "not a folder"],
     );
     assert!(!run.exists());
-    refuses_to_train(folder.path(), "", 1, &["holds no dataset", "transforms"]);
+    refuses_to_train(folder.path(), "", 3, &["holds no dataset", "transforms"]);
     let set = copied_set();
     fs::remove_dir_all(set.path().join("low")).unwrap();
-    refuses_to_train(set.path(), "", 1, &["no photograph is left to train on"]);
+    refuses_to_train(set.path(), "", 3, &["no photograph is left to train on"]);
 }
 
 #[test]
 fn a_listing_cut_short_is_named() {
     let set = copied_set();
     edit(set.path().join("transforms_train.json"), |text| text[..text.len() / 2].to_owned());
-    refuses_to_train(set.path(), "", 1, &["transforms_train.json", "cut short"]);
+    refuses_to_train(set.path(), "", 3, &["transforms_train.json", "cut short"]);
 }
 
 #[test]
@@ -409,7 +411,7 @@ fn two_views_of_one_name_are_refused() {
     edit(set.path().join("transforms_train.json"), |text| {
         text.replace("low/002.png", "low/001.png")
     });
-    refuses_to_train(set.path(), "", 1, &["two views are named 001"]);
+    refuses_to_train(set.path(), "", 3, &["two views are named 001"]);
 }
 
 /// The fixture's set as COLMAP leaves one, after a change of its cameras and images.
@@ -436,7 +438,7 @@ fn a_colmap_model_trains_and_what_is_wrong_with_one_is_named() {
     trains_and_says(colmap_set(same, same).path(), &[]);
 
     let set = colmap_set(|text| text.replace(" PINHOLE ", " FISHEYE "), same);
-    refuses_to_train(set.path(), "", 1, &["FISHEYE"]);
+    refuses_to_train(set.path(), "", 3, &["FISHEYE"]);
 
     // Every pose: no view is left. One pose: the others go on.
     let spoil = |count: usize| {
@@ -453,11 +455,11 @@ fn a_colmap_model_trains_and_what_is_wrong_with_one_is_named() {
             text.lines().map(line).collect()
         }
     };
-    refuses_to_train(colmap_set(same, spoil(9)).path(), "", 1, &["pose is not finite"]);
+    refuses_to_train(colmap_set(same, spoil(9)).path(), "", 3, &["pose is not finite"]);
     trains_and_says(colmap_set(same, spoil(1)).path(), &["000.png", "pose is not finite"]);
 
     let set = colmap_set(|text| text.replace(" 64 48 ", " 64 64 "), same);
-    refuses_to_train(set.path(), "", 1, &["is 64x48 but its camera is 64x64"]);
+    refuses_to_train(set.path(), "", 3, &["is 64x48 but its camera is 64x64"]);
 
     let set = colmap_set(same, same);
     // A count of ten thousand points, and then nothing.
@@ -465,7 +467,41 @@ fn a_colmap_model_trains_and_what_is_wrong_with_one_is_named() {
     points.extend([0; 20]);
     fs::remove_file(set.path().join("sparse/0/points3D.txt")).unwrap();
     fs::write(set.path().join("sparse/0/points3D.bin"), points).unwrap();
-    refuses_to_train(set.path(), "", 1, &["points3D.bin", "cut short"]);
+    refuses_to_train(set.path(), "", 3, &["points3D.bin", "cut short"]);
+}
+
+#[test]
+fn points_that_no_device_holds_and_views_that_show_nothing_are_said() {
+    let set = copied_set();
+    edit(set.path().join("colmap_sparse/0/points3D.txt"), |text| {
+        text + "900001 1e39 0 0 1 2 3 0.5\n900002 0 -1e300 0 1 2 3 0.5\n900003 1e9 0 0 1 2 3 0.5\n"
+    });
+    trains_and_says(set.path(), &["3 of ", "points", "left out"]);
+
+    let set = copied_set();
+    edit(set.path().join("transforms_train.json"), |text| {
+        // The second view looks the other way: x and z of its axes are negated.
+        let mut listing: Value = serde_json::from_str(&text).unwrap();
+        for row in
+            listing["frames"][1]["transform_matrix"].as_array_mut().unwrap().iter_mut().take(3)
+        {
+            for column in [0, 2] {
+                row[column] = Value::from(-row[column].as_f64().unwrap());
+            }
+        }
+        listing.to_string()
+    });
+    trains_and_says(set.path(), &["view 002 shows nothing"]);
+}
+
+#[test]
+fn pictures_larger_than_their_views_are_refused_before_they_are_decoded() {
+    let set = copied_set();
+    let bomb = |path: &str| {
+        Image::from_fn(1200, 900, |_, _| [0.5; 3]).save_png8(set.path().join(path)).unwrap()
+    };
+    bomb("high/000.png");
+    refuses_to_train(set.path(), "", 3, &["high/000.png", "1200x900", "64 times"]);
 }
 
 #[test]
@@ -513,7 +549,7 @@ fn a_configuration_with_an_unknown_key_names_it() {
     refuses_to_train(
         Path::new(&fixture().set()),
         &arguments,
-        1,
+        3,
         &["config.toml", "stepz", "(line 2)"],
     );
 }
@@ -521,12 +557,12 @@ fn a_configuration_with_an_unknown_key_names_it() {
 #[test]
 fn no_device_and_an_unknown_one_are_said_with_the_remedy() {
     let set = fixture().set();
-    refuses_to_train(Path::new(&set), "--device voodoo", 1, &["voodoo", "there are: "]);
-    refuses_to_train(Path::new(&set), "--device 99", 1, &["number 99", "there are: "]);
+    refuses_to_train(Path::new(&set), "--device voodoo", 4, &["voodoo", "there are: "]);
+    refuses_to_train(Path::new(&set), "--device 99", 4, &["number 99", "there are: "]);
     let nothing =
         [("VK_DRIVER_FILES", "/nonexistent.json"), ("VK_ICD_FILENAMES", "/nonexistent.json")];
     for arguments in ["doctor", "bench", "demo --out /nonexistent/demo"] {
-        refused_with(arguments, &nothing, 1, &["no Vulkan device", "install"]);
+        refused_with(arguments, &nothing, 4, &["no Vulkan device", "install"]);
     }
 }
 
@@ -552,7 +588,7 @@ fn what_is_no_finished_run_is_refused_by_eval_and_render() {
     let run = folder.path().display();
     for command in ["eval", "render --split all --out x"] {
         let (command, options) = command.split_once(' ').unwrap_or((command, ""));
-        refused(&format!("{command} {run} {options}"), 1, &["no config.toml", "nightsplat train"]);
+        refused(&format!("{command} {run} {options}"), 3, &["no config.toml", "nightsplat train"]);
     }
     let config = fs::read_to_string(fixture().path("run/config.toml")).unwrap();
     let moved = folder.path().join("moved");
@@ -564,7 +600,7 @@ fn what_is_no_finished_run_is_refused_by_eval_and_render() {
     refused(&format!("eval {run}"), 1, &["model.ply", "did not finish"]);
     let model = fs::read(fixture().path("run/model.ply")).unwrap();
     fs::write(folder.path().join("model.ply"), &model).unwrap();
-    refused(&format!("eval {run}"), 1, &["config.toml", "moved", "correct `dataset`"]);
+    refused(&format!("eval {run}"), 1, &["config.toml", "moved", "--dataset"]);
     fs::write(folder.path().join("config.toml"), config).unwrap();
     fs::write(folder.path().join("model.ply"), &model[..model.len() / 2]).unwrap();
     refused(&format!("eval {run}"), 1, &["model.ply"]);

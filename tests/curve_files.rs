@@ -18,7 +18,7 @@ fn load(name: &str, text: &str) -> Result<ToneSettings, Error> {
 
 #[test]
 fn a_family_with_its_own_constants_is_read_from_toml() {
-    let settings = load("my.toml", "family = \"gamma\"\n[constants]\na = 0.9\nb = 0.4\n").unwrap();
+    let settings = load("my.toml", "curve = \"gamma\"\n[constants]\na = 0.9\nb = 0.4\n").unwrap();
     assert_eq!(
         (settings.curve, settings.constants.as_slice()),
         (ToneCurve::Gamma, &[0.9, 0.4][..])
@@ -122,4 +122,35 @@ fn another_curve_brings_its_own_constants_and_the_same_keeps_them() {
     assert_eq!([ase.gain_c, ase.theta, ase.alpha], [3.0, 0.4, 0.12]);
     let gamma = mine.with_curve(ToneCurve::Gamma);
     assert_eq!(gamma.constants, Family::find("gamma").unwrap().defaults());
+}
+
+#[test]
+fn the_family_of_a_curve_has_one_key_and_its_old_name_is_read() {
+    let settings = load("my.toml", "family = \"AP3\"\ngain_c = 2.0\n").unwrap();
+    assert_eq!((settings.curve, settings.gain_c), (ToneCurve::Ap3, 2.0));
+    let twice = load("my.toml", "family = \"ap3\"\ncurve = \"ase\"\n").unwrap_err().to_string();
+    assert!(twice.contains("twice"), "{twice}");
+    let tone = ToneSettings::new(ToneCurve::Ap3);
+    let text = TrainConfig { tone, ..TrainConfig::default() }.to_toml().unwrap();
+    assert!(text.contains("curve = \"ap3\"") && !text.contains("family"), "{text}");
+    for name in ["AP3", "Ap3", "ap3"] {
+        assert_eq!(name.parse::<CurveChoice>().unwrap(), ToneCurve::Ap3.into());
+    }
+}
+
+#[test]
+fn a_rounded_curve_is_the_same_to_the_kernels_and_short() {
+    let long = ToneSettings {
+        gain_c: 1.234_567_890_123e-250,
+        alpha: 0.1 + 0.2,
+        constants: vec![1.0 / 3.0, -2.0 / 7.0, 1e-7, 3.0],
+        ..ToneSettings::new(ToneCurve::FittedCubic)
+    };
+    let short = long.clone().rounded();
+    assert_eq!((short.gain_c, short.alpha), (0.0, 0.3));
+    for (long, short) in long.constants.iter().zip(&short.constants) {
+        assert_eq!((*long as f32).to_bits(), (*short as f32).to_bits());
+        assert!(short.to_string().len() <= 12, "{short}");
+    }
+    assert_eq!(short.clone().rounded(), short);
 }

@@ -380,7 +380,7 @@ fn sets_of_any_kind_have_a_plan_or_one_clear_error() {
     let log = fs::read_to_string(out.join("train.csv")).unwrap();
     assert!(!log.contains(",003,") && !log.contains(",005,"));
     black(|_| true);
-    refused(&format!("diagnose {root}"), 1, &["as good as black", "expose longer"]);
+    refused(&format!("diagnose {root}"), 3, &["as good as black", "expose longer"]);
 
     // Half the views well lit.
     let set = written(&Capture { stops: vec![0.0, 4.5], ..Capture::default() });
@@ -421,10 +421,10 @@ fn a_plan_of_another_dataset_or_none_at_all_is_refused_in_one_line() {
     let plan = set.path().join("plan.toml");
     succeed(&format!("diagnose {root} --plan {} --downscale 2", plan.display()));
     let train = format!("train {root} --out {} --steps 1 --plan {}", out.display(), plan.display());
-    refused(&train, 1, &["plan.toml", "another dataset"]);
+    refused(&train, 3, &["plan.toml", "another dataset"]);
     fs::write(&plan, "steps = 4\n").unwrap();
-    refused(&train, 1, &["plan.toml", "is no plan"]);
+    refused(&train, 3, &["plan.toml", "is no plan"]);
     fs::remove_file(&plan).unwrap();
-    refused(&train, 1, &["plan.toml", "cannot be read"]);
+    refused(&train, 3, &["plan.toml", "cannot be read"]);
     assert!(!out.exists());
 }

@@ -6,7 +6,7 @@ use nightsplat::attributes::Attribute;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::gpu::{Gpu, Reference};
 use nightsplat::kernels::adam;
-use nightsplat::optimizer::{Adam, AdamBuffers, LearningRates, Moments, Schedule};
+use nightsplat::optimizer::{Adam, AdamBuffers, FiniteCheck, LearningRates, Moments, Schedule};
 
 /// Two features and SH of degree 1.
 const COLUMNS: u32 = 25;
@@ -266,5 +266,31 @@ fn a_buffer_that_is_too_short_is_refused() {
             adam.record(pass, step, &rates, [2, 14, 0], buffers, &status)
         });
         assert!(result.is_err(), "{lengths:?} {status_len} {step}");
+    }
+}
+
+#[test]
+fn the_first_value_that_is_not_finite_is_found_wherever_it_stands_and_none_where_there_is_none() {
+    let gpu = gpu();
+    let mut check = FiniteCheck::new(&gpu).unwrap();
+    for count in [1, 3, 4, 255, 1024, 1025, 4097] {
+        // Extremes are finite; what lies behind the last value does not count.
+        let mut values: Vec<f32> =
+            (0..count + 4).map(|i| [f32::MAX, -f32::MAX, 1e-45, -0.0][i % 4]).collect();
+        values[count] = f32::NAN;
+        let buffer = gpu.buffer("values", &values).unwrap();
+        assert_eq!(check.first(&gpu, &buffer, count).unwrap(), None, "{count}");
+        for wrong in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, -f32::NAN] {
+            for at in [0, count / 2, count - 1] {
+                let mut values = values.clone();
+                values[at] = wrong;
+                values[count - 1] = wrong;
+                let buffer = gpu.buffer("values", &values).unwrap();
+                let found = gpu.checked(|| check.first(&gpu, &buffer, count));
+                found.1.agree().unwrap();
+                assert_eq!(found.0.unwrap(), Some(at), "{wrong} at {at} of {count}");
+            }
+        }
+        assert!(check.first(&gpu, &buffer, count + 5).is_err());
     }
 }

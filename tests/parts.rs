@@ -331,7 +331,7 @@ fn a_run_with_networks_is_saved_scored_and_shown_layer_by_layer() {
     let config = std::fs::read_to_string(run.join("config.toml")).unwrap();
     std::fs::write(run.join("config.toml"), config.replace("channels = 4", "channels = 5"))
         .unwrap();
-    refused(&format!("eval {at}"), 1, &["networks.safetensors", "\"channels\":4"]);
+    refused(&format!("eval {at}"), 3, &["networks.safetensors", "\"channels\":4"]);
 }
 
 #[test]
@@ -349,7 +349,7 @@ fn a_layer_that_the_model_lacks_is_named_with_those_it_has() {
     let text = std::fs::read_to_string(&config).unwrap();
     let with_denoiser = text.replace("denoiser = false", "denoiser = true");
     std::fs::write(&config, &with_denoiser).unwrap();
-    refused(&format!("eval {at}"), 1, &["networks.safetensors"]);
+    refused(&format!("eval {at}"), 3, &["networks.safetensors"]);
     let of_paper = with_denoiser.replace("form = \"identity\"", "form = \"paper\"");
     std::fs::write(&config, of_paper).unwrap();
     refused(&format!("eval {at}"), 2, &["no noise, which the denoiser takes"]);

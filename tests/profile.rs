@@ -87,9 +87,9 @@ fn a_profile_that_is_none_is_refused_in_one_line() {
     for command in [&train, &tone] {
         refused(&format!("{command} --profile {file} --curve ap3"), 2, &["--profile", "--curve"]);
         refused(&format!("{command} --profile {file} --gain 2"), 2, &["--profile", "--gain"]);
-        refused(&format!("{command} --curve {file}"), 1, &["profile.toml", "--profile"]);
+        refused(&format!("{command} --curve {file}"), 3, &["profile.toml", "--profile"]);
         refused(&format!("{command} --curve profile"), 2, &["--profile FILE"]);
-        refused(&format!("{command} --profile {}", path("absent.toml")), 1, &["absent.toml"]);
+        refused(&format!("{command} --profile {}", path("absent.toml")), 3, &["absent.toml"]);
     }
     refused(&format!("{train} --profile {file} --set tone.brightness=0.5"), 2, &["references"]);
     refused(&format!("{train} --set tone.curve=profile"), 2, &["--profile"]);
@@ -101,17 +101,17 @@ fn a_profile_that_is_none_is_refused_in_one_line() {
         ("segments = [\n    [", "segments = [\n    [0.99, ", "red has 18 values"),
     ] {
         fs::write(&file, good.replacen(from, to, 1)).unwrap();
-        refused(&format!("{tone} --profile {file}"), 1, &["profile.toml", part]);
+        refused(&format!("{tone} --profile {file}"), 3, &["profile.toml", part]);
     }
     let mut lines: Vec<String> = good.lines().map(str::to_owned).collect();
     let red = lines.iter().position(|line| line.starts_with("segments")).unwrap() + 1;
     lines[red] = format!("    [0.9{}],", ", 0.1".repeat(16));
     fs::write(&file, lines.join("\n")).unwrap();
-    refused(&format!("{tone} --profile {file}"), 1, &["segments of red fall from 0.9 to 0.1"]);
+    refused(&format!("{tone} --profile {file}"), 3, &["segments of red fall from 0.9 to 0.1"]);
 
     refused(&format!("fit {set} --profile --family ase"), 2, &["--profile", "--family"]);
     fs::remove_dir_all(folder.path().join("set/high")).unwrap();
-    refused(&format!("fit {set} --profile --out {file}"), 1, &["holds no pairs"]);
+    refused(&format!("fit {set} --profile --out {file}"), 3, &["holds no pairs"]);
     fs::create_dir(folder.path().join("set/high")).unwrap();
-    refused(&format!("fit {set} --profile --out {file}"), 1, &["set/"]);
+    refused(&format!("fit {set} --profile --out {file}"), 3, &["set/"]);
 }

@@ -224,8 +224,8 @@ fn misuse_is_refused_before_anything_is_trained() {
     refused("--alpha 2", 2, &["alpha is 2"]);
     refused("--steps no --curves all", 2, &["--steps"]);
     refused("--curves all --jobs 0", 2, &["--jobs"]);
-    refused("--curves all --device voodoo", 1, &["voodoo"]);
-    refused("--curves all --reference nowhere", 1, &["nowhere"]);
+    refused("--curves all --device voodoo", 4, &["voodoo"]);
+    refused("--curves all --reference nowhere", 3, &["nowhere"]);
     let nowhere = tempfile::tempdir().unwrap().path().join("set");
     let arguments = format!("sweep {0} --out {0}/out --curves all", nowhere.display());
     let (_, said) = run(&arguments, 1);

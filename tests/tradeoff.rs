@@ -178,8 +178,8 @@ fn misuse_is_refused_before_anything_is_trained() {
     refused("--knob downscale=2,4", 2, &["downscale", "resolution_steps"]);
     refused("--preset fast", 2, &["--presets"]);
     refused("--presets fast,slow", 2, &["slow", "draft"]);
-    refused("--device voodoo", 1, &["voodoo"]);
-    refused("--reference nowhere", 1, &["nowhere"]);
+    refused("--device voodoo", 4, &["voodoo"]);
+    refused("--reference nowhere", 3, &["nowhere"]);
     let nowhere = tempfile::tempdir().unwrap().path().join("set");
     let (_, said) = run(&format!("tradeoff {0} --out {0}/out", nowhere.display()), 1);
     assert!(said.contains("is not a folder") && !nowhere.exists(), "{said}");

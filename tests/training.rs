@@ -36,7 +36,7 @@ fn config() -> TrainConfig {
 }
 
 fn mean_psnr(dataset: &Dataset, gaussians: &Gaussians) -> f64 {
-    let mut player = Player::new(&gpu(), gaussians, false, None, None).unwrap();
+    let mut player = Player::new(&gpu(), gaussians, &TrainConfig::default(), None).unwrap();
     let scored = eval::score(dataset, |view| player.render(view)).unwrap();
     let scores: Vec<Scores> = scored.iter().map(|view| view.scores).collect();
     Scores::mean(&scores).unwrap().psnr
@@ -287,6 +287,7 @@ fn a_render_shows_what_its_model_was_trained_to() {
     advance(&mut trainer, 60);
     let view = &dataset.views[0];
     let in_training = trainer.render(&view.camera).unwrap();
-    let mut player = Player::new(&gpu(), &trainer.gaussians().unwrap(), false, None, None).unwrap();
+    let mut player =
+        Player::new(&gpu(), &trainer.gaussians().unwrap(), &TrainConfig::default(), None).unwrap();
     assert_eq!(in_training.colors.data, player.render(view).unwrap().colors.data);
 }

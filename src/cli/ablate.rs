@@ -1,5 +1,6 @@
 //! `nightsplat ablate`: what each part of the model buys on a scene, and what it costs.
 
+use std::borrow::Cow;
 use std::io::Write;
 use std::path::PathBuf;
 
@@ -11,7 +12,7 @@ use super::table;
 use super::train::{TrainOptions, held_unless};
 use crate::Error;
 use crate::dataset::Dataset;
-use crate::eval;
+use crate::eval::{self, Yardstick};
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::image::Image;
 use crate::output::write_whole;
@@ -78,7 +79,7 @@ pub fn run(args: &AblateArgs) -> Result<()> {
     let dark = eval::score(&dataset, |view| {
         // A test view without its dark photograph shows nothing.
         let black = || Image::filled(view.camera.width, view.camera.height, [0.0; 3]);
-        Ok(view.image.clone().unwrap_or_else(black).into())
+        Ok(view.loaded()?.map_or_else(black, Cow::into_owned).into())
     })?;
     let table = comparison::score_table("model", &dark, &runs);
     let test_views = dataset.test_views().filter(|view| view.reference.is_some());
@@ -97,18 +98,20 @@ pub fn run(args: &AblateArgs) -> Result<()> {
         tables: vec![table.clone()],
     };
     let known = config.tone.knows_references().map(|known| eval::with_reference(&known));
-    page.intro.extend(known.clone());
+    let against = Yardstick::kind(&config.tone, &dataset).label();
+    let against = against.map(|label| format!("The test views are scored {label}."));
+    let notes: Vec<String> = known.into_iter().chain(against).collect();
+    page.intro.extend(notes.clone());
     let index = args.out.join("index.html");
     write_whole(&index, page.html().as_bytes())?;
     write_whole(
         &args.out.join("table.md"),
-        (table.markdown()
-            + &known.as_deref().map(|line| format!("\n{line}\n")).unwrap_or_default())
+        (table.markdown() + &notes.iter().map(|line| format!("\n{line}\n")).collect::<String>())
             .as_bytes(),
     )?;
     let mut out = std::io::stdout().lock();
     write!(out, "{}\n{}\n", table::of(&table), index.display())?;
-    if let Some(line) = known {
+    for line in notes {
         writeln!(out, "{line}")?;
     }
     Ok(())

@@ -75,10 +75,12 @@ impl Run {
             return Ok(false);
         }
         let found = load_config(&self.folder)?;
-        // A run records the tile that it took; where none is asked for, any is right.
-        let found = TrainConfig { tile: self.config.tile.and(found.tile), ..found };
-        if found != self.config {
-            let differs = difference(&found.to_toml()?, &self.config.to_toml()?);
+        // A run records the tile and the frame that it took; where none is asked for, any is right.
+        let (tile, frame) = (self.config.tile.and(found.tile), self.config.frame.and(found.frame));
+        let found = TrainConfig { tile, frame, ..found };
+        let own = self.config.clone().with_absolute_paths();
+        if found != own {
+            let differs = difference(&found.to_toml()?, &own.to_toml()?);
             let problem = format!("holds another run ({differs}); choose another --out");
             return Err(Error::output(&self.folder, problem));
         }

@@ -50,9 +50,8 @@ struct Curve {
 ///
 /// # Errors
 /// As [`text`], or standard output cannot be written to.
-pub fn run(args: &CurvesArgs) -> Result<()> {
-    write!(std::io::stdout().lock(), "{}", text(args)?)
-        .map_err(|error| Error::output("standard output", error.to_string()))
+pub fn run(args: &CurvesArgs) -> anyhow::Result<()> {
+    Ok(write!(std::io::stdout().lock(), "{}", text(args)?)?)
 }
 
 /// What the command prints; the plot is written.

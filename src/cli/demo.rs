@@ -111,7 +111,7 @@ fn train_with(curve: ToneCurve, gpu: &Gpu, dataset: &Dataset, out: &Path) -> cra
 /// What the dark photographs themselves score: the least that a model must beat.
 fn dark_scores(dataset: &Dataset) -> crate::Result<Vec<ViewScore>> {
     let nothing = || Error::input(&dataset.root, "has a test view without its dark photograph");
-    eval::score(dataset, |view| Ok(view.image.clone().ok_or_else(nothing)?.into()))
+    eval::score(dataset, |view| Ok(view.loaded()?.ok_or_else(nothing)?.into_owned().into()))
 }
 
 /// The name of a run on the page.

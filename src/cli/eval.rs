@@ -1,4 +1,4 @@
-//! `nightsplat eval`: score a finished run on its test views.
+//! `nightsplat eval`: score a run on its test views.
 
 use std::io::Write;
 use std::path::PathBuf;
@@ -7,16 +7,20 @@ use anyhow::Result;
 
 use super::finished_run::FinishedRun;
 use super::{progress_bar, table};
-use crate::eval::{self, ViewScore};
+use crate::eval::{self, ViewScore, Yardstick};
 use crate::gpu::DeviceChoice;
 use crate::metrics::Scores;
+use crate::output::printable;
 use crate::run;
 use crate::train::Learning;
 
-/// Score a finished run on the test views of its dataset.
+/// Score a run on the test views of its dataset.
 ///
 /// Renders every test view that has a normal-light reference image and compares the two in 8 bits: PSNR over all
-/// channels, the mean of the three channels' PSNRs (what the paper's code computes), and SSIM.
+/// channels, the mean of the three channels' PSNRs (what the paper's code computes), and SSIM. Where no test view has one,
+/// each is compared with its own pseudo-GT, what the run's curve makes of its photograph, and that is said: it tells how
+/// well the model shows its targets, not how right these are. A run that was stopped is scored as it was at its last
+/// checkpoint.
 #[derive(Clone, Debug, clap::Args)]
 pub struct EvalArgs {
     /// The run directory that `nightsplat train` wrote
@@ -24,7 +28,10 @@ pub struct EvalArgs {
     /// Print what metrics.json holds instead of a table
     #[arg(long)]
     pub json: bool,
-    /// Write what was scored to RUN/eval/renders and RUN/eval/references
+    /// Where the dataset is now, or another copy of it; what differs from the run's views is said [default: where the run found it]
+    #[arg(long, value_name = "DIR")]
+    pub dataset: Option<PathBuf>,
+    /// Write what was scored to RUN/eval/renders, and what it was compared with to RUN/eval/references or RUN/eval/targets
     #[arg(long)]
     pub save_images: bool,
     /// The device: a part of its name or its index in `nightsplat doctor` [default: that of the run]
@@ -35,19 +42,22 @@ pub struct EvalArgs {
 /// Scores the run and prints the scores.
 ///
 /// # Errors
-/// The folder holds no finished run, its dataset is gone, or a file cannot be written.
+/// The folder holds no run with a model, its dataset is gone, or a file cannot be written.
 pub fn run(args: &EvalArgs) -> Result<()> {
-    let FinishedRun { config, dataset, gaussian_count, mut player } =
-        FinishedRun::open(&args.run, args.device.as_ref())?;
-    let bar = progress_bar(dataset.test_views().filter(|view| view.reference.is_some()).count());
-    let scored = eval::score(&dataset, |view| {
-        bar.set_message(view.name.clone());
+    let FinishedRun { gpu, config, dataset, gaussian_count, mut player } =
+        FinishedRun::open(&args.run, args.dataset.as_deref(), args.device.as_ref())?;
+    let yardstick = Yardstick::of(&gpu, &config.tone, &dataset)?;
+    let bar = progress_bar(yardstick.view_count(&dataset));
+    let scored = eval::score_by(&yardstick, &dataset, |view| {
+        bar.set_message(printable(&view.name).into_owned());
         player.render(view).inspect(|_| bar.inc(1))
     })?;
     bar.finish_and_clear();
     if scored.is_empty() {
         let root = dataset.root.display();
-        tracing::warn!("{root}: no test view has a reference image, so there is nothing to score");
+        tracing::warn!(
+            "{root}: no test view has a reference image or a photograph, so there is nothing to score"
+        );
     }
     if args.save_images {
         eval::save_images(&args.run.join("eval"), &scored)?;
@@ -56,7 +66,9 @@ pub fn run(args: &EvalArgs) -> Result<()> {
     if args.json {
         let recorded = run::load_metrics(&args.run);
         let seconds = recorded["seconds"].as_f64();
-        let mut metrics = eval::metrics(&scored, seconds, gaussian_count, config.steps);
+        let steps = recorded["steps"].as_u64().or_else(|| run::stopped_at(&args.run));
+        let steps = steps.unwrap_or(config.steps);
+        let mut metrics = eval::metrics(&scored, seconds, gaussian_count, steps);
         eval::add_reference(&mut metrics, &config.tone);
         for what in [run::SPENT, run::TARGET_EXPOSURE] {
             if let Some(known) = recorded.get(what) {
@@ -71,6 +83,9 @@ pub fn run(args: &EvalArgs) -> Result<()> {
         write!(out, "{}", score_table(&scored))?;
         if let Some(known) = config.tone.knows_references() {
             writeln!(out, "{}", eval::with_reference(&known))?;
+        }
+        if let Some(label) = eval::label(&scored) {
+            writeln!(out, "{label}")?;
         }
     }
     Ok(())

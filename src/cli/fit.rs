@@ -235,7 +235,7 @@ pub fn apply(args: &FitArgs) -> Result<Vec<Fitted>> {
 /// The curve with what is known of it in comments.
 fn toml(fitted: &Fitted) -> Result<String> {
     let Fitted { family, formula, fit, .. } = fitted;
-    let settings = toml::to_string(&fit.settings).map_err(|error| {
+    let settings = toml::to_string(&fit.settings.clone().rounded()).map_err(|error| {
         Error::output("the curve", format!("cannot be written as TOML: {error}"))
     })?;
     let mut text = format!(

@@ -8,7 +8,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::{Value, json};
 
 use crate::dataset::Dataset;
-use crate::eval::{self, ViewScore};
+use crate::eval::{self, Against, ViewScore};
 use crate::gpu::Gpu;
 use crate::run::{self, Event, HeldRun, Trained};
 use crate::train::{StepReport, TrainConfig};
@@ -55,6 +55,8 @@ pub(crate) fn train(
 #[derive(Debug)]
 pub(crate) struct Reporter {
     form: ProgressForm,
+    /// What JSON says of a run at its start.
+    facts: Value,
     bar: ProgressBar,
     /// The last step.
     steps: u64,
@@ -66,7 +68,19 @@ pub(crate) struct Reporter {
 impl Reporter {
     pub(crate) fn new(form: ProgressForm) -> Self {
         let now = Instant::now();
-        Self { form, bar: ProgressBar::hidden(), steps: 0, begin: (now, 0), spoke: now }
+        Self {
+            form,
+            facts: json!({}),
+            bar: ProgressBar::hidden(),
+            steps: 0,
+            begin: (now, 0),
+            spoke: now,
+        }
+    }
+
+    /// The same, which says so much more of a run at its start where it says JSON.
+    pub(crate) fn with_facts(self, facts: Value) -> Self {
+        Self { facts, ..self }
     }
 
     /// Says it.
@@ -120,7 +134,10 @@ impl Reporter {
         let line = match event {
             Event::Started { step, steps } => {
                 self.start(step, steps);
-                json!({ "event": "started", "step": step, "steps": steps })
+                let mut started = json!({ "event": "started", "step": step, "steps": steps });
+                let facts = self.facts.as_object().into_iter().flatten();
+                facts.for_each(|(name, value)| started[name] = value.clone());
+                started
             }
             Event::Step(report) if self.is_due() || report.step == self.steps => {
                 let StepReport { step, view, loss, gaussians, .. } = report;
@@ -184,9 +201,12 @@ pub(crate) fn summary(scored: &[ViewScore]) -> Option<String> {
     let (mean, r0) = eval::means(scored);
     let mean = mean?;
     let before = r0.map(|r0| format!("; before the denoiser {:.2} dB, {:.3}", r0.psnr, r0.ssim));
+    let against = scored.first().filter(|view| view.against != Against::References);
+    let against = against.map(|view| format!(" against their {}", view.against.name()));
     Some(format!(
-        "{} test views: PSNR {:.2} dB (channel mean {:.2}), SSIM {:.3}{}",
+        "{} test views{}: PSNR {:.2} dB (channel mean {:.2}), SSIM {:.3}{}",
         scored.len(),
+        against.unwrap_or_default(),
         mean.psnr,
         mean.psnr_channel_mean,
         mean.ssim,
@@ -203,6 +223,7 @@ fn scores(scored: &[ViewScore]) -> Value {
             "psnr_channel_mean": mean.psnr_channel_mean,
             "ssim": mean.ssim,
             "views": scored.len(),
+            "against": scored.first().map(|view| view.against.name()),
         })
     })
 }

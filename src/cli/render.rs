@@ -1,4 +1,6 @@
-//! `nightsplat render`: pictures of a finished run from the cameras of its dataset.
+//! `nightsplat render`: pictures of a run from the cameras of its dataset, or along a path through them.
+
+mod video;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -7,25 +9,45 @@ use anyhow::Result;
 
 use super::finished_run::FinishedRun;
 use super::{ImageFormat, progress_bar};
+use crate::camera::{Camera, CameraPath};
 use crate::dataset::{Dataset, Split, View};
 use crate::eval::Layer;
 use crate::exposure::Affine;
 use crate::gpu::DeviceChoice;
 use crate::image::Image;
+use crate::output::printable;
 use crate::tone::exposed_anew;
 use crate::{Error, run};
 
-/// Render a finished run from the cameras of its dataset, whether they took an image or not.
+/// Render a run from the cameras of its dataset, whether they took an image or not, or along a path through them.
+///
+/// A run that was stopped is shown as it was at its last checkpoint.
 #[derive(Clone, Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
 pub struct RenderArgs {
     /// The run directory that `nightsplat train` wrote
     pub run: PathBuf,
     /// Which cameras
+    #[arg(long, value_enum, required_unless_present = "path", conflicts_with = "path")]
+    pub split: Option<SplitChoice>,
+    /// Fly in place of standing where the photographs were taken
     #[arg(long, value_enum)]
-    pub split: SplitChoice,
+    pub path: Option<PathChoice>,
+    /// How many pictures a path has
+    #[arg(long, value_name = "N", default_value_t = 120, requires = "path", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    pub frames: u32,
+    /// Pictures a second of the video
+    #[arg(long, value_name = "N", default_value_t = 30, value_parser = clap::value_parser!(u16).range(1..=1000))]
+    pub fps: u16,
+    /// Make a video of a path's pictures as well, with the ffmpeg on your path; FILE.png: a moving PNG, without it
+    #[arg(long, value_name = "FILE", requires = "path")]
+    pub video: Option<PathBuf>,
     /// The folder to write to, one picture per view; pictures of the same names are replaced
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
+    /// Where the dataset is now, or another copy of it; what differs from the run's views is said [default: where the run found it]
+    #[arg(long, value_name = "DIR")]
+    pub dataset: Option<PathBuf>,
     /// What to show: rgb, denoised, depth, structure, illumination or noise [default: denoised where the model has a
     /// denoiser, else rgb]. A PNG of depth stretches from the least to the largest value of the view
     #[arg(long)]
@@ -40,6 +62,32 @@ pub struct RenderArgs {
     /// The device: a part of its name or its index in `nightsplat doctor` [default: that of the run]
     #[arg(long, value_name = "NAME|INDEX")]
     pub device: Option<DeviceChoice>,
+}
+
+const EXAMPLES: &str = "Examples:
+  nightsplat render run --split test --out pictures
+  nightsplat render run --path orbit --frames 180 --out frames --video orbit.mp4
+  nightsplat render run --path interpolate --out frames --video flight.png";
+
+/// How a camera flies.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum PathChoice {
+    /// Around the point nearest to all optical axes
+    Orbit,
+    /// About the mean camera, two turns; for photographs from one side
+    Spiral,
+    /// Smoothly through all training cameras by name
+    Interpolate,
+}
+
+impl From<PathChoice> for CameraPath {
+    fn from(path: PathChoice) -> Self {
+        match path {
+            PathChoice::Orbit => Self::Orbit,
+            PathChoice::Spiral => Self::Spiral,
+            PathChoice::Interpolate => Self::Interpolate,
+        }
+    }
 }
 
 /// Views by what they are for.
@@ -63,38 +111,76 @@ impl SplitChoice {
     }
 }
 
-/// Renders the views.
+/// A picture to be made.
+struct Shot {
+    /// Its file's name without extension.
+    name: String,
+    camera: Camera,
+}
+
+/// Renders the views, or a path.
 ///
 /// # Errors
-/// The folder holds no finished run, its dataset is gone or has no such view, or a file cannot be written.
+/// The folder holds no run with a model, its dataset is gone or has no such view, a file cannot be written, or there is no
+/// ffmpeg where a video is asked for.
 pub fn run(args: &RenderArgs) -> Result<()> {
-    let RenderArgs { run, split, out, layer, view_exposure, format, device } = args;
-    let FinishedRun { dataset, mut player, .. } = FinishedRun::open(run, device.as_ref())?;
-    let exposures = if *view_exposure { Some(ViewExposures::of(run)?) } else { None };
-    let views: Vec<&View> = dataset.views.iter().filter(|view| split.includes(view)).collect();
-    if views.is_empty() {
-        let problem = "has no view of that split; try --split all";
-        return Err(Error::input(&dataset.root, problem).into());
+    let RenderArgs { run, out, layer, view_exposure, format, device, .. } = args;
+    if let Some(video) = &args.video {
+        video::check(video, *format)?;
     }
+    let FinishedRun { dataset, mut player, .. } =
+        FinishedRun::open(run, args.dataset.as_deref(), device.as_ref())?;
+    let exposures = if *view_exposure { Some(ViewExposures::of(run)?) } else { None };
+    let shots = shots(args, &dataset)?;
     make_folder(out, &dataset, run)?;
-    let bar = progress_bar(views.len());
-    for view in &views {
-        bar.set_message(view.name.clone());
-        let path = out.join(format!("{}.{}", view.name, format.extension()));
+    let bar = progress_bar(shots.len());
+    for Shot { name, camera } in &shots {
+        bar.set_message(printable(name).into_owned());
+        let path = file(out, name, *format);
         let color = |image: Image| match &exposures {
-            Some(exposures) => format.save(&exposures.applied(view, image), &path),
+            Some(exposures) => format.save(&exposures.applied(name, image), &path),
             None => format.save(&image, &path),
         };
         match layer {
-            None => color(player.render(view)?.output().clone())?,
-            Some(layer) if layer.is_color() => color(player.layer(view, *layer)?)?,
-            Some(layer) => save_numbers(player.layer(view, *layer)?, *layer, *format, &path)?,
+            None => color(player.render_camera(camera)?.output().clone())?,
+            Some(layer) if layer.is_color() => color(player.layer(camera, *layer)?)?,
+            Some(layer) => save_numbers(player.layer(camera, *layer)?, *layer, *format, &path)?,
         }
         bar.inc(1);
     }
     bar.finish_and_clear();
-    tracing::info!("{} pictures are in {}", views.len(), out.display());
+    tracing::info!("{} pictures are in {}", shots.len(), out.display());
+    if let Some(video) = &args.video {
+        let files: Vec<PathBuf> = shots.iter().map(|shot| file(out, &shot.name, *format)).collect();
+        video::make(video, out, &files, args.fps)?;
+    }
     Ok(())
+}
+
+fn file(folder: &Path, name: &str, format: ImageFormat) -> PathBuf {
+    folder.join(format!("{name}.{}", format.extension()))
+}
+
+/// What is to be seen, from where.
+fn shots(args: &RenderArgs, dataset: &Dataset) -> crate::Result<Vec<Shot>> {
+    let Some(path) = args.path else {
+        let includes = |view: &&View| args.split.is_none_or(|split| split.includes(view));
+        let views = dataset.views.iter().filter(includes);
+        let shots: Vec<Shot> =
+            views.map(|view| Shot { name: view.name.clone(), camera: view.camera }).collect();
+        if shots.is_empty() {
+            let problem = "has no view of that split; try --split all";
+            return Err(Error::input(&dataset.root, problem));
+        }
+        return Ok(shots);
+    };
+    let poses: Vec<Camera> = dataset.train_views().map(|view| view.camera).collect();
+    let cameras = CameraPath::from(path).cameras(&poses, args.frames as usize)?.into_iter();
+    // As ffmpeg counts them.
+    Ok(cameras
+        .zip(0..)
+        .map(|(camera, index)| Shot { name: format!("{index:05}"), camera })
+        .collect())
 }
 
 /// The exposures of a run's training views beside the one of its model.
@@ -120,16 +206,16 @@ impl ViewExposures {
     }
 
     /// The model's picture of a view at the exposure of the view's target.
-    fn applied(&self, view: &View, mut image: Image) -> Image {
+    fn applied(&self, view: &str, mut image: Image) -> Image {
         let number = |value: &serde_json::Value| value.as_f64();
         let exposure = match self {
             Self::Learned(exposures) => {
-                let own = exposures.get(&view.name);
+                let own = exposures.get(view);
                 return own.map_or(image.clone(), |own| own.applied(&image));
             }
             Self::OfTargets(exposure) => exposure,
         };
-        let gains = number(&exposure["model_gain"]).zip(number(&exposure["gains"][&view.name]));
+        let gains = number(&exposure["model_gain"]).zip(number(&exposure["gains"][view]));
         let Some((from, to)) = gains else { return image };
         let knots = exposed_anew([from, to], number(&exposure["scene"]["weight"]).unwrap_or(1.0));
         for x in &mut image.data {

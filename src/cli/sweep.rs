@@ -190,7 +190,8 @@ fn manifest(args: &SweepArgs, runs: &[Run]) -> crate::Result<String> {
 /// delta0, the mean over the training views, where the sweep has the adaptive black level.
 fn adaptive_offset(runs: &[Run], dataset: &Dataset) -> Option<f64> {
     let run = runs.iter().find(|run| run.point.value(OFFSET) == Some(ADAPTIVE))?;
-    let images = dataset.train_views().filter_map(|view| view.image.as_ref());
+    // Those that can be read: what cannot is said where it is trained on.
+    let images = dataset.train_views().filter_map(|view| view.loaded().ok().flatten());
     let offsets: Vec<f64> =
         images.map(|image| run.config.tone.offset(Statistics::of(&image.data).ratio())).collect();
     Some(offsets.iter().sum::<f64>() / offsets.len() as f64)

@@ -1,5 +1,6 @@
 //! Tables for the terminal.
 
+use crate::output::printable;
 use crate::report::{Column, Table};
 
 /// A table of the report, as the terminal shows it.
@@ -20,13 +21,15 @@ pub(super) fn of(table: &Table) -> String {
 /// The rows with their columns aligned: the first to the left, the others to the right.
 pub(super) fn aligned(rows: &[Vec<String>]) -> String {
     let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
-    let cell_width =
-        |row: &Vec<String>, column: usize| row.get(column).map_or(0, |cell| cell.chars().count());
+    let cell_width = |row: &Vec<String>, column: usize| {
+        row.get(column).map_or(0, |cell| printable(cell).chars().count())
+    };
     let widths: Vec<usize> = (0..columns)
         .map(|column| rows.iter().map(|row| cell_width(row, column)).max().unwrap_or(0))
         .collect();
     let line = |row: &Vec<String>| {
         let cells = row.iter().zip(&widths).enumerate().map(|(column, (cell, &width))| {
+            let cell = printable(cell);
             if column == 0 { format!("{cell:width$}") } else { format!("  {cell:>width$}") }
         });
         cells.collect::<String>().trim_end().to_owned() + "\n"

@@ -17,6 +17,7 @@ use crate::eval;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::image::{Image, Mask};
 use crate::metrics::Scores;
+use crate::output::printable;
 use crate::pseudo_gt::PseudoGt;
 use crate::report::Distribution;
 use crate::tone::{
@@ -249,7 +250,7 @@ pub(super) fn apply_settings(args: &ToneArgs, settings: ToneSettings) -> Result<
     let mut views = vec![];
     let mut unusable = None;
     for photograph in &photographs {
-        progress.set_message(photograph.name.clone());
+        progress.set_message(printable(&photograph.name).into_owned());
         match mapped(&mut set, photograph) {
             Ok(mapped) => {
                 if let Some(target) = &photograph.target {

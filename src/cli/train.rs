@@ -1,21 +1,28 @@
 //! `nightsplat train`: dark photographs in, a run directory out.
 
+mod facts;
+
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use anyhow::Result;
 
+use self::facts::Facts;
 use super::diagnose;
 use super::progress::{ProgressForm, Reporter, summary};
+use super::signals;
 use crate::dataset::Dataset;
 use crate::densify::DensityControl;
 use crate::diagnose::{Diagnosis, Plan};
 use crate::eval;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::nn::Precision;
-use crate::run::{self, HeldRun, RunDirectory, Trained};
+use crate::output::printable;
+use crate::run::{self, HeldRun, RunDirectory, Session, Trained};
 use crate::tone::{CurveChoice, GainChoice, Profile, ToneCurve, ToneSettings};
-use crate::train::{Background, Learning, ModelName, Part, Preset, TrainConfig};
+use crate::train::{
+    Background, CacheSize, Learning, ModelName, Part, Preset, StopConfig, TrainConfig,
+};
 
 /// Train a 3D Gaussian Splatting model from dark photographs.
 ///
@@ -27,13 +34,13 @@ use crate::train::{Background, Learning, ModelName, Part, Preset, TrainConfig};
 pub struct TrainArgs {
     /// The dataset: a folder with transforms*.json (LOM, RealX3D, NeRF) or a COLMAP model in sparse/, as `nightsplat pose` makes one
     pub dataset: PathBuf,
-    /// The run directory to write: config.toml, model.ply, the networks, train.csv, a checkpoint, metrics.json
+    /// The run directory to write: config.toml, model.ply, the networks, train.csv, evals.csv, a checkpoint, metrics.json
     #[arg(long, value_name = "RUN")]
     pub out: PathBuf,
     /// Replace the run that RUN already holds
     #[arg(long)]
     pub overwrite: bool,
-    /// Go on from the checkpoint in RUN, or begin where there is none; the model gets the same bits as in one go
+    /// Go on from the checkpoint in RUN, or begin where there is none; the model gets the same bits as in one go. Give the options that the run began with; --steps may be more, --max-gaussians less, and what is logged another
     #[arg(long, conflicts_with = "overwrite")]
     pub resume: bool,
     /// The plan that `nightsplat diagnose --plan` wrote, in place of a diagnosis now; none: no plan, the defaults
@@ -74,6 +81,15 @@ pub(crate) struct TrainOptions {
     /// Shrink the photographs by this factor [default: {downscale}]
     #[arg(long, value_name = "F")]
     downscale: Option<f64>,
+    /// Shrink photographs whose longest side is still larger to so many pixels; 0 or none: take them as they are. Brightness is measured, and the curve applied, at their own size [default: {max_resolution}]
+    #[arg(long, value_name = "N|none", value_parser = max_resolution)]
+    max_resolution: Option<u32>,
+    /// Memory for photographs, such as 4G, on the device and decoded on the host; the rest waits on disk, which takes time and changes no bit [default: a quarter of the memory of each]
+    #[arg(long, value_name = "SIZE")]
+    cache: Option<CacheSize>,
+    /// Hold out every Nth view by name, whatever split the dataset has; 0: none, train on all [default: the dataset's split, else every 8th]
+    #[arg(long, value_name = "N")]
+    test_every: Option<usize>,
     /// Everything random follows from it; the same seed gives the same bits [default: {seed}]
     #[arg(long, value_name = "S")]
     seed: Option<u64>,
@@ -106,18 +122,33 @@ pub(crate) struct TrainOptions {
     invert_masks: bool,
     #[command(flatten)]
     model: ModelOptions,
+    /// Nothing nearer to a camera is seen, in units of the scene's extent: of how far the cameras stand from their middle [default: {near}]
+    #[arg(long, value_name = "N")]
+    near: Option<f64>,
     /// The device: a part of its name or its index in `nightsplat doctor` [default: the best]
     #[arg(long, value_name = "NAME|INDEX")]
     device: Option<String>,
     /// A TOML file with any of the settings of a run's config.toml
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// Score the test views every N steps as well as at the end
+    /// Score the test views every N steps as well as at the end: a line, and a row of evals.csv
     #[arg(long, value_name = "N")]
     eval_every: Option<u64>,
-    /// Write what --resume goes on from every N steps; 0: never [default: {checkpoint_every}]
+    /// Leave RUN/tensorboard: losses, rates, Gaussians, scores, and a test view, for `tensorboard --logdir RUN`
+    #[arg(long)]
+    tensorboard: bool,
+    /// Write what --resume goes on from, and the model, every N steps; 0: never [default: {checkpoint_every}]
     #[arg(long, value_name = "N")]
     checkpoint_every: Option<u64>,
+    /// Write it whenever the last is so many minutes old, too; 0: never [default: {checkpoint_minutes}]
+    #[arg(long, value_name = "MINUTES")]
+    checkpoint_minutes: Option<f64>,
+    /// Save and stop after so many minutes, with exit code 75; --resume goes on; 0: train to the end [default: {max_minutes}]
+    #[arg(long, value_name = "MINUTES")]
+    max_minutes: Option<f64>,
+    /// Log a checksum of every plane of the parameters to hashes.csv every N steps; 0: never [default: {hash_every}]
+    #[arg(long, value_name = "N")]
+    hash_every: Option<u64>,
     /// Compare every pass of every Nth step with its CPU reference, and warn of what differs; 0: never [default: {check.every}]
     #[arg(long, value_name = "N")]
     check_every: Option<u64>,
@@ -213,6 +244,35 @@ impl TrainOptions {
         self.model.model.is_some() || self.model.parts.is_some()
     }
 
+    /// A line for each option that says something of a part which `config` has not.
+    fn idle(&self, config: &TrainConfig) -> Vec<String> {
+        let (model, networks) = (&self.model, [Part::Denoiser, Part::Tonemapper]);
+        let options: [(&str, bool, &[Part]); 7] = [
+            ("denoiser-crop", model.denoiser_crop.is_some(), &networks),
+            ("denoiser-channels", model.denoiser_channels.is_some(), &[Part::Denoiser]),
+            ("denoiser-stages", model.denoiser_stages.is_some(), &[Part::Denoiser]),
+            ("denoiser-repeats", model.denoiser_repeats.is_some(), &[Part::Denoiser]),
+            ("denoiser-precision", model.denoiser_precision.is_some(), &[Part::Denoiser]),
+            ("depth", model.depth.is_some(), &[Part::Depth]),
+            ("depth-is-disparity", model.depth_is_disparity, &[Part::Depth]),
+        ];
+        let is_idle = |parts: &[Part]| !parts.iter().any(|&part| config.model.has(part));
+        let idle = options.into_iter().filter(|(_, is_given, parts)| *is_given && is_idle(parts));
+        let line = |(option, _, parts): (&str, bool, &[Part])| {
+            let names: Vec<&str> = parts.iter().map(|part| part.name()).collect();
+            format!(
+                "--{option} has no effect, as the model has no {}; --parts {} switches it on",
+                names.join(" and no "),
+                names[0]
+            )
+        };
+        let mut lines: Vec<String> = idle.map(line).collect();
+        if self.check_stops && config.check.every == 0 {
+            lines.push("--check-stops has no effect, as no step is checked; --check-every N says which are".to_owned());
+        }
+        lines
+    }
+
     /// Whether a diagnosis of the photographs is to decide what no option says.
     pub(super) fn wants_a_plan(&self) -> bool {
         self.config.is_none() && self.model.preset.is_none_or(Preset::is_planned)
@@ -293,15 +353,23 @@ impl TrainOptions {
             (config.steps, config.stop.views) = (steps, 0);
         }
         set(&mut config.downscale, &self.downscale);
+        set(&mut config.max_resolution, &self.max_resolution);
+        config.cache = self.cache.or(config.cache);
+        config.test_every = self.test_every.or(config.test_every);
+        config.tensorboard |= self.tensorboard;
         set(&mut config.seed, &self.seed);
         set(&mut config.sh_degree, &self.sh_degree);
         set(&mut config.ssim_weight, &self.ssim_weight);
         set(&mut config.max_gaussians, &self.max_gaussians);
         set(&mut config.density.control, &self.density);
         set(&mut config.background, &self.background);
+        set(&mut config.near, &self.near);
         set(&mut config.device, &self.device);
         set(&mut config.eval_every, &self.eval_every);
         set(&mut config.checkpoint_every, &self.checkpoint_every);
+        set(&mut config.checkpoint_minutes, &self.checkpoint_minutes);
+        set(&mut config.max_minutes, &self.max_minutes);
+        set(&mut config.hash_every, &self.hash_every);
         set(&mut config.check.every, &self.check_every);
         config.check.stops |= self.check_stops;
         config.invert_masks |= self.invert_masks;
@@ -324,21 +392,37 @@ impl TrainOptions {
 /// Whatever keeps the run from its end, in one line.
 pub fn run(args: &TrainArgs) -> Result<()> {
     let config = args.options.config(args.dataset.clone())?;
-    if !args.resume {
-        RunDirectory::check(&args.out, args.overwrite)?;
+    match args.resume {
+        true => RunDirectory::check_resumed(&args.out)?,
+        false => RunDirectory::check(&args.out, args.overwrite)?,
     }
     let gpu = Gpu::new(&config.device.parse::<DeviceChoice>()?)?;
     let Planned { config, plan, dataset } = planned(args, config, &gpu)?;
+    let finished = if args.resume { run::done_steps(&args.out, &config, &dataset)? } else { None };
+    if let Some(steps) = finished {
+        let done = format!("{} is done: {steps} steps", args.out.display());
+        return Ok(writeln!(std::io::stdout(), "{}", printable(&done))?);
+    }
+    for line in args.options.idle(&config) {
+        tracing::warn!("{line}");
+    }
     let form = args.progress.unwrap_or_else(ProgressForm::of_terminal);
     let is_text = form != ProgressForm::Json;
     let mut out = std::io::stdout();
-    if let Some(plan) = plan.as_ref().filter(|_| is_text) {
-        say(&mut out, args, &gpu, &dataset, plan)?;
+    let facts = Facts::of(&gpu, &config, plan.as_ref(), &dataset);
+    if is_text {
+        write!(
+            out,
+            "{}{}",
+            facts.text(),
+            plan.as_ref().map(diagnose::decisions).unwrap_or_default()
+        )?;
     }
     let held = if args.resume { HeldRun::Resume } else { held_unless(args.overwrite) };
-    let mut progress = Reporter::new(form);
+    let mut progress = Reporter::new(form).with_facts(serde_json::json!(facts));
+    let session = Session { plan: plan.as_ref(), held, requests: signals::requests()? };
     let Trained { trainer, scored, spent, .. } =
-        run::train_planned(&gpu, &config, plan.as_ref(), &dataset, &args.out, held, |event| {
+        run::train_in(&gpu, &config, &dataset, &args.out, &session, |event| {
             progress.observe(event);
         })?;
     if !is_text {
@@ -350,6 +434,9 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     }
     if let Some(known) = config.tone.knows_references() {
         writeln!(out, "{}", eval::with_reference(&known))?;
+    }
+    if let Some(label) = eval::label(&scored) {
+        writeln!(out, "the scores are {label}")?;
     }
     writeln!(
         out,
@@ -369,8 +456,9 @@ struct Planned {
     dataset: Dataset,
 }
 
-/// Loads the dataset and plans the run, where no option says everything. A run that goes on keeps to its plan.
+/// Loads the dataset, whose sizes are looked at first, and plans the run, where no option says everything. A run that goes on keeps to its plan.
 fn planned(args: &TrainArgs, config: TrainConfig, gpu: &Gpu) -> crate::Result<Planned> {
+    config.check_sizes(gpu)?;
     let is_resumed = args.resume && args.out.join("config.toml").is_file();
     let given = args.plan.clone().filter(|path| path != Path::new("none"));
     let file = given.or_else(|| run::plan_of(&args.out).filter(|_| is_resumed));
@@ -380,6 +468,7 @@ fn planned(args: &TrainArgs, config: TrainConfig, gpu: &Gpu) -> crate::Result<Pl
         return Ok(Planned { config, plan: None, dataset });
     }
     let config = args.options.planned_config(config.dataset, None)?;
+    let config = if is_resumed { as_begun(args, config)? } else { config };
     let options = diagnose::load_options(&config);
     let mut dataset = Dataset::load(&config.dataset, &options)?;
     let plan = match file {
@@ -394,29 +483,26 @@ fn planned(args: &TrainArgs, config: TrainConfig, gpu: &Gpu) -> crate::Result<Pl
     };
     dataset.leave_out(&plan.left_out);
     let config = args.options.planned_config(config.dataset, Some(&plan))?;
+    let config = if is_resumed { as_begun(args, config)? } else { config };
     Ok(Planned { config, plan: Some(plan), dataset })
 }
 
-/// Prints what is looked at, and the plan.
-fn say(
-    out: &mut impl Write,
-    args: &TrainArgs,
-    gpu: &Gpu,
-    dataset: &Dataset,
-    plan: &Plan,
-) -> Result<()> {
-    let [width, height] = plan.dataset.size;
-    writeln!(
-        out,
-        "{}: {} views of {width}x{height} to train on, {} held out, {} points; on {}",
-        args.dataset.display(),
-        dataset.train_views().count(),
-        dataset.test_views().count(),
-        dataset.points.len(),
-        gpu.properties().name
-    )?;
-    write!(out, "{}", diagnose::decisions(plan))?;
-    Ok(())
+/// A run that is made longer keeps the views that it began with: those held out stay so, and end it no more.
+fn as_begun(args: &TrainArgs, config: TrainConfig) -> crate::Result<TrainConfig> {
+    let begun = run::load_config(&args.out)?.stop;
+    if args.options.steps.is_none() || config.stop.views == begun.views {
+        return Ok(config);
+    }
+    let stop = StopConfig { views: begun.views, every: config.steps, ..config.stop };
+    Ok(TrainConfig { stop, ..config })
+}
+
+/// What `--max-resolution` says.
+fn max_resolution(text: &str) -> Result<u32, String> {
+    match text {
+        "none" => Ok(0),
+        _ => text.parse().map_err(|_| "a number of pixels, or none".to_owned()),
+    }
 }
 
 /// What `--overwrite` says.

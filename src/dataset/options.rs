@@ -9,6 +9,14 @@ use crate::{Error, Result};
 pub struct LoadOptions {
     /// Factor by which width and height shrink, at least 1; sizes are rounded to whole pixels.
     pub downscale: f64,
+    /// The longest side of a view, pixels: photographs that exceed it behind `downscale` shrink to it; 0: they do not.
+    pub max_resolution: u32,
+    /// Every so many views by name are held out, whatever split the dataset has; 0: none; left out: the dataset's own
+    /// split, else every eighth.
+    pub test_every: Option<usize>,
+    /// Bytes that the decoded photographs to train on may take: where they take more, none is kept, and each is read anew
+    /// whenever it is looked at; none: no limit.
+    pub keep: Option<u64>,
     /// A folder of reference images by name, in place of what is found beside the input.
     pub reference: Option<PathBuf>,
     /// Whether test views load their dark photograph too, where there is one.
@@ -36,6 +44,9 @@ impl Default for LoadOptions {
     fn default() -> Self {
         Self {
             downscale: 1.0,
+            max_resolution: 0,
+            test_every: None,
+            keep: None,
             reference: None,
             load_low_test: true,
             hold_out: 0,
@@ -46,6 +57,15 @@ impl Default for LoadOptions {
 }
 
 impl LoadOptions {
+    /// The size at which a photograph of this size is loaded.
+    pub fn loaded_size(&self, width: u32, height: u32) -> (u32, u32) {
+        let longest = f64::from(width.max(height)) / self.downscale;
+        let limit = f64::from(self.max_resolution);
+        let beyond = if self.max_resolution > 0 { (longest / limit).max(1.0) } else { 1.0 };
+        let side = |pixels: u32| (f64::from(pixels) / self.downscale / beyond).round() as u32;
+        (side(width), side(height))
+    }
+
     /// Refuses options that make no sense.
     ///
     /// # Errors
@@ -57,6 +77,10 @@ impl LoadOptions {
             return Err(Error::Usage(format!(
                 "`LoadOptions::downscale` is {downscale}; it must be 1 or more"
             )));
+        }
+        if self.test_every == Some(1) {
+            let problem = "`LoadOptions::test_every` is 1, which leaves no view to train on; it must be 0 or 2 and more";
+            return Err(Error::Usage(problem.to_owned()));
         }
         match &self.reference {
             Some(folder) if !folder.is_dir() => {

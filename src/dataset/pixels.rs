@@ -14,6 +14,9 @@ use crate::{Error, Result};
 /// The shortest side that leaves something to train on, pixels.
 const MIN_SIDE: u32 = 16;
 
+/// Of a decoded photograph.
+const BYTES_PER_PIXEL: u64 = 12;
+
 /// What a view is made of.
 #[derive(Clone, Debug)]
 pub(super) struct Source {
@@ -53,9 +56,15 @@ pub(super) fn load(
             None => groups.push((source.lens, vec![source])),
         }
     }
-    let loaded = groups.into_par_iter().map(|(lens, group)| load_group(&lens, group, options));
-    let loaded = loaded.collect::<Result<Vec<_>>>()?;
-    let mut loaded: Vec<Loaded> = loaded.into_iter().flatten().collect();
+    let options = &resolved(&groups, options);
+    let largest = groups.iter().map(|(lens, _)| pixels(lens.width, lens.height)).max();
+    let at_once = Image::decoded_at_once(largest.unwrap_or_default());
+    let mut loaded: Vec<Loaded> = vec![];
+    for groups in groups.chunks(at_once) {
+        let groups =
+            groups.par_iter().map(|(lens, group)| load_group(lens, group, options, at_once));
+        loaded.extend(groups.collect::<Result<Vec<_>>>()?.into_iter().flatten());
+    }
     loaded.sort_by(|a, b| a.name.cmp(&b.name));
     let mut views = Vec::with_capacity(loaded.len());
     for Loaded { view, problems, .. } in loaded {
@@ -65,7 +74,43 @@ pub(super) fn load(
     Ok(views)
 }
 
-/// A photograph that was shrunk on loading.
+fn pixels(width: u32, height: u32) -> u64 {
+    u64::from(width) * u64::from(height)
+}
+
+/// The options with `keep` decided: none where every photograph is kept. Says where `max_resolution` acts.
+fn resolved(groups: &[(Lens, Vec<Source>)], options: &LoadOptions) -> LoadOptions {
+    let mut bytes = 0;
+    let mut shrunk: Vec<&Lens> = vec![];
+    for (lens, group) in groups {
+        let (width, height) = options.loaded_size(lens.width, lens.height);
+        let photographs = group.iter().filter(|source| source.input.is_some()).count() as u64;
+        bytes += photographs * pixels(width, height) * BYTES_PER_PIXEL;
+        let free = LoadOptions { max_resolution: 0, ..options.clone() };
+        if free.loaded_size(lens.width, lens.height) != (width, height) {
+            shrunk.push(lens);
+        }
+    }
+    if let Some(lens) = shrunk.first() {
+        let (width, height) = options.loaded_size(lens.width, lens.height);
+        let (w, h, limit) = (lens.width, lens.height, options.max_resolution);
+        let more = if shrunk.len() > 1 { ", and others alike" } else { "" };
+        tracing::warn!(
+            "photographs of {w}x{h} are trained on at {width}x{height}{more}: `LoadOptions::max_resolution` is {limit}; 0 \
+             takes them as they are"
+        );
+    }
+    let keep = options.keep.filter(|&most| bytes > most);
+    if let Some(most) = keep {
+        let [bytes, most] = [bytes, most].map(|bytes| bytes as f64 / f64::from(1 << 30));
+        tracing::info!(
+            "the photographs take {bytes:.1} GiB decoded, the cache has {most:.1}: they are read anew when they are looked at"
+        );
+    }
+    LoadOptions { keep, ..options.clone() }
+}
+
+/// A photograph that was shrunk on loading, or is not kept.
 #[derive(Clone, Debug)]
 pub struct Original {
     path: PathBuf,
@@ -76,10 +121,14 @@ pub struct Original {
 impl Original {
     /// Reads it anew, undistorted, at its own size.
     pub(super) fn load(&self) -> Result<Image> {
+        self.load_at((self.lens.width, self.lens.height))
+    }
+
+    /// The same, shrunk.
+    pub(super) fn load_at(&self, size: (u32, u32)) -> Result<Image> {
         let Self { path, lens } = self;
         let undistortion = undistortion(lens, &path.to_string_lossy())?;
-        let image = loaded(path, lens)?;
-        prepared(image, path, lens, undistortion.as_ref(), (lens.width, lens.height))
+        prepared(loaded(path, lens)?, path, lens, undistortion.as_ref(), size)
     }
 }
 
@@ -133,6 +182,37 @@ fn loaded(path: &Path, lens: &Lens) -> Result<Image> {
     Ok(image.turned(orientation))
 }
 
+/// Refuses a file by the size that it declares, before that costs memory: a picture of another shape than its camera's, or
+/// of far more pixels.
+fn check_size(path: &Path, lens: &Lens) -> Result<()> {
+    // What has no readable header is named when it is decoded.
+    let Ok(size) = Image::size_of(path) else { return Ok(()) };
+    let (width, height) = turn(path, size, lens).size(size);
+    if lens.fitted(width, height).is_none() {
+        return Err(disagreement(path, size, lens));
+    }
+    check_excess(path, (width, height), lens)
+}
+
+fn check_excess(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Result<()> {
+    const MOST_TIMES: u64 = 64;
+    let pixels = |width: u32, height: u32| u64::from(width) * u64::from(height);
+    if pixels(width, height) > MOST_TIMES * pixels(lens.width, lens.height) {
+        let (w, h) = (lens.width, lens.height);
+        let problem = format!(
+            "is {width}x{height}, over {MOST_TIMES} times the pixels of its view's {w}x{h}; shrink it"
+        );
+        return Err(Error::input(path, problem));
+    }
+    Ok(())
+}
+
+/// A view's name, and the size at which it is loaded.
+pub(super) fn loaded_size(source: &Source, options: &LoadOptions) -> Result<(String, [u32; 2])> {
+    let lens = fitted_lens(source)?;
+    Ok((source.name.clone(), options.loaded_size(lens.width, lens.height).into()))
+}
+
 fn disagreement(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Error {
     let (w, h) = (lens.width, lens.height);
     let (seen_width, seen_height) = Orientation::of(path).size((width, height));
@@ -148,15 +228,18 @@ fn disagreement(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Error 
 }
 
 /// Views of one lens share its undistortion map.
-fn load_group(lens: &Lens, group: Vec<Source>, options: &LoadOptions) -> Result<Vec<Loaded>> {
-    let downscale = options.downscale;
-    let side = |pixels: u32| (f64::from(pixels) / downscale).round() as u32;
-    let size = (side(lens.width), side(lens.height));
+fn load_group(
+    lens: &Lens,
+    group: &[Source],
+    options: &LoadOptions,
+    at_once: usize,
+) -> Result<Vec<Loaded>> {
+    let size = options.loaded_size(lens.width, lens.height);
     let name = group.first().map_or("", |source| source.name.as_str());
     if size.0.min(size.1) < MIN_SIDE {
         return Err(Error::Usage(format!(
-            "downscale {downscale} leaves {}x{} pixels of view {name}, at least {MIN_SIDE} are needed; lower it",
-            size.0, size.1
+            "downscale {} leaves {}x{} pixels of view {name}, at least {MIN_SIDE} are needed; lower it",
+            options.downscale, size.0, size.1
         )));
     }
     let undistortion = undistortion(lens, name)?;
@@ -166,10 +249,14 @@ fn load_group(lens: &Lens, group: Vec<Source>, options: &LoadOptions) -> Result<
             group.len() - 1
         );
     }
-    group
-        .into_par_iter()
-        .map(|source| load_view(source, lens, undistortion.as_ref(), size, options))
-        .collect()
+    let mut loaded = vec![];
+    for sources in group.chunks(at_once) {
+        let views = sources.par_iter().cloned();
+        let views =
+            views.map(|source| load_view(source, lens, undistortion.as_ref(), size, options));
+        loaded.extend(views.collect::<Result<Vec<_>>>()?);
+    }
+    Ok(loaded)
 }
 
 /// What makes a pinhole of the lens; none where it is one.
@@ -194,6 +281,7 @@ fn load_view(
     let mut problems = Vec::new();
     let mut image = |path: Option<PathBuf>| -> Result<Option<Image>> {
         let Some(path) = path else { return Ok(None) };
+        check_size(&path, lens)?;
         match loaded(&path, lens) {
             Ok(image) => prepared(image, &path, lens, undistortion, size).map(Some),
             Err(error) => {
@@ -203,7 +291,9 @@ fn load_view(
         }
     };
     let is_shrunk = size != (lens.width, lens.height);
-    let original = input.clone().filter(|_| is_shrunk).map(|path| Original { path, lens: *lens });
+    let is_kept = options.keep.is_none();
+    let original = input.clone().filter(|_| is_shrunk || !is_kept);
+    let original = original.map(|path| Original { path, lens: *lens });
     let paths = [input.clone(), reference.clone()];
     let (mut image, mut reference) = (image(input)?, image(reference)?);
     // Of what was read: a file that does not decode is named once.
@@ -234,8 +324,9 @@ fn load_view(
     };
     let camera = camera.resized(size.0, size.1);
     let original = original.filter(|_| image.is_some());
+    let image = image.filter(|_| is_kept);
     let view = View { name: name.clone(), split, camera, image, original, reference, mask, depth };
-    let view = (split == Split::Test || view.image.is_some()).then_some(view);
+    let view = (split == Split::Test || view.has_photograph()).then_some(view);
     Ok(Loaded { name, view, problems })
 }
 
@@ -247,6 +338,7 @@ fn depth_map(
     size: (u32, u32),
     is_disparity: bool,
 ) -> Result<Vec<f32>> {
+    check_excess(path, Image::size_of(path)?, lens)?;
     let mut map = Image::load_as_stored(path)?;
     if (map.width, map.height) != (lens.width, lens.height) {
         let (w, h) = (lens.width, lens.height);
@@ -283,7 +375,9 @@ pub(super) fn prepared(
     } else {
         image.resized(lens.width, lens.height)
     };
-    let image =
-        undistortion.map_or_else(|| image.clone(), |undistortion| undistortion.apply(&image));
-    Ok(image.resized(size.0, size.1))
+    let image = match undistortion {
+        Some(undistortion) => undistortion.apply(&image),
+        None => image,
+    };
+    Ok(if (image.width, image.height) == size { image } else { image.resized(size.0, size.1) })
 }

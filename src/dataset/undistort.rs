@@ -48,11 +48,11 @@ impl Undistortion {
     pub(super) fn apply(&self, photograph: &Image) -> Image {
         let pixels = photograph.pixel_count();
         let mut data = vec![0.0; 3 * pixels];
+        let planes = [0, 1, 2].map(|plane| &photograph.data[plane * pixels..][..pixels]);
         for (index, position) in self.positions.iter().enumerate() {
             let taps = Taps::at(*position, photograph.width as usize, photograph.height as usize);
-            for plane in 0..3 {
-                let start = plane * pixels;
-                data[start + index] = taps.sample(&photograph.data[start..start + pixels]);
+            for (plane, value) in taps.sample(planes).into_iter().enumerate() {
+                data[plane * pixels + index] = value;
             }
         }
         Image { width: photograph.width, height: photograph.height, data }
@@ -136,17 +136,22 @@ impl Taps {
         Self { columns, across, rows: rows.map(|row| row * width), down }
     }
 
-    fn sample(&self, plane: &[f32]) -> f32 {
-        let (mut sum, mut low, mut high) = (0.0, f32::INFINITY, f32::NEG_INFINITY);
+    /// All planes at once: one plane's sum waits for each addition, three keep the processor busy.
+    fn sample<const N: usize>(&self, planes: [&[f32]; N]) -> [f32; N] {
+        let (mut sum, mut low, mut high) = ([0.0; N], [f32::INFINITY; N], [f32::NEG_INFINITY; N]);
         for (row, down) in self.rows.iter().zip(self.down) {
             for (column, across) in self.columns.iter().zip(self.across) {
-                let value = plane[row + column];
-                sum += down * across * value;
-                low = low.min(value);
-                high = high.max(value);
+                let weight = down * across;
+                for plane in 0..N {
+                    let value = planes[plane][row + column];
+                    sum[plane] += weight * value;
+                    // Not `min` and `max`, which look for a NaN first.
+                    low[plane] = if value < low[plane] { value } else { low[plane] };
+                    high[plane] = if value > high[plane] { value } else { high[plane] };
+                }
             }
         }
-        sum.clamp(low, high)
+        std::array::from_fn(|plane| sum[plane].max(low[plane]).min(high[plane]))
     }
 }
 
@@ -293,7 +298,7 @@ mod tests {
         let plane =
             [0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0, 1.0];
         for x in (0..=40).map(|step| step as f32 / 10.0) {
-            let value = Taps::at([x, 2.0], 4, 4).sample(&plane);
+            let [value] = Taps::at([x, 2.0], 4, 4).sample([&plane]);
             assert!((0.0..=1.0).contains(&value), "{x}: {value}");
         }
     }

@@ -2,9 +2,10 @@
 
 use glam::DVec2;
 
+use crate::Result;
 use crate::camera::Camera;
 use crate::dataset::{Dataset, Point, View};
-use crate::image::linear_from_srgb;
+use crate::image::{Image, linear_from_srgb};
 use crate::scene::init;
 use crate::tone::{luminance, measurable};
 
@@ -32,7 +33,10 @@ pub(super) struct Shared {
 
 impl Shared {
     /// Of training views, in their order.
-    pub(super) fn of(dataset: &Dataset, views: &[(usize, &View)]) -> Self {
+    ///
+    /// # Errors
+    /// A photograph can no longer be read.
+    pub(super) fn of(dataset: &Dataset, views: &[(usize, &View)]) -> Result<Self> {
         let random;
         let points = if dataset.points.is_empty() {
             let cameras: Vec<Camera> = views.iter().map(|(_, view)| view.camera).collect();
@@ -66,16 +70,16 @@ impl Shared {
         let (sum, visible) = visible.fold((0, 0), |(sum, n), count| (sum + count, n + 1));
         let own =
             |place| if dataset.points.is_empty() { 0 } else { stride * count(counted, place) };
-        Self {
+        Ok(Self {
             points: (0..views.len()).map(own).collect(),
             overlaps: (0..views.len()).map(overlap).collect(),
             views_per_point: sum as f64 / visible.max(1) as f64,
             exposures: if dataset.points.is_empty() {
                 vec![None; views.len()]
             } else {
-                exposures(&brightness(&points, counted, views), views.len())
+                exposures(&brightness(&points, counted, views)?, views.len())
             },
-        }
+        })
     }
 }
 
@@ -96,20 +100,23 @@ fn brightness(
     points: &[&Point],
     seen: &[Vec<usize>],
     views: &[(usize, &View)],
-) -> Vec<Vec<(usize, f64)>> {
-    let of_view = |point: &Point, place: usize| {
-        let at = pixel(&views[place].1.camera, point)?;
-        Some((place, light_around(views[place].1, at)?.log2()))
-    };
-    let of_point = |(point, places): (&&Point, &Vec<usize>)| -> Vec<(usize, f64)> {
-        places.iter().filter_map(|&place| of_view(point, place)).collect()
-    };
-    points.iter().zip(seen).map(of_point).filter(|seen| seen.len() >= 2).collect()
+) -> Result<Vec<Vec<(usize, f64)>>> {
+    let mut lights = vec![vec![]; points.len()];
+    // One photograph after another: they may have to be read anew.
+    for (place, (_, view)) in views.iter().enumerate() {
+        let Some(image) = view.loaded()? else { continue };
+        for ((point, places), lights) in points.iter().zip(seen).zip(&mut lights) {
+            let at = pixel(&view.camera, point).filter(|_| places.contains(&place));
+            let light = at.and_then(|at| light_around(&image, at));
+            lights.extend(light.map(|light| (place, light.log2())));
+        }
+    }
+    lights.retain(|seen| seen.len() >= 2);
+    Ok(lights)
 }
 
 /// The mean linear luminance around a pixel.
-fn light_around(view: &View, at: DVec2) -> Option<f64> {
-    let image = view.image.as_ref()?;
+fn light_around(image: &Image, at: DVec2) -> Option<f64> {
     let (width, height) = (i64::from(image.width), i64::from(image.height));
     let (x, y) = (at.x as i64, at.y as i64);
     if !(REACH..width - REACH).contains(&x) || !(REACH..height - REACH).contains(&y) {

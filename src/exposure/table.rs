@@ -51,6 +51,7 @@ pub fn save(path: &Path, exposures: &[(String, Affine)]) -> Result<()> {
     let mut text = COLUMNS.join(",") + "\n";
     for (name, affine) in exposures {
         let Affine { gain: [r, g, b], bias } = affine;
+        let name = name.replace(char::is_control, "_");
         text += &format!("{name},{:.3},{r},{g},{b},", affine.stops());
         text += &format!("{},{},{}\n", bias[0], bias[1], bias[2]);
     }

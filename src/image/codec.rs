@@ -11,7 +11,7 @@ use ::image::{
 #[cfg(not(feature = "raw"))]
 use super::files::RAW_REMEDY;
 use super::files::{HEIC_REMEDY, is_raw};
-use super::{Image, exr_file, from_interleaved, jpeg, linear_from_srgb, srgb_from_linear};
+use super::{Image, budget, exr_file, from_interleaved, jpeg, linear_from_srgb, srgb_from_linear};
 use crate::output::write_whole;
 use crate::{Error, Result};
 
@@ -57,6 +57,7 @@ impl Image {
         bytes: Vec<u8>,
         from_exr_value: exr_file::FromExrValue,
     ) -> Result<(Self, Vec<usize>)> {
+        budget::check(path, &bytes)?;
         if bytes.starts_with(&exr_file::MAGIC) {
             return exr_file::load(path, bytes, from_exr_value);
         }
@@ -129,9 +130,24 @@ impl Image {
     /// # Errors
     /// [`Error::Output`] names the file; nothing half-written is left under its name.
     pub fn save_png8(&self, path: impl AsRef<Path>) -> Result<()> {
-        let bytes: Vec<u8> =
-            self.interleaved().map(|value| (value.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
-        self.save_png(path.as_ref(), &bytes, ExtendedColorType::Rgb8)
+        self.save_png(path.as_ref(), &self.to_rgb8(), ExtendedColorType::Rgb8)
+    }
+
+    /// The file that [`Image::save_png8`] writes.
+    ///
+    /// # Errors
+    /// None but for what no memory is left for.
+    pub fn to_png8(&self) -> Result<Vec<u8>> {
+        let mut file = Vec::new();
+        PngEncoder::new(&mut file)
+            .write_image(&self.to_rgb8(), self.width, self.height, ExtendedColorType::Rgb8)
+            .map_err(|error| Error::output("a picture", format!("cannot be encoded: {error}")))?;
+        Ok(file)
+    }
+
+    /// Red, green and blue of every pixel in 8 bits: values clamped to [0, 1], rounded to nearest.
+    pub fn to_rgb8(&self) -> Vec<u8> {
+        self.interleaved().map(|value| (value.clamp(0.0, 1.0) * 255.0).round() as u8).collect()
     }
 
     /// Writes a JPEG of little loss, values clamped to [0, 1], with an Exif segment, where there is one, behind its start.

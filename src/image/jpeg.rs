@@ -2,6 +2,7 @@
 //!
 //! Other decoders round otherwise, by fractions of a code value; a tone curve multiplies that by ten.
 
+mod coded;
 mod structure;
 
 use std::panic::catch_unwind;
@@ -167,6 +168,20 @@ mod tests {
                     }
                 }
                 decodes_if_sound(&bytes, name, round);
+            }
+        }
+    }
+
+    #[test]
+    fn a_picture_of_which_two_thirds_are_missing_is_refused_though_it_has_an_end() {
+        for (name, _) in PICTURES {
+            let whole = fixture(name);
+            let scan = whole.windows(2).position(|marker| marker == [0xFF, 0xDA]).unwrap();
+            for part in [3, 2] {
+                let length = scan + (whole.len() - scan) / part;
+                let cut = [&whole[..length], &[0xFF, 0xD9]].concat();
+                let message = load(Path::new("photo.jpg"), &cut).unwrap_err().to_string();
+                assert!(message.contains("photo.jpg: this JPEG is cut short"), "{name}: {message}");
             }
         }
     }

@@ -36,6 +36,13 @@ impl<'a> TensorFile<'a> {
         self.metadata.metadata().as_ref()?.get(key).map(String::as_str)
     }
 
+    /// Every tensor's name and bytes, in the order of the file.
+    pub(crate) fn tensors(&self) -> Vec<(String, &'a [u8])> {
+        let names = self.metadata.offset_keys().into_iter();
+        let bytes = |name: String| Some((self.tensor(&name)?.1, name));
+        names.filter_map(bytes).map(|(bytes, name)| (name, bytes)).collect()
+    }
+
     /// A tensor and its bytes.
     pub(crate) fn tensor(&self, name: &str) -> Option<(&TensorInfo, &'a [u8])> {
         let info = self.metadata.info(name)?;

@@ -1,11 +1,44 @@
 //! How far kernels get on a device that ends loops after so many turns.
 
+use super::RenderSettings;
 use crate::gpu::{Gpu, Properties};
+use crate::{Error, Result};
 
 /// How many splats the blending kernels take in one turn of their inner loop. A device that ends loops after so many turns
 /// follows a hundred thousand splats on a tile with two; one and four were measured slower there.
 pub(super) fn splats_per_turn(gpu: &Gpu) -> u32 {
     if gpu.properties().max_loop_iterations < u32::MAX { 2 } else { 1 }
+}
+
+impl RenderSettings {
+    /// Refuses a view that this device cannot render and train on, from its size alone.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] names the view, the limit, and the longest side that it leaves; the tile does not suit the device.
+    pub fn check_size(&self, gpu: &Gpu, view: &str, [width, height]: [u32; 2]) -> Result<()> {
+        let Properties { name: device, max_storage_buffer_range: bindable, .. } = gpu.properties();
+        let [tile_width, tile_height] = self.tile_on(gpu)?;
+        let bytes_per_pixel = (self.channels() * size_of::<f32>()) as u64;
+        let bytes = u64::from(width) * u64::from(height) * bytes_per_pixel;
+        let tiles = u64::from(width.div_ceil(tile_width)) * u64::from(height.div_ceil(tile_height));
+        let most = most_tiles(gpu) as u64;
+        let (excess, what) = if bytes > *bindable {
+            let what = format!("its render takes {bytes} bytes, {device} binds {bindable} at most");
+            (bytes as f64 / *bindable as f64, what)
+        } else if tiles > most {
+            let what = format!(
+                "it has {tiles} tiles of {tile_width}x{tile_height} pixels, {device} follows {most}"
+            );
+            (tiles as f64 / most as f64, what)
+        } else {
+            return Ok(());
+        };
+        // A side is rounded, and so are tiles.
+        let longest = 0.99 * f64::from(width.max(height)) / excess.sqrt();
+        Err(Error::Usage(format!(
+            "view {view} is {width}x{height}: {what}; lower `TrainConfig::max_resolution` to {longest:.0}"
+        )))
+    }
 }
 
 /// Turns of a kernel's loops beside those that are counted.

@@ -7,28 +7,42 @@
 //!     networks.safetensors    the weights of the networks, where the model has any
 //!     train.csv      one line per step
 //!     held_out.csv   scores of the views that were kept from training, where there are any
-//!     progress.csv   scores of the test views on the way, with what it took, where they are asked for
+//!     evals.csv      scores of the test views on the way, with what it took, where they are asked for
+//!     views.csv      every view, what it is for and how large it is
+//!     tensorboard/   the same for TensorBoard, where that is asked for
 //!     exposures.csv  gain and bias of the training views, where they are learned
+//!     hashes.csv     checksums of the parameters on the way, where they are asked for
 //!     checkpoint.safetensors  what the run goes on from, overwritten every so many steps
+//!     checkpoint.before.safetensors    the one before, for where that is damaged
 //!     metrics.json   scores of the test views
+//!     done.json      that the run is whole, and of which configuration and dataset it is
 //! ```
 //!
-//! A file appears under its name only once it is complete, `metrics.json` last: a directory that has it is whole.
+//! A file appears under its name only once it is complete, `metrics.json` and `done.json` last: a directory that has them is
+//! whole. The model is written with every checkpoint, too: a run that was stopped can be looked at. While a process trains
+//! in it, it holds `.lock`.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
-use std::io::{BufWriter, Write};
+use std::io::{BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
 
-use super::meter::Spent;
+use glam::DVec3;
+
+use super::aside::{self, Aside, unwritable};
+use super::ledger;
+use super::lock::RunLock;
+pub use super::progress::Progress;
+use super::tensorboard::EventFile;
+use crate::camera::Frame;
+use crate::dataset::{Dataset, Split, View};
 use crate::diagnose::Plan;
 use crate::exposure::{Affine, table};
 use crate::gpu::Gpu;
 use crate::loss::Term;
-use crate::metrics::Scores;
-use crate::output::write_whole;
+use crate::output::{csv_field, write_whole};
 use crate::scene::{Features, Gaussians, ply};
-use crate::train::{ModelConfig, Networks, StepReport, TrainConfig, Trainer};
+use crate::train::{ModelConfig, Networks, StepReport, TrainConfig, Trainer, check_checkpoint};
 use crate::{Error, Result};
 
 /// A run directory and the log that grows in it.
@@ -40,18 +54,27 @@ pub struct RunDirectory {
     terms: Vec<Term>,
     /// What the steps took that the log held already.
     seconds_before: f64,
+    raw_colors: bool,
+    /// The run that was here before; back in its place if this is dropped before [`RunDirectory::settle`].
+    aside: Aside,
+    /// Behind `aside`: nobody else begins before that is in order.
+    _lock: RunLock,
 }
 
 /// The files of a run that a new run replaces; nothing else in the directory is touched.
-const FILES: [&str; 10] = [
+pub(super) const FILES: [&str; 14] = [
+    DONE,
     "metrics.json",
     "model.ply",
     NETWORKS,
     EXPOSURES,
     CHECKPOINT,
+    CHECKPOINT_BEFORE,
     LOG,
     HELD_OUT,
     PROGRESS,
+    HASHES,
+    VIEWS,
     PLAN,
     "config.toml",
 ];
@@ -63,7 +86,16 @@ const LOG: &str = "train.csv";
 const HELD_OUT: &str = "held_out.csv";
 
 /// Scores of the test views on the way, and what it took.
-const PROGRESS: &str = "progress.csv";
+const PROGRESS: &str = "evals.csv";
+
+/// Name, split and size of every view.
+const VIEWS: &str = "views.csv";
+
+/// The folder of event files.
+const TENSORBOARD: &str = "tensorboard";
+
+/// Checksums of the parameters on the way.
+const HASHES: &str = "hashes.csv";
 
 /// What was decided for the photographs, and why.
 const PLAN: &str = "plan.toml";
@@ -83,16 +115,38 @@ const NETWORKS: &str = "networks.safetensors";
 /// The state of an unfinished run, or of a finished one that may be made longer.
 const CHECKPOINT: &str = "checkpoint.safetensors";
 
+/// The one before.
+const CHECKPOINT_BEFORE: &str = "checkpoint.before.safetensors";
+
+/// The sign that the run is whole, and what it is of.
+pub(super) const DONE: &str = "done.json";
+
 impl RunDirectory {
     /// Refuses a place where no run can begin, before anything is loaded or written.
     ///
     /// # Errors
-    /// It holds a run already and `overwrite` is false, or lies beneath a file.
+    /// Another process trains there; it holds a run already and `overwrite` is false; it holds files of a run's names that
+    /// are no run's; or it lies beneath a file.
     pub fn check(path: &Path, overwrite: bool) -> Result<()> {
         let used = FILES.iter().find(|file| path.join(file).exists());
-        if let Some(file) = used.filter(|_| !overwrite) {
-            let problem =
-                format!("already holds a run ({file}); pass `HeldRun::Replace` to replace it");
+        match used.filter(|_| !overwrite) {
+            Some(file) => RunLock::check(path).and(Err(held(path, file))),
+            None => Self::check_resumed(path),
+        }
+    }
+
+    /// Refuses a place where no run can begin or go on.
+    ///
+    /// # Errors
+    /// Another process trains there, or it holds files of a run's names that are no run's, or lies beneath a file.
+    pub fn check_resumed(path: &Path) -> Result<()> {
+        RunLock::check(path)?;
+        if let Some(file) = FILES.iter().find(|file| path.join(file).exists())
+            && !is_run(path)
+        {
+            let problem = format!(
+                "holds {file}, but no config.toml of a run: it is somebody else's; name another folder"
+            );
             return Err(Error::output(path, problem));
         }
         match path.ancestors().find(|folder| folder.exists()) {
@@ -103,25 +157,63 @@ impl RunDirectory {
         }
     }
 
-    /// Makes the directory and writes the configuration.
+    /// Locks the directory, which comes to be where it is not there, and puts it in order.
     ///
     /// # Errors
-    /// It holds a run already and `overwrite` is false, or it cannot be written.
+    /// Another process trains there, or it cannot be written.
+    pub(super) fn lock(path: &Path) -> Result<RunLock> {
+        std::fs::create_dir_all(path).map_err(|error| unwritable(path, &error))?;
+        let lock = RunLock::take(path)?;
+        aside::recover(path)?;
+        Ok(lock)
+    }
+
+    /// Makes the directory and writes the configuration. A run that was there before stays until [`RunDirectory::settle`].
+    ///
+    /// # Errors
+    /// It holds a run already and `overwrite` is false, or somebody else's files; another process trains there; or it cannot
+    /// be written.
     pub fn create(path: &Path, config: &TrainConfig, overwrite: bool) -> Result<Self> {
         Self::check(path, overwrite)?;
-        std::fs::create_dir_all(path).map_err(|error| unwritable(path, &error))?;
-        remove(path, &FILES)?;
-        let mut run = Self::open(path, config, "", 0.0)?;
+        Self::create_locked(path, Self::lock(path)?, config, overwrite)
+    }
+
+    pub(super) fn create_locked(
+        path: &Path,
+        lock: RunLock,
+        config: &TrainConfig,
+        overwrite: bool,
+    ) -> Result<Self> {
+        // What was recovered is a run, too.
+        if let Some(file) = FILES.iter().find(|file| path.join(file).exists() && !overwrite) {
+            return Err(held(path, file));
+        }
+        let aside = Aside::set(path)?;
+        remove_events(path)?;
+        let mut run = Self::open(path, config, "", 0.0, aside, lock)?;
         let columns: String = run.terms.iter().map(|term| format!("{},", term.column)).collect();
         run.log_line(&format!("step,view,loss,{columns}gaussians,milliseconds"))?;
         Ok(run)
+    }
+
+    /// The run has come to be: what was there before goes.
+    ///
+    /// # Errors
+    /// The directory cannot be written.
+    pub fn settle(&mut self) -> Result<()> {
+        self.aside.give_up()
     }
 
     /// Takes up a run again after `step`: its log is cut there, and it is unfinished.
     ///
     /// # Errors
     /// The directory cannot be written, or its log does not reach `step`.
-    pub fn resume(path: &Path, config: &TrainConfig, step: u64) -> Result<Self> {
+    pub(super) fn resume(
+        path: &Path,
+        lock: RunLock,
+        config: &TrainConfig,
+        step: u64,
+    ) -> Result<Self> {
         let log_path = path.join(LOG);
         let text = std::fs::read_to_string(&log_path)
             .map_err(|error| Error::input(&log_path, format!("cannot be read ({error})")))?;
@@ -136,19 +228,36 @@ impl RunDirectory {
         }
         let milliseconds = |line: &&str| line.trim_end().rsplit(',').next()?.parse::<f64>().ok();
         let seconds_before = lines.iter().filter_map(milliseconds).sum::<f64>() / 1e3;
-        remove(path, &["metrics.json", "model.ply", NETWORKS, EXPOSURES])?;
-        Self::open(path, config, &lines.concat(), seconds_before)
+        remove(path, &[DONE, "metrics.json", "model.ply", NETWORKS, EXPOSURES])?;
+        Self::open(path, config, &lines.concat(), seconds_before, Aside::default(), lock)
     }
 
     /// Writes the configuration and what the log begins with.
-    fn open(path: &Path, config: &TrainConfig, log: &str, seconds_before: f64) -> Result<Self> {
-        write_whole(&path.join("config.toml"), config.to_toml()?.as_bytes())?;
+    fn open(
+        path: &Path,
+        config: &TrainConfig,
+        log: &str,
+        seconds_before: f64,
+        aside: Aside,
+        lock: RunLock,
+    ) -> Result<Self> {
+        let recorded = config.clone().with_absolute_paths();
+        write_whole(&path.join("config.toml"), recorded.to_toml()?.as_bytes())?;
         let log_path = path.join(LOG);
         write_whole(&log_path, log.as_bytes())?;
         let log = File::options().append(true).open(&log_path);
         let log = BufWriter::new(log.map_err(|error| unwritable(&log_path, &error))?);
         let terms = config.loss().terms();
-        Ok(Self { path: path.to_owned(), log, terms, seconds_before })
+        let raw_colors = config.model.raw_colors;
+        Ok(Self {
+            path: path.to_owned(),
+            log,
+            terms,
+            seconds_before,
+            raw_colors,
+            aside,
+            _lock: lock,
+        })
     }
 
     /// The scores of the held-out views up to a step, in order: step, PSNR in dB.
@@ -197,18 +306,70 @@ impl RunDirectory {
         write_whole(&self.path.join(PLAN), plan.to_toml()?.as_bytes())
     }
 
+    /// Writes which views there are, for whoever opens the run with another copy of them.
+    ///
+    /// # Errors
+    /// The disk is full or gone.
+    pub fn save_views(&self, dataset: &Dataset) -> Result<()> {
+        let lines: String = view_lines(dataset).into_iter().map(|line| line + "\n").collect();
+        let text = format!("name,split,width,height\n{lines}");
+        write_whole(&self.path.join(VIEWS), text.as_bytes())
+    }
+
+    /// Begins event files for TensorBoard, behind a step.
+    pub(super) fn events(&self, step: u64) -> Result<EventFile> {
+        EventFile::create(&self.path.join(TENSORBOARD), step)
+    }
+
     /// What the steps took that a resumed run had behind it, in seconds.
     pub fn seconds_before(&self) -> f64 {
         self.seconds_before
     }
 
-    /// Writes what the run can go on from, behind a log that reaches as far.
+    /// Writes what the run can go on from, behind a log that reaches as far, and the model as it is now. The checkpoint
+    /// before stays; while this is written it is the only one.
     ///
     /// # Errors
-    /// The disk is full or gone, or the device was lost.
+    /// The disk is full or gone, the device was lost, or a parameter is not finite.
     pub fn save_checkpoint(&mut self, trainer: &mut Trainer) -> Result<()> {
         self.log.flush().map_err(|error| unwritable(&self.path, &error))?;
-        trainer.save_checkpoint(&self.path.join(CHECKPOINT))
+        let [newest, before] = [CHECKPOINT, CHECKPOINT_BEFORE].map(|file| self.path.join(file));
+        if newest.exists() {
+            std::fs::rename(&newest, before).map_err(|error| unwritable(&newest, &error))?;
+        }
+        trainer.save_checkpoint(&newest)?;
+        self.save_trained(trainer)
+    }
+
+    /// Writes the model and what belongs to it, as it is now.
+    ///
+    /// # Errors
+    /// The disk is full or gone, the device was lost, or a parameter is not finite.
+    pub(super) fn save_trained(&mut self, trainer: &mut Trainer) -> Result<()> {
+        self.save_model(trainer)?;
+        if let Some(networks) = trainer.networks() {
+            self.save_networks(networks)?;
+        }
+        match trainer.exposures()? {
+            Some(exposures) => self.save_exposures(&exposures),
+            None => Ok(()),
+        }
+    }
+
+    /// Where it is.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Appends the checksum of every plane of the parameters to `hashes.csv`.
+    ///
+    /// # Errors
+    /// The disk is full or gone.
+    pub(super) fn log_hashes(&self, step: u64, gaussians: &Gaussians) -> Result<()> {
+        let path = self.path.join(HASHES);
+        let known = std::fs::read_to_string(&path).unwrap_or_default();
+        let text = ledger::extended(&known, step, gaussians);
+        write_whole(&path, text.as_bytes())
     }
 
     /// Appends a step to `train.csv`.
@@ -219,6 +380,7 @@ impl RunDirectory {
         let StepReport { step, view, loss, gaussians, milliseconds, .. } = report;
         let terms: String =
             self.terms.iter().map(|&term| format!("{:.6},", report.term(term))).collect();
+        let view = csv_field(view);
         self.log_line(&format!("{step},{view},{loss:.6},{terms}{gaussians},{milliseconds:.2}"))
     }
 
@@ -230,19 +392,26 @@ impl RunDirectory {
         self.log.flush().map_err(|error| unwritable(&self.path, &error))
     }
 
-    /// Writes `model.ply`, in the colours that viewers show.
+    /// Writes `model.ply`, in the colours that viewers show and in the dataset's world: relative to
+    /// [`Frame::file_origin`], which a comment says where it is not the world's own.
     ///
     /// # Errors
-    /// The disk is full or gone.
-    pub fn save_model(&mut self, gaussians: &Gaussians, raw_colors: bool) -> Result<()> {
+    /// The disk is full or gone, or a parameter is not finite.
+    pub fn save_model(&mut self, trainer: &Trainer) -> Result<()> {
         self.flush_log()?;
-        let path = self.path.join("model.ply");
-        if !raw_colors {
-            return ply::save(gaussians, path);
+        let (mut gaussians, frame) = (trainer.gaussians_in_frame()?, trainer.frame());
+        trainer.refuse_not_finite(&gaussians)?;
+        let origin = frame.file_origin();
+        if *frame != Frame::WORLD {
+            gaussians = gaussians.to_world(frame, origin);
         }
-        let mut gaussians = gaussians.clone();
-        gaussians.shift_colors(-0.5);
-        ply::save(&gaussians, path)
+        if self.raw_colors {
+            gaussians.shift_colors(-0.5);
+        }
+        let [x, y, z] = origin.to_array();
+        let comment = format!("world = position + {x} {y} {z}");
+        let comments = if origin == DVec3::ZERO { &[][..] } else { &[comment.as_str()] };
+        ply::save_with_comments(&gaussians, self.path.join("model.ply"), comments)
     }
 
     /// Writes the weights of the networks.
@@ -274,73 +443,90 @@ impl RunDirectory {
     }
 }
 
-/// The scores of the test views at one step of a run, and what the steps up to it took.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Progress {
-    /// Counted from 1.
-    pub step: u64,
-    /// On the wall, without scoring.
-    pub seconds: f64,
-    /// On all processors together, without scoring; none where the system does not say.
-    pub processor_seconds: Option<f64>,
-    /// Of the whole machine; none where it has no counter.
-    pub joules: Option<f64>,
-    /// The number of Gaussians.
-    pub gaussians: u64,
-    /// The mean over the test views, dB.
-    pub psnr: f64,
-    /// The mean over the test views.
-    pub ssim: f64,
-}
-
-impl Progress {
-    const COLUMNS: &str = "step,seconds,processor_seconds,joules,gaussians,psnr,ssim";
-
-    pub(super) fn new(step: u64, gaussians: usize, scores: &Scores, spent: &Spent) -> Self {
-        Self {
-            step,
-            seconds: spent.seconds,
-            processor_seconds: spent.processor_seconds,
-            joules: spent.joules,
-            gaussians: gaussians as u64,
-            psnr: scores.psnr,
-            ssim: scores.ssim,
-        }
-    }
-
-    fn line(&self) -> String {
-        let Self { step, seconds, gaussians, psnr, ssim, .. } = self;
-        let [processor, joules] = [self.processor_seconds, self.joules]
-            .map(|value| value.map_or_else(String::new, |value| format!("{value:.2}")));
-        format!("{step},{seconds:.3},{processor},{joules},{gaussians},{psnr},{ssim}\n")
-    }
-
-    fn parse(line: &str) -> Option<Self> {
-        let fields: Vec<&str> = line.split(',').collect();
-        let [step, seconds, processor, joules, gaussians, psnr, ssim] = fields[..] else {
-            return None;
-        };
-        Some(Self {
-            step: step.parse().ok()?,
-            seconds: seconds.parse().ok()?,
-            processor_seconds: processor.parse().ok(),
-            joules: joules.parse().ok(),
-            gaussians: gaussians.parse().ok()?,
-            psnr: psnr.parse().ok()?,
-            ssim: ssim.parse().ok()?,
-        })
-    }
-}
-
 /// How a run came to where it is; nothing where its test views were scored at the end alone.
 pub fn load_progress(run: &Path) -> Vec<Progress> {
     let text = std::fs::read_to_string(run.join(PROGRESS)).unwrap_or_default();
     text.lines().filter_map(Progress::parse).collect()
 }
 
-/// The checkpoint of a run; none where there is none.
+/// How the views of a dataset differ from those that a run was trained and scored on, in words; none where they are the
+/// same, or the run does not say which those were.
+pub fn other_views(run: &Path, dataset: &Dataset) -> Option<String> {
+    let text = std::fs::read_to_string(run.join(VIEWS)).ok()?;
+    let own: BTreeSet<&str> = text.lines().skip(1).collect();
+    let lines = view_lines(dataset);
+    let others: BTreeSet<&str> = lines.iter().map(String::as_str).collect();
+    let [gone, new] = [own.difference(&others), others.difference(&own)].map(|lines| {
+        let lines: Vec<&str> = lines.copied().collect();
+        lines.first().map(|first| format!("{} (the first: {first})", lines.len()))
+    });
+    match (gone, new) {
+        (None, None) => None,
+        (Some(gone), Some(new)) => {
+            Some(format!("{gone} views of the run are not in it, {new} are new"))
+        }
+        (Some(gone), None) => Some(format!("{gone} views of the run are not in it")),
+        (None, Some(new)) => Some(format!("{new} views are new")),
+    }
+}
+
+/// A line for every view.
+fn view_lines(dataset: &Dataset) -> Vec<String> {
+    let line = |view: &View| {
+        let split = match view.split {
+            Split::Train => "train",
+            Split::Test => "test",
+            Split::HeldOut => "held_out",
+        };
+        format!("{},{split},{},{}", view.name, view.camera.width, view.camera.height)
+    };
+    dataset.views.iter().map(line).collect()
+}
+
+/// The step of the model of a run that did not come to its end; none of a finished one, and where none is known.
+pub fn stopped_at(run: &Path) -> Option<u64> {
+    if is_finished(run) {
+        return None;
+    }
+    // The header of a safetensors file, length first, is JSON with a note in which the checkpoint says what it is.
+    let mut file = File::open(checkpoint(run)?).ok()?;
+    let mut length = [0; 8];
+    file.read_exact(&mut length).ok()?;
+    let mut header = String::new();
+    file.take(u64::from_le_bytes(length)).read_to_string(&mut header).ok()?;
+    let header: serde_json::Value = serde_json::from_str(&header).ok()?;
+    let note = header["__metadata__"]["checkpoint"].as_str()?;
+    serde_json::from_str::<serde_json::Value>(note).ok()?["step"].as_u64()
+}
+
+/// The checkpoint that a run goes on from: the newest that is whole, else the newest, to say what is wrong with it; none
+/// where there is none.
 pub(super) fn checkpoint(run: &Path) -> Option<PathBuf> {
-    Some(run.join(CHECKPOINT)).filter(|path| path.is_file())
+    let [newest, before] = [CHECKPOINT, CHECKPOINT_BEFORE].map(|file| run.join(file));
+    let problem = match newest.is_file().then(|| check_checkpoint(&newest)) {
+        Some(Ok(())) => return Some(newest),
+        Some(Err(problem)) => Some(problem),
+        None => None,
+    };
+    if before.is_file() && check_checkpoint(&before).is_ok() {
+        if let Some(problem) = problem {
+            tracing::warn!("{problem}: the run goes on from the checkpoint before");
+        }
+        return Some(before);
+    }
+    [newest, before].into_iter().find(|path| path.is_file())
+}
+
+/// Whether a directory holds a run, be it of another version: a configuration with what every one has.
+fn is_run(path: &Path) -> bool {
+    let text = std::fs::read_to_string(path.join("config.toml")).unwrap_or_default();
+    let table = text.parse::<toml::Table>().unwrap_or_default();
+    ["dataset", "steps", "seed", "tone"].iter().all(|key| table.contains_key(*key))
+}
+
+fn held(path: &Path, file: &str) -> Error {
+    let problem = format!("already holds a run ({file}); pass `HeldRun::Replace` to replace it");
+    Error::output(path, problem)
 }
 
 /// Whether a directory holds a run that reached its end.
@@ -365,7 +551,7 @@ pub fn load_config(run: &Path) -> Result<TrainConfig> {
             "is no run directory: it has no config.toml; name what `nightsplat train` wrote";
         return Err(Error::input(run, problem));
     }
-    TrainConfig::load(&path)
+    Ok(TrainConfig::load(&path)?.with_paths_from(run))
 }
 
 /// The plan that a run keeps to; none where it keeps to none.
@@ -376,11 +562,13 @@ pub fn plan_of(run: &Path) -> Option<PathBuf> {
 /// The trained Gaussians of a run.
 ///
 /// # Errors
-/// The run has not been trained to its end, or the file is cut short.
+/// The run has not been trained to its end or a checkpoint, or the file is cut short.
 pub fn load_model(run: &Path, raw_colors: bool) -> Result<Gaussians> {
     let path = run.join("model.ply");
     if !path.is_file() {
-        return Err(Error::input(run, "has no model.ply: the run did not finish; train it again"));
+        let problem = "has no model.ply: the run did not finish, nor come to a checkpoint; train it again, or go on with \
+                       --resume";
+        return Err(Error::input(run, problem));
     }
     let mut gaussians = ply::load(path)?;
     if raw_colors {
@@ -425,8 +613,16 @@ fn remove(run: &Path, files: &[&str]) -> Result<()> {
     Ok(())
 }
 
-fn unwritable(path: &Path, error: &std::io::Error) -> Error {
-    Error::output(path, format!("cannot be written ({error}); check the folder and the disk"))
+fn remove_events(run: &Path) -> Result<()> {
+    let folder = run.join(TENSORBOARD);
+    let Ok(entries) = std::fs::read_dir(&folder) else { return Ok(()) };
+    for file in entries.flatten().map(|entry| entry.path()) {
+        let name = file.file_name().unwrap_or_default().to_string_lossy();
+        if name.starts_with("events.out.tfevents.") && name.ends_with(".nightsplat") {
+            std::fs::remove_file(&file).map_err(|error| unwritable(&file, &error))?;
+        }
+    }
+    Ok(())
 }
 
 #[cfg(test)]
@@ -461,10 +657,18 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let run = RunDirectory::create(folder.path(), &TrainConfig::default(), false).unwrap();
         assert!(run.progress(9).is_empty());
-        let scores = Scores { psnr: 24.5, psnr_channel_mean: 25.0, ssim: 0.75 };
-        let spent = |seconds, joules| Spent { seconds, joules, ..Spent::default() };
-        let progress = [(2, spent(0.5, None)), (4, spent(1.25, Some(30.5)))]
-            .map(|(step, spent)| Progress::new(step, 7, &scores, &spent));
+        let progress = |step, seconds, joules| Progress {
+            step,
+            views: 2,
+            psnr: 24.5,
+            psnr_channel_mean: 25.0,
+            ssim: 0.75,
+            seconds,
+            processor_seconds: None,
+            joules,
+            gaussians: 7,
+        };
+        let progress = [progress(2, 0.5, None), progress(4, 1.25, Some(30.5))];
         run.save_progress(&progress).unwrap();
         assert_eq!(load_progress(folder.path()), progress);
         assert_eq!(run.progress(3), progress[..1]);

@@ -1,16 +1,19 @@
 //! Trains into a run directory and tells an observer.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
 use super::directory::{Progress, SPENT, TARGET_EXPOSURE};
 use super::meter::{Meter, Spent};
-use super::{Event, RunDirectory, directory};
-use crate::Result;
-use crate::dataset::Dataset;
+use super::tensorboard::EventFile;
+use super::{Event, Requests, RunDirectory, directory, done};
+use crate::dataset::{Dataset, View};
 use crate::diagnose::Plan;
-use crate::eval::{self, ViewScore};
+use crate::eval::{self, ViewScore, Yardstick};
 use crate::gpu::Gpu;
-use crate::train::{TrainConfig, Trainer};
+use crate::scene::ATTRIBUTES;
+use crate::train::{Learning, StepReport, TrainConfig, Trainer};
+use crate::{Error, Result, Stop};
 
 /// What becomes of a run that the directory already holds.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -22,6 +25,17 @@ pub enum HeldRun {
     Replace,
     /// It goes on from its checkpoint, to the bits that it would have had in one go; without one it begins anew.
     Resume,
+}
+
+/// How a run comes to be, and what may be asked of it.
+#[derive(Clone, Debug, Default)]
+pub struct Session<'a> {
+    /// The plan that its configuration and dataset follow already; it is kept in the run directory.
+    pub plan: Option<&'a Plan>,
+    /// What becomes of a run that is there.
+    pub held: HeldRun,
+    /// What is asked of it on the way.
+    pub requests: Requests,
 }
 
 /// What a run made.
@@ -72,37 +86,35 @@ pub fn train(
     held: HeldRun,
     observe: impl FnMut(Event<'_>),
 ) -> Result<Trained> {
-    train_planned(gpu, config, None, dataset, out, held, observe)
+    train_in(gpu, config, dataset, out, &Session { held, ..Session::default() }, observe)
 }
 
-/// As [`train`], by a plan that `config` and `dataset` follow already, which is kept in the run directory.
+/// As [`train`], in a [`Session`].
 ///
 /// # Errors
-/// As there.
-pub fn train_planned(
+/// As there, and [`Error::Stopped`] where the run was asked to stop or has taken `TrainConfig::max_minutes`.
+pub fn train_in(
     gpu: &Gpu,
     config: &TrainConfig,
-    plan: Option<&Plan>,
     dataset: &Dataset,
     out: &Path,
-    held: HeldRun,
+    session: &Session<'_>,
     mut observe: impl FnMut(Event<'_>),
 ) -> Result<Trained> {
     gpu.reset_peak_memory();
-    let (mut directory, mut trainer) = begin(gpu, config, dataset, out, held)?;
-    if let Some(plan) = plan {
+    let (mut directory, mut trainer) = begin(gpu, config, dataset, out, session.held)?;
+    if let Some(plan) = session.plan {
         directory.save_plan(plan)?;
     }
+    directory.save_views(dataset)?;
     observe(Event::Started { step: trainer.steps_done(), steps: config.steps });
-    let mut course = Course::new(config, dataset, &directory, &trainer);
-    let losses = course.train_to_the_end(&mut trainer, &mut directory, &mut observe)?;
+    let mut course = Course::new(gpu, config, dataset, &directory, &trainer)?;
+    let requests = &session.requests;
+    let losses = course.train_to_the_end(&mut trainer, &mut directory, requests, &mut observe)?;
     trainer.leave_out_what_gains_nothing()?;
     let spent = course.meter.spent(gpu.peak_memory());
     let scored = course.evaluate(&mut trainer, &directory, &mut observe)?;
-    directory.save_model(&trainer.gaussians()?, config.model.raw_colors)?;
-    if let Some(networks) = trainer.networks() {
-        directory.save_networks(networks)?;
-    }
+    directory.save_trained(&mut trainer)?;
     let (gaussians, steps) = (trainer.gaussian_count(), trainer.steps_done());
     let mut metrics = eval::metrics(&scored, spent.seconds, gaussians, steps);
     metrics[SPENT] = serde_json::json!(spent);
@@ -110,11 +122,11 @@ pub fn train_planned(
     if let Some(exposure) = trainer.target_exposure() {
         metrics[TARGET_EXPOSURE] = serde_json::json!(exposure);
     }
-    if let Some(exposures) = trainer.exposures()? {
-        directory.save_exposures(&exposures)?;
+    if config.exposure.learn == Learning::On {
         eval::add_exposure(&mut metrics, &scored)?;
     }
     directory.save_metrics(&metrics)?;
+    done::save(out, config, trainer.fingerprint(), steps)?;
     let trained = Trained { trainer, scored, losses, spent };
     observe(Event::Finished(&trained));
     Ok(trained)
@@ -128,14 +140,27 @@ fn begin(
     out: &Path,
     held: HeldRun,
 ) -> Result<(RunDirectory, Trainer)> {
-    let checkpoint = directory::checkpoint(out).filter(|_| held == HeldRun::Resume);
-    let config = &with_tile(gpu, config, checkpoint.is_some().then_some(out))?;
+    match held {
+        HeldRun::Refuse => RunDirectory::check(out, false)?,
+        HeldRun::Replace => RunDirectory::check(out, true)?,
+        HeldRun::Resume => RunDirectory::check_resumed(out)?,
+    }
+    let lock = RunDirectory::lock(out)?;
+    let resumes = held == HeldRun::Resume;
+    let checkpoint = if resumes { directory::checkpoint(out) } else { None };
+    let mut config =
+        with_tile_and_frame(gpu, config, dataset, checkpoint.is_some().then_some(out))?;
+    config.spool = config.spool.or_else(|| existing(out));
+    let config = &config;
+    let mut trainer = Trainer::new(gpu, config.clone(), dataset)?;
     if let Some(checkpoint) = checkpoint {
-        let mut trainer = Trainer::new(gpu, config.clone(), dataset)?;
         trainer.restore(&checkpoint)?;
         let step = trainer.steps_done();
         tracing::info!("{} goes on after step {step}", out.display());
-        return Ok((RunDirectory::resume(out, config, step)?, trainer));
+        let mut directory = RunDirectory::resume(out, lock, config, step)?;
+        // What it had of a later step is gone: the model is that of the checkpoint again.
+        directory.save_trained(&mut trainer)?;
+        return Ok((directory, trainer));
     }
     // Without a checkpoint, an unfinished run is nothing to lose.
     let replaces = match held {
@@ -143,39 +168,61 @@ fn begin(
         HeldRun::Replace => true,
         HeldRun::Resume => !directory::is_finished(out),
     };
-    let directory = RunDirectory::create(out, config, replaces)?;
-    Ok((directory, Trainer::new(gpu, config.clone(), dataset)?))
+    Ok((RunDirectory::create_locked(out, lock, config, replaces)?, trainer))
 }
 
-/// The configuration with the tile that is to be recorded: the same tiles give the same bits, whatever is measured later.
-/// It is the configuration's own, else that of the run that is `resumed`, else the fastest known on the device.
-fn with_tile(gpu: &Gpu, config: &TrainConfig, resumed: Option<&Path>) -> Result<TrainConfig> {
+/// The run directory, or the folder that it will lie in: a disk of that size has room for photographs.
+fn existing(out: &Path) -> Option<PathBuf> {
+    let folders = out.ancestors().filter(|folder| !folder.as_os_str().is_empty());
+    folders.map(Path::to_owned).find(|folder| folder.is_dir())
+}
+
+/// The configuration with the tile and the frame that are to be recorded: the same ones give the same bits, whatever is
+/// measured later. Each is the configuration's own, else that of the run that is `resumed`, else the fastest known on the
+/// device and that of the dataset. A run that records no frame was trained in the world.
+fn with_tile_and_frame(
+    gpu: &Gpu,
+    config: &TrainConfig,
+    dataset: &Dataset,
+    resumed: Option<&Path>,
+) -> Result<TrainConfig> {
     let mut config = config.clone();
-    if let Some(run) = resumed.filter(|_| config.tile.is_none()) {
-        let recorded = directory::load_config(run)?.tile;
-        config.tile = recorded.filter(|&tile| gpu.properties().suits_tile(tile));
+    if let Some(run) = resumed {
+        let recorded = directory::load_config(run)?;
+        let tile = recorded.tile.filter(|&tile| gpu.properties().suits_tile(tile));
+        config.tile = config.tile.or(tile);
+        config.frame = Some(recorded.frame.unwrap_or_default());
     }
     config.tile = Some(config.render_settings().tile_on(gpu)?);
+    config.frame.get_or_insert_with(|| dataset.frame());
     Ok(config)
 }
 
 /// How far a run has come, and what that took.
 struct Course<'a> {
+    gpu: &'a Gpu,
     config: &'a TrainConfig,
     dataset: &'a Dataset,
     meter: Meter,
     progress: Vec<Progress>,
+    /// Once something was scored.
+    yardstick: Option<Yardstick>,
+    /// For TensorBoard.
+    events: Option<EventFile>,
 }
 
 impl<'a> Course<'a> {
     fn new(
+        gpu: &'a Gpu,
         config: &'a TrainConfig,
         dataset: &'a Dataset,
         directory: &RunDirectory,
         trainer: &Trainer,
-    ) -> Self {
-        let meter = Meter::new(directory.seconds_before());
-        Self { config, dataset, meter, progress: directory.progress(trainer.steps_done()) }
+    ) -> Result<Self> {
+        let (meter, step) = (Meter::new(directory.seconds_before()), trainer.steps_done());
+        let progress = directory.progress(step);
+        let events = config.tensorboard.then(|| directory.events(step)).transpose()?;
+        Ok(Self { gpu, config, dataset, meter, progress, yardstick: None, events })
     }
 
     /// Logs every step, writes checkpoints and ends early where that is asked for; gives the losses.
@@ -183,22 +230,32 @@ impl<'a> Course<'a> {
         &mut self,
         trainer: &mut Trainer,
         directory: &mut RunDirectory,
+        requests: &Requests,
         observe: &mut impl FnMut(Event<'_>),
     ) -> Result<Vec<f64>> {
         let (config, mut losses) = (self.config, vec![]);
+        let (begin, mut saved) = (Instant::now(), Instant::now());
+        let is_over = |since: Instant, minutes: f64| {
+            minutes > 0.0 && since.elapsed() >= Duration::from_secs_f64(60.0 * minutes)
+        };
         let score_every = if config.stop.views > 0 { config.stop.every } else { 0 };
         let mut held_out = directory.held_out_scores(trainer.steps_done());
         while trainer.steps_done() < config.steps {
             let next = |every| (trainer.steps_done() + 1).checked_next_multiple_of(every);
-            let until = [config.eval_every, config.checkpoint_every, score_every];
+            let until =
+                [config.eval_every, config.checkpoint_every, score_every, config.hash_every];
             let until = until.into_iter().filter_map(next).min().unwrap_or(config.steps);
             let reports = self.meter.of(|| trainer.advance(until))?;
             for report in &reports {
                 losses.push(report.loss);
                 directory.log(report)?;
+                self.tell_events(report)?;
                 observe(Event::Step(report));
             }
             directory.flush_log()?;
+            if !reports.is_empty() {
+                directory.settle()?;
+            }
             let Some(step) = reports.last().map(|report| report.step) else { continue };
             let falls_on = |every: u64| every > 0 && step.is_multiple_of(every);
             // Before the checkpoint: what goes on from there knows the score.
@@ -209,9 +266,20 @@ impl<'a> Course<'a> {
                 directory.save_held_out(&held_out)?;
                 observe(Event::HeldOut { step, psnr });
             }
-            if falls_on(config.checkpoint_every) {
+            if falls_on(config.hash_every) {
+                directory.log_hashes(step, &trainer.gaussians_in_frame()?)?;
+            }
+            let stop =
+                requests.stops().or(is_over(begin, config.max_minutes).then_some(Stop::TimeUp));
+            let stop = stop.filter(|_| step < config.steps);
+            let saves = requests.takes_save() || is_over(saved, config.checkpoint_minutes);
+            if falls_on(config.checkpoint_every) || saves || stop.is_some() {
                 directory.save_checkpoint(trainer)?;
+                saved = Instant::now();
                 observe(Event::Checkpointed { step });
+            }
+            if let Some(cause) = stop {
+                return Err(Error::Stopped { run: directory.path().to_owned(), step, cause });
             }
             if falls_on(score_every) && has_converged(config, &held_out) && step < config.steps {
                 tracing::info!("step {step}: the held-out views have converged");
@@ -231,17 +299,66 @@ impl<'a> Course<'a> {
         directory: &RunDirectory,
         observe: &mut impl FnMut(Event<'_>),
     ) -> Result<Vec<ViewScore>> {
-        let scored = eval::score(self.dataset, |view| trainer.render(&view.camera))?;
+        let yardstick = match self.yardstick.take() {
+            Some(known) => known,
+            None => Yardstick::of(self.gpu, &self.config.tone, self.dataset)?,
+        };
+        let render = |view: &View| trainer.render(&view.camera);
+        let scored = eval::score_by(&yardstick, self.dataset, render)?;
+        self.yardstick = Some(yardstick);
         let step = trainer.steps_done();
         observe(Event::Evaluated { step, scored: &scored });
+        self.tell_events_scores(step, &scored)?;
         if let Some(scores) = eval::means(&scored).0.filter(|_| self.config.eval_every > 0) {
             let (gaussians, spent) = (trainer.gaussian_count(), self.meter.spent(0));
             // A finished run that goes on begins where it was scored last.
             self.progress.retain(|earlier| earlier.step < step);
-            self.progress.push(Progress::new(step, gaussians, &scores, &spent));
+            self.progress.push(Progress::new(step, gaussians, scored.len(), &scores, &spent));
             directory.save_progress(&self.progress)?;
         }
         Ok(scored)
+    }
+}
+
+impl Course<'_> {
+    /// Writes what TensorBoard draws over the steps, of every tenth.
+    fn tell_events(&mut self, report: &StepReport) -> Result<()> {
+        const EVERY: u64 = 10;
+        let Some(events) = &mut self.events else { return Ok(()) };
+        let step = report.step;
+        if !step.is_multiple_of(EVERY) && step < self.config.steps {
+            return Ok(());
+        }
+        let named = |group: &str, name: &str, value| (format!("{group}/{name}"), value);
+        let mut values = vec![("loss/all".to_owned(), report.loss)];
+        values.extend(report.terms.iter().map(|(term, value)| named("loss", term.column, *value)));
+        values.push(("model/Gaussians".to_owned(), report.gaussians as f64));
+        values.push(("model/milliseconds a step".to_owned(), report.milliseconds));
+        let rates = self.config.schedule.learning_rates(step, self.dataset.extent());
+        values.extend(ATTRIBUTES.iter().map(|own| named("rates", own.name, rates[own.attribute])));
+        events.scalars(step, &values)?;
+        events.flush()
+    }
+
+    /// Writes scores and the first test view.
+    fn tell_events_scores(&mut self, step: u64, scored: &[ViewScore]) -> Result<()> {
+        let (Some(events), Some(first)) = (&mut self.events, scored.first()) else { return Ok(()) };
+        let group = format!("test views against {}", first.against.name());
+        if let Some(mean) = eval::means(scored).0 {
+            let values = [
+                ("PSNR", mean.psnr),
+                ("channel-mean PSNR", mean.psnr_channel_mean),
+                ("SSIM", mean.ssim),
+            ];
+            events
+                .scalars(step, &values.map(|(name, value)| (format!("{group}/{name}"), value)))?;
+        }
+        let pictures = [("render", &first.render), (first.against.name(), &first.reference)];
+        for (name, image) in pictures {
+            let tag = format!("view {}/{name}", first.name);
+            events.picture(step, &tag, [image.width, image.height], &image.to_png8()?)?;
+        }
+        events.flush()
     }
 }
 

@@ -212,11 +212,7 @@ pub fn random(cameras: &[Camera], count: usize, seed: u64) -> Vec<DVec3> {
             camera.view_from_world.inverse().transform_point3(in_view)
         };
         let seen_twice = |position: &DVec3| {
-            cameras
-                .iter()
-                .filter(|camera| pixel_inside(camera, *position).is_some())
-                .nth(1)
-                .is_some()
+            cameras.iter().filter(|camera| camera.sees(*position).is_some()).nth(1).is_some()
         };
         (1..TRIES).map(position).find(seen_twice).unwrap_or_else(|| position(0))
     };
@@ -231,14 +227,6 @@ fn radius(cameras: &[Camera]) -> f64 {
     // Below this the spread is the rounding of one place's coordinates.
     let least = 1e-9 * mean.length().max(1.0);
     if radius > least { radius } else { 1.0 }
-}
-
-/// Where a camera sees a position, pixels; none behind the camera or outside its image.
-fn pixel_inside(camera: &Camera, position: DVec3) -> Option<DVec2> {
-    let size = DVec2::new(camera.width.into(), camera.height.into());
-    camera
-        .project(position)
-        .filter(|pixel| pixel.cmpge(DVec2::ZERO).all() && pixel.cmplt(size).all())
 }
 
 /// The colour of each point: the mean of what the training views that see it show in their targets, RGB.
@@ -261,7 +249,7 @@ pub fn colors_from_views<I: Borrow<Image>>(
         let target = target.borrow();
         grey.add(mean_grey(&view.counted(target)));
         seen.par_iter_mut().zip(points).for_each(|([tracked, inside], point)| {
-            let Some(pixel) = pixel_inside(&view.camera, point.position) else { return };
+            let Some(pixel) = view.camera.sees(point.position) else { return };
             if view.mask.as_ref().is_some_and(|mask| mask.hides_around(pixel)) {
                 return;
             }

@@ -60,11 +60,23 @@ fn properties(shape: Shape) -> Vec<Property> {
 /// # Errors
 /// [`Error::Output`] where the file cannot be written.
 pub fn save(gaussians: &Gaussians, path: impl AsRef<Path>) -> Result<()> {
+    save_with_comments(gaussians, path, &[])
+}
+
+/// As [`save`], with lines of the header that readers skip.
+///
+/// # Errors
+/// As there.
+pub fn save_with_comments(
+    gaussians: &Gaussians,
+    path: impl AsRef<Path>,
+    comments: &[&str],
+) -> Result<()> {
     let path = path.as_ref();
     let failed = |error: std::io::Error| Error::output(path, format!("cannot be written: {error}"));
     let name = path.file_name().ok_or_else(|| Error::output(path, "is not a file name"))?;
     let partial = path.with_file_name(format!("{}.partial", name.to_string_lossy()));
-    let written = write(gaussians, &partial).and_then(|()| fs::rename(&partial, path));
+    let written = write(gaussians, &partial, comments).and_then(|()| fs::rename(&partial, path));
     if written.is_err() {
         // The first failure is the one worth reporting; a leftover of it is not.
         let _ = fs::remove_file(&partial);
@@ -72,12 +84,16 @@ pub fn save(gaussians: &Gaussians, path: impl AsRef<Path>) -> Result<()> {
     written.map_err(failed)
 }
 
-fn write(gaussians: &Gaussians, path: &Path) -> std::io::Result<()> {
+fn write(gaussians: &Gaussians, path: &Path, comments: &[&str]) -> std::io::Result<()> {
     const NORMALS: [&str; 3] = ["nx", "ny", "nz"];
     let properties = properties(gaussians.shape);
     let (means, others) = properties.split_at(3);
     let mut file = BufWriter::new(fs::File::create(path)?);
-    writeln!(file, "ply\nformat binary_little_endian 1.0\nelement vertex {}", gaussians.count)?;
+    writeln!(file, "ply\nformat binary_little_endian 1.0")?;
+    for comment in comments {
+        writeln!(file, "comment {comment}")?;
+    }
+    writeln!(file, "element vertex {}", gaussians.count)?;
     let names = means.iter().map(|property| property.name.as_str());
     let names = names.chain(NORMALS).chain(others.iter().map(|property| property.name.as_str()));
     for name in names {

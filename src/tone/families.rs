@@ -105,7 +105,10 @@ impl Family {
 
     /// The family of that name or alias.
     pub fn find(name: &str) -> Option<&'static Self> {
-        super::FAMILIES.iter().find(|family| family.name == name || family.aliases.contains(&name))
+        super::FAMILIES.iter().find(|family| {
+            family.name.eq_ignore_ascii_case(name)
+                || family.aliases.iter().any(|alias| alias.eq_ignore_ascii_case(name))
+        })
     }
 }
 

@@ -104,6 +104,23 @@ impl ToneSettings {
         }
     }
 
+    /// The same with every number as the shortest decimal that is the same number to the kernels, which compute in 32 bits.
+    #[must_use]
+    pub fn rounded(self) -> Self {
+        let round = |value: f64| {
+            let single = value as f32;
+            // Of no consequence to a kernel, and hundreds of digits long.
+            let single = if single.is_subnormal() { 0.0 } else { single };
+            single.to_string().parse().unwrap_or(value)
+        };
+        let Self { gain_c, theta, alpha, beta, base_gain, colour, .. } = self;
+        let [gain_c, theta, alpha, beta, base_gain, colour] =
+            [gain_c, theta, alpha, beta, base_gain, colour].map(round);
+        let brightness = self.brightness.map(round);
+        let constants = self.constants.iter().copied().map(round).collect();
+        Self { gain_c, theta, alpha, beta, base_gain, colour, brightness, constants, ..self }
+    }
+
     /// Whether the gain follows from the photographs' [`super::Exposure`].
     pub fn takes_exposure(&self) -> bool {
         self.auto_gain || self.curve == ToneCurve::Auto
@@ -349,8 +366,10 @@ impl Default for ToneSettings {
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Written {
-    #[serde(alias = "family")]
     curve: Option<ToneCurve>,
+    /// What `curve` was called once.
+    #[serde(skip_serializing)]
+    family: Option<ToneCurve>,
     gain_c: Option<f64>,
     theta: Option<f64>,
     alpha: Option<f64>,
@@ -379,7 +398,19 @@ impl TryFrom<Written> for ToneSettings {
             (None, Some(_)) => ToneCurve::Profile,
             (None, None) => ToneCurve::Auto,
         };
-        let defaults = Self::new(written.curve.unwrap_or(given));
+        if written.family.is_some() {
+            static SAID: std::sync::Once = std::sync::Once::new();
+            SAID.call_once(|| {
+                tracing::warn!("`family` of a curve is called `curve` now; the old name is read")
+            });
+            if written.curve.is_some() {
+                return Err(
+                    "it names its family twice, as `curve` and as `family`; leave `family` out"
+                        .to_owned(),
+                );
+            }
+        }
+        let defaults = Self::new(written.curve.or(written.family).unwrap_or(given));
         let family = defaults.curve.family();
         let constants = match written.constants {
             None => defaults.constants,
@@ -431,6 +462,7 @@ impl From<ToneSettings> for Written {
             names.map(|constant| constant.name.to_owned()).zip(settings.constants).collect();
         Self {
             curve: Some(settings.curve),
+            family: None,
             gain_c: Some(settings.gain_c),
             theta: Some(settings.theta),
             alpha: Some(settings.alpha),

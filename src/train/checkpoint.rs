@@ -1,22 +1,27 @@
 //! Checkpoints: a run goes on from one as if it had never stopped.
 //!
 //! Random numbers are functions of seed and step, so a checkpoint holds what a step leaves behind and no more: the
-//! Gaussians and what else is learned with their moments, and the statistics of density control.
+//! Gaussians and what else is learned with their moments, and the statistics of density control; beside them what tells
+//! whether it is whole and of this run.
 
 use std::collections::HashMap;
 use std::path::Path;
 
+use rayon::prelude::*;
 use safetensors::tensor::{Dtype, TensorView};
 use serde::{Deserialize, Serialize};
 
 use super::ends::Ends;
 use super::model::Model;
 use super::{TrainConfig, Trainer, learnables};
+use crate::dataset::Fingerprint;
 use crate::densify::DeviceGaussians;
 use crate::gpu::{Buffer, Gpu};
+use crate::hash::{self, Hasher};
 use crate::nn::TensorFile;
 use crate::optimizer::{AdamBuffers, Moments};
 use crate::output::write_whole_with;
+use crate::scene::Gaussians;
 use crate::{Error, Result};
 
 /// The key of the metadata that holds a [`Header`] as JSON: several keys would come in another order every time.
@@ -37,6 +42,51 @@ struct Header {
     /// What the held-out views have ended.
     #[serde(default)]
     ends: Ends,
+    /// What it was trained on; older files do not say.
+    #[serde(default)]
+    dataset: Option<Fingerprint>,
+    /// That of this header without it, and of the tensors; older files have none.
+    #[serde(default)]
+    checksum: Option<String>,
+}
+
+impl Header {
+    /// The checksum of a file with this header and these tensors, in the order of their names.
+    fn checksum_with(&self, mut tensors: Vec<(String, &[u8])>) -> String {
+        let Self { format, step, config, ends, dataset, .. } = self;
+        let mut hasher = Hasher::default();
+        hasher
+            .write(serde_json::json!([format, step, config, ends, dataset]).to_string().as_bytes());
+        tensors.sort_unstable();
+        for (name, bytes) in tensors {
+            hasher.write(name.as_bytes());
+            hasher.write(bytes);
+        }
+        hash::text(hasher.finish())
+    }
+
+    /// Whether it is the header of what the file holds.
+    fn describes(&self, file: &TensorFile<'_>) -> bool {
+        let Some(checksum) = &self.checksum else { return true };
+        *checksum == self.checksum_with(file.tensors())
+    }
+}
+
+/// Whether a checkpoint is as it was written.
+///
+/// # Errors
+/// [`Error::Input`] says that it is not, or that the file cannot be read.
+pub(crate) fn check_checkpoint(path: &Path) -> Result<()> {
+    let bytes = std::fs::read(path)
+        .map_err(|error| Error::input(path, format!("cannot be read ({error})")))?;
+    let damaged = |problem: &str| Error::input(path, format!("is no whole checkpoint ({problem})"));
+    let file = TensorFile::of(&bytes).map_err(|error| damaged(&error.to_string()))?;
+    let header = file.note(HEADER).and_then(|header| serde_json::from_str::<Header>(header).ok());
+    match header {
+        Some(header) if header.describes(&file) => Ok(()),
+        Some(_) => Err(damaged("its checksum is another")),
+        None => Err(damaged("its header is damaged")),
+    }
 }
 
 /// A tensor of the state.
@@ -53,22 +103,31 @@ impl Trainer {
     /// The file cannot be written, or the device was lost.
     pub fn save_checkpoint(&mut self, path: &Path) -> Result<()> {
         let gpu = self.gpu.clone();
-        let header = Header {
+        let mut header = Header {
             format: FORMAT.to_owned(),
             step: self.step,
             config: self.config.to_toml()?,
             ends: self.ends.clone(),
+            dataset: Some(self.fingerprint.clone()),
+            checksum: None,
         };
-        let header = serde_json::json!(header).to_string();
-        let metadata = HashMap::from([(HEADER.to_owned(), header)]);
         let mut downloads = vec![];
         for State { name, shape, buffer } in self.state() {
             let mut values = gpu.read(buffer)?;
             values.truncate(shape.iter().product());
             downloads.push((name, shape, values));
         }
+        for (name, _, values) in &downloads {
+            self.refuse_values(name, values)?;
+        }
         let mut visits = gpu.read(&self.model.visit_counts)?;
         visits.truncate(self.model.count());
+        let tensors =
+            downloads.iter().map(|(name, _, values)| (name.clone(), bytemuck::cast_slice(values)));
+        let visit_counts = (VISIT_COUNTS.to_owned(), bytemuck::cast_slice(&visits));
+        header.checksum = Some(header.checksum_with(tensors.chain([visit_counts]).collect()));
+        let header = serde_json::json!(header).to_string();
+        let metadata = HashMap::from([(HEADER.to_owned(), header)]);
         let view = |name: &str, shape: &[usize], dtype, bytes| -> std::io::Result<_> {
             let view = TensorView::new(dtype, shape.to_vec(), bytes);
             Ok((name.to_owned(), view.map_err(std::io::Error::other)?))
@@ -106,44 +165,79 @@ impl Trainer {
         let damaged =
             |problem: String| Error::input(path, format!("is no whole checkpoint ({problem})"));
         let file = TensorFile::of(&bytes).map_err(|error| damaged(error.to_string()))?;
-        let (step, ends) = self.header_of(path, &file)?;
+        let header = self.header_of(path, &file)?;
         let visits: Vec<u32> = values(&file, VISIT_COUNTS, Dtype::U32, None).map_err(damaged)?;
         let gpu = self.gpu.clone();
         let mut restored = Model::zeros(&gpu, visits.len(), self.model.shape())?;
         gpu.write(&mut restored.visit_counts, &visits)?;
         let fresh = std::mem::replace(&mut self.model, restored);
-        if let Err(error) = self.read_state(&gpu, &file, &damaged) {
+        if let Err(error) = self.read_state(&gpu, &file, &header, &damaged) {
             self.model = fresh;
             return Err(error);
         }
-        (self.step, self.ends) = (step, ends);
+        (self.step, self.ends) = (header.step, header.ends);
         self.reserve()
     }
 
-    /// The step of a checkpoint that this run can go on from, and what had ended by then.
-    fn header_of(&self, path: &Path, file: &TensorFile<'_>) -> Result<(u64, Ends)> {
+    /// The header of a checkpoint that this run can go on from.
+    fn header_of(&self, path: &Path, file: &TensorFile<'_>) -> Result<Header> {
         let refused = |problem: String| Error::input(path, problem);
         let anew = "begin anew with `HeldRun::Replace`";
         let header = file.note(HEADER).and_then(|header| serde_json::from_str(header).ok());
-        let Some(Header { step, config, ends, .. }) =
-            header.filter(|h: &Header| h.format == FORMAT)
-        else {
+        let Some(header) = header.filter(|h: &Header| h.format == FORMAT) else {
             return Err(refused(format!("is no `{FORMAT}`; {anew}")));
         };
-        let config = TrainConfig::from_toml(&config)
+        let Header { step, config, dataset, .. } = &header;
+        let config = TrainConfig::from_toml(config)
             .map_err(|error| refused(format!("was made by another version ({error}); {anew}")))?;
         if let Some(difference) = config.difference(&self.config) {
             return Err(refused(format!(
                 "was made with {difference}; give the settings that the run began with, or {anew}"
             )));
         }
+        match dataset.as_ref().map(|dataset| dataset.difference(&self.fingerprint)) {
+            Some(None) => {}
+            Some(Some(difference)) => {
+                return Err(refused(format!(
+                    "was trained on another dataset ({difference}); give the one that the run began with, or {anew}"
+                )));
+            }
+            None => tracing::warn!(
+                "{}: is of an older version, which does not say on what it was trained; it is taken to be this dataset",
+                path.display()
+            ),
+        }
         let steps = self.config.steps;
-        if step > steps {
+        if *step > steps {
             return Err(refused(format!(
                 "is at step {step}, this run ends at {steps}; raise `TrainConfig::steps`"
             )));
         }
-        Ok((step, ends))
+        Ok(header)
+    }
+
+    /// Refuses Gaussians that hold NaN or infinity.
+    ///
+    /// # Errors
+    /// [`Error::ParameterNotFinite`] names step and plane.
+    pub(crate) fn refuse_not_finite(&self, gaussians: &Gaussians) -> Result<()> {
+        self.refuse_values("gaussians.parameters", &gaussians.parameters)
+    }
+
+    fn refuse_values(&self, name: &str, values: &[f32]) -> Result<()> {
+        match values.par_iter().position_first(|value| !value.is_finite()) {
+            Some(at) => Err(self.not_finite(name, at)),
+            None => Ok(()),
+        }
+    }
+
+    /// What to say of a value of the state, by its tensor's name.
+    pub(super) fn not_finite(&self, name: &str, at: usize) -> Error {
+        let (plane, gaussian) = match name.strip_prefix("gaussians.") {
+            Some(_) => self.model.place_of(at),
+            None => (name.to_owned(), at),
+        };
+        Error::ParameterNotFinite { step: self.step, plane, gaussian }
     }
 
     /// Every tensor is read before one is changed, but for those of the model.
@@ -151,6 +245,7 @@ impl Trainer {
         &mut self,
         gpu: &Gpu,
         file: &TensorFile<'_>,
+        header: &Header,
         damaged: &dyn Fn(String) -> Error,
     ) -> Result<()> {
         let read = |state: State<'_>| {
@@ -162,6 +257,9 @@ impl Trainer {
             Err(damaged(format!("`{}` holds values that are not finite", state.name)))
         };
         let values = self.state().into_iter().map(read).collect::<Result<Vec<_>>>()?;
+        if !header.describes(file) {
+            return Err(damaged("its checksum is another".to_owned()));
+        }
         self.state()
             .into_iter()
             .zip(values)

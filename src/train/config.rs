@@ -4,22 +4,28 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
+use super::cache::CacheSize;
 use super::exposures::{ExposureConfig, Learning};
 use super::held_out::StopConfig;
 use super::parts::ModelConfig;
 use super::precision::PrecisionConfig;
 use super::streams;
+use crate::camera::frame::{FRAME_EXTENT, Frame};
 use crate::dataset::{Dataset, DepthOptions, LoadOptions};
 use crate::densify::DensityControl;
+use crate::gpu::Gpu;
 use crate::loss::LossConfig;
 use crate::nn::Form;
 use crate::optimizer::Schedule;
 use crate::random::Stream;
 use crate::render::RenderSettings;
 use crate::scene::init::Start;
-use crate::scene::{Features, MAX_SH_DEGREE, Shape};
+use crate::scene::{ATTRIBUTES, Attribute, Features, MAX_SH_DEGREE, Shape};
 use crate::tone::ToneSettings;
 use crate::{Error, Result};
+
+/// No rate of use is near it, and a step of it overflows nothing.
+const MOST_RATE: f64 = 100.0;
 
 /// What is seen where no splat is.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -61,6 +67,18 @@ pub struct TrainConfig {
     pub steps: u64,
     /// Factor by which photographs shrink.
     pub downscale: f64,
+    /// The longest side of a view, pixels; photographs beyond it shrink to it. 0: no limit.
+    pub max_resolution: u32,
+    /// Every so many views by name are held out in place of the dataset's own split; 0: none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub test_every: Option<usize>,
+    /// What the photographs may take, on the device and decoded on the host; what does not fit waits on disk, and no bit
+    /// changes. Left out: a quarter of the memory of each.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub cache: Option<CacheSize>,
+    /// The folder for what exceeds the cache; none: that of the system's temporary files.
+    #[serde(skip)]
+    pub spool: Option<PathBuf>,
     /// Everything random follows from it.
     pub seed: u64,
     /// Highest degree of the spherical harmonics.
@@ -75,6 +93,15 @@ pub struct TrainConfig {
     pub eval_every: u64,
     /// Writes a checkpoint every so many steps; 0: never.
     pub checkpoint_every: u64,
+    /// Writes one whenever the last is so many minutes old, too; 0: never.
+    pub checkpoint_minutes: f64,
+    /// Saves and stops after so many minutes, to go on another time; 0: trains to the end.
+    pub max_minutes: f64,
+    /// Logs a checksum of every plane of the parameters every so many steps; 0: never.
+    pub hash_every: u64,
+    /// Leaves event files for TensorBoard.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub tensorboard: bool,
     /// Steps whose every pass is compared with its CPU reference.
     pub check: CheckConfig,
     /// The device: a part of its name or its index; empty: the best.
@@ -82,6 +109,12 @@ pub struct TrainConfig {
     /// The tile that one subgroup renders, in pixels; left out, it is the fastest known on the device, and recorded.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tile: Option<[u32; 2]>,
+    /// Nothing nearer to a camera is seen, in units of the extent, which is taken as the power of two of which it is 0.75 to
+    /// 1.5 times.
+    pub near: f64,
+    /// Where the model is trained; left out, it is found from the cameras, and recorded.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub frame: Option<Frame>,
     /// Random points to begin with where the dataset has none.
     pub random_points: usize,
     /// The curve that lifts each photograph.
@@ -139,6 +172,10 @@ impl Default for TrainConfig {
             invert_masks: false,
             steps: 5000,
             downscale: 1.0,
+            max_resolution: 1600,
+            test_every: None,
+            cache: None,
+            spool: None,
             seed: 10,
             sh_degree: MAX_SH_DEGREE,
             ssim_weight: 0.2,
@@ -146,9 +183,15 @@ impl Default for TrainConfig {
             background: Background::Black,
             eval_every: 0,
             checkpoint_every: 1000,
+            checkpoint_minutes: 10.0,
+            max_minutes: 0.0,
+            hash_every: 0,
+            tensorboard: false,
             check: CheckConfig::default(),
             device: String::new(),
             tile: None,
+            near: 0.1,
+            frame: None,
             random_points: 20_000,
             tone: ToneSettings::default(),
             start: Start::default(),
@@ -188,7 +231,9 @@ impl TrainConfig {
     pub fn load(path: &Path) -> Result<Self> {
         let text = std::fs::read_to_string(path)
             .map_err(|error| Error::input(path, format!("cannot be read: {error}")))?;
-        Self::from_toml(&text).map_err(|problem| Error::input(path, problem.to_string()))
+        let config =
+            Self::from_toml(&text).and_then(|config| config.check_finite().map(|()| config));
+        config.map_err(|problem| Error::input(path, problem.to_string()))
     }
 
     /// Reads TOML; what it leaves out keeps its default.
@@ -215,6 +260,9 @@ impl TrainConfig {
     pub fn load_options(&self) -> LoadOptions {
         LoadOptions {
             downscale: self.downscale,
+            max_resolution: self.max_resolution,
+            test_every: self.test_every,
+            keep: CacheSize::on_host(self.cache),
             reference: self.reference.clone(),
             invert_masks: self.invert_masks,
             hold_out: self.stop.views,
@@ -246,6 +294,28 @@ impl TrainConfig {
         }
     }
 
+    /// Refuses photographs that the device could not train on at the size that is asked for. Only their headers are read.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] names the first such view and the option that helps; [`Error::Input`] is what is wrong with the
+    /// dataset's listing.
+    pub fn check_sizes(&self, gpu: &Gpu) -> Result<()> {
+        let settings = self.render_settings();
+        let sizes = Dataset::sizes(&self.dataset, &self.load_options())?;
+        sizes.into_iter().try_for_each(|(view, size)| settings.check_size(gpu, &view, size))
+    }
+
+    /// The same run of another copy of its dataset; what lay in its folder lies there, too.
+    pub fn move_dataset(&mut self, dataset: &Path) {
+        let from = std::mem::replace(&mut self.dataset, dataset.to_owned());
+        let inside = [&mut self.reference, &mut self.model.depth_folder, &mut self.exposure.start];
+        for folder in inside.into_iter().flatten() {
+            if let Ok(place) = folder.strip_prefix(&from) {
+                *folder = dataset.join(place);
+            }
+        }
+    }
+
     /// What the rasteriser is specialised for.
     pub fn render_settings(&self) -> RenderSettings {
         RenderSettings {
@@ -253,6 +323,7 @@ impl TrainConfig {
             raw_colors: self.model.raw_colors,
             observes: self.model.network.form == Form::Identity,
             tile: self.tile,
+            near: (self.near * FRAME_EXTENT) as f32,
             ..RenderSettings::default()
         }
     }
@@ -291,8 +362,37 @@ impl TrainConfig {
             let problem = format!("`TrainConfig::seed` is {seed}; it must be at most {most}");
             return Err(Error::Usage(problem));
         }
-        let density = &self.density;
+        self.check_finite()?;
+        let (density, schedule) = (&self.density, &self.schedule);
+        let minutes = |minutes: f64| (0.0..=1e9).contains(&minutes);
         let rules = [
+            ("density.split_scale", density.split_scale, density.split_scale >= 0.0, "0 or more"),
+            (
+                "density.min_opacity",
+                density.min_opacity,
+                (0.0..1.0).contains(&density.min_opacity),
+                "0 or more and below 1",
+            ),
+            ("`TrainConfig::near`", self.near, (1e-6..=1.0).contains(&self.near), "0.000001 to 1"),
+            (
+                "frame.scale",
+                self.frame.unwrap_or_default().scale,
+                self.frame.unwrap_or_default().is_sound(),
+                "above 0, and the centre finite",
+            ),
+            (
+                "schedule.final_means_rate",
+                schedule.final_means_rate,
+                schedule.final_means_rate > 0.0 && schedule.final_means_rate <= MOST_RATE,
+                "above 0 and at most 100",
+            ),
+            (
+                "`TrainConfig::checkpoint_minutes`",
+                self.checkpoint_minutes,
+                minutes(self.checkpoint_minutes),
+                "0 to 1e9",
+            ),
+            ("`TrainConfig::max_minutes`", self.max_minutes, minutes(self.max_minutes), "0 to 1e9"),
             ("`TrainConfig::steps`", self.steps as f64, self.steps >= 1, "at least 1"),
             (
                 "`TrainConfig::sh_degree`",
@@ -320,6 +420,17 @@ impl TrainConfig {
                 "0.001 to 1000",
             ),
         ];
+        for (spec, rate) in ATTRIBUTES.iter().zip(schedule.initial_rates.0) {
+            // The decay of the means' rate divides by it.
+            let least = if spec.attribute == Attribute::Means { f64::MIN_POSITIVE } else { 0.0 };
+            if !(least..=MOST_RATE).contains(&rate) {
+                let (name, rule) = (spec.name, if least > 0.0 { "above 0" } else { "0 or more" });
+                let problem = format!(
+                    "schedule.initial_rates.{name} is {rate}; it must be {rule} and at most {MOST_RATE}"
+                );
+                return Err(Error::Usage(problem));
+            }
+        }
         for (name, value, holds, rule) in rules {
             if !(holds && value.is_finite()) {
                 return Err(Error::Usage(format!("{name} is {value}; it must be {rule}")));
@@ -362,6 +473,11 @@ mod tests {
         assert!(
             refused(TrainConfig { sh_degree: 4, ..Default::default() }).contains("::sh_degree`")
         );
+        for rate in [f64::NAN, f64::INFINITY, -1e-3, 0.0, 1e9] {
+            let mut config = TrainConfig::default();
+            config.schedule.initial_rates[Attribute::Means] = rate;
+            assert!(refused(config).contains("schedule.initial_rates.means"), "{rate}");
+        }
         let mut config = TrainConfig::default();
         config.model.weights.low_ssim = 1.5;
         assert!(refused(config).contains("low_ssim"));

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::views::Views;
 use super::{TrainConfig, Trainer};
-use crate::dataset::{Dataset, LoadOptions, Photograph};
+use crate::dataset::{Dataset, LoadOptions, Photograph, View};
 use crate::exposure::{Affine, ExposureRates, table};
 use crate::image::{Image, exposure_value, linear_from_srgb, srgb_from_linear};
 use crate::pseudo_gt::PseudoGt;
@@ -203,13 +203,14 @@ impl Targets<'_> {
     /// takes much of the difference away before.
     fn affine_of_stops(&mut self, name: &str, stops: f64) -> Result<Affine> {
         let mut views = self.dataset.train_views().filter(|view| view.name == name);
-        let Some(photograph) = views.find_map(|view| view.image.as_ref()) else {
+        let Some(photograph) = views.next().map(View::loaded).transpose()?.flatten() else {
             return Ok(Affine::IDENTITY);
         };
         let scale = (-stops).exp2() as f32;
         let without = |&x: &f32| srgb_from_linear(scale * linear_from_srgb(x));
-        let neutral = Image { data: photograph.data.iter().map(without).collect(), ..*photograph };
-        let affine = Affine::least_squares(&self.target(&neutral)?, &self.target(photograph)?)?;
+        let neutral =
+            Image { data: photograph.data.iter().map(without).collect(), ..*photograph.as_ref() };
+        let affine = Affine::least_squares(&self.target(&neutral)?, &self.target(&photograph)?)?;
         // Of a photograph of one colour there is no more to say than that.
         let is_exposure = affine.gain.iter().all(|&gain| gain > 0.0);
         Ok(if is_exposure { affine } else { Affine::IDENTITY })

@@ -4,14 +4,15 @@ use serde::{Deserialize, Serialize};
 
 use super::Trainer;
 use super::terms::NetworkTerms;
-use super::views::lifted_from;
-use crate::camera::Camera;
-use crate::dataset::{Dataset, Split};
+use super::views::{lifted_from, measured};
+use crate::camera::{Camera, Frame};
+use crate::dataset::{Dataset, Split, View};
 use crate::exposure::Exposures;
+use crate::gpu::Gpu;
 use crate::image::{Image, Mask};
 use crate::metrics::psnr_of_counted;
 use crate::pseudo_gt::PseudoGt;
-use crate::tone::Scene;
+use crate::tone::{Scene, ToneSettings};
 use crate::{Error, Result};
 
 /// When a run, or a part of it, ends before its last step. The scores are against targets, never against references.
@@ -67,7 +68,7 @@ impl StopConfig {
     }
 }
 
-/// Cameras, and what they are to show.
+/// Cameras in the frame, and what they are to show.
 #[derive(Debug, Default)]
 pub(super) struct HeldOut(Vec<Shown>);
 
@@ -81,19 +82,49 @@ struct Shown {
 
 impl HeldOut {
     /// The held-out views of a dataset with their targets, made as those of its training views.
-    pub(super) fn new(pseudo_gt: &mut PseudoGt, dataset: &Dataset, scene: &Scene) -> Result<Self> {
-        let settings = pseudo_gt.settings().clone();
-        let mut views = vec![];
+    pub(super) fn new(
+        pseudo_gt: &mut PseudoGt,
+        dataset: &Dataset,
+        frame: &Frame,
+        scene: &Scene,
+    ) -> Result<Self> {
+        let mut shown = vec![];
         for view in dataset.views.iter().filter(|view| view.split == Split::HeldOut) {
-            let Some(image) = &view.image else { continue };
-            let whole = lifted_from(view, image, settings.lift_first)?;
-            let lift = settings.lift(scene, &pseudo_gt.measure(&view.counted(&whole))?);
-            let target = pseudo_gt.lifted(&whole, &lift)?;
-            let target = target.resized(image.width, image.height);
-            views.push(Shown { camera: view.camera, target, mask: view.mask.clone() });
+            if let Some(target) = target(pseudo_gt, view, scene)? {
+                let camera = frame.camera(&view.camera);
+                shown.push(Shown { camera, target, mask: view.mask.clone() });
+            }
         }
-        Ok(Self(views))
+        Ok(Self(shown))
     }
+}
+
+/// The target of a view, made as those of the training views are; none without a photograph.
+fn target(pseudo_gt: &mut PseudoGt, view: &View, scene: &Scene) -> Result<Option<Image>> {
+    let settings = pseudo_gt.settings().clone();
+    let Some(photograph) = lifted_from(view, settings.lift_first)? else { return Ok(None) };
+    let lift = settings.lift(scene, &pseudo_gt.measure(&view.counted(&photograph))?);
+    let target = pseudo_gt.lifted(&photograph, &lift)?;
+    Ok(Some(target.resized(view.camera.width, view.camera.height)))
+}
+
+/// What `tone` makes of the test views' photographs in the scene of the training photographs, by name: the targets that
+/// they would have were they trained on.
+///
+/// # Errors
+/// Every training photograph is as good as black where their exposure is asked for; a photograph can no longer be read;
+/// the device is out of memory or lost.
+pub fn targets_of_test_views(
+    gpu: &Gpu,
+    tone: &ToneSettings,
+    dataset: &Dataset,
+) -> Result<Vec<(String, Image)>> {
+    let mut pseudo_gt = PseudoGt::new(gpu, tone)?;
+    let (scene, _) = measured(&mut pseudo_gt, dataset)?;
+    let targets = dataset.test_views().map(|view| {
+        Ok(target(&mut pseudo_gt, view, &scene)?.map(|target| (view.name.clone(), target)))
+    });
+    Ok(targets.collect::<Result<Vec<_>>>()?.into_iter().flatten().collect())
 }
 
 impl Trainer {

@@ -6,7 +6,7 @@ use crate::Result;
 use crate::densify::{Densifier, DensifyInputs, DensifyReport, DeviceGaussians, Round};
 use crate::gpu::{Buffer, Gpu};
 use crate::optimizer::Moments;
-use crate::scene::{Gaussians, Shape, rest_coefficients, width};
+use crate::scene::{ATTRIBUTES, Gaussians, Shape, rest_coefficients, width};
 
 /// Planes of every attribute with their moments and gradients, and the statistics of density control. Buffers are as long
 /// as the Gaussians need or longer.
@@ -116,6 +116,20 @@ impl Model {
             gpu.write(buffer, &gaussians.parameters)?;
         }
         Ok(())
+    }
+
+    /// The attribute and the Gaussian that the parameter at an index belongs to.
+    pub(super) fn place_of(&self, parameter: usize) -> (String, usize) {
+        let none = Gaussians { count: self.count(), shape: self.shape, parameters: vec![] };
+        let planes = ATTRIBUTES.iter().map(|spec| (spec, none.plane(spec.attribute)));
+        let within = planes.into_iter().find(|(_, plane)| plane.contains(&parameter));
+        within.map_or_else(
+            || ("parameters".to_owned(), parameter),
+            |(spec, plane)| {
+                let width = plane.len() / self.count().max(1);
+                (spec.name.to_owned(), (parameter - plane.start) / width.max(1))
+            },
+        )
     }
 
     /// # Errors

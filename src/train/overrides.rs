@@ -5,7 +5,27 @@ use std::collections::BTreeMap;
 use toml::{Table, Value};
 
 use super::TrainConfig;
+use crate::hash::{self, Hasher};
 use crate::{Error, Result};
+
+/// The settings that no result depends on beyond its rounding: where the dataset lies, what is kept and logged and when,
+/// how long the run may take, and what it finds for itself.
+const FREE: [&str; 14] = [
+    "dataset",
+    "device",
+    "tile",
+    "frame.center",
+    "frame.scale",
+    "cache",
+    "tensorboard",
+    "eval_every",
+    "checkpoint_every",
+    "checkpoint_minutes",
+    "max_minutes",
+    "hash_every",
+    "check.every",
+    "check.stops",
+];
 
 impl TrainConfig {
     /// The configuration with each `KEY=VALUE` of `assignments` in turn, such as `tone.alpha=0.1`. A value is TOML, or
@@ -41,21 +61,10 @@ impl TrainConfig {
 
     /// The first setting in which a run of `self` differs from one of `other`, with both values: `tone.alpha = 0.1, not
     /// 0.12`. Left out is what changes no step beyond its rounding: how long the run is, where the photographs lie, when it
-    /// is scored and saved, on which device and by which tiles.
+    /// is scored and saved, on which device and by which tiles. A lower limit of the Gaussians is no difference either: a
+    /// run that outgrows its machine goes on with what it has.
     pub fn difference(&self, other: &Self) -> Option<String> {
-        const FREE: [&str; 11] = [
-            "steps",
-            "dataset",
-            "reference",
-            "device",
-            "tile",
-            "eval_every",
-            "checkpoint_every",
-            "check.every",
-            "check.stops",
-            "stop.every",
-            "stop.gain",
-        ];
+        const ALSO: [&str; 4] = ["steps", "reference", "stop.every", "stop.gain"];
         let tables = [self, other].map(Table::try_from);
         let [own, others] = match &tables {
             [Ok(own), Ok(others)] => [own, others].map(|table| settings("", table)),
@@ -66,9 +75,42 @@ impl TrainConfig {
         let value = |settings: &BTreeMap<String, Value>, key: &str| {
             settings.get(key).map_or_else(|| "nothing".to_owned(), Value::to_string)
         };
-        let mut keys = own.keys().chain(others.keys()).filter(|key| !FREE.contains(&key.as_str()));
+        let is_lower_limit =
+            |key: &String| key == "max_gaussians" && other.max_gaussians <= self.max_gaussians;
+        let keys = own.keys().chain(others.keys());
+        let is_free = |key: &str| FREE.contains(&key) || ALSO.contains(&key);
+        let mut keys = keys.filter(|key| !is_free(key) && !is_lower_limit(key));
         keys.find(|&key| own.get(key) != others.get(key))
             .map(|key| format!("{key} = {}, not {}", value(&own, key), value(&others, key)))
+    }
+
+    /// A checksum of every setting that a result depends on: all but where the dataset lies, when the run is saved and
+    /// checked, how long it may take, and what it finds for itself.
+    ///
+    /// # Errors
+    /// None for a configuration that [`TrainConfig::check`] accepts.
+    pub fn checksum(&self) -> Result<String> {
+        let own = self.clone().with_absolute_paths();
+        let table = Table::try_from(own).map_err(|error| Error::Usage(error.to_string()))?;
+        let mut hasher = Hasher::default();
+        for (key, value) in settings("", &table) {
+            if !FREE.contains(&key.as_str()) {
+                hasher.write(key.as_bytes());
+                hasher.write(value.to_string().as_bytes());
+            }
+        }
+        Ok(hash::text(hasher.finish()))
+    }
+
+    /// Refuses numbers that are none, wherever they stand.
+    pub(super) fn check_finite(&self) -> Result<()> {
+        let table = Table::try_from(self).map_err(|error| Error::Usage(error.to_string()))?;
+        match settings("", &table).iter().find_map(|(key, value)| Some((key, not_finite(value)?))) {
+            Some((key, number)) => {
+                Err(Error::Usage(format!("{key} is {number}; it must be finite")))
+            }
+            None => Ok(()),
+        }
     }
 
     fn with_one(&self, key: &str, text: &str) -> Result<Self> {
@@ -95,6 +137,15 @@ impl TrainConfig {
             let is_known = known.iter().any(|known| known == key);
             if is_known { refused(error.message().trim()) } else { unknown(key, &known) }
         })
+    }
+}
+
+/// The first number of a value that is NaN or infinite.
+fn not_finite(value: &Value) -> Option<f64> {
+    match value {
+        Value::Float(number) => Some(*number).filter(|number| !number.is_finite()),
+        Value::Array(values) => values.iter().find_map(not_finite),
+        _ => None,
     }
 }
 
@@ -187,6 +238,26 @@ mod tests {
             ..TrainConfig::default()
         };
         assert_eq!(config.difference(&other).unwrap(), "model.depth_folder = nothing, not \"d\"");
+    }
+
+    #[test]
+    fn no_setting_is_nan_or_infinite_unnoticed() {
+        let table = Table::try_from(TrainConfig::default()).unwrap();
+        let all = settings("", &table);
+        let numbers = all.iter().filter(|(_, value)| value.is_float());
+        let mut count = 0;
+        for (key, _) in numbers {
+            for wrong in ["nan", "inf", "-inf"] {
+                let config = with(&[&format!("{key}={wrong}")]).unwrap();
+                let checked = config.check();
+                let message = checked.expect_err(key).to_string();
+                let name = key.rsplit('.').next().unwrap();
+                let is_named = message.contains(name) || message.contains(&name.replace("_c", ""));
+                assert!(is_named, "{key}={wrong}: {message}");
+            }
+            count += 1;
+        }
+        assert!(count > 30, "{count}");
     }
 
     #[test]

@@ -47,15 +47,15 @@ pub(super) enum Photograph {
 
 #[derive(Debug)]
 pub(super) struct Coded {
-    decoder: Arc<Decoder>,
-    value_count: usize,
+    pub(super) decoder: Arc<Decoder>,
+    pub(super) value_count: usize,
     /// Four or two in a word.
-    codes: Buffer<u32>,
+    pub(super) codes: Buffer<u32>,
     /// One per code.
-    values: Arc<Buffer<f32>>,
+    pub(super) values: Arc<Buffer<f32>>,
 }
 
-type Decoder = Pipeline<decode::Kernel>;
+pub(super) type Decoder = Pipeline<decode::Kernel>;
 
 /// Brings photographs to the device in the bits that are asked for.
 #[derive(Debug)]
@@ -172,6 +172,17 @@ impl Photograph {
         match self {
             Self::Plain(buffer) => buffer.len(),
             Self::Coded(coded) => coded.value_count,
+        }
+    }
+
+    /// What it takes on the device, bytes.
+    pub(super) fn bytes(&self) -> u64 {
+        let values = |buffer: &Buffer<f32>| (buffer.len() * size_of::<f32>()) as u64;
+        match self {
+            Self::Plain(buffer) => values(buffer),
+            Self::Coded(coded) => {
+                (coded.codes.len() * size_of::<u32>()) as u64 + values(&coded.values)
+            }
         }
     }
 

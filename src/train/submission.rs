@@ -20,6 +20,8 @@ pub(super) const MOST_STEPS: u64 = 64;
 const SUBMISSION: Duration = Duration::from_millis(50);
 /// Whoever trains hears of it about this often.
 const STRETCH: Duration = Duration::from_millis(500);
+/// The parameters are looked at for NaN after so many steps: a hundredth part of what Adam reads of them.
+const FINITE_STEPS: u64 = 50;
 /// One runs, one waits for it.
 const IN_FLIGHT: usize = 2;
 
@@ -84,8 +86,9 @@ impl Trainer {
                     break;
                 }
                 let steps = next..=last.min(next + self.pace.steps() - 1);
-                next = steps.end() + 1;
-                in_flight.push_back(self.submit(steps)?);
+                let fitting = self.views.bring(&self.config, steps)?;
+                in_flight.push_back(self.submit(next..=fitting)?);
+                next = fitting + 1;
             }
             let Some(oldest) = in_flight.pop_front() else { break };
             // What is in flight behind a step that failed changes nothing.
@@ -99,7 +102,23 @@ impl Trainer {
         if !reports.is_empty() && self.decides_degree_at(self.step) {
             self.decide_degree()?;
         }
+        if self.step >= self.checked + FINITE_STEPS {
+            self.check_finite()?;
+        }
         Ok(reports)
+    }
+
+    /// Looks at every parameter of the Gaussians on the device.
+    ///
+    /// # Errors
+    /// [`Error::ParameterNotFinite`] names the last step and the plane.
+    fn check_finite(&mut self) -> Result<()> {
+        self.checked = self.step;
+        let count = self.model.count() * self.model.gaussians.column_count as usize;
+        match self.finite.first(&self.gpu, &self.model.gaussians.parameters, count)? {
+            Some(at) => Err(self.not_finite("gaussians.parameters", at)),
+            None => Ok(()),
+        }
     }
 
     fn submit(&mut self, steps: RangeInclusive<u64>) -> Result<Submitted> {

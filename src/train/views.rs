@@ -1,16 +1,18 @@
 //! The training views on the device: dark photographs, their curves, and the order in which steps take them.
 
 use std::borrow::Cow;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
+use std::ops::RangeInclusive;
 use std::sync::Arc;
 
 use glam::{DVec3, UVec2, Vec3};
 use serde::Serialize;
 
-use super::precision::{Darkroom, Photograph, PhotographBits};
+use super::cache::{Cache, CacheSize, Kept};
+use super::precision::Darkroom;
 use super::{TrainConfig, streams};
 use crate::Result;
-use crate::camera::Camera;
+use crate::camera::{Camera, Frame};
 use crate::dataset::{Dataset, Point, View};
 use crate::exposure::Affine;
 use crate::gpu::{Buffer, Gpu};
@@ -20,8 +22,8 @@ use crate::loss::ViewSource;
 use crate::nn::Form;
 use crate::pseudo_gt::PseudoGt;
 use crate::random::Stream;
-use crate::scene::{COLOR_CHANNELS, Feature, Gaussians, Shape, init};
-use crate::tone::{Exposure, Scene, Statistics, ToneCurve, ToneSettings, all_black};
+use crate::scene::{COLOR_CHANNELS, Feature, Gaussians, Shape, init, width};
+use crate::tone::{Exposure, Measured, Scene, Statistics, ToneCurve, ToneSettings, all_black};
 
 /// One training view.
 #[derive(Debug)]
@@ -33,13 +35,14 @@ pub(super) struct TrainView {
     pub(super) place: usize,
     /// Index into the dataset's views.
     index: usize,
+    /// In the frame.
     pub(super) camera: Camera,
     /// Depth from elsewhere, (H, W), where the dataset's is of another size.
     depth: Option<Vec<f32>>,
     /// What the loss applies `tone` to, planar (3, H, W), sRGB-encoded: the dark photograph, or the target itself.
-    pub(super) input: Photograph,
+    pub(super) input: Kept,
     /// The dark photograph, where that is not the input and a network sees it.
-    pub(super) photograph: Option<Photograph>,
+    pub(super) photograph: Option<Kept>,
     /// The curve that the photograph gets; one element. Where the input is the target already, none.
     pub(super) tone: Buffer<ToneParameters>,
     /// Whether the input is the target.
@@ -71,14 +74,17 @@ impl TargetExposure {
 /// All training views in the dataset's order, as they are and then by level of the resolution schedule, each half the
 /// size of the one before.
 #[derive(Debug)]
-pub(super) struct Views(Vec<Vec<TrainView>>);
+pub(super) struct Views {
+    levels: Vec<Vec<TrainView>>,
+    cache: Cache,
+}
 
 /// A view whose shorter side would fall below this is not shrunk any more, in pixels.
 const SHORTEST_SIDE: u32 = 32;
 
 impl Views {
     /// Measures every training photograph, and uploads it or its target in as many sizes as there are levels; the
-    /// photographs too where `keeps_photographs`. One photograph at a time is in memory at its own size.
+    /// photographs too where a network sees them. One photograph at a time is in memory at its own size.
     ///
     /// # Errors
     /// Every photograph is as good as black where their exposure is asked for; a photograph can no longer be read; the
@@ -87,35 +93,24 @@ impl Views {
         gpu: &Gpu,
         pseudo_gt: &mut PseudoGt,
         dataset: &Dataset,
-        levels: usize,
-        keeps_photographs: bool,
-        bits: PhotographBits,
+        frame: &Frame,
+        config: &TrainConfig,
     ) -> Result<(Self, Scene, Option<TargetExposure>)> {
         let settings = pseudo_gt.settings().clone();
-        let photographs: Vec<(usize, &View, &Image)> = (dataset.views.iter().enumerate())
-            .filter(|(_, view)| view.is_train())
-            .filter_map(|(index, view)| view.image.as_ref().map(|image| (index, view, image)))
-            .collect();
-        let mut measured = vec![];
-        for &(_, view, image) in &photographs {
-            let whole = lifted_from(view, image, settings.lift_first)?;
-            measured.push(pseudo_gt.measure(&view.counted(&whole))?);
-        }
-        let scene = settings.scene(&measured).ok_or_else(|| all_black(&dataset.root))?;
-        let mut darkroom = Darkroom::new(gpu, bits);
+        let keeps_photographs = config.model.denoiser || config.model.tonemapper;
+        let (scene, measured) = measured(pseudo_gt, dataset)?;
+        let mut darkroom = Darkroom::new(gpu, config.precision.photographs);
+        let budget = CacheSize::on_device(config.cache, gpu);
+        let mut cache = Cache::new(gpu, budget, config.spool.clone());
         let mut views = vec![];
-        views.resize_with(levels, Vec::<TrainView>::new);
-        let mut gains = BTreeMap::new();
-        for (place, (&(index, view, image), measured)) in
-            photographs.iter().zip(&measured).enumerate()
-        {
+        views.resize_with(config.schedule.resolution_levels(), Vec::<TrainView>::new);
+        let (count, mut gains) = (measured.len(), BTreeMap::new());
+        for (place, ((index, view), measured)) in photographs(dataset).zip(&measured).enumerate() {
             let lift = settings.lift(&scene, measured);
             gains.extend(lift.gain.map(|gain| (view.name.clone(), gain)));
-            let target = if settings.lift_first {
-                Some(pseudo_gt.lifted(&*lifted_from(view, image, true)?, &lift)?)
-            } else {
-                None
-            };
+            let original = if settings.lift_first { view.photograph()? } else { None };
+            let target = original.map(|original| pseudo_gt.lifted(&original, &lift)).transpose()?;
+            let Some(image) = view.loaded()? else { continue };
             for (level, views) in views.iter_mut().enumerate() {
                 let size = shrunk(UVec2::new(image.width, image.height), level as u32);
                 let photograph = view.blacked_out(image.resized(size.x, size.y));
@@ -125,19 +120,19 @@ impl Views {
                     None => None,
                 };
                 let is_baked = target.is_some();
-                let kept = (is_baked && keeps_photographs)
-                    .then(|| darkroom.upload("low", &photograph.data));
+                let mut upload = |name, data| cache.keep(darkroom.upload(name, data)?);
+                let kept = (is_baked && keeps_photographs).then(|| upload("low", &photograph.data));
                 let name = if is_baked { "target" } else { "low" };
-                let input = darkroom.upload(name, &target.as_ref().unwrap_or(&photograph).data)?;
+                let input = upload(name, &target.as_ref().unwrap_or(&photograph).data)?;
                 let none = ToneSettings::new(ToneCurve::None).parameters(&Statistics::default());
                 let depth = view.depth.as_ref().filter(|_| level > 0);
                 views.push(TrainView {
                     name: view.name.clone(),
-                    number: level * photographs.len() + place,
+                    number: level * count + place,
                     place,
                     index,
-                    camera: view.camera.resized(size.x, size.y),
-                    depth: depth.map(|depth| resized_plane(depth, image, size)),
+                    camera: frame.camera(&view.camera).resized(size.x, size.y),
+                    depth: depth.map(|depth| resized_plane(depth, &image, size)),
                     input,
                     photograph: kept.transpose()?,
                     tone: gpu.buffer("tone", &[if is_baked { none } else { lift.parameters }])?,
@@ -149,7 +144,45 @@ impl Views {
         // The targets of a profile are as bright as its references.
         let exposure = scene.exposure.clone().filter(|_| settings.profile.is_none());
         let exposure = exposure.map(|scene| TargetExposure::new(scene, gains));
-        Ok((Self(views), scene, exposure))
+        Ok((Self { levels: views, cache }, scene, exposure))
+    }
+
+    /// Brings to the device what steps need of their views, as many steps as fit there side by side but one at least; the
+    /// last of them.
+    ///
+    /// # Errors
+    /// Photographs that wait in a file cannot be read, or the device is out of memory or lost.
+    pub(super) fn bring(
+        &mut self,
+        config: &TrainConfig,
+        steps: RangeInclusive<u64>,
+    ) -> Result<u64> {
+        if self.cache.holds_all() {
+            return Ok(*steps.end());
+        }
+        let (mut wanted, mut bytes, mut last) = (BTreeSet::new(), 0, *steps.start());
+        for step in steps {
+            let level = config.schedule.resolution_level(step);
+            let view = self.of_step(config.seed, step, level);
+            let own = view.input.bytes() + view.photograph.as_ref().map_or(0, Kept::bytes);
+            let is_new = !wanted.contains(&view.number);
+            if !wanted.is_empty() && is_new && bytes + own > self.cache.budget() {
+                break;
+            }
+            bytes += if is_new { own } else { 0 };
+            wanted.insert(view.number);
+            last = step;
+        }
+        let (mut all, mut places) = (vec![], vec![]);
+        for view in self.levels.iter_mut().flatten() {
+            let is_wanted = wanted.contains(&view.number);
+            for kept in std::iter::once(&mut view.input).chain(view.photograph.as_mut()) {
+                places.extend(is_wanted.then_some(all.len()));
+                all.push(kept);
+            }
+        }
+        self.cache.bring(&mut all, &places)?;
+        Ok(last)
     }
 
     /// Keeps the target of every view beside what the loss makes it of, for [`TrainView::kept_target`].
@@ -157,7 +190,7 @@ impl Views {
     /// # Errors
     /// The device is out of memory or lost.
     pub(super) fn keep_targets(&mut self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<()> {
-        for view in self.0.iter_mut().flatten().filter(|view| !view.is_baked) {
+        for view in self.levels.iter_mut().flatten().filter(|view| !view.is_baked) {
             view.target = Some(view.target(gpu, pseudo_gt)?);
         }
         Ok(())
@@ -175,12 +208,12 @@ impl Views {
             depth: view.depth.as_deref().or(dataset.views[view.index].depth.as_deref()),
             target: Box::new(|| view.target(gpu, pseudo_gt)),
         };
-        self.0.iter().flatten().map(source).collect()
+        self.levels.iter().flatten().map(source).collect()
     }
 
     /// The view that a step trains on, at one of the levels: every epoch takes each view once, in an order of its own.
     pub(super) fn of_step(&self, seed: u64, step: u64, level: usize) -> &TrainView {
-        let views = &self.0[level];
+        let views = &self.levels[level];
         let count = views.len() as u64;
         let (epoch, place) = ((step - 1) / count, (step - 1) % count);
         let stream = Stream::new(seed, streams::VIEWS);
@@ -195,37 +228,50 @@ impl Views {
 
     /// The views of all levels, by number.
     pub(super) fn all(&self) -> Vec<&TrainView> {
-        let mut views: Vec<&TrainView> = self.0.iter().flatten().collect();
+        let mut views: Vec<&TrainView> = self.levels.iter().flatten().collect();
         views.sort_by_key(|view| view.number);
         views
     }
 
     /// The views, unshrunk.
     pub(super) fn whole(&self) -> &[TrainView] {
-        self.0.first().map_or(&[], Vec::as_slice)
+        self.levels.first().map_or(&[], Vec::as_slice)
     }
 
     /// How many floats the largest input, and the largest photograph beside one, have to be decoded to.
     pub(super) fn decoded_lens(&self) -> [usize; 2] {
-        let views = || self.0.iter().flatten();
+        let views = || self.levels.iter().flatten();
         let inputs = views().map(|view| view.input.decoded_len()).max();
         let photographs = views().filter_map(|view| view.photograph.as_ref());
-        let photographs = photographs.map(Photograph::decoded_len).max();
+        let photographs = photographs.map(Kept::decoded_len).max();
         [inputs, photographs].map(Option::unwrap_or_default)
     }
 
     pub(super) fn cameras(&self) -> impl Iterator<Item = &Camera> {
-        self.0.iter().flatten().map(|view| &view.camera)
+        self.levels.iter().flatten().map(|view| &view.camera)
+    }
+
+    /// Warns of every view in which none of the first Gaussians, given in the frame, has its mean: most often its pose is wrong.
+    pub(super) fn say_what_shows_nothing(&self, gaussians: &Gaussians) {
+        let means: Vec<DVec3> = gaussians.means().iter().map(|mean| mean.as_dvec3()).collect();
+        for TrainView { name, camera, .. } in self.whole() {
+            if !means.iter().any(|&mean| camera.sees(mean).is_some()) {
+                tracing::warn!(
+                    "view {name} shows nothing: none of the {} first Gaussians lies in it; check its pose",
+                    means.len()
+                );
+            }
+        }
     }
 
     /// The names of the training photographs.
     pub(super) fn names(&self) -> impl Iterator<Item = &str> {
-        self.0.first().into_iter().flatten().map(|view| view.name.as_str())
+        self.levels.first().into_iter().flatten().map(|view| view.name.as_str())
     }
 
     /// Width and height of every view, unshrunk.
     pub(super) fn sizes(&self) -> Vec<UVec2> {
-        self.0.first().into_iter().flatten().map(TrainView::size).collect()
+        self.levels.first().into_iter().flatten().map(TrainView::size).collect()
     }
 
     /// One Gaussian per point of the dataset, or per random point where there is none, coloured as the targets of the
@@ -238,21 +284,33 @@ impl Views {
         config: &TrainConfig,
         exposures: Option<&[Affine]>,
     ) -> Result<Gaussians> {
+        let frame = config.frame.unwrap_or_default();
         let random;
         let points = if dataset.points.is_empty() {
             let cameras: Vec<Camera> = self.cameras().cloned().collect();
             let count = config.random_points.min(config.max_gaussians);
             let seed = Stream::new(config.seed, streams::POINTS).bits(0);
             tracing::info!("no points in the dataset: {count} random ones");
-            let point = |position| Point { position, views: vec![] };
+            let point = |position| Point { position: frame.to_world(position), views: vec![] };
             random = init::random(&cameras, count, seed).into_iter().map(point).collect();
             &random
         } else {
             &dataset.points
         };
         let kept = &points[..points.len().min(config.max_gaussians)];
+        let columns = width(config.render_settings().shape);
+        let bindable =
+            gpu.properties().max_storage_buffer_range / (columns * size_of::<f32>()) as u64;
+        let fitting = usize::try_from(bindable).unwrap_or(usize::MAX);
+        if kept.len() > fitting {
+            let (of, device) = (kept.len(), &gpu.properties().name);
+            tracing::warn!(
+                "{fitting} of {of} points begin as Gaussians: {device} binds no more; `TrainConfig::max_gaussians` asks for fewer"
+            );
+        }
+        let kept = &kept[..kept.len().min(fitting)];
         let colors = init::colors_from_views(kept, &dataset.views, |index| {
-            let view = self.0.iter().flatten().find(|view| view.index == index);
+            let view = self.levels.iter().flatten().find(|view| view.index == index);
             let target = view.map(|view| {
                 let target = view.target_image(gpu, pseudo_gt)?;
                 let exposure = exposures.and_then(|exposures| exposures.get(view.place));
@@ -260,14 +318,15 @@ impl Views {
             });
             target.transpose()
         })?;
-        let positions: Vec<DVec3> = kept.iter().map(|point| point.position).collect();
+        let positions: Vec<DVec3> =
+            kept.iter().map(|point| frame.from_world(point.position)).collect();
         let seed = Stream::new(config.seed, streams::FEATURES).bits(0);
         let shape = Shape { sh_degree: config.sh_degree, features: config.model.features() };
         let mut gaussians = init::from_points(&positions, &colors, shape, &config.start, seed)?;
         if config.model.network.form == Form::Identity {
             let low = if shape.features.illumination {
                 init::colors_from_views(kept, &dataset.views, |index| {
-                    let view = self.0.iter().flatten().find(|view| view.index == index);
+                    let view = self.levels.iter().flatten().find(|view| view.index == index);
                     view.map(|view| view.image(gpu, &*view.whole_photograph(gpu)?)).transpose()
                 })?
             } else {
@@ -298,18 +357,38 @@ fn begin_as_identity(gaussians: &mut Gaussians, colors: &[Vec3], low: &[Vec3]) {
     }
 }
 
+/// The training views that have a photograph, and their places in the dataset.
+fn photographs(dataset: &Dataset) -> impl Iterator<Item = (usize, &View)> {
+    let views = dataset.views.iter().enumerate();
+    views.filter(|(_, view)| view.is_train() && view.has_photograph())
+}
+
+/// What is measured of all training photographs together, and of each.
+///
+/// # Errors
+/// Every photograph is as good as black where their exposure is asked for; a photograph can no longer be read; the
+/// device is out of memory or lost.
+pub(super) fn measured(
+    pseudo_gt: &mut PseudoGt,
+    dataset: &Dataset,
+) -> Result<(Scene, Vec<Measured>)> {
+    let lift_first = pseudo_gt.settings().lift_first;
+    let mut measured = vec![];
+    for (_, view) in photographs(dataset) {
+        let Some(photograph) = lifted_from(view, lift_first)? else { continue };
+        measured.push(pseudo_gt.measure(&view.counted(&photograph))?);
+    }
+    let scene = pseudo_gt.settings().scene(&measured).ok_or_else(|| all_black(&dataset.root))?;
+    Ok((scene, measured))
+}
+
 /// What is measured of a view and becomes its target: the photograph as its camera took it where it is lifted before it is
-/// shrunk, else as it was loaded.
+/// shrunk, else as it was loaded; none where the view has none.
 ///
 /// # Errors
 /// As [`View::photograph`].
-pub(super) fn lifted_from<'a>(
-    view: &'a View,
-    loaded: &'a Image,
-    lift_first: bool,
-) -> Result<Cow<'a, Image>> {
-    let original = if lift_first { view.photograph()? } else { None };
-    Ok(original.unwrap_or(Cow::Borrowed(loaded)))
+pub(super) fn lifted_from(view: &View, lift_first: bool) -> Result<Option<Cow<'_, Image>>> {
+    if lift_first { view.photograph() } else { view.loaded() }
 }
 
 /// A size halved as often as its level says and its shorter side allows.

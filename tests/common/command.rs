@@ -49,3 +49,9 @@ pub(crate) fn refused_with(
         assert!(line.contains(part), "{arguments}: no `{part}` in: {line}");
     }
 }
+
+/// Whether a program is on the path.
+pub(crate) fn exists(program: &str) -> bool {
+    let path = std::env::var_os("PATH").unwrap_or_default();
+    std::env::split_paths(&path).any(|folder| folder.join(program).is_file())
+}

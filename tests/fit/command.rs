@@ -61,7 +61,13 @@ fn what_is_written_is_a_curve_that_others_take() {
     assert_eq!(fitted.len(), FAMILIES.len() - 1);
     let best = &fitted[0];
     let choice: CurveChoice = out.to_str().unwrap().parse().unwrap();
-    assert_eq!(choice.settings().unwrap(), best.fit.settings);
+    assert_eq!(choice.settings().unwrap(), best.fit.settings.clone().rounded());
+    let written = std::fs::read_to_string(&out).unwrap();
+    let numbers = written.lines().filter_map(|line| line.split_once(" = ")).map(|(_, text)| text);
+    assert!(
+        numbers.filter(|text| text.parse::<f64>().is_ok()).all(|text| text.len() <= 12),
+        "{written}"
+    );
     let folds = &best.held_out.as_ref().unwrap().folds;
     assert_eq!(folds.iter().map(|fold| fold.name.as_str()).collect::<Vec<_>>(), ["a", "b"]);
     let scores: Vec<f64> =

@@ -15,13 +15,15 @@ const PICTURE_WIDTH: u32 = 240;
 const SHOWN: usize = 12;
 
 pub(super) fn html(dataset: &Dataset, diagnosis: &Diagnosis, plan: &Plan) -> String {
-    let views: Vec<&View> = dataset.train_views().filter(|view| view.image.is_some()).collect();
+    let views: Vec<&View> = dataset.train_views().filter(|view| view.has_photograph()).collect();
     let exposure = exposure(&views);
     let (mut dark, mut lifted) = (Distribution::new("photographs"), Distribution::new("lifted"));
     let stride = views.len().div_ceil(SHOWN).max(1);
     let mut rows = vec![];
     for view in views.iter().step_by(stride) {
-        let Some(image) = &view.image else { continue };
+        // One that can no longer be read has no picture.
+        let Ok(Some(image)) = view.loaded() else { continue };
+        let image = image.as_ref();
         let target = exposure.as_ref().map_or_else(|| image.clone(), |found| lift(image, found));
         dark.add(&image.data);
         lifted.add(&target.data);
@@ -51,7 +53,7 @@ pub(super) fn html(dataset: &Dataset, diagnosis: &Diagnosis, plan: &Plan) -> Str
 fn exposure(views: &[&View]) -> Option<Exposure> {
     let histograms: Vec<LuminanceHistogram> = views
         .iter()
-        .filter_map(|view| view.image.as_ref().map(|image| LuminanceHistogram::of(&image.data)))
+        .filter_map(|view| Some(LuminanceHistogram::of(&view.loaded().ok()??.data)))
         .collect();
     Exposure::of(&histograms, None)
 }

@@ -6,12 +6,12 @@ use serde_json::Value;
 
 use crate::Result;
 use crate::cli::batch::Run;
-use crate::cli::batch::csv::{field, number};
+use crate::cli::batch::csv::number;
 use crate::cli::batch::point::{ADAPTIVE, OFFSET, Point, SEED};
 use crate::cli::batch::runner::Failure;
 use crate::cli::batch::sample::{deviation, mean};
-use crate::eval::WITH_REFERENCE;
-use crate::output::write_whole;
+use crate::eval::{AGAINST, WITH_REFERENCE};
+use crate::output::{csv_field, write_whole};
 use crate::report::{Bar, Best, Column, Mark, Report, Series, Table, bars, plot_points};
 
 /// The files of a leaderboard.
@@ -101,7 +101,7 @@ impl Leaderboard {
         write_whole(&html, self.html(failures).as_bytes())?;
         let mut text = "point,seconds\n".to_owned();
         for (name, seconds) in &self.timings {
-            text += &format!("{},{}\n", field(name), number(*seconds));
+            text += &format!("{},{}\n", csv_field(name), number(*seconds));
         }
         write_whole(&timings, text.as_bytes())
     }
@@ -159,10 +159,12 @@ impl Leaderboard {
         }
         let is_marked = self.rows.iter().any(Row::knows_references);
         header.extend(["gaussians", "runs"].map(str::to_owned));
+        let against = self.yardstick().is_some();
         header.extend(is_marked.then(|| WITH_REFERENCE.to_owned()));
+        header.extend(against.then(|| AGAINST.to_owned()));
         let cells = |row: &Row| {
             let values =
-                self.keys.iter().map(|key| field(row.point.value(key).unwrap_or_default()));
+                self.keys.iter().map(|key| csv_field(row.point.value(key).unwrap_or_default()));
             let mut cells: Vec<String> = values.collect();
             for score in &self.scores {
                 cells.push(number(row.mean(score)));
@@ -170,6 +172,7 @@ impl Leaderboard {
             }
             cells.extend([number(row.gaussians()), row.metrics.len().to_string()]);
             cells.extend(is_marked.then(|| row.knows_references().to_string()));
+            cells.extend(against.then(|| csv_field(row.yardstick().unwrap_or_default())));
             cells.join(",")
         };
         let lines = std::iter::once(header.join(",")).chain(self.rows.iter().map(cells));
@@ -207,11 +210,15 @@ impl Leaderboard {
         }
         if self.scores.is_empty() {
             notes.push(
-                "No test view has a reference image, so there is nothing to rank.".to_owned(),
+                "No test view has a reference image or a photograph, so there is nothing to rank."
+                    .to_owned(),
             );
         }
         if self.rows.iter().any(Row::knows_references) {
             notes.push("Rows with reference have targets that know references and are not comparable with the others.".to_owned());
+        }
+        if let Some(against) = self.yardstick() {
+            notes.push(format!("The test views are scored {against}."));
         }
         if let Some(offset) = self.adaptive_offset {
             notes.push(format!(
@@ -298,6 +305,11 @@ impl Leaderboard {
         if row.knows_references() { format!("{label} (with reference)") } else { label }
     }
 
+    /// What scores are against, where that is no reference image.
+    fn yardstick(&self) -> Option<&str> {
+        self.rows.iter().find_map(Row::yardstick)
+    }
+
     /// The row that others are compared with; none where it is not the only one of its curve.
     fn baseline_row(&self) -> Option<&Row> {
         let baseline = self.baseline?;
@@ -320,6 +332,11 @@ impl Row {
     /// A run's targets knew references.
     fn knows_references(&self) -> bool {
         self.metrics.iter().any(|metrics| metrics.get(WITH_REFERENCE).is_some())
+    }
+
+    /// What its scores are against, where that is no reference image.
+    fn yardstick(&self) -> Option<&str> {
+        self.metrics.iter().find_map(|metrics| metrics.get(AGAINST)?.as_str())
     }
 
     fn gaussians(&self) -> Option<f64> {

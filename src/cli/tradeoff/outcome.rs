@@ -4,9 +4,10 @@ use serde_json::{Map, Value, json};
 
 use super::knobs::BASE;
 use crate::cli::batch::Run;
-use crate::cli::batch::csv::{field, number};
+use crate::cli::batch::csv::number;
 use crate::cli::batch::point::{PRESET, Point, SEED};
 use crate::cli::batch::sample::{deviation, mean};
+use crate::output::csv_field;
 use crate::report::{Best, Column, Table};
 use crate::run::{Progress, load_progress};
 
@@ -249,8 +250,12 @@ pub(super) fn csv(outcomes: &[Outcome]) -> String {
     });
     let line = |(index, outcome): (usize, &Outcome)| {
         let (knob, value) = outcome.knob().unwrap_or_default();
-        let mut cells =
-            vec![field(outcome.preset()), field(knob), field(value), outcome.runs().to_string()];
+        let mut cells = vec![
+            csv_field(outcome.preset()),
+            csv_field(knob),
+            csv_field(value),
+            outcome.runs().to_string(),
+        ];
         for measure in Measure::ALL {
             cells.extend([number(outcome.mean(measure)), number(outcome.deviation(measure))]);
         }
@@ -269,11 +274,11 @@ const FRONTS: [(&str, Measure); 2] =
 pub(super) fn anytime_csv(outcomes: &[Outcome]) -> String {
     let mut text = "point,step,seconds,processor_seconds,joules,gaussians,psnr,ssim\n".to_owned();
     for outcome in outcomes {
-        for Progress { step, seconds, processor_seconds, joules, gaussians, psnr, ssim } in
+        for Progress { step, seconds, processor_seconds, joules, gaussians, psnr, ssim, .. } in
             &outcome.progress
         {
             let (name, processor, joules) =
-                (field(&outcome.point.name()), number(*processor_seconds), number(*joules));
+                (csv_field(&outcome.point.name()), number(*processor_seconds), number(*joules));
             text += &format!(
                 "{name},{step},{seconds},{processor},{joules},{gaussians},{psnr},{ssim}\n"
             );

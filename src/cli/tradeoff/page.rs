@@ -175,7 +175,8 @@ impl Page<'_> {
             image: image.clone(),
         };
         let mut pictures: Vec<Picture> = vec![];
-        pictures.extend(view.image.as_ref().map(|dark| picture("photograph", String::new(), dark)));
+        let dark = view.loaded()?;
+        pictures.extend(dark.map(|dark| picture("photograph", String::new(), &dark)));
         for outcome in self.outcomes.iter().filter(|outcome| outcome.knob().is_none()) {
             let is_its = |run: &&Run| {
                 let mut point = run.point.clone();
@@ -202,7 +203,7 @@ impl Page<'_> {
         let gaussians = run::load_model(&run.folder, raw_colors)?;
         let networks =
             run::load_networks(self.gpu, &run.folder, &config.model, gaussians.shape.features)?;
-        let mut player = Player::new(self.gpu, &gaussians, raw_colors, config.tile, networks)?;
+        let mut player = Player::new(self.gpu, &gaussians, &config, networks)?;
         Ok(player.render(view)?.output().clone())
     }
 }

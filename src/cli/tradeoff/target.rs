@@ -25,7 +25,7 @@ impl Target {
         if dataset.test_views().any(|view| view.reference.is_some()) {
             return Ok(Self::References);
         }
-        if dataset.test_views().any(|view| view.image.is_some()) {
+        if dataset.test_views().any(|view| view.has_photograph()) {
             return Ok(Self::PseudoGt);
         }
         let problem = "has no held-out view to score; list one in transforms_test.json or test.txt, or add photographs: \

@@ -1,0 +1,202 @@
+//! Where a model is trained: near the origin, and of an extent near 2, wherever and however large its world is.
+//!
+//! ```text
+//! position in the frame = (position in the world - center) * scale
+//! ```
+//!
+//! The device computes in f32, whose numbers are dense near zero; near plane, squared distances and first sizes are
+//! absolute. So cameras and points go into the frame on the host, in f64, and what is trained comes back. The scale is a power
+//! of two and a world that lies near its origin is not moved, so that a world of an extent of 1.5 to 3 is its own frame, to
+//! the bit.
+
+use glam::{DAffine3, DVec3};
+use serde::{Deserialize, Serialize};
+
+use super::Camera;
+
+/// A translation and a scaling of the world.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Frame {
+    /// The frame's origin in the world.
+    pub center: [f64; 3],
+    /// Units of the frame in a unit of the world, above 0.
+    pub scale: f64,
+}
+
+/// The extent that a frame is made for.
+pub const FRAME_EXTENT: f64 = 2.0;
+
+/// A frame is not moved from an origin that is so many extents away at most: f32 loses three bits.
+const NEAR_ORIGIN: f64 = 8.0;
+
+/// Positions so many extents away from the origin are 1e-5 of the extent apart in f32: files have them from another one.
+const FAR_FROM_ORIGIN: f64 = 64.0;
+
+/// A camera so many times as far from the middle as half of them are stands elsewhere.
+const OUTLIER: f64 = 32.0;
+
+impl Default for Frame {
+    fn default() -> Self {
+        Self::WORLD
+    }
+}
+
+impl Frame {
+    /// The world itself.
+    pub const WORLD: Self = Self { center: [0.0; 3], scale: 1.0 };
+
+    /// The frame of cameras around `center` that are `extent` world units wide.
+    pub fn new(center: DVec3, extent: f64) -> Self {
+        // The power of two that brings the extent to 0.75 to 1.5 times the frame's; within what has an inverse.
+        let octave = (0.75 * FRAME_EXTENT / extent).log2().ceil().clamp(-900.0, 900.0);
+        let scale = octave.exp2();
+        let is_near = center.abs().max_element() * scale <= NEAR_ORIGIN * FRAME_EXTENT;
+        let center = if is_near { DVec3::ZERO } else { center };
+        Self { center: center.to_array(), scale }
+    }
+
+    /// Refuses numbers that are no frame.
+    pub fn is_sound(&self) -> bool {
+        self.scale.is_normal() && self.scale > 0.0 && self.center().is_finite()
+    }
+
+    fn center(&self) -> DVec3 {
+        DVec3::from_array(self.center)
+    }
+
+    /// A position in the world, in the frame.
+    pub fn from_world(&self, position: DVec3) -> DVec3 {
+        (position - self.center()) * self.scale
+    }
+
+    /// A position in the frame, in the world.
+    pub fn to_world(&self, position: DVec3) -> DVec3 {
+        position / self.scale + self.center()
+    }
+
+    /// The same camera before the frame; its view space is scaled alike.
+    pub fn camera(&self, camera: &Camera) -> Camera {
+        if *self == Self::WORLD {
+            return *camera;
+        }
+        let DAffine3 { matrix3, translation } = camera.view_from_world;
+        let translation = (translation + matrix3 * self.center()) * self.scale;
+        Camera { view_from_world: DAffine3 { matrix3, translation }, ..*camera }
+    }
+
+    /// What files hold positions relative to: the world's origin, or the frame's where f32 is too coarse for that.
+    pub fn file_origin(&self) -> DVec3 {
+        let center = self.center();
+        let is_far = center.abs().max_element() * self.scale > FAR_FROM_ORIGIN * FRAME_EXTENT;
+        if is_far { center } else { DVec3::ZERO }
+    }
+}
+
+/// Where cameras stand: their mean, and 1.1 times the largest distance of one to it (3DGS). Those that stand more than 32
+/// times as far out as half of them are left out, which is the case of broken poses.
+///
+/// Where all stand in one spot, or there is one, the distance is zero.
+pub fn spread(centers: &[DVec3]) -> (DVec3, f64) {
+    let mut around = centers.to_vec();
+    let middle = DVec3::from_array([0, 1, 2].map(|axis| median(centers.iter().map(|c| c[axis]))));
+    let half = median(centers.iter().map(|center| center.distance(middle)));
+    if half > 0.0 {
+        around.retain(|center| center.distance(middle) <= OUTLIER * half);
+    }
+    let mean = around.iter().sum::<DVec3>() / around.len().max(1) as f64;
+    let radius = around.iter().map(|center| center.distance(mean)).fold(0.0, f64::max);
+    // Below this the spread is the rounding of one place's coordinates.
+    let is_spread = radius > 1e-12 * mean.length();
+    (mean, if is_spread { 1.1 * radius } else { 0.0 })
+}
+
+/// Whether a camera stands where [`spread`] leaves it out.
+pub fn stands_elsewhere(center: DVec3, (mean, extent): (DVec3, f64)) -> bool {
+    // Within the spread every camera is nearer than its extent.
+    extent > 0.0 && !(center.distance(mean) <= extent)
+}
+
+/// The median; 0 of nothing.
+fn median(values: impl Iterator<Item = f64>) -> f64 {
+    let mut values: Vec<f64> = values.collect();
+    let middle = values.len() / 2;
+    if values.is_empty() {
+        return 0.0;
+    }
+    *values.select_nth_unstable_by(middle, f64::total_cmp).1
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::{DQuat, DVec2};
+
+    use super::*;
+
+    fn camera(translation: DVec3) -> Camera {
+        let rotation = DQuat::from_euler(glam::EulerRot::XYZ, 0.3, -0.7, 1.1);
+        Camera {
+            width: 100,
+            height: 60,
+            focal: DVec2::new(80.0, 90.0),
+            principal_point: DVec2::new(47.0, 33.0),
+            view_from_world: DAffine3::from_rotation_translation(rotation, translation),
+        }
+    }
+
+    #[test]
+    fn a_camera_before_the_frame_shows_what_it_shows_of_the_world() {
+        for (extent, offset) in [(2.0, 0.0), (2e-6, 0.0), (2e6, 3e7), (1.0, 1e7), (40.0, 1e7)] {
+            let center = DVec3::new(offset, -0.5 * offset, 0.1 * offset);
+            let frame = Frame::new(center, extent);
+            let rotation = camera(DVec3::ZERO).view_from_world.matrix3;
+            let camera = camera(rotation * -center + DVec3::new(0.1, 0.2, 1.0) * extent);
+            for x in [-0.3, 0.0, 0.2] {
+                let position = center + extent * DVec3::new(x, 0.1, -0.2);
+                let there = camera.project(position).unwrap();
+                let here = frame.camera(&camera).project(frame.from_world(position)).unwrap();
+                // An offset of 1e7 extents leaves nine digits of a pixel's position.
+                assert!(here.distance(there) < 1e-5, "{extent} {offset}: {here} {there}");
+                let back = frame.to_world(frame.from_world(position));
+                assert!(back.distance(position) <= 1e-8 * extent.max(offset), "{back}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_world_near_its_origin_of_an_extent_of_one_and_a_half_to_three_is_its_own_frame() {
+        for extent in [1.51, 2.0, 2.99] {
+            assert_eq!(Frame::new(DVec3::splat(4.0), extent), Frame::WORLD, "{extent}");
+        }
+        assert_eq!(Frame::new(DVec3::ZERO, 3.1).scale, 0.5);
+        assert_eq!(Frame::new(DVec3::ZERO, 1.4).scale, 2.0);
+        for exponent in -40..40 {
+            let extent = 1.7 * f64::from(exponent).exp2();
+            assert_eq!(Frame::new(DVec3::ZERO, extent).scale * extent, 1.7);
+        }
+        let far = Frame::new(DVec3::new(1e7, 0.0, 0.0), 2.0);
+        assert_eq!((far.center[0], far.file_origin().x), (1e7, 1e7));
+        assert_eq!(Frame::new(DVec3::new(100.0, 0.0, 0.0), 2.0).file_origin(), DVec3::ZERO);
+        for extent in [1e-300, 1e300, f64::MIN_POSITIVE, f64::MAX] {
+            assert!(Frame::new(DVec3::ZERO, extent).is_sound(), "{extent}");
+        }
+    }
+
+    #[test]
+    fn a_camera_far_from_all_others_moves_nothing() {
+        let ring: Vec<DVec3> = (0..12)
+            .map(f64::from)
+            .map(|a| DVec3::new((0.5 * a).cos(), (0.5 * a).sin(), 0.0))
+            .collect();
+        let alone = spread(&ring);
+        for far in [1e3, 1e30, 1e308] {
+            let mut with_one = ring.clone();
+            with_one.push(DVec3::splat(far));
+            assert_eq!(spread(&with_one), alone, "{far}");
+            assert!(stands_elsewhere(DVec3::splat(far), alone));
+        }
+        assert!(ring.iter().all(|&center| !stands_elsewhere(center, alone)));
+        assert_eq!(spread(&[DVec3::ONE; 3]), (DVec3::ONE, 0.0));
+        assert_eq!(spread(&[]), (DVec3::ZERO, 0.0));
+    }
+}

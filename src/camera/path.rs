@@ -1,0 +1,248 @@
+//! Flights of a camera through the poses of photographs: what a video of a model shows.
+
+use std::f64::consts::TAU;
+
+use glam::{DAffine3, DMat3, DQuat, DVec3, DVec4};
+
+use super::Camera;
+use crate::{Error, Result};
+
+/// How a camera flies.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum CameraPath {
+    /// A circle around the point nearest to all optical axes, as high and as far as the cameras are on the mean.
+    Orbit,
+    /// Two turns about the mean pose, as wide as the cameras lie apart, looking at what they look at (LLFF).
+    Spiral,
+    /// A smooth curve through every pose, in order.
+    Interpolate,
+}
+
+/// Turns of a spiral; it comes and goes once along the optical axis meanwhile.
+const TURNS: f64 = 2.0;
+
+impl CameraPath {
+    /// The cameras of so many frames, with the image and focal lengths of the first of `poses`.
+    ///
+    /// # Errors
+    /// [`Error::Usage`]: there is no pose, or the cameras look in parallel, so that there is nothing to look at from all
+    /// sides.
+    pub fn cameras(self, poses: &[Camera], frames: usize) -> Result<Vec<Camera>> {
+        let first = poses.first().ok_or_else(|| {
+            Error::Usage("a path leads along cameras, and there are none".to_owned())
+        })?;
+        let at = |view_from_world| Camera { view_from_world, ..*first };
+        let views: Vec<DAffine3> = match self {
+            Self::Interpolate => interpolated(poses, frames),
+            Self::Orbit => orbit(poses, frames)?,
+            Self::Spiral => spiral(poses, frames),
+        };
+        Ok(views.into_iter().map(at).collect())
+    }
+}
+
+/// Uniform Catmull-Rom splines of the centres and, on one side of the sphere, of the rotations.
+fn interpolated(poses: &[Camera], frames: usize) -> Vec<DAffine3> {
+    let world_from_view = poses.iter().map(|pose| pose.view_from_world.inverse());
+    let centers: Vec<DVec3> = world_from_view.clone().map(|pose| pose.translation).collect();
+    let mut turns: Vec<DVec4> = vec![];
+    for pose in world_from_view {
+        let turn = DVec4::from(DQuat::from_mat3(&pose.matrix3).normalize());
+        // Both signs are the same rotation; the nearer one is the shorter way.
+        let is_far = turns.last().is_some_and(|last| last.dot(turn) < 0.0);
+        turns.push(if is_far { -turn } else { turn });
+    }
+    let segments = poses.len() - 1;
+    let frame = |index: usize| {
+        let along = segments as f64 * index as f64 / (frames.max(2) - 1) as f64;
+        let segment = (along as usize).min(segments.saturating_sub(1));
+        let t = along - segment as f64;
+        let knot = |offset: usize| (segment + offset).saturating_sub(1).min(segments);
+        let knots = [0, 1, 2, 3].map(knot);
+        let center: DVec3 = weights(t).into_iter().zip(knots).map(|(w, k)| w * centers[k]).sum();
+        let turn: DVec4 = weights(t).into_iter().zip(knots).map(|(w, k)| w * turns[k]).sum();
+        DAffine3::from_rotation_translation(DQuat::from_vec4(turn).normalize(), center).inverse()
+    };
+    (0..frames).map(frame).collect()
+}
+
+/// Of four knots, between the middle ones.
+fn weights(t: f64) -> [f64; 4] {
+    let (t2, t3) = (t * t, t * t * t);
+    [
+        0.5 * (-t3 + 2.0 * t2 - t),
+        0.5 * (3.0 * t3 - 5.0 * t2 + 2.0),
+        0.5 * (-3.0 * t3 + 4.0 * t2 + t),
+        0.5 * (t3 - t2),
+    ]
+}
+
+fn orbit(poses: &[Camera], frames: usize) -> Result<Vec<DAffine3>> {
+    let target = nearest_to_axes(poses).ok_or_else(|| {
+        let problem = "the cameras look in parallel: there is no point to orbit; take --path spiral or interpolate";
+        Error::Usage(problem.to_owned())
+    })?;
+    let up = mean(poses.iter().map(up)).normalize_or(DVec3::NEG_Y);
+    let offsets = poses.iter().map(|pose| pose.center() - target);
+    let level = |offset: DVec3| offset - offset.dot(up) * up;
+    let height = offsets.clone().map(|offset| offset.dot(up)).sum::<f64>() / poses.len() as f64;
+    let radius =
+        offsets.clone().map(|offset| level(offset).length()).sum::<f64>() / poses.len() as f64;
+    let begin = offsets.map(level).next().unwrap_or_default();
+    let begin = begin.try_normalize().unwrap_or_else(|| up.any_orthonormal_vector());
+    let side = up.cross(begin);
+    let frame = |index: usize| {
+        let (sin, cos) = (TAU * index as f64 / frames.max(1) as f64).sin_cos();
+        let center = target + height * up + radius * (cos * begin + sin * side);
+        looking(center, target, up)
+    };
+    Ok((0..frames).map(frame).collect())
+}
+
+fn spiral(poses: &[Camera], frames: usize) -> Vec<DAffine3> {
+    let center = mean(poses.iter().map(Camera::center));
+    let forward = mean(poses.iter().map(forward)).normalize_or(DVec3::Z);
+    let up = mean(poses.iter().map(up)).normalize_or(DVec3::NEG_Y);
+    let middle = looking(center, center + forward, up);
+    let from_middle = |pose: &Camera| middle.transform_point3(pose.center()).abs();
+    let radii = [0, 1, 2].map(|axis| {
+        let mut away: Vec<f64> = poses.iter().map(|pose| from_middle(pose)[axis]).collect();
+        away.sort_by(f64::total_cmp);
+        away[(away.len() - 1) * 9 / 10]
+    });
+    let reach = DVec3::from(radii).length().max(f64::MIN_POSITIVE);
+    let ahead = nearest_to_axes(poses).map(|target| (target - center).dot(forward));
+    // What parallel cameras look at is anywhere; far, the frames look in parallel too.
+    let focus = ahead.filter(|&ahead| ahead > 0.0).unwrap_or(10.0 * reach);
+    let world_from_middle = middle.inverse();
+    let frame = |index: usize| {
+        let angle = TAU * TURNS * index as f64 / frames.max(1) as f64;
+        let offset = DVec3::new(angle.cos(), angle.sin(), (angle / TURNS).sin());
+        let at = world_from_middle.transform_point3(DVec3::from(radii) * offset);
+        looking(at, center + focus * forward, up)
+    };
+    (0..frames).map(frame).collect()
+}
+
+/// World to view of a camera at `center` that looks at `target`, `up` upwards.
+fn looking(center: DVec3, target: DVec3, up: DVec3) -> DAffine3 {
+    let forward = (target - center).normalize_or(DVec3::Z);
+    let right = forward.cross(up).try_normalize();
+    let right = right.unwrap_or_else(|| forward.any_orthonormal_vector());
+    let world_from_view = DMat3::from_cols(right, forward.cross(right), forward);
+    DAffine3::from_mat3_translation(world_from_view, center).inverse()
+}
+
+/// The point with the least squared distances to the optical axes; none where they are as good as parallel.
+fn nearest_to_axes(poses: &[Camera]) -> Option<DVec3> {
+    /// Less of the cameras' turns says nothing of a distance.
+    const LEAST_DETERMINANT: f64 = 1e-6;
+    let (mut matrix, mut vector) = (DMat3::ZERO, DVec3::ZERO);
+    for pose in poses {
+        let axis = forward(pose);
+        let across =
+            DMat3::IDENTITY - DMat3::from_cols(axis * axis.x, axis * axis.y, axis * axis.z);
+        matrix += across;
+        vector += across * pose.center();
+    }
+    let matrix = matrix * (1.0 / poses.len() as f64);
+    let is_definite = matrix.determinant() > LEAST_DETERMINANT;
+    is_definite.then(|| matrix.inverse() * (vector / poses.len() as f64))
+}
+
+/// In the world.
+fn forward(pose: &Camera) -> DVec3 {
+    pose.view_from_world.matrix3.row(2)
+}
+
+/// In the world; an image's y points down.
+fn up(pose: &Camera) -> DVec3 {
+    -pose.view_from_world.matrix3.row(1)
+}
+
+fn mean(vectors: impl ExactSizeIterator<Item = DVec3>) -> DVec3 {
+    let count = vectors.len().max(1) as f64;
+    vectors.sum::<DVec3>() / count
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::DVec2;
+
+    use super::*;
+
+    const TARGET: DVec3 = DVec3::new(0.5, -0.25, 2.0);
+
+    /// So many cameras on a part of a circle, a bit above what they look at.
+    fn ring(count: usize, turn: f64) -> Vec<Camera> {
+        let pose = |index: usize| {
+            let (sin, cos) = (turn * index as f64 / count as f64).sin_cos();
+            let center = TARGET + DVec3::new(3.0 * cos, -1.0, 3.0 * sin);
+            Camera {
+                width: 64,
+                height: 48,
+                focal: DVec2::splat(50.0),
+                principal_point: DVec2::new(32.0, 24.0),
+                view_from_world: looking(center, TARGET, DVec3::NEG_Y),
+            }
+        };
+        (0..count).map(pose).collect()
+    }
+
+    fn sees_the_target_in_the_middle(camera: &Camera) -> bool {
+        camera.project(TARGET).is_some_and(|pixel| pixel.distance(camera.principal_point) < 1e-6)
+    }
+
+    #[test]
+    fn an_interpolated_path_goes_through_every_pose_and_nowhere_far_from_them() {
+        let poses = ring(5, 2.0);
+        let frames = CameraPath::Interpolate.cameras(&poses, 41).unwrap();
+        assert_eq!(frames.len(), 41);
+        for (pose, frame) in poses.iter().zip(frames.iter().step_by(10)) {
+            assert!(frame.center().distance(pose.center()) < 1e-9);
+            assert!(
+                forward(frame).dot(forward(pose)) > 1.0 - 1e-9
+                    && up(frame).dot(up(pose)) > 1.0 - 1e-9
+            );
+        }
+        let step = frames.windows(2).map(|two| two[0].center().distance(two[1].center()));
+        assert!(step.fold(0.0, f64::max) < 0.25);
+        for frame in &frames {
+            assert!((frame.view_from_world.matrix3.determinant() - 1.0).abs() < 1e-9);
+        }
+        let one = CameraPath::Interpolate.cameras(&poses[..1], 3).unwrap();
+        assert!(one.iter().all(|frame| frame.center().distance(poses[0].center()) < 1e-9));
+    }
+
+    #[test]
+    fn an_orbit_looks_at_what_all_cameras_look_at_from_where_they_are() {
+        let poses = ring(7, 2.0);
+        let frames = CameraPath::Orbit.cameras(&poses, 12).unwrap();
+        assert!(frames.iter().all(sees_the_target_in_the_middle));
+        assert!(frames[0].center().distance(poses[0].center()) < 0.2, "{}", frames[0].center());
+        let opposite = frames[0].center() - TARGET;
+        let opposite = TARGET + DVec3::new(-opposite.x, opposite.y, -opposite.z);
+        assert!(frames[6].center().distance(opposite) < 0.2, "{}", frames[6].center());
+        let mut parallel = poses[0];
+        parallel.view_from_world.translation += DVec3::X;
+        let refused = CameraPath::Orbit.cameras(&[poses[0], parallel], 3).unwrap_err().to_string();
+        assert!(refused.contains("in parallel") && refused.contains("spiral"), "{refused}");
+        assert!(CameraPath::Orbit.cameras(&[], 3).is_err());
+    }
+
+    #[test]
+    fn a_spiral_stays_among_the_cameras_and_looks_where_they_look() {
+        let poses = ring(9, 0.6);
+        let frames = CameraPath::Spiral.cameras(&poses, 30).unwrap();
+        let center = mean(poses.iter().map(Camera::center));
+        for frame in &frames {
+            assert!(frame.center().distance(center) < 1.5);
+            assert!(forward(frame).dot((TARGET - frame.center()).normalize()) > 0.99);
+        }
+        // Cameras in parallel have no point in common, and still a spiral.
+        let mut parallel = poses[0];
+        parallel.view_from_world.translation += DVec3::X;
+        let frames = CameraPath::Spiral.cameras(&[poses[0], parallel], 5).unwrap();
+        assert!(frames.iter().all(|frame| frame.view_from_world.is_finite()));
+    }
+}

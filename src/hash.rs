@@ -1,0 +1,91 @@
+//! Checksums of 64 bits: whether numbers and bytes are what they were. Against chance and decay, not against anybody.
+//!
+//! A word at a time is folded into the state by the two halves of a product, as wyhash does; the same bytes give the same
+//! number on every machine.
+
+/// A checksum that grows with what is written to it.
+#[derive(Clone, Copy, Debug)]
+pub struct Hasher(u64);
+
+/// Odd, with half of the bits set: the golden ratio's and the square root of three's.
+const WORD: u64 = 0x9E37_79B9_7F4A_7C15;
+const LENGTH: u64 = 0xBB67_AE85_84CA_A73B;
+
+impl Default for Hasher {
+    fn default() -> Self {
+        Self(LENGTH)
+    }
+}
+
+impl Hasher {
+    /// Takes bytes; where one slice ends and the next begins counts.
+    pub fn write(&mut self, bytes: &[u8]) {
+        let (words, rest) = bytes.as_chunks::<8>();
+        let mut last = [0; 8];
+        last[..rest.len()].copy_from_slice(rest);
+        for word in words.iter().chain([&last]) {
+            self.0 = folded(self.0 ^ u64::from_le_bytes(*word), WORD);
+        }
+        self.0 = folded(self.0 ^ bytes.len() as u64, LENGTH);
+    }
+
+    /// Takes numbers by their bits.
+    pub fn write_numbers(&mut self, numbers: &[f64]) {
+        numbers.iter().for_each(|number| self.write(&number.to_bits().to_le_bytes()));
+    }
+
+    /// The checksum of what was written so far.
+    pub fn finish(self) -> u64 {
+        folded(self.0, WORD)
+    }
+}
+
+/// The checksum of some bytes.
+pub fn of(bytes: &[u8]) -> u64 {
+    let mut hasher = Hasher::default();
+    hasher.write(bytes);
+    hasher.finish()
+}
+
+/// As files have it: sixteen hexadecimal digits.
+pub fn text(hash: u64) -> String {
+    format!("{hash:016x}")
+}
+
+fn folded(a: u64, b: u64) -> u64 {
+    let product = u128::from(a) * u128::from(b);
+    // A factor of zero would forget all that was before.
+    (product as u64) ^ (product >> 64) as u64 ^ a.rotate_left(32)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_bit_every_length_and_every_border_counts() {
+        let bytes: Vec<u8> = (0..67_u32).map(|i| (i * i % 251) as u8).collect();
+        let mut seen = std::collections::BTreeSet::from([of(&bytes)]);
+        for bit in 0..8 * bytes.len() {
+            let mut flipped = bytes.clone();
+            flipped[bit / 8] ^= 1 << (bit % 8);
+            assert!(seen.insert(of(&flipped)), "bit {bit}");
+        }
+        for length in 0..bytes.len() {
+            assert!(seen.insert(of(&bytes[..length])), "length {length}");
+            let mut parted = Hasher::default();
+            parted.write(&bytes[..length]);
+            parted.write(&bytes[length..]);
+            assert!(seen.insert(parted.finish()), "parted at {length}");
+        }
+        for zeros in 2..40 {
+            assert!(seen.insert(of(&vec![0; zeros])), "{zeros} zeros");
+        }
+    }
+
+    #[test]
+    fn a_checksum_is_the_same_on_every_machine() {
+        assert_eq!(text(of(b"nightsplat")), "02603cd5976257bc");
+        assert_eq!(text(of(b"")), "f2b4f503f53f54e1");
+    }
+}

@@ -1,0 +1,48 @@
+//! `done.json`: that a run is whole, and of which configuration and dataset it is. Whoever schedules runs asks for it, and
+//! a run that is asked for again finds itself done.
+
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+
+use super::directory::DONE;
+use crate::dataset::{Dataset, Fingerprint};
+use crate::output::write_whole;
+use crate::train::TrainConfig;
+use crate::{Error, Result};
+
+#[derive(Debug, PartialEq, Serialize, Deserialize)]
+struct Done {
+    /// Checksum of what a result depends on.
+    configuration: String,
+    /// Checksum of what was trained on.
+    dataset: String,
+    /// The step that ended it.
+    steps: u64,
+}
+
+/// Writes the sign, behind everything else.
+pub(super) fn save(
+    run: &Path,
+    config: &TrainConfig,
+    dataset: &Fingerprint,
+    steps: u64,
+) -> Result<()> {
+    let done = Done { configuration: config.checksum()?, dataset: dataset.checksum(), steps };
+    let text =
+        serde_json::to_string_pretty(&done).map_err(|error| Error::Usage(error.to_string()))?;
+    write_whole(&run.join(DONE), (text + "\n").as_bytes())
+}
+
+/// The step that ended the run in a directory, if it is the whole of one of this configuration on this dataset.
+///
+/// # Errors
+/// None for a configuration that [`TrainConfig::check`] accepts.
+pub fn done_steps(run: &Path, config: &TrainConfig, dataset: &Dataset) -> Result<Option<u64>> {
+    let text = std::fs::read_to_string(run.join(DONE)).unwrap_or_default();
+    let done = serde_json::from_str::<Done>(&text).ok().filter(|_| run.join("model.ply").is_file());
+    let Some(done) = done else { return Ok(None) };
+    let is_same = done.configuration == config.checksum()?
+        && done.dataset == Fingerprint::of(dataset).checksum();
+    Ok(is_same.then_some(done.steps))
+}

@@ -1,0 +1,124 @@
+//! One training at a time in a run directory.
+//!
+//! The lock is advisory and belongs to the open file: it goes with the process, however that ends. The file holds the
+//! process's number for whoever comes second, and is removed at the end.
+
+use std::fs::{File, TryLockError};
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use crate::{Error, Result};
+
+/// A run directory that nobody else trains in while this lives.
+#[derive(Debug)]
+pub(super) struct RunLock {
+    path: PathBuf,
+    /// What holds the lock.
+    _file: File,
+}
+
+const LOCK: &str = ".lock";
+
+impl RunLock {
+    /// # Errors
+    /// Another process trains in the directory, or it cannot be written.
+    pub(super) fn take(run: &Path) -> Result<Self> {
+        let path = run.join(LOCK);
+        let unusable = |error: std::io::Error| {
+            Error::output(run, format!("cannot be locked ({error}); check the folder and the disk"))
+        };
+        loop {
+            let options =
+                File::options().read(true).write(true).create(true).truncate(false).clone();
+            let mut file = options.open(&path).map_err(unusable)?;
+            match file.try_lock() {
+                Err(TryLockError::WouldBlock) => return Err(taken(run, &path)),
+                // A file system without locks: one training at a time is up to its user.
+                Err(TryLockError::Error(_)) | Ok(()) => {}
+            }
+            // Whoever had it before may have removed the file in between.
+            if is_at(&file, &path) {
+                let process = format!("{}\n", std::process::id());
+                file.set_len(0)
+                    .and_then(|()| file.write_all(process.as_bytes()))
+                    .map_err(unusable)?;
+                return Ok(Self { path, _file: file });
+            }
+        }
+    }
+
+    /// Whether [`RunLock::take`] would find nobody there.
+    ///
+    /// # Errors
+    /// As there.
+    pub(super) fn check(run: &Path) -> Result<()> {
+        let path = run.join(LOCK);
+        match File::open(&path).map(|file| file.try_lock_shared()) {
+            Ok(Err(TryLockError::WouldBlock)) => Err(taken(run, &path)),
+            _ => Ok(()),
+        }
+    }
+}
+
+impl Drop for RunLock {
+    fn drop(&mut self) {
+        // Behind the removal the file is nobody's, and the lock ends with it.
+        let _ = std::fs::remove_file(&self.path);
+    }
+}
+
+fn taken(run: &Path, path: &Path) -> Error {
+    let process = std::fs::read_to_string(path).unwrap_or_default();
+    let process = match process.trim() {
+        "" => "another process".to_owned(),
+        number => format!("process {number}"),
+    };
+    Error::output(
+        run,
+        format!("{process} trains in it; wait until that ends, or name another folder"),
+    )
+}
+
+#[cfg(unix)]
+fn is_at(file: &File, path: &Path) -> bool {
+    use std::os::unix::fs::MetadataExt;
+    let both = file.metadata().ok().zip(path.metadata().ok());
+    both.is_some_and(|(own, there)| (own.dev(), own.ino()) == (there.dev(), there.ino()))
+}
+
+/// A file that is open cannot be removed.
+#[cfg(not(unix))]
+fn is_at(_: &File, _: &Path) -> bool {
+    true
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_second_training_in_a_directory_is_refused_with_the_process_that_has_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let held = RunLock::take(folder.path()).unwrap();
+        for error in
+            [RunLock::take(folder.path()).unwrap_err(), RunLock::check(folder.path()).unwrap_err()]
+        {
+            let message = error.to_string();
+            let process = format!("process {} trains in it", std::process::id());
+            assert!(
+                message.contains(&process) && message.contains(folder.path().to_str().unwrap()),
+                "{message}"
+            );
+        }
+        drop(held);
+        RunLock::check(folder.path()).unwrap();
+        assert_eq!(
+            std::fs::read_dir(folder.path()).unwrap().count(),
+            0,
+            "it leaves nothing behind"
+        );
+        // What a killed process leaves is no lock.
+        std::fs::write(folder.path().join(LOCK), "1\n").unwrap();
+        drop(RunLock::take(folder.path()).unwrap());
+    }
+}

@@ -1,0 +1,278 @@
+//! Event files as TensorBoard reads them: numbers and pictures over the steps of a run.
+//!
+//! A file is records of (length u64, masked CRC-32C of that, bytes, masked CRC-32C of those), little-endian, as TensorFlow's
+//! `TFRecord` has them; the bytes are a protocol buffer `tensorflow.Event`, of which a few fields are written.
+
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::path::{Path, PathBuf};
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use crate::{Error, Result};
+
+/// A file that grows.
+#[derive(Debug)]
+pub(super) struct EventFile {
+    path: PathBuf,
+    file: BufWriter<File>,
+}
+
+impl EventFile {
+    /// Begins another file in `folder`, whose events are to hold behind `step`: what earlier files say of later steps, of a
+    /// run that was cut off, is forgotten.
+    ///
+    /// # Errors
+    /// The folder cannot be written.
+    pub(super) fn create(folder: &Path, step: u64) -> Result<Self> {
+        let failed = |error: std::io::Error| unwritable(folder, &error);
+        std::fs::create_dir_all(folder).map_err(failed)?;
+        // Readers take the files of a run in the order of their names.
+        let (now, mut number) = (seconds() as u64, 0);
+        let (path, file) = loop {
+            let path = folder.join(format!("events.out.tfevents.{now:010}.{number:04}.nightsplat"));
+            match File::create_new(&path) {
+                Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => number += 1,
+                file => break (path, file.map_err(failed)?),
+            }
+        };
+        let mut events = Self { path, file: BufWriter::new(file) };
+        events.write(0, &Message::default().bytes(3, b"brain.Event:2"))?;
+        // SessionLog { status: START }.
+        events.write(step + 1, &Message::default().message(7, &Message::default().varint(1, 1)))?;
+        events.flush()?;
+        Ok(events)
+    }
+
+    /// Numbers at a step, each under its name; a slash in it parts a group from a name.
+    ///
+    /// # Errors
+    /// The disk is full or gone.
+    pub(super) fn scalars(&mut self, step: u64, values: &[(String, f64)]) -> Result<()> {
+        let mut summary = Message::default();
+        for (tag, value) in values {
+            let value = Message::default().bytes(1, tag.as_bytes()).float(2, *value as f32);
+            summary = summary.message(1, &value);
+        }
+        self.write(step, &Message::default().message(5, &summary))
+    }
+
+    /// A picture at a step, as a PNG file has it.
+    ///
+    /// # Errors
+    /// The disk is full or gone.
+    pub(super) fn picture(
+        &mut self,
+        step: u64,
+        tag: &str,
+        [width, height]: [u32; 2],
+        png: &[u8],
+    ) -> Result<()> {
+        const RGB: u64 = 3;
+        let image = Message::default().varint(1, height.into()).varint(2, width.into());
+        let image = image.varint(3, RGB).bytes(4, png);
+        let value = Message::default().bytes(1, tag.as_bytes()).message(4, &image);
+        self.write(step, &Message::default().message(5, &Message::default().message(1, &value)))
+    }
+
+    /// What was written is in the file, for whoever watches.
+    ///
+    /// # Errors
+    /// The disk is full or gone.
+    pub(super) fn flush(&mut self) -> Result<()> {
+        self.file.flush().map_err(|error| unwritable(&self.path, &error))
+    }
+
+    /// Writes what an event says as one record.
+    fn write(&mut self, step: u64, what: &Message) -> Result<()> {
+        let mut event = Message::default().double(1, seconds()).varint(2, step);
+        event.0.extend(&what.0);
+        let length = (event.0.len() as u64).to_le_bytes();
+        let parts: [&[u8]; 4] = [
+            &length,
+            &masked(crc32c(&length)).to_le_bytes(),
+            &event.0,
+            &masked(crc32c(&event.0)).to_le_bytes(),
+        ];
+        let written = parts.into_iter().try_for_each(|part| self.file.write_all(part));
+        written.map_err(|error| unwritable(&self.path, &error))
+    }
+}
+
+/// The clock on the wall.
+fn seconds() -> f64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |since| since.as_secs_f64())
+}
+
+fn unwritable(path: &Path, error: &std::io::Error) -> Error {
+    Error::output(path, format!("cannot be written ({error}); check the folder and the disk"))
+}
+
+/// The fields of a protocol buffer, one behind the other.
+#[derive(Default)]
+struct Message(Vec<u8>);
+
+impl Message {
+    fn key(mut self, field: u64, wire_type: u64) -> Self {
+        self.number(field << 3 | wire_type);
+        self
+    }
+
+    /// Seven bits a byte, the least first; the highest bit says that more follow.
+    fn number(&mut self, mut value: u64) {
+        while value >= 0x80 {
+            self.0.push(value as u8 | 0x80);
+            value >>= 7;
+        }
+        self.0.push(value as u8);
+    }
+
+    fn varint(self, field: u64, value: u64) -> Self {
+        let mut message = self.key(field, 0);
+        message.number(value);
+        message
+    }
+
+    fn double(self, field: u64, value: f64) -> Self {
+        let mut message = self.key(field, 1);
+        message.0.extend(value.to_le_bytes());
+        message
+    }
+
+    fn bytes(self, field: u64, bytes: &[u8]) -> Self {
+        let mut message = self.key(field, 2);
+        message.number(bytes.len() as u64);
+        message.0.extend(bytes);
+        message
+    }
+
+    fn float(self, field: u64, value: f32) -> Self {
+        let mut message = self.key(field, 5);
+        message.0.extend(value.to_le_bytes());
+        message
+    }
+
+    fn message(self, field: u64, inner: &Self) -> Self {
+        self.bytes(field, &inner.0)
+    }
+}
+
+/// The cyclic redundancy check of Castagnoli, reflected.
+fn crc32c(bytes: &[u8]) -> u32 {
+    const TABLE: [u32; 256] = table();
+    let step = |crc: u32, byte: &u8| TABLE[((crc ^ u32::from(*byte)) & 0xff) as usize] ^ (crc >> 8);
+    !bytes.iter().fold(u32::MAX, step)
+}
+
+const fn table() -> [u32; 256] {
+    const POLYNOMIAL: u32 = 0x82f6_3b78;
+    let (mut table, mut byte) = ([0; 256], 0);
+    while byte < 256 {
+        let (mut crc, mut bit) = (byte as u32, 0);
+        while bit < 8 {
+            crc = if crc & 1 == 1 { crc >> 1 ^ POLYNOMIAL } else { crc >> 1 };
+            bit += 1;
+        }
+        table[byte] = crc;
+        byte += 1;
+    }
+    table
+}
+
+/// A check of data that holds checks is masked, says the format.
+fn masked(crc: u32) -> u32 {
+    crc.rotate_right(15).wrapping_add(0xa282_ead8)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_check_is_castagnolis() {
+        // RFC 3720, B.4.
+        assert_eq!(crc32c(b"123456789"), 0xe306_9283);
+        assert_eq!(crc32c(&[0; 32]), 0x8a91_36aa);
+        assert_eq!(crc32c(&[0xff; 32]), 0x62a8_ab43);
+    }
+
+    /// The fields of a message: number and bytes, numbers as eight of them.
+    fn fields(mut bytes: &[u8]) -> Vec<(u64, Vec<u8>)> {
+        fn number(bytes: &mut &[u8]) -> u64 {
+            let (mut value, mut shift) = (0, 0);
+            loop {
+                let byte = bytes[0];
+                *bytes = &bytes[1..];
+                value |= u64::from(byte & 0x7f) << shift;
+                shift += 7;
+                if byte < 0x80 {
+                    return value;
+                }
+            }
+        }
+        let mut fields = vec![];
+        while !bytes.is_empty() {
+            let key = number(&mut bytes);
+            let len = match key & 7 {
+                0 => {
+                    fields.push((key >> 3, number(&mut bytes).to_le_bytes().to_vec()));
+                    continue;
+                }
+                1 => 8,
+                2 => number(&mut bytes) as usize,
+                5 => 4,
+                other => panic!("wire type {other}"),
+            };
+            fields.push((key >> 3, bytes[..len].to_vec()));
+            bytes = &bytes[len..];
+        }
+        fields
+    }
+
+    /// The events of a file, every check verified.
+    fn events(path: &Path) -> Vec<Vec<(u64, Vec<u8>)>> {
+        let bytes = std::fs::read(path).unwrap();
+        let (mut rest, mut events) = (&bytes[..], vec![]);
+        let word = |bytes: &[u8]| u32::from_le_bytes(bytes[..4].try_into().unwrap());
+        while !rest.is_empty() {
+            let len = u64::from_le_bytes(rest[..8].try_into().unwrap()) as usize;
+            assert_eq!(word(&rest[8..]), masked(crc32c(&rest[..8])));
+            let data = &rest[12..12 + len];
+            assert_eq!(word(&rest[12 + len..]), masked(crc32c(data)));
+            events.push(fields(data));
+            rest = &rest[16 + len..];
+        }
+        events
+    }
+
+    #[test]
+    fn what_is_written_is_read_back() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut file = EventFile::create(folder.path(), 7).unwrap();
+        let values = [("loss/l1".to_owned(), 0.25), ("Gaussians".to_owned(), 70_000.0)];
+        file.scalars(300, &values).unwrap();
+        file.picture(301, "view 3", [640, 480], b"pixels").unwrap();
+        file.flush().unwrap();
+        let read = events(&file.path);
+        let field = |event: usize, number: u64| -> Vec<u8> {
+            read[event].iter().find(|(own, _)| *own == number).unwrap().1.clone()
+        };
+        assert_eq!(field(0, 3), b"brain.Event:2");
+        let step = |event| u64::from_le_bytes(field(event, 2).try_into().unwrap());
+        assert_eq!([step(1), step(2), step(3)], [8, 300, 301]);
+        let wall = f64::from_le_bytes(field(2, 1).try_into().unwrap());
+        assert!((wall - seconds()).abs() < 60.0);
+        for ((_, value), (tag, expected)) in fields(&field(2, 5)).iter().zip(&values) {
+            let value = fields(value);
+            assert_eq!(value[0], (1, tag.as_bytes().to_vec()));
+            assert_eq!(value[1], (2, (*expected as f32).to_le_bytes().to_vec()));
+        }
+        let picture = fields(&fields(&field(3, 5))[0].1);
+        let image = fields(&picture[1].1);
+        let number = |bytes: &Vec<u8>| u64::from_le_bytes(bytes.clone().try_into().unwrap());
+        assert_eq!([0, 1, 2].map(|place| number(&image[place].1)), [480, 640, 3]);
+        assert_eq!(image[3], (4, b"pixels".to_vec()));
+        // Another file of the same second is another file.
+        let again = EventFile::create(folder.path(), 0).unwrap();
+        assert_ne!(again.path, file.path);
+    }
+}

@@ -1,0 +1,414 @@
+//! Which of the training photographs are on the device, where they do not all fit: the others wait in a file.
+//!
+//! The file holds them as the device had them, so that the cache changes no bit. It has no name where the system allows
+//! that, and goes with the run.
+
+use std::fs::File;
+use std::io::{Read, Seek, SeekFrom, Write};
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+
+use serde::{Deserialize, Serialize};
+
+use super::precision::{Decoder, Photograph};
+use crate::gpu::{Buffer, Gpu, Recorder};
+use crate::{Error, Result};
+
+/// The fraction of the device's memory, and of the machine's, that photographs take where nothing else is asked for.
+const SHARE: f64 = 0.25;
+
+/// How much memory the training photographs may take, on the device and decoded on the host: bytes, as `512M` or `4G`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub struct CacheSize(pub u64);
+
+/// What the letters stand for, powers of 1024.
+const UNITS: [(char, u32); 4] = [('K', 10), ('M', 20), ('G', 30), ('T', 40)];
+
+impl std::str::FromStr for CacheSize {
+    type Err = Error;
+
+    fn from_str(text: &str) -> Result<Self> {
+        let upper = text.trim().to_ascii_uppercase();
+        let plain = upper.trim_end_matches('B').trim_end_matches('I');
+        let unit = UNITS.iter().find(|(letter, _)| plain.ends_with(*letter));
+        let number = unit.map_or(plain, |(letter, _)| plain.trim_end_matches(*letter)).trim();
+        let bytes = number
+            .parse::<f64>()
+            .map(|number| number * 2.0_f64.powi(unit.map_or(0, |(_, power)| *power).cast_signed()));
+        // Positive phrasing: a NaN fails the test too.
+        match bytes {
+            Ok(bytes) if (0.0..1e18).contains(&bytes) => Ok(Self(bytes as u64)),
+            _ => Err(Error::Usage(format!(
+                "`{text}` is no size of memory; write bytes, or 512M, 4G, 1.5G"
+            ))),
+        }
+    }
+}
+
+impl std::fmt::Display for CacheSize {
+    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self(bytes) = *self;
+        let unit = UNITS.iter().rev().find(|(_, power)| bytes > 0 && bytes % (1 << power) == 0);
+        match unit {
+            Some((letter, power)) => write!(out, "{}{letter}", bytes >> power),
+            None => write!(out, "{bytes}"),
+        }
+    }
+}
+
+impl TryFrom<String> for CacheSize {
+    type Error = Error;
+
+    fn try_from(text: String) -> Result<Self> {
+        text.parse()
+    }
+}
+
+impl From<CacheSize> for String {
+    fn from(size: CacheSize) -> Self {
+        size.to_string()
+    }
+}
+
+impl CacheSize {
+    /// What the host may keep of decoded photographs: so much, or a quarter of its memory; none where that is not known.
+    pub(super) fn on_host(size: Option<Self>) -> Option<u64> {
+        size.map(|Self(bytes)| bytes).or_else(|| Some((SHARE * host_memory()? as f64) as u64))
+    }
+
+    /// What the device may keep: so much, or a quarter of its memory.
+    pub(super) fn on_device(size: Option<Self>, gpu: &Gpu) -> u64 {
+        size.map_or((SHARE * gpu.properties().memory as f64) as u64, |Self(bytes)| bytes)
+    }
+}
+
+/// Bytes of memory that the machine has; none where the system does not say.
+fn host_memory() -> Option<u64> {
+    let text = std::fs::read_to_string("/proc/meminfo").ok()?;
+    let line = text.lines().find_map(|line| line.strip_prefix("MemTotal:"))?;
+    Some(line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()? << 10)
+}
+
+/// Which photographs are on the device.
+#[derive(Debug)]
+pub(super) struct Cache {
+    gpu: Gpu,
+    budget: u64,
+    /// Bytes that are on the device.
+    taken: u64,
+    /// Counts what is asked for.
+    clock: u64,
+    folder: Option<PathBuf>,
+    /// Once something does not fit.
+    spool: Option<Arc<Spool>>,
+}
+
+/// A photograph on the device, in the file, or both.
+#[derive(Debug)]
+pub(super) struct Kept {
+    on_device: Option<Photograph>,
+    in_file: Option<InFile>,
+    value_count: usize,
+    decoded_len: usize,
+    bytes: u64,
+    /// When it was asked for last.
+    asked: u64,
+}
+
+impl Cache {
+    /// One of so many bytes on the device; what does not fit lies in `folder`, or where the system has temporary files.
+    pub(super) fn new(gpu: &Gpu, budget: u64, folder: Option<PathBuf>) -> Self {
+        Self { gpu: gpu.clone(), budget, taken: 0, clock: 0, folder, spool: None }
+    }
+
+    /// Takes in a photograph, which stays on the device where there is room.
+    ///
+    /// # Errors
+    /// The file cannot be written, or the device was lost.
+    pub(super) fn keep(&mut self, photograph: Photograph) -> Result<Kept> {
+        let mut kept = Kept {
+            in_file: None,
+            value_count: photograph.len(),
+            decoded_len: photograph.decoded_len(),
+            bytes: photograph.bytes(),
+            asked: 0,
+            on_device: Some(photograph),
+        };
+        self.taken += kept.bytes;
+        if self.taken > self.budget {
+            self.put_away(&mut kept)?;
+        }
+        Ok(kept)
+    }
+
+    /// Whether everything taken in so far is on the device, and always will be.
+    pub(super) fn holds_all(&self) -> bool {
+        self.spool.is_none()
+    }
+
+    /// How many bytes of photographs may be asked for at once.
+    pub(super) fn budget(&self) -> u64 {
+        self.budget
+    }
+
+    /// Brings `wanted` of `all` to the device, in place of those that were not asked for the longest; they stay there until
+    /// the next call.
+    ///
+    /// # Errors
+    /// The file cannot be read or written, or the device is out of memory or lost.
+    pub(super) fn bring(&mut self, all: &mut [&mut Kept], wanted: &[usize]) -> Result<()> {
+        self.clock += 1;
+        for &place in wanted {
+            all[place].asked = self.clock;
+        }
+        for &place in wanted {
+            if all[place].on_device.is_some() {
+                continue;
+            }
+            while self.taken + all[place].bytes > self.budget {
+                let idle = all.iter_mut().filter(|kept| kept.on_device.is_some());
+                let idle = idle.filter(|kept| kept.asked < self.clock);
+                let Some(oldest) = idle.min_by_key(|kept| kept.asked) else { break };
+                self.put_away(oldest)?;
+            }
+            let kept = &mut all[place];
+            if let Some(in_file) = &kept.in_file {
+                kept.on_device = Some(in_file.load(&self.gpu)?);
+                self.taken += kept.bytes;
+            }
+        }
+        Ok(())
+    }
+
+    /// Takes a photograph off the device, behind writing it to the file the first time.
+    fn put_away(&mut self, kept: &mut Kept) -> Result<()> {
+        let Some(photograph) = kept.on_device.take() else { return Ok(()) };
+        if kept.in_file.is_none() {
+            let spool = match &self.spool {
+                Some(spool) => Arc::clone(spool),
+                None => {
+                    let folder = self.folder.clone().unwrap_or_else(std::env::temp_dir);
+                    let gib = self.budget as f64 / f64::from(1 << 30);
+                    tracing::info!(
+                        "the photographs exceed the cache of {gib:.2} GiB on the device: the rest waits in {}",
+                        folder.display()
+                    );
+                    Arc::new(Spool::new(&folder)?)
+                }
+            };
+            kept.in_file = Some(InFile::save(&self.gpu, &photograph, &spool)?);
+            self.spool = Some(spool);
+        }
+        self.taken -= kept.bytes;
+        Ok(())
+    }
+}
+
+impl Kept {
+    /// How many values it has.
+    pub(super) fn len(&self) -> usize {
+        self.value_count
+    }
+
+    /// How many floats have to be there to decode it to.
+    pub(super) fn decoded_len(&self) -> usize {
+        self.decoded_len
+    }
+
+    /// What it takes on the device.
+    pub(super) fn bytes(&self) -> u64 {
+        self.bytes
+    }
+
+    /// Its values: as they are, or decoded into `scratch`, which is as long or longer.
+    ///
+    /// # Errors
+    /// `scratch` is shorter, or the photograph was not brought to the device.
+    pub(super) fn decoded<'a>(
+        &'a self,
+        pass: &mut Recorder<'_>,
+        scratch: &'a mut Buffer<f32>,
+    ) -> Result<&'a Buffer<f32>> {
+        let absent =
+            || Error::Usage("a photograph is trained on that is not on the device".to_owned());
+        self.on_device.as_ref().ok_or_else(absent)?.decoded(pass, scratch)
+    }
+
+    /// Its values in a buffer of their own, or in the one that it is; wherever it lies.
+    ///
+    /// # Errors
+    /// The file cannot be read, or the device is out of memory or lost.
+    pub(super) fn whole(&self, gpu: &Gpu) -> Result<Arc<Buffer<f32>>> {
+        match (&self.on_device, &self.in_file) {
+            (None, Some(in_file)) => in_file.load(gpu)?.whole(gpu),
+            (Some(photograph), _) => photograph.whole(gpu),
+            (None, None) => Err(Error::Usage("a photograph is gone".to_owned())),
+        }
+    }
+}
+
+/// Where a photograph lies in the file.
+#[derive(Debug)]
+struct InFile {
+    spool: Arc<Spool>,
+    name: String,
+    offset: u64,
+    /// Codes, or the values themselves.
+    word_count: usize,
+    value_count: usize,
+    /// What codes stand for lies behind them.
+    palette: Option<(Arc<Decoder>, usize)>,
+}
+
+impl InFile {
+    fn save(gpu: &Gpu, photograph: &Photograph, spool: &Arc<Spool>) -> Result<Self> {
+        let (name, words, palette, decoder) = match photograph {
+            Photograph::Plain(buffer) => {
+                let words = gpu.read(buffer)?.into_iter().map(f32::to_bits).collect();
+                (buffer.name(), words, vec![], None)
+            }
+            Photograph::Coded(coded) => {
+                let palette = gpu.read(&*coded.values)?;
+                let words = gpu.read(&coded.codes)?;
+                (coded.codes.name(), words, palette, Some(Arc::clone(&coded.decoder)))
+            }
+        };
+        let offset =
+            spool.append(&[bytemuck::cast_slice(&words), bytemuck::cast_slice(&palette)])?;
+        Ok(Self {
+            spool: Arc::clone(spool),
+            name: name.to_owned(),
+            offset,
+            word_count: words.len(),
+            value_count: photograph.len(),
+            palette: decoder.map(|decoder| (decoder, palette.len())),
+        })
+    }
+
+    fn load(&self, gpu: &Gpu) -> Result<Photograph> {
+        let Self { spool, name, offset, word_count, value_count, palette } = self;
+        let Some((decoder, palette_len)) = palette else {
+            let values: Vec<f32> = spool.read(*offset, *word_count)?;
+            return Ok(Photograph::Plain(Arc::new(gpu.buffer(name, &values)?)));
+        };
+        let words: Vec<u32> = spool.read(*offset, *word_count)?;
+        let behind = offset + size_of_val(words.as_slice()) as u64;
+        let values: Vec<f32> = spool.read(behind, *palette_len)?;
+        Ok(Photograph::Coded(super::precision::Coded {
+            decoder: Arc::clone(decoder),
+            value_count: *value_count,
+            codes: gpu.buffer(name, &words)?,
+            values: Arc::new(gpu.buffer("palette", &values)?),
+        }))
+    }
+}
+
+/// A file that only grows.
+#[derive(Debug)]
+struct Spool {
+    folder: PathBuf,
+    file: Mutex<File>,
+}
+
+impl Spool {
+    fn new(folder: &Path) -> Result<Self> {
+        let file = tempfile::tempfile_in(folder).map_err(|error| unusable(folder, &error))?;
+        Ok(Self { folder: folder.to_owned(), file: Mutex::new(file) })
+    }
+
+    /// Where it begins.
+    fn append(&self, parts: &[&[u8]]) -> Result<u64> {
+        let mut file = self.file.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut append = || {
+            let offset = file.seek(SeekFrom::End(0))?;
+            parts.iter().try_for_each(|part| file.write_all(part))?;
+            Ok(offset)
+        };
+        append().map_err(|error| unusable(&self.folder, &error))
+    }
+
+    fn read<T: bytemuck::Pod>(&self, offset: u64, len: usize) -> Result<Vec<T>> {
+        let mut file = self.file.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut values = vec![T::zeroed(); len];
+        file.seek(SeekFrom::Start(offset))
+            .and_then(|_| file.read_exact(bytemuck::cast_slice_mut(&mut values)))
+            .map_err(|error| unusable(&self.folder, &error))?;
+        Ok(values)
+    }
+}
+
+fn unusable(folder: &Path, error: &std::io::Error) -> Error {
+    let problem = format!(
+        "cannot hold the photographs that exceed the cache ({error}); raise `TrainConfig::cache` or make room on the disk"
+    );
+    Error::output(folder, problem)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::precision::Darkroom;
+    use super::*;
+    use crate::gpu::testing::gpu;
+    use crate::train::PhotographBits;
+
+    #[test]
+    fn sizes_are_read_as_people_write_them() {
+        for (text, bytes, said) in [
+            ("4G", 4 << 30, "4G"),
+            ("512m", 512 << 20, "512M"),
+            ("1.5 GiB", 3 << 29, "1536M"),
+            ("100kB", 100 << 10, "100K"),
+            ("1000", 1000, "1000"),
+            ("0", 0, "0"),
+        ] {
+            let size: CacheSize = text.parse().unwrap();
+            assert_eq!((size.0, size.to_string().as_str()), (bytes, said), "{text}");
+            assert_eq!(size.to_string().parse::<CacheSize>().unwrap(), size);
+        }
+        for text in ["", "G", "-1G", "much", "4X", "NaN"] {
+            assert!(text.parse::<CacheSize>().is_err(), "{text}");
+        }
+    }
+
+    #[test]
+    fn whatever_the_cache_holds_every_photograph_comes_back_bit_for_bit() {
+        let gpu = gpu();
+        // Few different values are coded in 8 bits, more in 16, most not at all.
+        let values = |photograph: usize| -> Vec<f32> {
+            let different = [7, 700, 100_000][photograph % 3];
+            (0..9000).map(|i| ((i * 31 + photograph) % different) as f32 / 1e5).collect()
+        };
+        for budget in [0, 40_000, 1 << 30] {
+            let mut cache = Cache::new(&gpu, budget, None);
+            let mut darkroom = Darkroom::new(&gpu, PhotographBits::Exact);
+            let kept = (0..7).map(|i| cache.keep(darkroom.upload("low", &values(i)).unwrap()));
+            let mut kept = kept.collect::<Result<Vec<_>>>().unwrap();
+            assert_eq!(cache.holds_all(), budget == 1 << 30);
+            for wanted in [&[0, 1][..], &[6], &[5, 2], &[3], &[0, 4], &[2]] {
+                let mut all: Vec<&mut Kept> = kept.iter_mut().collect();
+                cache.bring(&mut all, wanted).unwrap();
+                for &place in wanted {
+                    let mut scratch = gpu.uninit("decoded", 9000).unwrap();
+                    let mut plain = None;
+                    gpu.run("decode", |pass| {
+                        let decoded = kept[place].decoded(pass, &mut scratch)?;
+                        plain = Some(pass.download(decoded)?);
+                        Ok(())
+                    })
+                    .unwrap();
+                    let decoded = plain.unwrap().wait().unwrap();
+                    assert!(decoded[..9000] == values(place), "{budget}: {place}");
+                }
+                let on_device: u64 =
+                    kept.iter().filter(|one| one.on_device.is_some()).map(Kept::bytes).sum();
+                assert_eq!(on_device, cache.taken);
+                let asked: u64 = wanted.iter().map(|&place| kept[place].bytes()).sum();
+                assert!(cache.taken <= budget.max(asked), "{} of {budget}", cache.taken);
+            }
+            for (place, kept) in kept.iter().enumerate() {
+                assert!(gpu.read(&*kept.whole(&gpu).unwrap()).unwrap() == values(place));
+            }
+        }
+    }
+}

@@ -1,0 +1,62 @@
+//! The paths of a configuration, which mean the same wherever it is read.
+
+use std::path::{Path, PathBuf};
+
+use super::TrainConfig;
+
+impl TrainConfig {
+    /// The same with absolute paths, as a run records it.
+    pub fn with_absolute_paths(mut self) -> Self {
+        for path in self.paths() {
+            // Without a current folder there is nothing that it could be below.
+            if let Ok(absolute) = std::path::absolute(&*path) {
+                *path = absolute;
+            }
+        }
+        self
+    }
+
+    /// The same as a run in `folder` means it: relative paths, which older runs and edited ones have, begin there. One that
+    /// leads nowhere from there begins at the current folder, which is said.
+    pub(crate) fn with_paths_from(mut self, folder: &Path) -> Self {
+        for path in self.paths().into_iter().filter(|path| path.is_relative()) {
+            let from_run = folder.join(&*path);
+            if from_run.exists() {
+                *path = from_run;
+            } else if path.exists() {
+                tracing::warn!(
+                    "{}: {} is taken from the current folder; make it absolute",
+                    folder.join("config.toml").display(),
+                    path.display()
+                );
+            }
+        }
+        self
+    }
+
+    /// Those that are given.
+    fn paths(&mut self) -> Vec<&mut PathBuf> {
+        let optional =
+            [&mut self.reference, &mut self.model.depth_folder, &mut self.exposure.start];
+        let paths = optional.into_iter().flatten().chain([&mut self.dataset]);
+        paths.filter(|path| !path.as_os_str().is_empty()).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_relative_path_begins_at_the_run_and_a_recorded_one_is_absolute() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::create_dir(folder.path().join("photos")).unwrap();
+        let config = TrainConfig { dataset: "photos".into(), ..TrainConfig::default() };
+        let resolved = config.clone().with_paths_from(folder.path());
+        assert_eq!(resolved.dataset, folder.path().join("photos"));
+        assert_eq!(resolved.reference, None);
+        assert!(config.with_absolute_paths().dataset.is_absolute());
+        let none = TrainConfig::default();
+        assert_eq!(none.clone().with_absolute_paths(), none);
+    }
+}
