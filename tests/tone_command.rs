@@ -25,6 +25,7 @@ fn args(input: &Path, out: PathBuf) -> ToneArgs {
         theta: None,
         scene_statistics: false,
         reference: None,
+        invert_masks: false,
         json: false,
         report: None,
         compare: vec![],
