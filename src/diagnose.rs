@@ -183,7 +183,8 @@ impl Diagnosis {
         let mut scene =
             SceneDiagnosis::of(&own, photographs, &shared, &exposure, dataset.points.len());
         // A pixel of a shrunk target is the mean of so many, each way.
-        scene.target_noise /= options.downscale.max(1.0);
+        let shrink = own.iter().map(|view| options.shrink(view.size[0], view.size[1]));
+        scene.target_noise /= shrink.fold(1.0, f64::max);
         Ok(Self {
             dataset: dataset.root.clone(),
             test_views: dataset.test_views().count(),

@@ -4,6 +4,7 @@ mod aside;
 mod directory;
 mod done;
 mod events;
+mod generations;
 mod ledger;
 mod lock;
 mod meter;

@@ -281,7 +281,7 @@ impl Trainer {
         let [inputs, photographs] = views.decoded_lens();
         let mut trainer = Self {
             gpu: gpu.clone(),
-            fingerprint: Fingerprint::of(dataset),
+            fingerprint: Fingerprint::of(dataset)?,
             frame,
             extent: dataset.extent() * frame.scale,
             target_exposure,

@@ -15,6 +15,7 @@ mod common;
 
 fn args(input: &Path, out: PathBuf) -> ToneArgs {
     ToneArgs {
+        invert_masks: false,
         input: input.to_owned(),
         curve: ToneCurve::Ap3.into(),
         profile: None,

@@ -76,7 +76,7 @@ mod tests {
             assert_eq!(args.options.config("photos".into()).unwrap(), expected, "{option}");
             checked += 1;
         }
-        assert_eq!(checked, 24);
+        assert_eq!(checked, 25);
         assert_eq!(filled("c [{tone.gain_c of ase}, {tone.gain_c of ap3}]"), "c [3, 1]");
     }
 }

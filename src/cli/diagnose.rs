@@ -47,6 +47,9 @@ pub struct DiagnoseArgs {
     /// Plan for photographs shrunk by this factor; they are measured as stored [default: {downscale}]
     #[arg(long, value_name = "F")]
     pub downscale: Option<f64>,
+    /// Plan for photographs of at most so many pixels on their longest side, as `train` has it; 0 or none: no limit [default: {max_resolution}]
+    #[arg(long, value_name = "N|none", value_parser = super::train::max_resolution)]
+    pub max_resolution: Option<u32>,
     /// Plan for this preset: draft, fast, balanced or best [default: balanced]
     #[arg(long, value_name = "NAME")]
     pub preset: Option<Preset>,
@@ -76,6 +79,7 @@ pub fn run(args: &DiagnoseArgs) -> Result<()> {
     args.preset.unwrap_or(Preset::Balanced).apply(&mut config)?;
     config.steps = args.steps.unwrap_or(config.steps);
     config.downscale = args.downscale.unwrap_or(config.downscale);
+    config.max_resolution = args.max_resolution.unwrap_or(config.max_resolution);
     let gpu = Gpu::new(&args.device.clone().unwrap_or_default())?;
     let options = load_options(&config);
     let dataset = Dataset::load(&config.dataset, &options)?;

@@ -398,13 +398,13 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     }
     let gpu = Gpu::new(&config.device.parse::<DeviceChoice>()?)?;
     let Planned { config, plan, dataset } = planned(args, config, &gpu)?;
+    for line in args.options.idle(&config) {
+        tracing::warn!("{line}");
+    }
     let finished = if args.resume { run::done_steps(&args.out, &config, &dataset)? } else { None };
     if let Some(steps) = finished {
         let done = format!("{} is done: {steps} steps", args.out.display());
         return Ok(writeln!(std::io::stdout(), "{}", printable(&done))?);
-    }
-    for line in args.options.idle(&config) {
-        tracing::warn!("{line}");
     }
     let form = args.progress.unwrap_or_else(ProgressForm::of_terminal);
     let is_text = form != ProgressForm::Json;
@@ -498,7 +498,7 @@ fn as_begun(args: &TrainArgs, config: TrainConfig) -> crate::Result<TrainConfig>
 }
 
 /// What `--max-resolution` says.
-fn max_resolution(text: &str) -> Result<u32, String> {
+pub(super) fn max_resolution(text: &str) -> Result<u32, String> {
     match text {
         "none" => Ok(0),
         _ => text.parse().map_err(|_| "a number of pixels, or none".to_owned()),

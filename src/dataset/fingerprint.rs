@@ -6,6 +6,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::{Dataset, View};
+use crate::Result;
 use crate::hash::{self, Hasher};
 
 /// What distinguishes one dataset from another, as it was loaded.
@@ -19,15 +20,18 @@ pub struct Fingerprint {
 
 impl Fingerprint {
     /// Reads every pixel once.
-    pub fn of(dataset: &Dataset) -> Self {
+    ///
+    /// # Errors
+    /// A photograph that was not kept can no longer be read.
+    pub fn of(dataset: &Dataset) -> Result<Self> {
         let views = dataset.views.par_iter().filter(|view| view.is_for_training());
-        let views =
-            views.map(|view| (view.name.clone(), [camera(view), pixels(view)].map(hash::text)));
+        let views = views
+            .map(|view| Ok((view.name.clone(), [camera(view), pixels(view)?].map(hash::text))));
         let mut points = Hasher::default();
         for point in &dataset.points {
             points.write_numbers(&point.position.to_array());
         }
-        Self { views: views.collect(), points: hash::text(points.finish()) }
+        Ok(Self { views: views.collect::<Result<_>>()?, points: hash::text(points.finish()) })
     }
 
     /// All of it in one checksum.
@@ -73,10 +77,11 @@ fn camera(View { camera, .. }: &View) -> u64 {
     hasher.finish()
 }
 
-fn pixels(View { image, depth, .. }: &View) -> u64 {
+fn pixels(view: &View) -> Result<u64> {
     let mut hasher = Hasher::default();
-    for numbers in image.iter().map(|image| &image.data).chain(depth) {
+    let image = view.loaded()?;
+    for numbers in image.iter().map(|image| &image.data).chain(&view.depth) {
         hasher.write(bytemuck::cast_slice(numbers));
     }
-    hasher.finish()
+    Ok(hasher.finish())
 }

@@ -59,11 +59,21 @@ impl Default for LoadOptions {
 impl LoadOptions {
     /// The size at which a photograph of this size is loaded.
     pub fn loaded_size(&self, width: u32, height: u32) -> (u32, u32) {
-        let longest = f64::from(width.max(height)) / self.downscale;
-        let limit = f64::from(self.max_resolution);
-        let beyond = if self.max_resolution > 0 { (longest / limit).max(1.0) } else { 1.0 };
+        let beyond = self.beyond(width, height);
         let side = |pixels: u32| (f64::from(pixels) / self.downscale / beyond).round() as u32;
         (side(width), side(height))
+    }
+
+    /// Pixels of a photograph of this size to a pixel of it as loaded, each way.
+    pub fn shrink(&self, width: u32, height: u32) -> f64 {
+        self.downscale * self.beyond(width, height)
+    }
+
+    /// How many times the longest side exceeds `max_resolution` behind `downscale`.
+    fn beyond(&self, width: u32, height: u32) -> f64 {
+        let longest = f64::from(width.max(height)) / self.downscale;
+        let limit = f64::from(self.max_resolution);
+        if self.max_resolution > 0 { (longest / limit).max(1.0) } else { 1.0 }
     }
 
     /// Refuses options that make no sense.

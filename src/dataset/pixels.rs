@@ -96,7 +96,7 @@ fn resolved(groups: &[(Lens, Vec<Source>)], options: &LoadOptions) -> LoadOption
         let (w, h, limit) = (lens.width, lens.height, options.max_resolution);
         let more = if shrunk.len() > 1 { ", and others alike" } else { "" };
         tracing::warn!(
-            "photographs of {w}x{h} are trained on at {width}x{height}{more}: `LoadOptions::max_resolution` is {limit}; 0 \
+            "photographs of {w}x{h} are trained on at {width}x{height}{more}: max_resolution is {limit}, 0 \
              takes them as they are"
         );
     }

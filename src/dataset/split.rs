@@ -65,7 +65,7 @@ pub(super) fn say_whose_split_gives_way(root: &Path, frames: &[ListedView], opti
     };
     if let Some((own, every)) = own.zip(options.test_every) {
         tracing::warn!(
-            "{}: {own} split the views, which gives way to `LoadOptions::test_every` {every}; scores do not compare with \
+            "{}: {own} split the views, which gives way to test_every = {every}; scores do not compare with \
              those of its own split",
             root.display()
         );

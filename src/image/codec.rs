@@ -157,11 +157,9 @@ impl Image {
     pub(crate) fn save_jpeg(&self, path: impl AsRef<Path>, exif: Option<&[u8]>) -> Result<()> {
         const QUALITY: u8 = 97;
         let path = path.as_ref();
-        let bytes: Vec<u8> =
-            self.interleaved().map(|value| (value.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
         let mut file = Vec::new();
         JpegEncoder::new_with_quality(&mut file, QUALITY)
-            .write_image(&bytes, self.width, self.height, ExtendedColorType::Rgb8)
+            .write_image(&self.to_rgb8(), self.width, self.height, ExtendedColorType::Rgb8)
             .map_err(|error| Error::output(path, format!("cannot be encoded: {error}")))?;
         let (start, rest) = file.split_at(jpeg::MAGIC.len());
         write_whole(path, &[start, exif.unwrap_or_default(), rest].concat())

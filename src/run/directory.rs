@@ -30,6 +30,7 @@ use std::path::{Path, PathBuf};
 use glam::DVec3;
 
 use super::aside::{self, Aside, unwritable};
+use super::generations::{self, CHECKPOINT, CHECKPOINT_BEFORE};
 use super::ledger;
 use super::lock::RunLock;
 pub use super::progress::Progress;
@@ -42,7 +43,7 @@ use crate::gpu::Gpu;
 use crate::loss::Term;
 use crate::output::{csv_field, write_whole};
 use crate::scene::{Features, Gaussians, ply};
-use crate::train::{ModelConfig, Networks, StepReport, TrainConfig, Trainer, check_checkpoint};
+use crate::train::{ModelConfig, Networks, StepReport, TrainConfig, Trainer};
 use crate::{Error, Result};
 
 /// A run directory and the log that grows in it.
@@ -55,6 +56,8 @@ pub struct RunDirectory {
     /// What the steps took that the log held already.
     seconds_before: f64,
     raw_colors: bool,
+    /// Whether what it replaces is still there.
+    is_new: bool,
     /// The run that was here before; back in its place if this is dropped before [`RunDirectory::settle`].
     aside: Aside,
     /// Behind `aside`: nobody else begins before that is in order.
@@ -111,12 +114,6 @@ const EXPOSURES: &str = "exposures.csv";
 
 /// The weights of the networks.
 const NETWORKS: &str = "networks.safetensors";
-
-/// The state of an unfinished run, or of a finished one that may be made longer.
-const CHECKPOINT: &str = "checkpoint.safetensors";
-
-/// The one before.
-const CHECKPOINT_BEFORE: &str = "checkpoint.before.safetensors";
 
 /// The sign that the run is whole, and what it is of.
 pub(super) const DONE: &str = "done.json";
@@ -189,7 +186,6 @@ impl RunDirectory {
             return Err(held(path, file));
         }
         let aside = Aside::set(path)?;
-        remove_events(path)?;
         let mut run = Self::open(path, config, "", 0.0, aside, lock)?;
         let columns: String = run.terms.iter().map(|term| format!("{},", term.column)).collect();
         run.log_line(&format!("step,view,loss,{columns}gaussians,milliseconds"))?;
@@ -201,7 +197,8 @@ impl RunDirectory {
     /// # Errors
     /// The directory cannot be written.
     pub fn settle(&mut self) -> Result<()> {
-        self.aside.give_up()
+        self.aside.give_up()?;
+        if std::mem::take(&mut self.is_new) { remove_events(&self.path) } else { Ok(()) }
     }
 
     /// Takes up a run again after `step`: its log is cut there, and it is unfinished.
@@ -214,6 +211,7 @@ impl RunDirectory {
         config: &TrainConfig,
         step: u64,
     ) -> Result<Self> {
+        generations::keep_whole(path)?;
         let log_path = path.join(LOG);
         let text = std::fs::read_to_string(&log_path)
             .map_err(|error| Error::input(&log_path, format!("cannot be read ({error})")))?;
@@ -245,19 +243,12 @@ impl RunDirectory {
         write_whole(&path.join("config.toml"), recorded.to_toml()?.as_bytes())?;
         let log_path = path.join(LOG);
         write_whole(&log_path, log.as_bytes())?;
-        let log = File::options().append(true).open(&log_path);
-        let log = BufWriter::new(log.map_err(|error| unwritable(&log_path, &error))?);
+        let file = File::options().append(true).open(&log_path);
+        let file = BufWriter::new(file.map_err(|error| unwritable(&log_path, &error))?);
         let terms = config.loss().terms();
-        let raw_colors = config.model.raw_colors;
-        Ok(Self {
-            path: path.to_owned(),
-            log,
-            terms,
-            seconds_before,
-            raw_colors,
-            aside,
-            _lock: lock,
-        })
+        let (raw_colors, is_new) = (config.model.raw_colors, log.is_empty());
+        let path = path.to_owned();
+        Ok(Self { path, log: file, terms, seconds_before, raw_colors, is_new, aside, _lock: lock })
     }
 
     /// The scores of the held-out views up to a step, in order: step, PSNR in dB.
@@ -333,10 +324,7 @@ impl RunDirectory {
     /// The disk is full or gone, the device was lost, or a parameter is not finite.
     pub fn save_checkpoint(&mut self, trainer: &mut Trainer) -> Result<()> {
         self.log.flush().map_err(|error| unwritable(&self.path, &error))?;
-        let [newest, before] = [CHECKPOINT, CHECKPOINT_BEFORE].map(|file| self.path.join(file));
-        if newest.exists() {
-            std::fs::rename(&newest, before).map_err(|error| unwritable(&newest, &error))?;
-        }
+        let newest = generations::make_room(&self.path)?;
         trainer.save_checkpoint(&newest)?;
         self.save_trained(trainer)
     }
@@ -489,7 +477,7 @@ pub fn stopped_at(run: &Path) -> Option<u64> {
         return None;
     }
     // The header of a safetensors file, length first, is JSON with a note in which the checkpoint says what it is.
-    let mut file = File::open(checkpoint(run)?).ok()?;
+    let mut file = File::open(generations::newest(run)?).ok()?;
     let mut length = [0; 8];
     file.read_exact(&mut length).ok()?;
     let mut header = String::new();
@@ -497,24 +485,6 @@ pub fn stopped_at(run: &Path) -> Option<u64> {
     let header: serde_json::Value = serde_json::from_str(&header).ok()?;
     let note = header["__metadata__"]["checkpoint"].as_str()?;
     serde_json::from_str::<serde_json::Value>(note).ok()?["step"].as_u64()
-}
-
-/// The checkpoint that a run goes on from: the newest that is whole, else the newest, to say what is wrong with it; none
-/// where there is none.
-pub(super) fn checkpoint(run: &Path) -> Option<PathBuf> {
-    let [newest, before] = [CHECKPOINT, CHECKPOINT_BEFORE].map(|file| run.join(file));
-    let problem = match newest.is_file().then(|| check_checkpoint(&newest)) {
-        Some(Ok(())) => return Some(newest),
-        Some(Err(problem)) => Some(problem),
-        None => None,
-    };
-    if before.is_file() && check_checkpoint(&before).is_ok() {
-        if let Some(problem) = problem {
-            tracing::warn!("{problem}: the run goes on from the checkpoint before");
-        }
-        return Some(before);
-    }
-    [newest, before].into_iter().find(|path| path.is_file())
 }
 
 /// Whether a directory holds a run, be it of another version: a configuration with what every one has.

@@ -43,6 +43,6 @@ pub fn done_steps(run: &Path, config: &TrainConfig, dataset: &Dataset) -> Result
     let done = serde_json::from_str::<Done>(&text).ok().filter(|_| run.join("model.ply").is_file());
     let Some(done) = done else { return Ok(None) };
     let is_same = done.configuration == config.checksum()?
-        && done.dataset == Fingerprint::of(dataset).checksum();
+        && done.dataset == Fingerprint::of(dataset)?.checksum();
     Ok(is_same.then_some(done.steps))
 }

@@ -1,17 +1,17 @@
 //! Trains into a run directory and tells an observer.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::time::{Duration, Instant};
 
 use super::directory::{Progress, SPENT, TARGET_EXPOSURE};
 use super::meter::{Meter, Spent};
 use super::tensorboard::EventFile;
-use super::{Event, Requests, RunDirectory, directory, done};
+use super::{Event, Requests, RunDirectory, directory, done, generations};
+use crate::attributes::{ATTRIBUTES, AttributeSpec};
 use crate::dataset::{Dataset, View};
 use crate::diagnose::Plan;
 use crate::eval::{self, ViewScore, Yardstick};
 use crate::gpu::Gpu;
-use crate::scene::ATTRIBUTES;
 use crate::train::{Learning, StepReport, TrainConfig, Trainer};
 use crate::{Error, Result, Stop};
 
@@ -108,7 +108,7 @@ pub fn train_in(
     }
     directory.save_views(dataset)?;
     observe(Event::Started { step: trainer.steps_done(), steps: config.steps });
-    let mut course = Course::new(gpu, config, dataset, &directory, &trainer)?;
+    let mut course = Course::new(gpu, config, dataset, &directory, &trainer);
     let requests = &session.requests;
     let losses = course.train_to_the_end(&mut trainer, &mut directory, requests, &mut observe)?;
     trainer.leave_out_what_gains_nothing()?;
@@ -147,10 +147,11 @@ fn begin(
     }
     let lock = RunDirectory::lock(out)?;
     let resumes = held == HeldRun::Resume;
-    let checkpoint = if resumes { directory::checkpoint(out) } else { None };
+    let checkpoint = if resumes { generations::newest(out) } else { None };
     let mut config =
         with_tile_and_frame(gpu, config, dataset, checkpoint.is_some().then_some(out))?;
-    config.spool = config.spool.or_else(|| existing(out));
+    // A disk that has room for the run has it for photographs.
+    config.spool.get_or_insert_with(|| out.to_owned());
     let config = &config;
     let mut trainer = Trainer::new(gpu, config.clone(), dataset)?;
     if let Some(checkpoint) = checkpoint {
@@ -169,12 +170,6 @@ fn begin(
         HeldRun::Resume => !directory::is_finished(out),
     };
     Ok((RunDirectory::create_locked(out, lock, config, replaces)?, trainer))
-}
-
-/// The run directory, or the folder that it will lie in: a disk of that size has room for photographs.
-fn existing(out: &Path) -> Option<PathBuf> {
-    let folders = out.ancestors().filter(|folder| !folder.as_os_str().is_empty());
-    folders.map(Path::to_owned).find(|folder| folder.is_dir())
 }
 
 /// The configuration with the tile and the frame that are to be recorded: the same ones give the same bits, whatever is
@@ -204,10 +199,12 @@ struct Course<'a> {
     config: &'a TrainConfig,
     dataset: &'a Dataset,
     meter: Meter,
+    /// Steps that were done before.
+    begin: u64,
     progress: Vec<Progress>,
     /// Once something was scored.
     yardstick: Option<Yardstick>,
-    /// For TensorBoard.
+    /// For TensorBoard, once there is something to tell.
     events: Option<EventFile>,
 }
 
@@ -218,11 +215,10 @@ impl<'a> Course<'a> {
         dataset: &'a Dataset,
         directory: &RunDirectory,
         trainer: &Trainer,
-    ) -> Result<Self> {
-        let (meter, step) = (Meter::new(directory.seconds_before()), trainer.steps_done());
-        let progress = directory.progress(step);
-        let events = config.tensorboard.then(|| directory.events(step)).transpose()?;
-        Ok(Self { gpu, config, dataset, meter, progress, yardstick: None, events })
+    ) -> Self {
+        let (meter, begin) = (Meter::new(directory.seconds_before()), trainer.steps_done());
+        let progress = directory.progress(begin);
+        Self { gpu, config, dataset, meter, begin, progress, yardstick: None, events: None }
     }
 
     /// Logs every step, writes checkpoints and ends early where that is asked for; gives the losses.
@@ -249,12 +245,14 @@ impl<'a> Course<'a> {
             for report in &reports {
                 losses.push(report.loss);
                 directory.log(report)?;
-                self.tell_events(report)?;
                 observe(Event::Step(report));
             }
             directory.flush_log()?;
             if !reports.is_empty() {
                 directory.settle()?;
+            }
+            if config.tensorboard {
+                self.tell_events(directory, &reports)?;
             }
             let Some(step) = reports.last().map(|report| report.step) else { continue };
             let falls_on = |every: u64| every > 0 && step.is_multiple_of(every);
@@ -322,21 +320,26 @@ impl<'a> Course<'a> {
 
 impl Course<'_> {
     /// Writes what TensorBoard draws over the steps, of every tenth.
-    fn tell_events(&mut self, report: &StepReport) -> Result<()> {
+    fn tell_events(&mut self, directory: &RunDirectory, reports: &[StepReport]) -> Result<()> {
         const EVERY: u64 = 10;
-        let Some(events) = &mut self.events else { return Ok(()) };
-        let step = report.step;
-        if !step.is_multiple_of(EVERY) && step < self.config.steps {
-            return Ok(());
-        }
+        let events = match &mut self.events {
+            Some(events) => events,
+            None => self.events.insert(directory.events(self.begin)?),
+        };
         let named = |group: &str, name: &str, value| (format!("{group}/{name}"), value);
-        let mut values = vec![("loss/all".to_owned(), report.loss)];
-        values.extend(report.terms.iter().map(|(term, value)| named("loss", term.column, *value)));
-        values.push(("model/Gaussians".to_owned(), report.gaussians as f64));
-        values.push(("model/milliseconds a step".to_owned(), report.milliseconds));
-        let rates = self.config.schedule.learning_rates(step, self.dataset.extent());
-        values.extend(ATTRIBUTES.iter().map(|own| named("rates", own.name, rates[own.attribute])));
-        events.scalars(step, &values)?;
+        for StepReport { step, loss, terms, gaussians, milliseconds, .. } in reports {
+            if !step.is_multiple_of(EVERY) && *step < self.config.steps {
+                continue;
+            }
+            let mut values = vec![("loss/all".to_owned(), *loss)];
+            values.extend(terms.iter().map(|(term, value)| named("loss", term.column, *value)));
+            values.push(("model/Gaussians".to_owned(), *gaussians as f64));
+            values.push(("model/milliseconds a step".to_owned(), *milliseconds));
+            let rates = self.config.schedule.learning_rates(*step, self.dataset.extent());
+            let rate = |own: &AttributeSpec| named("rates", own.name, rates[own.attribute]);
+            values.extend(ATTRIBUTES.iter().map(rate));
+            events.scalars(*step, &values)?;
+        }
         events.flush()
     }
 

@@ -96,6 +96,7 @@ impl Preset {
     fn apply_benchmark(self, config: &mut TrainConfig) {
         (config.schedule, config.density) = (Schedule::paper(), DensityConfig::paper());
         config.start = Start::PAPER;
+        config.max_resolution = 0;
         config.model.follow_paper();
         let curve = config.tone.curve;
         let of_curve = |ase: f64, ap3: f64| match curve {

@@ -304,9 +304,7 @@ impl Views {
         let fitting = usize::try_from(bindable).unwrap_or(usize::MAX);
         if kept.len() > fitting {
             let (of, device) = (kept.len(), &gpu.properties().name);
-            tracing::warn!(
-                "{fitting} of {of} points begin as Gaussians: {device} binds no more; `TrainConfig::max_gaussians` asks for fewer"
-            );
+            tracing::warn!("{fitting} of {of} points begin as Gaussians: {device} binds no more");
         }
         let kept = &kept[..kept.len().min(fitting)];
         let colors = init::colors_from_views(kept, &dataset.views, |index| {

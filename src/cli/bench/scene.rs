@@ -81,7 +81,7 @@ fn config(curve: ToneCurve) -> TrainConfig {
     let mut config = TrainConfig { tone: ToneSettings::new(curve), ..TrainConfig::default() };
     config.schedule.sh_degree_interval = 1;
     config.schedule.boost = 1.0;
-    config.schedule.densify_after = u64::MAX;
+    config.schedule.densify_after = i64::MAX as u64;
     config.schedule.resolution_steps = [0, 0];
     config
 }

@@ -159,7 +159,7 @@ impl Leaderboard {
         }
         let is_marked = self.rows.iter().any(Row::knows_references);
         header.extend(["gaussians", "runs"].map(str::to_owned));
-        let against = self.yardstick().is_some();
+        let against = self.rows.iter().any(|row| row.yardstick().is_some());
         header.extend(is_marked.then(|| WITH_REFERENCE.to_owned()));
         header.extend(against.then(|| AGAINST.to_owned()));
         let cells = |row: &Row| {
@@ -217,9 +217,10 @@ impl Leaderboard {
         if self.rows.iter().any(Row::knows_references) {
             notes.push("Rows with reference have targets that know references and are not comparable with the others.".to_owned());
         }
-        if let Some(against) = self.yardstick() {
-            notes.push(format!("The test views are scored {against}."));
-        }
+        let mut yardsticks: Vec<&str> = self.rows.iter().filter_map(Row::yardstick).collect();
+        yardsticks.sort_unstable();
+        yardsticks.dedup();
+        notes.extend(yardsticks.iter().map(|against| format!("Test views are scored {against}.")));
         if let Some(offset) = self.adaptive_offset {
             notes.push(format!(
                 "The adaptive black level is {offset:.4}, the mean of delta0 over the training views."
@@ -303,11 +304,6 @@ impl Leaderboard {
         let label =
             if words.is_empty() && except.is_none() { "all".to_owned() } else { words.join(", ") };
         if row.knows_references() { format!("{label} (with reference)") } else { label }
-    }
-
-    /// What scores are against, where that is no reference image.
-    fn yardstick(&self) -> Option<&str> {
-        self.rows.iter().find_map(Row::yardstick)
     }
 
     /// The row that others are compared with; none where it is not the only one of its curve.
