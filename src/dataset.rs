@@ -196,7 +196,12 @@ impl Dataset {
         let root = root.as_ref();
         options.check()?;
         if !root.is_dir() {
-            return Err(Error::input(root, "is not a folder; name the dataset's folder"));
+            let problem = if root.is_file() {
+                "is a file, not a folder; of a clip `nightsplat pose` makes a dataset"
+            } else {
+                "is not a folder; name the dataset's folder"
+            };
+            return Err(Error::input(root, problem));
         }
         let files = Files::default();
         let Listing { mut frames, mut skipped, remarks } = list(root, &files)?;
