@@ -6,6 +6,7 @@
 
 mod colmap;
 mod fingerprint;
+mod listing;
 mod masks;
 mod members;
 mod names;
@@ -14,6 +15,7 @@ mod pixels;
 mod place;
 mod points;
 mod similarity;
+mod split;
 pub mod synthetic;
 mod text_file;
 mod transforms;
@@ -21,22 +23,23 @@ mod undistort;
 mod unused;
 
 use std::borrow::Cow;
-use std::collections::{BTreeSet, HashMap};
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use glam::{DAffine3, DVec3};
+use glam::DVec3;
 
-use crate::camera::{Camera, Lens};
-use crate::image::files::{self, Files};
+use crate::camera::Camera;
+use crate::image::files::Files;
 use crate::image::{Image, Mask};
 use crate::{Error, Result};
 pub use fingerprint::Fingerprint;
+use listing::{ListedView, Listing, list, warn};
 use members::with_held_out;
 pub use options::{DepthOptions, LoadOptions};
 pub use pixels::Original;
 use pixels::Source;
 use points::points;
-use text_file::read_text;
+use split::{TEST_EVERY, say_whose_split_gives_way, split};
 
 /// Photographs with cameras, and points of the scene they show.
 #[derive(Clone, Debug)]
@@ -86,6 +89,22 @@ impl View {
         self.split != Split::Test
     }
 
+    /// The planes of one of its images, of any size, without the pixels that do not count.
+    pub fn counted<'a>(&self, image: &'a Image) -> Cow<'a, [f32]> {
+        match &self.mask {
+            Some(mask) => mask.counted(image).into(),
+            None => (&image.data).into(),
+        }
+    }
+
+    /// One of its images, of any size, of which the pixels that do not count are black.
+    pub fn blacked_out(&self, image: Image) -> Image {
+        match &self.mask {
+            Some(mask) => mask.blacked_out(image),
+            None => image,
+        }
+    }
+
     /// Whether there is a photograph, kept or to be read anew.
     pub fn has_photograph(&self) -> bool {
         self.image.is_some() || self.original.is_some()
@@ -101,22 +120,6 @@ impl View {
             (Some(image), _) => Ok(Some(Cow::Borrowed(image))),
             (None, Some(original)) => original.load_at(size).map(Cow::Owned).map(Some),
             (None, None) => Ok(None),
-        }
-    }
-
-    /// The planes of one of its images, of any size, without the pixels that do not count.
-    pub fn counted<'a>(&self, image: &'a Image) -> Cow<'a, [f32]> {
-        match &self.mask {
-            Some(mask) => mask.counted(image).into(),
-            None => (&image.data).into(),
-        }
-    }
-
-    /// One of its images, of any size, of which the pixels that do not count are black.
-    pub fn blacked_out(&self, image: Image) -> Image {
-        match &self.mask {
-            Some(mask) => mask.blacked_out(image),
-            None => image,
         }
     }
 
@@ -167,39 +170,12 @@ pub struct Point {
     pub views: Vec<u32>,
 }
 
-/// One view as a listing describes it, before any pixel is read.
-#[derive(Clone, Debug)]
-struct ListedView {
-    name: String,
-    /// Path as listed, relative to the root.
-    listed: String,
-    /// Path below the folder of all photographs.
-    below: String,
-    /// `None`: the split rule decides.
-    split: Option<Split>,
-    /// The listed file, where it exists.
-    file: Option<PathBuf>,
-    lens: Lens,
-    /// Rigid; the world is the listing's.
-    view_from_world: DAffine3,
-}
-
-#[derive(Debug, Default)]
-struct Listing {
-    frames: Vec<ListedView>,
-    skipped: Vec<String>,
-    /// What was chosen, and what lies there unused; a line each.
-    remarks: Vec<String>,
-}
-
 /// Folders that hold the dark input where a normal-light twin lies beside them.
 const DARK_FOLDERS: [&str; 2] = ["low", "images_low"];
 /// Folders that may hold the normal-light twin.
 const NORMAL_FOLDERS: [&str; 4] = ["high", "val", "test", "images"];
 /// Folders that may hold depth maps.
 const DEPTH_FOLDERS: [&str; 2] = ["depth", "depth_maps"];
-/// Every eighth of the name-sorted views is held out where nothing else says which.
-const TEST_EVERY: usize = 8;
 
 impl Dataset {
     /// Loads the dataset below `root`.
@@ -222,6 +198,14 @@ impl Dataset {
     pub fn load(root: impl AsRef<Path>, options: &LoadOptions) -> Result<Self> {
         let root = root.as_ref();
         options.check()?;
+        if !root.is_dir() {
+            let problem = if root.is_file() {
+                "is a file, not a folder; of a clip `nightsplat pose` makes a dataset"
+            } else {
+                "is not a folder; name the dataset's folder"
+            };
+            return Err(Error::input(root, problem));
+        }
         let files = Files::default();
         let Listing { mut frames, mut skipped, remarks } = list(root, &files)?;
         warn(&remarks);
@@ -325,187 +309,6 @@ impl Dataset {
             Some(Photograph { name, split, input: input?, reference, mask })
         };
         Ok((sources.into_iter().filter_map(photograph).collect(), skipped, remarks))
-    }
-}
-
-/// The views by name, all different.
-fn list(root: &Path, files: &Files) -> Result<Listing> {
-    if !root.is_dir() {
-        return Err(Error::input(root, "is not a folder; name the dataset's folder"));
-    }
-    let mut listing = Listing::default();
-    let listings = transforms::find(root);
-    for (path, split) in &listings {
-        transforms::read(root, path, *split, files, &mut listing)?;
-    }
-    if listings.is_empty() {
-        list_colmap(root, files, &mut listing)?;
-    }
-    if listing.frames.is_empty() {
-        let first = listing.skipped.first().map_or("its listing is empty", String::as_str);
-        return Err(Error::input(
-            root,
-            format!("has no usable view ({first}); export the cameras anew"),
-        ));
-    }
-    names::tell_apart(&mut listing.frames);
-    refuse_two_of_one_name(root, &listing.frames)?;
-    listing.frames.sort_by(|a, b| a.name.cmp(&b.name));
-    listing.remarks.extend(unused::remarks(root, &listing.frames));
-    Ok(listing)
-}
-
-fn warn(remarks: &[String]) {
-    for remark in remarks {
-        tracing::warn!("{remark}");
-    }
-}
-
-fn list_colmap(root: &Path, files: &Files, listing: &mut Listing) -> Result<()> {
-    let models = colmap::find(root, &["cameras", "images"]);
-    let file_of =
-        |name: &str| files.find(root, name).or_else(|| files.find(&root.join("images"), name));
-    let chosen = colmap::largest(&models, |name| file_of(&name.replace('\\', "/")).is_some())?;
-    let Some((folder, counts)) = chosen else {
-        return Err(Error::input(root, no_dataset(root)));
-    };
-    if counts.len() > 1 {
-        let (taken, all) =
-            (folder.strip_prefix(root).unwrap_or(folder).display(), counts.iter().sum::<usize>());
-        let counts: Vec<String> = counts.iter().map(usize::to_string).collect();
-        listing.remarks.push(format!(
-            "{}: COLMAP left {} models, of {} photographs; {taken}, the largest, is taken, and what the others place of these {all} is not",
-            root.display(),
-            models.len(),
-            counts.join(", "),
-        ));
-    }
-    let lenses = colmap::read_cameras(folder)?;
-    for image in colmap::read_images(folder)? {
-        let name = image.name.replace('\\', "/");
-        let lens = lenses.get(&image.camera).copied().ok_or_else(|| {
-            Error::input(
-                folder,
-                format!("{name} has camera {}, which is not listed; export it anew", image.camera),
-            )
-        })?;
-        let Some(view_from_world) = image.view_from_world else {
-            listing.skipped.push(format!("{name}: its pose is not finite"));
-            continue;
-        };
-        let beside_root = files.find(root, &name);
-        let listed = if beside_root.is_some() { name.clone() } else { format!("images/{name}") };
-        let file = beside_root.or_else(|| files.find(&root.join("images"), &name));
-        let (name, below) = (files::stem(&name).to_owned(), name);
-        let split = None;
-        listing.frames.push(ListedView { name, listed, below, split, file, lens, view_from_world });
-    }
-    Ok(())
-}
-
-/// What there is in place of a dataset, and the remedy.
-fn no_dataset(root: &Path) -> String {
-    let expected = "transforms_train.json, transforms.json or a COLMAP model in sparse/0";
-    match files::photographs_in(root).map_or(0, |photographs| photographs.len()) {
-        0 => format!("holds no dataset; expected {expected}"),
-        count => format!(
-            "holds no dataset but {count} photographs, whose poses are not known; find them with `nightsplat pose {} --out DATASET` (expected {expected})",
-            root.display()
-        ),
-    }
-}
-
-fn refuse_two_of_one_name(root: &Path, frames: &[ListedView]) -> Result<()> {
-    let mut listed = HashMap::new();
-    for frame in frames {
-        if let Some(other) = listed.insert(&frame.name, &frame.listed) {
-            let problem = format!(
-                "two views are named {} ({other} and {}); rename or remove one, file names must differ",
-                frame.name, frame.listed
-            );
-            return Err(Error::input(root, problem));
-        }
-    }
-    Ok(())
-}
-
-/// Frames that the listing did not assign: by `test.txt` (a name a line), else every eighth. Sorted by name already. Where
-/// it is asked for, every so many instead, whatever else says; 0: none.
-fn split(
-    root: &Path,
-    frames: &mut [ListedView],
-    test_every: Option<usize>,
-    files: &Files,
-) -> Result<()> {
-    if let Some(every) = test_every {
-        split_anew(root, frames, every, files);
-        return Ok(());
-    }
-    let path = root.join("test.txt");
-    let mut undecided: Vec<&mut ListedView> =
-        frames.iter_mut().filter(|frame| frame.split.is_none()).collect();
-    if undecided.is_empty() || !path.is_file() {
-        for (index, frame) in undecided.into_iter().enumerate() {
-            frame.split = Some(if index % TEST_EVERY == 0 { Split::Test } else { Split::Train });
-        }
-        return Ok(());
-    }
-    let text = read_text(&path)?;
-    let known: BTreeSet<String> = undecided.iter().map(|frame| frame.name.clone()).collect();
-    let lines = text.lines().map(str::trim).filter(|line| !line.is_empty());
-    let (mut held_out, mut unknown) = (BTreeSet::new(), BTreeSet::new());
-    for line in lines {
-        match names::possible(line).into_iter().find(|name| known.contains(name)) {
-            Some(name) => held_out.insert(name),
-            None => unknown.insert(line.to_owned()),
-        };
-    }
-    for frame in &mut undecided {
-        frame.split = Some(if held_out.contains(&frame.name) { Split::Test } else { Split::Train });
-    }
-    if let Some(name) = unknown.first() {
-        tracing::warn!(
-            "{}: {} names match no view, the first is {name}",
-            path.display(),
-            unknown.len()
-        );
-    }
-    Ok(())
-}
-
-/// Says where the dataset has a split that is asked to give way to another.
-fn say_whose_split_gives_way(root: &Path, frames: &[ListedView], options: &LoadOptions) {
-    let own = if frames.iter().any(|frame| frame.split.is_some()) {
-        Some("its transforms files")
-    } else {
-        Some("its test.txt").filter(|_| root.join("test.txt").is_file())
-    };
-    if let Some((own, every)) = own.zip(options.test_every) {
-        tracing::warn!(
-            "{}: {own} split the views, which gives way to test_every = {every}; scores do not compare with \
-             those of its own split",
-            root.display()
-        );
-    }
-}
-
-/// Holds out every so many views by name in place of the dataset's own split. A listed test view of which there is no dark
-/// photograph cannot be trained on: it stays a pose.
-fn split_anew(root: &Path, frames: &mut [ListedView], every: usize, files: &Files) {
-    let training = frames.iter().filter(|frame| frame.split == Some(Split::Train));
-    let training_folders: BTreeSet<String> =
-        training.map(|frame| frame.folder().to_owned()).collect();
-    let mut place = 0;
-    for frame in frames {
-        let lists_input =
-            frame.split != Some(Split::Test) || training_folders.contains(frame.folder());
-        let is_posed_only =
-            frame.split == Some(Split::Test) && frame.input(root, lists_input, files).is_none();
-        if !is_posed_only {
-            let is_test = every > 0 && place % every == 0;
-            frame.split = Some(if is_test { Split::Test } else { Split::Train });
-            place += 1;
-        }
     }
 }
 

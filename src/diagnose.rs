@@ -159,13 +159,13 @@ impl Diagnosis {
         };
         let paths = views.iter().map(|(_, view)| path(view)).collect::<Result<Vec<_>>>()?;
         let shared = Shared::of(dataset, &views)?;
-        let area =
-            |path: &Path| Image::size_of(path).map(|(w, h)| u64::from(w) * u64::from(h)).ok();
-        let largest = paths.iter().filter_map(|file| area(&file.input)).max().unwrap_or_default();
-        let invert = options.invert_masks;
-        let mut photographs = vec![];
-        for paths in paths.chunks(Image::decoded_at_once(largest)) {
-            let loaded = paths.par_iter().map(|file| Photograph::load(file, invert));
+        let area = |file: &&dataset::Photograph| {
+            Image::size_of(&file.input).map(|(w, h)| u64::from(w) * u64::from(h))
+        };
+        let largest = paths.iter().filter_map(|file| area(file).ok()).max().unwrap_or_default();
+        let (mut photographs, invert) = (vec![], options.invert_masks);
+        for files in paths.chunks(Image::decoded_at_once(largest)) {
+            let loaded = files.par_iter().map(|file| Photograph::load(file, invert));
             photographs.extend(loaded.collect::<Result<Vec<_>>>()?);
         }
         let exposure = Exposure::of(photographs.iter().map(|one| &one.histogram), None);

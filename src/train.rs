@@ -49,7 +49,6 @@ pub use held_out::{StopConfig, targets_of_test_views};
 use masks::Masks;
 use model::Model;
 pub use networks::Networks;
-use parts::say_what_parts_see;
 pub use parts::{ModelConfig, ModelName, NetworkRates, Part};
 pub use precision::{PhotographBits, PrecisionConfig};
 pub use preset::Preset;
@@ -250,7 +249,7 @@ impl Trainer {
             tracing::info!("{}", scene.reason());
         }
         let sizes = views.sizes();
-        say_what_parts_see(&config.model, &sizes);
+        config.model.say_what_parts_see(&sizes);
         let starts = views.exposures(&mut pseudo_gt, dataset, &scene, &config)?;
         let gaussians = match gaussians {
             Some(gaussians) if gaussians.shape == settings.shape => match frame {

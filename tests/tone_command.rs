@@ -15,7 +15,6 @@ mod common;
 
 fn args(input: &Path, out: PathBuf) -> ToneArgs {
     ToneArgs {
-        invert_masks: false,
         input: input.to_owned(),
         curve: ToneCurve::Ap3.into(),
         profile: None,
@@ -26,6 +25,7 @@ fn args(input: &Path, out: PathBuf) -> ToneArgs {
         theta: None,
         scene_statistics: false,
         reference: None,
+        invert_masks: false,
         json: false,
         report: None,
         compare: vec![],

@@ -164,20 +164,32 @@ fn fitted_lens(source: &Source) -> Result<Lens> {
     Ok(fitted)
 }
 
-/// A view's name, and the size at which it is loaded.
-pub(super) fn loaded_size(source: &Source, options: &LoadOptions) -> Result<(String, [u32; 2])> {
-    let lens = fitted_lens(source)?;
-    Ok((source.name.clone(), options.loaded_size(lens.width, lens.height).into()))
+/// How a photograph is turned to be what its camera took. Poses are of what is stored, as COLMAP reads it; where the
+/// camera's size is that of what is seen, and not of what is stored, they are of that.
+pub(super) fn turn(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Orientation {
+    if lens.fitted(width, height).is_some() {
+        return Orientation::UPRIGHT;
+    }
+    let said = Orientation::of(path);
+    let (width, height) = said.size((width, height));
+    if lens.fitted(width, height).is_some() { said } else { Orientation::UPRIGHT }
+}
+
+/// A photograph as its camera took it.
+fn loaded(path: &Path, lens: &Lens) -> Result<Image> {
+    let image = Image::load(path)?;
+    let orientation = turn(path, (image.width, image.height), lens);
+    Ok(image.turned(orientation))
 }
 
 /// Refuses a file by the size that it declares, before that costs memory: a picture of another shape than its camera's, or
 /// of far more pixels.
 fn check_size(path: &Path, lens: &Lens) -> Result<()> {
     // What has no readable header is named when it is decoded.
-    let Ok((width, height)) = Image::size_of(path) else { return Ok(()) };
-    let (width, height) = turn(path, (width, height), lens).size((width, height));
+    let Ok(size) = Image::size_of(path) else { return Ok(()) };
+    let (width, height) = turn(path, size, lens).size(size);
     if lens.fitted(width, height).is_none() {
-        return Err(disagreement(path, (width, height), lens));
+        return Err(disagreement(path, size, lens));
     }
     check_excess(path, (width, height), lens)
 }
@@ -195,22 +207,10 @@ fn check_excess(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Result
     Ok(())
 }
 
-/// How a photograph is turned to be what its camera took. Poses are of what is stored, as COLMAP reads it; where the
-/// camera's size is that of what is seen, and not of what is stored, they are of that.
-pub(super) fn turn(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Orientation {
-    if lens.fitted(width, height).is_some() {
-        return Orientation::UPRIGHT;
-    }
-    let said = Orientation::of(path);
-    let (width, height) = said.size((width, height));
-    if lens.fitted(width, height).is_some() { said } else { Orientation::UPRIGHT }
-}
-
-/// A photograph as its camera took it.
-fn loaded(path: &Path, lens: &Lens) -> Result<Image> {
-    let image = Image::load(path)?;
-    let orientation = turn(path, (image.width, image.height), lens);
-    Ok(image.turned(orientation))
+/// A view's name, and the size at which it is loaded.
+pub(super) fn loaded_size(source: &Source, options: &LoadOptions) -> Result<(String, [u32; 2])> {
+    let lens = fitted_lens(source)?;
+    Ok((source.name.clone(), options.loaded_size(lens.width, lens.height).into()))
 }
 
 fn disagreement(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Error {

@@ -8,10 +8,11 @@ use std::path::{Path, PathBuf};
 use glam::{DAffine3, DMat3, DVec2, DVec3};
 use serde::Deserialize;
 
+use super::Split;
 use super::colmap::SUPPORTED;
+use super::listing::{ListedView, Listing};
 use super::names::below_first;
 use super::text_file::read_text;
-use super::{ListedView, Listing, Split};
 use crate::camera::{Distortion, Lens};
 use crate::image::Image;
 use crate::image::files::{Files, stem};

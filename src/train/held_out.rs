@@ -88,13 +88,14 @@ impl HeldOut {
         frame: &Frame,
         scene: &Scene,
     ) -> Result<Self> {
-        let mut views = vec![];
+        let mut shown = vec![];
         for view in dataset.views.iter().filter(|view| view.split == Split::HeldOut) {
-            let Some(target) = target(pseudo_gt, view, scene)? else { continue };
-            let (camera, mask) = (frame.camera(&view.camera), view.mask.clone());
-            views.push(Shown { camera, target, mask });
+            if let Some(target) = target(pseudo_gt, view, scene)? {
+                let camera = frame.camera(&view.camera);
+                shown.push(Shown { camera, target, mask: view.mask.clone() });
+            }
         }
-        Ok(Self(views))
+        Ok(Self(shown))
     }
 }
 

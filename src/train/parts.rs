@@ -146,6 +146,25 @@ impl NetworkRates {
 }
 
 impl ModelConfig {
+    /// Says where the parts of a model see less than they are set to.
+    pub(super) fn say_what_parts_see(&self, sizes: &[UVec2]) {
+        let shortest = sizes.iter().map(|size| size.min_element()).min().unwrap_or_default();
+        let boxes = DepthBoxes::new(UVec2::splat(shortest), self.depth_box);
+        if self.depth && boxes.side < self.depth_box {
+            let (wanted, side) = (self.depth_box, boxes.side);
+            tracing::warn!(
+                "depth boxes of {wanted} pixels exceed the views: {side} pixels in the smallest"
+            );
+        }
+        let longest = sizes.iter().map(|size| size.max_element()).max().unwrap_or_default();
+        if (self.denoiser || self.tonemapper) && self.denoiser_crop > longest {
+            let crop = self.denoiser_crop;
+            tracing::warn!(
+                "a crop of {crop} pixels exceeds every view: the networks see whole views"
+            );
+        }
+    }
+
     /// Whether a part is on.
     pub fn has(&self, part: Part) -> bool {
         match part {
@@ -200,23 +219,6 @@ impl ModelConfig {
             return Err(Error::Usage(problem));
         }
         Ok(())
-    }
-}
-
-/// Says where the parts of a model see less than they are set to.
-pub(super) fn say_what_parts_see(model: &ModelConfig, sizes: &[UVec2]) {
-    let shortest = sizes.iter().map(|size| size.min_element()).min().unwrap_or_default();
-    let boxes = DepthBoxes::new(UVec2::splat(shortest), model.depth_box);
-    if model.depth && boxes.side < model.depth_box {
-        let (wanted, side) = (model.depth_box, boxes.side);
-        tracing::warn!(
-            "depth boxes of {wanted} pixels exceed the views: {side} pixels in the smallest"
-        );
-    }
-    let longest = sizes.iter().map(|size| size.max_element()).max().unwrap_or_default();
-    if (model.denoiser || model.tonemapper) && model.denoiser_crop > longest {
-        let crop = model.denoiser_crop;
-        tracing::warn!("a crop of {crop} pixels exceeds every view: the networks see whole views");
     }
 }
 

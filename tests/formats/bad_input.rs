@@ -12,7 +12,7 @@ use crate::{load, names, view};
 
 /// The one-line error of loading `root`, which must say all of `parts`.
 fn refused(root: &Path, parts: &[&str]) {
-    refused_with(root, &LoadOptions::default(), 1, parts);
+    refused_with(root, &LoadOptions::default(), 3, parts);
 }
 
 fn refused_with(root: &Path, options: &LoadOptions, exit_code: u8, parts: &[&str]) {
@@ -338,7 +338,7 @@ fn a_downscale_that_leaves_no_image_is_misuse() {
     refused_with(
         folder.path(),
         &LoadOptions { reference, ..LoadOptions::default() },
-        1,
+        3,
         &["nowhere"],
     );
 }

@@ -130,7 +130,7 @@ fn colmap_that_fails_or_finds_too_little_is_told_in_a_line_and_leaves_nothing() 
             .unwrap();
         let stderr = String::from_utf8(output.stderr).unwrap();
         let errors: Vec<&str> = stderr.lines().filter(|line| line.starts_with("error: ")).collect();
-        assert_eq!((output.status.code(), errors.len()), (Some(1), 1), "{stderr}");
+        assert_eq!((output.status.code(), errors.len()), (Some(3), 1), "{stderr}");
         assert!(parts.iter().all(|part| errors[0].contains(part)), "{stderr}");
         assert!(root.join("scene.colmap.log").is_file());
         nothing_is_left(&out);
@@ -156,7 +156,7 @@ fn the_focal_length_that_a_camera_wrote_is_what_colmap_begins_with() {
     }
     let colmap = stub(root, &format!("mapper) cp -r $images {}/seen; exit 1;;", root.display()));
     let (photos, out) = (photos.display(), root.join("scene"));
-    run(&format!("pose {photos} --out {} --colmap {}", out.display(), colmap.display()), 1);
+    run(&format!("pose {photos} --out {} --colmap {}", out.display(), colmap.display()), 3);
     for index in 0..3 {
         let seen = fs::read(root.join(format!("seen/{index}.JPG"))).unwrap();
         let focal = b"\xa4\x05\0\x03\0\0\0\x01\0\x1c";
@@ -188,10 +188,10 @@ fn what_keeps_pose_from_beginning_is_told_in_a_line() {
         ],
     );
     let train = format!("train {} --out {}", photos.display(), root.join("run").display());
-    refused(&train, 1, &["9 photographs", "nightsplat pose", "--out DATASET"]);
-    refused(&pose(&root.join("absent"), "--colmap true"), 1, &["absent", "cannot be read"]);
+    refused(&train, 3, &["9 photographs", "nightsplat pose", "--out DATASET"]);
+    refused(&pose(&root.join("absent"), "--colmap true"), 3, &["absent", "cannot be read"]);
     fs::create_dir(root.join("empty")).unwrap();
-    refused(&pose(&root.join("empty"), "--colmap true"), 1, &["holds 0 photographs"]);
+    refused(&pose(&root.join("empty"), "--colmap true"), 3, &["holds 0 photographs"]);
     refused(&pose(&photos, "--colmap true --fps 0"), 2, &["--fps"]);
     fs::write(root.join("clip.mp4"), "no clip").unwrap();
     let clip = root.join("clip.mp4");
@@ -200,18 +200,18 @@ fn what_keeps_pose_from_beginning_is_told_in_a_line() {
         2,
         &["`/nowhere/ffmpeg` is not found", "apt install ffmpeg", "--ffmpeg PATH"],
     );
-    refused(&pose(&clip, "--colmap true --ffmpeg false"), 1, &["false", "ended with"]);
+    refused(&pose(&clip, "--colmap true --ffmpeg false"), 3, &["false", "ended with"]);
     fs::copy(photos.join("v01.png"), photos.join("v00.webp")).unwrap();
     refused(
         &pose(&photos, "--colmap true"),
-        1,
+        3,
         &["v00.png and v00.webp are two photographs of one name"],
     );
     fs::remove_file(photos.join("v00.webp")).unwrap();
     for index in 0..9 {
         photograph(&photos.join(name(index)).with_extension("png"), SIZE, 0.0);
     }
-    refused(&pose(&photos, "--colmap true"), 1, &["photos", "black"]);
+    refused(&pose(&photos, "--colmap true"), 3, &["photos", "black"]);
     nothing_is_left(&out);
 }
 
@@ -256,7 +256,7 @@ fn of_a_clip_the_sharpest_frame_of_each_window_is_taken() {
         out.display(),
         colmap.display()
     );
-    let (_, stderr) = run(&arguments, 1);
+    let (_, stderr) = run(&arguments, 3);
     assert!(stderr.contains("4 photographs lifted"), "{stderr}");
     let mut seen: Vec<String> = fs::read_dir(root.join("seen"))
         .unwrap()
