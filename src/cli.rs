@@ -19,6 +19,7 @@ pub mod demo;
 pub mod diagnose;
 pub mod doctor;
 pub mod eval;
+pub mod export;
 mod finished_run;
 #[cfg(feature = "fit")]
 pub mod fit;
@@ -53,6 +54,7 @@ const EXAMPLES: &str = "Start with:
   nightsplat train photos --out run                 train from a folder of dark photographs
   nightsplat eval run --save-images                 score it where there are references
   nightsplat render run --split all --out pictures  see the model from every camera
+  nightsplat export run --to html                   a page with the splat to fly through
   nightsplat sweep photos --out sweep --curves all  train with every curve, and rank them
   nightsplat tradeoff photos --out tradeoff         what time and memory buy
 
@@ -67,6 +69,7 @@ enum Command {
     Pose(pose::PoseArgs),
     Eval(eval::EvalArgs),
     Render(render::RenderArgs),
+    Export(export::ExportArgs),
     Tone(tone::ToneArgs),
     Curves(curves::CurvesArgs),
     Sweep(Box<sweep::SweepArgs>),
@@ -109,6 +112,7 @@ impl Cli {
             Command::Pose(args) => pose::run(&args),
             Command::Eval(args) => eval::run(&args),
             Command::Render(args) => render::run(&args),
+            Command::Export(args) => export::run(&args),
             Command::Tone(args) => Ok(tone::run(&args)?),
             Command::Curves(args) => curves::run(&args),
             #[cfg(feature = "fit")]

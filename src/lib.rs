@@ -43,6 +43,7 @@
 //! - [`eval`]: scores of the test views
 //! - [`run`]: a training run, its events and its directory
 //! - [`report`]: tables and plots in one self-contained page
+//! - [`export`]: a model in the formats of others
 //! - `cli`: one file per subcommand (feature `cli`)
 
 pub mod attributes;
@@ -57,6 +58,8 @@ pub mod diagnose;
 pub mod error;
 #[cfg(feature = "io")]
 pub mod eval;
+#[cfg(feature = "io")]
+pub mod export;
 pub mod exposure;
 #[cfg(feature = "fit")]
 pub mod fit;

@@ -5,6 +5,7 @@ use std::fmt::Write as _;
 use crate::image::Image;
 
 pub use self::bars::{Bar, bars};
+pub(crate) use self::data_uri::{base64, jpeg};
 pub use self::distribution::{Distribution, distributions};
 pub use self::plot::{Mark, Series, VerticalLine, plot, plot_points, plot_with_lines, svg_file};
 pub use self::table::{Best, Column, Table};
@@ -122,7 +123,7 @@ impl Comparison {
 }
 
 /// Text as HTML and SVG show it, also inside a quoted attribute.
-fn escape(text: &str) -> String {
+pub(crate) fn escape(text: &str) -> String {
     let mut escaped = String::with_capacity(text.len());
     for character in text.chars() {
         match character {

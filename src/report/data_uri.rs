@@ -1,28 +1,37 @@
 //! Images inside a page: PNG in base64 (RFC 4648) in a data URI.
 
-use image::{ExtendedColorType, ImageEncoder as _, codecs::png::PngEncoder};
+use image::codecs::{jpeg::JpegEncoder, png::PngEncoder};
+use image::{ExtendedColorType, ImageEncoder, ImageResult};
 
 use crate::image::Image;
 
 /// The image as an 8-bit PNG; an empty URI for an image without pixels.
 pub(super) fn png(image: &Image) -> String {
-    let pixels = image.pixel_count();
-    let byte = |index: usize| (image.data[index].clamp(0.0, 1.0) * 255.0).round() as u8;
-    let bytes: Vec<u8> =
-        (0..3 * pixels).map(|index| byte(index % 3 * pixels + index / 3)).collect();
     let mut file = Vec::new();
-    match PngEncoder::new(&mut file).write_image(
-        &bytes,
-        image.width,
-        image.height,
-        ExtendedColorType::Rgb8,
-    ) {
-        Ok(()) => format!("data:image/png;base64,{}", base64(&file)),
-        Err(_) => String::from("data:,"),
-    }
+    let written = write(image, PngEncoder::new(&mut file));
+    uri("png", written.map(|()| file))
 }
 
-fn base64(bytes: &[u8]) -> String {
+/// The image as a JPEG of little loss; an empty URI for an image without pixels.
+pub(crate) fn jpeg(image: &Image) -> String {
+    const QUALITY: u8 = 90;
+    let mut file = Vec::new();
+    let written = write(image, JpegEncoder::new_with_quality(&mut file, QUALITY));
+    uri("jpeg", written.map(|()| file))
+}
+
+fn write(image: &Image, encoder: impl ImageEncoder) -> ImageResult<()> {
+    encoder.write_image(&image.to_rgb8(), image.width, image.height, ExtendedColorType::Rgb8)
+}
+
+fn uri(kind: &str, file: ImageResult<Vec<u8>>) -> String {
+    file.map_or_else(
+        |_| "data:,".to_owned(),
+        |file| format!("data:image/{kind};base64,{}", base64(&file)),
+    )
+}
+
+pub(crate) fn base64(bytes: &[u8]) -> String {
     const ALPHABET: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
     let mut text = String::with_capacity(bytes.len().div_ceil(3) * 4);
     for group in bytes.chunks(3) {

@@ -1,0 +1,208 @@
+//! `nightsplat export`: a run's model in the formats of others.
+
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use anyhow::Result;
+use glam::DAffine3;
+
+use super::finished_run::FinishedRun;
+use crate::camera::Camera;
+use crate::dataset::{Dataset, View};
+use crate::export::page::{Bookmark, Page};
+use crate::export::{Provenance, glb, sog, spz};
+use crate::gpu::DeviceChoice;
+use crate::image::Image;
+use crate::output::{printable, write_whole};
+use crate::render::RenderSettings;
+use crate::scene::{Gaussians, ply};
+use crate::train::TrainConfig;
+use crate::{Error, run};
+
+/// Write a run's model in the format of a viewer, as bright as it was trained to be.
+#[derive(Clone, Debug, clap::Args)]
+#[command(
+    after_help = "  nightsplat export run --to html             run/model.html: the splat, a viewer, photographs to compare
+  nightsplat export run --to spz --out a.spz  a tenth of the size, eight bits a number
+  nightsplat export run --to glb              glTF with KHR_gaussian_splatting, every number as it was trained"
+)]
+pub struct ExportArgs {
+    /// The run directory that `nightsplat train` wrote
+    pub run: PathBuf,
+    /// The format
+    #[arg(long, value_enum, value_name = "FORMAT")]
+    pub to: Format,
+    /// The file to write; one of that name is replaced [default: model with the format's ending, in the run]
+    #[arg(long, value_name = "FILE")]
+    pub out: Option<PathBuf>,
+    /// The version of SPZ: 4, or 3, which more readers know
+    #[arg(long, value_name = "3|4", default_value_t = 4, value_parser = clap::value_parser!(u8).range(3..=4))]
+    pub spz: u8,
+    /// For html: at most so many views to begin from, with their photographs
+    #[arg(long, value_name = "N", default_value_t = 8)]
+    pub views: usize,
+    /// For html: where the dataset lies now [default: that of the run]
+    #[arg(long, value_name = "DIR")]
+    pub dataset: Option<PathBuf>,
+    /// For html of a model with networks: a part of the device's name or its index [default: that of the run]
+    #[arg(long, value_name = "NAME|INDEX")]
+    pub device: Option<DeviceChoice>,
+}
+
+/// What a model can be written as.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum Format {
+    /// The layout that every viewer opens, with a header that says where it comes from.
+    Ply,
+    /// A tenth of the size; eight bits a number.
+    Spz,
+    /// glTF with `KHR_gaussian_splatting`.
+    Glb,
+    /// A fifteenth of the size; `PlayCanvas`.
+    Sog,
+    /// A page with a viewer of its own.
+    Html,
+}
+
+impl Format {
+    const fn extension(self) -> &'static str {
+        match self {
+            Self::Ply => "ply",
+            Self::Spz => "spz",
+            Self::Glb => "glb",
+            Self::Sog => "sog",
+            Self::Html => "html",
+        }
+    }
+}
+
+/// Writes the file.
+///
+/// # Errors
+/// The folder holds no run with a model, the model does not fit the format, or the file cannot be written; nothing
+/// half-written is left.
+pub fn run(args: &ExportArgs) -> Result<()> {
+    let config = run::load_config(&args.run)?;
+    // As the file has it, which is as viewers show it.
+    let gaussians = run::load_model(&args.run, false)?;
+    let extension = args.to.extension();
+    let own = args.run.join(format!("model.{extension}"));
+    let out = args.out.as_ref().unwrap_or(&own);
+    if args.to == Format::Ply && is_same(out, &own) {
+        let problem =
+            "is the model itself, which has its header already; name another file with --out";
+        return Err(Error::output(out, problem).into());
+    }
+    if let Some(step) = run::stopped_at(&args.run) {
+        tracing::warn!("{}: stopped at step {step} of {}", args.run.display(), config.steps);
+    }
+    if config.model.denoiser || config.model.tonemapper {
+        tracing::warn!(
+            "{}: its networks stay behind; what is exported is the splat alone",
+            args.run.display()
+        );
+    }
+    let provenance = provenance(args, &config);
+    match args.to {
+        Format::Ply => {
+            let lines = provenance.lines();
+            let lines: Vec<&str> = lines.iter().map(String::as_str).collect();
+            ply::save_with_comments(&gaussians, out, &lines)?;
+        }
+        Format::Spz => {
+            let version = if args.spz == 3 { spz::Version::V3 } else { spz::Version::V4 };
+            write_whole(out, &spz::encode(&gaussians, version)?)?;
+        }
+        Format::Glb => write_whole(out, &glb::encode(&gaussians, &provenance)?)?,
+        Format::Sog => write_whole(out, &sog::encode(&gaussians, &provenance)?)?,
+        Format::Html => {
+            write_whole(out, page(args, &config, &gaussians, provenance)?.as_bytes())?;
+        }
+    }
+    let (shown, count) = (out.display().to_string(), gaussians.count);
+    let kib = std::fs::metadata(out).map_or(0, |file| file.len()).div_ceil(1024);
+    let line = format!(
+        "{}: {count} Gaussians in {kib} KiB, as bright as their targets",
+        printable(&shown)
+    );
+    Ok(writeln!(std::io::stdout(), "{line}")?)
+}
+
+fn is_same(a: &Path, b: &Path) -> bool {
+    a.canonicalize().ok().zip(b.canonicalize().ok()).is_some_and(|(a, b)| a == b)
+}
+
+fn provenance(args: &ExportArgs, config: &TrainConfig) -> Provenance {
+    let gain = run::load_metrics(&args.run)[run::TARGET_EXPOSURE]["model_gain"].as_f64();
+    let exposure = gain.map(|gain| format!("its photographs', times {gain:.2} before the curve"));
+    Provenance {
+        dataset: config.dataset.file_name().unwrap_or_default().to_string_lossy().into_owned(),
+        curve: config.tone.curve.to_string(),
+        exposure: exposure.unwrap_or_else(|| "of its targets".to_owned()),
+    }
+}
+
+/// The page, with a bookmark for some of the test views, or of all where none is held out.
+fn page(
+    args: &ExportArgs,
+    config: &TrainConfig,
+    gaussians: &Gaussians,
+    provenance: Provenance,
+) -> Result<String> {
+    let frame = config.frame.unwrap_or_default();
+    let title = format!("{} by nightsplat", provenance.dataset);
+    let bookmarks = if config.model.denoiser || config.model.tonemapper {
+        let FinishedRun { mut player, dataset, .. } =
+            FinishedRun::open(&args.run, args.dataset.as_deref(), args.device.as_ref())?;
+        bookmarks(args, config, &dataset, |view| {
+            let networks = player.render(view)?.output().clone();
+            Ok(Some(("model with its networks".to_owned(), networks)))
+        })?
+    } else {
+        let mut config = config.clone();
+        if let Some(dataset) = &args.dataset {
+            config.move_dataset(dataset);
+        }
+        let mut options = config.load_options();
+        options.load_low_test = true;
+        let dataset = Dataset::load(&config.dataset, &options)?;
+        bookmarks(args, &config, &dataset, |_| Ok(None))?
+    };
+    let near = f64::from(RenderSettings::default().near) / frame.scale;
+    Ok(Page { title, gaussians, provenance, bookmarks, near }.html()?)
+}
+
+fn bookmarks(
+    args: &ExportArgs,
+    config: &TrainConfig,
+    dataset: &Dataset,
+    mut rendered: impl FnMut(&View) -> crate::Result<Option<(String, Image)>>,
+) -> crate::Result<Vec<Bookmark>> {
+    let mut views: Vec<&View> = dataset.test_views().collect();
+    if views.is_empty() {
+        views = dataset.views.iter().collect();
+    }
+    let (all, count) = (views.len(), args.views.clamp(1, views.len().max(1)));
+    let origin = config.frame.unwrap_or_default().file_origin();
+    let bookmark = |place: usize| {
+        let view = views[place * all / count];
+        let pictures = [
+            view.loaded()?.map(|image| ("photograph".to_owned(), image.into_owned())),
+            view.reference.clone().map(|image| ("reference".to_owned(), image)),
+            rendered(view)?,
+        ];
+        Ok(Bookmark {
+            name: view.name.clone(),
+            camera: moved(&view.camera, origin),
+            pictures: pictures.into_iter().flatten().collect(),
+        })
+    };
+    (0..count).map(bookmark).collect()
+}
+
+/// The same camera before positions that are relative to `origin`.
+fn moved(camera: &Camera, origin: glam::DVec3) -> Camera {
+    let DAffine3 { matrix3, translation } = camera.view_from_world;
+    let view_from_world = DAffine3 { matrix3, translation: translation + matrix3 * origin };
+    Camera { view_from_world, ..*camera }
+}
