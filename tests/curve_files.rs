@@ -105,7 +105,7 @@ fn what_is_wrong_with_a_file_is_named() {
         let message = error.to_string();
         assert!(message.contains(part) && message.contains(name), "{message}");
         assert!(!message.contains('\n'), "{message}");
-        assert_eq!(error.exit_code(), 1, "{message}");
+        assert_eq!(error.exit_code(), 3, "{message}");
     }
     let absent = CurveChoice::File(PathBuf::from("absent.toml")).settings().unwrap_err();
     assert!(absent.to_string().contains("absent.toml"));

@@ -177,7 +177,7 @@ fn a_run_that_was_stopped_is_rendered_scored_and_made_longer_with_a_lower_cap() 
     assert_eq!(json(path("run/metrics.json"))["steps"], 14);
     let higher = options.replace("4000", "5000");
     let arguments = train(folder.path(), "run", &format!("--steps 15 --resume {higher}"));
-    refused(&arguments, 1, &["max_gaussians"]);
+    refused(&arguments, 3, &["max_gaussians"]);
 }
 
 #[test]
@@ -230,7 +230,7 @@ fn a_run_is_opened_with_another_copy_of_its_dataset_and_what_differs_is_said() {
     fs::remove_dir_all(path("set")).unwrap();
     let [run_folder, copied, shown] =
         ["run", "copy", "shown"].map(|name| path(name).display().to_string());
-    refused(&format!("eval {run_folder}"), 1, &["set", "--dataset"]);
+    refused(&format!("eval {run_folder}"), 3, &["set", "--dataset"]);
     let (printed, said) = run(&format!("eval {run_folder} --json --dataset {copied}"), 0);
     let printed: Value = serde_json::from_str(&printed).unwrap();
     assert_eq!(printed, json(path("run/metrics.json")));
@@ -332,4 +332,59 @@ fn a_parts_option_without_the_part_is_said_with_both_names() {
     }
     let with = said("b", "--steps 1 --parts denoiser --denoiser-channels 4 --denoiser-crop 16");
     assert!(!with.contains("no effect"), "{with}");
+}
+
+#[test]
+fn large_photographs_shrink_to_a_limit_that_is_said_and_recorded() {
+    let folder = folder();
+    let path = |name: &str| folder.path().join(name);
+    let views = |out: &str| fs::read_to_string(path(out).join("views.csv")).unwrap();
+    let (_, said) = run(&train(folder.path(), "run", "--steps 2 --max-resolution 24"), 0);
+    assert!(said.contains("48x32 are trained on at 24x16"), "{said}");
+    assert!(views("run").contains("001,train,24,16"), "{}", views("run"));
+    // Behind another factor, which does more by itself.
+    let (_, said) =
+        run(&train(folder.path(), "both", "--steps 2 --max-resolution 40 --downscale 2"), 0);
+    assert!(!said.contains("trained on at") && views("both").contains("001,train,24,16"), "{said}");
+    succeed(&train(folder.path(), "none", "--steps 2 --max-resolution none"));
+    assert!(views("none").contains("001,train,48,32"));
+    let config = fs::read_to_string(path("none/config.toml")).unwrap();
+    assert!(config.contains("max_resolution = 0"), "{config}");
+}
+
+#[test]
+fn whatever_the_cache_leaves_on_disk_the_model_has_the_same_bits() {
+    let folder = folder();
+    let model = |out: &str, options: &str| {
+        succeed(&train(folder.path(), out, &format!("--steps 30 --progress none {options}")));
+        fs::read(folder.path().join(out).join("model.ply")).unwrap()
+    };
+    for options in ["--model plain", "--curve ase --parts tonemapper --plan none"] {
+        let all = model("all", &format!("{options} --overwrite"));
+        for size in ["0", "20K"] {
+            let some = model("some", &format!("{options} --overwrite --cache {size}"));
+            assert!(all == some, "{options} --cache {size}");
+        }
+    }
+    refused(&train(folder.path(), "no", "--cache much"), 2, &["much", "4G"]);
+}
+
+#[test]
+fn views_that_a_device_cannot_train_on_are_refused_from_their_headers_with_the_size_that_it_can() {
+    let bindable = nightsplat::gpu::testing::gpu().properties().max_storage_buffer_range;
+    if bindable > 1 << 30 {
+        eprintln!("not run: this device binds {bindable} bytes");
+        return;
+    }
+    let folder = folder();
+    let low = folder.path().join("set/low");
+    // A header and no pixel: whoever decoded it would say so.
+    for file in fs::read_dir(&low).unwrap().map(|entry| entry.unwrap().path()) {
+        let mut encoder = png::Encoder::new(fs::File::create(file).unwrap(), 12_000, 8_000);
+        encoder.set_color(png::ColorType::Rgb);
+        drop(encoder.write_header().unwrap());
+    }
+    let arguments = train(folder.path(), "run", "--max-resolution 0");
+    refused(&arguments, 2, &["is 12000x8000", "binds", "--max-resolution to "]);
+    assert!(!folder.path().join("run").exists());
 }

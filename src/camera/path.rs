@@ -82,7 +82,7 @@ fn orbit(poses: &[Camera], frames: usize) -> Result<Vec<DAffine3>> {
         let problem = "the cameras look in parallel: there is no point to orbit; take --path spiral or interpolate";
         Error::Usage(problem.to_owned())
     })?;
-    let up = mean(poses.iter().map(up)).normalize_or(DVec3::NEG_Y);
+    let up = upwards(poses);
     let offsets = poses.iter().map(|pose| pose.center() - target);
     let level = |offset: DVec3| offset - offset.dot(up) * up;
     let height = offsets.clone().map(|offset| offset.dot(up)).sum::<f64>() / poses.len() as f64;
@@ -102,7 +102,7 @@ fn orbit(poses: &[Camera], frames: usize) -> Result<Vec<DAffine3>> {
 fn spiral(poses: &[Camera], frames: usize) -> Vec<DAffine3> {
     let center = mean(poses.iter().map(Camera::center));
     let forward = mean(poses.iter().map(forward)).normalize_or(DVec3::Z);
-    let up = mean(poses.iter().map(up)).normalize_or(DVec3::NEG_Y);
+    let up = upwards(poses);
     let middle = looking(center, center + forward, up);
     let from_middle = |pose: &Camera| middle.transform_point3(pose.center()).abs();
     let radii = [0, 1, 2].map(|axis| {
@@ -153,6 +153,23 @@ fn nearest_to_axes(poses: &[Camera]) -> Option<DVec3> {
 /// In the world.
 fn forward(pose: &Camera) -> DVec3 {
     pose.view_from_world.matrix3.row(2)
+}
+
+/// What is up in the world, for cameras that are held level: across all their horizontal axes, on the side of their mean.
+/// Cameras on one side that look down have a mean that leans.
+fn upwards(poses: &[Camera]) -> DVec3 {
+    let mut horizontal = DMat3::from_diagonal(DVec3::splat(1e-6));
+    for pose in poses {
+        let right = pose.view_from_world.matrix3.row(0);
+        let axes = [right * right.x, right * right.y, right * right.z];
+        horizontal += DMat3::from_cols(axes[0], axes[1], axes[2]) * (1.0 / poses.len() as f64);
+    }
+    // Inverse iteration: what the axes have least of is left.
+    let (inverse, mut up) = (horizontal.inverse(), mean(poses.iter().map(up)));
+    for _ in 0..8 {
+        up = (inverse * up).normalize_or(DVec3::NEG_Y);
+    }
+    up
 }
 
 /// In the world; an image's y points down.

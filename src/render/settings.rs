@@ -1,5 +1,6 @@
 //! What a renderer is made for, and the tile that suits a device.
 
+use super::limits::most_tiles;
 use crate::gpu::Gpu;
 use crate::scene::{Features, Shape};
 use crate::{Error, Result};
@@ -56,6 +57,31 @@ impl RenderSettings {
         let remedy = format!("1 to 32 times {lanes} pixels; without `tile` the device chooses");
         let problem = format!("{width}x{height} tiles do not suit {lanes} lanes");
         Err(Error::Usage(format!("{problem}; take a tile of {remedy}")))
+    }
+
+    /// The tile for views of these sizes: that of [`RenderSettings::tile_on`], twice and more as high where nothing names a
+    /// tile and the device could not follow so many of them.
+    ///
+    /// # Errors
+    /// As there.
+    pub fn tile_for(
+        &self,
+        gpu: &Gpu,
+        sizes: impl Iterator<Item = [u32; 2]> + Clone,
+    ) -> Result<[u32; 2]> {
+        let mut tile = self.tile_on(gpu)?;
+        let count = |[width, height]: [u32; 2], tile: [u32; 2]| {
+            width.div_ceil(tile[0]) as usize * height.div_ceil(tile[1]) as usize
+        };
+        let most = most_tiles(gpu);
+        while self.tile.is_none() && sizes.clone().any(|size| count(size, tile) > most) {
+            let higher = [tile[0], 2 * tile[1]];
+            if !gpu.properties().suits_tile(higher) {
+                break;
+            }
+            tile = higher;
+        }
+        Ok(tile)
     }
 
     /// Values per pixel of a render: RGB and the features.

@@ -188,7 +188,8 @@ fn with_tile_and_frame(
         config.tile = config.tile.or(tile);
         config.frame = Some(recorded.frame.unwrap_or_default());
     }
-    config.tile = Some(config.render_settings().tile_on(gpu)?);
+    let sizes = dataset.views.iter().map(|view| [view.camera.width, view.camera.height]);
+    config.tile = Some(config.render_settings().tile_for(gpu, sizes)?);
     config.frame.get_or_insert_with(|| dataset.frame());
     Ok(config)
 }

@@ -95,14 +95,14 @@ fn pairs_that_cannot_be_used_are_named_in_one_line() {
     let two = FitArgs { normal: Some(path("good/high")), ..args(&[path("good/low")]) };
     assert_eq!(apply(&two).unwrap()[0].fit, apply(&args(&[path("good")])).unwrap()[0].fit);
 
-    fails(args(&[path("absent")]), "is not a folder", 1);
-    fails(args(&[path("good/low")]), "--normal", 1);
+    fails(args(&[path("absent")]), "is not a folder", 3);
+    fails(args(&[path("good/low")]), "--normal", 3);
     fails(
         FitArgs { normal: Some(path("good/high")), ..args(&[path("good/low"), path("good")]) },
         "--normal",
         2,
     );
-    fails(FitArgs { normal: Some(path("nowhere")), ..args(&[path("good/low")]) }, "nowhere", 1);
+    fails(FitArgs { normal: Some(path("nowhere")), ..args(&[path("good/low")]) }, "nowhere", 3);
     fails(
         FitArgs { out: Some(path("no/folder.toml")), ..args(&[path("good")]) },
         "cannot be written",
@@ -122,27 +122,27 @@ fn pairs_that_cannot_be_used_are_named_in_one_line() {
     assert_eq!(apply(&args(&[path("good")])).unwrap()[0].fit.values, 4800.0);
     fails(FitArgs { cross_validate: true, ..args(&[path("good")]) }, "1 pairs in 5 folds", 2);
     std::fs::rename(path("good/high/0.png"), path("good/high/7.png")).unwrap();
-    fails(args(&[path("good")]), "no photograph has a partner", 1);
+    fails(args(&[path("good")]), "no photograph has a partner", 3);
 
     scene(&path("sizes"), 2);
     dark(41, 0.05, 0.0, 1).save_png8(path("sizes/low/1.png")).unwrap();
-    fails(args(&[path("sizes")]), "1.png: is 41x41 but its reference 40x40", 1);
+    fails(args(&[path("sizes")]), "1.png: is 41x41 but its reference 40x40", 3);
 
     scene(&path("twins"), 1);
     dark(40, 0.05, 0.0, 1).save_exr(path("twins/low/0.exr")).unwrap();
-    fails(args(&[path("twins")]), "same name", 1);
+    fails(args(&[path("twins")]), "same name", 3);
 
     scene(&path("broken"), 1);
     std::fs::write(path("broken/low/0.png"), b"no image").unwrap();
-    fails(args(&[path("broken")]), "0.png", 1);
+    fails(args(&[path("broken")]), "0.png", 3);
 
     scene(&path("black"), 2);
     for name in ["black/low/0.png", "black/low/1.png"] {
         Image::filled(40, 40, [0.0; 3]).save_png8(path(name)).unwrap();
     }
-    fails(args(&[path("black")]), "black", 1);
+    fails(args(&[path("black")]), "black", 3);
 
     scene(&path("flat"), 1);
     Image::filled(40, 40, [0.1; 3]).save_png8(path("flat/low/0.png")).unwrap();
-    fails(args(&[path("flat")]), "1 different values", 1);
+    fails(args(&[path("flat")]), "1 different values", 3);
 }
