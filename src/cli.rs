@@ -54,7 +54,11 @@ const EXAMPLES: &str = "Start with:
   nightsplat eval run --save-images                 score it where there are references
   nightsplat render run --split all --out pictures  see the model from every camera
   nightsplat sweep photos --out sweep --curves all  train with every curve, and rank them
-  nightsplat tradeoff photos --out tradeoff         what time and memory buy";
+  nightsplat tradeoff photos --out tradeoff         what time and memory buy
+
+Exit codes:
+  0 done; 1 failed; 2 misuse; 3 data that cannot be used; 4 no device, or not enough memory;
+  75 saved, run it again (train --max-minutes); 130 and 143 saved (SIGINT and SIGTERM)";
 
 #[derive(Debug, Subcommand)]
 enum Command {

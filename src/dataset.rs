@@ -7,9 +7,12 @@
 mod colmap;
 mod fingerprint;
 mod masks;
+mod members;
 mod names;
 mod options;
 mod pixels;
+mod place;
+mod points;
 mod similarity;
 pub mod synthetic;
 mod text_file;
@@ -18,20 +21,21 @@ mod undistort;
 mod unused;
 
 use std::borrow::Cow;
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeSet, HashMap};
 use std::path::{Path, PathBuf};
 
 use glam::{DAffine3, DVec3};
 
-use crate::camera::{Camera, Frame, Lens, frame};
+use crate::camera::{Camera, Lens};
 use crate::image::files::{self, Files};
 use crate::image::{Image, Mask};
 use crate::{Error, Result};
 pub use fingerprint::Fingerprint;
+use members::with_held_out;
 pub use options::{DepthOptions, LoadOptions};
 pub use pixels::Original;
 use pixels::Source;
-use similarity::Similarity;
+use points::points;
 use text_file::read_text;
 
 /// Photographs with cameras, and points of the scene they show.
@@ -196,8 +200,6 @@ const NORMAL_FOLDERS: [&str; 4] = ["high", "val", "test", "images"];
 const DEPTH_FOLDERS: [&str; 2] = ["depth", "depth_maps"];
 /// Every eighth of the name-sorted views is held out where nothing else says which.
 const TEST_EVERY: usize = 8;
-/// The largest camera-centre error, relative to the cameras' extent, at which two worlds count as the same.
-const MAX_WORLD_RESIDUAL: f64 = 0.01;
 
 impl Dataset {
     /// Loads the dataset below `root`.
@@ -323,90 +325,6 @@ impl Dataset {
             Some(Photograph { name, split, input: input?, reference, mask })
         };
         Ok((sources.into_iter().filter_map(photograph).collect(), skipped, remarks))
-    }
-
-    /// Leaves out views by name; points forget them.
-    pub fn leave_out(&mut self, names: &[String]) {
-        let stays: Vec<bool> = self.views.iter().map(|view| !names.contains(&view.name)).collect();
-        let place = |view: u32| {
-            let stays_before = stays[..view as usize].iter().filter(|&&stays| stays).count();
-            stays[view as usize].then_some(stays_before as u32)
-        };
-        for point in &mut self.points {
-            point.views = point.views.iter().filter_map(|&view| place(view)).collect();
-        }
-        self.views.retain(|view| !names.contains(&view.name));
-    }
-
-    /// The training views.
-    pub fn train_views(&self) -> impl Iterator<Item = &View> {
-        self.views.iter().filter(|view| view.split == Split::Train)
-    }
-
-    /// The held-out views.
-    pub fn test_views(&self) -> impl Iterator<Item = &View> {
-        self.views.iter().filter(|view| view.split == Split::Test)
-    }
-
-    /// The scene's size as 3DGS takes it: 1.1 times the largest distance of a training camera to their mean, world units.
-    /// Where all stand in one spot, half of the points are within it; without points it is 1.
-    pub fn extent(&self) -> f64 {
-        self.place().1
-    }
-
-    /// Where the scene is trained.
-    pub fn frame(&self) -> Frame {
-        let (center, extent) = self.place();
-        Frame::new(center, extent)
-    }
-
-    /// The middle of the training cameras, and the extent.
-    fn place(&self) -> (DVec3, f64) {
-        let centers = self.train_views().map(|view| view.camera.center());
-        let (center, spread) = frame::spread(&centers.collect::<Vec<DVec3>>());
-        if spread > 0.0 {
-            return (center, spread);
-        }
-        let mut away: Vec<f64> =
-            self.points.iter().map(|point| point.position.distance(center)).collect();
-        let half = away.len() / 2;
-        let typical = (!away.is_empty())
-            .then(|| *away.select_nth_unstable_by(half, f64::total_cmp).1)
-            .filter(|&distance| distance > 0.0);
-        (center, typical.unwrap_or(1.0))
-    }
-
-    /// Leaves out the points that no number of the device holds or that lie a million extents away: they are of no use, and
-    /// what they are made of would not stay finite.
-    fn leave_out_far_points(&mut self) {
-        const MOST_EXTENTS: f64 = 1e6;
-        let (center, extent) = self.place();
-        let before = self.points.len();
-        // Positive phrasing: a NaN fails the test too.
-        self.points.retain(|point| point.position.distance(center) <= MOST_EXTENTS * extent);
-        let gone = before - self.points.len();
-        if gone > 0 {
-            tracing::warn!(
-                "{}: {gone} of {before} points lie more than a million times the cameras' extent away, or nowhere; they are \
-                 left out",
-                self.root.display()
-            );
-        }
-    }
-
-    /// Says which training cameras stand far from all others.
-    fn say_what_stands_elsewhere(&self) {
-        let (center, extent) = self.place();
-        for view in self.train_views() {
-            let own = view.camera.center();
-            if frame::stands_elsewhere(own, (center, extent)) {
-                tracing::warn!(
-                    "view {} stands {:.0e} extents of the other cameras away from them; check its pose",
-                    view.name,
-                    own.distance(center) / extent
-                );
-            }
-        }
     }
 }
 
@@ -676,91 +594,5 @@ impl ListedView {
         let beside =
             NORMAL_FOLDERS.iter().filter_map(|folder| self.find(&root.join(folder), files));
         self.file.clone().into_iter().chain(beside).find(|file| Some(file) != input)
-    }
-}
-
-/// Keeps so many training views from training, an eighth of them at most, spread evenly.
-fn with_held_out(mut views: Vec<View>, count: usize) -> Vec<View> {
-    const MOST: usize = 8;
-    let mut training: Vec<&mut View> = views.iter_mut().filter(|view| view.is_train()).collect();
-    let (of, count) = (training.len(), count.min(training.len() / MOST));
-    for place in 0..count {
-        training[(2 * place + 1) * of / (2 * count)].split = Split::HeldOut;
-    }
-    views
-}
-
-/// The points of the dataset's COLMAP model, brought into the views' world.
-fn points(root: &Path, views: &[View]) -> Result<Vec<Point>> {
-    let by_name: BTreeMap<&str, u32> =
-        views.iter().zip(0..).map(|(view, index)| (view.name.as_str(), index)).collect();
-    let view_named = |image: &str| {
-        let names = names::possible(&image.replace('\\', "/"));
-        names.iter().find_map(|name| by_name.get(name.as_str()).copied())
-    };
-    let models = colmap::find(root, &["images", "points3D"]);
-    let Some((folder, _)) = colmap::largest(&models, |name| view_named(name).is_some())? else {
-        return Ok(Vec::new());
-    };
-    let images = colmap::read_images(folder)?;
-    let points = colmap::read_points(folder)?;
-    let shared = images.iter().filter_map(|image| {
-        let view = view_named(&image.name)?;
-        Some((image.id, view, image.view_from_world?.inverse().translation))
-    });
-    let shared: Vec<(u32, u32, DVec3)> = shared.collect();
-    let pairs: Vec<_> = shared
-        .iter()
-        .map(|(_, view, center)| (*center, views[*view as usize].camera.center()))
-        .collect();
-    let Some(to_views) = same_world(folder, &pairs) else {
-        return Ok(Vec::new());
-    };
-    let view_of: HashMap<u32, u32> =
-        shared.iter().map(|(image, view, _)| (*image, *view)).collect();
-    let point = |point: colmap::ModelPoint| {
-        let seen_by: BTreeSet<u32> =
-            point.images.iter().filter_map(|image| view_of.get(image).copied()).collect();
-        Point { position: to_views(point.position), views: seen_by.into_iter().collect() }
-    };
-    Ok(points.into_iter().map(point).collect())
-}
-
-/// The map from the model's world to the views'; a warning and `None` where the two do not belong together.
-fn same_world(folder: &Path, pairs: &[(DVec3, DVec3)]) -> Option<Box<dyn Fn(DVec3) -> DVec3>> {
-    if !pairs.is_empty() && pairs.iter().all(|(model, view)| model == view) {
-        return Some(Box::new(|point| point));
-    }
-    let folder = folder.display();
-    let Some(similarity) = Similarity::solve(pairs) else {
-        tracing::warn!(
-            "{folder}: {} shared cameras do not tell its place; its points are left out",
-            pairs.len()
-        );
-        return None;
-    };
-    let residual = similarity.residual;
-    if residual > MAX_WORLD_RESIDUAL {
-        tracing::warn!(
-            "{folder}: its cameras are off by {residual:.3} of their extent; its points are left out"
-        );
-        return None;
-    }
-    tracing::info!(
-        "{folder}: brought into the views' world, residual {residual:.1e} of the cameras' extent"
-    );
-    Some(Box::new(move |point| similarity.apply(point)))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_world_that_is_off_by_more_than_a_hundredth_gives_no_points() {
-        let center = |i: i32| DVec3::new(f64::from(i % 3), f64::from(i / 3), f64::from(i * i % 5));
-        let bent: Vec<_> =
-            (0..9).map(|i| (center(i), center(i) + DVec3::X * 0.3 * f64::from(i % 2))).collect();
-        assert!(same_world(Path::new("sparse/0"), &bent).is_none());
     }
 }

@@ -7,6 +7,7 @@
 //! - barriers follow from what a kernel declares it reads and writes, never from the caller;
 //! - a borrowed device ([`Gpu::from_host`]) keeps everything that it had: we destroy what we created and nothing else.
 
+mod address_space;
 mod buffer;
 mod check;
 mod checked;

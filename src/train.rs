@@ -30,7 +30,7 @@ use crate::densify::{Densifier, DensifySettings};
 use crate::exposure::Exposures;
 use crate::gpu::{Buffer, CheckReport, Gpu, PassTime, Recorder};
 use crate::image::Image;
-use crate::loss::{DepthBoxes, LogSlot, LossLog, Losses, StepLosses, Term, TermInputs};
+use crate::loss::{LogSlot, LossLog, Losses, StepLosses, Term, TermInputs};
 use crate::nn::Form;
 use crate::optimizer::{Adam, AdamBuffers, FiniteCheck, Learnable};
 use crate::pseudo_gt::PseudoGt;
@@ -49,6 +49,7 @@ pub use held_out::{StopConfig, targets_of_test_views};
 use masks::Masks;
 use model::Model;
 pub use networks::Networks;
+use parts::say_what_parts_see;
 pub use parts::{ModelConfig, ModelName, NetworkRates, Part};
 pub use precision::{PhotographBits, PrecisionConfig};
 pub use preset::Preset;
@@ -581,23 +582,6 @@ fn learnables<'a>(
     let networks = networks.iter_mut().flat_map(|terms| terms.networks.parameters_mut());
     let networks = networks.map(|parameters| parameters as &mut dyn Learnable);
     networks.chain(exposures.iter_mut().map(|exposures| exposures as &mut dyn Learnable))
-}
-
-/// Says where the parts of a model see less than they are set to.
-fn say_what_parts_see(model: &ModelConfig, sizes: &[UVec2]) {
-    let shortest = sizes.iter().map(|size| size.min_element()).min().unwrap_or_default();
-    let boxes = DepthBoxes::new(UVec2::splat(shortest), model.depth_box);
-    if model.depth && boxes.side < model.depth_box {
-        let (wanted, side) = (model.depth_box, boxes.side);
-        tracing::warn!(
-            "depth boxes of {wanted} pixels exceed the views: {side} pixels in the smallest"
-        );
-    }
-    let longest = sizes.iter().map(|size| size.max_element()).max().unwrap_or_default();
-    if (model.denoiser || model.tonemapper) && model.denoiser_crop > longest {
-        let crop = model.denoiser_crop;
-        tracing::warn!("a crop of {crop} pixels exceeds every view: the networks see whole views");
-    }
 }
 
 /// The background of a step.

@@ -65,7 +65,7 @@ fn points_that_no_device_holds_and_views_that_show_nothing_are_said() {
 fn pictures_larger_than_their_views_are_refused_before_they_are_decoded() {
     let set = small_set();
     let bomb = |path: &str| {
-        Image::from_fn(1200, 900, |_, _| [0.5; 3]).save_png8(set.path().join(path)).unwrap()
+        Image::from_fn(1200, 900, |_, _| [0.5; 3]).save_png8(set.path().join(path)).unwrap();
     };
     bomb("high/000.png");
     refused(&train(set.path()), 3, &["high/000.png", "1200x900", "64 times"]);

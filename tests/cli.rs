@@ -306,6 +306,8 @@ fn bench_checks_and_times_every_kernel_of_a_step_and_names_the_others() {
         "exposure_center",
         "exposure_gradient",
         "first_not_finite",
+        "mask_gradient",
+        "mask_render",
         "tone_mix",
         "tone_profile",
         "tone_table",

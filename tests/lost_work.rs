@@ -20,7 +20,7 @@ impl Place {
     fn new() -> Self {
         let place = Self(tempfile::tempdir().unwrap());
         let options = SyntheticOptions { views: 9, width: 40, height: 30, seed: 2 };
-        synthetic::write(&place.path("set"), &options).unwrap();
+        synthetic::write(place.path("set"), &options).unwrap();
         place
     }
 
@@ -84,18 +84,21 @@ fn log(run: &Path) -> Vec<String> {
 #[test]
 fn a_signal_saves_and_stops_and_the_run_goes_on_to_the_same_bits() {
     let place = Place::new();
-    succeed(&place.train("straight", "--steps 700"));
+    succeed(&place.train("straight", "--steps 400"));
     for (signal, code, said) in [("-INT", 130, "interrupted"), ("-TERM", 143, "told to end")] {
         let name = format!("stopped{signal}");
-        let mut child = begun(&place.train(&name, "--steps 700"));
+        let mut child = begun(&place.train(&name, "--steps 400"));
         send(signal, &child);
         let _ = child.stdout.take();
         let (status, stderr) = ended(child);
         assert_eq!(status, code, "{stderr}");
         assert!(stderr.contains(said) && stderr.contains("--resume"), "{stderr}");
-        assert!(!place.path(&name).join("model.ply").exists(), "the run ended before the signal");
+        assert!(
+            !place.path(&name).join("metrics.json").exists(),
+            "the run ended before the signal"
+        );
         assert!(!place.path(&name).join(".lock").exists());
-        succeed(&place.train(&name, "--steps 700 --resume"));
+        succeed(&place.train(&name, "--steps 400 --resume"));
         assert!(place.read(&format!("{name}/model.ply")) == place.read("straight/model.ply"));
         assert_eq!(log(&place.path(&name)), log(&place.path("straight")));
     }
@@ -131,7 +134,7 @@ fn a_run_saves_when_asked_and_when_its_checkpoint_is_old_and_goes_on() {
 #[test]
 fn a_run_whose_time_is_up_is_to_be_run_again_and_a_finished_one_is_not() {
     let place = Place::new();
-    let train = place.train("run", "--steps 300 --resume --max-minutes 0.002");
+    let train = place.train("run", "--steps 120 --resume --max-minutes 0.002");
     let mut rounds = 0;
     loop {
         let output = command(&train).output().unwrap();
@@ -145,14 +148,14 @@ fn a_run_whose_time_is_up_is_to_be_run_again_and_a_finished_one_is_not() {
         assert!(!place.path("run/done.json").exists() && rounds < 300);
     }
     assert!(rounds > 0);
-    succeed(&place.train("straight", "--steps 300"));
+    succeed(&place.train("straight", "--steps 120"));
     assert!(place.read("run/model.ply") == place.read("straight/model.ply"));
     // Again: nothing is done, and nothing is touched.
     let modified = || fs::metadata(place.path("run/model.ply")).unwrap().modified().unwrap();
     let before = modified();
     assert!(succeed(&train).contains("is done"));
     assert_eq!(modified(), before);
-    succeed(&place.train("run", "--steps 310 --resume"));
+    succeed(&place.train("run", "--steps 130 --resume"));
     assert!(modified() > before, "a longer run is another");
 }
 
@@ -321,4 +324,18 @@ fn the_exit_code_says_who_can_do_something_about_it() {
     refused(&format!("eval {}", place.0.path().display()), 3, &["no config.toml"]);
     refused(&place.train("new", "--steps 1 --device voodoo"), 4, &["voodoo"]);
     assert!(!place.path("new").exists());
+}
+
+#[test]
+fn too_little_address_space_is_said_before_a_driver_faults() {
+    let place = Place::new();
+    let program = command("").get_program().to_str().unwrap().to_owned();
+    for kilobytes in [300_000, 600_000] {
+        let line =
+            format!("ulimit -v {kilobytes}; exec {program} {}", place.train("run", "--steps 1"));
+        let output = Command::new("sh").args(["-c", &line]).output().unwrap();
+        let stderr = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(4), "{stderr}");
+        assert!(stderr.contains("`ulimit -v`") && stderr.lines().count() == 1, "{stderr}");
+    }
 }

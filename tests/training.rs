@@ -259,6 +259,33 @@ fn a_loss_that_is_not_finite_names_step_view_and_term() {
 }
 
 #[test]
+fn a_parameter_that_is_not_finite_ends_the_run_with_step_and_plane_and_reaches_no_file() {
+    let (dataset, config) = (dataset(), config());
+    let mut gaussians =
+        Trainer::new(&gpu(), config.clone(), &dataset).unwrap().gaussians().unwrap();
+    gaussians.quats_mut()[7][2] = f32::NAN;
+    let mut trainer = Trainer::from_gaussians(&gpu(), config, &dataset, &gaussians).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("checkpoint.safetensors");
+    let refused = trainer.save_checkpoint(&path).unwrap_err().to_string();
+    assert!(refused.contains("step 0: number 7 of quats is not finite"), "{refused}");
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+    // No round of density control comes before the look.
+    let error = loop {
+        match trainer.advance(60) {
+            Ok(reports) => {
+                assert!(reports.iter().all(|report| report.step < 60), "it went unnoticed");
+            }
+            Err(error) => break error,
+        }
+    };
+    assert!(
+        matches!(&error, Error::ParameterNotFinite { step: 50..=60, plane, .. } if plane == "quats"),
+        "{error}"
+    );
+}
+
+#[test]
 fn a_set_without_points_begins_with_random_ones() {
     let mut dataset = dataset();
     dataset.points.clear();

@@ -114,7 +114,7 @@ pub fn spread(centers: &[DVec3]) -> (DVec3, f64) {
 /// Whether a camera stands where [`spread`] leaves it out.
 pub fn stands_elsewhere(center: DVec3, (mean, extent): (DVec3, f64)) -> bool {
     // Within the spread every camera is nearer than its extent.
-    extent > 0.0 && !(center.distance(mean) <= extent)
+    extent > 0.0 && center.distance(mean) > extent
 }
 
 /// The median; 0 of nothing.

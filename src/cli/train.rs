@@ -30,6 +30,9 @@ use crate::train::{
 /// where the dataset has them, are only ever used for scores. What the model has is decided by looking at the photographs
 /// first (`nightsplat diagnose`), and said; any option wins over that. With --config, or a preset that states it all
 /// (paper, or a benchmark's), nothing is decided.
+///
+/// SIGINT and SIGTERM save and stop, with exit code 130 or 143, and a second one ends the process at once; SIGUSR1 saves and
+/// goes on. --resume goes on from there to the same bits; where the run is done it does nothing and succeeds.
 #[derive(Clone, Debug, clap::Args)]
 pub struct TrainArgs {
     /// The dataset: a folder with transforms*.json (LOM, RealX3D, NeRF) or a COLMAP model in sparse/, as `nightsplat pose` makes one

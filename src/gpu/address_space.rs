@@ -37,7 +37,9 @@ mod tests {
     #[test]
     fn the_limit_is_read_where_there_is_one() {
         let table = |value: &str| {
-            format!("Limit  Soft Limit  Hard Limit  Units\nMax address space  {value}  unlimited  bytes\n")
+            format!(
+                "Limit  Soft Limit  Hard Limit  Units\nMax address space  {value}  unlimited  bytes\n"
+            )
         };
         assert_eq!(limit(&table("307200000")), Some(307_200_000));
         assert_eq!(limit(&table("unlimited")), None);

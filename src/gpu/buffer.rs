@@ -250,7 +250,7 @@ impl Memory {
         // SAFETY: the device is live; the buffer is bound once to memory that satisfies its requirements.
         unsafe {
             let raw =
-                shared.device.create_buffer(&info, None).map_err(out_of_memory(name, bytes))?;
+                shared.device.create_buffer(&info, None).map_err(out_of_memory(name, size))?;
             let requirements = shared.device.get_buffer_memory_requirements(raw);
             let desc = AllocationCreateDesc {
                 name,
@@ -265,7 +265,7 @@ impl Memory {
             };
             let allocation = allocated.map_err(|error| {
                 shared.device.destroy_buffer(raw, None);
-                out_of_memory(name, bytes)(error)
+                out_of_memory(name, size)(error)
             })?;
             let bound =
                 shared.device.bind_buffer_memory(raw, allocation.memory(), allocation.offset());

@@ -13,7 +13,9 @@ use gpu_allocator::vulkan::{Allocator, AllocatorCreateDesc};
 use super::checked::Checks;
 use super::cooperative::{self, CooperativeMatrix};
 use super::requirements::{EXTENSIONS, Offered, required_device_features};
-use super::{Gpu, Properties, Queue, REQUIREMENTS, Shared, statistics, tuning, validation};
+use super::{
+    Gpu, Properties, Queue, REQUIREMENTS, Shared, address_space, statistics, tuning, validation,
+};
 use crate::{Error, Result};
 
 /// What to install where there is no Vulkan; the same words for a missing loader and a missing driver.
@@ -187,6 +189,7 @@ impl Gpu {
     }
 
     fn open(choice: &DeviceChoice, validate: bool, takes_tuning: bool) -> Result<Self> {
+        address_space::check()?;
         let mut owned = instance(validate)?;
         let opened = choose(&owned.instance, choice).and_then(|(physical, offered)| {
             owned.cache_path = cache_path(&offered);

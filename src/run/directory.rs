@@ -22,7 +22,6 @@
 //! whole. The model is written with every checkpoint, too: a run that was stopped can be looked at. While a process trains
 //! in it, it holds `.lock`.
 
-use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::{BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
@@ -39,11 +38,10 @@ use crate::camera::Frame;
 use crate::dataset::{Dataset, Split, View};
 use crate::diagnose::Plan;
 use crate::exposure::{Affine, table};
-use crate::gpu::Gpu;
 use crate::loss::Term;
 use crate::output::{csv_field, write_whole};
-use crate::scene::{Features, Gaussians, ply};
-use crate::train::{ModelConfig, Networks, StepReport, TrainConfig, Trainer};
+use crate::scene::{Gaussians, ply};
+use crate::train::{Networks, StepReport, TrainConfig, Trainer};
 use crate::{Error, Result};
 
 /// A run directory and the log that grows in it.
@@ -92,7 +90,7 @@ const HELD_OUT: &str = "held_out.csv";
 const PROGRESS: &str = "evals.csv";
 
 /// Name, split and size of every view.
-const VIEWS: &str = "views.csv";
+pub(super) const VIEWS: &str = "views.csv";
 
 /// The folder of event files.
 const TENSORBOARD: &str = "tensorboard";
@@ -110,10 +108,10 @@ pub(crate) const TARGET_EXPOSURE: &str = "target_exposure";
 pub(crate) const SPENT: &str = "spent";
 
 /// Gain and bias of the training views.
-const EXPOSURES: &str = "exposures.csv";
+pub(super) const EXPOSURES: &str = "exposures.csv";
 
 /// The weights of the networks.
-const NETWORKS: &str = "networks.safetensors";
+pub(super) const NETWORKS: &str = "networks.safetensors";
 
 /// The sign that the run is whole, and what it is of.
 pub(super) const DONE: &str = "done.json";
@@ -437,29 +435,8 @@ pub fn load_progress(run: &Path) -> Vec<Progress> {
     text.lines().filter_map(Progress::parse).collect()
 }
 
-/// How the views of a dataset differ from those that a run was trained and scored on, in words; none where they are the
-/// same, or the run does not say which those were.
-pub fn other_views(run: &Path, dataset: &Dataset) -> Option<String> {
-    let text = std::fs::read_to_string(run.join(VIEWS)).ok()?;
-    let own: BTreeSet<&str> = text.lines().skip(1).collect();
-    let lines = view_lines(dataset);
-    let others: BTreeSet<&str> = lines.iter().map(String::as_str).collect();
-    let [gone, new] = [own.difference(&others), others.difference(&own)].map(|lines| {
-        let lines: Vec<&str> = lines.copied().collect();
-        lines.first().map(|first| format!("{} (the first: {first})", lines.len()))
-    });
-    match (gone, new) {
-        (None, None) => None,
-        (Some(gone), Some(new)) => {
-            Some(format!("{gone} views of the run are not in it, {new} are new"))
-        }
-        (Some(gone), None) => Some(format!("{gone} views of the run are not in it")),
-        (None, Some(new)) => Some(format!("{new} views are new")),
-    }
-}
-
 /// A line for every view.
-fn view_lines(dataset: &Dataset) -> Vec<String> {
+pub(super) fn view_lines(dataset: &Dataset) -> Vec<String> {
     let line = |view: &View| {
         let split = match view.split {
             Split::Train => "train",
@@ -529,53 +506,6 @@ pub fn plan_of(run: &Path) -> Option<PathBuf> {
     Some(run.join(PLAN)).filter(|path| path.is_file())
 }
 
-/// The trained Gaussians of a run.
-///
-/// # Errors
-/// The run has not been trained to its end or a checkpoint, or the file is cut short.
-pub fn load_model(run: &Path, raw_colors: bool) -> Result<Gaussians> {
-    let path = run.join("model.ply");
-    if !path.is_file() {
-        let problem = "has no model.ply: the run did not finish, nor come to a checkpoint; train it again, or go on with \
-                       --resume";
-        return Err(Error::input(run, problem));
-    }
-    let mut gaussians = ply::load(path)?;
-    if raw_colors {
-        gaussians.shift_colors(0.5);
-    }
-    Ok(gaussians)
-}
-
-/// The trained networks of a run; none where its model has none. `features` are those that its Gaussians came to have:
-/// a part that found nothing to learn from has none, whatever the configuration asks for.
-///
-/// # Errors
-/// Their file is missing or damaged, or holds networks of another configuration.
-pub fn load_networks(
-    gpu: &Gpu,
-    run: &Path,
-    model: &ModelConfig,
-    features: Features,
-) -> Result<Option<Networks>> {
-    if !model.denoiser && !model.tonemapper {
-        return Ok(None);
-    }
-    let mut networks = Networks::new(gpu, model, features, 0)?;
-    networks.load(&run.join(NETWORKS))?;
-    Ok(Some(networks))
-}
-
-/// What the exposures of a run's training views make of its model, by name; none where it has learned none.
-///
-/// # Errors
-/// The file is damaged.
-pub fn load_exposures(run: &Path) -> Result<BTreeMap<String, Affine>> {
-    let path = run.join(EXPOSURES);
-    let known = if path.is_file() { table::load(&path)? } else { vec![] };
-    Ok(known.into_iter().filter_map(|known| Some((known.name, known.affine?))).collect())
-}
-
 fn remove(run: &Path, files: &[&str]) -> Result<()> {
     for file in files.iter().map(|file| run.join(file)).filter(|file| file.exists()) {
         std::fs::remove_file(&file).map_err(|error| unwritable(&file, &error))?;
@@ -598,6 +528,7 @@ fn remove_events(run: &Path) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::run::load_model;
 
     #[test]
     fn a_run_is_only_replaced_when_asked() {

@@ -3,9 +3,10 @@
 use std::path::PathBuf;
 use std::str::FromStr;
 
+use glam::UVec2;
 use serde::{Deserialize, Serialize};
 
-use crate::loss::Weights;
+use crate::loss::{DepthBoxes, Weights};
 use crate::nn::{Denoiser, DenoiserSettings, Form, Tonemapper};
 use crate::scene::Features;
 use crate::{Error, Result};
@@ -199,6 +200,23 @@ impl ModelConfig {
             return Err(Error::Usage(problem));
         }
         Ok(())
+    }
+}
+
+/// Says where the parts of a model see less than they are set to.
+pub(super) fn say_what_parts_see(model: &ModelConfig, sizes: &[UVec2]) {
+    let shortest = sizes.iter().map(|size| size.min_element()).min().unwrap_or_default();
+    let boxes = DepthBoxes::new(UVec2::splat(shortest), model.depth_box);
+    if model.depth && boxes.side < model.depth_box {
+        let (wanted, side) = (model.depth_box, boxes.side);
+        tracing::warn!(
+            "depth boxes of {wanted} pixels exceed the views: {side} pixels in the smallest"
+        );
+    }
+    let longest = sizes.iter().map(|size| size.max_element()).max().unwrap_or_default();
+    if (model.denoiser || model.tonemapper) && model.denoiser_crop > longest {
+        let crop = model.denoiser_crop;
+        tracing::warn!("a crop of {crop} pixels exceeds every view: the networks see whole views");
     }
 }
 

@@ -1,0 +1,69 @@
+//! Where a scene lies, how large it is, and what lies so far from it that it is none of it.
+
+use glam::DVec3;
+
+use super::Dataset;
+use crate::camera::{Frame, frame};
+
+impl Dataset {
+    /// The scene's size as 3DGS takes it: 1.1 times the largest distance of a training camera to their mean, world units.
+    /// Where all stand in one spot, half of the points are within it; without points it is 1.
+    pub fn extent(&self) -> f64 {
+        self.place().1
+    }
+
+    /// Where the scene is trained.
+    pub fn frame(&self) -> Frame {
+        let (center, extent) = self.place();
+        Frame::new(center, extent)
+    }
+
+    /// The middle of the training cameras, and the extent.
+    fn place(&self) -> (DVec3, f64) {
+        let centers = self.train_views().map(|view| view.camera.center());
+        let (center, spread) = frame::spread(&centers.collect::<Vec<DVec3>>());
+        if spread > 0.0 {
+            return (center, spread);
+        }
+        let mut away: Vec<f64> =
+            self.points.iter().map(|point| point.position.distance(center)).collect();
+        let half = away.len() / 2;
+        let typical = (!away.is_empty())
+            .then(|| *away.select_nth_unstable_by(half, f64::total_cmp).1)
+            .filter(|&distance| distance > 0.0);
+        (center, typical.unwrap_or(1.0))
+    }
+
+    /// Leaves out the points that no number of the device holds or that lie a million extents away: they are of no use, and
+    /// what they are made of would not stay finite.
+    pub(super) fn leave_out_far_points(&mut self) {
+        const MOST_EXTENTS: f64 = 1e6;
+        let (center, extent) = self.place();
+        let before = self.points.len();
+        // Positive phrasing: a NaN fails the test too.
+        self.points.retain(|point| point.position.distance(center) <= MOST_EXTENTS * extent);
+        let gone = before - self.points.len();
+        if gone > 0 {
+            tracing::warn!(
+                "{}: {gone} of {before} points lie more than a million times the cameras' extent away, or nowhere; they are \
+                 left out",
+                self.root.display()
+            );
+        }
+    }
+
+    /// Says which training cameras stand far from all others.
+    pub(super) fn say_what_stands_elsewhere(&self) {
+        let (center, extent) = self.place();
+        for view in self.train_views() {
+            let own = view.camera.center();
+            if frame::stands_elsewhere(own, (center, extent)) {
+                tracing::warn!(
+                    "view {} stands {:.0e} extents of the other cameras away from them; check its pose",
+                    view.name,
+                    own.distance(center) / extent
+                );
+            }
+        }
+    }
+}
