@@ -1,5 +1,5 @@
 //! Runs as their users meet them: without references, with another split, stopped on the way, opened elsewhere, seen from a
-//! path, watched by TensorBoard.
+//! path, watched by `TensorBoard`.
 #![cfg(feature = "cli")]
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -155,7 +155,9 @@ fn a_run_that_was_stopped_is_rendered_scored_and_made_longer_with_a_lower_cap() 
     let model = |run: &str| fs::read(path(run).join("model.ply")).unwrap();
     let whole = model("run");
     // As it would be had it been killed behind its last checkpoint.
-    fs::remove_file(path("run/metrics.json")).unwrap();
+    for file in ["metrics.json", "done.json"] {
+        fs::remove_file(path("run").join(file)).unwrap();
+    }
     fs::copy(path("ten/model.ply"), path("run/model.ply")).unwrap();
     assert_eq!(stopped_at(&path("run")), Some(10));
     let run_folder = path("run").display().to_string();
@@ -382,7 +384,8 @@ fn views_that_a_device_cannot_train_on_are_refused_from_their_headers_with_the_s
     for file in fs::read_dir(&low).unwrap().map(|entry| entry.unwrap().path()) {
         let mut encoder = png::Encoder::new(fs::File::create(file).unwrap(), 12_000, 8_000);
         encoder.set_color(png::ColorType::Rgb);
-        drop(encoder.write_header().unwrap());
+        let mut writer = encoder.write_header().unwrap();
+        writer.write_chunk(png::chunk::IDAT, &[]).unwrap();
     }
     let arguments = train(folder.path(), "run", "--max-resolution 0");
     refused(&arguments, 2, &["is 12000x8000", "binds", "--max-resolution to "]);

@@ -30,6 +30,7 @@ use crate::train::{Preset, TrainConfig};
 /// p10 / p90; EV are stops more light than the other views show of the same points; noise is
 /// its standard deviation at the mean, in linear light; blur is that of the edges, in pixels;
 /// overlap is how much of what a view shows the others look at. No reference image is looked at.
+#[expect(clippy::doc_markdown, reason = "in help, {setting} stands for its default")]
 #[derive(Clone, Debug, clap::Args)]
 #[command(verbatim_doc_comment)]
 pub struct DiagnoseArgs {

@@ -9,7 +9,7 @@
 //!     held_out.csv   scores of the views that were kept from training, where there are any
 //!     evals.csv      scores of the test views on the way, with what it took, where they are asked for
 //!     views.csv      every view, what it is for and how large it is
-//!     tensorboard/   the same for TensorBoard, where that is asked for
+//!     tensorboard/   the same for `TensorBoard`, where that is asked for
 //!     exposures.csv  gain and bias of the training views, where they are learned
 //!     hashes.csv     checksums of the parameters on the way, where they are asked for
 //!     checkpoint.safetensors  what the run goes on from, overwritten every so many steps
@@ -305,7 +305,7 @@ impl RunDirectory {
         write_whole(&self.path.join(VIEWS), text.as_bytes())
     }
 
-    /// Begins event files for TensorBoard, behind a step.
+    /// Begins event files for `TensorBoard`, behind a step.
     pub(super) fn events(&self, step: u64) -> Result<EventFile> {
         EventFile::create(&self.path.join(TENSORBOARD), step)
     }

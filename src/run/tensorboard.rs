@@ -1,4 +1,4 @@
-//! Event files as TensorBoard reads them: numbers and pictures over the steps of a run.
+//! Event files as `TensorBoard` reads them: numbers and pictures over the steps of a run.
 //!
 //! A file is records of (length u64, masked CRC-32C of that, bytes, masked CRC-32C of those), little-endian, as TensorFlow's
 //! `TFRecord` has them; the bytes are a protocol buffer `tensorflow.Event`, of which a few fields are written.

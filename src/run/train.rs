@@ -205,7 +205,7 @@ struct Course<'a> {
     progress: Vec<Progress>,
     /// Once something was scored.
     yardstick: Option<Yardstick>,
-    /// For TensorBoard, once there is something to tell.
+    /// For `TensorBoard`, once there is something to tell.
     events: Option<EventFile>,
 }
 
@@ -320,7 +320,7 @@ impl<'a> Course<'a> {
 }
 
 impl Course<'_> {
-    /// Writes what TensorBoard draws over the steps, of every tenth.
+    /// Writes what `TensorBoard` draws over the steps, of every tenth.
     fn tell_events(&mut self, directory: &RunDirectory, reports: &[StepReport]) -> Result<()> {
         const EVERY: u64 = 10;
         let events = match &mut self.events {

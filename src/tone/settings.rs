@@ -401,7 +401,7 @@ impl TryFrom<Written> for ToneSettings {
         if written.family.is_some() {
             static SAID: std::sync::Once = std::sync::Once::new();
             SAID.call_once(|| {
-                tracing::warn!("`family` of a curve is called `curve` now; the old name is read")
+                tracing::warn!("`family` of a curve is called `curve` now; the old name is read");
             });
             if written.curve.is_some() {
                 return Err(

@@ -99,7 +99,7 @@ pub struct TrainConfig {
     pub max_minutes: f64,
     /// Logs a checksum of every plane of the parameters every so many steps; 0: never.
     pub hash_every: u64,
-    /// Leaves event files for TensorBoard.
+    /// Leaves event files for `TensorBoard`.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub tensorboard: bool,
     /// Steps whose every pass is compared with its CPU reference.
