@@ -276,13 +276,6 @@ mod tests {
                 (degrees - WIDEST).abs() < 1e-3 || (!is_cropped && degrees < WIDEST),
                 "{degrees}"
             );
-            let ours = map.apply(&image_of(&lens, lens.focal, distortion));
-            let pinhole = image_of(&lens, map.focal, NONE);
-            // The waves beyond 50 degrees are shorter than the pixels of the fisheye.
-            let middle = |image: &Image| image.pixel(50, 37);
-            for (a, b) in middle(&ours).into_iter().zip(middle(&pinhole)) {
-                assert!((a - b).abs() < 1e-2, "{a} {b}");
-            }
         }
     }
 
