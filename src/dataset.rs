@@ -208,7 +208,6 @@ impl Dataset {
         }
         let files = Files::default();
         let Listing { mut frames, mut skipped, remarks } = list(root, &files)?;
-        warn(&remarks);
         say_whose_split_gives_way(root, &frames, options);
         split(root, &mut frames, options.test_every, &files)?;
 
@@ -221,6 +220,8 @@ impl Dataset {
             );
             return Err(Error::input(root, problem));
         }
+        // Behind what may end it: an error is said alone.
+        warn(&remarks);
         let views = with_held_out(views, options.hold_out);
         let points = points(root, &views)?;
         for line in &skipped {
