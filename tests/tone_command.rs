@@ -117,24 +117,24 @@ fn bad_input_is_named_in_one_line() {
         assert!(message.contains(part) && !message.contains('\n'), "{message}");
         assert_eq!(error.exit_code(), code, "{message}");
     };
-    fails(args(&path("absent"), out.clone()), "absent", 1);
+    fails(args(&path("absent"), out.clone()), "absent", 3);
 
     std::fs::create_dir(path("empty")).unwrap();
-    fails(args(&path("empty"), out.clone()), "no PNG, JPEG, WebP, TIFF or EXR", 1);
+    fails(args(&path("empty"), out.clone()), "no PNG, JPEG, WebP, TIFF or EXR", 3);
 
     std::fs::write(path("broken.png"), b"no image").unwrap();
-    fails(args(&path("broken.png"), out.clone()), "broken.png", 1);
+    fails(args(&path("broken.png"), out.clone()), "broken.png", 3);
 
     std::fs::create_dir(path("all_broken")).unwrap();
     for name in ["all_broken/a.png", "all_broken/b.png"] {
         std::fs::write(path(name), b"no image").unwrap();
     }
-    fails(args(&path("all_broken"), out.clone()), "b.png", 1);
+    fails(args(&path("all_broken"), out.clone()), "b.png", 3);
 
     std::fs::create_dir(path("twins")).unwrap();
     dark(4, 4).save_png8(path("twins/a.png")).unwrap();
     dark(4, 4).save_exr(path("twins/a.exr")).unwrap();
-    fails(args(&path("twins"), out.clone()), "same file", 1);
+    fails(args(&path("twins"), out.clone()), "same file", 3);
 
     dark(4, 4).save_png8(path("good.png")).unwrap();
     let before = std::fs::read(path("good.png")).unwrap();
@@ -421,7 +421,7 @@ fn a_well_lit_folder_stays_as_it_is_and_a_black_one_is_refused() {
     Image::filled(40, 30, [0.004; 3]).save_png8(folder.join("a.png")).unwrap();
     let error = apply(&args).unwrap_err();
     assert!(error.to_string().contains("as good as black"), "{error}");
-    assert_eq!(error.exit_code(), 1);
+    assert_eq!(error.exit_code(), 3);
     let refused = |args: ToneArgs, part: &str| {
         let message = in_options(&apply(&args).unwrap_err().to_string());
         assert!(message.contains(part) && !message.contains('\n'), "{message}");
