@@ -31,5 +31,5 @@ fn without_a_loader_the_remedy_is_said() {
     std::fs::write(folder.path().join("libvulkan.so.1"), "").unwrap();
     let environment = [("LD_LIBRARY_PATH", folder.path().to_str().unwrap())];
     let remedy = ["there is no Vulkan loader", "apt install libvulkan1"];
-    refused_with("doctor --json", &environment, 1, &remedy);
+    refused_with("doctor --json", &environment, 4, &remedy);
 }

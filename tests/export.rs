@@ -12,7 +12,9 @@ use common::command::{refused, succeed};
 fn trained(folder: &Path) -> String {
     let root = folder.display();
     succeed(&format!("synth {root}/set --views 9 --width 40 --height 32"));
-    succeed(&format!("train {root}/set --out {root}/run --curve ase --steps 12 --progress none"));
+    succeed(&format!(
+        "train {root}/set --out {root}/run --plan none --curve ase --steps 12 --progress none"
+    ));
     format!("{root}/run")
 }
 

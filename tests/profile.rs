@@ -55,7 +55,7 @@ fn a_profile_is_fitted_frozen_used_and_named_with_every_result() {
     let again: Value = serde_json::from_str(&succeed(&format!("eval {out} --json"))).unwrap();
     assert_eq!(again["with_reference"], LABEL);
     let plain = path("plain");
-    assert!(!succeed(&format!("{train} --out {plain}")).contains("reference"));
+    assert!(!succeed(&format!("{train} --out {plain}")).contains(LABEL));
     assert_eq!(metrics(&plain)["with_reference"], Value::Null);
 
     fs::rename(format!("{file}.again"), &file).unwrap();

@@ -228,7 +228,7 @@ fn misuse_is_refused_before_anything_is_trained() {
     refused("--curves all --reference nowhere", 3, &["nowhere"]);
     let nowhere = tempfile::tempdir().unwrap().path().join("set");
     let arguments = format!("sweep {0} --out {0}/out --curves all", nowhere.display());
-    let (_, said) = run(&arguments, 1);
+    let (_, said) = run(&arguments, 3);
     assert!(said.contains("is not a folder") && !nowhere.exists(), "{said}");
 }
 

@@ -181,7 +181,7 @@ fn misuse_is_refused_before_anything_is_trained() {
     refused("--device voodoo", 4, &["voodoo"]);
     refused("--reference nowhere", 3, &["nowhere"]);
     let nowhere = tempfile::tempdir().unwrap().path().join("set");
-    let (_, said) = run(&format!("tradeoff {0} --out {0}/out", nowhere.display()), 1);
+    let (_, said) = run(&format!("tradeoff {0} --out {0}/out", nowhere.display()), 3);
     assert!(said.contains("is not a folder") && !nowhere.exists(), "{said}");
 
     // A set of one photograph has none to score.
@@ -194,7 +194,7 @@ fn misuse_is_refused_before_anything_is_trained() {
         fs::write(path, list.to_string()).unwrap();
     }
     let tradeoff = Tradeoff::of(one.path(), "--steps 2");
-    let (_, said) = run(&tradeoff.arguments, 1);
+    let (_, said) = run(&tradeoff.arguments, 3);
     let line = said.lines().last().unwrap();
     assert!(line.contains(one.path().to_str().unwrap()), "{line}");
     assert!(line.contains("no held-out view to score"), "{line}");

@@ -96,7 +96,7 @@ pub fn run(args: &ExportArgs) -> Result<()> {
     if let Some(step) = run::stopped_at(&args.run) {
         tracing::warn!("{}: stopped at step {step} of {}", args.run.display(), config.steps);
     }
-    if config.model.denoiser || config.model.tonemapper {
+    if has_networks(&config) {
         tracing::warn!(
             "{}: its networks stay behind; what is exported is the splat alone",
             args.run.display()
@@ -128,6 +128,10 @@ pub fn run(args: &ExportArgs) -> Result<()> {
     Ok(writeln!(std::io::stdout(), "{line}")?)
 }
 
+fn has_networks(config: &TrainConfig) -> bool {
+    config.model.denoiser || config.model.tonemapper
+}
+
 fn is_same(a: &Path, b: &Path) -> bool {
     a.canonicalize().ok().zip(b.canonicalize().ok()).is_some_and(|(a, b)| a == b)
 }
@@ -151,7 +155,7 @@ fn page(
 ) -> Result<String> {
     let frame = config.frame.unwrap_or_default();
     let title = format!("{} by nightsplat", provenance.dataset);
-    let bookmarks = if config.model.denoiser || config.model.tonemapper {
+    let bookmarks = if has_networks(config) {
         let FinishedRun { mut player, dataset, .. } =
             FinishedRun::open(&args.run, args.dataset.as_deref(), args.device.as_ref())?;
         bookmarks(args, config, &dataset, |view| {

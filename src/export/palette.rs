@@ -61,14 +61,14 @@ pub(super) fn vectors(points: &[f32], width: usize, size: usize) -> (Vec<f32>, V
     }
     while heap.len() < size {
         let Some(cell) = heap.pop() else { break };
-        if !(cell.error > 0.0) {
+        if cell.error <= 0.0 {
             heap.push(cell);
             break;
         }
         let part = &mut order[cell.range.clone()];
         let value = |point: u32| points[width * point as usize + cell.axis];
         // Stable, so that the same points give the same cells everywhere.
-        part.sort_by(|&a, &b| (value(a) > cell.mean).cmp(&(value(b) > cell.mean)));
+        part.sort_by_key(|&point| value(point) > cell.mean);
         let middle = cell.range.start + part.partition_point(|&point| value(point) <= cell.mean);
         if middle == cell.range.start || middle == cell.range.end {
             heap.push(Cell { error: 0.0, ..cell });
