@@ -24,8 +24,8 @@ mod raw;
 
 #[cfg(feature = "io")]
 pub use exif::exposure_value;
-#[cfg(feature = "cli")]
-pub(crate) use jpeg::exif_segment;
+#[cfg(feature = "io")]
+pub use jpeg::exif_segment;
 pub use mask::Mask;
 #[cfg(feature = "io")]
 pub use orientation::Orientation;

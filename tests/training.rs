@@ -4,7 +4,6 @@
 
 use glam::{DVec2, UVec2, Vec3};
 use nightsplat::Error;
-use nightsplat::attributes::Attribute;
 use nightsplat::dataset::{Dataset, Split};
 use nightsplat::densify::DensityControl;
 use nightsplat::eval::{self, Player};

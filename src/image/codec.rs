@@ -154,7 +154,7 @@ impl Image {
     ///
     /// # Errors
     /// [`Error::Output`] names the file; nothing half-written is left under its name.
-    pub(crate) fn save_jpeg(&self, path: impl AsRef<Path>, exif: Option<&[u8]>) -> Result<()> {
+    pub fn save_jpeg(&self, path: impl AsRef<Path>, exif: Option<&[u8]>) -> Result<()> {
         const QUALITY: u8 = 97;
         let path = path.as_ref();
         let mut file = Vec::new();

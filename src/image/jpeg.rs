@@ -31,7 +31,7 @@ pub(super) fn load(path: &Path, bytes: &[u8]) -> Result<Option<Image>> {
 }
 
 /// The Exif segment of a JPEG file, marker and length before it, said to be stored upright; none where it has none.
-pub(crate) fn exif_segment(bytes: &[u8]) -> Option<Vec<u8>> {
+pub fn exif_segment(bytes: &[u8]) -> Option<Vec<u8>> {
     const EXIF: u8 = 0xE1;
     let mut at = MAGIC.len();
     loop {
