@@ -198,14 +198,6 @@ impl Dataset {
     pub fn load(root: impl AsRef<Path>, options: &LoadOptions) -> Result<Self> {
         let root = root.as_ref();
         options.check()?;
-        if !root.is_dir() {
-            let problem = if root.is_file() {
-                "is a file, not a folder; of a clip `nightsplat pose` makes a dataset"
-            } else {
-                "is not a folder; name the dataset's folder"
-            };
-            return Err(Error::input(root, problem));
-        }
         let files = Files::default();
         let Listing { mut frames, mut skipped, remarks } = list(root, &files)?;
         say_whose_split_gives_way(root, &frames, options);

@@ -28,7 +28,7 @@ use crate::{Error, Result};
 use geometry::Shared;
 pub use noise::Noise;
 use photograph::Measured;
-pub use plan::{Fingerprint, Number, Plan, Switch};
+pub use plan::{Number, Plan, PlannedViews, Switch};
 
 /// A view this many times as blurred as the median is named, and at least so many pixels more.
 const BLURRED: [f64; 2] = [1.6, 0.7];
@@ -138,7 +138,7 @@ pub struct Diagnosis {
     /// How many training views have a depth map.
     pub depth_maps: usize,
     #[serde(skip)]
-    fingerprint: Fingerprint,
+    fingerprint: PlannedViews,
 }
 
 impl Diagnosis {
@@ -194,7 +194,7 @@ impl Diagnosis {
             scene,
             views: own,
             depth_maps: views.iter().filter(|(_, view)| view.depth.is_some()).count(),
-            fingerprint: Fingerprint::of(dataset),
+            fingerprint: PlannedViews::of(dataset),
         })
     }
 
@@ -313,11 +313,6 @@ fn target_noise(noise: Noise, light: f64, exposure: &Exposure, shared: &Shared) 
     let slope = (soft(encoded + step) - soft(encoded - step)) / (2.0 * step);
     let slope = weight * slope + (1.0 - weight);
     slope * noise.deviation(light) / noise::slope(light) / shared.views_per_point.max(1.0).sqrt()
-}
-
-/// The hash FNV-1a of some bytes or words: equal ones have equal hashes, on every machine.
-fn fnv1a(words: impl Iterator<Item = u64>) -> u64 {
-    words.fold(0xcbf2_9ce4_8422_2325, |hash, word| (hash ^ word).wrapping_mul(0x0100_0000_01b3))
 }
 
 /// The standard deviation; none of fewer than two values.

@@ -10,9 +10,13 @@ mod palette;
 pub mod sog;
 pub mod spz;
 
+use std::io::Write as _;
+
+use flate2::{Compression, write::GzEncoder};
 use glam::Vec3;
 
 use crate::scene::Gaussians;
+use crate::{Error, Result};
 
 /// Where a model comes from: what a file says of itself.
 #[derive(Clone, Debug, Default)]
@@ -77,6 +81,12 @@ fn unit([w, x, y, z]: [f32; 4]) -> [f32; 4] {
 
 fn sigmoid(x: f32) -> f32 {
     1.0 / (1.0 + (-x).exp())
+}
+
+fn gzip(bytes: &[u8]) -> Result<Vec<u8>> {
+    let mut encoder = GzEncoder::new(vec![], Compression::best());
+    let written = encoder.write_all(bytes).and_then(|()| encoder.finish());
+    written.map_err(|error| Error::output("an export", format!("cannot be compressed: {error}")))
 }
 
 #[cfg(test)]

@@ -53,7 +53,7 @@ impl Measured {
             patches,
             blur: blur(image),
             unevenness: unevenness(&luminance, image.width as usize),
-            checksum: super::fnv1a(image.data.iter().map(|value| value.to_bits().into())),
+            checksum: crate::hash::of(bytemuck::cast_slice(&image.data)),
         }
     }
 }

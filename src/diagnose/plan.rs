@@ -4,7 +4,7 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use super::{Diagnosis, SceneDiagnosis, fnv1a};
+use super::{Diagnosis, SceneDiagnosis};
 use crate::dataset::{Dataset, View};
 use crate::scene::{Features, Shape, width};
 use crate::tone::ToneCurve;
@@ -58,7 +58,7 @@ pub struct Number {
 /// Which dataset a plan is for: its training views by name and loaded size.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Fingerprint {
+pub struct PlannedViews {
     /// How many.
     pub views: usize,
     /// Width and height of the first.
@@ -67,7 +67,7 @@ pub struct Fingerprint {
     pub fingerprint: String,
 }
 
-impl Fingerprint {
+impl PlannedViews {
     /// The dataset's own.
     pub fn of(dataset: &Dataset) -> Self {
         let views: Vec<_> = dataset.views.iter().filter(|view| view.is_for_training()).collect();
@@ -93,7 +93,7 @@ pub struct Plan {
     #[serde(default)]
     pub left_out: Vec<String>,
     /// Which dataset it is for.
-    pub dataset: Fingerprint,
+    pub dataset: PlannedViews,
     /// A tone curve makes the targets; else the photographs are.
     pub curve: Switch,
     /// Each view's exposure is learned.
@@ -200,7 +200,7 @@ impl Plan {
                 format!("is no plan: {message}{place}; make one with `nightsplat diagnose`"),
             )
         })?;
-        let own = Fingerprint::of(dataset);
+        let own = PlannedViews::of(dataset);
         if plan.dataset != own {
             let (of, is) = (plan.dataset.described(), own.described());
             let problem = format!(
@@ -324,4 +324,9 @@ fn max_gaussians(
         format!("one for {PIXELS_PER_GAUSSIAN} of the {pixels:.0} pixels to train on")
     };
     Number { value: wanted.min(fitting).min(limit).round().max(1.0) as u64, why }
+}
+
+/// The hash FNV-1a, which plans hold: equal bytes have equal hashes, on every machine.
+fn fnv1a(bytes: impl Iterator<Item = u64>) -> u64 {
+    bytes.fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ byte).wrapping_mul(0x0100_0000_01b3))
 }

@@ -6,8 +6,7 @@
 use half::f16;
 use serde_json::json;
 
-use super::spz::gzip;
-use super::{GENERATOR, Provenance};
+use super::{GENERATOR, Provenance, gzip};
 use crate::Result;
 use crate::camera::Camera;
 use crate::image::Image;

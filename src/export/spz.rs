@@ -3,12 +3,9 @@
 //! Version 4 has a plain header, a table and a Zstandard stream for each attribute; version 3, which more readers know, one
 //! gzip stream of a shorter header and the same bytes. Axes are those of OpenGL.
 
-use std::io::Write as _;
-
-use flate2::{Compression, write::GzEncoder};
 use ruzstd::encoding::{CompressionLevel, compress_to_vec};
 
-use super::{half_turn, sigmoid, unit};
+use super::{gzip, half_turn, sigmoid, unit};
 use crate::scene::{Gaussians, rest_coefficients};
 use crate::{Error, Result};
 
@@ -74,12 +71,6 @@ pub fn encode(gaussians: &Gaussians, version: Version) -> Result<Vec<u8>> {
             Ok(file)
         }
     }
-}
-
-pub(super) fn gzip(bytes: &[u8]) -> Result<Vec<u8>> {
-    let mut encoder = GzEncoder::new(vec![], Compression::best());
-    let written = encoder.write_all(bytes).and_then(|()| encoder.finish());
-    written.map_err(|error| Error::output("an export", format!("cannot be compressed: {error}")))
 }
 
 /// As many as leave room for the farthest position.

@@ -150,19 +150,27 @@ impl Image {
         self.interleaved().map(|value| (value.clamp(0.0, 1.0) * 255.0).round() as u8).collect()
     }
 
+    /// A JPEG file of a quality from 1 to 100, values clamped to [0, 1].
+    ///
+    /// # Errors
+    /// [`Error::Output`] where the image has no pixels, or more to a side than JPEG counts.
+    pub fn to_jpeg(&self, quality: u8) -> Result<Vec<u8>> {
+        let mut file = Vec::new();
+        JpegEncoder::new_with_quality(&mut file, quality)
+            .write_image(&self.to_rgb8(), self.width, self.height, ExtendedColorType::Rgb8)
+            .map_err(|error| Error::output("a picture", format!("cannot be encoded: {error}")))?;
+        Ok(file)
+    }
+
     /// Writes a JPEG of little loss, values clamped to [0, 1], with an Exif segment, where there is one, behind its start.
     ///
     /// # Errors
     /// [`Error::Output`] names the file; nothing half-written is left under its name.
     pub fn save_jpeg(&self, path: impl AsRef<Path>, exif: Option<&[u8]>) -> Result<()> {
         const QUALITY: u8 = 97;
-        let path = path.as_ref();
-        let mut file = Vec::new();
-        JpegEncoder::new_with_quality(&mut file, QUALITY)
-            .write_image(&self.to_rgb8(), self.width, self.height, ExtendedColorType::Rgb8)
-            .map_err(|error| Error::output(path, format!("cannot be encoded: {error}")))?;
+        let file = self.to_jpeg(QUALITY)?;
         let (start, rest) = file.split_at(jpeg::MAGIC.len());
-        write_whole(path, &[start, exif.unwrap_or_default(), rest].concat())
+        write_whole(path.as_ref(), &[start, exif.unwrap_or_default(), rest].concat())
     }
 
     /// Writes a 16-bit RGB PNG: values clamped to [0, 1], rounded to nearest.

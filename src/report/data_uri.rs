@@ -1,30 +1,20 @@
 //! Images inside a page: PNG in base64 (RFC 4648) in a data URI.
 
-use image::codecs::{jpeg::JpegEncoder, png::PngEncoder};
-use image::{ExtendedColorType, ImageEncoder, ImageResult};
-
+use crate::Result;
 use crate::image::Image;
 
 /// The image as an 8-bit PNG; an empty URI for an image without pixels.
 pub(super) fn png(image: &Image) -> String {
-    let mut file = Vec::new();
-    let written = write(image, PngEncoder::new(&mut file));
-    uri("png", written.map(|()| file))
+    uri("png", image.to_png8())
 }
 
 /// The image as a JPEG of little loss; an empty URI for an image without pixels.
 pub(crate) fn jpeg(image: &Image) -> String {
     const QUALITY: u8 = 90;
-    let mut file = Vec::new();
-    let written = write(image, JpegEncoder::new_with_quality(&mut file, QUALITY));
-    uri("jpeg", written.map(|()| file))
+    uri("jpeg", image.to_jpeg(QUALITY))
 }
 
-fn write(image: &Image, encoder: impl ImageEncoder) -> ImageResult<()> {
-    encoder.write_image(&image.to_rgb8(), image.width, image.height, ExtendedColorType::Rgb8)
-}
-
-fn uri(kind: &str, file: ImageResult<Vec<u8>>) -> String {
+fn uri(kind: &str, file: Result<Vec<u8>>) -> String {
     file.map_or_else(
         |_| "data:,".to_owned(),
         |file| format!("data:image/{kind};base64,{}", base64(&file)),

@@ -12,6 +12,7 @@ use std::path::Path;
 
 use super::{FEATURES, Feature, Features, Gaussians, MAX_SH_DEGREE, Shape, width};
 use crate::attributes::{ATTRIBUTES, Attribute, AttributeSpec, Ply, planes, rest_coefficients};
+use crate::output::write_whole_with;
 use crate::{Error, Result};
 
 /// A property of the file: its name, the attribute and the component of it that it holds.
@@ -72,16 +73,7 @@ pub fn save_with_comments(
     path: impl AsRef<Path>,
     comments: &[&str],
 ) -> Result<()> {
-    let path = path.as_ref();
-    let failed = |error: std::io::Error| Error::output(path, format!("cannot be written: {error}"));
-    let name = path.file_name().ok_or_else(|| Error::output(path, "is not a file name"))?;
-    let partial = path.with_file_name(format!("{}.partial", name.to_string_lossy()));
-    let written = write(gaussians, &partial, comments).and_then(|()| fs::rename(&partial, path));
-    if written.is_err() {
-        // The first failure is the one worth reporting; a leftover of it is not.
-        let _ = fs::remove_file(&partial);
-    }
-    written.map_err(failed)
+    write_whole_with(path.as_ref(), |partial| write(gaussians, partial, comments))
 }
 
 fn write(gaussians: &Gaussians, path: &Path, comments: &[&str]) -> std::io::Result<()> {

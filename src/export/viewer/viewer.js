@@ -108,7 +108,8 @@
     const built = program(gl), sort = sorter(means, count);
     texture(gl, 0, 3 * count, [gl.RGBA32F, gl.RGBA, gl.FLOAT], geometry(means, rest, count));
     texture(gl, 1, coefficients * count, [gl.RGBA16F, gl.RGBA, gl.HALF_FLOAT], harmonics(rest, count, coefficients));
-    const uniform = (name) => gl.getUniformLocation(built, name);
+    const places = {};
+    const uniform = (name) => places[name] ??= gl.getUniformLocation(built, name);
     gl.uniform1i(uniform('geometry'), 0);
     gl.uniform1i(uniform('harmonics'), 1);
     gl.uniform1i(uniform('coefficients'), coefficients);
