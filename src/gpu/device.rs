@@ -12,6 +12,8 @@ use gpu_allocator::vulkan::{Allocator, AllocatorCreateDesc};
 
 use super::checked::Checks;
 use super::cooperative::{self, CooperativeMatrix};
+use super::faults::Faults;
+use super::memory::{BudgetQuery, MemoryUsage};
 use super::requirements::{EXTENSIONS, Offered, required_device_features};
 use super::{
     Gpu, Properties, Queue, REQUIREMENTS, Shared, address_space, statistics, tuning, validation,
@@ -262,6 +264,7 @@ impl Gpu {
         queue: Queue,
         owned: Option<Owned>,
     ) -> Result<Self> {
+        let faults = Faults::from_environment()?;
         let name = properties.name.clone();
         let fail = |call| move |result| Error::Vulkan { call, device: name.clone(), result };
         let allocator = Allocator::new(&AllocatorCreateDesc {
@@ -270,7 +273,7 @@ impl Gpu {
             physical_device: physical,
             debug_settings: Default::default(),
             buffer_device_address: false,
-            allocation_sizes: Default::default(),
+            allocation_sizes: super::memory::block_sizes(),
         })
         .map_err(|error| Error::NoDevice(format!("{}: {error}", properties.name)))?;
         let mut kind =
@@ -307,7 +310,9 @@ impl Gpu {
                 progress: Mutex::default(),
                 timeline,
                 last_use: AtomicU64::new(0),
-                usage: super::buffer::MemoryUsage::default(),
+                usage: MemoryUsage::default(),
+                budget: BudgetQuery::of(instance, physical),
+                faults,
                 retired: Mutex::new(vec![]),
                 recorded: super::recorder::Recorded::default(),
                 checks: Checks::default(),
