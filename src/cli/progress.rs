@@ -10,7 +10,7 @@ use serde_json::{Value, json};
 use crate::dataset::Dataset;
 use crate::eval::{self, Against, ViewScore};
 use crate::gpu::Gpu;
-use crate::run::{self, Event, HeldRun, Trained};
+use crate::run::{self, Event, HeldRun, Session, Trained};
 use crate::train::{MemoryEstimate, StepReport, TrainConfig};
 
 /// How a run says what it does.
@@ -47,8 +47,22 @@ pub(crate) fn train(
     out: &Path,
     held: HeldRun,
 ) -> crate::Result<Trained> {
+    train_in(gpu, config, dataset, out, &Session { held, ..Session::default() })
+}
+
+/// The same in a session.
+///
+/// # Errors
+/// Those of [`run::train_in`].
+pub(crate) fn train_in(
+    gpu: &Gpu,
+    config: &TrainConfig,
+    dataset: &Dataset,
+    out: &Path,
+    session: &Session<'_>,
+) -> crate::Result<Trained> {
     let mut progress = Reporter::new(ProgressForm::of_terminal());
-    run::train(gpu, config, dataset, out, held, |event| progress.observe(event))
+    run::train_in(gpu, config, dataset, out, session, |event| progress.observe(event))
 }
 
 /// What a run is going to take, in a line.

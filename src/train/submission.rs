@@ -117,10 +117,12 @@ impl Trainer {
                 break;
             }
         }
+        self.ends.degree_due = !reports.is_empty() && self.decides_degree_at(self.step);
         if !reports.is_empty() && self.densifies_at(self.step) {
+            // Due whether or not there is memory to ask.
+            self.ends.density_due = Some(0);
             self.ends.density_due = Some(self.renderer.intersections()?);
         }
-        self.ends.degree_due = !reports.is_empty() && self.decides_degree_at(self.step);
         sent?;
         self.control()?;
         if self.step >= self.checked + FINITE_STEPS {
