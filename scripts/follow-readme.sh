@@ -10,8 +10,8 @@ git ls-files -z --cached --others --exclude-standard | xargs -0 -I {} sh -c '[ -
     tar -c -T - | tar -x -C "$scratch"
 cd "$scratch"
 
-# Installed beside everything else, built where the last build may be found again.
-export CARGO_INSTALL_ROOT=$scratch/installed CARGO_TARGET_DIR=${CARGO_TARGET_DIR:-$root/target}/readme
+# Installed in the copy, built from the dependencies that are built already.
+export CARGO_INSTALL_ROOT=$scratch/installed CARGO_TARGET_DIR=${CARGO_TARGET_DIR:-$root/target}
 export PATH=$scratch/installed/bin:$PATH
 
 has() { command -v "$1" > /dev/null; }
