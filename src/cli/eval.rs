@@ -38,8 +38,8 @@ pub struct EvalArgs {
     /// Write what was scored to RUN/eval/renders, and what it was compared with to RUN/eval/references or RUN/eval/targets
     #[arg(long)]
     pub save_images: bool,
-    /// The device: a part of its name or its index in `nightsplat doctor` [default: that of the run]
-    #[arg(long, value_name = "NAME|INDEX")]
+    /// The device: uuid:, pci: or index of `nightsplat doctor`, a part of its name, or cpu [default: that of the run]
+    #[arg(long, value_name = "DEVICE")]
     pub device: Option<DeviceChoice>,
 }
 

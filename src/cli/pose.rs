@@ -66,8 +66,8 @@ pub struct PoseArgs {
     /// Replace a dataset that `pose` wrote before
     #[arg(long)]
     pub overwrite: bool,
-    /// The device that lifts: a part of its name or its index in `nightsplat doctor` [default: the best]
-    #[arg(long, value_name = "NAME|INDEX")]
+    /// The device that lifts: uuid:, pci: or index of `nightsplat doctor`, a part of its name, or cpu [default: the best]
+    #[arg(long, value_name = "DEVICE")]
     pub device: Option<DeviceChoice>,
 }
 
