@@ -11,8 +11,11 @@ mod address_space;
 mod buffer;
 mod check;
 mod checked;
+mod choice;
 mod cooperative;
+mod descriptors;
 mod device;
+mod device_report;
 mod faults;
 mod kernel;
 mod memory;
@@ -35,12 +38,16 @@ use ash::{ext, khr, vk};
 
 pub use buffer::{Buffer, Download};
 pub use check::{CheckReport, CheckedPass, Difference, Tolerance};
+pub(crate) use choice::SchedulerVariables;
+pub use choice::{DeviceChoice, PciAddress};
 pub use cooperative::CooperativeMatrix;
-pub use device::{DeviceChoice, DeviceReport, HostDevice, RequirementReport, devices};
+pub use descriptors::PUSH_VARIABLE;
+pub use device::HostDevice;
+pub use device_report::{DeviceLimits, DeviceReport, RequirementReport, devices};
 pub use kernel::{Binding, Bound, Interface, Kernel, Reference};
 pub use memory::MemoryBudget;
 pub use pipeline::Pipeline;
-pub use recorder::{Recorder, Threads};
+pub use recorder::{HostRecording, Recorder, Threads};
 pub use requirements::{REQUIREMENTS, Requirement, required_device_features};
 pub use statistics::Statistic;
 pub use submission::{PassTime, Submission};
@@ -81,6 +88,8 @@ pub struct Properties {
     pub is_cpu: bool,
     /// Products of 16-bit matrices; none where the device does not offer them or a host lends it.
     pub cooperative_matrix: Option<CooperativeMatrix>,
+    /// Passes may push their descriptors; where not, they bind sets.
+    pub pushes_descriptors: bool,
     /// Kernels can be asked for their registers and spills; never of a device that a host lends.
     pub tells_statistics: bool,
 }
@@ -89,7 +98,7 @@ pub struct Properties {
 struct Shared {
     properties: Properties,
     device: ash::Device,
-    push_descriptor: khr::push_descriptor::Device,
+    descriptors: descriptors::Descriptors,
     /// Labels; absent where the instance does not offer them.
     debug: Option<ext::debug_utils::Device>,
     /// Statistics of compiled kernels; absent where the device does not tell them.
@@ -146,6 +155,7 @@ enum Retired {
     Buffer(vk::Buffer, gpu_allocator::vulkan::Allocation),
     Pipeline(vk::Pipeline, vk::PipelineLayout, vk::DescriptorSetLayout),
     Commands(vk::CommandPool),
+    Descriptors(vk::DescriptorPool),
     Queries(vk::QueryPool),
 }
 
@@ -259,6 +269,7 @@ impl Shared {
                     self.device.destroy_descriptor_set_layout(set_layout, None);
                 }
                 Retired::Commands(pool) => self.device.destroy_command_pool(pool, None),
+                Retired::Descriptors(pool) => self.device.destroy_descriptor_pool(pool, None),
                 Retired::Queries(pool) => self.device.destroy_query_pool(pool, None),
             }
         }

@@ -317,6 +317,14 @@ impl Trainer {
         self.model.download(&self.gpu)
     }
 
+    /// The gradient of every parameter that the last step left, in the frame.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub fn gradients(&self) -> Result<Gaussians> {
+        self.model.download_gradients(&self.gpu)
+    }
+
     /// What is trained on.
     pub fn fingerprint(&self) -> &Fingerprint {
         &self.fingerprint

@@ -134,8 +134,8 @@ pub(crate) struct TrainOptions {
     /// Nothing nearer to a camera is seen, in units of the scene's extent: of how far the cameras stand from their middle [default: {near}]
     #[arg(long, value_name = "N")]
     near: Option<f64>,
-    /// The device: a part of its name or its index in `nightsplat doctor` [default: the best]
-    #[arg(long, value_name = "NAME|INDEX")]
+    /// The device: uuid:, pci: or index of `nightsplat doctor`, a part of its name, or cpu [default: the best]
+    #[arg(long, value_name = "DEVICE")]
     device: Option<String>,
     /// A TOML file with any of the settings of a run's config.toml
     #[arg(long, value_name = "FILE")]

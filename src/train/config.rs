@@ -112,7 +112,7 @@ pub struct TrainConfig {
     pub tensorboard: bool,
     /// Steps whose every pass is compared with its CPU reference.
     pub check: CheckConfig,
-    /// The device: a part of its name or its index; empty: the best.
+    /// The device: `uuid:` or `pci:` and which, `cpu`, its index, or a part of its name; empty: the best.
     pub device: String,
     /// The tile that one subgroup renders, in pixels; left out, it is the fastest known on the device, and recorded.
     #[serde(skip_serializing_if = "Option::is_none")]

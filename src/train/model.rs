@@ -130,7 +130,17 @@ impl Model {
     /// # Errors
     /// The device was lost.
     pub(super) fn download(&self, gpu: &Gpu) -> Result<Gaussians> {
-        let mut parameters = gpu.read(&self.gaussians.parameters)?;
+        self.planes(gpu, &self.gaussians.parameters)
+    }
+
+    /// # Errors
+    /// The device was lost.
+    pub(super) fn download_gradients(&self, gpu: &Gpu) -> Result<Gaussians> {
+        self.planes(gpu, &self.gradients)
+    }
+
+    fn planes(&self, gpu: &Gpu, buffer: &Buffer<f32>) -> Result<Gaussians> {
+        let mut parameters = gpu.read(buffer)?;
         parameters.truncate(self.count() * width(self.shape));
         Ok(Gaussians { count: self.count(), shape: self.shape, parameters })
     }
