@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """A sweep on HyperQueue (`pip install hyperqueue`): every point a task, any number of workers, leaderboard at the end.
 
-    hyperqueue.py photos --out sweep --curves all --seeds 1,2,3
+    on_hyperqueue.py photos --out sweep --curves all --seeds 1,2,3
 
 takes what `nightsplat sweep` takes. Without a server (`hq server start`) it starts one with WORKERS workers (2) here. A task
 whose worker dies is given to another, and goes on from the checkpoint of its point.
@@ -17,8 +17,17 @@ from hyperqueue import Client, Job, LocalCluster
 from hyperqueue.cluster import WorkerConfig
 
 PROGRAM = os.environ.get("NIGHTSPLAT", "nightsplat")
-# Exit code 75 says: saved, run me again. 137 and 143: killed, for lack of memory say.
-AGAIN = 'for attempt in $(seq 20); do "$@"; code=$?; case $code in 75 | 137 | 143) ;; *) exit $code ;; esac; done; exit $code'
+# Exit code 75 says: saved, run me again. 137 and 143: killed, for lack of memory say. $0 is the lock of the point: a training
+# may have outlived the worker that began it, and is waited for.
+AGAIN = """
+for attempt in $(seq 20); do
+    [ ! -e "$0" ] || flock "$0" true
+    "$@"
+    code=$?
+    case $code in 75 | 137 | 143) ;; *) exit $code ;; esac
+done
+exit $code
+"""
 
 
 def main() -> None:
@@ -36,9 +45,10 @@ def run(points: list[list[str]]) -> None:
     logs = Path(os.environ.get("LOGS", "hyperqueue-logs")).absolute()
     logs.mkdir(parents=True, exist_ok=True)
     for point in points:
-        name = Path(point[point.index("--out") + 1]).name
+        folder = Path(point[point.index("--out") + 1])
+        name = folder.name
         log = str(logs / f"{name}.log")
-        job.program(["sh", "-c", AGAIN, "sh", *point], name=name, stdout=log, stderr=log, crash_limit=20)
+        job.program(["sh", "-c", AGAIN, str(folder / ".lock"), *point], name=name, stdout=log, stderr=log, crash_limit=20)
     if (Path.home() / ".hq-server" / "hq-current").exists():
         wait(Client(), job)
         return
