@@ -87,8 +87,13 @@ fn memory_that_runs_out_anywhere_leaves_a_checkpoint_and_no_finished_run() {
         let (name, out) = (&names[index], folder.path().join(format!("run{index}")));
         fail_allocation(&gpu, index as u64 + 1);
         let (error, last) = train(&gpu, &config, &dataset, &out, HeldRun::Refuse);
+        let asked = allocations(&gpu).len();
         fail_allocation(&gpu, 0);
-        let error = error.unwrap_or_else(|| panic!("{name} ({index}): the run says it is done"));
+        let Some(error) = error else {
+            // Steps may come in fewer submissions than they did before.
+            assert!(asked <= index, "{name} ({index}): the run says it is done");
+            continue;
+        };
         assert_eq!(error.exit_code(), 4, "{name} ({index}): {error}");
         for sign in ["done.json", "metrics.json"] {
             assert!(!out.join(sign).exists(), "{name} ({index}): {sign}");
