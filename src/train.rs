@@ -303,8 +303,8 @@ impl Trainer {
             model: Model::upload(gpu, &gaussians)?,
             renderer,
             losses,
+            networks: NetworkTerms::new(gpu, &config, &sizes, !masks.is_empty())?,
             masks,
-            networks: NetworkTerms::new(gpu, &config, &sizes)?,
             exposures,
             adam,
             finite,
@@ -491,7 +491,8 @@ impl Trainer {
                 }
                 _ => target,
             };
-            networks.record(pass, inputs, Photographs { low, target }, d_render, log)?;
+            let photographs = Photographs { mask: masks.of_view(view.number), low, target };
+            networks.record(pass, inputs, photographs, d_render, log)?;
             masks.hide(pass, view.number, (size, channels), d_render)?;
         }
         self.renderer.backward(
