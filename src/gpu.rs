@@ -16,7 +16,9 @@ mod cooperative;
 mod descriptors;
 mod device;
 mod device_report;
+mod faults;
 mod kernel;
+mod memory;
 mod pipeline;
 mod recorder;
 mod requirements;
@@ -43,6 +45,7 @@ pub use descriptors::PUSH_VARIABLE;
 pub use device::HostDevice;
 pub use device_report::{DeviceLimits, DeviceReport, RequirementReport, devices};
 pub use kernel::{Binding, Bound, Interface, Kernel, Reference};
+pub use memory::MemoryBudget;
 pub use pipeline::Pipeline;
 pub use recorder::{HostRecording, Recorder, Threads};
 pub use requirements::{REQUIREMENTS, Requirement, required_device_features};
@@ -106,7 +109,10 @@ struct Shared {
     timeline: vk::Semaphore,
     /// The timeline value after which a resource that is dropped now is unused.
     last_use: AtomicU64,
-    usage: buffer::MemoryUsage,
+    usage: memory::MemoryUsage,
+    /// What else takes memory of the device; absent where the driver does not tell.
+    budget: Option<memory::BudgetQuery>,
+    faults: faults::Faults,
     retired: Mutex<Vec<(u64, Retired)>>,
     recorded: recorder::Recorded,
     /// The threads whose submissions are checked.
@@ -184,10 +190,15 @@ impl Shared {
         }
     }
 
+    /// What the timeline has reached.
+    fn reached(&self) -> u64 {
+        // SAFETY: the semaphore lives as long as `self`. A lost device may not know.
+        unsafe { self.device.get_semaphore_counter_value(self.timeline) }.unwrap_or(0)
+    }
+
     /// The label of the submission that the device is at; where it is done with all, of the last.
     fn unfinished(&self) -> Option<String> {
-        // SAFETY: the semaphore lives as long as `self`. A lost device may not know.
-        let done = unsafe { self.device.get_semaphore_counter_value(self.timeline) }.unwrap_or(0);
+        let done = self.reached();
         let progress = lock(&self.progress);
         let (mut all, later) =
             (progress.labels.values(), progress.labels.range(done.saturating_add(1)..));
@@ -212,6 +223,9 @@ impl Shared {
         // SAFETY: the semaphore lives as long as `self`.
         unsafe { self.device.wait_semaphores(&wait, u64::MAX) }
             .map_err(|result| self.error("vkWaitSemaphores", result))?;
+        if self.faults.is_lost() {
+            return Err(self.error("vkWaitSemaphores", vk::Result::ERROR_DEVICE_LOST));
+        }
         self.collect(value);
         let mut progress = lock(&self.progress);
         progress.labels = progress.labels.split_off(&value);
@@ -243,6 +257,7 @@ impl Shared {
             match retired {
                 Retired::Buffer(raw, allocation) => {
                     self.device.destroy_buffer(raw, None);
+                    self.usage.subtract(allocation.size());
                     if let Some(allocator) = lock(&self.allocator).as_mut() {
                         // Freeing can only fail for an allocation of another allocator.
                         allocator.free(allocation).unwrap_or_default();

@@ -96,7 +96,8 @@ void main() {
     splats[i] = splat;
 
     vec3 center = -transpose(mat3(camera.view_from_world)) * camera.view_from_world[3];
-    vec3 color = sh_color(i, normalize(mean - center));
+    vec3 offset = mean - center;
+    vec3 color = sh_color(i, normalize(offset * finite_scale(length(offset))));
     for (uint c = 0; c < 3; c++) colors[CHANNELS * i + c] = color[c];
     uint features = FEATURES_COLUMN * gaussian_count + FEATURE_COUNT * i;
     for (uint k = 0; k < FEATURE_COUNT; k++) colors[CHANNELS * i + 3 + k] = parameters[features + k];

@@ -56,6 +56,8 @@ vec4 rotation_backward(vec4 q, mat3 d) {
 
 // Writes the gradients of the SH coefficients; returns that of the mean, through the viewing direction.
 vec3 sh_backward(uint i, vec3 offset, vec3 d_color) {
+    float small = finite_scale(length(offset));
+    offset *= small;
     float distance = max(length(offset), 1e-12);
     vec3 direction = offset / distance;
     float basis[16];
@@ -70,7 +72,7 @@ vec3 sh_backward(uint i, vec3 offset, vec3 d_color) {
         d_direction += dot(coefficient, d_color) * basis_gradient[k];
         for (uint c = 0; c < 3; c++) gradients[rest + c] = basis[k] * d_color[c];
     }
-    return (d_direction - direction * dot(direction, d_direction)) / distance;
+    return small * ((d_direction - direction * dot(direction, d_direction)) / distance);
 }
 
 void store_zero(uint i) {
@@ -129,25 +131,27 @@ void main() {
     vec3 t1 = world_from_view * (camera.focal.y / z * vec3(0.0, 1.0, -slope.y));
     vec3 u0 = t0 * scaled_axes, u1 = t1 * scaled_axes;
 
-    // conic = inverse(cov2d), cov2d = U U^T + 0.3 I
+    // conic = inverse(cov2d), cov2d = U U^T + 0.3 I. Of conic U the large terms cancel, all of them for a needle; by hand,
+    // what is left of them is (U1 x N, N x U0) with N = U0 x U1.
     float a = splat.conic.x, b = splat.conic.y, c = splat.conic.z;
-    float d_xx = -(a * a * d_conic.x + a * b * d_conic.y + b * b * d_conic.z);
-    float d_xy = -(2.0 * a * b * d_conic.x + (a * c + b * b) * d_conic.y + 2.0 * b * c * d_conic.z);
-    float d_yy = -(b * b * d_conic.x + b * c * d_conic.y + c * c * d_conic.z);
-    vec3 d_u0 = 2.0 * d_xx * u0 + d_xy * u1;
-    vec3 d_u1 = 2.0 * d_yy * u1 + d_xy * u0;
+    vec3 normal = cross(u0, u1);
+    float det = dot(normal, normal) + DILATION * (dot(u0, u0) + dot(u1, u1)) + DILATION * DILATION;
+    vec3 w0 = (cross(u1, normal) + DILATION * u0) / det;  // rows of conic U
+    vec3 w1 = (cross(normal, u0) + DILATION * u1) / det;
+    vec3 g0 = d_conic.x * w0 + 0.5 * d_conic.y * w1;
+    vec3 g1 = 0.5 * d_conic.y * w0 + d_conic.z * w1;
+    vec3 d_u0 = -2.0 * (a * g0 + b * g1);
+    vec3 d_u1 = -2.0 * (b * g0 + c * g1);
+    vec3 d_log_scale = -2.0 * (w0 * g0 + w1 * g1);
 
     // U = (J W) (R S)
     mat3 d_scaled_axes = outerProduct(t0, d_u0) + outerProduct(t1, d_u1);
-    vec3 d_log_scale;
     mat3 d_axes;
-    for (uint k = 0; k < 3; k++) {
-        d_log_scale[k] = dot(d_scaled_axes[k], scaled_axes[k]);
-        d_axes[k] = d_scaled_axes[k] * scale[k];
-    }
+    for (uint k = 0; k < 3; k++) d_axes[k] = d_scaled_axes[k] * scale[k];
     vec4 d_unit = rotation_backward(unit, d_axes);
-    float norm = length(quat);
-    vec4 d_quat = norm > 1e-12 ? (d_unit - unit * dot(unit, d_unit)) / norm : vec4(0.0);
+    float small = finite_scale(length(quat));
+    float norm = length(small * quat);
+    vec4 d_quat = norm > 1e-12 ? small * ((d_unit - unit * dot(unit, d_unit)) / norm) : vec4(0.0);
 
     // J = focal / z (1, 0, -slope)
     vec3 d_j0 = view_rotation * (scaled_axes * d_u0);
@@ -163,7 +167,9 @@ void main() {
     STORE_VEC3(MEANS_COLUMN, i, d_mean);
     STORE_VEC4(QUATS_COLUMN, i, d_quat);
     STORE_VEC3(LOG_SCALES_COLUMN, i, d_log_scale);
-    gradients[RAW_OPACITIES_COLUMN * gaussian_count + i] = d_opacity * splat.opacity * (1.0 - splat.opacity);
+    uint raw_opacity = RAW_OPACITIES_COLUMN * gaussian_count + i;
+    // Of an opaque Gaussian 1 - opacity is rounding; its complement is not.
+    gradients[raw_opacity] = d_opacity * splat.opacity * sigmoid(-parameters[raw_opacity]);
 
     if (status[0] == 0) {
         float nearness = min(1.0, z / damping_depth);

@@ -1,9 +1,10 @@
 //! `nightsplat bench`: check a step against the CPU references pass by pass, then time its kernels and stages; or find the
-//! fastest tiles, or how the cost grows.
+//! fastest tiles, how the cost grows, or what comes of hostile inputs.
 
 mod growth;
 mod scene;
 mod stages;
+pub mod stress;
 mod tune;
 
 use std::collections::BTreeMap;
@@ -35,6 +36,10 @@ pub struct BenchArgs {
     /// exponents
     #[arg(long, conflicts_with = "tune")]
     pub growth: bool,
+    /// Train on hostile inputs instead, every pass checked, and show what comes of each and the largest errors against the
+    /// references in f64
+    #[arg(long, conflicts_with_all = ["tune", "growth"])]
+    pub stress: bool,
     /// The device: uuid:, pci: or index of `nightsplat doctor`, a part of its name, or cpu [default: the best]
     #[arg(long, value_name = "DEVICE")]
     pub device: Option<DeviceChoice>,
@@ -103,6 +108,9 @@ pub fn run(args: &BenchArgs) -> Result<()> {
         let is_sized = args.width.is_some() || args.height.is_some();
         let sizes = if is_sized { &[[width, height]][..] } else { &TUNED_SIZES };
         return tune::run(&bench, sizes, args.gaussians, args.json);
+    }
+    if args.stress {
+        return stress::run(&bench.gpu, args.json);
     }
     if args.growth {
         return growth::run(&bench, [width, height], args.gaussians, args.json);

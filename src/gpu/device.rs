@@ -14,6 +14,8 @@ use super::choice::Picked;
 use super::cooperative;
 use super::descriptors::Descriptors;
 use super::device_report::{device_memory, max_workgroups, report};
+use super::faults::Faults;
+use super::memory::{BudgetQuery, MemoryUsage};
 use super::requirements::{OPTIONAL_EXTENSIONS, Offered, required_device_features};
 use super::{
     DeviceChoice, DeviceReport, Gpu, Properties, Queue, SchedulerVariables, Shared, address_space,
@@ -190,6 +192,7 @@ impl Gpu {
         queue: Queue,
         owned: Option<Owned>,
     ) -> Result<Self> {
+        let faults = Faults::from_environment()?;
         let name = properties.name.clone();
         let fail = |call| move |result| Error::Vulkan { call, device: name.clone(), result };
         let allocator = Allocator::new(&AllocatorCreateDesc {
@@ -198,7 +201,7 @@ impl Gpu {
             physical_device: physical,
             debug_settings: Default::default(),
             buffer_device_address: false,
-            allocation_sizes: Default::default(),
+            allocation_sizes: super::memory::block_sizes(),
         })
         .map_err(|error| Error::NoDevice(format!("{}: {error}", properties.name)))?;
         let mut kind =
@@ -235,7 +238,9 @@ impl Gpu {
                 progress: Mutex::default(),
                 timeline,
                 last_use: AtomicU64::new(0),
-                usage: super::buffer::MemoryUsage::default(),
+                usage: MemoryUsage::default(),
+                budget: BudgetQuery::of(instance, physical),
+                faults,
                 retired: Mutex::new(vec![]),
                 recorded: super::recorder::Recorded::default(),
                 checks: Checks::default(),

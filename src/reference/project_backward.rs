@@ -9,7 +9,7 @@ use super::sh::{sh_basis, sh_basis_gradient};
 use super::splat::{Splat, stored_record};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::project_backward::{Constants, Kernel, Params, Slices, Tolerances};
-use crate::kernels::splat::RECORD_HEAD;
+use crate::kernels::splat::{DILATION, RECORD_HEAD};
 
 /// The gradients that arrive at one splat.
 #[derive(Clone, Debug)]
@@ -48,15 +48,18 @@ pub fn project_gaussian_backward(
 
     let [a, b, c] = splat.conic.to_array();
     let d_conic = d_splat.conic;
-    let d_xx = -(a * a * d_conic.x + a * b * d_conic.y + b * b * d_conic.z);
-    let d_xy = -(2.0 * a * b * d_conic.x + (a * c + b * b) * d_conic.y + 2.0 * b * c * d_conic.z);
-    let d_yy = -(b * b * d_conic.x + b * c * d_conic.y + c * c * d_conic.z);
-    let d_u0 = 2.0 * d_xx * u0 + d_xy * u1;
-    let d_u1 = 2.0 * d_yy * u1 + d_xy * u0;
+    let normal = u0.cross(u1);
+    let trace = u0.dot(u0) + u1.dot(u1);
+    let det = normal.dot(normal) + DILATION * trace + DILATION * DILATION;
+    let w0 = (u1.cross(normal) + DILATION * u0) / det;
+    let w1 = (normal.cross(u0) + DILATION * u1) / det;
+    let g0 = d_conic.x * w0 + 0.5 * d_conic.y * w1;
+    let g1 = 0.5 * d_conic.y * w0 + d_conic.z * w1;
+    let d_u0 = -2.0 * (a * g0 + b * g1);
+    let d_u1 = -2.0 * (b * g0 + c * g1);
+    let d_log_scale = -2.0 * (w0 * g0 + w1 * g1);
 
     let d_scaled_axes = outer_product(t0, d_u0) + outer_product(t1, d_u1);
-    let d_log_scale =
-        DVec3::from_array([0, 1, 2].map(|k| d_scaled_axes.col(k).dot(scaled_axes.col(k))));
     let d_unit = rotation_backward(unit, d_scaled_axes * DMat3::from_diagonal(scale));
     let norm = gaussian.quat.length();
     let d_quat = if norm > 1e-12 { (d_unit - unit * unit.dot(d_unit)) / norm } else { DVec4::ZERO };
@@ -81,7 +84,7 @@ pub fn project_gaussian_backward(
         mean: world_from_view * d_xy_view.extend(d_z) + d_mean_sh,
         quat: d_quat,
         log_scale: d_log_scale,
-        raw_opacity: d_splat.opacity * opacity * (1.0 - opacity),
+        raw_opacity: d_splat.opacity * opacity * sigmoid(-gaussian.raw_opacity),
         features: d_splat.features.clone(),
         sh: d_sh,
     }

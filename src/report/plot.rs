@@ -88,7 +88,7 @@ pub fn plot_in_groups(
         let whole = HEIGHT + above;
         let _ = writeln!(
             panels,
-            "<svg y=\"{height}\" width=\"{WIDTH}\" height=\"{whole}\" viewBox=\"0 {} {WIDTH} {whole}\">\n{panel}</svg>",
+            "<svg y=\"{height}\" overflow=\"visible\" width=\"{WIDTH}\" height=\"{whole}\" viewBox=\"0 {} {WIDTH} {whole}\">\n{panel}</svg>",
             0.0 - above
         );
         height += whole + GAP;
@@ -241,16 +241,19 @@ const SAMPLE: f64 = 28.0;
 fn legend_places(series: &[Series]) -> (Vec<[f64; 2]>, f64) {
     const ROW: f64 = 16.0;
     let (mut x, mut y) = (LEFT + 60.0, 14.0);
-    let mut places = vec![];
+    let mut places: Vec<[f64; 2]> = vec![];
     for Series { name, .. } in series {
         let width = 7.0 * name.chars().count() as f64 + SAMPLE + 24.0;
         if x + width > WIDTH && x > LEFT + 60.0 {
-            (x, y) = (LEFT + 60.0, y - ROW);
+            (x, y) = (LEFT + 60.0, y + ROW);
         }
         places.push([x, y]);
         x += width;
     }
-    (places, 14.0 - y)
+    // The last row is that of the axis's name.
+    let above = y - 14.0;
+    places.iter_mut().for_each(|place| place[1] -= above);
+    (places, above)
 }
 
 /// A plot as a file of its own, in the colours of the page's style.

@@ -78,16 +78,11 @@ impl Model {
         round: Round,
     ) -> Result<DensifyReport> {
         let inputs = DensifyInputs {
-            grad_norm_sums: &self.grad_norm_sums,
-            visit_counts: &self.visit_counts,
+            grad_norm_sums: &mut self.grad_norm_sums,
+            visit_counts: &mut self.visit_counts,
             gradients: &mut self.gradients,
         };
         let report = densifier.densify(&mut self.gaussians, inputs, round)?;
-        let capacity = self.gradients.len() / (self.gaussians.column_count as usize).max(1);
-        if self.capacity() < self.count() {
-            self.grad_norm_sums = gpu.uninit("grad_norm_sums", capacity)?;
-            self.visit_counts = gpu.uninit("visit_counts", capacity)?;
-        }
         gpu.run("clear_statistics", |pass| {
             pass.fill(&mut self.grad_norm_sums, 0);
             pass.fill(&mut self.visit_counts, 0);
@@ -135,7 +130,17 @@ impl Model {
     /// # Errors
     /// The device was lost.
     pub(super) fn download(&self, gpu: &Gpu) -> Result<Gaussians> {
-        let mut parameters = gpu.read(&self.gaussians.parameters)?;
+        self.planes(gpu, &self.gaussians.parameters)
+    }
+
+    /// # Errors
+    /// The device was lost.
+    pub(super) fn download_gradients(&self, gpu: &Gpu) -> Result<Gaussians> {
+        self.planes(gpu, &self.gradients)
+    }
+
+    fn planes(&self, gpu: &Gpu, buffer: &Buffer<f32>) -> Result<Gaussians> {
+        let mut parameters = gpu.read(buffer)?;
         parameters.truncate(self.count() * width(self.shape));
         Ok(Gaussians { count: self.count(), shape: self.shape, parameters })
     }

@@ -1,0 +1,302 @@
+//! The table of hostile inputs.
+
+use glam::Vec3;
+
+use super::hostile::{Hostile, camera_of_focal};
+use crate::Result;
+use crate::gpu::Gpu;
+use crate::random::Stream;
+use crate::render::RenderSettings;
+use crate::scene::Gaussians;
+use crate::tone::{ToneCurve, ToneSettings};
+
+/// An input, and what is to come of it.
+#[derive(Debug)]
+pub struct Case {
+    /// The input.
+    pub name: &'static str,
+    /// What is to come of it, in words.
+    pub outcome: &'static str,
+    /// What it takes.
+    pub effort: Effort,
+    pub(super) expect: Expect,
+    pub(super) build: fn(&Gpu) -> Result<Hostile>,
+}
+
+/// What a case takes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Effort {
+    /// A second or less.
+    Small,
+    /// Seconds to minutes: the references go through every pixel and splat.
+    Large,
+    /// As large as the device takes it: too much for the references.
+    Unchecked,
+}
+
+/// What is to come of a case. Whatever it is, loss, gradients and parameters are finite.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Expect {
+    /// The Gaussians that it is about learn.
+    Learns,
+    /// They have no gradient and stay as they are.
+    NoTrace,
+    /// The steps are done.
+    Trains,
+    /// An error that says this.
+    Refusal(&'static str),
+}
+
+const SIZE: [u32; 2] = [32, 24];
+
+fn scales(log: [f64; 3]) -> Result<Hostile> {
+    let log = Vec3::from_array(log.map(|power| (power * std::f64::consts::LN_10) as f32));
+    Ok(Hostile::gaussians(1, SIZE, |gaussians, i| gaussians.log_scales_mut()[i] = log))
+}
+
+fn opacity(raw: f32) -> Result<Hostile> {
+    Ok(Hostile::gaussians(1, SIZE, |gaussians, i| gaussians.raw_opacities_mut()[i] = raw))
+}
+
+fn quat(quat: [f32; 4]) -> Result<Hostile> {
+    Ok(Hostile::gaussians(1, SIZE, |gaussians, i| gaussians.quats_mut()[i] = quat))
+}
+
+fn mean(x: f32, y: f32, z: f32) -> Result<Hostile> {
+    Ok(Hostile::gaussians(1, SIZE, |gaussians, i| gaussians.means_mut()[i] = Vec3::new(x, y, z)))
+}
+
+/// So many at one place: the same ones, or colours and opacities of their own.
+fn coincident(count: usize) -> Result<Hostile> {
+    let stream = Stream::new(14, 1);
+    Ok(Hostile::gaussians(count, SIZE, |gaussians, i| {
+        gaussians.quats_mut()[i] = [1.0, 0.2, 0.1, 0.0];
+        gaussians.raw_opacities_mut()[i] = -4.0;
+        gaussians.dc_mut()[i].x = stream.normal(i as u64) as f32;
+    }))
+}
+
+/// So many faint ones on a pixel of an image of one tile, one behind the other.
+fn crowd(count: usize) -> Result<Hostile> {
+    let mut own = Hostile::gaussians(count, [16, 8], |gaussians, i| {
+        let depth = 1.0 + 4.0 * i as f32 / 100_000.0;
+        gaussians.means_mut()[i] = Vec3::new(0.0, 0.0, depth);
+        gaussians.log_scales_mut()[i] = Vec3::splat((0.1 * depth / 14.4).ln());
+        gaussians.raw_opacities_mut()[i] = -4.5;
+    });
+    own.config.steps = 1;
+    Ok(own)
+}
+
+fn focal(focal: f64) -> Result<Hostile> {
+    Ok(Hostile::seen_by(camera_of_focal(focal, SIZE), 1, |gaussians, i| {
+        gaussians.means_mut()[i] = Vec3::new(0.0, 0.0, 3.0);
+    }))
+}
+
+fn size(width: u32, height: u32) -> Result<Hostile> {
+    Ok(Hostile::gaussians(1, [width, height], |_, _| ()))
+}
+
+/// One that covers a view of more than ten thousand tiles.
+fn wide() -> Result<Hostile> {
+    let mut own = Hostile::gaussians(1, [1920, 1080], |gaussians, i| {
+        gaussians.log_scales_mut()[i] = Vec3::splat(3.0);
+    });
+    own.config.steps = 1;
+    Ok(own)
+}
+
+/// A square view of 8192 pixels, or the largest that the device takes.
+fn largest(gpu: &Gpu) -> Result<Hostile> {
+    let settings = RenderSettings::default();
+    let fits = |side: u32| settings.check_size(gpu, "of stress", [side; 2]).is_ok();
+    let (mut low, mut high) = (16, 8193);
+    while high - low > 1 {
+        let middle = (low + high) / 2;
+        *(if fits(middle) { &mut low } else { &mut high }) = middle;
+    }
+    let mut own = Hostile::gaussians(1, [low; 2], |_, _| ());
+    own.config.steps = 1;
+    own.config.tile = Some(settings.tile_for(gpu, std::iter::once([low; 2]))?);
+    Ok(own)
+}
+
+/// Refused, or else the step would be done.
+fn beyond(gpu: &Gpu) -> Result<Hostile> {
+    RenderSettings::default().check_size(gpu, "of stress", [65_535; 2])?;
+    size(16, 16)
+}
+
+fn sh(dc: f32, rest: f32) -> Result<Hostile> {
+    let stream = Stream::new(14, 2);
+    Ok(Hostile::gaussians(1, SIZE, |gaussians, i| {
+        if dc > 0.0 {
+            gaussians.dc_mut()[i] = Vec3::splat(dc);
+        }
+        for (k, own) in (0..15).zip(gaussians.rest_mut()) {
+            let draw = |c: u64| rest * stream.normal(3 * k + c) as f32;
+            *own = Vec3::from_array([0, 1, 2].map(draw));
+        }
+    }))
+}
+
+fn gain(gain: f32) -> Result<Hostile> {
+    Hostile::gaussians(1, SIZE, |_, _| ()).exposed(gain)
+}
+
+const fn case(
+    name: &'static str,
+    outcome: &'static str,
+    expect: Expect,
+    build: fn(&Gpu) -> Result<Hostile>,
+) -> Case {
+    Case { name, outcome, effort: Effort::Small, expect, build }
+}
+
+const fn large(mut case: Case) -> Case {
+    case.effort = Effort::Large;
+    case
+}
+
+use Expect::{Learns, NoTrace, Refusal, Trains};
+
+/// Every input.
+pub const CASES: &[Case] = &[
+    case("scales 1e-20", "a dot as wide as the dilation; Adam lifts them to e^-30", Trains, |_| {
+        scales([-20.0; 3])
+    }),
+    case("scales 1e-20, 1, 1e-20", "a needle as wide as the dilation", Learns, |_| {
+        scales([-20.0, 0.0, -20.0])
+    }),
+    case("scales 1e3", "covers the view", Learns, |_| scales([3.0; 3])),
+    case(
+        "scales 1e10",
+        "culled, then lowered by Adam to e^13, which covers the view",
+        Trains,
+        |_| scales([10.0; 3]),
+    ),
+    case(
+        "scales 1e20",
+        "culled, then lowered by Adam to e^13, which covers the view",
+        Trains,
+        |_| scales([20.0; 3]),
+    ),
+    case("scales 1e-20, 1, 1e20", "culled, then lowered by Adam to e^13", Trains, |_| {
+        scales([-20.0, 0.0, 20.0])
+    }),
+    case("raw opacity -100", "culled: no trace", NoTrace, |_| opacity(-100.0)),
+    case("raw opacity -20", "culled: no trace", NoTrace, |_| opacity(-20.0)),
+    case("raw opacity -5.5", "just above 1/255: learns", Learns, |_| opacity(-5.5)),
+    case("raw opacity 20", "opaque; learns", Learns, |_| opacity(20.0)),
+    case("raw opacity 100", "opaque; learns but for its opacity", Learns, |_| opacity(100.0)),
+    case("quaternion 0", "unturned, and no gradient turns it", Learns, |_| quat([0.0; 4])),
+    case("quaternion 1e-40", "unturned, and no gradient turns it", Learns, |_| {
+        quat([1e-40, 2e-40, -1e-40, 0.0])
+    }),
+    case("quaternion 1e-10", "as of unit length", Learns, |_| quat([1e-10, 2e-10, -1e-10, 3e-11])),
+    case("quaternion 1e15", "as of unit length", Learns, |_| quat([1e15, 2e15, -1e15, 3e14])),
+    case("quaternion 1e30", "as of unit length", Learns, |_| quat([1e30, 2e30, -1e30, 3e29])),
+    case("quaternion 1e38", "as of unit length", Learns, |_| quat([1e38, 2e38, -1e38, 3e37])),
+    case("mean on the near plane", "culled: no trace", NoTrace, |_| mean(0.0, 0.0, 0.2)),
+    case("mean 1e-6 behind the near plane", "seen", Learns, |_| mean(0.01, 0.0, 0.200_001)),
+    case("mean behind the camera", "culled: no trace", NoTrace, |_| mean(0.1, 0.1, -3.0)),
+    case("mean in the camera", "culled: no trace", NoTrace, |_| mean(0.0, 0.0, 0.0)),
+    case("mean 1e-7 away", "culled: no trace", NoTrace, |_| mean(1e-8, 1e-8, 1e-7)),
+    case("mean 1e7 away", "a dot as wide as the dilation", Learns, |_| mean(1e5, 1e5, 1e7)),
+    case("mean 1e7 beside", "outside of the view: no trace", NoTrace, |_| mean(1e7, 0.0, 3.0)),
+    case("mean 1e30 away", "a dot as wide as the dilation", Learns, |_| mean(1e28, 1e28, 1e30)),
+    case("mean 1e38 beside", "culled: no trace", NoTrace, |_| mean(1e38, 0.0, 3.0)),
+    case("500 coincident", "blended in the order of their numbers", Learns, |_| coincident(500)),
+    large(case("5000 coincident", "blended in the order of their numbers", Learns, |_| {
+        coincident(5000)
+    })),
+    large(case("one over 16 000 tiles", "covers the view", Learns, |_| wide())),
+    case(
+        "2000 on one pixel",
+        "blended; those behind a full pixel have no gradient",
+        Learns,
+        |_| crowd(2000),
+    ),
+    large(case(
+        "100 000 on one pixel",
+        "blended; those behind a full pixel have no gradient",
+        Learns,
+        |_| crowd(100_000),
+    )),
+    case("no Gaussian", "black", Trains, |_| {
+        size(32, 24).map(|mut own| {
+            own.gaussians = Some(Gaussians::zeros(0, 3));
+            own.concerned = 0..0;
+            own
+        })
+    }),
+    case("one Gaussian", "learns", Learns, |_| Ok(Hostile::alone(SIZE))),
+    case("focal length 1", "seen", Learns, |_| focal(1.0)),
+    case("focal length 1e3", "seen", Learns, |_| focal(1e3)),
+    case("focal length 1e6", "seen", Learns, |_| focal(1e6)),
+    case("view 1x1", "learns", Learns, |_| size(1, 1)),
+    case("view 1x64", "learns", Learns, |_| size(1, 64)),
+    case("view 64x1", "learns", Learns, |_| size(64, 1)),
+    Case {
+        effort: Effort::Unchecked,
+        ..case("the largest square view, to 8192", "learns", Learns, largest)
+    },
+    case(
+        "view 65535x65535",
+        "refused, with the longest side that the device takes",
+        Refusal("max_resolution"),
+        beyond,
+    ),
+    case("SH coefficients 1e6 of degree 0", "learns", Learns, |_| sh(1e6, 0.0)),
+    case("SH coefficients 1e6 above degree 0", "learns", Learns, |_| sh(0.0, 1e6)),
+    case("exposure gain 1e-6", "learns", Trains, |_| gain(1e-6)),
+    case("exposure gain 1e6", "learns", Trains, |_| gain(1e6)),
+    case("photograph black: p90 = 0", "trains towards a target of black", Trains, |_| {
+        Ok(Hostile::photograph(|_, _| [0.0; 3]))
+    }),
+    case(
+        "photograph black, curve auto",
+        "refused: nothing to lift",
+        Refusal("as good as black"),
+        |_| {
+            let mut own = Hostile::photograph(|_, _| [0.0; 3]);
+            own.config.tone = ToneSettings::new(ToneCurve::Auto);
+            Ok(own)
+        },
+    ),
+    case("photograph of one value: p10 = p90", "trains", Trains, |_| {
+        Ok(Hostile::photograph(|_, _| [0.05; 3]))
+    }),
+    case("photograph white", "trains", Trains, |_| Ok(Hostile::photograph(|_, _| [1.0; 3]))),
+    case("photograph black but for one pixel", "trains", Trains, |_| {
+        Ok(Hostile::photograph(|x, y| [f32::from(u8::from(x == 5 && y == 7)); 3]))
+    }),
+    case("EXR scaled by 1e-6", "trains", Trains, |_| Hostile::exr(|value, _, _| 1e-6 * value)),
+    case("EXR scaled by 1e6", "trains", Trains, |_| Hostile::exr(|value, _, _| 1e6 * value)),
+    case("EXR of denormals", "trains as black", Trains, |_| {
+        Hostile::exr(|value, _, _| 1e-40 * value)
+    }),
+    case("EXR with NaN", "they hide their pixels", Trains, |_| {
+        Hostile::exr(|value, x, y| if (x + y) % 5 == 0 { f32::NAN } else { value })
+    }),
+    case(
+        "EXR with infinity and below 0",
+        "infinity hides its pixels, below 0 is black",
+        Trains,
+        |_| {
+            Hostile::exr(|value, x, y| match (x + y) % 5 {
+                0 => f32::INFINITY,
+                1 => f32::NEG_INFINITY,
+                2 => -value,
+                _ => value,
+            })
+        },
+    ),
+    case("EXR with 1e38", "trains", Trains, |_| {
+        Hostile::exr(|value, x, y| if (x + y) % 5 == 0 { 1e38 } else { value })
+    }),
+    case("EXR of NaN", "refused", Refusal("no photograph is left"), |_| {
+        Hostile::exr(|_, _, _| f32::NAN)
+    }),
+];
