@@ -9,7 +9,7 @@ use crate::kernels::splat::RECORD_HEAD;
 use crate::kernels::status::{STATUS_CROWDED, STATUS_NOT_FINITE, STATUS_OVERFLOWED, STATUS_WORDS};
 
 /// The first guess of how many tiles a Gaussian meets; a view that needs more makes the memory grow.
-pub(crate) const TILES_PER_GAUSSIAN: u32 = 6;
+const TILES_PER_GAUSSIAN: u32 = 6;
 
 /// How many depth ranks one subgroup counts the tiles of. Small: `emit` sums up what precedes a rank within them.
 pub(super) const RANKS_PER_PARTITION: u32 = 256;
