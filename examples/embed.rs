@@ -13,7 +13,7 @@ use ash::vk::Handle as _;
 use ash::{khr, vk};
 use glam::{DAffine3, DVec2, DVec3, Vec3};
 use nightsplat::camera::Camera;
-use nightsplat::gpu::{Gpu, HostDevice, required_device_features};
+use nightsplat::gpu::{Gpu, HostDevice, HostRecording, required_device_features};
 use nightsplat::image::Image;
 use nightsplat::render::{RenderOptions, RenderSettings, Renderer, Status};
 use nightsplat::scene::{Gaussians, init};
@@ -149,7 +149,7 @@ impl Host {
     /// Records, submits and waits.
     fn submit(
         &self,
-        record: impl FnOnce(vk::CommandBuffer) -> nightsplat::Result<()>,
+        record: impl FnOnce(vk::CommandBuffer) -> nightsplat::Result<HostRecording>,
     ) -> Result<(), Box<dyn Error>> {
         let device = &self.device;
         let allocate = vk::CommandBufferAllocateInfo::default()
@@ -159,7 +159,8 @@ impl Host {
         unsafe {
             let commands = device.allocate_command_buffers(&allocate)?;
             device.begin_command_buffer(commands[0], &vk::CommandBufferBeginInfo::default())?;
-            record(commands[0])?;
+            // What it binds stays until the queue is idle.
+            let _held = record(commands[0])?;
             device.end_command_buffer(commands[0])?;
             let submit = [vk::SubmitInfo::default().command_buffers(&commands)];
             device.queue_submit(self.queue, &submit, vk::Fence::null())?;

@@ -13,6 +13,7 @@ mod batch;
 pub mod bench;
 pub mod check;
 mod comparison;
+pub mod completions;
 pub mod curves;
 mod defaults;
 pub mod demo;
@@ -23,6 +24,7 @@ pub mod export;
 mod finished_run;
 #[cfg(feature = "fit")]
 pub mod fit;
+pub mod man;
 pub mod pose;
 pub mod progress;
 pub mod render;
@@ -85,6 +87,8 @@ enum Command {
     Doctor(doctor::DoctorArgs),
     Bench(bench::BenchArgs),
     Check(Box<check::CheckArgs>),
+    Completions(completions::CompletionsArgs),
+    Man(man::ManArgs),
 }
 
 /// Whatever is given to a subcommand that this build lacks.
@@ -130,6 +134,8 @@ impl Cli {
             Command::Doctor(args) => doctor::run(&args),
             Command::Bench(args) => bench::run(&args),
             Command::Check(args) => check::run(&args),
+            Command::Completions(args) => completions::run(args),
+            Command::Man(args) => Ok(man::run(&args)?),
         }
     }
 }

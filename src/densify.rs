@@ -84,9 +84,9 @@ pub struct DeviceGaussians {
 #[derive(Debug)]
 pub struct DensifyInputs<'a> {
     /// Sums of the norms of the screen-space gradients, in normalised device units.
-    pub grad_norm_sums: &'a Buffer<f32>,
+    pub grad_norm_sums: &'a mut Buffer<f32>,
     /// In how many steps the Gaussian was seen.
-    pub visit_counts: &'a Buffer<u32>,
+    pub visit_counts: &'a mut Buffer<u32>,
     /// The gradients, as planes; what they hold is lost.
     pub gradients: &'a mut Buffer<f32>,
 }
@@ -129,8 +129,6 @@ pub struct Densifier {
     sort: RadixSort,
     scan: Scan,
     scratch: Scratch,
-    /// The device's limit was the reason that a round refused to grow, and the user knows.
-    has_warned: bool,
 }
 
 /// The decision for every Gaussian.
@@ -191,7 +189,6 @@ impl Densifier {
             sort: RadixSort::new(gpu, 0)?,
             scan: Scan::new(gpu, 0)?,
             scratch: Scratch::new(gpu, 0)?,
-            has_warned: false,
         })
     }
 
@@ -199,32 +196,32 @@ impl Densifier {
     /// count; buffers that were too short for it are longer.
     ///
     /// # Errors
-    /// A buffer is shorter than the Gaussians need, or the device is out of memory or lost.
+    /// A buffer is shorter than the Gaussians need, or the device is out of memory: the Gaussians are as they were then. Or
+    /// the device is lost.
     pub fn densify(
         &mut self,
         gaussians: &mut DeviceGaussians,
-        inputs: DensifyInputs<'_>,
+        mut inputs: DensifyInputs<'_>,
         round: Round,
     ) -> Result<DensifyReport> {
         check(gaussians, &inputs)?;
         let limit = self.limit(gaussians.column_count).min(round.most);
         let tally = self.decide(gaussians, &inputs, limit, round)?;
         let report = report(gaussians.count, &tally);
-        if report.refused > 0 && limit < self.settings.max_gaussians && !self.has_warned {
-            self.has_warned = true;
-            tracing::warn!(
-                "growth stops at {limit} Gaussians, all that the device can bind at once"
-            );
-        }
-        self.scatter(gaussians, inputs.gradients, &report, limit, round.step)?;
+        self.scatter(gaussians, &mut inputs, &report, limit, round.step)?;
         Ok(report)
     }
 
     /// The most Gaussians there may be: the setting, or what one binding holds where that is less.
-    fn limit(&self, column_count: u32) -> usize {
+    pub(crate) fn limit(&self, column_count: u32) -> usize {
         let floats = self.gpu.properties().max_storage_buffer_range / size_of::<f32>() as u64;
         let bindable = floats.min(u64::from(u32::MAX)) as usize / column_count.max(1) as usize;
         self.settings.max_gaussians.min(bindable)
+    }
+
+    /// What a round takes beside the Gaussians, for each, in bytes.
+    pub(crate) fn bytes_per_gaussian(&self) -> usize {
+        5 * size_of::<u32>() + self.sort.bytes_per_item()
     }
 
     /// Leaves every fate and every place on the device, and returns the counts.
@@ -292,7 +289,7 @@ impl Densifier {
     fn scatter(
         &self,
         gaussians: &mut DeviceGaussians,
-        spare: &mut Buffer<f32>,
+        inputs: &mut DensifyInputs<'_>,
         report: &DensifyReport,
         limit: usize,
         step: u64,
@@ -301,8 +298,6 @@ impl Densifier {
             return Ok(());
         }
         let DeviceGaussians { count, column_count, feature_count, .. } = *gaussians;
-        let columns = column_count as usize;
-        let (len, capacity) = (report.count * columns, capacity(report.count, limit) * columns);
         let new_gaussian_count = report.count as u32;
         let seed = self.settings.seed;
         let params = densify_scatter::Params {
@@ -319,35 +314,72 @@ impl Densifier {
             column_count,
             feature_count,
         };
+        let mut room = self.room(gaussians, inputs, report.count, limit)?;
+        let DensifyInputs { grad_norm_sums, visit_counts, gradients: spare } = inputs;
         let Scratch { fates, offsets, .. } = &self.scratch;
         let Moments { first, second } = &mut gaussians.moments;
         let threads = Threads::Exactly([count, 1, 1]);
         self.gpu.run("densify_scatter", |pass| {
-            self.make_room(spare, len, capacity)?;
+            take(&mut room.planes, spare);
             let parameters = &mut gaussians.parameters;
             let buffers =
                 densify_scatter::Buffers { parameters, fates, offsets, new_parameters: spare };
             pass.dispatch(&self.scatter, &params, buffers, threads)?;
             std::mem::swap(parameters, spare);
             for moments in [first, second] {
-                self.make_room(spare, len, capacity)?;
+                take(&mut room.planes, spare);
                 let buffers =
                     densify_moments::Buffers { moments, fates, offsets, new_moments: spare };
                 pass.dispatch(&self.moments, &moments_params, buffers, threads)?;
                 std::mem::swap(moments, spare);
             }
-            self.make_room(spare, len, capacity)
+            take(&mut room.planes, spare);
+            Ok(())
         })?;
+        if let Some((sums, counts)) = room.statistics {
+            (**grad_norm_sums, **visit_counts) = (sums, counts);
+        }
         gaussians.count = new_gaussian_count;
         Ok(())
     }
 
-    /// A buffer that is too short goes once the device is done with it, and a longer one takes its place.
-    fn make_room(&self, buffer: &mut Buffer<f32>, len: usize, capacity: usize) -> Result<()> {
-        if buffer.len() < len {
-            *buffer = self.gpu.uninit("planes", capacity)?;
-        }
-        Ok(())
+    /// What takes the place of buffers that are too short for `count` Gaussians, all of it before one of them goes.
+    fn room(
+        &self,
+        DeviceGaussians { column_count, parameters, moments, .. }: &DeviceGaussians,
+        inputs: &DensifyInputs<'_>,
+        count: usize,
+        limit: usize,
+    ) -> Result<Room> {
+        let (columns, capacity) = (*column_count as usize, capacity(count, limit));
+        // In the order in which they are free.
+        let planes = [inputs.gradients, parameters, &moments.first, &moments.second];
+        let planes = planes.map(|plane| {
+            let is_short = plane.len() < count * columns;
+            is_short.then(|| self.gpu.uninit("planes", capacity * columns)).transpose()
+        });
+        let [a, b, c, d] = planes;
+        let statistics = if inputs.grad_norm_sums.len() < count {
+            let sums = self.gpu.uninit("grad_norm_sums", capacity)?;
+            Some((sums, self.gpu.uninit("visit_counts", capacity)?))
+        } else {
+            None
+        };
+        Ok(Room { planes: [a?, b?, c?, d?].into_iter(), statistics })
+    }
+}
+
+/// Buffers for more Gaussians.
+struct Room {
+    /// Those that a plane set is to take in turn, where its own is too short.
+    planes: std::array::IntoIter<Option<Buffer<f32>>, 4>,
+    statistics: Option<(Buffer<f32>, Buffer<u32>)>,
+}
+
+/// Puts the next of `planes` in the place of `spare`, which goes once the device is done with it.
+fn take(planes: &mut impl Iterator<Item = Option<Buffer<f32>>>, spare: &mut Buffer<f32>) {
+    if let Some(longer) = planes.next().flatten() {
+        *spare = longer;
     }
 }
 

@@ -142,6 +142,18 @@ pub enum Error {
         /// Who asked.
         cause: Stop,
     },
+    /// Several runs that were asked to stop did so; those under way are saved.
+    #[error("{}: {cause} with {done} of {all} runs done; the same command goes on", folder.display())]
+    BatchStopped {
+        /// The folder of their run directories.
+        folder: PathBuf,
+        /// Runs that are finished.
+        done: usize,
+        /// Runs that there are to be.
+        all: usize,
+        /// Who asked.
+        cause: Stop,
+    },
     /// A checked pass left other numbers than its CPU reference.
     #[error(
         "the device disagrees with the CPU references: {what}; update the driver, or report this with the output of \
@@ -177,7 +189,7 @@ impl Error {
             | Self::DeviceLost { .. }
             | Self::Vulkan { .. }
             | Self::Crowded { .. } => 4,
-            Self::Stopped { cause, .. } => cause.exit_code(),
+            Self::Stopped { cause, .. } | Self::BatchStopped { cause, .. } => cause.exit_code(),
             Self::Output { .. }
             | Self::NotFinite { .. }
             | Self::ParameterNotFinite { .. }

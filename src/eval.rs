@@ -13,7 +13,8 @@ use crate::dataset::{Dataset, View};
 use crate::exposure::Affine;
 use crate::gpu::{Buffer, Gpu};
 use crate::image::Image;
-use crate::metrics::Scores;
+use crate::lpips::Lpips;
+use crate::metrics::{self, Scores};
 use crate::render::{RenderOptions, RenderSettings, Renderer};
 use crate::scene::{Feature, Features, Gaussians};
 use crate::tone::{ToneCurve, ToneSettings};
@@ -320,6 +321,26 @@ pub fn score_by(
     Ok(scored)
 }
 
+/// Adds LPIPS to the scores of what was shown, over the pixels that count.
+///
+/// # Errors
+/// A view is too small for it, or the device is out of memory or lost.
+pub fn add_lpips(
+    scored: &mut [ViewScore],
+    dataset: &Dataset,
+    gpu: &Gpu,
+    lpips: &Lpips,
+) -> Result<()> {
+    for ViewScore { name, scores, render, reference, .. } in scored {
+        let view = dataset.views.iter().find(|view| view.name == *name);
+        let mask = view.and_then(|view| view.mask.as_ref());
+        let mask = mask.map(|mask| mask.resized(render.width, render.height).into_owned());
+        let shown = metrics::counted(render, reference, mask.as_ref());
+        scores.lpips = Some(lpips.distance(gpu, &shown, reference)?);
+    }
+    Ok(())
+}
+
 /// `metrics.json`: means and views, and what the run took; null where that, or a mean, is not known.
 pub fn metrics(
     scored: &[ViewScore],
@@ -434,6 +455,9 @@ fn entry(scores: &Scores, r0: Option<&Scores>) -> Value {
         "psnr_channel_mean": scores.psnr_channel_mean,
         "ssim": scores.ssim,
     });
+    if let Some(lpips) = scores.lpips {
+        entry["lpips"] = json!(lpips);
+    }
     if let Some(r0) = r0 {
         entry["r0"] = self::entry(r0, None);
     }

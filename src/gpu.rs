@@ -11,9 +11,14 @@ mod address_space;
 mod buffer;
 mod check;
 mod checked;
+mod choice;
 mod cooperative;
+mod descriptors;
 mod device;
+mod device_report;
+mod faults;
 mod kernel;
+mod memory;
 mod pipeline;
 mod recorder;
 mod requirements;
@@ -33,11 +38,16 @@ use ash::{ext, khr, vk};
 
 pub use buffer::{Buffer, Download};
 pub use check::{CheckReport, CheckedPass, Difference, Tolerance};
+pub(crate) use choice::SchedulerVariables;
+pub use choice::{DeviceChoice, PciAddress};
 pub use cooperative::CooperativeMatrix;
-pub use device::{DeviceChoice, DeviceReport, HostDevice, RequirementReport, devices};
+pub use descriptors::PUSH_VARIABLE;
+pub use device::HostDevice;
+pub use device_report::{DeviceLimits, DeviceReport, RequirementReport, devices};
 pub use kernel::{Binding, Bound, Interface, Kernel, Reference};
+pub use memory::MemoryBudget;
 pub use pipeline::Pipeline;
-pub use recorder::{Recorder, Threads};
+pub use recorder::{HostRecording, Recorder, Threads};
 pub use requirements::{REQUIREMENTS, Requirement, required_device_features};
 pub use statistics::Statistic;
 pub use submission::{PassTime, Submission};
@@ -78,6 +88,8 @@ pub struct Properties {
     pub is_cpu: bool,
     /// Products of 16-bit matrices; none where the device does not offer them or a host lends it.
     pub cooperative_matrix: Option<CooperativeMatrix>,
+    /// Passes may push their descriptors; where not, they bind sets.
+    pub pushes_descriptors: bool,
     /// Kernels can be asked for their registers and spills; never of a device that a host lends.
     pub tells_statistics: bool,
 }
@@ -86,7 +98,7 @@ pub struct Properties {
 struct Shared {
     properties: Properties,
     device: ash::Device,
-    push_descriptor: khr::push_descriptor::Device,
+    descriptors: descriptors::Descriptors,
     /// Labels; absent where the instance does not offer them.
     debug: Option<ext::debug_utils::Device>,
     /// Statistics of compiled kernels; absent where the device does not tell them.
@@ -97,7 +109,10 @@ struct Shared {
     timeline: vk::Semaphore,
     /// The timeline value after which a resource that is dropped now is unused.
     last_use: AtomicU64,
-    usage: buffer::MemoryUsage,
+    usage: memory::MemoryUsage,
+    /// What else takes memory of the device; absent where the driver does not tell.
+    budget: Option<memory::BudgetQuery>,
+    faults: faults::Faults,
     retired: Mutex<Vec<(u64, Retired)>>,
     recorded: recorder::Recorded,
     /// The threads whose submissions are checked.
@@ -140,6 +155,7 @@ enum Retired {
     Buffer(vk::Buffer, gpu_allocator::vulkan::Allocation),
     Pipeline(vk::Pipeline, vk::PipelineLayout, vk::DescriptorSetLayout),
     Commands(vk::CommandPool),
+    Descriptors(vk::DescriptorPool),
     Queries(vk::QueryPool),
 }
 
@@ -174,10 +190,15 @@ impl Shared {
         }
     }
 
+    /// What the timeline has reached.
+    fn reached(&self) -> u64 {
+        // SAFETY: the semaphore lives as long as `self`. A lost device may not know.
+        unsafe { self.device.get_semaphore_counter_value(self.timeline) }.unwrap_or(0)
+    }
+
     /// The label of the submission that the device is at; where it is done with all, of the last.
     fn unfinished(&self) -> Option<String> {
-        // SAFETY: the semaphore lives as long as `self`. A lost device may not know.
-        let done = unsafe { self.device.get_semaphore_counter_value(self.timeline) }.unwrap_or(0);
+        let done = self.reached();
         let progress = lock(&self.progress);
         let (mut all, later) =
             (progress.labels.values(), progress.labels.range(done.saturating_add(1)..));
@@ -202,6 +223,9 @@ impl Shared {
         // SAFETY: the semaphore lives as long as `self`.
         unsafe { self.device.wait_semaphores(&wait, u64::MAX) }
             .map_err(|result| self.error("vkWaitSemaphores", result))?;
+        if self.faults.is_lost() {
+            return Err(self.error("vkWaitSemaphores", vk::Result::ERROR_DEVICE_LOST));
+        }
         self.collect(value);
         let mut progress = lock(&self.progress);
         progress.labels = progress.labels.split_off(&value);
@@ -233,6 +257,7 @@ impl Shared {
             match retired {
                 Retired::Buffer(raw, allocation) => {
                     self.device.destroy_buffer(raw, None);
+                    self.usage.subtract(allocation.size());
                     if let Some(allocator) = lock(&self.allocator).as_mut() {
                         // Freeing can only fail for an allocation of another allocator.
                         allocator.free(allocation).unwrap_or_default();
@@ -244,6 +269,7 @@ impl Shared {
                     self.device.destroy_descriptor_set_layout(set_layout, None);
                 }
                 Retired::Commands(pool) => self.device.destroy_command_pool(pool, None),
+                Retired::Descriptors(pool) => self.device.destroy_descriptor_pool(pool, None),
                 Retired::Queries(pool) => self.device.destroy_query_pool(pool, None),
             }
         }

@@ -36,6 +36,7 @@
 //! - [`render`]: the differentiable rasteriser
 //! - [`window`]: the rectangle of a view that networks run on
 //! - [`nn`]: denoiser and tonemapper, forward and backward
+//! - [`lpips`]: how far a render is from its reference image to a network's eye
 //! - [`loss`]: the loss terms with their gradients, and their log
 //! - [`densify`]: clone, split, prune
 //! - [`train`]: one step after another
@@ -69,6 +70,8 @@ pub mod hash;
 pub mod image;
 pub mod kernels;
 pub mod loss;
+#[cfg(feature = "io")]
+pub mod lpips;
 pub mod metrics;
 pub mod nn;
 pub mod optimizer;

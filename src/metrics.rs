@@ -1,5 +1,7 @@
 //! Scores of a render against its reference image: PSNR and SSIM, in f64, on sRGB-encoded values with peak 1.
 
+use std::borrow::Cow;
+
 use rayon::prelude::*;
 
 use crate::image::{Image, Mask};
@@ -14,6 +16,9 @@ pub struct Scores {
     pub psnr_channel_mean: f64,
     /// Mean structural similarity; see [`ssim`].
     pub ssim: f64,
+    /// The distance to a network's eye, where its weights are at hand: `lpips::Lpips` adds it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub lpips: Option<f64>,
 }
 
 impl Scores {
@@ -26,11 +31,11 @@ impl Scores {
             psnr: psnr(render, reference)?,
             psnr_channel_mean: psnr_channel_mean(render, reference)?,
             ssim: ssim(render, reference)?,
+            lpips: None,
         })
     }
 
-    /// Every score over the pixels that count alone. What is hidden of the render is taken for the reference: SSIM sees no
-    /// difference there from where it counts.
+    /// Every score over the pixels that count alone; see [`counted`].
     ///
     /// # Errors
     /// As [`Scores::of`]; no pixel counts.
@@ -38,17 +43,17 @@ impl Scores {
         let Some(mask) = mask else { return Self::of(render, reference) };
         let mask = mask.resized(render.width, render.height);
         let errors = weighted_errors(render, reference, &mask)?;
+        let shown = counted(render, reference, Some(&mask));
         let width = render.width as usize;
-        let ssim = channels(render, reference)?.into_par_iter().map(|(a, b)| {
-            let shown = a.iter().zip(b).zip(&mask.weights);
-            let shown: Vec<f32> = shown.map(|((&a, &b), &w)| w * a + (1.0 - w) * b).collect();
-            weighted_mean(ssim_map(&shown, b, width), &mask)
-        });
+        let ssim = channels(&shown, reference)?
+            .into_par_iter()
+            .map(|(a, b)| weighted_mean(ssim_map(a, b, width), &mask));
         let ssim: Vec<f64> = ssim.collect();
         Ok(Self {
             psnr: decibels(mean(&errors)),
             psnr_channel_mean: mean(&errors.map(decibels)),
             ssim: mean(&ssim),
+            lpips: None,
         })
     }
 
@@ -60,8 +65,23 @@ impl Scores {
             psnr: mean(|scores| scores.psnr),
             psnr_channel_mean: mean(|scores| scores.psnr_channel_mean),
             ssim: mean(|scores| scores.ssim),
+            lpips: scores
+                .iter()
+                .map(|scores| scores.lpips)
+                .sum::<Option<f64>>()
+                .map(|sum| sum / scores.len() as f64),
         })
     }
+}
+
+/// The render, and in place of what a mask of its size hides the reference: a measure of what is around a pixel sees no
+/// difference there.
+pub fn counted<'a>(render: &'a Image, reference: &Image, mask: Option<&Mask>) -> Cow<'a, Image> {
+    let Some(mask) = mask else { return Cow::Borrowed(render) };
+    let weights = mask.weights.iter().cycle();
+    let shown = render.data.iter().zip(&reference.data).zip(weights);
+    let data = shown.map(|((&a, &b), &w)| w * a + (1.0 - w) * b).collect();
+    Cow::Owned(Image { data, ..*render })
 }
 
 /// Peak signal-to-noise ratio over all pixels and channels, dB; infinite for equal images.

@@ -6,6 +6,8 @@
 //!
 //! Norms use the statistics of the image itself, in training and afterwards: there are no running averages.
 
+#[cfg(feature = "io")]
+mod alexnet;
 mod conv;
 mod denoiser;
 #[cfg(feature = "io")]
@@ -21,6 +23,8 @@ use serde::{Deserialize, Serialize};
 use crate::gpu::{Buffer, Gpu};
 use crate::{Error, Result};
 
+#[cfg(feature = "io")]
+pub(crate) use alexnet::{AlexNet, LAYERS, published};
 pub use conv::Precision;
 pub use denoiser::{Denoiser, DenoiserSettings};
 #[cfg(feature = "io")]

@@ -30,6 +30,7 @@ use crate::{Error, Result};
 pub use frame::Frame;
 use frame::RANKS_PER_PARTITION;
 pub use frame::Status;
+pub(crate) use frame::TILES_PER_GAUSSIAN;
 use limits::{longest_run, most_tiles, splats_per_turn};
 pub use settings::RenderSettings;
 
@@ -192,6 +193,29 @@ impl Renderer {
     /// The most intersections of a view whose records the device can bind at once.
     pub fn most_intersections(&self) -> u32 {
         self.frame.most_intersections(&self.gpu)
+    }
+
+    /// What each Gaussian takes beside its own numbers, in bytes.
+    pub(crate) fn bytes_per_gaussian(&self) -> usize {
+        self.frame.bytes_per_gaussian() + self.depth_sort.bytes_per_item()
+    }
+
+    /// What the buffers take that follow the numbers of Gaussians and intersections, those of the sorts left out, which come
+    /// with the first render; in bytes.
+    pub(crate) fn reserved_bytes(&self) -> usize {
+        let Frame { splats, tiles, .. } = &self.frame;
+        splats.len() * self.frame.bytes_per_gaussian()
+            + tiles.len() * self.frame.bytes_per_intersection()
+    }
+
+    /// What each intersection of a view takes, in bytes.
+    pub(crate) fn bytes_per_intersection(&self) -> usize {
+        self.frame.bytes_per_intersection() + self.tile_sort.bytes_per_item()
+    }
+
+    /// How many intersections there is room for.
+    pub(crate) fn intersection_capacity(&self) -> u32 {
+        self.frame.intersection_capacity()
     }
 
     /// How many intersections the last render had; waits for it.

@@ -8,6 +8,7 @@ mod exposures;
 mod growth;
 mod held_out;
 mod masks;
+mod memory;
 mod model;
 mod networks;
 mod overrides;
@@ -47,6 +48,7 @@ pub use exposures::{ExposureConfig, Learning};
 use held_out::HeldOut;
 pub use held_out::{NotFinite, StopConfig, targets_of_test_views};
 use masks::Masks;
+pub use memory::MemoryEstimate;
 use model::Model;
 pub use networks::Networks;
 pub use parts::{ModelConfig, ModelName, NetworkRates, Part};
@@ -182,6 +184,12 @@ pub struct Trainer {
     /// After this step the parameters were looked at last.
     checked: u64,
     densifier: Densifier,
+    /// That there is no room to grow was said.
+    has_said_room: bool,
+    /// What ended the last stretch behind steps that were done.
+    failed: Option<Error>,
+    /// On the device, beside what follows the number of Gaussians and intersections, in bytes.
+    fixed_bytes: f64,
     /// Of a step's view, what is kept in fewer bits: the loss's input, and the photograph where a network sees it besides.
     decoded: [Buffer<f32>; 2],
     d_render: Buffer<f32>,
@@ -237,6 +245,9 @@ impl Trainer {
         settings: RenderSettings,
         kernels: ScopedJoinHandle<'_, Result<Kernels>>,
     ) -> Result<Self> {
+        if let Some(CacheSize(bytes)) = config.max_vram {
+            gpu.limit_memory(bytes);
+        }
         let mut pseudo_gt = PseudoGt::new(gpu, &config.tone)?;
         let frame = config.frame.unwrap_or_default();
         let (mut views, scene, target_exposure) =
@@ -299,6 +310,9 @@ impl Trainer {
             finite,
             checked: 0,
             densifier,
+            has_said_room: false,
+            failed: None,
+            fixed_bytes: 0.0,
             decoded: [gpu.uninit("decoded", inputs)?, gpu.uninit("decoded low", photographs)?],
             d_render: gpu.uninit("d_render", values)?,
             log: LossLog::new(gpu, MOST_STEPS as usize)?,
@@ -306,6 +320,7 @@ impl Trainer {
             config,
         };
         trainer.reserve()?;
+        trainer.fixed_bytes = trainer.measure_fixed_bytes();
         Ok(trainer)
     }
 

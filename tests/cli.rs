@@ -180,6 +180,22 @@ fn eval_agrees_with_train_and_saves_what_it_scored() {
 }
 
 #[test]
+fn eval_scores_lpips_where_it_is_given_the_weights() {
+    let fixture = fixture();
+    let weights = fixture.path("weights.safetensors");
+    common::lpips::write(&weights, |_, _, _| {});
+    let eval = format!("eval {} --lpips {}", fixture.run(), weights.display());
+    let scores: Value = serde_json::from_str(&succeed(&format!("{eval} --json"))).unwrap();
+    let of = |name: &str| scores["views"][name]["lpips"].as_f64().unwrap();
+    let mean = scores["mean"]["lpips"].as_f64().unwrap();
+    assert!((mean - (of("000") + of("008")) / 2.0).abs() < 1e-12 && mean > 0.0, "{scores}");
+    let table = succeed(&eval);
+    assert!(table.contains("LPIPS") && table.contains(&format!("{mean:.4}")), "{table}");
+    fs::write(&weights, "of nothing").unwrap();
+    refused(&eval, 3, &["weights.safetensors", "safetensors"]);
+}
+
+#[test]
 fn a_set_without_references_and_photographs_of_test_views_scores_nothing() {
     let set = copied_set();
     fs::remove_dir_all(set.path().join("high")).unwrap();

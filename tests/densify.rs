@@ -116,8 +116,8 @@ impl Host {
             },
         };
         let inputs = DensifyInputs {
-            grad_norm_sums: &upload("grad_norm_sums", &self.grad_norm_sums),
-            visit_counts: &gpu.buffer("visit_counts", &self.visit_counts).unwrap(),
+            grad_norm_sums: &mut upload("grad_norm_sums", &self.grad_norm_sums),
+            visit_counts: &mut gpu.buffer("visit_counts", &self.visit_counts).unwrap(),
             gradients: &mut upload("gradients", &vec![f32::NAN; self.count * COLUMNS]),
         };
         let mut densifier = Densifier::new(gpu, settings).unwrap();
@@ -498,8 +498,8 @@ fn a_buffer_that_is_too_short_is_refused() {
             },
         };
         let inputs = DensifyInputs {
-            grad_norm_sums: &gpu.zeros("grad_norm_sums", len(3, 2)).unwrap(),
-            visit_counts: &gpu.zeros("visit_counts", len(4, 2)).unwrap(),
+            grad_norm_sums: &mut gpu.zeros("grad_norm_sums", len(3, 2)).unwrap(),
+            visit_counts: &mut gpu.zeros("visit_counts", len(4, 2)).unwrap(),
             gradients: &mut gpu.zeros("gradients", 28).unwrap(),
         };
         assert!(densifier.densify(&mut gaussians, inputs, LAST).is_err(), "{short}");
@@ -578,14 +578,14 @@ fn buffers_that_suffice_are_kept_and_others_grow_with_headroom() {
     };
     gpu.write(&mut gaussians.parameters, &host.parameters).unwrap();
     let mut gradients = plane("gradients");
-    let visit_counts = gpu.buffer("visit_counts", &[1; 300]).unwrap();
+    let mut visit_counts = gpu.buffer("visit_counts", &[1; 300]).unwrap();
     let mut densifier = Densifier::new(&gpu, CONSERVING).unwrap();
     for (pulled, count, capacity) in [(10, 110, 200), (110, 220, 330)] {
         let mut sums = vec![0.0; 300];
         sums[..pulled].fill(1.0);
         let inputs = DensifyInputs {
-            grad_norm_sums: &gpu.buffer("grad_norm_sums", &sums).unwrap(),
-            visit_counts: &visit_counts,
+            grad_norm_sums: &mut gpu.buffer("grad_norm_sums", &sums).unwrap(),
+            visit_counts: &mut visit_counts,
             gradients: &mut gradients,
         };
         let report = densifier.densify(&mut gaussians, inputs, LAST).unwrap();

@@ -6,7 +6,7 @@ use nightsplat::gpu::REQUIREMENTS;
 use serde_json::Value;
 
 mod common;
-use common::command::{refused_with, succeed};
+use common::command::{command, refused_with, succeed};
 
 #[test]
 fn json_holds_every_requirement_of_every_device_and_the_choice() {
@@ -18,9 +18,47 @@ fn json_holds_every_requirement_of_every_device_and_the_choice() {
         let requirements = device["requirements"].as_array().unwrap();
         let names = requirements.iter().map(|requirement| requirement["name"].as_str().unwrap());
         assert!(names.eq(REQUIREMENTS.iter().map(|requirement| requirement.name)));
+        assert_eq!(device["uuid"].as_str().map(str::len), Some(36));
+        assert!(device["kind"].is_string() && device.get("pci").is_some());
+        assert!(device["limits"]["max_storage_buffer_range"].as_u64() >= Some(1 << 27));
     }
+    assert_eq!(chosen["missing"].as_array().map(Vec::len), Some(0));
     let mut requirements = chosen["requirements"].as_array().unwrap().iter();
     assert!(requirements.all(|requirement| requirement["met"] == true));
+}
+
+#[test]
+fn a_schedulers_variables_that_name_no_device_are_one_line() {
+    for (variable, value) in [("CUDA_VISIBLE_DEVICES", "99"), ("ROCR_VISIBLE_DEVICES", "GPU-ff")] {
+        let said = [&format!("{variable}={value}"), "which Vulkan does not have", "--device"];
+        for command in ["doctor", "bench"] {
+            refused_with(command, &[(variable, value)], 4, &said.map(|part| part as &str));
+        }
+    }
+    for choice in ["uuid:fedcba98", "pci:ffff:ff:1f.7", "no such device"] {
+        let command = format!("bench --device {}", choice.replace(' ', "_"));
+        refused_with(&command, &[], 4, &["there is no Vulkan device", "there are: "]);
+    }
+    refused_with("bench --device uuid:xyz", &[], 2, &["is no UUID"]);
+}
+
+#[test]
+fn an_empty_list_of_gpus_leaves_the_software_device() {
+    let printed: Value = serde_json::from_str(&succeed("doctor --json")).unwrap();
+    let is_software = |device: &Value| device["kind"] == "software";
+    if !printed["devices"].as_array().unwrap().iter().any(is_software) {
+        eprintln!("not run: there is no software device");
+        return;
+    }
+    let empty = ["CUDA", "ROCR", "HIP"].map(|vendor| (format!("{vendor}_VISIBLE_DEVICES"), ""));
+    let output = command("doctor --json").envs(empty).output().unwrap();
+    let printed: Value = serde_json::from_slice(&output.stdout).unwrap();
+    let chosen = &printed["devices"][printed["chosen"].as_u64().unwrap() as usize];
+    assert!(
+        !["NVIDIA", "AMD"].iter().any(|vendor| chosen["name"].as_str().unwrap().contains(vendor))
+    );
+    let reason = "CUDA_VISIBLE_DEVICES= ROCR_VISIBLE_DEVICES= HIP_VISIBLE_DEVICES=";
+    assert_eq!(printed["reason"], reason);
 }
 
 #[test]

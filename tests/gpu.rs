@@ -38,13 +38,14 @@ fn ones_and_zeros(count: usize, threads: Threads<'_>) -> Vec<f32> {
 #[test]
 fn a_device_that_is_not_there_is_answered_with_those_that_are() {
     let all = devices().unwrap();
-    let choices = ["no such device", "99"].map(|text| text.parse::<DeviceChoice>().unwrap());
-    assert_eq!(choices[1], DeviceChoice::Index(99));
-    for choice in choices {
-        let error = Gpu::new(&choice).unwrap_err();
+    for (text, wanted) in [
+        ("no such device", "`no such device`"),
+        ("99", "number 99"),
+        ("uuid:fedcba98", "UUID begins with fedcba98"),
+        ("pci:ffff:ff:1f.7", "at ffff:ff:1f.7"),
+    ] {
+        let error = Gpu::new(&text.parse().unwrap()).unwrap_err();
         let message = error.to_string();
-        let wanted =
-            if choice == DeviceChoice::Index(99) { "number 99" } else { "`no such device`" };
         assert!(matches!(error, Error::NoDevice(_)) && message.contains(wanted), "{message}");
         assert!(all.iter().all(|device| message.contains(&device.name)), "{message}");
         assert!(!message.contains('\n'), "{message}");
@@ -57,6 +58,14 @@ fn a_device_is_found_by_a_part_of_its_name_in_any_case() {
     let part = name[..name.len() / 2].to_uppercase();
     let found = Gpu::new(&DeviceChoice::Name(part)).unwrap();
     assert_eq!(found.properties().name, name);
+}
+
+#[test]
+fn every_device_is_found_by_its_uuid() {
+    for device in devices().unwrap().iter().filter(|device| device.missing().is_none()) {
+        let choice: DeviceChoice = format!("uuid:{}", device.uuid).parse().unwrap();
+        assert_eq!(Gpu::new(&choice).unwrap().properties().name, device.name);
+    }
 }
 
 #[test]

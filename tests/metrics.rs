@@ -64,7 +64,7 @@ fn images_without_pixels_or_cut_short_are_refused() {
 #[test]
 fn the_mean_of_no_scores_is_none() {
     assert_eq!(Scores::mean(&[]), None);
-    let scores = |psnr| Scores { psnr, psnr_channel_mean: psnr + 1.0, ssim: 0.5 };
+    let scores = |psnr| Scores { psnr, psnr_channel_mean: psnr + 1.0, ssim: 0.5, lpips: None };
     assert_eq!(Scores::mean(&[scores(20.0), scores(30.0)]), Some(scores(25.0)));
 }
 

@@ -176,7 +176,7 @@ fn a_run_tells_its_observer_everything_in_order() {
         let out = folder.path().join("run");
         let trained = run::train(&gpu(), config, &dataset, &out, held, |event| {
             told.push(match event {
-                Event::Started { step, steps } => format!("started {step} of {steps}"),
+                Event::Started { step, steps, .. } => format!("started {step} of {steps}"),
                 Event::Step(report) => format!("step {}", report.step),
                 Event::Checkpointed { step } => format!("checkpointed {step}"),
                 Event::Evaluated { step, scored } => format!("evaluated {step}: {}", scored.len()),

@@ -62,7 +62,7 @@ fn a_finished_point_is_never_trained_twice_and_a_killed_one_is() {
     let left = sweep.left();
     assert_eq!(left.len(), 4);
     for (line, point) in left.iter().zip(points) {
-        assert!(line.ends_with(&format!("{point} --overwrite")), "{line}");
+        assert!(line.ends_with(&format!("{point} --resume")), "{line}");
     }
     assert!(!sweep.path("sweep.toml").exists(), "--dry-run writes nothing");
 

@@ -8,7 +8,8 @@ use nightsplat::Error;
 use nightsplat::cli::ImageFormat;
 use nightsplat::cli::in_options;
 use nightsplat::cli::tone::{ToneArgs, ToneReport, apply};
-use nightsplat::image::Image;
+use nightsplat::image::{Image, srgb_from_linear};
+use nightsplat::metrics::psnr;
 use nightsplat::tone::{GainChoice, Statistics, ToneCurve, ToneSettings};
 
 mod common;
@@ -402,6 +403,34 @@ fn the_automatic_curve_says_how_bright_and_why_and_lends_its_brightness() {
         let brighter = apply(&ToneArgs { brightness: Some(0.6), ..lent }).unwrap();
         let found = brighter.scene.after.mean_luminance;
         assert!((found - 0.6).abs() < 0.02, "{curve}: {found}");
+    }
+}
+
+#[test]
+fn linear_light_of_a_known_exposure_comes_out_as_bright_as_of_any_other() {
+    let dir = tempfile::tempdir().unwrap();
+    // Scene-referred light of two decades, as a camera RAW has it; what reaches the sensor is a part of it.
+    let light = |x: u32, y: u32| 10.0_f32.powf(-2.0 * ((7 * x + 11 * y) % 40) as f32 / 40.0);
+    let target = |exposure: f32| {
+        let [folder, out] =
+            ["dark", "out"].map(|name| dir.path().join(format!("{name}{exposure}")));
+        std::fs::create_dir(&folder).unwrap();
+        let photograph =
+            Image::from_fn(40, 30, |x, y| [srgb_from_linear(exposure * light(x, y)); 3]);
+        photograph.save_exr(folder.join("a.exr")).unwrap();
+        let args =
+            ToneArgs { out: Some(out.clone()), format: ImageFormat::Exr, ..automatic(&folder) };
+        let report = apply(&args).unwrap();
+        (report.exposure.unwrap(), Image::load(out.join("a.exr")).unwrap())
+    };
+    let (exposure, eighth) = target(1.0 / 8.0);
+    for stops in 4..8 {
+        let (darker, image) = target(0.5_f32.powi(stops));
+        assert!(darker.gain > exposure.gain, "{stops}: {} {}", darker.gain, exposure.gain);
+        let off = (darker.target - exposure.target).abs();
+        assert!(off < 0.03, "{stops}: {} {}", darker.target, exposure.target);
+        let psnr = psnr(&image, &eighth).unwrap();
+        assert!(psnr > 30.0, "{stops} stops below the light: {psnr} dB");
     }
 }
 

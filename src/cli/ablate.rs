@@ -8,6 +8,7 @@ use anyhow::Result;
 
 use super::comparison::{self, Run};
 use super::progress;
+use super::signals;
 use super::table;
 use super::train::{TrainOptions, held_unless};
 use crate::Error;
@@ -17,6 +18,7 @@ use crate::gpu::{DeviceChoice, Gpu};
 use crate::image::Image;
 use crate::output::write_whole;
 use crate::report::{Report, plot};
+use crate::run::{HeldRun, Session};
 use crate::train::{Part, TrainConfig};
 
 /// Train colour alone, each part of LITA-GS alone beside it, and all of them: same seed, same steps.
@@ -34,6 +36,9 @@ pub struct AblateArgs {
     /// Replace the runs that DIR already holds
     #[arg(long)]
     pub overwrite: bool,
+    /// Go on with the runs that DIR holds, behind the same command that was stopped
+    #[arg(long, conflicts_with = "overwrite")]
+    pub resume: bool,
     #[command(flatten)]
     pub(crate) options: TrainOptions,
 }
@@ -63,17 +68,19 @@ pub fn run(args: &AblateArgs) -> Result<()> {
     let models = models(&config);
     for Model { folder, .. } in &models {
         let taken = args.out.join(folder);
-        if taken.join("config.toml").exists() && !args.overwrite {
-            let problem = "already holds a run; pass --overwrite to replace it";
+        if taken.join("config.toml").exists() && !args.overwrite && !args.resume {
+            let problem =
+                "already holds a run; pass --resume to go on or --overwrite to replace it";
             return Err(Error::output(taken, problem).into());
         }
     }
-    let mut runs = vec![];
+    let (requests, mut runs) = (signals::requests()?, vec![]);
     for (i, Model { folder, title, config }) in models.iter().enumerate() {
         tracing::info!("{} of {}: {title}", i + 1, models.len());
         let out = args.out.join(folder);
-        let held = held_unless(args.overwrite);
-        let trained = progress::train(&gpu, config, &dataset, &out, held)?;
+        let held = if args.resume { HeldRun::Resume } else { held_unless(args.overwrite) };
+        let session = Session { held, requests: requests.clone(), ..Session::default() };
+        let trained = progress::train_in(&gpu, config, &dataset, &out, &session)?;
         runs.push(Run::new(title.clone(), trained));
     }
     let dark = eval::score(&dataset, |view| {

@@ -59,7 +59,7 @@ impl Run {
         arguments.extend(point.arguments());
         let file = plan.map_or("none", |(file, _)| file);
         arguments.extend(["--plan", file].map(str::to_owned));
-        arguments.extend(["--out".to_owned(), unicode(&folder)?, "--overwrite".to_owned()]);
+        arguments.extend(["--out".to_owned(), unicode(&folder)?, "--resume".to_owned()]);
         let args = train_args(&name, &arguments)?;
         let config = match plan {
             Some((_, plan)) => args.options.planned_config(args.dataset, Some(plan))?,
@@ -93,7 +93,7 @@ impl Run {
         serde_json::from_slice(&text).ok()
     }
 
-    /// The command as a shell takes it.
+    /// The command as a shell takes it, which may be given any number of times.
     pub(super) fn command_line(&self) -> Result<String> {
         let program = std::env::current_exe()
             .map_err(|error| Error::input("nightsplat", format!("cannot be found: {error}")))?;

@@ -40,8 +40,8 @@ pub struct BenchArgs {
     /// references in f64
     #[arg(long, conflicts_with_all = ["tune", "growth"])]
     pub stress: bool,
-    /// The device: a part of its name or its index in `nightsplat doctor` [default: the best]
-    #[arg(long, value_name = "NAME|INDEX")]
+    /// The device: uuid:, pci: or index of `nightsplat doctor`, a part of its name, or cpu [default: the best]
+    #[arg(long, value_name = "DEVICE")]
     pub device: Option<DeviceChoice>,
     /// Pixels per row of the view [default: 512; with --tune, 500 and 1920]
     #[arg(long)]

@@ -29,8 +29,8 @@ pub struct DemoArgs {
     /// The folder to write to; an earlier demo in it is replaced
     #[arg(long, value_name = "DIR", default_value = "demo")]
     pub out: PathBuf,
-    /// The device: a part of its name or its index in `nightsplat doctor` [default: the best]
-    #[arg(long, value_name = "NAME|INDEX")]
+    /// The device: uuid:, pci: or index of `nightsplat doctor`, a part of its name, or cpu [default: the best]
+    #[arg(long, value_name = "DEVICE")]
     pub device: Option<DeviceChoice>,
 }
 

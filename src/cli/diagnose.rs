@@ -57,8 +57,8 @@ pub struct DiagnoseArgs {
     /// Plan for so many steps [default: the preset's]
     #[arg(long, value_name = "N")]
     pub steps: Option<u64>,
-    /// The device: a part of its name or its index in `nightsplat doctor` [default: the best]
-    #[arg(long, value_name = "NAME|INDEX")]
+    /// The device: uuid:, pci: or index of `nightsplat doctor`, a part of its name, or cpu [default: the best]
+    #[arg(long, value_name = "DEVICE")]
     pub device: Option<DeviceChoice>,
 }
 

@@ -6,7 +6,7 @@ use anyhow::Result;
 use serde::Serialize;
 
 use crate::Error;
-use crate::gpu::{CooperativeMatrix, DeviceReport, devices};
+use crate::gpu::{CooperativeMatrix, DeviceChoice, DeviceReport, SchedulerVariables, devices};
 
 /// List the Vulkan devices, what training requires, and whether each device offers it.
 #[derive(Clone, Copy, Debug, clap::Args)]
@@ -19,46 +19,60 @@ pub struct DoctorArgs {
 /// What `--json` prints.
 #[derive(Serialize)]
 struct Output<'a> {
-    devices: &'a [DeviceReport],
+    devices: Vec<Listed<'a>>,
     /// Index of the device that is used unless `--device` picks another.
     chosen: Option<usize>,
+    /// The variables of a scheduler that picked it.
+    reason: Option<String>,
+}
+
+#[derive(Serialize)]
+struct Listed<'a> {
+    #[serde(flatten)]
+    report: &'a DeviceReport,
+    /// The names of the requirements that it does not meet.
+    missing: Vec<&'static str>,
 }
 
 /// Prints the report.
 ///
 /// # Errors
-/// There is no Vulkan, or no device that meets every requirement (which is printed nevertheless).
+/// There is no Vulkan, or no device that meets every requirement, or a scheduler's variables name none (what there is, is
+/// printed nevertheless).
 pub fn run(args: &DoctorArgs) -> Result<()> {
     let devices = devices()?;
-    let chosen = chosen(&devices);
+    let picked = SchedulerVariables::of_this_process().pick(&DeviceChoice::Best, &devices);
+    let reason = picked.as_ref().ok().and_then(|picked| picked.reason.clone());
+    let checked = picked.and_then(|picked| match devices[picked.index].missing() {
+        None => Ok(picked.index),
+        Some(feature) => {
+            let (device, feature) = (devices[picked.index].name.clone(), feature.to_owned());
+            Err(Error::MissingFeature { device, feature })
+        }
+    });
+    let chosen = checked.as_ref().ok().copied();
     let text = if args.json {
-        serde_json::to_string_pretty(&Output { devices: &devices, chosen })?
+        let listed =
+            |report| Listed { report, missing: DeviceReport::all_missing(report).collect() };
+        let devices = devices.iter().map(listed).collect();
+        serde_json::to_string_pretty(&Output { devices, chosen, reason })?
     } else {
-        table(&devices, chosen)
+        table(&devices, chosen, reason.as_deref())
     };
     writeln!(std::io::stdout().lock(), "{}", text.trim_end())?;
-    let lacking = devices.first().and_then(|device| Some((device.name.clone(), device.missing()?)));
-    match (chosen, lacking) {
-        (None, Some((device, feature))) => {
-            Err(Error::MissingFeature { device, feature: feature.to_owned() }.into())
-        }
-        _ => Ok(()),
-    }
+    checked?;
+    Ok(())
 }
 
-/// The first that lacks nothing, as [`DeviceChoice::Best`](crate::gpu::DeviceChoice::Best) has it.
-fn chosen(devices: &[DeviceReport]) -> Option<usize> {
-    devices.iter().position(|device| device.missing().is_none())
-}
-
-fn table(devices: &[DeviceReport], chosen: Option<usize>) -> String {
+fn table(devices: &[DeviceReport], chosen: Option<usize>, reason: Option<&str>) -> String {
     let mut text = String::new();
     for (index, device) in devices.iter().enumerate() {
-        let DeviceReport { name, kind, api_version, subgroup_size, memory, .. } = device;
+        let DeviceReport { name, kind, api_version, uuid, pci, subgroup_size, memory, .. } = device;
+        let pci = pci.map_or_else(String::new, |address| format!(", pci:{address}"));
         let requirements = &device.requirements;
         let gib = *memory as f64 / f64::from(1 << 30);
         text += &format!(
-            "{index}  {name}\n   {kind}, Vulkan {api_version}, subgroups of {subgroup_size}, {gib:.1} GiB\n"
+            "{index}  {name}\n   {kind}, Vulkan {api_version}, subgroups of {subgroup_size}, {gib:.1} GiB\n   uuid:{uuid}{pci}\n"
         );
         let width = requirements.iter().map(|requirement| requirement.name.len()).max();
         let width = width.unwrap_or(0);
@@ -75,8 +89,11 @@ fn table(devices: &[DeviceReport], chosen: Option<usize>) -> String {
         };
         text += "\n";
     }
+    let reason = reason.map_or_else(String::new, |reason| format!(" ({reason})"));
     match chosen {
-        Some(index) => text + &format!("device {index} is used unless --device picks another"),
+        Some(index) => {
+            text + &format!("device {index} is used{reason} unless --device picks another")
+        }
         None => text + "no device will do",
     }
 }
@@ -84,7 +101,7 @@ fn table(devices: &[DeviceReport], chosen: Option<usize>) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::gpu::RequirementReport;
+    use crate::gpu::{DeviceLimits, RequirementReport};
 
     fn device(name: &str, is_recent: bool) -> DeviceReport {
         let requirement = |name, met| RequirementReport { name, why: "it is needed", met };
@@ -92,32 +109,40 @@ mod tests {
             name: name.to_owned(),
             kind: "discrete",
             api_version: "1.3.0".to_owned(),
+            vendor: 1,
+            uuid: "00-11".to_owned(),
+            pci: is_recent.then_some("65:1.2".parse().unwrap()),
             subgroup_size: 32,
             memory: 3 << 29,
+            limits: DeviceLimits::default(),
             cooperative_matrix: is_recent.then_some(CooperativeMatrix { m: 8, n: 16, k: 32 }),
             requirements: vec![requirement("Vulkan 1.3", true), requirement("shiny", is_recent)],
         }
     }
 
     #[test]
-    fn the_first_device_that_lacks_nothing_is_chosen_and_what_others_lack_is_shown() {
+    fn the_table_says_what_each_device_is_and_lacks_and_which_is_used() {
         let devices = [device("Abacus", false), device("Babbage", true), device("Curta", true)];
-        assert_eq!(chosen(&devices), Some(1));
-        let table = table(&devices, chosen(&devices));
+        let text = table(&devices, Some(1), None);
+        assert!(text.starts_with(
+            "0  Abacus\n   discrete, Vulkan 1.3.0, subgroups of 32, 1.5 GiB\n   uuid:00-11\n"
+        ));
+        assert!(text.contains("   uuid:00-11, pci:0000:65:01.2\n"), "{text}");
         assert!(
-            table.starts_with("0  Abacus\n   discrete, Vulkan 1.3.0, subgroups of 32, 1.5 GiB\n")
+            text.contains("   yes  Vulkan 1.3  it is needed\n   no   shiny       it is needed\n")
         );
+        assert!(text.contains("also 8x16x32 matrices") && text.contains("no 16-bit matrices"));
+        assert!(text.ends_with("device 1 is used unless --device picks another"));
+        let by_a_scheduler = table(&devices, Some(2), Some("CUDA_VISIBLE_DEVICES=1"));
         assert!(
-            table.contains("   yes  Vulkan 1.3  it is needed\n   no   shiny       it is needed\n")
+            by_a_scheduler.ends_with(
+                "device 2 is used (CUDA_VISIBLE_DEVICES=1) unless --device picks another"
+            )
         );
-        assert!(table.contains("also 8x16x32 matrices") && table.contains("no 16-bit matrices"));
-        assert!(table.ends_with("device 1 is used unless --device picks another"));
     }
 
     #[test]
     fn where_no_device_will_do_none_is_chosen() {
-        let devices = [device("Abacus", false)];
-        assert_eq!(chosen(&devices), None);
-        assert!(table(&devices, None).ends_with("no device will do"));
+        assert!(table(&[device("Abacus", false)], None, None).ends_with("no device will do"));
     }
 }

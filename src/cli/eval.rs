@@ -9,6 +9,7 @@ use super::finished_run::FinishedRun;
 use super::{progress_bar, table};
 use crate::eval::{self, ViewScore, Yardstick};
 use crate::gpu::DeviceChoice;
+use crate::lpips::Lpips;
 use crate::metrics::Scores;
 use crate::output::printable;
 use crate::run;
@@ -31,11 +32,14 @@ pub struct EvalArgs {
     /// Where the dataset is now, or another copy of it; what differs from the run's views is said [default: where the run found it]
     #[arg(long, value_name = "DIR")]
     pub dataset: Option<PathBuf>,
+    /// Score LPIPS too, with AlexNet's weights in safetensors; the guide has the command that converts the published ones
+    #[arg(long, value_name = "WEIGHTS")]
+    pub lpips: Option<PathBuf>,
     /// Write what was scored to RUN/eval/renders, and what it was compared with to RUN/eval/references or RUN/eval/targets
     #[arg(long)]
     pub save_images: bool,
-    /// The device: a part of its name or its index in `nightsplat doctor` [default: that of the run]
-    #[arg(long, value_name = "NAME|INDEX")]
+    /// The device: uuid:, pci: or index of `nightsplat doctor`, a part of its name, or cpu [default: that of the run]
+    #[arg(long, value_name = "DEVICE")]
     pub device: Option<DeviceChoice>,
 }
 
@@ -46,13 +50,17 @@ pub struct EvalArgs {
 pub fn run(args: &EvalArgs) -> Result<()> {
     let FinishedRun { gpu, config, dataset, gaussian_count, mut player } =
         FinishedRun::open(&args.run, args.dataset.as_deref(), args.device.as_ref())?;
+    let lpips = args.lpips.as_ref().map(|weights| Lpips::load(&gpu, weights)).transpose()?;
     let yardstick = Yardstick::of(&gpu, &config.tone, &dataset)?;
     let bar = progress_bar(yardstick.view_count(&dataset));
-    let scored = eval::score_by(&yardstick, &dataset, |view| {
+    let mut scored = eval::score_by(&yardstick, &dataset, |view| {
         bar.set_message(printable(&view.name).into_owned());
         player.render(view).inspect(|_| bar.inc(1))
     })?;
     bar.finish_and_clear();
+    if let Some(lpips) = &lpips {
+        eval::add_lpips(&mut scored, &dataset, &gpu, lpips)?;
+    }
     if scored.is_empty() {
         let root = dataset.root.display();
         tracing::warn!(
@@ -92,23 +100,25 @@ pub fn run(args: &EvalArgs) -> Result<()> {
 }
 
 fn score_table(scored: &[ViewScore]) -> String {
+    let (mean, mean_r0) = eval::means(scored);
+    let mut header = vec!["view", "PSNR", "channel mean", "SSIM"];
+    header.extend(mean.and_then(|mean| mean.lpips).map(|_| "LPIPS"));
+    // Before the denoiser.
+    header.extend(mean_r0.iter().flat_map(|_| ["PSNR of R_0", "SSIM of R_0"]));
     let row = |name: &str, scores: &Scores, r0: Option<&Scores>| {
-        let Scores { psnr, psnr_channel_mean, ssim } = scores;
+        let Scores { psnr, psnr_channel_mean, ssim, lpips } = scores;
         let mut row = vec![
             name.to_owned(),
             format!("{psnr:.2}"),
             format!("{psnr_channel_mean:.2}"),
             format!("{ssim:.4}"),
         ];
+        row.extend(lpips.map(|lpips| format!("{lpips:.4}")));
         row.extend(
             r0.into_iter().flat_map(|r0| [format!("{:.2}", r0.psnr), format!("{:.4}", r0.ssim)]),
         );
         row
     };
-    let (mean, mean_r0) = eval::means(scored);
-    let mut header = vec!["view", "PSNR", "channel mean", "SSIM"];
-    // Before the denoiser.
-    header.extend(mean_r0.iter().flat_map(|_| ["PSNR of R_0", "SSIM of R_0"]));
     let mut rows = vec![header.into_iter().map(str::to_owned).collect()];
     rows.extend(scored.iter().map(|view| row(&view.name, &view.scores, view.r0.as_ref())));
     rows.extend(mean.map(|mean| row("mean", &mean, mean_r0.as_ref())));

@@ -44,8 +44,8 @@ pub struct ExportArgs {
     /// For html: where the dataset lies now [default: that of the run]
     #[arg(long, value_name = "DIR")]
     pub dataset: Option<PathBuf>,
-    /// For html of a model with networks: a part of the device's name or its index [default: that of the run]
-    #[arg(long, value_name = "NAME|INDEX")]
+    /// For html of a model with networks, the device: uuid:, pci: or index of `nightsplat doctor`, a part of its name, or cpu [default: that of the run]
+    #[arg(long, value_name = "DEVICE")]
     pub device: Option<DeviceChoice>,
 }
 

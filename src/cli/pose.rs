@@ -2,6 +2,7 @@
 
 mod clip;
 mod lifted;
+mod reconstruction;
 mod tool;
 
 use std::collections::BTreeMap;
@@ -12,6 +13,7 @@ use std::time::Instant;
 
 use anyhow::Result;
 
+use self::reconstruction::{Mapper, Matcher, Reconstruction};
 use self::tool::Tool;
 use crate::Error;
 use crate::dataset::Dataset;
@@ -43,6 +45,12 @@ pub struct PoseArgs {
     /// Which photographs are compared: each with each, or with those that follow it by name [default: sequential for a clip, else exhaustive]
     #[arg(long, value_enum)]
     pub matcher: Option<Matcher>,
+    /// How cameras are placed: one after the other, or all at once, which many photographs are faster by
+    #[arg(long, value_enum, default_value_t = Mapper::Incremental)]
+    pub mapper: Mapper,
+    /// The program `glomap`, which places all at once where your COLMAP is older than 4.0
+    #[arg(long, value_name = "PATH", default_value = "glomap")]
+    pub glomap: PathBuf,
     /// COLMAP's model of the lens, the same for all photographs of one size
     #[arg(long, value_name = "NAME", default_value = "OPENCV")]
     pub camera_model: String,
@@ -58,27 +66,9 @@ pub struct PoseArgs {
     /// Replace a dataset that `pose` wrote before
     #[arg(long)]
     pub overwrite: bool,
-    /// The device that lifts: a part of its name or its index in `nightsplat doctor` [default: the best]
-    #[arg(long, value_name = "NAME|INDEX")]
+    /// The device that lifts: uuid:, pci: or index of `nightsplat doctor`, a part of its name, or cpu [default: the best]
+    #[arg(long, value_name = "DEVICE")]
     pub device: Option<DeviceChoice>,
-}
-
-/// Which photographs COLMAP compares.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-pub enum Matcher {
-    /// Each with each.
-    Exhaustive,
-    /// Each with those that follow it by name.
-    Sequential,
-}
-
-impl Matcher {
-    fn command(self) -> &'static str {
-        match self {
-            Self::Exhaustive => "exhaustive_matcher",
-            Self::Sequential => "sequential_matcher",
-        }
-    }
 }
 
 /// Two cameras tell the shape of little.
@@ -101,6 +91,9 @@ pub fn run(args: &PoseArgs) -> Result<()> {
     let mut out = Unfinished::new(&args.out, args.overwrite)?;
     let colmap = Tool::new(&args.colmap, "colmap", &out.log)
         .found(&format!("by hand: {}", by_hand(&args.photos, &args.out)))?;
+    let matcher =
+        args.matcher.unwrap_or(if is_clip { Matcher::Sequential } else { Matcher::Exhaustive });
+    let reconstruction = Reconstruction::new(args, colmap, matcher, &out.work)?;
     let photographs = if is_clip {
         let ffmpeg = Tool::new(&args.ffmpeg, "ffmpeg", &out.log).found("")?;
         clip::frames(&ffmpeg, &args.photos, args.fps, &out.work.join("frames"))?
@@ -111,7 +104,7 @@ pub fn run(args: &PoseArgs) -> Result<()> {
     let lifted = out.work.join("lifted");
     let gain = lifted::write(&gpu, &photographs, &lifted)?;
     say(begin, &format!("{} photographs lifted (gain {gain:.1})", photographs.len()))?;
-    let models = reconstructed(args, &colmap, &out.work, is_clip, begin)?;
+    let models = reconstruction.models(&lifted, |what| say(begin, what))?;
     let (model, placed) = Dataset::largest_model(&models)?.filter(|(_, placed)| placed.len() >= FEWEST).ok_or_else(|| {
         let problem = format!(
             "COLMAP found no cameras for these {} photographs: they show too little in common or no texture; take more of them, closer together, or expose longer ({} has its output)",
@@ -163,69 +156,6 @@ fn by_hand(photos: &Path, out: &Path) -> String {
          colmap mapper --database_path {out}/database.db --image_path lifted --output_path {out}/sparse && \
          cp -r {photos} {out}/images"
     )
-}
-
-/// COLMAP's models, in a folder each.
-fn reconstructed(
-    args: &PoseArgs,
-    colmap: &Tool<'_>,
-    work: &Path,
-    is_clip: bool,
-    begin: Instant,
-) -> Result<PathBuf> {
-    let matcher =
-        args.matcher.unwrap_or(if is_clip { Matcher::Sequential } else { Matcher::Exhaustive });
-    let (lifted, database, models) =
-        (work.join("lifted"), work.join("database.db"), work.join("sparse"));
-    create(&models)?;
-    let [lifted, database, output] = [&lifted, &database, &models].map(|path| path.as_os_str());
-    let gpu = if args.colmap_gpu { "1" } else { "0" };
-    // Versions before 3.12 call the same option by another name.
-    let option = |stage: &str, new: &'static str, old: &'static str| {
-        if colmap.helps_with(stage, new) { format!("--{new}") } else { format!("--{old}") }
-    };
-    let use_gpu =
-        option("feature_extractor", "FeatureExtraction.use_gpu", "SiftExtraction.use_gpu");
-    colmap.run(
-        "feature_extractor",
-        &[
-            "--database_path".as_ref(),
-            database,
-            "--image_path".as_ref(),
-            lifted,
-            "--ImageReader.single_camera".as_ref(),
-            if lifted::are_of_one_size(Path::new(lifted)) { "1" } else { "0" }.as_ref(),
-            "--ImageReader.camera_model".as_ref(),
-            args.camera_model.as_ref(),
-            use_gpu.as_ref(),
-            gpu.as_ref(),
-        ],
-    )?;
-    say(begin, "features extracted")?;
-    let use_gpu = option(matcher.command(), "FeatureMatching.use_gpu", "SiftMatching.use_gpu");
-    colmap.run(
-        matcher.command(),
-        &["--database_path".as_ref(), database, use_gpu.as_ref(), gpu.as_ref()],
-    )?;
-    say(begin, "features matched")?;
-    let mapped = colmap.run(
-        "mapper",
-        &[
-            "--database_path".as_ref(),
-            database,
-            "--image_path".as_ref(),
-            lifted,
-            "--output_path".as_ref(),
-            output,
-        ],
-    );
-    // It fails where it found nothing to begin with, which is said of the photographs.
-    match mapped {
-        Err(_) if colmap.said("No good initial image pair found") => {}
-        outcome => outcome?,
-    }
-    say(begin, "cameras placed")?;
-    Ok(models)
 }
 
 /// The masks beside the photographs go with them.

@@ -10,8 +10,8 @@ use serde_json::{Value, json};
 use crate::dataset::Dataset;
 use crate::eval::{self, Against, ViewScore};
 use crate::gpu::Gpu;
-use crate::run::{self, Event, HeldRun, Trained};
-use crate::train::{StepReport, TrainConfig};
+use crate::run::{self, Event, HeldRun, Session, Trained};
+use crate::train::{MemoryEstimate, StepReport, TrainConfig};
 
 /// How a run says what it does.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -47,8 +47,41 @@ pub(crate) fn train(
     out: &Path,
     held: HeldRun,
 ) -> crate::Result<Trained> {
+    train_in(gpu, config, dataset, out, &Session { held, ..Session::default() })
+}
+
+/// The same in a session.
+///
+/// # Errors
+/// Those of [`run::train_in`].
+pub(crate) fn train_in(
+    gpu: &Gpu,
+    config: &TrainConfig,
+    dataset: &Dataset,
+    out: &Path,
+    session: &Session<'_>,
+) -> crate::Result<Trained> {
     let mut progress = Reporter::new(ProgressForm::of_terminal());
-    run::train(gpu, config, dataset, out, held, |event| progress.observe(event))
+    run::train_in(gpu, config, dataset, out, session, |event| progress.observe(event))
+}
+
+/// What a run is going to take, in a line.
+fn foreseen(memory: &MemoryEstimate) -> String {
+    let size = |bytes: u64| match bytes >> 20 {
+        mebibytes @ 0..10_000 => format!("{mebibytes} MiB"),
+        mebibytes => format!("{:.1} GiB", mebibytes as f64 / 1024.0),
+    };
+    let MemoryEstimate { gaussians, device, host, most_gaussians, most_device, most_host } = memory;
+    let now = format!(
+        "memory: a step with {gaussians} Gaussians takes {} on the device, {} on the host",
+        size(*device),
+        size(*host)
+    );
+    if most_gaussians == gaussians {
+        return now;
+    }
+    let (most_device, most_host) = (size(*most_device), size(*most_host));
+    format!("{now}; up to {most_gaussians}, {most_device} and {most_host}")
 }
 
 /// Says what a run does, event by event.
@@ -95,8 +128,9 @@ impl Reporter {
 
     fn draw(&mut self, event: Event<'_>) {
         match event {
-            Event::Started { step, steps } => {
+            Event::Started { step, steps, memory } => {
                 self.start(step, steps);
+                say(&foreseen(memory));
                 self.bar = bar(steps).with_position(step);
             }
             Event::Step(report) => {
@@ -116,7 +150,10 @@ impl Reporter {
 
     fn write(&mut self, event: Event<'_>) {
         match event {
-            Event::Started { step, steps } => self.start(step, steps),
+            Event::Started { step, steps, memory } => {
+                self.start(step, steps);
+                say(&foreseen(memory));
+            }
             Event::Step(report) if self.is_due() => say(&self.line(report)),
             Event::HeldOut { step, psnr } => {
                 say(&format!("step {step}: held-out views {psnr:.2} dB against their targets"));
@@ -132,9 +169,11 @@ impl Reporter {
 
     fn print(&mut self, event: Event<'_>) {
         let line = match event {
-            Event::Started { step, steps } => {
+            Event::Started { step, steps, memory } => {
                 self.start(step, steps);
-                let mut started = json!({ "event": "started", "step": step, "steps": steps });
+                let mut started = json!({
+                    "event": "started", "step": step, "steps": steps, "memory": memory,
+                });
                 let facts = self.facts.as_object().into_iter().flatten();
                 facts.for_each(|(name, value)| started[name] = value.clone());
                 started

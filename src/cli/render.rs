@@ -59,8 +59,8 @@ pub struct RenderArgs {
     /// The files to write
     #[arg(long, value_enum, default_value_t)]
     pub format: ImageFormat,
-    /// The device: a part of its name or its index in `nightsplat doctor` [default: that of the run]
-    #[arg(long, value_name = "NAME|INDEX")]
+    /// The device: uuid:, pci: or index of `nightsplat doctor`, a part of its name, or cpu [default: that of the run]
+    #[arg(long, value_name = "DEVICE")]
     pub device: Option<DeviceChoice>,
 }
 

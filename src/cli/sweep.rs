@@ -34,7 +34,7 @@ use crate::tone::Statistics;
 /// Train over a grid of settings, each point in its own run directory, and rank the results.
 ///
 /// A point is one `nightsplat train` command, run as a process of its own. Interrupt the sweep at any time and give the
-/// same command again: finished points stay, the others are trained anew. A point that fails is reported, and the
+/// same command again: finished points stay, those under way go on from what they saved. A point that fails is reported, and the
 /// others go on. More values may join a list later; another base or another set of lists needs another --out.
 #[derive(Clone, Debug, Args)]
 #[command(after_help = EXAMPLES)]
@@ -122,7 +122,7 @@ pub fn run(args: &SweepArgs) -> Result<()> {
         return Ok(());
     }
     let bar = progress_bar(left.len());
-    let failures = runner::train(&left, args.jobs.into(), &bar);
+    let failures = runner::train(&left, args.jobs.into(), &bar, (&args.out, runs.len()))?;
 
     let baseline = args.table.and_then(PaperTable::baseline);
     let leaderboard = Leaderboard::new(&runs, baseline, adaptive_offset(&runs, &dataset));

@@ -74,8 +74,8 @@ pub struct ToneArgs {
     /// The files to write: 8- or 16-bit PNG, or float EXR in linear light
     #[arg(long, value_enum, default_value_t)]
     pub format: ImageFormat,
-    /// The device, by a part of its name or by index [default: the best]
-    #[arg(long, value_name = "NAME|INDEX")]
+    /// The device: uuid:, pci: or index of `nightsplat doctor`, a part of its name, or cpu [default: the best]
+    #[arg(long, value_name = "DEVICE")]
     pub device: Option<DeviceChoice>,
 }
 

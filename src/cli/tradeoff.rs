@@ -131,7 +131,9 @@ pub fn run(args: &TradeoffArgs) -> Result<()> {
         return Ok(());
     }
     comparison.prepare(args)?;
-    let failures = runner::train(&left.iter().collect::<Vec<_>>(), 1, &progress_bar(left.len()));
+    let (bar, all) = (progress_bar(left.len()), comparison.runs.len());
+    let left: Vec<&Run> = left.iter().collect();
+    let failures = runner::train(&left, 1, &bar, (&args.out, all))?;
     let outcomes = Outcome::all(&comparison.runs);
     let page = comparison.page(&outcomes, &failures).html()?;
     for (file, text) in

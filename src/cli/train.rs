@@ -90,6 +90,12 @@ pub(crate) struct TrainOptions {
     /// Memory for photographs, such as 4G, on the device and decoded on the host; the rest waits on disk, which takes time and changes no bit [default: a quarter of the memory of each]
     #[arg(long, value_name = "SIZE")]
     cache: Option<CacheSize>,
+    /// The most that buffers may take on the device, such as 4G: growth stops in time, and what exceeds it all the same ends the run, saved, with exit code 4 [default: all that there is]
+    #[arg(long, value_name = "SIZE")]
+    max_vram: Option<CacheSize>,
+    /// The most that the process is to take on the host, as far as that can be foreseen: growth stops in time [default: all that there is]
+    #[arg(long, value_name = "SIZE")]
+    max_ram: Option<CacheSize>,
     /// Hold out every Nth view by name, whatever split the dataset has; 0: none, train on all [default: the dataset's split, else every 8th]
     #[arg(long, value_name = "N")]
     test_every: Option<usize>,
@@ -128,8 +134,8 @@ pub(crate) struct TrainOptions {
     /// Nothing nearer to a camera is seen, in units of the scene's extent: of how far the cameras stand from their middle [default: {near}]
     #[arg(long, value_name = "N")]
     near: Option<f64>,
-    /// The device: a part of its name or its index in `nightsplat doctor` [default: the best]
-    #[arg(long, value_name = "NAME|INDEX")]
+    /// The device: uuid:, pci: or index of `nightsplat doctor`, a part of its name, or cpu [default: the best]
+    #[arg(long, value_name = "DEVICE")]
     device: Option<String>,
     /// A TOML file with any of the settings of a run's config.toml
     #[arg(long, value_name = "FILE")]
@@ -358,6 +364,8 @@ impl TrainOptions {
         set(&mut config.downscale, &self.downscale);
         set(&mut config.max_resolution, &self.max_resolution);
         config.cache = self.cache.or(config.cache);
+        config.max_vram = self.max_vram.or(config.max_vram);
+        config.max_ram = self.max_ram.or(config.max_ram);
         config.test_every = self.test_every.or(config.test_every);
         config.tensorboard |= self.tensorboard;
         set(&mut config.seed, &self.seed);

@@ -349,8 +349,16 @@ fn depth_map(
     let map = undistortion.map_or_else(|| map.clone(), |undistortion| undistortion.apply(&map));
     let mut depth = map.resized(size.0, size.1).data;
     depth.truncate(size.0 as usize * size.1 as usize);
+    if let Some(value) = depth.iter().find(|value| !value.is_finite()) {
+        return Err(Error::input(path, format!("holds a depth of {value}")));
+    }
     if depth.iter().all(|&value| value == depth[0]) {
         return Err(Error::input(path, "is the same everywhere"));
+    }
+    // Only ratios count; the squares of what lies beyond would not be floats.
+    let largest = depth.iter().fold(0.0_f32, |largest, value| largest.max(value.abs()));
+    if !(1e-12..1e12).contains(&largest) {
+        depth.iter_mut().for_each(|value| *value /= largest);
     }
     if is_disparity {
         depth.iter_mut().for_each(|value| *value = -*value);

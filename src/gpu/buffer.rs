@@ -2,7 +2,7 @@
 
 use std::marker::PhantomData;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::Ordering;
 
 use ash::vk;
 use gpu_allocator::vulkan::{Allocation, AllocationCreateDesc, AllocationScheme};
@@ -72,16 +72,6 @@ impl<T: bytemuck::Pod> Buffer<T> {
 }
 
 impl Gpu {
-    /// The most bytes that live buffers, staging included, have taken together since [`Gpu::reset_peak_memory`].
-    pub fn peak_memory(&self) -> u64 {
-        self.shared.usage.peak()
-    }
-
-    /// Counts the peak anew, from what is allocated now.
-    pub fn reset_peak_memory(&self) {
-        self.shared.usage.reset_peak();
-    }
-
     /// A buffer of `len` elements whose contents are undefined.
     ///
     /// # Errors
@@ -201,32 +191,6 @@ impl<T: bytemuck::Pod> Download<T> {
     }
 }
 
-/// Bytes of all live buffers, staging included.
-#[derive(Debug, Default)]
-pub(super) struct MemoryUsage {
-    now: AtomicU64,
-    peak: AtomicU64,
-}
-
-impl MemoryUsage {
-    fn add(&self, bytes: u64) {
-        let now = self.now.fetch_add(bytes, Ordering::AcqRel) + bytes;
-        self.peak.fetch_max(now, Ordering::AcqRel);
-    }
-
-    fn subtract(&self, bytes: u64) {
-        self.now.fetch_sub(bytes, Ordering::AcqRel);
-    }
-
-    pub(super) fn peak(&self) -> u64 {
-        self.peak.load(Ordering::Acquire)
-    }
-
-    pub(super) fn reset_peak(&self) {
-        self.peak.store(self.now.load(Ordering::Acquire), Ordering::Release);
-    }
-}
-
 impl Memory {
     fn new(shared: &Arc<Shared>, name: &str, bytes: u64, location: MemoryLocation) -> Result<Self> {
         let limit = shared.properties.max_storage_buffer_range;
@@ -252,6 +216,18 @@ impl Memory {
             let raw =
                 shared.device.create_buffer(&info, None).map_err(out_of_memory(name, size))?;
             let requirements = shared.device.get_buffer_memory_requirements(raw);
+            if shared.faults.fails_allocation(name) {
+                shared.device.destroy_buffer(raw, None);
+                return Err(out_of_memory(name, size)(AllocationError::OutOfMemory));
+            }
+            let admitted = shared.usage.admit(requirements.size).or_else(|_| {
+                shared.collect(shared.reached());
+                shared.usage.admit(requirements.size)
+            });
+            if let Err(refused) = admitted {
+                shared.device.destroy_buffer(raw, None);
+                return Err(out_of_memory(name, size)(refused));
+            }
             let desc = AllocationCreateDesc {
                 name,
                 requirements,
@@ -281,7 +257,6 @@ impl Memory {
 impl Drop for Memory {
     fn drop(&mut self) {
         if let Some(allocation) = self.allocation.take() {
-            self.shared.usage.subtract(allocation.size());
             self.shared.retire(Retired::Buffer(self.raw, allocation));
             // Without work in flight nothing else would come by to free it.
             if self.shared.last_use.load(Ordering::Acquire) == 0 {

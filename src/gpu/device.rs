@@ -2,7 +2,6 @@
 
 use std::ffi::{CStr, c_void};
 use std::path::PathBuf;
-use std::str::FromStr;
 use std::sync::atomic::AtomicU64;
 use std::sync::{Arc, Mutex, OnceLock};
 
@@ -11,10 +10,16 @@ use ash::{ext, khr, vk};
 use gpu_allocator::vulkan::{Allocator, AllocatorCreateDesc};
 
 use super::checked::Checks;
-use super::cooperative::{self, CooperativeMatrix};
-use super::requirements::{EXTENSIONS, Offered, required_device_features};
+use super::choice::Picked;
+use super::cooperative;
+use super::descriptors::Descriptors;
+use super::device_report::{device_memory, max_workgroups, report};
+use super::faults::Faults;
+use super::memory::{BudgetQuery, MemoryUsage};
+use super::requirements::{OPTIONAL_EXTENSIONS, Offered, required_device_features};
 use super::{
-    Gpu, Properties, Queue, REQUIREMENTS, Shared, address_space, statistics, tuning, validation,
+    DeviceChoice, DeviceReport, Gpu, Properties, Queue, SchedulerVariables, Shared, address_space,
+    statistics, tuning, validation,
 };
 use crate::{Error, Result};
 
@@ -22,72 +27,10 @@ use crate::{Error, Result};
 const INSTALL: &str = "install a Vulkan driver, or the software device: on Debian \
      `apt install libvulkan1 mesa-vulkan-drivers`";
 
-/// Which device to use.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub enum DeviceChoice {
-    /// The first that meets all requirements: discrete before integrated, virtual, and software devices.
-    #[default]
-    Best,
-    /// By position in [`devices`].
-    Index(usize),
-    /// By a part of the name, in any case of letters.
-    Name(String),
-}
-
-impl FromStr for DeviceChoice {
-    type Err = Error;
-
-    /// A number is an index, an empty text the best device, anything else a part of the name.
-    fn from_str(text: &str) -> Result<Self> {
-        Ok(match text.parse() {
-            Ok(index) => Self::Index(index),
-            Err(_) if text.is_empty() => Self::Best,
-            Err(_) => Self::Name(text.to_owned()),
-        })
-    }
-}
-
-/// One device and how it meets the requirements, for `doctor`.
-#[derive(Clone, Debug, serde::Serialize)]
-pub struct DeviceReport {
-    /// The device's name.
-    pub name: String,
-    /// discrete, integrated, virtual, software or other.
-    pub kind: &'static str,
-    /// Vulkan version.
-    pub api_version: String,
-    /// Lanes of a subgroup.
-    pub subgroup_size: u32,
-    /// Bytes of device-local memory.
-    pub memory: u64,
-    /// The matrices that `--denoiser-precision half` builds on, where the device offers any.
-    pub cooperative_matrix: Option<CooperativeMatrix>,
-    /// Every requirement, in the order of [`REQUIREMENTS`].
-    pub requirements: Vec<RequirementReport>,
-}
-
-/// One requirement and whether a device meets it.
-#[derive(Clone, Copy, Debug, serde::Serialize)]
-pub struct RequirementReport {
-    /// The Vulkan name of the feature, extension or limit.
-    pub name: &'static str,
-    /// What it is needed for.
-    pub why: &'static str,
-    /// Whether the device meets it.
-    pub met: bool,
-}
-
-impl DeviceReport {
-    /// The first requirement that the device does not meet, by its name.
-    pub fn missing(&self) -> Option<&'static str> {
-        self.requirements.iter().find(|requirement| !requirement.met).map(|missing| missing.name)
-    }
-}
-
 /// A device that a host application lends, as raw handles, so that C++ hosts and other Vulkan bindings work.
 ///
-/// The host must have enabled [`required_device_features`] and `VK_KHR_push_descriptor` on the device, and keeps device,
-/// instance and queue alive for as long as the [`Gpu`] and everything made with it.
+/// The host must have enabled [`required_device_features`] on the device, had better enable `VK_KHR_push_descriptor` where
+/// there is one, as passes are recorded faster then, and keeps device, instance and queue alive for as long as the [`Gpu`] and everything made with it.
 #[derive(Clone, Copy, Debug)]
 pub struct HostDevice {
     /// The address of `vkGetInstanceProcAddr` of the host's loader.
@@ -106,13 +49,13 @@ pub struct HostDevice {
 
 /// What we created around a device of our own.
 pub(super) struct Owned {
-    instance: ash::Instance,
+    pub(super) instance: ash::Instance,
     messenger: Option<(ext::debug_utils::Instance, vk::DebugUtilsMessengerEXT)>,
     cache_path: Option<PathBuf>,
     /// Where the fastest tiles are kept.
     pub(super) tuning_path: Option<PathBuf>,
     /// Last, because the instance's functions live in the library.
-    entry: ash::Entry,
+    pub(super) entry: ash::Entry,
 }
 
 impl Owned {
@@ -142,19 +85,6 @@ impl Owned {
             self.instance.destroy_instance(None);
         }
     }
-}
-
-/// Every Vulkan device of this machine, the best first, whether it meets the requirements or not.
-///
-/// # Errors
-/// There is no Vulkan loader, or no device at all.
-pub fn devices() -> Result<Vec<DeviceReport>> {
-    let owned = instance(false)?;
-    let reports = physical_devices(&owned.instance)
-        .and_then(|all| all.into_iter().map(|physical| report(&owned, physical)).collect());
-    // SAFETY: no device was created from the instance.
-    unsafe { owned.destroy() };
-    reports
 }
 
 impl Gpu {
@@ -191,7 +121,7 @@ impl Gpu {
     fn open(choice: &DeviceChoice, validate: bool, takes_tuning: bool) -> Result<Self> {
         address_space::check()?;
         let mut owned = instance(validate)?;
-        let opened = choose(&owned.instance, choice).and_then(|(physical, offered)| {
+        let opened = choose(&owned, choice).and_then(|(physical, offered)| {
             owned.cache_path = cache_path(&offered);
             if takes_tuning {
                 let vk::PhysicalDeviceProperties { vendor_id, device_id, .. } = offered.properties;
@@ -262,6 +192,7 @@ impl Gpu {
         queue: Queue,
         owned: Option<Owned>,
     ) -> Result<Self> {
+        let faults = Faults::from_environment()?;
         let name = properties.name.clone();
         let fail = |call| move |result| Error::Vulkan { call, device: name.clone(), result };
         let allocator = Allocator::new(&AllocatorCreateDesc {
@@ -270,7 +201,7 @@ impl Gpu {
             physical_device: physical,
             debug_settings: Default::default(),
             buffer_device_address: false,
-            allocation_sizes: Default::default(),
+            allocation_sizes: super::memory::block_sizes(),
         })
         .map_err(|error| Error::NoDevice(format!("{}: {error}", properties.name)))?;
         let mut kind =
@@ -296,8 +227,8 @@ impl Gpu {
             .then(|| khr::pipeline_executable_properties::Device::new(instance, &device));
         Ok(Self {
             shared: Arc::new(Shared {
+                descriptors: Descriptors::of(instance, &device, properties.pushes_descriptors),
                 properties,
-                push_descriptor: khr::push_descriptor::Device::new(instance, &device),
                 debug,
                 executables,
                 tuned_tiles: OnceLock::new(),
@@ -307,7 +238,9 @@ impl Gpu {
                 progress: Mutex::default(),
                 timeline,
                 last_use: AtomicU64::new(0),
-                usage: super::buffer::MemoryUsage::default(),
+                usage: MemoryUsage::default(),
+                budget: BudgetQuery::of(instance, physical),
+                faults,
                 retired: Mutex::new(vec![]),
                 recorded: super::recorder::Recorded::default(),
                 checks: Checks::default(),
@@ -321,7 +254,7 @@ impl Gpu {
 // ---------------------------------------------------------------------------
 // Instance
 
-fn loader_error(result: vk::Result) -> Error {
+pub(super) fn loader_error(result: vk::Result) -> Error {
     match result {
         // The loader's words for no driver at all.
         vk::Result::ERROR_INCOMPATIBLE_DRIVER => no_device(),
@@ -349,24 +282,40 @@ fn validation_is_installed() -> bool {
     })
 }
 
-fn instance(validate: bool) -> Result<Owned> {
+fn instance_has(entry: &ash::Entry, extension: &CStr) -> Result<bool> {
+    // SAFETY: no preconditions.
+    let all =
+        unsafe { entry.enumerate_instance_extension_properties(None) }.map_err(loader_error)?;
+    Ok(all.iter().any(|own| own.extension_name_as_c_str() == Ok(extension)))
+}
+
+pub(super) fn instance(validate: bool) -> Result<Owned> {
     let entry = entry()?;
     let app = vk::ApplicationInfo::default()
         .application_name(c"nightsplat")
         .api_version(vk::API_VERSION_1_3);
     let layers = [validation::LAYER.as_ptr()];
-    let extensions = [ext::debug_utils::NAME.as_ptr(), ext::validation_features::NAME.as_ptr()];
+    let mut extensions = vec![];
+    if validate {
+        extensions.extend([ext::debug_utils::NAME, ext::validation_features::NAME]);
+    }
+    let mut flags = vk::InstanceCreateFlags::empty();
+    // Without it, a loader hides devices that fall short of Vulkan in what we do not use: MoltenVK.
+    if instance_has(&entry, khr::portability_enumeration::NAME)? {
+        extensions.push(khr::portability_enumeration::NAME);
+        flags |= vk::InstanceCreateFlags::ENUMERATE_PORTABILITY_KHR;
+    }
+    let extensions: Vec<_> = extensions.into_iter().map(CStr::as_ptr).collect();
     let checks = [vk::ValidationFeatureEnableEXT::SYNCHRONIZATION_VALIDATION];
     let mut features = vk::ValidationFeaturesEXT::default().enabled_validation_features(&checks);
     let messenger_info = validation::messenger();
     let mut early = messenger_info;
-    let mut info = vk::InstanceCreateInfo::default().application_info(&app);
+    let mut info = vk::InstanceCreateInfo::default()
+        .application_info(&app)
+        .flags(flags)
+        .enabled_extension_names(&extensions);
     if validate {
-        info = info
-            .enabled_layer_names(&layers)
-            .enabled_extension_names(&extensions)
-            .push_next(&mut features)
-            .push_next(&mut early);
+        info = info.enabled_layer_names(&layers).push_next(&mut features).push_next(&mut early);
     }
     // SAFETY: `info` points at live locals.
     unsafe {
@@ -387,7 +336,7 @@ fn instance(validate: bool) -> Result<Owned> {
 // Physical device
 
 /// All devices, the most capable kind first; the driver's order within a kind.
-fn physical_devices(instance: &ash::Instance) -> Result<Vec<vk::PhysicalDevice>> {
+pub(super) fn physical_devices(instance: &ash::Instance) -> Result<Vec<vk::PhysicalDevice>> {
     // SAFETY: the instance is live.
     let mut all = unsafe { instance.enumerate_physical_devices() }.map_err(loader_error)?;
     if all.is_empty() {
@@ -407,80 +356,23 @@ fn physical_devices(instance: &ash::Instance) -> Result<Vec<vk::PhysicalDevice>>
     Ok(all)
 }
 
-fn choose(
-    instance: &ash::Instance,
-    choice: &DeviceChoice,
-) -> Result<(vk::PhysicalDevice, Offered)> {
-    let offers = physical_devices(instance)?
-        .into_iter()
-        .map(|physical| Ok((physical, Offered::gather(instance, physical).map_err(loader_error)?)))
-        .collect::<Result<Vec<_>>>()?;
-    let names: Vec<_> = offers.iter().map(|(_, o)| o.device_name()).collect();
-    let index = match choice {
-        // Where none meets all requirements, the first is named with what it lacks.
-        DeviceChoice::Best => {
-            Some(offers.iter().position(|(_, o)| o.missing().is_none()).unwrap_or(0))
+/// The device that is meant, by what the machine's devices and a scheduler's variables say.
+fn choose(owned: &Owned, choice: &DeviceChoice) -> Result<(vk::PhysicalDevice, Offered)> {
+    let all = physical_devices(&owned.instance)?;
+    let reports =
+        all.iter().map(|&physical| report(owned, physical)).collect::<Result<Vec<_>>>()?;
+    let Picked { index, reason, is_doubtful } =
+        SchedulerVariables::of_this_process().pick(choice, &reports)?;
+    if let Some(reason) = reason {
+        let DeviceReport { name, uuid, .. } = &reports[index];
+        match is_doubtful {
+            true => tracing::warn!("{name}, {uuid}: {reason}"),
+            false => tracing::info!("{name}, {uuid}: {reason}"),
         }
-        DeviceChoice::Index(index) => Some(*index).filter(|&index| index < offers.len()),
-        DeviceChoice::Name(part) => {
-            let part = part.to_lowercase();
-            names.iter().position(|name| name.to_lowercase().contains(&part))
-        }
-    };
-    let chosen = index.and_then(|index| offers.into_iter().nth(index));
-    let Some((physical, offered)) = chosen else {
-        let wanted = match choice {
-            DeviceChoice::Name(name) => format!("called `{name}`"),
-            DeviceChoice::Index(index) => format!("number {index}"),
-            DeviceChoice::Best => String::new(),
-        };
-        let names = names.join(", ");
-        return Err(Error::NoDevice(format!(
-            "there is no Vulkan device {wanted}; there are: {names}"
-        )));
-    };
+    }
+    let offered = Offered::gather(&owned.instance, all[index]).map_err(loader_error)?;
     offered.check()?;
-    Ok((physical, offered))
-}
-
-fn report(
-    Owned { instance, entry, .. }: &Owned,
-    physical: vk::PhysicalDevice,
-) -> Result<DeviceReport> {
-    let offered = Offered::gather(instance, physical).map_err(loader_error)?;
-    let version = offered.properties.api_version;
-    let (major, minor, patch) = (
-        vk::api_version_major(version),
-        vk::api_version_minor(version),
-        vk::api_version_patch(version),
-    );
-    Ok(DeviceReport {
-        name: offered.device_name(),
-        kind: match offered.properties.device_type {
-            vk::PhysicalDeviceType::DISCRETE_GPU => "discrete",
-            vk::PhysicalDeviceType::INTEGRATED_GPU => "integrated",
-            vk::PhysicalDeviceType::VIRTUAL_GPU => "virtual",
-            vk::PhysicalDeviceType::CPU => "software",
-            _ => "other",
-        },
-        api_version: format!("{major}.{minor}.{patch}"),
-        subgroup_size: offered.subgroup_size,
-        memory: device_memory(instance, physical),
-        cooperative_matrix: cooperative::offered(entry, instance, physical, &offered),
-        requirements: REQUIREMENTS
-            .iter()
-            .map(|r| RequirementReport { name: r.name, why: r.why, met: r.met_by(&offered) })
-            .collect(),
-    })
-}
-
-/// Bytes of device-local memory.
-fn device_memory(instance: &ash::Instance, physical: vk::PhysicalDevice) -> u64 {
-    // SAFETY: the handle was enumerated from the instance.
-    let memory = unsafe { instance.get_physical_device_memory_properties(physical) };
-    let heaps = memory.memory_heaps_as_slice().iter();
-    let local = heaps.filter(|heap| heap.flags.contains(vk::MemoryHeapFlags::DEVICE_LOCAL));
-    local.map(|heap| heap.size).sum()
+    Ok((all[index], offered))
 }
 
 fn properties(
@@ -508,8 +400,7 @@ fn properties(
             .required_subgroup_size_stages
             .contains(vk::ShaderStageFlags::COMPUTE),
         max_storage_buffer_range: u64::from(limits.max_storage_buffer_range),
-        max_workgroups: limits.max_compute_work_group_count[0]
-            .min(limits.max_compute_work_group_count[1]),
+        max_workgroups: max_workgroups(&limits),
         max_loop_iterations: match driver.driver_id {
             vk::DriverId::MESA_LLVMPIPE => LLVMPIPE_LOOP_ITERATIONS,
             _ => u32::MAX,
@@ -518,6 +409,7 @@ fn properties(
         timestamp_period: limits.timestamp_period,
         is_cpu: offered.properties.device_type == vk::PhysicalDeviceType::CPU,
         cooperative_matrix: None,
+        pushes_descriptors: offered.pushes_descriptors(),
         tells_statistics: false,
     }
 }
@@ -536,7 +428,11 @@ fn create_device(
     let queues = [vk::DeviceQueueCreateInfo::default()
         .queue_family_index(family)
         .queue_priorities(&priorities)];
-    let mut extensions: Vec<_> = EXTENSIONS.iter().map(|name| name.as_ptr()).collect();
+    let is_wanted = |name: &&CStr| {
+        offered.has(name) && (*name != khr::push_descriptor::NAME || offered.pushes_descriptors())
+    };
+    let optional = OPTIONAL_EXTENSIONS.iter().copied().filter(is_wanted);
+    let mut extensions: Vec<_> = optional.map(CStr::as_ptr).collect();
     let (mut vulkan12, mut vulkan13) = required_device_features();
     let mut matrices =
         vk::PhysicalDeviceCooperativeMatrixFeaturesKHR::default().cooperative_matrix(true);
@@ -586,5 +482,5 @@ fn cache_folder() -> Option<PathBuf> {
 
 /// A device that has the extension has its one feature.
 fn tells_statistics(offered: &Offered) -> bool {
-    offered.extensions.contains(statistics::EXTENSION.to_string_lossy().as_ref())
+    offered.has(statistics::EXTENSION)
 }

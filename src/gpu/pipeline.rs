@@ -22,7 +22,7 @@ pub(super) struct Objects {
     pub(super) interface: &'static Interface,
     pub(super) raw: vk::Pipeline,
     pub(super) layout: vk::PipelineLayout,
-    set_layout: vk::DescriptorSetLayout,
+    pub(super) set_layout: vk::DescriptorSetLayout,
     pub(super) shared: Arc<Shared>,
 }
 
@@ -45,8 +45,8 @@ impl Gpu {
         let fail = |call| move |result| shared.error(call, result);
         // SAFETY: every create info points at live locals, and what fails half-way is destroyed here.
         unsafe {
-            let set_layout = set_layout(&shared.device, interface)
-                .map_err(fail("vkCreateDescriptorSetLayout"))?;
+            let set_layout =
+                set_layout(shared, interface).map_err(fail("vkCreateDescriptorSetLayout"))?;
             let layout = match pipeline_layout(&shared.device, interface, set_layout) {
                 Ok(layout) => layout,
                 Err(result) => {
@@ -74,7 +74,7 @@ impl Gpu {
 /// # Safety
 /// The device is live.
 unsafe fn set_layout(
-    device: &ash::Device,
+    shared: &Shared,
     interface: &Interface,
 ) -> Result<vk::DescriptorSetLayout, vk::Result> {
     let bindings: Vec<_> = interface
@@ -89,10 +89,10 @@ unsafe fn set_layout(
         })
         .collect();
     let info = vk::DescriptorSetLayoutCreateInfo::default()
-        .flags(vk::DescriptorSetLayoutCreateFlags::PUSH_DESCRIPTOR_KHR)
+        .flags(shared.descriptors.set_layout_flags())
         .bindings(&bindings);
     // SAFETY: `info` points at live locals.
-    unsafe { device.create_descriptor_set_layout(&info, None) }
+    unsafe { shared.device.create_descriptor_set_layout(&info, None) }
 }
 
 /// # Safety

@@ -9,6 +9,7 @@ use ash::vk;
 use ash::vk::Handle as _;
 
 use super::checked::Checked;
+use super::descriptors::Sets;
 use super::pipeline::Objects;
 use super::{Bound, Buffer, Gpu, Interface, Pipeline, Reference, Shared};
 use crate::{Error, Result};
@@ -28,6 +29,8 @@ pub enum Threads<'a> {
 #[derive(Debug)]
 pub struct Recorder<'g> {
     shared: &'g Arc<Shared>,
+    /// What its passes bind.
+    pub(super) sets: Sets,
     pub(super) commands: vk::CommandBuffer,
     /// The timeline value that signals the end of this recording.
     pub(super) value: u64,
@@ -37,6 +40,13 @@ pub struct Recorder<'g> {
     pending: HashMap<vk::Buffer, bool>,
     /// Where every pass is run alone and compared with its reference.
     pub(super) checked: Option<Checked<'g>>,
+}
+
+/// What a recording of the host application's binds; nothing on a device with `VK_KHR_push_descriptor`.
+#[derive(Debug)]
+#[must_use = "it stays until the host's submission is done"]
+pub struct HostRecording {
+    _sets: Sets,
 }
 
 /// What was recorded since the device was opened.
@@ -62,6 +72,7 @@ impl<'g> Recorder<'g> {
     ) -> Self {
         let mut recorder = Self {
             shared,
+            sets: Sets::new(shared),
             commands,
             value,
             queries,
@@ -119,7 +130,7 @@ impl<'g> Recorder<'g> {
             _ => self.fold(name, self.workgroups(pipeline.interface, threads))?,
         };
         self.begin_label(name);
-        self.bind(pipeline, params, bound);
+        self.bind(pipeline, params, bound)?;
         let device = &self.shared.device;
         // SAFETY: recording; a retired buffer outlives this submission.
         unsafe {
@@ -209,41 +220,6 @@ impl<'g> Recorder<'g> {
         self.pending.clear();
     }
 
-    fn bind(&self, pipeline: &Objects, params: &[u8], bound: &[Bound]) {
-        let infos: Vec<_> = bound
-            .iter()
-            .map(|b| [vk::DescriptorBufferInfo::default().buffer(b.raw).range(vk::WHOLE_SIZE)])
-            .collect();
-        let writes: Vec<_> = pipeline
-            .interface
-            .bindings
-            .iter()
-            .zip(&infos)
-            .map(|(binding, info)| {
-                vk::WriteDescriptorSet::default()
-                    .dst_binding(binding.index)
-                    .descriptor_type(vk::DescriptorType::STORAGE_BUFFER)
-                    .buffer_info(info)
-            })
-            .collect();
-        let (commands, bind_point) = (self.commands, vk::PipelineBindPoint::COMPUTE);
-        // SAFETY: recording; pipeline and buffers are live and match the layout by construction.
-        unsafe {
-            self.shared.device.cmd_bind_pipeline(commands, bind_point, pipeline.raw);
-            self.shared.push_descriptor.cmd_push_descriptor_set(
-                commands,
-                bind_point,
-                pipeline.layout,
-                0,
-                &writes,
-            );
-            if !params.is_empty() {
-                let stage = vk::ShaderStageFlags::COMPUTE;
-                self.shared.device.cmd_push_constants(commands, pipeline.layout, stage, 0, params);
-            }
-        }
-    }
-
     /// The workgroups of a dispatch; none where the device alone knows.
     pub(super) fn workgroups(&self, interface: &Interface, threads: Threads<'_>) -> [u32; 3] {
         match threads {
@@ -307,16 +283,16 @@ impl Gpu {
     ///
     /// # Safety
     /// `commands` is recording on this device's queue family, outside a render pass, and every buffer and pipeline used
-    /// stays alive until the host's submission is done.
+    /// stays alive until the host's submission is done; so does what is returned.
     pub unsafe fn record_into(
         &self,
         commands: u64,
         record: impl FnOnce(&mut Recorder<'_>) -> Result<()>,
-    ) -> Result<()> {
+    ) -> Result<HostRecording> {
         let commands = vk::CommandBuffer::from_raw(commands);
         let mut recorder = Recorder::new(&self.shared, commands, HOST_SUBMITS, None);
         record(&mut recorder)?;
         recorder.finish();
-        Ok(())
+        Ok(HostRecording { _sets: recorder.sets })
     }
 }

@@ -3,8 +3,10 @@
 use std::collections::BTreeSet;
 use std::ffi::CStr;
 
-use ash::{khr, vk};
+use ash::{ext, khr, vk};
 
+use super::choice::PciAddress;
+use super::descriptors::{MAX_BUFFERS, PUSH_VARIABLE};
 use crate::{Error, Result};
 
 /// The subgroup operations that our kernels use.
@@ -16,12 +18,16 @@ const SUBGROUP_OPERATIONS: vk::SubgroupFeatureFlags = vk::SubgroupFeatureFlags::
         | vk::SubgroupFeatureFlags::SHUFFLE.as_raw(),
 );
 
-/// The device extensions that a device is created with.
-pub(super) const EXTENSIONS: &[&CStr] = &[khr::push_descriptor::NAME];
+/// The device extensions that a device of our own is created with where it has them.
+pub(super) const OPTIONAL_EXTENSIONS: &[&CStr] =
+    &[khr::push_descriptor::NAME, khr::portability_subset::NAME];
 
 /// What a physical device offers, gathered once.
 pub(super) struct Offered {
     pub(super) properties: vk::PhysicalDeviceProperties,
+    pub(super) uuid: [u8; vk::UUID_SIZE],
+    pub(super) pci: Option<PciAddress>,
+    pub(super) max_allocation: u64,
     pub(super) subgroup_size: u32,
     pub(super) subgroup_operations: vk::SubgroupFeatureFlags,
     pub(super) subgroup_stages: vk::ShaderStageFlags,
@@ -70,14 +76,9 @@ pub const REQUIREMENTS: &[Requirement] = &[
         offered: |o| o.compute_family.is_some(),
     },
     Requirement {
-        name: "VK_KHR_push_descriptor",
-        why: "binds the buffers of a pass while it is recorded",
-        offered: |o| o.extensions.contains("VK_KHR_push_descriptor"),
-    },
-    Requirement {
-        name: "maxPushDescriptors >= 16",
+        name: "maxPerStageDescriptorStorageBuffers >= 16",
         why: "the most buffers that one pass binds",
-        offered: |o| o.max_push_descriptors >= 16,
+        offered: |o| o.properties.limits.max_per_stage_descriptor_storage_buffers >= MAX_BUFFERS,
     },
     Requirement {
         name: "timelineSemaphore",
@@ -134,8 +135,8 @@ pub const REQUIREMENTS: &[Requirement] = &[
     },
 ];
 
-/// The features a device must be created with, to chain into `VkDeviceCreateInfo`; the extension is
-/// `VK_KHR_push_descriptor`. For hosts that lend their device to [`Gpu::from_host`](super::Gpu::from_host).
+/// The features a device must be created with, to chain into `VkDeviceCreateInfo`; with the extension
+/// `VK_KHR_push_descriptor`, where there is one, passes are recorded faster. For hosts that lend their device to [`Gpu::from_host`](super::Gpu::from_host).
 pub fn required_device_features()
 -> (vk::PhysicalDeviceVulkan12Features<'static>, vk::PhysicalDeviceVulkan13Features<'static>) {
     let vulkan12 = vk::PhysicalDeviceVulkan12Features::default()
@@ -154,41 +155,58 @@ impl Offered {
         instance: &ash::Instance,
         physical: vk::PhysicalDevice,
     ) -> Result<Self, vk::Result> {
+        // SAFETY: the handle is the instance's.
+        let extensions: BTreeSet<String> =
+            unsafe { instance.enumerate_device_extension_properties(physical)? }
+                .iter()
+                .filter_map(|e| Some(e.extension_name_as_c_str().ok()?.to_string_lossy().into()))
+                .collect();
+        let has = |name: &CStr| extensions.contains(name.to_string_lossy().as_ref());
         let mut vulkan11 = vk::PhysicalDeviceVulkan11Properties::default();
         let mut vulkan13_properties = vk::PhysicalDeviceVulkan13Properties::default();
         let mut push = vk::PhysicalDevicePushDescriptorPropertiesKHR::default();
+        let mut pci = vk::PhysicalDevicePCIBusInfoPropertiesEXT::default();
         let mut properties = vk::PhysicalDeviceProperties2::default()
             .push_next(&mut vulkan11)
-            .push_next(&mut vulkan13_properties)
-            .push_next(&mut push);
+            .push_next(&mut vulkan13_properties);
+        // Some drivers complain of what they do not know.
+        if has(khr::push_descriptor::NAME) {
+            properties = properties.push_next(&mut push);
+        }
+        let has_pci = has(ext::pci_bus_info::NAME);
+        if has_pci {
+            properties = properties.push_next(&mut pci);
+        }
         let mut vulkan12 = vk::PhysicalDeviceVulkan12Features::default();
         let mut vulkan13 = vk::PhysicalDeviceVulkan13Features::default();
         let mut features = vk::PhysicalDeviceFeatures2::default()
             .push_next(&mut vulkan12)
             .push_next(&mut vulkan13);
         // SAFETY: the chains point at live locals of the types that the structures name.
-        let (extensions, families) = unsafe {
+        let families = unsafe {
             instance.get_physical_device_properties2(physical, &mut properties);
             instance.get_physical_device_features2(physical, &mut features);
-            (
-                instance.enumerate_device_extension_properties(physical)?,
-                instance.get_physical_device_queue_family_properties(physical),
-            )
+            instance.get_physical_device_queue_family_properties(physical)
         };
         let properties = properties.properties;
-        let name = |e: &vk::ExtensionProperties| {
-            e.extension_name_as_c_str().ok().map(|name| name.to_string_lossy().into_owned())
-        };
         let compute =
             families.iter().position(|family| family.queue_flags.contains(vk::QueueFlags::COMPUTE));
         Ok(Self {
             properties,
+            uuid: vulkan11.device_uuid,
+            pci: has_pci.then_some(PciAddress {
+                domain: pci.pci_domain,
+                bus: pci.pci_bus,
+                device: pci.pci_device,
+                function: pci.pci_function,
+            }),
+            max_allocation: vulkan11.max_memory_allocation_size,
             subgroup_size: vulkan11.subgroup_size,
             subgroup_operations: vulkan11.subgroup_supported_operations,
             subgroup_stages: vulkan11.subgroup_supported_stages,
             required_subgroup_size_stages: vulkan13_properties.required_subgroup_size_stages,
             max_push_descriptors: push.max_push_descriptors,
-            extensions: extensions.iter().filter_map(name).collect(),
+            extensions,
             // The chain pointers die with this function.
             vulkan12: vk::PhysicalDeviceVulkan12Features {
                 p_next: std::ptr::null_mut(),
@@ -207,6 +225,16 @@ impl Offered {
     pub(super) fn device_name(&self) -> String {
         let name = self.properties.device_name_as_c_str();
         name.map_or_else(|_| "unnamed device".to_owned(), |name| name.to_string_lossy().into())
+    }
+
+    pub(super) fn has(&self, extension: &CStr) -> bool {
+        self.extensions.contains(extension.to_string_lossy().as_ref())
+    }
+
+    /// Whether passes may push their descriptors, and the user does not forbid it.
+    pub(super) fn pushes_descriptors(&self) -> bool {
+        let is_forbidden = std::env::var_os(PUSH_VARIABLE).is_some_and(|value| value == "off");
+        self.max_push_descriptors >= MAX_BUFFERS && !is_forbidden
     }
 
     /// # Errors
@@ -234,6 +262,7 @@ mod tests {
             vk::PhysicalDeviceProperties { api_version: vk::API_VERSION_1_3, ..Default::default() };
         properties.limits.max_compute_work_group_invocations = 256;
         properties.limits.max_compute_shared_memory_size = 24_576;
+        properties.limits.max_per_stage_descriptor_storage_buffers = 16;
         for (to, from) in properties.device_name.iter_mut().zip(b"Abacus 3000") {
             *to = *from as _;
         }
@@ -244,8 +273,11 @@ mod tests {
             subgroup_operations: SUBGROUP_OPERATIONS,
             subgroup_stages: vk::ShaderStageFlags::COMPUTE,
             required_subgroup_size_stages: vk::ShaderStageFlags::empty(),
-            max_push_descriptors: 16,
-            extensions: EXTENSIONS.iter().map(|name| name.to_str().unwrap().to_owned()).collect(),
+            uuid: [0; 16],
+            pci: None,
+            max_allocation: 1 << 30,
+            max_push_descriptors: 0,
+            extensions: BTreeSet::new(),
             vulkan12,
             vulkan13,
             compute_family: Some(0),
@@ -256,11 +288,12 @@ mod tests {
     #[test]
     fn each_missing_requirement_is_the_one_that_is_named() {
         type Break = (&'static str, fn(&mut Offered));
-        let breaks: [Break; 14] = [
+        let breaks: [Break; 13] = [
             ("Vulkan 1.3", |o| o.properties.api_version = vk::API_VERSION_1_2),
             ("compute queue", |o| o.compute_family = None),
-            ("VK_KHR_push_descriptor", |o| o.extensions.clear()),
-            ("maxPushDescriptors >= 16", |o| o.max_push_descriptors = 15),
+            ("maxPerStageDescriptorStorageBuffers >= 16", |o| {
+                o.properties.limits.max_per_stage_descriptor_storage_buffers = 15;
+            }),
             ("timelineSemaphore", |o| o.vulkan12.timeline_semaphore = vk::FALSE),
             ("scalarBlockLayout", |o| o.vulkan12.scalar_block_layout = vk::FALSE),
             ("hostQueryReset", |o| o.vulkan12.host_query_reset = vk::FALSE),

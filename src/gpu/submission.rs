@@ -219,6 +219,9 @@ impl Shared {
         label: &str,
     ) -> Result<()> {
         let fail = |call| move |result| self.error(call, result);
+        if self.faults.loses_submission() {
+            return Err(self.error("vkQueueSubmit2", vk::Result::ERROR_DEVICE_LOST));
+        }
         // SAFETY: recording.
         unsafe { self.device.end_command_buffer(commands) }.map_err(fail("vkEndCommandBuffer"))?;
         let commands = [vk::CommandBufferSubmitInfo::default().command_buffer(commands)];

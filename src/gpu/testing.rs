@@ -49,6 +49,21 @@ pub fn is_checked(gpu: &Gpu) -> bool {
     gpu.shared.checks.are_on()
 }
 
+/// Lets the allocation of this number fail, counted from 1 now on.
+pub fn fail_allocation(gpu: &Gpu, number: u64) {
+    gpu.shared.faults.fail_allocation(number);
+}
+
+/// The names of the buffers that were asked for since [`fail_allocation`], in order.
+pub fn allocations(gpu: &Gpu) -> Vec<String> {
+    gpu.shared.faults.allocations()
+}
+
+/// Loses the device at the submission of this number, counted from 1 now on.
+pub fn lose_at_submission(gpu: &Gpu, number: u64) {
+    gpu.shared.faults.lose_at_submission(number);
+}
+
 /// A wrong wiring: of the pass's parameters, `bits` of 32-bit number `word` reach the device flipped.
 #[derive(Clone, Copy, Debug)]
 pub struct Defect {

@@ -124,6 +124,7 @@ mod tests {
             timestamp_period: 1.0,
             is_cpu: false,
             cooperative_matrix: None,
+            pushes_descriptors: true,
             tells_statistics: false,
         }
     }

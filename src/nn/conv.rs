@@ -171,15 +171,15 @@ impl Conv {
 
 /// What a product is for.
 #[derive(Clone, Copy, Debug)]
-struct Form {
-    activation: Activation,
-    transposed: bool,
-    accumulate: bool,
+pub(super) struct Form {
+    pub(super) activation: Activation,
+    pub(super) transposed: bool,
+    pub(super) accumulate: bool,
 }
 
 /// A kernel that convolves, and the pixels and channels that a subgroup takes.
 #[derive(Debug)]
-struct Product {
+pub(super) struct Product {
     kernel: ProductKernel,
     columns: u32,
     rows: u32,
@@ -193,7 +193,7 @@ enum ProductKernel {
 }
 
 impl Product {
-    fn new(gpu: &Gpu, outputs: u32, form: Form, precision: Precision) -> Result<Self> {
+    pub(super) fn new(gpu: &Gpu, outputs: u32, form: Form, precision: Precision) -> Result<Self> {
         let Form { activation, transposed, accumulate } = form;
         let matrix = gpu.properties().cooperative_matrix;
         let matrix =
@@ -222,7 +222,7 @@ impl Product {
     }
 
     #[expect(clippy::too_many_arguments, reason = "a layer, its place and its images")]
-    fn record(
+    pub(super) fn record(
         &self,
         pass: &mut Recorder<'_>,
         size: UVec2,

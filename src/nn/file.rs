@@ -49,6 +49,22 @@ impl<'a> TensorFile<'a> {
         let (begin, end) = info.data_offsets;
         Some((info, &self.data[begin..end]))
     }
+
+    /// The values of a tensor of 32-bit floats; else what is wrong with it.
+    pub(crate) fn floats(
+        &self,
+        name: &str,
+        expected: &[usize],
+    ) -> std::result::Result<Vec<f32>, String> {
+        let (TensorInfo { shape, dtype, .. }, bytes) = self
+            .tensor(name)
+            .ok_or_else(|| format!("has no tensor `{name}`, which must be {expected:?}"))?;
+        if shape != expected || *dtype != Dtype::F32 {
+            return Err(format!("tensor `{name}` is {shape:?} {dtype}, not {expected:?} F32"));
+        }
+        let values = bytes.chunks_exact(4);
+        Ok(values.map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect())
+    }
 }
 
 /// Writes each network's tensors as `network.tensor`.
@@ -110,17 +126,7 @@ pub fn load(path: &Path, networks: &mut [&mut Parameters], gpu: &Gpu) -> Result<
         };
         let read = |tensor: &Tensor| {
             let name = format!("{prefix}.{}", tensor.name);
-            let expected = &tensor.shape;
-            let (TensorInfo { shape, dtype, .. }, bytes) = file.tensor(&name).ok_or_else(|| {
-                other(format!("has no tensor `{name}`, which must be {expected:?}"))
-            })?;
-            if shape != expected || *dtype != Dtype::F32 {
-                let problem = format!("tensor `{name}` is {shape:?} {dtype}, not {expected:?} F32");
-                return Err(other(problem));
-            }
-            let values = bytes.chunks_exact(4);
-            let values: Vec<f32> =
-                values.map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
+            let values = file.floats(&name, &tensor.shape).map_err(other)?;
             if values.iter().all(|value| value.is_finite()) {
                 return Ok(values);
             }

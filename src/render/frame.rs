@@ -11,7 +11,7 @@ use crate::kernels::status::{
 };
 
 /// The first guess of how many tiles a Gaussian meets; a view that needs more makes the memory grow.
-const TILES_PER_GAUSSIAN: u32 = 6;
+pub(crate) const TILES_PER_GAUSSIAN: u32 = 6;
 
 /// How many depth ranks one subgroup counts the tiles of. Small: `emit` sums up what precedes a rank within them.
 pub(super) const RANKS_PER_PARTITION: u32 = 256;
@@ -152,12 +152,29 @@ impl Frame {
     pub(super) fn set_intersection_capacity(&mut self, gpu: &Gpu, capacity: u32) -> Result<()> {
         let capacity = capacity as usize;
         if capacity != self.tiles.len() {
+            // What was there goes first: the two together may be more than there is.
+            for numbers in [&mut self.tiles, &mut self.slots, &mut self.owners] {
+                *numbers = gpu.uninit("intersections", 0)?;
+            }
+            self.records = gpu.uninit("records", 0)?;
+            gpu.free_unused();
             self.tiles = gpu.uninit("tiles", capacity)?;
             self.slots = gpu.uninit("slots", capacity)?;
             self.owners = gpu.uninit("owners", capacity)?;
             self.records = gpu.uninit("records", self.record_vectors() * capacity)?;
         }
         Ok(())
+    }
+
+    /// What each Gaussian takes, in bytes.
+    pub(super) fn bytes_per_gaussian(&self) -> usize {
+        let numbers = (4 + self.channels) * size_of::<f32>() + size_of::<UVec2>();
+        size_of::<ProjectedSplat>() + numbers + self.record_vectors() * size_of::<Vec3>()
+    }
+
+    /// What each intersection takes, in bytes.
+    pub(super) fn bytes_per_intersection(&self) -> usize {
+        3 * size_of::<u32>() + self.record_vectors() * size_of::<Vec3>()
     }
 
     /// The vectors of a gradient record.

@@ -2,7 +2,7 @@
 
 use super::Trained;
 use crate::eval::ViewScore;
-use crate::train::StepReport;
+use crate::train::{MemoryEstimate, StepReport};
 
 /// A moment of a run, in the order in which they come.
 #[derive(Clone, Copy, Debug)]
@@ -14,6 +14,8 @@ pub enum Event<'a> {
         step: u64,
         /// The step that ends the run.
         steps: u64,
+        /// What it is going to take.
+        memory: &'a MemoryEstimate,
     },
     /// A step is done and in the log. Steps are submitted several at a time and arrive so.
     Step(&'a StepReport),

@@ -27,7 +27,7 @@ impl Requests {
     }
 
     /// What asked to stop, if anything did.
-    pub(super) fn stops(&self) -> Option<Stop> {
+    pub fn stops(&self) -> Option<Stop> {
         let place = self.stop.load(Ordering::Relaxed).checked_sub(1)?;
         STOPS.get(place).copied()
     }

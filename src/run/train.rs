@@ -12,7 +12,7 @@ use crate::dataset::{Dataset, View};
 use crate::diagnose::Plan;
 use crate::eval::{self, ViewScore, Yardstick};
 use crate::gpu::Gpu;
-use crate::train::{Learning, StepReport, TrainConfig, Trainer};
+use crate::train::{Learning, MemoryEstimate, StepReport, TrainConfig, Trainer};
 use crate::{Error, Result, Stop};
 
 /// What becomes of a run that the directory already holds.
@@ -107,14 +107,16 @@ pub fn train_in(
         directory.save_plan(plan)?;
     }
     directory.save_views(dataset)?;
-    observe(Event::Started { step: trainer.steps_done(), steps: config.steps });
+    let memory = trainer.memory_estimate();
+    say_what_is_short(gpu, &memory);
+    observe(Event::Started { step: trainer.steps_done(), steps: config.steps, memory: &memory });
     let mut course = Course::new(gpu, config, dataset, &directory, &trainer);
     let requests = &session.requests;
-    let losses = course.train_to_the_end(&mut trainer, &mut directory, requests, &mut observe)?;
-    trainer.leave_out_what_gains_nothing()?;
-    let spent = course.meter.spent(gpu.peak_memory());
-    let scored = course.evaluate(&mut trainer, &directory, &mut observe)?;
-    directory.save_trained(&mut trainer)?;
+    let losses = course.train_to_the_end(&mut trainer, &mut directory, requests, &mut observe);
+    let losses = losses.inspect_err(|error| course.rescue(error, &mut trainer, &mut directory))?;
+    let finished = course.finish(&mut trainer, &mut directory, &mut observe);
+    let (scored, spent) =
+        finished.inspect_err(|error| course.rescue(error, &mut trainer, &mut directory))?;
     let (gaussians, steps) = (trainer.gaussian_count(), trainer.steps_done());
     let mut metrics = eval::metrics(&scored, spent.seconds, gaussians, steps);
     metrics[SPENT] = serde_json::json!(spent);
@@ -130,6 +132,21 @@ pub fn train_in(
     let trained = Trained { trainer, scored, losses, spent };
     observe(Event::Finished(&trained));
     Ok(trained)
+}
+
+/// Warns where the driver has less memory for us than the run may come to need.
+fn say_what_is_short(gpu: &Gpu, memory: &MemoryEstimate) {
+    let Some(budget) = gpu.memory_budget() else { return };
+    let left = budget.budget.saturating_sub(budget.usage) + gpu.memory_in_use();
+    if memory.most_device > left {
+        let mebibytes = |bytes: u64| bytes >> 20;
+        tracing::warn!(
+            "{} Gaussians may take {} MiB of the device, {} MiB are free: max_vram or max_gaussians stops growth in time",
+            memory.most_gaussians,
+            mebibytes(memory.most_device),
+            mebibytes(left)
+        );
+    }
 }
 
 /// A new run, or one that is taken up again.
@@ -202,6 +219,8 @@ struct Course<'a> {
     meter: Meter,
     /// Steps that were done before.
     begin: u64,
+    /// Steps that are in a checkpoint.
+    saved: u64,
     progress: Vec<Progress>,
     /// Once something was scored.
     yardstick: Option<Yardstick>,
@@ -219,7 +238,17 @@ impl<'a> Course<'a> {
     ) -> Self {
         let (meter, begin) = (Meter::new(directory.seconds_before()), trainer.steps_done());
         let progress = directory.progress(begin);
-        Self { gpu, config, dataset, meter, begin, progress, yardstick: None, events: None }
+        Self {
+            gpu,
+            config,
+            dataset,
+            meter,
+            begin,
+            saved: begin,
+            progress,
+            yardstick: None,
+            events: None,
+        }
     }
 
     /// Logs every step, writes checkpoints and ends early where that is asked for; gives the losses.
@@ -274,7 +303,7 @@ impl<'a> Course<'a> {
             let saves = requests.takes_save() || is_over(saved, config.checkpoint_minutes);
             if falls_on(config.checkpoint_every) || saves || stop.is_some() {
                 directory.save_checkpoint(trainer)?;
-                saved = Instant::now();
+                (self.saved, saved) = (step, Instant::now());
                 observe(Event::Checkpointed { step });
             }
             if let Some(cause) = stop {
@@ -289,6 +318,42 @@ impl<'a> Course<'a> {
             }
         }
         Ok(losses)
+    }
+
+    /// Scores the test views and writes the model.
+    fn finish(
+        &mut self,
+        trainer: &mut Trainer,
+        directory: &mut RunDirectory,
+        observe: &mut impl FnMut(Event<'_>),
+    ) -> Result<(Vec<ViewScore>, Spent)> {
+        trainer.leave_out_what_gains_nothing()?;
+        let spent = self.meter.spent(self.gpu.peak_memory());
+        let scored = self.evaluate(trainer, directory, observe)?;
+        directory.save_trained(trainer)?;
+        Ok((scored, spent))
+    }
+
+    /// Saves what was trained before an error that leaves it as it was: nothing but memory, a file or the like was missing.
+    fn rescue(&self, error: &Error, trainer: &mut Trainer, directory: &mut RunDirectory) {
+        let is_lost = matches!(
+            error,
+            Error::Stopped { .. }
+                | Error::DeviceLost { .. }
+                | Error::NotFinite { .. }
+                | Error::ParameterNotFinite { .. }
+                | Error::Disagrees { .. }
+        );
+        let step = trainer.steps_done();
+        if is_lost || step <= self.saved {
+            return;
+        }
+        match directory.save_checkpoint(trainer) {
+            Ok(()) => tracing::warn!("the run ends early; its {step} steps are saved"),
+            Err(error) => {
+                tracing::warn!("the run ends early, and its last steps are lost: {error}")
+            }
+        }
     }
 
     /// Scores the test views, which takes none of the run's time.

@@ -39,6 +39,11 @@ struct Scratch {
 }
 
 impl RadixSort {
+    /// What its scratch memory takes for each pair, in bytes.
+    pub(crate) fn bytes_per_item(&self) -> usize {
+        2 * size_of::<u32>() + (size_of::<u32>() << MAX_DIGIT_BITS) / self.partition_size as usize
+    }
+
     /// A sort with scratch memory for buffers of `capacity` pairs; buffers of another length have it made anew.
     ///
     /// # Errors

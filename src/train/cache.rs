@@ -72,14 +72,17 @@ impl From<CacheSize> for String {
 }
 
 impl CacheSize {
-    /// What the host may keep of decoded photographs: so much, or a quarter of its memory; none where that is not known.
-    pub(super) fn on_host(size: Option<Self>) -> Option<u64> {
-        size.map(|Self(bytes)| bytes).or_else(|| Some((SHARE * host_memory()? as f64) as u64))
+    /// What the host may keep of decoded photographs: so much, or a quarter of the memory that it may take; none where that
+    /// is not known.
+    pub(super) fn on_host(size: Option<Self>, most: Option<Self>) -> Option<u64> {
+        let most = || most.map(|Self(bytes)| bytes).or_else(host_memory);
+        size.map(|Self(bytes)| bytes).or_else(|| Some((SHARE * most()? as f64) as u64))
     }
 
-    /// What the device may keep: so much, or a quarter of its memory.
-    pub(super) fn on_device(size: Option<Self>, gpu: &Gpu) -> u64 {
-        size.map_or((SHARE * gpu.properties().memory as f64) as u64, |Self(bytes)| bytes)
+    /// What the device may keep: so much, or a quarter of the memory that may be taken of it.
+    pub(super) fn on_device(size: Option<Self>, most: Option<Self>, gpu: &Gpu) -> u64 {
+        let most = most.map_or(gpu.properties().memory, |Self(bytes)| bytes);
+        size.map_or((SHARE * most as f64) as u64, |Self(bytes)| bytes)
     }
 }
 

@@ -76,6 +76,14 @@ pub struct TrainConfig {
     /// changes. Left out: a quarter of the memory of each.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub cache: Option<CacheSize>,
+    /// The most memory that buffers may take on the device: growth stops in time, and what exceeds it all the same ends the
+    /// run, saved. Left out: all that there is.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub max_vram: Option<CacheSize>,
+    /// The most memory that the process is to take on the host, as far as that can be foreseen: growth stops in time. Left
+    /// out: all that there is.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub max_ram: Option<CacheSize>,
     /// The folder for what exceeds the cache; none: that of the system's temporary files.
     #[serde(skip)]
     pub spool: Option<PathBuf>,
@@ -104,7 +112,7 @@ pub struct TrainConfig {
     pub tensorboard: bool,
     /// Steps whose every pass is compared with its CPU reference.
     pub check: CheckConfig,
-    /// The device: a part of its name or its index; empty: the best.
+    /// The device: `uuid:` or `pci:` and which, `cpu`, its index, or a part of its name; empty: the best.
     pub device: String,
     /// The tile that one subgroup renders, in pixels; left out, it is the fastest known on the device, and recorded.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -175,6 +183,8 @@ impl Default for TrainConfig {
             max_resolution: 1600,
             test_every: None,
             cache: None,
+            max_vram: None,
+            max_ram: None,
             spool: None,
             seed: 10,
             sh_degree: MAX_SH_DEGREE,
@@ -262,7 +272,7 @@ impl TrainConfig {
             downscale: self.downscale,
             max_resolution: self.max_resolution,
             test_every: self.test_every,
-            keep: CacheSize::on_host(self.cache),
+            keep: CacheSize::on_host(self.cache, self.max_ram),
             reference: self.reference.clone(),
             invert_masks: self.invert_masks,
             hold_out: self.stop.views,

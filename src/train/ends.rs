@@ -29,6 +29,12 @@ pub(super) struct Ends {
     gaussians: Option<usize>,
     /// The highest degree that paid.
     pub(super) sh_degree: Option<u32>,
+    /// The intersections of the last step, where density control is due behind it and could not be done.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) density_due: Option<u32>,
+    /// Where it is due to decide if the SH degree in use has paid, and could not be done.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub(super) degree_due: bool,
 }
 
 impl Ends {
@@ -60,8 +66,11 @@ impl Trainer {
     pub(super) fn growth_limit(&mut self) -> Result<usize> {
         let growth_gain = self.config.stop.growth_gain;
         let [_, whole] = self.config.schedule.resolution_steps;
+        // What was scored before the memory was out is not scored twice.
+        let is_scored = self.ends.rounds.last().is_some_and(|round| round.step == self.step);
         if growth_gain > 0.0 && self.ends.gaussians.is_none() && self.step >= whole {
-            if let Some(psnr) = self.held_out_psnr()? {
+            let psnr = if is_scored { None } else { self.held_out_psnr()? };
+            if let Some(psnr) = psnr {
                 let (step, gaussians) = (self.step, self.model.count());
                 self.ends.rounds.push(Round {
                     step,
@@ -113,8 +122,9 @@ impl Trainer {
             self.step,
             degree - 1
         );
+        self.model.drop_degrees_above(&self.gpu, degree - 1)?;
         self.ends.sh_degree = Some(degree - 1);
-        self.model.drop_degrees_above(&self.gpu, degree - 1)
+        Ok(())
     }
 }
 

@@ -14,31 +14,45 @@ impl Trainer {
         schedule.densifies_at(step) && step + schedule.densify_interval <= self.config.steps
     }
 
-    /// Density control, behind the last step that was submitted.
-    pub(super) fn control_density(&mut self) -> Result<()> {
+    /// Density control behind the last step, whose view had so many intersections.
+    pub(super) fn control_density(&mut self, intersections: u32) -> Result<()> {
         let gpu = self.gpu.clone();
         let rounds_left = match self.config.density.control {
             DensityControl::Conserving => self.config.schedule.rounds_left(self.step),
             DensityControl::Paper => 1,
         };
         let grown = self.growth_limit()?.max(self.model.count());
-        let most = self.most_gaussians()?.min(grown);
-        let round = Round { step: self.step, rounds_left, most };
-        let changed = self.model.densify(&gpu, &mut self.densifier, round)?;
-        tracing::debug!("step {}: {changed:?}", self.step);
+        let (room, why) = self.room(intersections);
+        let round = Round { step: self.step, rounds_left, most: room.min(grown) };
+        let report = self.model.densify(&gpu, &mut self.densifier, round)?;
+        self.ends.density_due = None;
+        tracing::debug!("step {}: {report:?}", self.step);
+        if report.refused > 0 && room < self.config.max_gaussians && !self.has_said_room {
+            self.has_said_room = true;
+            tracing::warn!("growth stops at {room} Gaussians, {why}");
+        }
         self.reserve()
     }
 
-    /// How many Gaussians leave the device able to bind the intersections of a view, should it have twice as many of them for
-    /// each Gaussian as the last one has; at least as many as there are.
-    fn most_gaussians(&self) -> Result<usize> {
+    /// How many Gaussians there is room for, at least as many as there are, and what there is no more of. A view may have
+    /// twice as many intersections for each Gaussian as the last one had.
+    fn room(&self, intersections: u32) -> (usize, &'static str) {
         let pixels = |size: UVec2| f64::from(size.x) * f64::from(size.y);
         let largest = self.views.sizes().into_iter().map(pixels).fold(0.0, f64::max);
         let shrunk = largest / pixels(self.view_of(self.step).size());
-        let met = 2.0 * shrunk * f64::from(self.renderer.intersections()?.max(1));
+        let met = 2.0 * shrunk * f64::from(intersections.max(1));
         let count = self.model.count();
-        let growth = f64::from(self.renderer.most_intersections()) / met;
-        Ok(((count as f64 * growth) as usize).max(count))
+        let each = met / count.max(1) as f64;
+        let bindable = f64::from(self.renderer.most_intersections()) / each;
+        let bindable =
+            self.densifier.limit(self.model.gaussians.column_count).min(bindable as usize);
+        let bounds = [
+            (bindable, "all that the device can bind at once"),
+            (self.fitting_in_vram(each), "all that fits into max_vram"),
+            (self.fitting_in_ram(each), "all that fits into max_ram"),
+        ];
+        let (room, why) = bounds.into_iter().min_by_key(|(room, _)| *room).unwrap_or(bounds[0]);
+        (room.max(count), why)
     }
 }
 

@@ -89,16 +89,11 @@ impl Model {
         round: Round,
     ) -> Result<DensifyReport> {
         let inputs = DensifyInputs {
-            grad_norm_sums: &self.grad_norm_sums,
-            visit_counts: &self.visit_counts,
+            grad_norm_sums: &mut self.grad_norm_sums,
+            visit_counts: &mut self.visit_counts,
             gradients: &mut self.gradients,
         };
         let report = densifier.densify(&mut self.gaussians, inputs, round)?;
-        let capacity = self.gradients.len() / (self.gaussians.column_count as usize).max(1);
-        if self.capacity() < self.count() {
-            self.grad_norm_sums = gpu.uninit("grad_norm_sums", capacity)?;
-            self.visit_counts = gpu.uninit("visit_counts", capacity)?;
-        }
         gpu.run("clear_statistics", |pass| {
             pass.fill(&mut self.grad_norm_sums, 0);
             pass.fill(&mut self.visit_counts, 0);

@@ -10,13 +10,15 @@ use crate::{Error, Result};
 
 /// The settings that no result depends on beyond its rounding: where the dataset lies, what is kept and logged and when,
 /// how long the run may take, and what it finds for itself.
-const FREE: [&str; 14] = [
+const FREE: [&str; 16] = [
     "dataset",
     "device",
     "tile",
     "frame.center",
     "frame.scale",
     "cache",
+    "max_vram",
+    "max_ram",
     "tensorboard",
     "eval_every",
     "checkpoint_every",

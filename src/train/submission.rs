@@ -72,40 +72,81 @@ impl Trainer {
     }
 
     /// Trains up to `until`, to the next step of density control, or for about half a second.
+    ///
+    /// Where that fails behind steps that are done, these are reported first and the next call says why: what is reported
+    /// is what the model has.
     pub(super) fn submit_steps(&mut self, until: u64) -> Result<Vec<StepReport>> {
+        if let Some(error) = self.failed.take() {
+            return Err(error);
+        }
+        let mut reports = vec![];
+        match self.train_stretch(until, &mut reports) {
+            Err(error) if !reports.is_empty() => {
+                self.failed = Some(error);
+                Ok(reports)
+            }
+            done => done.map(|()| reports),
+        }
+    }
+
+    fn train_stretch(&mut self, until: u64, reports: &mut Vec<StepReport>) -> Result<()> {
+        // A run that goes on from where memory was out has that before it.
+        self.control()?;
         let (begin, mut next) = (Instant::now(), self.step + 1);
         let until = until.min(self.config.steps);
         // Density control may change the number of Gaussians, and what is decided of the SH degree the next step.
         let changes = |&step: &u64| self.densifies_at(step) || self.decides_degree_at(step);
         let last = (next..until).find(changes).unwrap_or(until);
-        let (mut in_flight, mut reports) = (VecDeque::new(), vec![]);
+        let (mut in_flight, mut sent) = (VecDeque::new(), Ok(()));
         loop {
-            while next <= last && in_flight.len() < self.pace.in_flight {
+            while sent.is_ok() && next <= last && in_flight.len() < self.pace.in_flight {
                 let has_news = !(reports.is_empty() && in_flight.is_empty());
                 if has_news && begin.elapsed() > STRETCH {
                     break;
                 }
                 let steps = next..=last.min(next + self.pace.steps() - 1);
-                let fitting = self.views.bring(&self.config, steps)?;
-                in_flight.push_back(self.submit(next..=fitting)?);
-                next = fitting + 1;
+                // Where one cannot be sent, those before it still change the model.
+                sent = self.bring_and_submit(steps).map(|submitted| {
+                    next = submitted.steps.end() + 1;
+                    in_flight.push_back(submitted);
+                });
             }
             let Some(oldest) = in_flight.pop_front() else { break };
             // What is in flight behind a step that failed changes nothing.
-            if !self.finish(oldest, &mut reports)? {
+            if !self.finish(oldest, reports)? {
                 break;
             }
         }
+        self.ends.degree_due = !reports.is_empty() && self.decides_degree_at(self.step);
         if !reports.is_empty() && self.densifies_at(self.step) {
-            self.control_density()?;
+            // Due whether or not there is memory to ask.
+            self.ends.density_due = Some(0);
+            self.ends.density_due = Some(self.renderer.intersections()?);
         }
-        if !reports.is_empty() && self.decides_degree_at(self.step) {
-            self.decide_degree()?;
-        }
+        sent?;
+        self.control()?;
         if self.step >= self.checked + FINITE_STEPS {
             self.check_finite()?;
         }
-        Ok(reports)
+        Ok(())
+    }
+
+    /// Does what is due behind the last step: each is done, or the model is as it was and it stays due.
+    fn control(&mut self) -> Result<()> {
+        if let Some(intersections) = self.ends.density_due {
+            self.control_density(intersections)?;
+        }
+        if self.ends.degree_due {
+            self.decide_degree()?;
+            self.ends.degree_due = false;
+        }
+        Ok(())
+    }
+
+    fn bring_and_submit(&mut self, steps: RangeInclusive<u64>) -> Result<Submitted> {
+        let first = *steps.start();
+        let fitting = self.views.bring(&self.config, steps)?;
+        self.submit(first..=fitting)
     }
 
     /// Looks at every parameter of the Gaussians on the device.

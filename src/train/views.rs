@@ -102,7 +102,7 @@ impl Views {
         let keeps_photographs = config.model.denoiser || config.model.tonemapper;
         let (scene, measured) = measured(pseudo_gt, dataset)?;
         let mut darkroom = Darkroom::new(gpu, config.precision.photographs);
-        let budget = CacheSize::on_device(config.cache, gpu);
+        let budget = CacheSize::on_device(config.cache, config.max_vram, gpu);
         let mut cache = Cache::new(gpu, budget, config.spool.clone());
         let mut views = vec![];
         views.resize_with(config.schedule.resolution_levels(), Vec::<TrainView>::new);

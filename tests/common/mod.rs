@@ -6,6 +6,7 @@
 pub(crate) mod chain;
 #[cfg(feature = "cli")]
 pub(crate) mod command;
+pub(crate) mod lpips;
 pub(crate) mod safetensors;
 pub(crate) mod setup;
 pub(crate) mod train;

@@ -100,6 +100,49 @@ fn the_dark_photographs_get_the_cameras_of_the_largest_model() {
 
 #[cfg(unix)]
 #[test]
+fn cameras_are_placed_all_at_once_by_colmap_where_it_can_or_by_glomap() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    let photos = photographed(root);
+    model(8).write_binary(&root.join("models/0"));
+    let models = format!("cp -r {}/models/* $output", root.display());
+    let pose = |out: &str, colmap: &Path, glomap: &str| {
+        let (photos, out) = (photos.display(), root.join(out));
+        format!(
+            "pose {photos} --out {} --colmap {} --mapper global --glomap {glomap}",
+            out.display(),
+            colmap.display()
+        )
+    };
+    // COLMAP from 4.0 on has it among its commands.
+    let new = stub(root, &format!("help) echo global_mapper;;\nglobal_mapper) {models};;"));
+    let (stdout, _) = run(&pose("new", &new, "/nowhere/glomap"), 0);
+    assert!(stdout.contains("8 of 9 photographs"), "{stdout}");
+    let log = fs::read_to_string(root.join("new/colmap.log")).unwrap();
+    let calibrated = log.find(" view_graph_calibrator --database_path").unwrap();
+    assert!(log.find(" global_mapper --database_path").unwrap() > calibrated, "{log}");
+
+    fs::rename(stub(root, &format!("mapper) {models};;")), root.join("glomap")).unwrap();
+    let old = stub(root, "mapper) exit 9;;");
+    let glomap = root.join("glomap");
+    succeed(&pose("old", &old, glomap.to_str().unwrap()));
+    assert_eq!(load(&root.join("old")).views.len(), 8);
+    refused(
+        &pose("none", &old, "/nowhere/glomap"),
+        2,
+        &["`/nowhere/glomap` is not found", "COLMAP 4.0", "--glomap PATH"],
+    );
+    assert!(!root.join("none").exists());
+    let lost = stub(
+        root,
+        "help) echo global_mapper;;\nglobal_mapper) echo 'failed to create sparse model'; exit 1;;",
+    );
+    let (_, stderr) = run(&pose("none", &lost, "glomap"), 3);
+    assert!(stderr.contains("no cameras for these 9 photographs"), "{stderr}");
+}
+
+#[cfg(unix)]
+#[test]
 fn colmap_that_fails_or_finds_too_little_is_told_in_a_line_and_leaves_nothing() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();

@@ -9,6 +9,7 @@ mod common;
 mod files;
 mod gradients;
 mod kernels;
+mod lpips;
 mod model;
 mod networks;
 mod torch;

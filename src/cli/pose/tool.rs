@@ -23,6 +23,11 @@ impl<'a> Tool<'a> {
         Self { path, name, log }
     }
 
+    /// Another whose output goes to the same log.
+    pub(super) fn beside(&self, path: &'a Path, name: &'static str) -> Self {
+        Self::new(path, name, self.log)
+    }
+
     /// The tool, once it is there.
     ///
     /// # Errors
@@ -42,12 +47,12 @@ impl<'a> Tool<'a> {
         )))
     }
 
-    /// Whether the help of one of its commands names an option.
-    pub(super) fn helps_with(&self, command: &str, option: &str) -> bool {
-        let output = Command::new(self.path).args([command, "-h"]).stdin(Stdio::null()).output();
+    /// Whether its help, of a command or of the whole, names something.
+    pub(super) fn helps_with(&self, help: &[&str], what: &str) -> bool {
+        let output = Command::new(self.path).args(help).stdin(Stdio::null()).output();
         output.is_ok_and(|output| {
             let text = [output.stdout, output.stderr].concat();
-            String::from_utf8_lossy(&text).contains(option)
+            String::from_utf8_lossy(&text).contains(what)
         })
     }
 
@@ -102,6 +107,9 @@ fn sources(name: &str) -> &'static str {
         "colmap" => {
             "Debian, Ubuntu: apt install colmap; Fedora: dnf install colmap; Arch: colmap of the AUR; macOS: brew install \
              colmap; Windows and others: https://github.com/colmap/colmap/releases"
+        }
+        "glomap" => {
+            "https://github.com/colmap/glomap/releases, or COLMAP 4.0 and later, which has it"
         }
         _ => {
             "Debian, Ubuntu: apt install ffmpeg; Fedora: dnf install ffmpeg-free; Arch: pacman -S ffmpeg; macOS: brew \

@@ -1,0 +1,149 @@
+//! What COLMAP is asked to do with the lifted photographs: features, matches, cameras.
+
+use std::ffi::OsStr;
+use std::path::{Path, PathBuf};
+
+use anyhow::Result;
+
+use super::tool::Tool;
+use super::{PoseArgs, create, lifted};
+
+/// Which photographs COLMAP compares.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum Matcher {
+    /// Each with each.
+    Exhaustive,
+    /// Each with those that follow it by name.
+    Sequential,
+}
+
+impl Matcher {
+    fn command(self) -> &'static str {
+        match self {
+            Self::Exhaustive => "exhaustive_matcher",
+            Self::Sequential => "sequential_matcher",
+        }
+    }
+}
+
+/// How cameras are placed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum Mapper {
+    /// One after the other (COLMAP's mapper).
+    Incremental,
+    /// All at once (GLOMAP, or COLMAP from 4.0 on).
+    Global,
+}
+
+/// The programs and files of one reconstruction.
+pub(super) struct Reconstruction<'a> {
+    colmap: Tool<'a>,
+    /// Where it is a program of its own that places cameras.
+    glomap: Option<Tool<'a>>,
+    args: &'a PoseArgs,
+    matcher: Matcher,
+    database: PathBuf,
+    models: PathBuf,
+}
+
+impl<'a> Reconstruction<'a> {
+    /// One in a folder of its own, by programs that are there.
+    ///
+    /// # Errors
+    /// Cameras are to be placed all at once, and neither COLMAP nor GLOMAP is there that does.
+    pub(super) fn new(
+        args: &'a PoseArgs,
+        colmap: Tool<'a>,
+        matcher: Matcher,
+        work: &Path,
+    ) -> Result<Self> {
+        let is_apart = args.mapper == Mapper::Global && !colmap.helps_with(&["help"], GLOBAL);
+        let glomap =
+            is_apart.then(|| colmap.beside(&args.glomap, "glomap").found("")).transpose()?;
+        let (database, models) = (work.join("database.db"), work.join("sparse"));
+        create(&models)?;
+        Ok(Self { colmap, glomap, args, matcher, database, models })
+    }
+
+    /// The folder that holds the models, a folder each; none where the photographs show too little.
+    ///
+    /// # Errors
+    /// A program fails.
+    pub(super) fn models(self, lifted: &Path, say: impl Fn(&str) -> Result<()>) -> Result<PathBuf> {
+        self.extract(lifted)?;
+        say("features extracted")?;
+        self.compare()?;
+        say("features matched")?;
+        // It fails where it found nothing to begin with, which is said of the photographs.
+        match self.place(lifted) {
+            Err(_) if NOTHING.iter().any(|words| self.colmap.said(words)) => {}
+            outcome => outcome?,
+        }
+        say("cameras placed")?;
+        Ok(self.models)
+    }
+
+    fn extract(&self, photographs: &Path) -> crate::Result<()> {
+        let command = "feature_extractor";
+        let is_one_camera = if lifted::are_of_one_size(photographs) { "1" } else { "0" };
+        self.colmap.run(
+            command,
+            &[
+                "--database_path".as_ref(),
+                self.database.as_ref(),
+                "--image_path".as_ref(),
+                photographs.as_ref(),
+                "--ImageReader.single_camera".as_ref(),
+                is_one_camera.as_ref(),
+                "--ImageReader.camera_model".as_ref(),
+                self.args.camera_model.as_ref(),
+                self.use_gpu(command, ["FeatureExtraction.use_gpu", "SiftExtraction.use_gpu"])
+                    .as_ref(),
+                self.gpu(),
+            ],
+        )
+    }
+
+    fn compare(&self) -> crate::Result<()> {
+        let command = self.matcher.command();
+        let use_gpu = self.use_gpu(command, ["FeatureMatching.use_gpu", "SiftMatching.use_gpu"]);
+        let database = ["--database_path".as_ref(), self.database.as_ref()];
+        self.colmap.run(command, &[&database[..], &[use_gpu.as_ref(), self.gpu()]].concat())
+    }
+
+    fn place(&self, photographs: &Path) -> crate::Result<()> {
+        let files: [&OsStr; 6] = [
+            "--database_path".as_ref(),
+            self.database.as_ref(),
+            "--image_path".as_ref(),
+            photographs.as_ref(),
+            "--output_path".as_ref(),
+            self.models.as_ref(),
+        ];
+        match (self.args.mapper, &self.glomap) {
+            (Mapper::Incremental, _) => self.colmap.run("mapper", &files),
+            (Mapper::Global, Some(glomap)) => glomap.run("mapper", &files),
+            (Mapper::Global, None) => {
+                // Placed all at once, cameras need their focal lengths before.
+                self.colmap.run("view_graph_calibrator", &files[..2])?;
+                self.colmap.run(GLOBAL, &files)
+            }
+        }
+    }
+
+    /// The option by its name in this version of COLMAP: before 3.12 it was another.
+    fn use_gpu(&self, command: &str, [new, old]: [&str; 2]) -> String {
+        let is_new = self.colmap.helps_with(&[command, "-h"], new);
+        format!("--{}", if is_new { new } else { old })
+    }
+
+    fn gpu(&self) -> &'static OsStr {
+        if self.args.colmap_gpu { "1" } else { "0" }.as_ref()
+    }
+}
+
+/// The command of COLMAP, from 4.0 on, that is GLOMAP.
+const GLOBAL: &str = "global_mapper";
+
+/// What a mapper says that found nothing to begin with.
+const NOTHING: [&str; 2] = ["No good initial image pair found", "failed to create sparse model"];

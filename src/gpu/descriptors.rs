@@ -1,0 +1,178 @@
+//! How a pass is given its buffers: descriptors are pushed into the recording, or where a device cannot, written to sets.
+
+use std::sync::Arc;
+
+use ash::{khr, vk};
+
+use super::pipeline::Objects;
+use super::{Bound, Recorder, Retired, Shared};
+use crate::Result;
+
+/// `off` in this variable binds descriptor sets also where a device could be pushed to. It changes no bit.
+pub const PUSH_VARIABLE: &str = "NIGHTSPLAT_PUSH_DESCRIPTORS";
+
+/// The most buffers that one pass binds.
+pub(super) const MAX_BUFFERS: u32 = 16;
+
+/// What a device takes.
+pub(super) enum Descriptors {
+    Pushed(khr::push_descriptor::Device),
+    InSets,
+}
+
+impl Descriptors {
+    /// Pushed where the device was created with the extension, as only then it tells the function's address.
+    pub(super) fn of(instance: &ash::Instance, device: &ash::Device, may_be_pushed: bool) -> Self {
+        let name = c"vkCmdPushDescriptorSetKHR".as_ptr();
+        // SAFETY: the device is live, the name ends with NUL.
+        let function = unsafe { (instance.fp_v1_0().get_device_proc_addr)(device.handle(), name) };
+        match function.filter(|_| may_be_pushed) {
+            Some(_) => Self::Pushed(khr::push_descriptor::Device::new(instance, device)),
+            None => Self::InSets,
+        }
+    }
+
+    pub(super) fn set_layout_flags(&self) -> vk::DescriptorSetLayoutCreateFlags {
+        match self {
+            Self::Pushed(_) => vk::DescriptorSetLayoutCreateFlags::PUSH_DESCRIPTOR_KHR,
+            Self::InSets => vk::DescriptorSetLayoutCreateFlags::empty(),
+        }
+    }
+}
+
+/// The sets of one recording; none where descriptors are pushed.
+#[derive(Debug)]
+pub(super) struct Sets {
+    shared: Arc<Shared>,
+    pools: Vec<vk::DescriptorPool>,
+    /// In the last pool.
+    left: u32,
+}
+
+/// Sets of a pool, each with room for [`MAX_BUFFERS`].
+const SETS_OF_A_POOL: u32 = 64;
+
+impl Sets {
+    pub(super) fn new(shared: &Arc<Shared>) -> Self {
+        Self { shared: Arc::clone(shared), pools: vec![], left: 0 }
+    }
+
+    /// A set that nothing was written to.
+    fn next(&mut self, layout: vk::DescriptorSetLayout) -> Result<vk::DescriptorSet> {
+        let shared = &self.shared;
+        if self.left == 0 {
+            let sizes = [vk::DescriptorPoolSize::default()
+                .ty(vk::DescriptorType::STORAGE_BUFFER)
+                .descriptor_count(SETS_OF_A_POOL * MAX_BUFFERS)];
+            let info =
+                vk::DescriptorPoolCreateInfo::default().max_sets(SETS_OF_A_POOL).pool_sizes(&sizes);
+            // SAFETY: the device is live; the pool is retired with this recording.
+            let pool = unsafe { shared.device.create_descriptor_pool(&info, None) }
+                .map_err(|result| shared.error("vkCreateDescriptorPool", result))?;
+            self.pools.push(pool);
+            self.left = SETS_OF_A_POOL;
+        }
+        self.left -= 1;
+        let layouts = [layout];
+        let pool = self.pools.last().copied().unwrap_or_default();
+        let info =
+            vk::DescriptorSetAllocateInfo::default().descriptor_pool(pool).set_layouts(&layouts);
+        // SAFETY: the pool is this recording's own and has room.
+        let sets = unsafe { shared.device.allocate_descriptor_sets(&info) }
+            .map_err(|result| shared.error("vkAllocateDescriptorSets", result))?;
+        Ok(sets[0])
+    }
+}
+
+impl Drop for Sets {
+    fn drop(&mut self) {
+        for pool in self.pools.drain(..) {
+            self.shared.retire(Retired::Descriptors(pool));
+        }
+    }
+}
+
+impl Recorder<'_> {
+    /// Binds pipeline, buffers and parameters of the next dispatch.
+    pub(super) fn bind(
+        &mut self,
+        pipeline: &Objects,
+        params: &[u8],
+        bound: &[Bound],
+    ) -> Result<()> {
+        let infos: Vec<_> = bound
+            .iter()
+            .map(|b| [vk::DescriptorBufferInfo::default().buffer(b.raw).range(vk::WHOLE_SIZE)])
+            .collect();
+        let mut writes: Vec<_> = pipeline
+            .interface
+            .bindings
+            .iter()
+            .zip(&infos)
+            .map(|(binding, info)| {
+                vk::WriteDescriptorSet::default()
+                    .dst_binding(binding.index)
+                    .descriptor_type(vk::DescriptorType::STORAGE_BUFFER)
+                    .buffer_info(info)
+            })
+            .collect();
+        let (commands, point, layout) =
+            (self.commands, vk::PipelineBindPoint::COMPUTE, pipeline.layout);
+        let shared = self.shared();
+        let device = &shared.device;
+        // SAFETY: recording; pipeline and buffers are live and match the layout by construction.
+        unsafe {
+            device.cmd_bind_pipeline(commands, point, pipeline.raw);
+            match &shared.descriptors {
+                Descriptors::Pushed(functions) => {
+                    functions.cmd_push_descriptor_set(commands, point, layout, 0, &writes);
+                }
+                Descriptors::InSets => {
+                    let set = self.sets.next(pipeline.set_layout)?;
+                    writes.iter_mut().for_each(|write| write.dst_set = set);
+                    device.update_descriptor_sets(&writes, &[]);
+                    device.cmd_bind_descriptor_sets(commands, point, layout, 0, &[set], &[]);
+                }
+            }
+            if !params.is_empty() {
+                let stage = vk::ShaderStageFlags::COMPUTE;
+                device.cmd_push_constants(commands, layout, stage, 0, params);
+            }
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::{DeviceChoice, Gpu, Threads};
+    use crate::kernels::relu_backward;
+
+    #[test]
+    fn a_recording_of_many_passes_binds_each_its_own_buffers_in_sets() {
+        let mut gpu = Gpu::new(&DeviceChoice::Best).unwrap();
+        Arc::get_mut(&mut gpu.shared).unwrap().descriptors = Descriptors::InSets;
+        let pipeline = gpu.pipeline::<relu_backward::Kernel>(&relu_backward::Constants {}).unwrap();
+        let passes = 2 * SETS_OF_A_POOL as usize + 3;
+        let activations = gpu.buffer("activations", &[0.0f32, 1.0]).unwrap();
+        let mut gradients: Vec<_> =
+            (0..passes).map(|i| gpu.buffer("gradient", &[i as f32 + 1.0; 2]).unwrap()).collect();
+        // The buffers of the recording before are gone when the next is made.
+        for _ in 0..2 {
+            gpu.run("many passes", |pass| {
+                for gradient in &mut gradients {
+                    let params = relu_backward::Params { value_count: 2 };
+                    let buffers = relu_backward::Buffers { activations: &activations, gradient };
+                    pass.dispatch(&pipeline, &params, buffers, Threads::Exactly([2, 1, 1]))?;
+                }
+                assert_eq!(pass.sets.pools.len(), 3);
+                Ok(())
+            })
+            .unwrap();
+        }
+        for (i, gradient) in gradients.iter().enumerate() {
+            assert_eq!(gpu.read(gradient).unwrap(), [0.0, i as f32 + 1.0]);
+        }
+    }
+}

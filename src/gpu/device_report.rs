@@ -1,0 +1,154 @@
+//! What `doctor` says of every device.
+
+use ash::vk;
+
+use super::REQUIREMENTS;
+use super::choice::PciAddress;
+use super::cooperative::{self, CooperativeMatrix};
+use super::device::{Owned, instance, loader_error, physical_devices};
+use super::requirements::Offered;
+use crate::Result;
+
+/// One device and how it meets the requirements, for `doctor`.
+#[derive(Clone, Debug, serde::Serialize)]
+pub struct DeviceReport {
+    /// The device's name.
+    pub name: String,
+    /// discrete, integrated, virtual, software or other.
+    pub kind: &'static str,
+    /// Vulkan version.
+    pub api_version: String,
+    /// The vendor's number, as PCI has them.
+    pub vendor: u32,
+    /// `VkPhysicalDeviceIDProperties::deviceUUID`, which NVIDIA's tools give behind `GPU-`.
+    pub uuid: String,
+    /// Where it sits on the PCI bus, if it does and says so.
+    pub pci: Option<PciAddress>,
+    /// Lanes of a subgroup.
+    pub subgroup_size: u32,
+    /// Bytes of device-local memory.
+    pub memory: u64,
+    /// What bounds a scene and a view.
+    pub limits: DeviceLimits,
+    /// The matrices that `--denoiser-precision half` builds on, where the device offers any.
+    pub cooperative_matrix: Option<CooperativeMatrix>,
+    /// Every requirement, in the order of [`REQUIREMENTS`].
+    pub requirements: Vec<RequirementReport>,
+}
+
+/// What a device can do at most.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize)]
+pub struct DeviceLimits {
+    /// Bytes that one storage buffer binding can span.
+    pub max_storage_buffer_range: u64,
+    /// Bytes of one allocation.
+    pub max_allocation: u64,
+    /// Workgroups of a dispatch along its first two dimensions.
+    pub max_workgroups: u32,
+    /// Invocations of a workgroup.
+    pub max_workgroup_invocations: u32,
+    /// Bytes that a workgroup shares.
+    pub max_shared_memory: u32,
+    /// Storage buffers that one kernel binds.
+    pub max_storage_buffers: u32,
+}
+
+/// One requirement and whether a device meets it.
+#[derive(Clone, Copy, Debug, serde::Serialize)]
+pub struct RequirementReport {
+    /// The Vulkan name of the feature, extension or limit.
+    pub name: &'static str,
+    /// What it is needed for.
+    pub why: &'static str,
+    /// Whether the device meets it.
+    pub met: bool,
+}
+
+impl DeviceReport {
+    /// The first requirement that the device does not meet, by its name.
+    pub fn missing(&self) -> Option<&'static str> {
+        self.all_missing().next()
+    }
+
+    /// Every requirement that the device does not meet, by its name.
+    pub fn all_missing(&self) -> impl Iterator<Item = &'static str> {
+        self.requirements.iter().filter(|requirement| !requirement.met).map(|missing| missing.name)
+    }
+}
+
+/// Every Vulkan device of this machine, the best first, whether it meets the requirements or not.
+///
+/// # Errors
+/// There is no Vulkan loader, or no device at all.
+pub fn devices() -> Result<Vec<DeviceReport>> {
+    let owned = instance(false)?;
+    let reports = physical_devices(&owned.instance)
+        .and_then(|all| all.into_iter().map(|physical| report(&owned, physical)).collect());
+    // SAFETY: no device was created from the instance.
+    unsafe { owned.destroy() };
+    reports
+}
+
+pub(super) fn report(
+    Owned { instance, entry, .. }: &Owned,
+    physical: vk::PhysicalDevice,
+) -> Result<DeviceReport> {
+    let offered = Offered::gather(instance, physical).map_err(loader_error)?;
+    let version = offered.properties.api_version;
+    let (major, minor, patch) = (
+        vk::api_version_major(version),
+        vk::api_version_minor(version),
+        vk::api_version_patch(version),
+    );
+    let limits = offered.properties.limits;
+    Ok(DeviceReport {
+        name: offered.device_name(),
+        kind: match offered.properties.device_type {
+            vk::PhysicalDeviceType::DISCRETE_GPU => "discrete",
+            vk::PhysicalDeviceType::INTEGRATED_GPU => "integrated",
+            vk::PhysicalDeviceType::VIRTUAL_GPU => "virtual",
+            vk::PhysicalDeviceType::CPU => "software",
+            _ => "other",
+        },
+        api_version: format!("{major}.{minor}.{patch}"),
+        vendor: offered.properties.vendor_id,
+        uuid: hyphenated(&offered.uuid),
+        pci: offered.pci,
+        subgroup_size: offered.subgroup_size,
+        memory: device_memory(instance, physical),
+        limits: DeviceLimits {
+            max_storage_buffer_range: u64::from(limits.max_storage_buffer_range),
+            max_allocation: offered.max_allocation,
+            max_workgroups: max_workgroups(&limits),
+            max_workgroup_invocations: limits.max_compute_work_group_invocations,
+            max_shared_memory: limits.max_compute_shared_memory_size,
+            max_storage_buffers: limits.max_per_stage_descriptor_storage_buffers,
+        },
+        cooperative_matrix: cooperative::offered(entry, instance, physical, &offered),
+        requirements: REQUIREMENTS
+            .iter()
+            .map(|r| RequirementReport { name: r.name, why: r.why, met: r.met_by(&offered) })
+            .collect(),
+    })
+}
+
+/// Of a dispatch along either of its first two dimensions.
+pub(super) fn max_workgroups(limits: &vk::PhysicalDeviceLimits) -> u32 {
+    limits.max_compute_work_group_count[0].min(limits.max_compute_work_group_count[1])
+}
+
+/// Bytes of device-local memory.
+pub(super) fn device_memory(instance: &ash::Instance, physical: vk::PhysicalDevice) -> u64 {
+    // SAFETY: the handle was enumerated from the instance.
+    let memory = unsafe { instance.get_physical_device_memory_properties(physical) };
+    let heaps = memory.memory_heaps_as_slice().iter();
+    let local = heaps.filter(|heap| heap.flags.contains(vk::MemoryHeapFlags::DEVICE_LOCAL));
+    local.map(|heap| heap.size).sum()
+}
+
+/// A UUID as everyone writes it.
+fn hyphenated(uuid: &[u8; 16]) -> String {
+    let hex = |bytes: &[u8]| bytes.iter().map(|byte| format!("{byte:02x}")).collect::<String>();
+    let groups = [&uuid[..4], &uuid[4..6], &uuid[6..8], &uuid[8..10], &uuid[10..]];
+    groups.map(hex).join("-")
+}

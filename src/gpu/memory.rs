@@ -1,0 +1,162 @@
+//! How much memory there is on a device, what we take of it, and what we may.
+
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use ash::{ext, vk};
+use gpu_allocator::AllocationSizes;
+
+use super::Gpu;
+
+/// The allocator asks for memory in blocks that begin small and double: a small model takes little, a large one few blocks.
+pub(super) fn block_sizes() -> AllocationSizes {
+    const MIB: u64 = 1 << 20;
+    AllocationSizes::new(16 * MIB, 8 * MIB)
+        .with_max_device_memblock_size(256 * MIB)
+        .with_max_host_memblock_size(64 * MIB)
+}
+
+/// What the driver says of the memory that is the device's own, all processes together (`VK_EXT_memory_budget`).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct MemoryBudget {
+    /// Bytes that this process may take before it gets slow or fails, what it has included.
+    pub budget: u64,
+    /// Bytes that this process takes now.
+    pub usage: u64,
+}
+
+/// What it takes to ask.
+pub(super) struct BudgetQuery {
+    instance: ash::Instance,
+    physical: vk::PhysicalDevice,
+}
+
+impl BudgetQuery {
+    /// None where the device does not offer the extension.
+    pub(super) fn of(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Option<Self> {
+        // SAFETY: the handle was enumerated from the instance.
+        let extensions = unsafe { instance.enumerate_device_extension_properties(physical) };
+        let is_offered = |own: &vk::ExtensionProperties| {
+            own.extension_name_as_c_str() == Ok(ext::memory_budget::NAME)
+        };
+        let is_offered = extensions.is_ok_and(|all| all.iter().any(is_offered));
+        is_offered.then(|| Self { instance: instance.clone(), physical })
+    }
+
+    fn ask(&self) -> MemoryBudget {
+        let mut budget = vk::PhysicalDeviceMemoryBudgetPropertiesEXT::default();
+        let mut memory = vk::PhysicalDeviceMemoryProperties2::default().push_next(&mut budget);
+        // SAFETY: the chain points at a live local, and the device offers the extension.
+        unsafe {
+            self.instance.get_physical_device_memory_properties2(self.physical, &mut memory);
+        }
+        let heaps = memory.memory_properties;
+        let is_local =
+            |heap: &vk::MemoryHeap| heap.flags.contains(vk::MemoryHeapFlags::DEVICE_LOCAL);
+        let heaps = heaps.memory_heaps_as_slice().iter();
+        let told = heaps.zip(budget.heap_budget.into_iter().zip(budget.heap_usage));
+        let local = told.filter(|(heap, _)| is_local(heap)).map(|(_, told)| told);
+        let [budget, usage] = local
+            .fold([0; 2], |[budgets, usages], (budget, usage)| [budgets + budget, usages + usage]);
+        MemoryBudget { budget, usage }
+    }
+}
+
+impl Gpu {
+    /// What the driver says of the device's memory now; none where it does not tell.
+    pub fn memory_budget(&self) -> Option<MemoryBudget> {
+        self.shared.budget.as_ref().map(BudgetQuery::ask)
+    }
+
+    /// The bytes of all buffers, staging included, and of those that the device is not done with.
+    pub fn memory_in_use(&self) -> u64 {
+        self.shared.usage.now.load(Ordering::Acquire)
+    }
+
+    /// The most that [`Gpu::memory_in_use`] has been since [`Gpu::reset_peak_memory`].
+    pub fn peak_memory(&self) -> u64 {
+        self.shared.usage.peak.load(Ordering::Acquire)
+    }
+
+    /// Frees the memory of what was dropped, as far as the device is done with it; otherwise the next wait does.
+    pub(crate) fn free_unused(&self) {
+        self.shared.collect(self.shared.reached());
+    }
+
+    /// Counts the peak anew, from what is allocated now.
+    pub fn reset_peak_memory(&self) {
+        let MemoryUsage { now, peak, .. } = &self.shared.usage;
+        peak.store(now.load(Ordering::Acquire), Ordering::Release);
+    }
+
+    /// From now on, a buffer that would take [`Gpu::memory_in_use`] beyond so many bytes is refused as if memory were out.
+    pub fn limit_memory(&self, bytes: u64) {
+        self.shared.usage.limit.store(bytes, Ordering::Release);
+    }
+}
+
+/// Bytes of all buffers, staging included.
+#[derive(Debug)]
+pub(super) struct MemoryUsage {
+    now: AtomicU64,
+    peak: AtomicU64,
+    limit: AtomicU64,
+}
+
+impl Default for MemoryUsage {
+    fn default() -> Self {
+        Self { now: AtomicU64::new(0), peak: AtomicU64::new(0), limit: AtomicU64::new(u64::MAX) }
+    }
+}
+
+/// Memory that there is, but not for us.
+#[derive(Debug, thiserror::Error)]
+#[error("{now} of {limit} bytes are taken")]
+pub(super) struct BeyondLimit {
+    now: u64,
+    limit: u64,
+}
+
+impl MemoryUsage {
+    /// # Errors
+    /// So many bytes more are beyond the limit.
+    pub(super) fn admit(&self, bytes: u64) -> Result<(), BeyondLimit> {
+        let (now, limit) = (self.now.load(Ordering::Acquire), self.limit.load(Ordering::Acquire));
+        if now.saturating_add(bytes) > limit { Err(BeyondLimit { now, limit }) } else { Ok(()) }
+    }
+
+    pub(super) fn add(&self, bytes: u64) {
+        let now = self.now.fetch_add(bytes, Ordering::AcqRel) + bytes;
+        self.peak.fetch_max(now, Ordering::AcqRel);
+    }
+
+    pub(super) fn subtract(&self, bytes: u64) {
+        self.now.fetch_sub(bytes, Ordering::AcqRel);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::gpu::{DeviceChoice, Gpu};
+
+    #[test]
+    fn memory_counts_until_the_device_is_done_with_it_and_no_further_than_the_limit() {
+        let gpu = Gpu::new(&DeviceChoice::Best).unwrap();
+        let before = gpu.memory_in_use();
+        let buffer = gpu.uninit::<u8>("buffer", 1 << 20).unwrap();
+        assert!(gpu.memory_in_use() >= before + (1 << 20));
+        gpu.limit_memory(before + (3 << 19));
+        let refused = gpu.uninit::<u8>("another", 1 << 20).unwrap_err();
+        assert_eq!(refused.exit_code(), 4, "{refused}");
+        drop(buffer);
+        assert_eq!(gpu.memory_in_use(), before);
+        gpu.uninit::<u8>("another", 1 << 20).unwrap();
+    }
+
+    #[test]
+    fn a_budget_is_no_less_than_what_is_taken() {
+        let gpu = Gpu::new(&DeviceChoice::Best).unwrap();
+        if let Some(budget) = gpu.memory_budget() {
+            assert!(budget.budget > 0 && budget.budget >= budget.usage, "{budget:?}");
+        }
+    }
+}
