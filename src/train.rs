@@ -381,9 +381,9 @@ impl Trainer {
     /// Steps that the configuration wants checked are, each on its own.
     ///
     /// # Errors
-    /// [`Error::NotFinite`] where a loss term or a gradient is NaN and `TrainConfig::stop` leaves no view out, [`Error::Crowded`] where the device cannot follow as many splats as
-    /// lie on one tile, [`Error::Disagrees`] where a checked step is to stop at a difference
-    /// and has one, or the device is out of memory or lost.
+    /// [`Error::NotFinite`] where a loss term or a gradient is NaN and [`StopConfig::not_finite`] leaves no view out,
+    /// [`Error::Crowded`] where the device cannot follow as many splats as lie on one tile, [`Error::Disagrees`] where a
+    /// checked step is to stop at a difference and has one, or the device is out of memory or lost.
     pub fn advance(&mut self, until: u64) -> Result<Vec<StepReport>> {
         match (self.step + 1).checked_next_multiple_of(self.config.check.every) {
             Some(checked) if checked > until => self.submit_steps(until),

@@ -77,26 +77,30 @@ fn at_once(mut own: Hostile) -> Hostile {
 /// Every hostile Gaussian of the table before one camera.
 fn all_at_once() -> Result<Hostile> {
     let log = |power: f32| power * std::f32::consts::LN_10;
-    Ok(Hostile::gaussians(24, SIZE, |gaussians, i| match i {
-        0..4 => gaussians.log_scales_mut()[i] = Vec3::splat(log([-20.0, 3.0, 10.0, 20.0][i])),
-        4 => gaussians.log_scales_mut()[i] = Vec3::new(log(-20.0), 0.0, log(20.0)),
-        5..10 => gaussians.raw_opacities_mut()[i] = [-100.0, -20.0, -5.5, 20.0, 100.0][i - 5],
-        10..16 => {
-            let size = [0.0, 1e-40, 1e-10, 1e15, 1e30, 1e38][i - 10];
-            gaussians.quats_mut()[i] = [1.0, 2.0, -1.0, 0.3].map(|k| k * size);
+    Ok(Hostile::gaussians(24, SIZE, |gaussians, i| {
+        // Apart, so that their order is not a matter of rounding.
+        gaussians.means_mut()[i].z = 3.0 + 0.1 * i as f32;
+        match i {
+            0..4 => gaussians.log_scales_mut()[i] = Vec3::splat(log([-20.0, 3.0, 10.0, 20.0][i])),
+            4 => gaussians.log_scales_mut()[i] = Vec3::new(log(-20.0), 0.0, log(20.0)),
+            5..10 => gaussians.raw_opacities_mut()[i] = [-100.0, -20.0, -5.5, 20.0, 100.0][i - 5],
+            10..16 => {
+                let size = [0.0, 1e-40, 1e-10, 1e15, 1e30, 1e38][i - 10];
+                gaussians.quats_mut()[i] = [1.0, 2.0, -1.0, 0.3].map(|k| k * size);
+            }
+            16..23 => {
+                gaussians.means_mut()[i] = [
+                    Vec3::new(0.0, 0.0, 0.2),
+                    Vec3::new(0.1, 0.1, -3.0),
+                    Vec3::ZERO,
+                    Vec3::splat(1e-7),
+                    Vec3::new(1e5, 1e5, 1e7),
+                    Vec3::new(1e7, 0.0, 3.0),
+                    Vec3::new(1e28, 1e28, 1e30),
+                ][i - 16];
+            }
+            _ => gaussians.dc_mut()[i] = Vec3::splat(1e6),
         }
-        16..23 => {
-            gaussians.means_mut()[i] = [
-                Vec3::new(0.0, 0.0, 0.2),
-                Vec3::new(0.1, 0.1, -3.0),
-                Vec3::ZERO,
-                Vec3::splat(1e-7),
-                Vec3::new(1e5, 1e5, 1e7),
-                Vec3::new(1e7, 0.0, 3.0),
-                Vec3::new(1e28, 1e28, 1e30),
-            ][i - 16];
-        }
-        _ => gaussians.dc_mut()[i] = Vec3::splat(1e6),
     }))
 }
 
@@ -248,7 +252,7 @@ pub const CASES: &[Case] = &[
     case("mean 1e7 beside", "outside of the view: no trace", NoTrace, |_| mean(1e7, 0.0, 3.0)),
     case("mean 1e30 away", "a dot as wide as the dilation", Learns, |_| mean(1e28, 1e28, 1e30)),
     case("mean 1e38 beside", "culled: no trace", NoTrace, |_| mean(1e38, 0.0, 3.0)),
-    quick(case("all of these at once", "as each by itself", Learns, |_| all_at_once())),
+    case("all of these at once", "as each by itself", Learns, |_| all_at_once()),
     case("500 coincident", "blended in the order of their numbers", Learns, |_| coincident(500)),
     large(case("5000 coincident", "blended in the order of their numbers", Learns, |_| {
         coincident(5000)
@@ -319,12 +323,12 @@ pub const CASES: &[Case] = &[
     case("EXR of denormals", "trains as black", Trains, |_| {
         Hostile::exr(|value, _, _| 1e-40 * value)
     }),
-    case("EXR with NaN", "they hide their pixels", Trains, |_| {
+    case("EXR with NaN", "they count as black, and a warning counts them", Trains, |_| {
         Hostile::exr(|value, x, y| if (x + y) % 5 == 0 { f32::NAN } else { value })
     }),
     quick(case(
         "EXR with infinity and below 0",
-        "infinity hides its pixels, below 0 is black",
+        "both count as black, and a warning counts them",
         Trains,
         |_| {
             Hostile::exr(|value, x, y| match (x + y) % 5 {
@@ -338,7 +342,7 @@ pub const CASES: &[Case] = &[
     case("EXR with 1e38", "trains", Trains, |_| {
         Hostile::exr(|value, x, y| if (x + y) % 5 == 0 { 1e38 } else { value })
     }),
-    case("EXR of NaN", "refused", Refusal("no photograph is left"), |_| {
+    case("EXR of NaN", "counts as black, and a warning says so", Trains, |_| {
         Hostile::exr(|_, _, _| f32::NAN)
     }),
 ];
