@@ -441,7 +441,7 @@ impl Renderer {
                 colors: &frame.colors,
                 tile_counts: &frame.tile_counts,
                 d_splats: &frame.d_splats,
-                status: &frame.status,
+                status: &mut frame.status,
                 gradients: gradients.parameters,
                 grad_norm_sums: gradients.grad_norm_sums,
                 visit_counts: gradients.visit_counts,

@@ -46,7 +46,7 @@ pub use config::{Background, CheckConfig, DensityConfig, TrainConfig};
 use ends::Ends;
 pub use exposures::{ExposureConfig, Learning};
 use held_out::HeldOut;
-pub use held_out::{StopConfig, targets_of_test_views};
+pub use held_out::{NotFinite, StopConfig, targets_of_test_views};
 use masks::Masks;
 pub use memory::MemoryEstimate;
 use model::Model;
@@ -261,8 +261,8 @@ impl Trainer {
             model: Model::upload(gpu, &gaussians)?,
             renderer,
             losses,
+            networks: NetworkTerms::new(gpu, &config, &sizes, !masks.is_empty())?,
             masks,
-            networks: NetworkTerms::new(gpu, &config, &sizes)?,
             exposures,
             adam,
             finite,
@@ -317,14 +317,6 @@ impl Trainer {
         self.model.download(&self.gpu)
     }
 
-    /// The gradient of every parameter that the last step left, in the frame.
-    ///
-    /// # Errors
-    /// The device was lost.
-    pub fn gradients(&self) -> Result<Gaussians> {
-        self.model.download_gradients(&self.gpu)
-    }
-
     /// What is trained on.
     pub fn fingerprint(&self) -> &Fingerprint {
         &self.fingerprint
@@ -347,9 +339,9 @@ impl Trainer {
     /// Steps that the configuration wants checked are, each on its own.
     ///
     /// # Errors
-    /// [`Error::NotFinite`] where a loss term is NaN, [`Error::Crowded`] where the device cannot follow as many splats as
-    /// lie on one tile, [`Error::Disagrees`] where a checked step is to stop at a difference
-    /// and has one, or the device is out of memory or lost.
+    /// [`Error::NotFinite`] where a loss term or a gradient is NaN and [`StopConfig::not_finite`] leaves no view out,
+    /// [`Error::Crowded`] where the device cannot follow as many splats as lie on one tile, [`Error::Disagrees`] where a
+    /// checked step is to stop at a difference and has one, or the device is out of memory or lost.
     pub fn advance(&mut self, until: u64) -> Result<Vec<StepReport>> {
         match (self.step + 1).checked_next_multiple_of(self.config.check.every) {
             Some(checked) if checked > until => self.submit_steps(until),
@@ -449,7 +441,8 @@ impl Trainer {
                 }
                 _ => target,
             };
-            networks.record(pass, inputs, Photographs { low, target }, d_render, log)?;
+            let photographs = Photographs { mask: masks.of_view(view.number), low, target };
+            networks.record(pass, inputs, photographs, d_render, log)?;
             masks.hide(pass, view.number, (size, channels), d_render)?;
         }
         self.renderer.backward(
