@@ -1,6 +1,6 @@
 # What a newcomer needs; everything else is cargo.
 
-.PHONY: demo test
+.PHONY: demo test stress
 
 # Trains on a small dark set of our own making and leaves demo/index.html.
 demo: vulkan
@@ -9,6 +9,10 @@ demo: vulkan
 # Every test, on whatever Vulkan device is best; a software device will do.
 test: vulkan
 	cargo test
+
+# What takes hours: hostile inputs, long runs, kills, fuzzing. docs/extremes.md has what it found.
+stress: vulkan
+	scripts/stress.py
 
 .PHONY: vulkan
 vulkan:

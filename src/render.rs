@@ -30,7 +30,6 @@ use crate::{Error, Result};
 pub use frame::Frame;
 use frame::RANKS_PER_PARTITION;
 pub use frame::Status;
-pub(crate) use frame::TILES_PER_GAUSSIAN;
 use limits::{longest_run, most_tiles, splats_per_turn};
 pub use settings::RenderSettings;
 
@@ -442,7 +441,7 @@ impl Renderer {
                 colors: &frame.colors,
                 tile_counts: &frame.tile_counts,
                 d_splats: &frame.d_splats,
-                status: &frame.status,
+                status: &mut frame.status,
                 gradients: gradients.parameters,
                 grad_norm_sums: gradients.grad_norm_sums,
                 visit_counts: gradients.visit_counts,

@@ -5,11 +5,13 @@
 #include "camera.glsl"
 #include "sh.glsl"
 #include "splat.glsl"
+#include "status.glsl"
 
 //! Project backward: one thread per Gaussian, from the gradients of its splat to those of its attributes.
 //!
 //! The chain of `project` read backwards; what it needs of the forward pass it computes again. Also keeps the statistics
-//! of density control: the norm of the screen-space gradient in normalised device units, damped near the camera.
+//! of density control: the norm of the screen-space gradient in normalised device units, damped near the camera. A gradient
+//! that is not finite raises a flag, so that neither this step nor those recorded behind it change a parameter.
 
 layout(local_size_x = 64) in;
 
@@ -29,7 +31,7 @@ layout(binding = 1) readonly  buffer Splats     { ProjectedSplat splats[]; };
 layout(binding = 2) readonly  buffer Colors     { float colors[]; };      // (gaussian_count, CHANNELS)
 layout(binding = 3) readonly  buffer TileCounts { uint tile_counts[]; };
 layout(binding = 4) readonly  buffer DSplats    { vec3 d_splats[]; };     // (gaussian_count, RECORD_VECTORS)
-layout(binding = 5) readonly  buffer Status     { uint status[]; };
+layout(binding = 5)           buffer Status     { uint status[]; };
 layout(binding = 6) writeonly buffer Gradients  { float gradients[]; };   // (columns x gaussian_count)
 layout(binding = 7) buffer GradNormSums { float grad_norm_sums[]; };
 layout(binding = 8) buffer VisitCounts  { uint visit_counts[]; };
@@ -73,6 +75,12 @@ vec3 sh_backward(uint i, vec3 offset, vec3 d_color) {
         for (uint c = 0; c < 3; c++) gradients[rest + c] = basis[k] * d_color[c];
     }
     return small * ((d_direction - direction * dot(direction, d_direction)) / distance);
+}
+
+// The largest magnitude by its bits, which are those of infinity or more where one is not finite.
+uint largest_bits(vec3 v) {
+    uvec3 bits = floatBitsToUint(v) & 0x7fffffffu;
+    return max(max(bits.x, bits.y), bits.z);
 }
 
 void store_zero(uint i) {
@@ -169,8 +177,17 @@ void main() {
     STORE_VEC3(LOG_SCALES_COLUMN, i, d_log_scale);
     uint raw_opacity = RAW_OPACITIES_COLUMN * gaussian_count + i;
     // Of an opaque Gaussian 1 - opacity is rounding; its complement is not.
-    gradients[raw_opacity] = d_opacity * splat.opacity * sigmoid(-parameters[raw_opacity]);
+    float d_raw_opacity = d_opacity * splat.opacity * sigmoid(-parameters[raw_opacity]);
+    gradients[raw_opacity] = d_raw_opacity;
 
+    uint bits = max(max(largest_bits(d_mean), largest_bits(d_quat.xyz)), largest_bits(d_log_scale));
+    // No basis function is beyond 8.
+    bits = max(max(bits, largest_bits(vec3(d_quat.w, d_raw_opacity, 0.0))), largest_bits(8.0 * d_color));
+    [[unroll]] for (uint k = 0; k < FEATURE_COUNT; k++) bits = max(bits, largest_bits(vec3(record[RECORD_HEAD + 3 + k])));
+    if (bits >= 0x7f800000u) {
+        if ((status[0] & ~STATUS_GRADIENT) == 0) atomicOr(status[0], STATUS_GRADIENT);
+        return;
+    }
     if (status[0] == 0) {
         float nearness = min(1.0, z / damping_depth);
         float damping = damping_weight * nearness * nearness + 1.0 - damping_weight;

@@ -10,6 +10,7 @@ use super::splat::{Splat, stored_record};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::project_backward::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::splat::{DILATION, RECORD_HEAD};
+use crate::kernels::status::STATUS_GRADIENT;
 
 /// The gradients that arrive at one splat.
 #[derive(Clone, Debug)]
@@ -197,14 +198,22 @@ impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
         let Slices { parameters, splats, colors, tile_counts, d_splats, status, .. } = slices;
         let Slices { gradients, grad_norm_sums, visit_counts, .. } = slices;
+        // Of all Gaussians, as the device may look at them in any order.
+        let before = status[0];
         let scene = Scene::new(params, constants);
         gradients[..scene.planes.len()].fill(0.0);
         for i in (0..scene.planes.count).filter(|&i| tile_counts[i] > 0) {
             let d_splat = scene.d_splat(colors, &scene.record(d_splats, i), i);
             let gaussian = scene.planes.load(parameters, i);
             let gradient = scene.backward(&gaussian, &Splat::from(&splats[i]), &d_splat);
-            scene.planes.store(&gradient, i, |at, value| gradients[at] = value as f32);
-            if status[0] == 0 {
+            let mut is_finite = (8.0 * d_splat.color.as_vec3()).is_finite();
+            scene.planes.store(&gradient, i, |at, value| {
+                gradients[at] = value as f32;
+                is_finite &= gradients[at].is_finite();
+            });
+            if !is_finite {
+                status[0] |= if before & !STATUS_GRADIENT == 0 { STATUS_GRADIENT } else { 0 };
+            } else if before == 0 {
                 grad_norm_sums[i] += scene.damped_norm(&gaussian, &d_splat) as f32;
                 visit_counts[i] += 1;
             }

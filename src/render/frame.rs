@@ -6,10 +6,12 @@ use crate::Result;
 use crate::gpu::{Buffer, Gpu};
 use crate::kernels::ProjectedSplat;
 use crate::kernels::splat::RECORD_HEAD;
-use crate::kernels::status::{STATUS_CROWDED, STATUS_NOT_FINITE, STATUS_OVERFLOWED, STATUS_WORDS};
+use crate::kernels::status::{
+    STATUS_CROWDED, STATUS_GRADIENT, STATUS_NOT_FINITE, STATUS_OVERFLOWED, STATUS_WORDS,
+};
 
 /// The first guess of how many tiles a Gaussian meets; a view that needs more makes the memory grow.
-pub(crate) const TILES_PER_GAUSSIAN: u32 = 6;
+const TILES_PER_GAUSSIAN: u32 = 6;
 
 /// How many depth ranks one subgroup counts the tiles of. Small: `emit` sums up what precedes a rank within them.
 pub(super) const RANKS_PER_PARTITION: u32 = 256;
@@ -21,6 +23,8 @@ pub struct Status {
     pub overflowed: bool,
     /// A loss term is NaN or infinite.
     pub not_finite: bool,
+    /// A gradient of a Gaussian is, and nothing before it was.
+    pub gradient_not_finite: bool,
     /// The most intersections that a render had since the status was cleared.
     pub intersections: u32,
     /// The most splats of one tile, where the device cannot follow so many; else 0.
@@ -34,6 +38,7 @@ impl Status {
         Self {
             overflowed: word(0) & STATUS_OVERFLOWED != 0,
             not_finite: word(0) & STATUS_NOT_FINITE != 0,
+            gradient_not_finite: word(0) & STATUS_GRADIENT != 0,
             intersections: word(1),
             crowd: if word(0) & STATUS_CROWDED == 0 { 0 } else { word(2) },
         }

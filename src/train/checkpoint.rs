@@ -42,6 +42,9 @@ struct Header {
     /// What the held-out views have ended.
     #[serde(default)]
     ends: Ends,
+    /// The views that it trains on no more.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    left_out: Vec<String>,
     /// What it was trained on; older files do not say.
     #[serde(default)]
     dataset: Option<Fingerprint>,
@@ -53,8 +56,10 @@ struct Header {
 impl Header {
     /// The checksum of a file with this header and these tensors, in the order of their names.
     fn checksum_with(&self, mut tensors: Vec<(String, &[u8])>) -> String {
-        let Self { format, step, config, ends, dataset, .. } = self;
+        let Self { format, step, config, ends, left_out, dataset, .. } = self;
         let mut hasher = Hasher::default();
+        // Older files have none.
+        left_out.iter().for_each(|name| hasher.write(name.as_bytes()));
         hasher
             .write(serde_json::json!([format, step, config, ends, dataset]).to_string().as_bytes());
         tensors.sort_unstable();
@@ -76,7 +81,7 @@ impl Header {
 ///
 /// # Errors
 /// [`Error::Input`] says that it is not, or that the file cannot be read.
-pub(crate) fn check_checkpoint(path: &Path) -> Result<()> {
+pub fn check_checkpoint(path: &Path) -> Result<()> {
     let bytes = std::fs::read(path)
         .map_err(|error| Error::input(path, format!("cannot be read ({error})")))?;
     let damaged = |problem: &str| Error::input(path, format!("is no whole checkpoint ({problem})"));
@@ -108,6 +113,7 @@ impl Trainer {
             step: self.step,
             config: self.config.to_toml()?,
             ends: self.ends.clone(),
+            left_out: self.views.left_out(),
             dataset: Some(self.fingerprint.clone()),
             checksum: None,
         };
@@ -175,6 +181,7 @@ impl Trainer {
             self.model = fresh;
             return Err(error);
         }
+        self.views.set_left_out(&header.left_out);
         (self.step, self.ends) = (header.step, header.ends);
         self.reserve()
     }

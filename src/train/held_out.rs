@@ -28,13 +28,41 @@ pub struct StopConfig {
     /// Growth ends once four rounds of density control gain less than so many dB for each doubling of the Gaussians; 0: it
     /// goes on to its last step.
     pub growth_gain: f64,
+    /// What is done about a view whose loss or gradient is not finite.
+    #[serde(skip_serializing_if = "NotFinite::is_stop")]
+    pub not_finite: NotFinite,
     /// The SH degree rises no further, and falls back, once the one in use gains less than so many dB; 0: it rises always.
     pub degree_gain: f64,
 }
 
+/// What is done about a view whose loss or gradient is NaN or infinite. The step that finds it changes nothing, either way.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum NotFinite {
+    /// The run ends with an error that names step, view and term.
+    #[default]
+    Stop,
+    /// The view is trained on no more.
+    SkipView,
+}
+
+impl NotFinite {
+    #[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes a reference")]
+    fn is_stop(&self) -> bool {
+        *self == Self::Stop
+    }
+}
+
 impl Default for StopConfig {
     fn default() -> Self {
-        Self { views: 0, every: 250, gain: 0.05, growth_gain: 0.0, degree_gain: 0.0 }
+        Self {
+            views: 0,
+            every: 250,
+            gain: 0.05,
+            growth_gain: 0.0,
+            not_finite: NotFinite::Stop,
+            degree_gain: 0.0,
+        }
     }
 }
 

@@ -2,11 +2,22 @@
 
 use glam::Vec3;
 
+use super::Trainer;
 use crate::Result;
 use crate::densify::{Densifier, DensifyInputs, DensifyReport, DeviceGaussians, Round};
 use crate::gpu::{Buffer, Gpu};
 use crate::optimizer::Moments;
 use crate::scene::{ATTRIBUTES, Gaussians, Shape, rest_coefficients, width};
+
+impl Trainer {
+    /// The gradient of every parameter that the last step left, in the frame.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub fn gradients(&self) -> Result<Gaussians> {
+        self.model.planes(&self.gpu, &self.model.gradients)
+    }
+}
 
 /// Planes of every attribute with their moments and gradients, and the statistics of density control. Buffers are as long
 /// as the Gaussians need or longer.
@@ -131,12 +142,6 @@ impl Model {
     /// The device was lost.
     pub(super) fn download(&self, gpu: &Gpu) -> Result<Gaussians> {
         self.planes(gpu, &self.gaussians.parameters)
-    }
-
-    /// # Errors
-    /// The device was lost.
-    pub(super) fn download_gradients(&self, gpu: &Gpu) -> Result<Gaussians> {
-        self.planes(gpu, &self.gradients)
     }
 
     fn planes(&self, gpu: &Gpu, buffer: &Buffer<f32>) -> Result<Gaussians> {

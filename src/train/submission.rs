@@ -8,7 +8,7 @@ use std::collections::VecDeque;
 use std::ops::RangeInclusive;
 use std::time::{Duration, Instant};
 
-use super::{StepReport, Trainer};
+use super::{NotFinite, StepReport, Trainer};
 use crate::gpu::Download;
 use crate::loss::{LossLogDownload, StepLosses};
 use crate::render::Status;
@@ -189,6 +189,8 @@ impl Trainer {
         self.pace.measure(at, count);
         // The steps from the first failed one on have changed nothing.
         let done = log.iter().take(count as usize).take_while(|losses| losses.status == 0).count();
+        // That flag goes up behind the loss: of the step before the first that saw it.
+        let done = if status.gradient_not_finite { done.saturating_sub(1) } else { done };
         let milliseconds = self.pace.step.as_secs_f64() * 1e3 * count as f64 / done.max(1) as f64;
         let losses = steps.zip(&log[..done]);
         reports.extend(losses.map(|(step, losses)| self.report(step, losses, milliseconds)));
@@ -216,7 +218,35 @@ impl Trainer {
             let view = format!("step {step}, view {}", view());
             return Err(self.renderer.too_crowded(view, status.crowd));
         }
-        let what = losses.first_not_finite().map_or("the loss", |term| term.name).to_owned();
-        Err(Error::NotFinite { step, view: view(), what })
+        let what = match losses.first_not_finite() {
+            Some(term) => term.name,
+            None if status.gradient_not_finite => "a gradient",
+            None => "the loss",
+        };
+        let error = Error::NotFinite { step, view: view(), what: what.to_owned() };
+        if self.config.stop.not_finite == NotFinite::Stop || !self.leave_out_view_of(step)? {
+            return Err(error);
+        }
+        tracing::warn!(
+            "{error}; the step has changed nothing, and the run goes on without the view"
+        );
+        Ok(())
+    }
+
+    /// Trains on the view of a step no more, as if that had never begun; false where it is the last view.
+    fn leave_out_view_of(&mut self, step: u64) -> Result<bool> {
+        let place = self.view_of(step).place;
+        if !self.views.leave_out(place) {
+            return Ok(false);
+        }
+        let Self { model, renderer, .. } = self;
+        self.gpu.clone().run("clear_status", |pass| {
+            renderer.clear_status(pass);
+            // Some Gaussians may have added to what density control goes by before the flag was up.
+            pass.fill(&mut model.grad_norm_sums, 0);
+            pass.fill(&mut model.visit_counts, 0);
+            Ok(())
+        })?;
+        Ok(true)
     }
 }

@@ -76,6 +76,8 @@ impl TargetExposure {
 #[derive(Debug)]
 pub(super) struct Views {
     levels: Vec<Vec<TrainView>>,
+    /// The places of those that are trained on no more.
+    left_out: BTreeSet<usize>,
     cache: Cache,
 }
 
@@ -144,7 +146,7 @@ impl Views {
         // The targets of a profile are as bright as its references.
         let exposure = scene.exposure.clone().filter(|_| settings.profile.is_none());
         let exposure = exposure.map(|scene| TargetExposure::new(scene, gains));
-        Ok((Self { levels: views, cache }, scene, exposure))
+        Ok((Self { levels: views, left_out: BTreeSet::new(), cache }, scene, exposure))
     }
 
     /// Brings to the device what steps need of their views, as many steps as fit there side by side but one at least; the
@@ -211,7 +213,8 @@ impl Views {
         self.levels.iter().flatten().map(source).collect()
     }
 
-    /// The view that a step trains on, at one of the levels: every epoch takes each view once, in an order of its own.
+    /// The view that a step trains on, at one of the levels: every epoch takes each view once, in an order of its own, and
+    /// for one that is left out the next again.
     pub(super) fn of_step(&self, seed: u64, step: u64, level: usize) -> &TrainView {
         let views = &self.levels[level];
         let count = views.len() as u64;
@@ -223,7 +226,27 @@ impl Views {
             let draw = stream.bits(epoch * count + left) % (left + 1);
             order.swap(left as usize, draw as usize);
         }
-        &views[order[place as usize]]
+        let from_place = order.iter().cycle().skip(place as usize).take(views.len());
+        let own = from_place.copied().find(|at| !self.left_out.contains(&views[*at].place));
+        &views[own.unwrap_or(order[place as usize])]
+    }
+
+    /// Trains on a view no more; false where there is no other.
+    pub(super) fn leave_out(&mut self, place: usize) -> bool {
+        let has_others = self.left_out.len() + 1 < self.whole().len();
+        has_others && self.left_out.insert(place)
+    }
+
+    /// The names of the views that are trained on no more.
+    pub(super) fn left_out(&self) -> Vec<String> {
+        let views = self.whole().iter().filter(|view| self.left_out.contains(&view.place));
+        views.map(|view| view.name.clone()).collect()
+    }
+
+    /// Leaves these views out, and no other.
+    pub(super) fn set_left_out(&mut self, names: &[String]) {
+        let views = self.whole().iter().filter(|view| names.contains(&view.name));
+        self.left_out = views.map(|view| view.place).collect();
     }
 
     /// The views of all levels, by number.

@@ -1,0 +1,147 @@
+#!/usr/bin/env python3
+"""The campaigns that take longer than tests may: each prints what it found, and the first that fails ends the script.
+
+    scripts/stress.py [table] [conditioning] [long] [kills] [fuzz] [guards]
+
+Without a name all of them run. NIGHTSPLAT names the command (default: target/release/nightsplat, built first), STEPS and
+KILLS how many steps and kills (100000 and 200), FUZZ_SECONDS what each fuzz target gets (600).
+"""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+COMMAND = os.environ.get("NIGHTSPLAT", "")
+STEPS = int(os.environ.get("STEPS", "100000"))
+KILLS = int(os.environ.get("KILLS", "200"))
+FUZZ_SECONDS = int(os.environ.get("FUZZ_SECONDS", "600"))
+PLAIN = ["--model", "plain", "--plan", "none", "--curve", "ap3"]
+# What a run may grow by between its first tenth and its last: the allocator's doings, no more.
+MOST_GROWTH = 1.05
+
+
+def run(*arguments, **options):
+    subprocess.run([str(argument) for argument in arguments], check=True, cwd=ROOT, **options)
+
+
+def command():
+    global COMMAND
+    if not COMMAND:
+        run("cargo", "build", "--release", "--bin", "nightsplat")
+        target = Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target"))
+        COMMAND = str(target / "release" / "nightsplat")
+    return COMMAND
+
+
+def synth(folder, side, views):
+    run(command(), "synth", folder, "--width", side, "--height", side, "--views", views, stdout=subprocess.DEVNULL)
+    return folder
+
+
+def table(_):
+    """Hostile inputs, each against the references."""
+    run(command(), "bench", "--stress")
+
+
+def conditioning(_):
+    """Adam over 100 000 steps, percentiles and means of 33 megapixels."""
+    run("cargo", "test", "--release", "--test", "conditioning", "--", "--include-ignored", "--nocapture")
+
+
+def resident(pid):
+    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+        if line.startswith("VmRSS"):
+            return int(line.split()[1])
+    return 0
+
+
+def long(folder):
+    """Memory over many steps: on a software device that of the device is the process's own."""
+    data, out = synth(folder / "set", 32, 8), folder / "long"
+    arguments = [command(), "train", data, "--out", out, "--steps", STEPS, "--max-gaussians", 1000, *PLAIN]
+    child = subprocess.Popen([str(a) for a in arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    samples = []
+    while child.poll() is None:
+        time.sleep(0.5)
+        samples.append(resident(child.pid) if child.poll() is None else 0)
+    samples = [sample for sample in samples if sample]
+    tenth = max(1, len(samples) // 10)
+    means = [sum(part) / len(part) for part in (samples[i:i + tenth] for i in range(0, len(samples), tenth))]
+    print(f"{STEPS} steps: resident MB by tenths of the run: " + ", ".join(f"{mean / 1024:.0f}" for mean in means))
+    # The first tenth holds the start, the second is the yardstick.
+    if child.returncode != 0 or (len(means) > 2 and means[-1] > MOST_GROWTH * means[1]):
+        sys.exit("memory grows, or the run failed")
+
+
+def kills(folder):
+    """Kills a run at any moment, again and again; it ends with the bytes of one that was left alone."""
+    data = synth(folder / "set", 32, 8)
+    rounds = random.Random(14)
+
+    def arguments(out):
+        return [str(a) for a in (command(), "train", data, "--out", out, "--steps", 2000, "--max-gaussians", 500,
+                                 "--checkpoint-every", 100, "--resume", *PLAIN)]
+
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    subprocess.run(arguments(folder / "straight"), check=True, **quiet)
+    expected = (folder / "straight" / "model.ply").read_bytes()
+    killed = runs = 0
+    while killed < KILLS:
+        runs += 1
+        out = folder / f"killed-{runs}"
+        while True:
+            child = subprocess.Popen(arguments(out), **quiet)
+            try:
+                # Enough kills: the last run may end.
+                code = child.wait(timeout=rounds.uniform(0.05, 4) if killed < KILLS else None)
+            except subprocess.TimeoutExpired:
+                child.send_signal(signal.SIGKILL)
+                child.wait()
+                killed += 1
+                continue
+            if code != 0:
+                sys.exit(f"after {killed} kills a run ended with {code}")
+            break
+        if (out / "model.ply").read_bytes() != expected:
+            sys.exit(f"after {killed} kills a run ended with other bytes")
+    print(f"{killed} kills over {runs} runs: every one ended with the bytes of a run that was left alone")
+
+
+def fuzz(_):
+    """Every fuzz target there is, so long each."""
+    targets = sorted(path.stem for path in (ROOT / "fuzz" / "fuzz_targets").glob("*.rs"))
+    if not targets:
+        print("not run: there are no fuzz targets")
+    for target in targets:
+        run("cargo", "fuzz", "run", target, "--", f"-max_total_time={FUZZ_SECONDS}")
+
+
+def guards(_):
+    """Takes every guard out of the kernels, one at a time: a test has to fail."""
+    run(sys.executable, ROOT / "scripts" / "plant-defects.py", "guard:")
+
+
+CAMPAIGNS = {campaign.__name__: campaign for campaign in (table, conditioning, long, kills, fuzz, guards)}
+
+
+def main():
+    names = sys.argv[1:] or list(CAMPAIGNS)
+    unknown = [name for name in names if name not in CAMPAIGNS]
+    if unknown:
+        sys.exit(f"unknown: {', '.join(unknown)}; there are {', '.join(CAMPAIGNS)}")
+    with tempfile.TemporaryDirectory() as folder:
+        for name in names:
+            print(f"== {name}: {CAMPAIGNS[name].__doc__.splitlines()[0]}", flush=True)
+            place = Path(folder) / name
+            place.mkdir()
+            CAMPAIGNS[name](place)
+
+
+if __name__ == "__main__":
+    main()
