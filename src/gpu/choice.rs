@@ -389,7 +389,7 @@ mod tests {
         for (text, name) in [
             ("", "Nine"),
             ("3", "Vega"),
-            ("rade", "Radeon"),
+            ("radeo", "Radeon"),
             ("uuid:46000000-0000-0000-0000-000000000046", "Four"),
             ("uuid:GPU-46", "Four"),
             ("uuid:460000000000", "Four"),

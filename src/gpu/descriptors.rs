@@ -142,37 +142,3 @@ impl Recorder<'_> {
         Ok(())
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::gpu::{DeviceChoice, Gpu, Threads};
-    use crate::kernels::relu_backward;
-
-    #[test]
-    fn a_recording_of_many_passes_binds_each_its_own_buffers_in_sets() {
-        let mut gpu = Gpu::new(&DeviceChoice::Best).unwrap();
-        Arc::get_mut(&mut gpu.shared).unwrap().descriptors = Descriptors::InSets;
-        let pipeline = gpu.pipeline::<relu_backward::Kernel>(&relu_backward::Constants {}).unwrap();
-        let passes = 2 * SETS_OF_A_POOL as usize + 3;
-        let activations = gpu.buffer("activations", &[0.0f32, 1.0]).unwrap();
-        let mut gradients: Vec<_> =
-            (0..passes).map(|i| gpu.buffer("gradient", &[i as f32 + 1.0; 2]).unwrap()).collect();
-        // The buffers of the recording before are gone when the next is made.
-        for _ in 0..2 {
-            gpu.run("many passes", |pass| {
-                for gradient in &mut gradients {
-                    let params = relu_backward::Params { value_count: 2 };
-                    let buffers = relu_backward::Buffers { activations: &activations, gradient };
-                    pass.dispatch(&pipeline, &params, buffers, Threads::Exactly([2, 1, 1]))?;
-                }
-                assert_eq!(pass.sets.pools.len(), 3);
-                Ok(())
-            })
-            .unwrap();
-        }
-        for (i, gradient) in gradients.iter().enumerate() {
-            assert_eq!(gpu.read(gradient).unwrap(), [0.0, i as f32 + 1.0]);
-        }
-    }
-}

@@ -26,6 +26,22 @@ pub fn gpu() -> Gpu {
     GPU.get_or_init(open).clone()
 }
 
+/// Another device with validation, whose passes bind descriptor sets wherever it is.
+///
+/// # Panics
+/// As [`gpu`].
+#[expect(clippy::panic, reason = "a test without a device must fail")]
+pub fn gpu_that_binds_sets() -> Gpu {
+    super::validation::fail_at_exit();
+    let choice = std::env::var("NIGHTSPLAT_DEVICE").unwrap_or_default();
+    let choice: DeviceChoice = choice.parse().unwrap_or_else(|error| panic!("{error}"));
+    let mut gpu = Gpu::with_validation(&choice).unwrap_or_else(|error| panic!("{error}"));
+    if let Some(shared) = std::sync::Arc::get_mut(&mut gpu.shared) {
+        shared.descriptors = super::descriptors::Descriptors::InSets;
+    }
+    gpu
+}
+
 /// Does what the validation layer must object to: creates a buffer of no bytes.
 pub fn misuse(gpu: &Gpu) {
     let device = &gpu.shared.device;
