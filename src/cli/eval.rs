@@ -32,7 +32,7 @@ pub struct EvalArgs {
     /// Where the dataset is now, or another copy of it; what differs from the run's views is said [default: where the run found it]
     #[arg(long, value_name = "DIR")]
     pub dataset: Option<PathBuf>,
-    /// Score LPIPS too, with AlexNet's weights in safetensors; the guide has the command that converts the published ones
+    /// Score LPIPS too, with the weights of its network in safetensors; the guide has the command that converts the published ones
     #[arg(long, value_name = "WEIGHTS")]
     pub lpips: Option<PathBuf>,
     /// Write what was scored to RUN/eval/renders, and what it was compared with to RUN/eval/references or RUN/eval/targets

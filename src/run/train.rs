@@ -351,7 +351,7 @@ impl<'a> Course<'a> {
         match directory.save_checkpoint(trainer) {
             Ok(()) => tracing::warn!("the run ends early; its {step} steps are saved"),
             Err(error) => {
-                tracing::warn!("the run ends early, and its last steps are lost: {error}")
+                tracing::warn!("the run ends early, and its last steps are lost: {error}");
             }
         }
     }
