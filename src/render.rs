@@ -30,7 +30,6 @@ use crate::{Error, Result};
 pub use frame::Frame;
 use frame::RANKS_PER_PARTITION;
 pub use frame::Status;
-pub(crate) use frame::TILES_PER_GAUSSIAN;
 use limits::{longest_run, most_tiles, splats_per_turn};
 pub use settings::RenderSettings;
 

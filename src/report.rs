@@ -7,7 +7,9 @@ use crate::image::Image;
 pub use self::bars::{Bar, bars};
 pub(crate) use self::data_uri::{base64, jpeg};
 pub use self::distribution::{Distribution, distributions};
-pub use self::plot::{Mark, Series, VerticalLine, plot, plot_points, plot_with_lines, svg_file};
+pub use self::plot::{
+    Mark, Series, VerticalLine, plot, plot_in_groups, plot_points, plot_with_lines, svg_file,
+};
 pub use self::table::{Best, Column, Table};
 pub use self::traces::{Trace, traces};
 
@@ -26,12 +28,12 @@ pub struct Report {
     pub title: String,
     /// The paragraphs under the heading.
     pub intro: Vec<String>,
+    /// Rows of pictures, in order.
+    pub comparisons: Vec<Comparison>,
     /// Tables of numbers, in order.
     pub tables: Vec<Table>,
     /// Plots, in order.
     pub plots: Vec<String>,
-    /// Rows of pictures, in order.
-    pub comparisons: Vec<Comparison>,
 }
 
 /// Pictures of one view side by side.
@@ -55,13 +57,8 @@ pub struct Picture {
 }
 
 impl Report {
-    /// The page as HTML: tables, plots, pictures.
+    /// The page as HTML: pictures, tables, plots.
     pub fn html(&self) -> String {
-        self.page(&(self.tables_html() + &self.plots_html() + &self.pictures_html()))
-    }
-
-    /// The same with the pictures first.
-    pub fn html_pictures_first(&self) -> String {
         self.page(&(self.pictures_html() + &self.tables_html() + &self.plots_html()))
     }
 

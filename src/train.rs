@@ -16,6 +16,7 @@ mod parts;
 mod paths;
 mod precision;
 mod preset;
+mod rendered;
 mod submission;
 mod terms;
 mod views;
@@ -23,14 +24,13 @@ mod views;
 use std::panic::resume_unwind;
 use std::thread::{self, ScopedJoinHandle};
 
-use glam::{DVec3, UVec2};
+use glam::DVec3;
 
 use crate::camera::{Camera, Frame};
 use crate::dataset::{Dataset, Fingerprint};
 use crate::densify::{Densifier, DensifySettings};
 use crate::exposure::Exposures;
 use crate::gpu::{Buffer, CheckReport, Gpu, PassTime, Recorder};
-use crate::image::Image;
 use crate::loss::{LogSlot, LossLog, Losses, StepLosses, Term, TermInputs};
 use crate::nn::Form;
 use crate::optimizer::{Adam, AdamBuffers, FiniteCheck, Learnable};
@@ -41,7 +41,7 @@ use crate::scene::{COLOR_CHANNELS, Gaussians, width};
 use crate::{Error, Result};
 
 pub use cache::CacheSize;
-pub(crate) use checkpoint::check_checkpoint;
+pub use checkpoint::check_checkpoint;
 pub use config::{Background, CheckConfig, DensityConfig, TrainConfig};
 use ends::Ends;
 pub use exposures::{ExposureConfig, Learning};
@@ -54,6 +54,7 @@ pub use networks::Networks;
 pub use parts::{ModelConfig, ModelName, NetworkRates, Part};
 pub use precision::{PhotographBits, PrecisionConfig};
 pub use preset::Preset;
+pub use rendered::Rendered;
 use submission::{MOST_STEPS, Pace};
 use terms::{NetworkTerms, Photographs};
 pub use views::TargetExposure;
@@ -69,49 +70,6 @@ mod streams {
     pub(super) const NETWORKS: u64 = 6;
     pub(super) const CROPS: u64 = 7;
     pub(super) const BOXES: u64 = 8;
-}
-
-/// What a model shows of a view.
-#[derive(Clone, Debug)]
-pub struct Rendered {
-    /// R_0: the Gaussians' colours.
-    pub colors: Image,
-    /// R_K, where the model has a denoiser.
-    pub denoised: Option<Image>,
-}
-
-impl Rendered {
-    /// Renders what `camera` sees of `gaussians`, (columns x Gaussians), and what the networks make of it.
-    ///
-    /// # Errors
-    /// As [`Renderer::render_image`]; the device is out of memory for the networks.
-    pub fn new(
-        renderer: &mut Renderer,
-        gaussians: &Buffer<f32>,
-        camera: &Camera,
-        options: &RenderOptions,
-        networks: Option<&mut Networks>,
-    ) -> Result<Self> {
-        let colors = renderer.render_image(gaussians, camera, options)?;
-        let size = UVec2::new(camera.width, camera.height);
-        let denoised = match networks {
-            Some(networks) => networks.denoised_image(renderer.render(), size)?,
-            None => None,
-        };
-        Ok(Self { colors, denoised })
-    }
-
-    /// What the model is scored on: R_K, or R_0 where there is no denoiser.
-    pub fn output(&self) -> &Image {
-        self.denoised.as_ref().unwrap_or(&self.colors)
-    }
-}
-
-/// A picture that no denoiser has seen.
-impl From<Image> for Rendered {
-    fn from(colors: Image) -> Self {
-        Self { colors, denoised: None }
-    }
 }
 
 /// What one step did.
@@ -303,8 +261,8 @@ impl Trainer {
             model: Model::upload(gpu, &gaussians)?,
             renderer,
             losses,
+            networks: NetworkTerms::new(gpu, &config, &sizes, !masks.is_empty())?,
             masks,
-            networks: NetworkTerms::new(gpu, &config, &sizes)?,
             exposures,
             adam,
             finite,
@@ -483,7 +441,8 @@ impl Trainer {
                 }
                 _ => target,
             };
-            networks.record(pass, inputs, Photographs { low, target }, d_render, log)?;
+            let photographs = Photographs { mask: masks.of_view(view.number), low, target };
+            networks.record(pass, inputs, photographs, d_render, log)?;
             masks.hide(pass, view.number, (size, channels), d_render)?;
         }
         self.renderer.backward(

@@ -8,10 +8,11 @@ use std::path::Path;
 
 use nightsplat::Error;
 use nightsplat::dataset::Dataset;
+use nightsplat::densify::DensityControl;
 use nightsplat::gpu::testing::{allocations, fail_allocation, lose_at_submission};
 use nightsplat::gpu::{DeviceChoice, Gpu};
-use nightsplat::run::{self, Event, HeldRun};
-use nightsplat::train::{ModelConfig, Part, TrainConfig};
+use nightsplat::run::{self, Event, HeldRun, Trained};
+use nightsplat::train::{MemoryEstimate, ModelConfig, Part, TrainConfig};
 
 mod common;
 use common::train::dataset;
@@ -76,15 +77,23 @@ fn memory_that_runs_out_anywhere_leaves_a_checkpoint_and_no_finished_run() {
     let mut numbers: Vec<usize> = sites.into_values().flatten().collect();
     numbers.sort_unstable();
     numbers.dedup();
-    eprintln!("{} allocations, {} sites", names.len(), numbers.len());
-    let begin = std::time::Instant::now();
+    // All of them take minutes.
+    if std::env::var_os("NIGHTSPLAT_ALL_SITES").is_none() {
+        let every = numbers.len() / 24;
+        numbers = numbers.into_iter().rev().step_by(every.max(1)).collect();
+    }
     let mut resumed = 0;
     for index in numbers {
         let (name, out) = (&names[index], folder.path().join(format!("run{index}")));
         fail_allocation(&gpu, index as u64 + 1);
         let (error, last) = train(&gpu, &config, &dataset, &out, HeldRun::Refuse);
+        let asked = allocations(&gpu).len();
         fail_allocation(&gpu, 0);
-        let error = error.unwrap_or_else(|| panic!("{name} ({index}): the run says it is done"));
+        let Some(error) = error else {
+            // Steps may come in fewer submissions than they did before.
+            assert!(asked <= index, "{name} ({index}): the run says it is done");
+            continue;
+        };
         assert_eq!(error.exit_code(), 4, "{name} ({index}): {error}");
         for sign in ["done.json", "metrics.json"] {
             assert!(!out.join(sign).exists(), "{name} ({index}): {sign}");
@@ -92,14 +101,13 @@ fn memory_that_runs_out_anywhere_leaves_a_checkpoint_and_no_finished_run() {
         let is_saved = out.join("checkpoint.safetensors").exists();
         assert!(is_saved || last == 0, "{name} ({index}): {last} steps are lost");
         if is_saved {
-            let (error, _) = train(&gpu, &config, &dataset, &out, HeldRun::Resume);
-            assert!(error.is_none(), "{name} ({index}): {error:?}");
+            let (again, _) = train(&gpu, &config, &dataset, &out, HeldRun::Resume);
+            assert!(again.is_none(), "{name} ({index}), {error}: {again:?}");
             let model = std::fs::read(out.join("model.ply")).unwrap();
-            assert!(model == expected, "{name} ({index}): another model");
+            assert!(model == expected, "{name} ({index}), {error}: another model");
             resumed += 1;
         }
     }
-    eprintln!("{resumed} resumed, {:?}", begin.elapsed());
     assert!(resumed > 5);
 }
 
@@ -111,17 +119,16 @@ fn a_device_that_is_lost_anywhere_leaves_the_last_checkpoint_to_go_on_from() {
     assert!(train(&gpu(), &config, &dataset, &straight, HeldRun::Refuse).0.is_none());
     let expected = std::fs::read(straight.join("model.ply")).unwrap();
     let mut resumed = 0;
-    for number in [1, 20, 40, 60, 70, 80, 90] {
+    for number in [1, 40, 65, 75, 85, 95] {
         let out = folder.path().join(format!("run{number}"));
         let lost = gpu();
         lose_at_submission(&lost, number);
-        let (error, last) = train(&lost, &config, &dataset, &out, HeldRun::Refuse);
+        let (error, _) = train(&lost, &config, &dataset, &out, HeldRun::Refuse);
         drop(lost);
         let Some(error) = error else { continue };
         assert!(matches!(error, Error::DeviceLost { .. }), "{number}: {error}");
         assert_eq!(error.exit_code(), 4);
         assert!(!out.join("done.json").exists() && !out.join("metrics.json").exists());
-        eprintln!("{number}: {last} {error}");
         if out.join("config.toml").exists() {
             let (error, _) = train(&gpu(), &config, &dataset, &out, HeldRun::Resume);
             assert!(error.is_none(), "{number}: {error:?}");
@@ -130,4 +137,73 @@ fn a_device_that_is_lost_anywhere_leaves_the_last_checkpoint_to_go_on_from() {
         }
     }
     assert!(resumed > 1);
+}
+
+/// A growing run on nine views, and what it said that it was going to take.
+fn foreseen(gpu: &Gpu, config: &TrainConfig) -> (MemoryEstimate, Trained) {
+    let (dataset, folder) = (dataset(9, [100, 75]), tempfile::tempdir().unwrap());
+    let mut foreseen = None;
+    let observe = |event: Event<'_>| {
+        if let Event::Started { memory, .. } = event {
+            foreseen = Some(*memory);
+        }
+    };
+    let out = folder.path().join("run");
+    let trained = run::train(gpu, config, &dataset, &out, HeldRun::Refuse, observe).unwrap();
+    (foreseen.unwrap(), trained)
+}
+
+/// Grows to all that it may have in its second round.
+fn growing() -> TrainConfig {
+    let mut config = TrainConfig {
+        steps: 60,
+        sh_degree: 2,
+        max_gaussians: 9000,
+        checkpoint_every: 40,
+        ..TrainConfig::default()
+    };
+    config.schedule.densify_after = 2;
+    config.schedule.densify_interval = 10;
+    config.schedule.resolution_steps = [0, 0];
+    config.density.control = DensityControl::Paper;
+    config.density.gradient_threshold = 1e-9;
+    config.density.min_opacity = 1e-4;
+    config
+}
+
+#[test]
+fn memory_is_foreseen_to_a_fifth() {
+    // Without validation, which takes memory of its own.
+    let gpu = Gpu::new(&DeviceChoice::Best).unwrap();
+    let (foreseen, trained) = foreseen(&gpu, &growing());
+    assert_eq!(trained.trainer.gaussian_count(), 9000);
+    assert_eq!(foreseen.most_gaussians, 9000);
+    let close = |foreseen: u64, came: u64| (0.8..=1.2).contains(&(foreseen as f64 / came as f64));
+    let (spent, own) = (&trained.spent, foreseen);
+    assert!(close(own.most_device, spent.device_bytes), "{own:?}, and {spent:?} came");
+    if let Some(host) = spent.host_bytes {
+        // Other tests of this process have left their peak; what is foreseen is no less than what is there.
+        assert!(own.most_host as f64 <= 1.2 * host as f64, "{own:?}, and {spent:?} came");
+    }
+}
+
+#[test]
+fn growth_stops_at_the_memory_that_it_may_have_and_at_the_same_number_every_time() {
+    let gpu = gpu();
+    let mut config = growing();
+    let vram = 7 << 20;
+    config.max_vram = vram.to_string().parse().ok();
+    let counts = [0; 2].map(|_| {
+        let (foreseen, trained) = foreseen(&gpu, &config);
+        let Trained { trainer, spent, .. } = trained;
+        assert!(spent.device_bytes <= vram, "{} of {vram}", spent.device_bytes);
+        assert!(trainer.gaussian_count() <= foreseen.most_gaussians);
+        trainer.gaussian_count()
+    });
+    gpu.limit_memory(u64::MAX);
+    assert!(counts[0] == counts[1] && counts[0] < 9000, "{counts:?}");
+    config.max_vram = None;
+    config.max_ram = "260M".parse().ok();
+    let (foreseen, trained) = self::foreseen(&gpu, &config);
+    assert!(trained.trainer.gaussian_count() <= foreseen.most_gaussians.max(counts[0]));
 }

@@ -6,11 +6,12 @@ use nightsplat::dataset::Dataset;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::image::{Image, Mask};
 use nightsplat::metrics::{Scores, psnr_of_counted};
+use nightsplat::nn::{DenoiserSettings, Form};
 use nightsplat::tone::{ToneCurve, ToneSettings};
 use nightsplat::train::{Learning, Part, TrainConfig, Trainer};
 
 mod common;
-use common::train::train;
+use common::train::{advance, train};
 
 /// Of every view the right third is hidden, and along its border a column by half.
 fn masked(mut dataset: Dataset, hidden: Option<[f32; 3]>) -> Dataset {
@@ -61,9 +62,31 @@ fn what_is_hidden_leaves_no_trace_in_the_model() {
 }
 
 #[test]
+fn what_is_hidden_leaves_no_trace_in_the_networks() {
+    for form in [Form::Identity, Form::Paper] {
+        let mut config = TrainConfig { steps: 6, ..config(ToneSettings::new(ToneCurve::Ap3)) };
+        config.model.set_parts(&[Part::Denoiser, Part::Tonemapper]);
+        config.model.network =
+            DenoiserSettings { channels: 4, stages: 2, form, ..Default::default() };
+        config.model.denoiser_crop = 24;
+        let denoised = |dataset: &Dataset| {
+            let mut trainer = Trainer::new(&gpu(), config.clone(), dataset).unwrap();
+            advance(&mut trainer, config.steps);
+            let camera = dataset.views[0].camera;
+            trainer.render(&camera).unwrap().denoised.unwrap().data
+        };
+        let one = denoised(&masked(dataset(), None));
+        let other = denoised(&masked(dataset(), Some([0.9, 0.0, 0.3])));
+        assert_eq!(one, other, "{form:?}");
+        assert_ne!(one, denoised(&dataset()), "{form:?}");
+    }
+}
+
+#[test]
 fn every_pass_of_a_masked_step_agrees_with_its_reference() {
     let mut with_parts = config(ToneSettings::new(ToneCurve::Ap3));
-    with_parts.model.set_parts(&[Part::Structure]);
+    with_parts.model.set_parts(&[Part::Structure, Part::Denoiser, Part::Tonemapper]);
+    with_parts.model.network = DenoiserSettings { channels: 4, stages: 2, ..Default::default() };
     let mut with_exposures = config(ToneSettings::default());
     with_exposures.exposure.learn = Learning::On;
     for config in [with_parts, with_exposures] {

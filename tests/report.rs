@@ -3,7 +3,7 @@
 use nightsplat::image::Image;
 use nightsplat::report::{
     Bar, Best, Column, Comparison, Distribution, Mark, Picture, Report, Series, Table, Trace, bars,
-    distributions, plot, plot_points, svg_file, traces,
+    distributions, plot, plot_in_groups, plot_points, svg_file, traces,
 };
 
 fn column(name: &str, digits: usize, best: Best) -> Column {
@@ -74,7 +74,8 @@ fn page(text: &str) -> String {
         scores: scores.into(),
         image: Image::filled(4, 3, [0.5, 2.0, -1.0]),
     };
-    let series = [Series { name: text.into(), points: vec![(0.0, 1.0), (10.0, 0.2)] }];
+    let series =
+        [Series { name: text.into(), points: vec![(0.0, 1.0), (10.0, 0.2)], ..Series::default() }];
     Report {
         title: text.into(),
         intro: vec![text.into()],
@@ -103,14 +104,17 @@ fn the_page_refers_to_nothing_outside_itself() {
 fn every_text_is_escaped() {
     let html = page("<b onload=\"x('&')\">");
     assert!(!html.contains("<b onload"));
-    // Title, heading, paragraph, two captions with alternative texts, row title, plot label, axes and legend.
-    assert_eq!(html.matches("&lt;b onload=&quot;x(&#39;&amp;&#39;)&quot;&gt;").count(), 13);
+    // Title, heading, paragraph, two captions with alternative texts, row title, plot label, axes, legend and its title.
+    assert_eq!(html.matches("&lt;b onload=&quot;x(&#39;&amp;&#39;)&quot;&gt;").count(), 14);
 }
 
 #[test]
 fn a_plot_draws_each_series_within_its_frame() {
-    let series =
-        |name: &str, points: &[(f64, f64)]| Series { name: name.into(), points: points.to_vec() };
+    let series = |name: &str, points: &[(f64, f64)]| Series {
+        name: name.into(),
+        points: points.to_vec(),
+        ..Series::default()
+    };
     let svg = plot(
         "step",
         "loss",
@@ -148,7 +152,7 @@ fn plots_of_nothing_of_one_value_and_of_extremes_stay_well_formed() {
     let extremes = [f64::MAX, f64::MIN, 1e30, -1e30, 0.0, 1e-300];
     let plots = [vec![], vec![(1.0, 2.0)], extremes.iter().map(|&value| (value, value)).collect()];
     for points in plots {
-        let svg = plot("step", "PSNR", &[Series { name: "a".into(), points }]);
+        let svg = plot("step", "PSNR", &[Series { name: "a".into(), points, ..Series::default() }]);
         assert!(!svg.contains("NaN") && !svg.contains("inf"), "{svg}");
     }
 }
@@ -177,6 +181,7 @@ fn a_legend_of_many_names_takes_rows_and_a_plot_can_be_a_file() {
     let series = |index: usize| Series {
         name: format!("a curve with number {index}"),
         points: vec![(0.0, 0.0), (1.0, 1.0)],
+        ..Series::default()
     };
     let svg = svg_file(&plot("t", "y", &(0..12).map(series).collect::<Vec<_>>()));
     assert!(
@@ -187,8 +192,81 @@ fn a_legend_of_many_names_takes_rows_and_a_plot_can_be_a_file() {
 }
 
 #[test]
+fn a_line_looks_alike_in_every_plot_of_a_page_and_its_legend_shows_how() {
+    let series = |line: Option<usize>| Series {
+        name: "ap3".into(),
+        points: vec![(0.0, 0.0), (1.0, 1.0)],
+        line,
+        ..Series::default()
+    };
+    let look = |svg: &str, element: &str| {
+        let rest = svg.split(element).nth(1).unwrap();
+        let stroke = rest.split("stroke=\"").nth(1).unwrap().split('"').next().unwrap().to_owned();
+        let dashes = rest.split("/>").next().unwrap().contains("stroke-dasharray=\"7 3\"");
+        (stroke, dashes)
+    };
+    // The seventh line of the page, alone in one plot and behind another in the next.
+    for svg in
+        [plot("t", "y", &[series(Some(6))]), plot("t", "y", &[series(Some(6)), series(None)])]
+    {
+        for element in ["<polyline", "class=\"sample\""] {
+            assert_eq!(
+                look(&svg, element),
+                ("var(--series-1)".to_owned(), true),
+                "{element}: {svg}"
+            );
+        }
+        assert_eq!(svg.matches("class=\"sample\"").count(), svg.matches("<polyline").count());
+        assert!(svg.contains("<title>ap3</title>"), "nothing is said where the pointer rests");
+    }
+}
+
+#[test]
+fn many_series_are_drawn_a_few_at_a_time_with_the_same_axes() {
+    let series = |index: usize| Series {
+        name: format!("curve {index}"),
+        points: vec![(0.0, 0.0), (3.0, index as f64)],
+        line: Some(index),
+        ..Series::default()
+    };
+    let svg = svg_file(&plot_in_groups("t", "y", &(0..37).map(series).collect::<Vec<_>>(), &[]));
+    let plots: Vec<&str> = svg.split("<svg y=").skip(1).collect();
+    assert_eq!((plots.len(), svg.matches("<polyline").count()), (7, 37));
+    for plot in plots {
+        assert!(plot.matches("<polyline").count() <= 6 && plot.contains(">30<"), "{plot}");
+    }
+    assert!(svg.contains(":hover"), "a line cannot be told from the others");
+}
+
+#[test]
+fn what_a_mean_is_of_is_drawn_as_a_line_from_least_to_greatest() {
+    let series = Series {
+        name: "ap3".into(),
+        points: vec![(0.0, 20.0), (1.0, 21.0)],
+        spreads: vec![(0.0, 18.0, 30.0)],
+        ..Series::default()
+    };
+    let svg = plot_points("gain", "PSNR", &[series], &[]);
+    assert_eq!(svg.matches("class=\"spread\"").count(), 1);
+    assert!(svg.contains(">30<"), "the axis does not reach the greatest: {svg}");
+    let bar = Bar { name: "a".into(), value: 20.0, spread: Some([19.0, 22.0]) };
+    assert_eq!(bars("PSNR", 2, &[bar]).matches("class=\"spread\"").count(), 1);
+}
+
+#[test]
+fn pictures_come_first_on_a_page() {
+    let html = page("chair");
+    let at = |part: &str| html.find(part).unwrap();
+    assert!(at("<img") < at("<table") && at("<table") < at("<polyline"));
+}
+
+#[test]
 fn few_points_have_dots_and_the_special_one_a_star() {
-    let series = [Series { name: "ap3".into(), points: vec![(0.0, 20.0), (0.1, 24.0)] }];
+    let series = [Series {
+        name: "ap3".into(),
+        points: vec![(0.0, 20.0), (0.1, 24.0)],
+        ..Series::default()
+    }];
     let mark = |name: &str, point| Mark { name: name.into(), point };
     let marks = [mark("adaptive <0.2>", (0.2, 30.0)), mark("nowhere", (f64::NAN, 1.0))];
     let svg = plot_points("delta0", "PSNR", &series, &marks);
@@ -201,7 +279,7 @@ fn few_points_have_dots_and_the_special_one_a_star() {
 
 #[test]
 fn bars_begin_at_zero_and_are_as_long_as_their_values() {
-    let bar = |name: &str, value| Bar { name: name.into(), value };
+    let bar = |name: &str, value| Bar { name: name.into(), value, spread: None };
     let rows = [bar("a", 20.0), bar("b & c", 5.0), bar("d", -5.0), bar("failed", f64::NAN)];
     let svg = bars("PSNR, dB", 2, &rows);
     let widths = svg.split(" width=\"").skip(1).map(|rest| rest.split('"').next().unwrap());

@@ -7,9 +7,13 @@ use clap::{Args, FromArgMatches};
 
 use self::point::Point;
 use super::train::TrainArgs;
+use crate::dataset::View;
 use crate::diagnose::Plan;
+use crate::eval::Player;
+use crate::gpu::Gpu;
+use crate::image::Image;
 use crate::output::write_whole;
-use crate::run::load_config;
+use crate::run;
 use crate::train::TrainConfig;
 use crate::{Error, Result};
 
@@ -74,7 +78,7 @@ impl Run {
         if !path.exists() {
             return Ok(false);
         }
-        let found = load_config(&self.folder)?;
+        let found = run::load_config(&self.folder)?;
         // A run records the tile and the frame that it took; where none is asked for, any is right.
         let (tile, frame) = (self.config.tile.and(found.tile), self.config.frame.and(found.frame));
         let found = TrainConfig { tile, frame, ..found };
@@ -91,6 +95,19 @@ impl Run {
     pub(super) fn metrics(&self) -> Option<serde_json::Value> {
         let text = std::fs::read(self.folder.join("metrics.json")).ok()?;
         serde_json::from_slice(&text).ok()
+    }
+
+    /// What the finished run makes of a view.
+    ///
+    /// # Errors
+    /// Its model cannot be read, or the device is lost.
+    pub(super) fn render(&self, gpu: &Gpu, view: &View) -> Result<Image> {
+        let config = run::load_config(&self.folder)?;
+        let gaussians = run::load_model(&self.folder, config.model.raw_colors)?;
+        let networks =
+            run::load_networks(gpu, &self.folder, &config.model, gaussians.shape.features)?;
+        let mut player = Player::new(gpu, &gaussians, &config, networks)?;
+        Ok(player.render(view)?.output().clone())
     }
 
     /// The command as a shell takes it, which may be given any number of times.

@@ -67,7 +67,7 @@ pub(super) fn score_table(label: &str, dark: &[ViewScore], runs: &[Run]) -> Tabl
     Table { title, label: label.to_owned(), columns, rows }
 }
 
-/// The mean loss of every epoch: single views differ too much for a line.
+/// The mean loss of every epoch: single views differ too much for a line. Losses against one target alone compare.
 pub(super) fn loss_series(runs: &[Run], epoch: usize) -> Vec<Series> {
     let of_run = |run: &Run| {
         let epochs = run.losses.chunks_exact(epoch.max(1)).enumerate();
@@ -75,7 +75,8 @@ pub(super) fn loss_series(runs: &[Run], epoch: usize) -> Vec<Series> {
             let mean = losses.iter().sum::<f64>() / losses.len() as f64;
             (((index + 1) * epoch) as f64, mean)
         };
-        Series { name: run.title.clone(), points: epochs.map(point).collect() }
+        let points = epochs.map(point).collect();
+        Series { name: run.title.clone(), points, ..Series::default() }
     };
     runs.iter().map(of_run).collect()
 }

@@ -7,7 +7,7 @@ use super::table;
 use crate::dataset::{Dataset, LoadOptions, Split};
 use crate::image::Image;
 use crate::output::write_whole;
-use crate::report::{Series, VerticalLine, plot_with_lines, svg_file};
+use crate::report::{Series, VerticalLine, plot_in_groups, svg_file};
 use crate::tone::{CurveChoice, FAMILIES, Family, Statistics, ToneCurve, ToneSettings};
 use crate::{Error, Result};
 
@@ -154,18 +154,20 @@ fn values(curves: &[Curve], at: &[f64], scene: Option<&Statistics>) -> String {
 fn drawing(curves: &[Curve], scene: Option<&Statistics>) -> String {
     const LAST: f64 = 3.0;
     const POINTS: u32 = 300;
-    let series = |curve: &Curve| Series {
+    let series = |(line, curve): (usize, &Curve)| Series {
+        line: Some(line),
         name: curve.name.clone(),
         points: (0..=POINTS)
             .map(|i| LAST * f64::from(i) / f64::from(POINTS))
             .map(|t| (t, value(&curve.settings, t, scene)))
             .collect(),
+        ..Series::default()
     };
     let mark = |x: f64, name: &str| VerticalLine { x, name: name.to_owned() };
     let marks = scene.map(|scene| {
         let mean = f64::from(scene.mean_luminance) / f64::from(scene.p90);
         vec![mark(scene.ratio(), "p10"), mark(mean, "mean Y"), mark(1.0, "p90")]
     });
-    let series: Vec<Series> = curves.iter().map(series).collect();
-    plot_with_lines("t = x / p90", "target", &series, &marks.unwrap_or_default())
+    let series: Vec<Series> = curves.iter().enumerate().map(series).collect();
+    plot_in_groups("t = x / p90", "target", &series, &marks.unwrap_or_default())
 }

@@ -15,7 +15,7 @@ use crate::gpu::{DeviceChoice, Gpu};
 use crate::optimizer::Schedule;
 use crate::output::write_whole;
 use crate::pseudo_gt::PseudoGt;
-use crate::report::{Distribution, Report, distributions, plot};
+use crate::report::{Distribution, Report, distributions};
 use crate::run::HeldRun;
 use crate::tone::{Scene, ToneCurve, ToneSettings};
 use crate::train::TrainConfig;
@@ -178,7 +178,7 @@ fn report(
             format!("{STEPS} steps each, on {}.", gpu.properties().name),
         ],
         tables: vec![comparison::score_table("target", dark, runs)],
-        plots: vec![plot("step", "loss", &comparison::loss_series(runs, train_views)), luminances],
+        plots: vec![luminances],
         comparisons: test_views.map(|view| comparison::of_view(view, dark, runs)).collect(),
     }
 }

@@ -30,6 +30,7 @@ use crate::Error;
 use crate::dataset::Dataset;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::tone::Statistics;
+use crate::train::TrainConfig;
 
 /// Train over a grid of settings, each point in its own run directory, and rank the results.
 ///
@@ -111,7 +112,7 @@ pub fn run(args: &SweepArgs) -> Result<()> {
     let first = &runs[0].config;
     let dataset = Dataset::load(&first.dataset, &first.load_options())?;
     if !args.dry_run && !left.is_empty() {
-        Gpu::new(&first.device.parse::<DeviceChoice>()?)?;
+        open(first)?;
     }
     batch::claim(&args.out, "sweep", &manifest(args, &runs)?, &leaderboard::FILES, !args.dry_run)?;
     let mut out = std::io::stdout().lock();
@@ -125,8 +126,17 @@ pub fn run(args: &SweepArgs) -> Result<()> {
     let failures = runner::train(&left, args.jobs.into(), &bar, (&args.out, runs.len()))?;
 
     let baseline = args.table.and_then(PaperTable::baseline);
-    let leaderboard = Leaderboard::new(&runs, baseline, adaptive_offset(&runs, &dataset));
-    leaderboard.save(&args.out, &failures)?;
+    let shared = &args.options.shared;
+    let leaderboard = Leaderboard::new(&runs, baseline, adaptive_offset(&runs, &dataset), shared);
+    // Scores do not need the device that the runs had; pictures do.
+    let pictures = match open(first) {
+        Ok(gpu) => leaderboard.pictures(&runs, &dataset, &gpu)?,
+        Err(problem) => {
+            tracing::warn!("{}: no pictures: {problem}", args.out.display());
+            None
+        }
+    };
+    leaderboard.save(&args.out, &failures, pictures)?;
     writeln!(
         out,
         "{}{}",
@@ -138,6 +148,10 @@ pub fn run(args: &SweepArgs) -> Result<()> {
         anyhow::bail!("{failed} of {all} points failed; the first: {}", failure.reason);
     }
     Ok(())
+}
+
+fn open(config: &TrainConfig) -> crate::Result<Gpu> {
+    Gpu::new(&config.device.parse::<DeviceChoice>()?)
 }
 
 /// The points of the grid, each checked as `train` would.

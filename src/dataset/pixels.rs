@@ -236,6 +236,13 @@ fn load_group(
 ) -> Result<Vec<Loaded>> {
     let size = options.loaded_size(lens.width, lens.height);
     let name = group.first().map_or("", |source| source.name.as_str());
+    if lens.width.min(lens.height) < MIN_SIDE {
+        let (width, height) = (lens.width, lens.height);
+        let problem = format!(
+            "is of {width}x{height} pixels, at least {MIN_SIDE} each way are needed; leave it out of the listing"
+        );
+        return Err(Error::input(format!("view {name}"), problem));
+    }
     if size.0.min(size.1) < MIN_SIDE {
         return Err(Error::Usage(format!(
             "downscale {} leaves {}x{} pixels of view {name}, at least {MIN_SIDE} are needed; lower it",

@@ -11,7 +11,7 @@ use crate::kernels::status::{
 };
 
 /// The first guess of how many tiles a Gaussian meets; a view that needs more makes the memory grow.
-pub(crate) const TILES_PER_GAUSSIAN: u32 = 6;
+const TILES_PER_GAUSSIAN: u32 = 6;
 
 /// How many depth ranks one subgroup counts the tiles of. Small: `emit` sums up what precedes a rank within them.
 pub(super) const RANKS_PER_PARTITION: u32 = 256;

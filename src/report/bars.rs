@@ -12,6 +12,8 @@ pub struct Bar {
     pub name: String,
     /// Its length; one that is not finite, or beyond 1e30, is left out and its name stays.
     pub value: f64,
+    /// Its least and greatest, of which the value is the mean.
+    pub spread: Option<[f64; 2]>,
 }
 
 /// SVG user units.
@@ -26,7 +28,9 @@ pub fn bars(value_name: &str, digits: usize, bars: &[Bar]) -> String {
     // The names have at most half of the width.
     let left = (7.0 * names as f64 + 12.0).min(WIDTH / 2.0);
     let is_drawable = |value: &f64| value.abs() <= 1e30;
-    let values = bars.iter().map(|bar| bar.value).filter(is_drawable);
+    let ends = |bar: &Bar| bar.spread.unwrap_or([bar.value; 2]);
+    let values = bars.iter().flat_map(ends).chain(bars.iter().map(|bar| bar.value));
+    let values = values.filter(is_drawable);
     let axis = Axis::around(values.chain([0.0]), left, WIDTH - RIGHT);
     let zero = axis.place(0.0);
 
@@ -37,7 +41,7 @@ pub fn bars(value_name: &str, digits: usize, bars: &[Bar]) -> String {
         name = escape(value_name)
     );
     // Writing to a string cannot fail, so the results below hold nothing.
-    for (row, Bar { name, value }) in bars.iter().enumerate() {
+    for (row, Bar { name, value, spread }) in bars.iter().enumerate() {
         let y = TOP + ROW * row as f64;
         let _ = write!(
             svg,
@@ -56,9 +60,16 @@ pub fn bars(value_name: &str, digits: usize, bars: &[Bar]) -> String {
                 y + 2.0,
                 (end - zero).abs(),
                 ROW - 5.0,
-                end.max(zero) + 6.0,
+                spread.map_or(end, |[_, high]| axis.place(high).max(end)).max(zero) + 6.0,
                 y + 14.0
             );
+            if let Some([low, high]) = spread.filter(|ends| ends.iter().all(is_drawable)) {
+                let (low, high, y) = (axis.place(low), axis.place(high), y + ROW / 2.0 - 0.5);
+                let _ = write!(
+                    svg,
+                    "<line class=\"spread\" x1=\"{low:.1}\" x2=\"{high:.1}\" y1=\"{y}\" y2=\"{y}\" stroke=\"var(--text)\" stroke-width=\"2\"/>"
+                );
+            }
         }
         svg.push('\n');
     }

@@ -62,6 +62,7 @@ pub fn distributions(of: &[Distribution]) -> String {
         Series {
             name: format!("{} (skewness {:.2})", distribution.name, distribution.skewness()),
             points: density.into_iter().map(|(x, y)| (x, y / peak)).collect(),
+            ..Series::default()
         }
     };
     plot("luminance", "density / its peak", &of.iter().map(series).collect::<Vec<_>>())

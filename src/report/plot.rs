@@ -14,6 +14,10 @@ pub struct Series {
     pub name: String,
     /// (x, y) in the order of x; points that are not finite, or beyond 1e30, are left out.
     pub points: Vec<(f64, f64)>,
+    /// Which line of its page it is: the same number has the same colour and dash in every plot; none: by its place in this.
+    pub line: Option<usize>,
+    /// (x, least, greatest) of what its points are means of; may be empty.
+    pub spreads: Vec<(f64, f64, f64)>,
 }
 
 /// A value of x that a vertical line marks.
@@ -68,6 +72,35 @@ pub fn plot_points(x_name: &str, y_name: &str, series: &[Series], marks: &[Mark]
     draw(x_name, y_name, series, &Extras { dot: 3.5, marks, ..Extras::default() })
 }
 
+/// As [`plot_with_lines`], for more series than one plot tells apart: a plot for every few of them, one below the other, all
+/// with the same axes.
+pub fn plot_in_groups(
+    x_name: &str,
+    y_name: &str,
+    series: &[Series],
+    lines: &[VerticalLine],
+) -> String {
+    let extras = Extras { lines, frame: series, ..Extras::default() };
+    let mut height = 0.0;
+    let mut panels = String::new();
+    for group in series.chunks(GROUP) {
+        let (above, panel) = panel(x_name, y_name, group, &extras);
+        let whole = HEIGHT + above;
+        let _ = writeln!(
+            panels,
+            "<svg y=\"{height}\" overflow=\"visible\" width=\"{WIDTH}\" height=\"{whole}\" viewBox=\"0 {} {WIDTH} {whole}\">\n{panel}</svg>",
+            0.0 - above
+        );
+        height += whole + GAP;
+    }
+    framed(x_name, y_name, 0.0, height - GAP, &panels)
+}
+
+/// Series that one plot tells apart.
+const GROUP: usize = 6;
+/// Between two plots of one drawing.
+const GAP: f64 = 24.0;
+
 /// What a plot has beside its lines.
 #[derive(Default)]
 struct Extras<'a> {
@@ -75,29 +108,43 @@ struct Extras<'a> {
     dot: f64,
     marks: &'a [Mark],
     lines: &'a [VerticalLine],
+    /// What the axes have room for beside what is drawn.
+    frame: &'a [Series],
 }
 
 fn draw(x_name: &str, y_name: &str, series: &[Series], extras: &Extras<'_>) -> String {
-    let &Extras { dot, marks, lines } = extras;
+    let (above, panel) = panel(x_name, y_name, series, extras);
+    framed(x_name, y_name, 0.0 - above, HEIGHT + above, &panel)
+}
+
+/// The drawing around what is in it.
+fn framed(x_name: &str, y_name: &str, top: f64, height: f64, panel: &str) -> String {
+    let (x_name, y_name) = (escape(x_name), escape(y_name));
+    format!(
+        "<svg viewBox=\"0 {top} {WIDTH} {height}\" role=\"img\" aria-label=\"{y_name} against {x_name}\" \
+         font-size=\"12\" fill=\"var(--quiet)\">\n{panel}</svg>"
+    )
+}
+
+/// Axes, lines and legend, and by how much the legend rises above the drawing.
+fn panel(x_name: &str, y_name: &str, series: &[Series], extras: &Extras<'_>) -> (f64, String) {
+    let &Extras { dot, marks, lines, frame } = extras;
     // Positive phrasing: a NaN fails the test too. The bound keeps differences of values finite.
     let is_drawable = |&(x, y): &(f64, f64)| x.abs() <= 1e30 && y.abs() <= 1e30;
     let marked = || marks.iter().map(|mark| mark.point);
     let points = || {
-        let lines = series.iter().flat_map(|series| series.points.iter().copied());
-        lines.chain(marked()).filter(is_drawable)
+        let all = series.iter().chain(frame);
+        let ends = |&(x, low, high): &(f64, f64, f64)| [(x, low), (x, high)];
+        let of = move |series: &Series| {
+            let spreads = series.spreads.iter().flat_map(ends);
+            series.points.iter().copied().chain(spreads).collect::<Vec<_>>()
+        };
+        all.flat_map(of).chain(marked()).filter(is_drawable)
     };
     let x_axis = Axis::around(points().map(|(x, _)| x), LEFT, WIDTH - RIGHT);
     let y_axis = Axis::around(points().map(|(_, y)| y), HEIGHT - BOTTOM, TOP);
-
     let (legend, legend_height) = legend_places(series);
-    let mut svg = format!(
-        "<svg viewBox=\"0 {} {WIDTH} {}\" role=\"img\" aria-label=\"{} against {}\" \
-         font-size=\"12\" fill=\"var(--quiet)\">\n",
-        0.0 - legend_height,
-        HEIGHT + legend_height,
-        escape(y_name),
-        escape(x_name)
-    );
+    let mut svg = String::new();
     // Writing to a string cannot fail, so the results below hold nothing.
     for tick in y_axis.ticks() {
         let y = y_axis.place(tick);
@@ -138,26 +185,39 @@ fn draw(x_name: &str, y_name: &str, series: &[Series], extras: &Extras<'_>) -> S
             escape(name)
         );
     }
-    for (index, (Series { name, points }, [text_x, text_y])) in
-        series.iter().zip(legend).enumerate()
-    {
-        let color = format!("var(--series-{})", index % COLORS);
-        let dashes = DASHES[index / COLORS % DASHES.len()];
-        let places = points.iter().filter(|point| is_drawable(point));
+    for (index, (series, [sample_x, text_y])) in series.iter().zip(legend).enumerate() {
+        let (name, line) = (escape(&series.name), series.line.unwrap_or(index));
+        let color = format!("var(--series-{})", line % COLORS);
+        let dashes = DASHES[line / COLORS % DASHES.len()];
+        let places = series.points.iter().filter(|point| is_drawable(point));
         let places: Vec<(f64, f64)> =
             places.map(|&(x, y)| (x_axis.place(x), y_axis.place(y))).collect();
-        let line = places.iter().map(|(x, y)| format!("{x:.1},{y:.1}"));
+        let sample_y = text_y - 4.0;
+        let points = places.iter().map(|(x, y)| format!("{x:.1},{y:.1}"));
         let _ = writeln!(
             svg,
-            "<polyline fill=\"none\" stroke=\"{color}\" stroke-width=\"2\"{dashes} stroke-linejoin=\"round\" points=\"{}\"/>\
-             <text x=\"{text_x}\" y=\"{text_y}\" fill=\"{color}\">{}</text>",
-            line.collect::<Vec<_>>().join(" "),
-            escape(name)
+            "<g class=\"series\"><title>{name}</title>\
+             <polyline fill=\"none\" stroke=\"{color}\" stroke-width=\"2\"{dashes} stroke-linejoin=\"round\" points=\"{}\"/>\
+             <line class=\"sample\" x1=\"{sample_x}\" x2=\"{}\" y1=\"{sample_y}\" y2=\"{sample_y}\" stroke=\"{color}\" stroke-width=\"2\"{dashes}/>\
+             <text x=\"{}\" y=\"{text_y}\" fill=\"var(--text)\">{name}</text>",
+            points.collect::<Vec<_>>().join(" "),
+            sample_x + SAMPLE,
+            sample_x + SAMPLE + 6.0,
         );
+        for &(x, low, high) in &series.spreads {
+            if is_drawable(&(x, low)) && is_drawable(&(x, high)) {
+                let (x, low, high) = (x_axis.place(x), y_axis.place(low), y_axis.place(high));
+                let _ = writeln!(
+                    svg,
+                    "<line class=\"spread\" x1=\"{x:.1}\" x2=\"{x:.1}\" y1=\"{low:.1}\" y2=\"{high:.1}\" stroke=\"{color}\" stroke-width=\"1.5\"/>"
+                );
+            }
+        }
         for (x, y) in places.iter().filter(|_| dot > 0.0) {
             let _ =
                 writeln!(svg, "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"{dot}\" fill=\"{color}\"/>");
         }
+        svg.push_str("</g>\n");
     }
     for Mark { name, point } in marks.iter().filter(|mark| is_drawable(&mark.point)) {
         let (x, y) = (x_axis.place(point.0), y_axis.place(point.1));
@@ -171,24 +231,29 @@ fn draw(x_name: &str, y_name: &str, series: &[Series], extras: &Extras<'_>) -> S
             escape(name)
         );
     }
-    svg.push_str("</svg>");
-    svg
+    (legend_height, svg)
 }
 
-/// Where each name of the legend begins, and by how much its rows rise above the drawing.
+/// The length of a line's sample in the legend: a dash shows twice.
+const SAMPLE: f64 = 28.0;
+
+/// Where each sample of the legend begins, and by how much its rows rise above the drawing.
 fn legend_places(series: &[Series]) -> (Vec<[f64; 2]>, f64) {
     const ROW: f64 = 16.0;
     let (mut x, mut y) = (LEFT + 60.0, 14.0);
-    let mut places = vec![];
+    let mut places: Vec<[f64; 2]> = vec![];
     for Series { name, .. } in series {
-        let width = 8.0 * name.chars().count() as f64 + 24.0;
+        let width = 7.0 * name.chars().count() as f64 + SAMPLE + 24.0;
         if x + width > WIDTH && x > LEFT + 60.0 {
-            (x, y) = (LEFT + 60.0, y - ROW);
+            (x, y) = (LEFT + 60.0, y + ROW);
         }
         places.push([x, y]);
         x += width;
     }
-    (places, 14.0 - y)
+    // The last row is that of the axis's name.
+    let above = y - 14.0;
+    places.iter_mut().for_each(|place| place[1] -= above);
+    (places, above)
 }
 
 /// A plot as a file of its own, in the colours of the page's style.

@@ -107,7 +107,7 @@ pub fn train_in(
         directory.save_plan(plan)?;
     }
     directory.save_views(dataset)?;
-    let memory = trainer.memory_estimate();
+    let memory = trainer.memory_estimate()?;
     say_what_is_short(gpu, &memory);
     observe(Event::Started { step: trainer.steps_done(), steps: config.steps, memory: &memory });
     let mut course = Course::new(gpu, config, dataset, &directory, &trainer);

@@ -81,7 +81,7 @@ impl Header {
 ///
 /// # Errors
 /// [`Error::Input`] says that it is not, or that the file cannot be read.
-pub(crate) fn check_checkpoint(path: &Path) -> Result<()> {
+pub fn check_checkpoint(path: &Path) -> Result<()> {
     let bytes = std::fs::read(path)
         .map_err(|error| Error::input(path, format!("cannot be read ({error})")))?;
     let damaged = |problem: &str| Error::input(path, format!("is no whole checkpoint ({problem})"));

@@ -2,6 +2,7 @@
 
 use glam::UVec2;
 
+use super::memory::MARGIN;
 use super::{TrainConfig, Trainer, streams};
 use crate::Result;
 use crate::densify::{DensifySettings, DensityControl, Round};
@@ -40,7 +41,7 @@ impl Trainer {
         let pixels = |size: UVec2| f64::from(size.x) * f64::from(size.y);
         let largest = self.views.sizes().into_iter().map(pixels).fold(0.0, f64::max);
         let shrunk = largest / pixels(self.view_of(self.step).size());
-        let met = 2.0 * shrunk * f64::from(intersections.max(1));
+        let met = MARGIN * shrunk * f64::from(intersections.max(1));
         let count = self.model.count();
         let each = met / count.max(1) as f64;
         let bindable = f64::from(self.renderer.most_intersections()) / each;

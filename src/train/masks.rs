@@ -16,15 +16,7 @@ pub(super) struct Masks {
     /// By the number of the view, (H, W).
     weights: Vec<Option<Buffer<f32>>>,
     /// None where no view has one.
-    kernels: Option<Kernels>,
-}
-
-#[derive(Debug)]
-struct Kernels {
-    render: Pipeline<mask_render::Kernel>,
-    gradient: Pipeline<mask_gradient::Kernel>,
-    /// (3, H, W) of the largest masked view.
-    shown: Buffer<f32>,
+    masking: Option<Masking>,
 }
 
 impl Masks {
@@ -47,16 +39,18 @@ impl Masks {
             largest = largest.max(if mask.is_some() { value_count(size) } else { 0 });
             weights.push(mask.transpose()?);
         }
-        let kernels = if largest > 0 {
-            Some(Kernels {
-                render: gpu.pipeline(&mask_render::Constants { tone_curve })?,
-                gradient: gpu.pipeline(&mask_gradient::Constants {})?,
-                shown: gpu.uninit("shown", largest)?,
-            })
-        } else {
-            None
-        };
-        Ok(Self { weights, kernels })
+        let masking = (largest > 0).then(|| Masking::new(gpu, tone_curve, largest));
+        Ok(Self { weights, masking: masking.transpose()? })
+    }
+
+    /// Whether no view has one.
+    pub(super) fn is_empty(&self) -> bool {
+        self.masking.is_none()
+    }
+
+    /// That of a view, (H, W).
+    pub(super) fn of_view(&self, view: usize) -> Option<&Buffer<f32>> {
+        self.weights.get(view)?.as_ref()
     }
 
     /// What the loss is to see of `render`, (3, H, W): itself, or where pixels are hidden their target.
@@ -69,20 +63,13 @@ impl Masks {
         view: usize,
         size: UVec2,
         render: &'a Buffer<f32>,
-        (low, tone): (&Buffer<f32>, &Buffer<ToneParameters>),
+        target: (&Buffer<f32>, &Buffer<ToneParameters>),
     ) -> Result<&'a Buffer<f32>> {
         let weights = self.weights.get(view).and_then(Option::as_ref);
-        let (Some(weights), Some(kernels)) = (weights, &mut self.kernels) else {
-            return Ok(render);
-        };
-        let value_count = value_count(size) as u32;
-        pass.dispatch(
-            &kernels.render,
-            &mask_render::Params { value_count, pixel_count: size.x * size.y },
-            mask_render::Buffers { weights, render, low, tone, shown: &mut kernels.shown },
-            Threads::Exactly([value_count, 1, 1]),
-        )?;
-        Ok(&kernels.shown)
+        match weights.zip(self.masking.as_mut()) {
+            Some((weights, masking)) => masking.shown(pass, weights, size, render, target),
+            None => Ok(render),
+        }
     }
 
     /// Makes of dL/d shown, in every one of `channels` channels, dL/d render.
@@ -96,12 +83,72 @@ impl Masks {
         (size, channels): (UVec2, usize),
         d_render: &mut Buffer<f32>,
     ) -> Result<()> {
-        let weights = self.weights.get(view).and_then(Option::as_ref);
-        let (Some(weights), Some(kernels)) = (weights, &self.kernels) else { return Ok(()) };
+        match self.of_view(view).zip(self.masking.as_ref()) {
+            Some((weights, masking)) => masking.hide(pass, weights, (size, channels), d_render),
+            None => Ok(()),
+        }
+    }
+}
+
+/// What applies a mask to an image that is compared with a target.
+#[derive(Debug)]
+pub(super) struct Masking {
+    render: Pipeline<mask_render::Kernel>,
+    gradient: Pipeline<mask_gradient::Kernel>,
+    /// (3, H, W) of the largest masked image.
+    shown: Buffer<f32>,
+}
+
+impl Masking {
+    /// For images of so many values and targets by `tone_curve`, a `CURVE_*`.
+    ///
+    /// # Errors
+    /// The device is out of memory.
+    pub(super) fn new(gpu: &Gpu, tone_curve: u32, values: usize) -> Result<Self> {
+        Ok(Self {
+            render: gpu.pipeline(&mask_render::Constants { tone_curve })?,
+            gradient: gpu.pipeline(&mask_gradient::Constants {})?,
+            shown: gpu.uninit("shown", values)?,
+        })
+    }
+
+    /// `render`, (3, H, W), and where `weights`, (H, W), hide it the target.
+    ///
+    /// # Errors
+    /// The pass cannot be recorded.
+    pub(super) fn shown(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        weights: &Buffer<f32>,
+        size: UVec2,
+        render: &Buffer<f32>,
+        (low, tone): (&Buffer<f32>, &Buffer<ToneParameters>),
+    ) -> Result<&Buffer<f32>> {
+        let value_count = value_count(size) as u32;
+        pass.dispatch(
+            &self.render,
+            &mask_render::Params { value_count, pixel_count: size.x * size.y },
+            mask_render::Buffers { weights, render, low, tone, shown: &mut self.shown },
+            Threads::Exactly([value_count, 1, 1]),
+        )?;
+        Ok(&self.shown)
+    }
+
+    /// Of dL/d shown, in every one of `channels` channels, dL/d render.
+    ///
+    /// # Errors
+    /// The pass cannot be recorded.
+    pub(super) fn hide(
+        &self,
+        pass: &mut Recorder<'_>,
+        weights: &Buffer<f32>,
+        (size, channels): (UVec2, usize),
+        d_render: &mut Buffer<f32>,
+    ) -> Result<()> {
         let pixel_count = size.x * size.y;
         let value_count = channels as u32 * pixel_count;
         pass.dispatch(
-            &kernels.gradient,
+            &self.gradient,
             &mask_gradient::Params { value_count, pixel_count },
             mask_gradient::Buffers { weights, d_render },
             Threads::Exactly([value_count, 1, 1]),

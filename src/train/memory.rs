@@ -6,7 +6,9 @@
 use serde::Serialize;
 
 use super::{CacheSize, Trainer};
-use crate::render::TILES_PER_GAUSSIAN;
+use crate::Result;
+use crate::camera::Camera;
+use crate::render::RenderOptions;
 
 /// What the program, the driver and its compiled kernels take on the host, about.
 const PROGRAM: f64 = 256.0 * 1024.0 * 1024.0;
@@ -18,8 +20,8 @@ const STATISTICS: f64 = 8.0;
 const HOST_PLANE_SETS: f64 = 3.0;
 /// A model that grows gets room for so many times as many Gaussians.
 const HEADROOM: f64 = 1.5;
-/// What buffers had room for before they grew the last time, as a part of what they have then: 1 / [`HEADROOM`] to 1.
-const BEFORE_GROWTH: f64 = 0.8;
+/// A view may have so many times as many intersections for each Gaussian as the last one had.
+pub(super) const MARGIN: f64 = 2.0;
 
 /// What a training is going to take, in bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -39,50 +41,62 @@ pub struct MemoryEstimate {
 }
 
 impl Trainer {
-    /// What the training is going to take, by what it takes now.
-    pub fn memory_estimate(&self) -> MemoryEstimate {
-        let count = self.model.count();
-        let per = self.per_gaussian();
-        let reserved = f64::from(self.renderer.intersection_capacity());
-        let device = per.steady(self.model.capacity() as f64) + self.intersection_bytes(reserved);
-        let most_gaussians = self.most_gaussians();
+    /// What the training is going to take, by what it takes now and what its largest view shows.
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub fn memory_estimate(&mut self) -> Result<MemoryEstimate> {
+        let met = f64::from(self.intersections_of_largest_view()?);
+        let (per, count) = (self.per_gaussian(), self.model.count());
+        let most_gaussians = self.most_gaussians(met);
         let most = most_gaussians as f64;
-        let intersections = reserved.max(f64::from(TILES_PER_GAUSSIAN) * most);
-        let grown = if most_gaussians > self.model.capacity() {
-            per.growing(BEFORE_GROWTH * most, most).max(per.saving(most))
-        } else {
-            per.saving(self.model.capacity() as f64)
-        };
+        let reserved = f64::from(self.renderer.intersection_capacity());
+        let device = self.fixed_bytes
+            + per.steady(self.model.capacity() as f64)
+            + self.intersection_bytes(reserved);
+        let intersections = reserved.max(met_by(most, met, count as f64));
+        let grown = per.growing_to(count as f64, self.model.capacity() as f64, most);
         let most_device = (self.fixed_bytes + self.intersection_bytes(intersections) + grown)
+            .max(device)
             .max(self.gpu.peak_memory() as f64);
-        let device = self.fixed_bytes + device;
         let host = |gaussians: f64, device: f64| {
             // On a software device, its buffers are the process's memory.
             let still_to_come = (device - self.gpu.memory_in_use() as f64).max(0.0);
             let shared = if self.gpu.properties().is_cpu { still_to_come } else { 0.0 };
             resident().unwrap_or(PROGRAM) + shared + HOST_PLANE_SETS * per.plane * gaussians
         };
-        MemoryEstimate {
+        Ok(MemoryEstimate {
             gaussians: count,
             device: device as u64,
             host: host(count as f64, device) as u64,
             most_gaussians,
             most_device: most_device as u64,
             most_host: host(most, most_device) as u64,
-        }
+        })
+    }
+
+    /// How many intersections the first Gaussians have in the largest view; there is room for them then.
+    fn intersections_of_largest_view(&mut self) -> Result<u32> {
+        let pixels = |camera: &&Camera| u64::from(camera.width) * u64::from(camera.height);
+        let Some(camera) = self.views.cameras().max_by_key(pixels).copied() else { return Ok(0) };
+        let options = RenderOptions { sh_degree: 0, background: [0.0; 3] };
+        let gaussians = &self.model.gaussians.parameters;
+        self.renderer.render_channels(gaussians, &camera, &options)?;
+        self.renderer.intersections()
     }
 
     /// The most Gaussians that the run can come to have: a limit that there is, or as many as all its rounds of growth can
     /// make.
-    fn most_gaussians(&self) -> usize {
-        let rounds = (self.step + 1..=self.config.steps).filter(|&step| self.densifies_at(step));
+    fn most_gaussians(&self, met: f64) -> usize {
+        let (count, interval) = (self.model.count(), self.config.schedule.densify_interval.max(1));
+        let rounds = (self.step / interval + 1..=self.config.steps / interval)
+            .filter(|round| self.densifies_at(round * interval));
         // A Gaussian becomes two at most.
-        let doubled =
-            (0..rounds.count()).try_fold(self.model.count(), |count, _| count.checked_mul(2));
+        let doubled = (0..rounds.count()).try_fold(count, |count, _| count.checked_mul(2));
         let limit = self.densifier.limit(self.model.gaussians.column_count);
-        let each = f64::from(TILES_PER_GAUSSIAN);
+        let each = MARGIN * met / count.max(1) as f64;
         let limit = limit.min(self.fitting_in_vram(each)).min(self.fitting_in_ram(each));
-        limit.min(doubled.unwrap_or(usize::MAX)).max(self.model.count())
+        limit.min(doubled.unwrap_or(usize::MAX)).max(count)
     }
 
     /// What is on the device now, less what follows the numbers of Gaussians and intersections, in bytes.
@@ -155,10 +169,32 @@ impl PerGaussian {
         self.steady(count) + count * self.plane
     }
 
+    /// The most that it takes to come from `count` with room for `capacity` to `most` by doubling, and to save them.
+    fn growing_to(&self, count: f64, capacity: f64, most: f64) -> f64 {
+        let (mut count, mut capacity, mut peak) = (count, capacity, 0.0_f64);
+        while count >= 1.0 && count < most {
+            count = (2.0 * count).min(most);
+            if count > capacity {
+                let room = (HEADROOM * count).min(most).max(count);
+                peak = peak.max(self.growing(capacity, room));
+                capacity = room;
+            }
+        }
+        peak.max(self.saving(capacity))
+    }
+
     /// So many come to be from so many: both are there for a moment.
     fn growing(&self, before: f64, count: f64) -> f64 {
         (before + count) * self.model() + before * self.working
     }
+}
+
+/// How many intersections `gaussians` have where `count` have `met` and all of them together cover the same: each is
+/// smaller then, and meets its own tile and those beyond its edges.
+fn met_by(gaussians: f64, met: f64, count: f64) -> f64 {
+    let each = met / count.max(1.0);
+    let beyond = (each.sqrt() - 1.0).max(0.0) * (count / gaussians).sqrt().min(1.0);
+    gaussians * each.min((1.0 + beyond).powi(2))
 }
 
 /// What the process has in memory now, in bytes; none where the system does not say.

@@ -2,6 +2,7 @@
 
 use glam::UVec2;
 
+use super::masks::Masking;
 use super::networks::Networks;
 use super::{ModelConfig, TrainConfig, streams};
 use crate::Result;
@@ -21,6 +22,8 @@ use crate::window::Window;
 /// What the networks of a view are held to, (3, H, W) each.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Photographs<'a> {
+    /// Which pixels count, (H, W); all where there is none.
+    pub(super) mask: Option<&'a Buffer<f32>>,
     /// The dark photograph.
     pub(super) low: &'a Buffer<f32>,
     /// Its target; the paper's networks do not look at it.
@@ -37,6 +40,8 @@ pub(super) struct NetworkTerms {
     crops: Stream,
     denoising: DenoisingLoss,
     low: Loss,
+    /// None where no view has a mask.
+    masking: Option<WindowMask>,
     /// The curve that leaves a photograph as it is.
     no_curve: Buffer<ToneParameters>,
     /// Of the window, (3, h, w) each: inputs, then gradients.
@@ -51,12 +56,44 @@ pub(super) struct NetworkTerms {
     d_output: Buffer<f32>,
 }
 
+/// The mask of a window.
+#[derive(Debug)]
+struct WindowMask {
+    masking: Masking,
+    /// (h, w)
+    weights: Buffer<f32>,
+}
+
+impl WindowMask {
+    /// As [`Masking::shown`].
+    fn shown(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        size: UVec2,
+        output: &Buffer<f32>,
+        held_to: (&Buffer<f32>, &Buffer<ToneParameters>),
+    ) -> Result<&Buffer<f32>> {
+        self.masking.shown(pass, &self.weights, size, output, held_to)
+    }
+
+    /// As [`Masking::hide`], of colours.
+    fn hide(&self, pass: &mut Recorder<'_>, size: UVec2, d_output: &mut Buffer<f32>) -> Result<()> {
+        self.masking.hide(pass, &self.weights, (size, COLOR_CHANNELS), d_output)
+    }
+}
+
 impl NetworkTerms {
-    /// The networks and terms of the parts that are on, with memory for views of these sizes; none where no part has any.
+    /// The networks and terms of the parts that are on, with memory for views of these sizes, of which some may have masks;
+    /// none where no part has any.
     ///
     /// # Errors
     /// The device is out of memory.
-    pub(super) fn new(gpu: &Gpu, config: &TrainConfig, sizes: &[UVec2]) -> Result<Option<Self>> {
+    pub(super) fn new(
+        gpu: &Gpu,
+        config: &TrainConfig,
+        sizes: &[UVec2],
+        is_masked: bool,
+    ) -> Result<Option<Self>> {
         let ModelConfig { weights, denoiser_crop, .. } = &config.model;
         if !config.model.denoiser && !config.model.tonemapper {
             return Ok(None);
@@ -87,6 +124,7 @@ impl NetworkTerms {
                 "no_curve",
                 &[ToneParameters { white: 1.0, gain: 1.0, ..ToneParameters::default() }],
             )?,
+            masking: None,
             illumination: empty("window_illumination")?,
             photograph: empty("window_photograph")?,
             d_colors: empty("d_window_colors")?,
@@ -97,6 +135,13 @@ impl NetworkTerms {
             networks,
         };
         sizes.iter().try_for_each(|&size| terms.reserve(gpu, size))?;
+        if is_masked {
+            let values = terms.photograph.len();
+            terms.masking = Some(WindowMask {
+                masking: Masking::new(gpu, ToneCurve::None.constant(), values)?,
+                weights: gpu.uninit("window_mask", values / COLOR_CHANNELS)?,
+            });
+        }
         Ok(Some(terms))
     }
 
@@ -154,18 +199,25 @@ impl NetworkTerms {
             crop => Window::random(inputs.size, crop, self.margin(), &self.crops, inputs.step),
         };
         self.networks.denoise(pass, inputs.render, inputs.size, &window)?;
+        let mask = photographs.mask.zip(self.masking.as_mut());
+        let is_masked = mask.is_some();
+        let low = (photographs.low, is_masked);
+        if let Some((mask, WindowMask { weights, .. })) = mask {
+            self.networks.windows.gather(pass, mask, inputs.size, 0..1, &window, weights)?;
+        }
         match self.form {
             Form::Identity => {
                 // What the denoiser learns is its own: the render stays what it would be without it.
-                self.record_denoising(pass, &window, Some(photographs.target), inputs.size, log)?;
+                let target = Some(photographs.target);
+                self.record_denoising(pass, &window, (target, is_masked), inputs.size, log)?;
                 self.denoise_backward(pass, &window, inputs, d_render)?;
                 pass.fill(&mut self.d_colors, 0);
-                self.record_low(pass, &window, inputs, photographs.low, d_render, log)?;
+                self.record_low(pass, &window, inputs, low, d_render, log)?;
             }
             Form::Paper => {
                 pass.fill(&mut self.d_colors, 0);
-                self.record_denoising(pass, &window, None, inputs.size, log)?;
-                self.record_low(pass, &window, inputs, photographs.low, d_render, log)?;
+                self.record_denoising(pass, &window, (None, is_masked), inputs.size, log)?;
+                self.record_low(pass, &window, inputs, low, d_render, log)?;
                 self.denoise_backward(pass, &window, inputs, d_render)?;
             }
         }
@@ -178,7 +230,7 @@ impl NetworkTerms {
         &mut self,
         pass: &mut Recorder<'_>,
         window: &Window,
-        target: Option<&Buffer<f32>>,
+        (target, is_masked): (Option<&Buffer<f32>>, bool),
         size: UVec2,
         log: &mut LogSlot<'_>,
     ) -> Result<()> {
@@ -189,17 +241,28 @@ impl NetworkTerms {
             let own = &mut self.photograph;
             windows.gather(pass, target, size, 0..COLOR_CHANNELS, window, own)?;
         }
+        let held_to = if target.is_some() { &self.photograph } else { colors };
+        let mut mask = self.masking.as_mut().filter(|_| is_masked);
+        let denoised = match &mut mask {
+            Some(mask) => {
+                mask.shown(pass, window.size, denoiser.denoised(), (held_to, &self.no_curve))?
+            }
+            None => denoiser.denoised(),
+        };
         self.denoising.record(
             pass,
             DenoisingInputs {
                 size: window.size,
                 interior: interior(window),
-                denoised: denoiser.denoised(),
-                render: if target.is_some() { &self.photograph } else { colors },
+                denoised,
+                render: held_to,
             },
             DenoisingGradients { d_denoised: &mut self.d_denoised, d_render: &mut self.d_colors },
             log,
-        )
+        )?;
+        let Some(mask) = mask else { return Ok(()) };
+        mask.hide(pass, window.size, &mut self.d_denoised)?;
+        mask.hide(pass, window.size, &mut self.d_colors)
     }
 
     /// From `dL/dR_K` to the noise map, and to R_0 in `d_colors`.
@@ -234,7 +297,7 @@ impl NetworkTerms {
         pass: &mut Recorder<'_>,
         window: &Window,
         &TermInputs { size: whole, features, render, .. }: &TermInputs<'_>,
-        low: &Buffer<f32>,
+        (low, is_masked): (&Buffer<f32>, bool),
         d_render: &mut Buffer<f32>,
         log: &mut LogSlot<'_>,
     ) -> Result<()> {
@@ -254,18 +317,29 @@ impl NetworkTerms {
             _ => (&*colors, &mut self.d_colors),
         };
         tonemapper.forward(pass, size, &self.illumination, denoised)?;
+        let mut mask = self.masking.as_mut().filter(|_| is_masked);
+        let output = match &mut mask {
+            Some(mask) => {
+                let target = (&self.photograph, &self.no_curve);
+                mask.shown(pass, size, tonemapper.output(), target)?
+            }
+            None => tonemapper.output(),
+        };
         self.low.record(
             pass,
             LossInputs {
                 size,
                 interior: interior(window),
-                render: tonemapper.output(),
+                render: output,
                 low: &self.photograph,
                 tone: &self.no_curve,
             },
             &mut self.d_output,
             log,
         )?;
+        if let Some(mask) = mask {
+            mask.hide(pass, size, &mut self.d_output)?;
+        }
         let d_illumination = &mut self.d_illumination;
         tonemapper.backward(
             pass,

@@ -325,6 +325,19 @@ fn intrinsics_that_make_no_camera_are_refused() {
 }
 
 #[test]
+fn a_photograph_of_one_pixel_is_named_and_no_option_blamed() {
+    let folder = tempfile::tempdir().unwrap();
+    single(folder.path(), 3);
+    for index in 0..3 {
+        photograph(&folder.path().join(format!("images/{}.png", name(index))), (1, 1), 0.2);
+    }
+    edit_json(&folder.path().join("transforms.json"), |all| {
+        (all["w"], all["h"]) = (json!(1), json!(1));
+    });
+    refused(folder.path(), &["view v00: is of 1x1 pixels", "at least 16"]);
+}
+
+#[test]
 fn a_downscale_that_leaves_no_image_is_misuse() {
     let folder = tempfile::tempdir().unwrap();
     single(folder.path(), 3);

@@ -52,7 +52,12 @@ pub(crate) fn photographs(
 
 /// A frame of a transforms file: view to world, OpenGL axes.
 pub(crate) fn frame(index: usize, file_path: &str) -> Value {
-    let world_from_gl = pose(index).inverse() * DAffine3::from_scale(DVec3::new(1.0, -1.0, -1.0));
+    frame_of(&pose(index), file_path)
+}
+
+/// The same of any pose.
+pub(crate) fn frame_of(pose: &DAffine3, file_path: &str) -> Value {
+    let world_from_gl = pose.inverse() * DAffine3::from_scale(DVec3::new(1.0, -1.0, -1.0));
     let (m, t) = (world_from_gl.matrix3, world_from_gl.translation);
     let row = |row: usize| json!([m.col(0)[row], m.col(1)[row], m.col(2)[row], t[row]]);
     json!({ "file_path": file_path, "transform_matrix": [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]] })

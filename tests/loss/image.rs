@@ -89,7 +89,10 @@ fn ssim_kernels(
     let (interior_begin, interior_end) = (interior.origin, interior.origin + interior.size);
     let [render, low] = images(size);
     let scale = 1.0 / render.len() as f32;
-    let outputs = gpu().properties().subgroup_size * columns - 10;
+    let lanes = gpu().properties().subgroup_size;
+    // A subgroup of four has no outputs beside the window's ends in a strip of the narrowest shape.
+    let columns = columns.max(10 / lanes + 1);
+    let outputs = lanes * columns - 10;
     let count = at_once * width.div_ceil(outputs) * height.div_ceil(rows);
     let threads = Threads::Workgroups([count, 1, 1]);
     let mut d_render = vec![f32::NAN; render.len()];

@@ -47,7 +47,7 @@ pub(super) fn html(dataset: &Dataset, diagnosis: &Diagnosis, plan: &Plan) -> Str
         plots: vec![distributions(&[dark, lifted])],
         comparisons: rows,
     }
-    .html_pictures_first()
+    .html()
 }
 
 fn exposure(views: &[&View]) -> Option<Exposure> {

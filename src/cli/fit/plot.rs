@@ -14,7 +14,8 @@ const BINS: usize = 64;
 /// Below this share of the pixels, a column's mean says little.
 const LEAST_COLUMN: f64 = 1e-4;
 /// What the page's style would say.
-const COLORS: [(&str, &str); 7] = [
+const COLORS: [(&str, &str); 8] = [
+    ("--text", "#23211e"),
     ("--quiet", "#6f6a63"),
     ("--line", "#ddd8d0"),
     ("--series-0", "#c2571a"),
@@ -52,7 +53,8 @@ pub(super) fn svg(fitted: &Fitted, pairs: &[&Pair], options: &FitOptions) -> Str
             let deviation = (column.sum_y2 / column.count - mean * mean).max(0.0).sqrt();
             (column.x, mean + deviations * deviation)
         };
-        Series { name: name.to_owned(), points: columns.map(point).collect() }
+        let points = columns.map(point).collect();
+        Series { name: name.to_owned(), points, ..Series::default() }
     };
     let statistics: Vec<Statistics> = pairs.iter().map(|pair| pair.statistics).collect();
     let statistics = Statistics::mean_of(&statistics).unwrap_or_default();
@@ -62,7 +64,8 @@ pub(super) fn svg(fitted: &Fitted, pairs: &[&Pair], options: &FitOptions) -> Str
             let t = end * i as f64 / (POINTS - 1) as f64;
             (t, f64::from(settings.curve.apply(t as f32 * statistics.p90, &parameters)))
         };
-        Series { name: name.to_owned(), points: (0..POINTS).map(point).collect() }
+        let points = (0..POINTS).map(point).collect();
+        Series { name: name.to_owned(), points, ..Series::default() }
     };
     let series = [
         curve(&format!("{} fitted", fitted.family), &fitted.fit.settings),

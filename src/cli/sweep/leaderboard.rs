@@ -10,9 +10,14 @@ use crate::cli::batch::csv::number;
 use crate::cli::batch::point::{ADAPTIVE, OFFSET, Point, SEED};
 use crate::cli::batch::runner::Failure;
 use crate::cli::batch::sample::{deviation, mean};
+use crate::dataset::Dataset;
 use crate::eval::{AGAINST, WITH_REFERENCE};
+use crate::gpu::Gpu;
+use crate::image::Image;
 use crate::output::{csv_field, write_whole};
-use crate::report::{Bar, Best, Column, Mark, Report, Series, Table, bars, plot_points};
+use crate::report::{
+    Bar, Best, Column, Comparison, Mark, Picture, Report, Series, Table, bars, plot_points,
+};
 
 /// The files of a leaderboard.
 pub(super) const FILES: [&str; 4] =
@@ -20,6 +25,9 @@ pub(super) const FILES: [&str; 4] =
 
 /// More lines than this in a plot are no longer told apart.
 const MAX_LINES: usize = 8;
+
+/// The best rows whose pictures are shown.
+const MAX_PICTURES: usize = 8;
 
 /// The scores of a point, over its seeds.
 #[derive(Clone, Debug)]
@@ -34,6 +42,8 @@ struct Row {
 #[derive(Clone, Debug)]
 pub(super) struct Leaderboard {
     dataset: String,
+    /// What all runs have in common.
+    settings: String,
     /// Those whose values differ, in the order of the names; never the seed.
     keys: Vec<String>,
     /// The best PSNR first.
@@ -54,6 +64,7 @@ impl Leaderboard {
         runs: &[Run],
         baseline: Option<&'static str>,
         adaptive_offset: Option<f64>,
+        shared: &[String],
     ) -> Self {
         let mut rows: Vec<Row> = vec![];
         let (mut timings, mut scores, mut seeds) = (vec![], vec![], vec![]);
@@ -80,6 +91,7 @@ impl Leaderboard {
         let dataset = runs.first().map(|run| run.config.dataset.display().to_string());
         Self {
             dataset: dataset.unwrap_or_default(),
+            settings: settings(runs, &seeds, shared),
             keys: differing(runs),
             rows,
             scores,
@@ -94,11 +106,16 @@ impl Leaderboard {
     ///
     /// # Errors
     /// The folder cannot be written.
-    pub(super) fn save(&self, folder: &Path, failures: &[Failure]) -> Result<()> {
+    pub(super) fn save(
+        &self,
+        folder: &Path,
+        failures: &[Failure],
+        pictures: Option<Comparison>,
+    ) -> Result<()> {
         let [csv, markdown, html, timings] = FILES.map(|file| folder.join(file));
         write_whole(&csv, self.csv().as_bytes())?;
         write_whole(&markdown, self.markdown(failures).as_bytes())?;
-        write_whole(&html, self.html(failures).as_bytes())?;
+        write_whole(&html, self.html(failures, pictures).as_bytes())?;
         let mut text = "point,seconds\n".to_owned();
         for (name, seconds) in &self.timings {
             text += &format!("{},{}\n", csv_field(name), number(*seconds));
@@ -187,13 +204,50 @@ impl Leaderboard {
         text
     }
 
-    fn html(&self, failures: &[Failure]) -> String {
+    /// The first test view with a reference image as it came in, as the best rows show it, and as it should be.
+    ///
+    /// # Errors
+    /// A model cannot be read, or the device is lost.
+    pub(super) fn pictures(
+        &self,
+        runs: &[Run],
+        dataset: &Dataset,
+        gpu: &Gpu,
+    ) -> Result<Option<Comparison>> {
+        let Some(view) = dataset.test_views().find(|view| view.reference.is_some()) else {
+            return Ok(None);
+        };
+        let picture = |caption: &str, scores: String, image: &Image| Picture {
+            caption: caption.to_owned(),
+            scores,
+            image: image.clone(),
+        };
+        let dark = view.loaded()?;
+        let mut pictures: Vec<Picture> =
+            dark.iter().map(|dark| picture("photograph", String::new(), dark)).collect();
+        for row in &self.rows {
+            let is_its = |run: &&Run| is_point(&run.point, &row.point) && run.metrics().is_some();
+            let Some(run) = runs.iter().find(is_its) else { continue };
+            let metrics = run.metrics().unwrap_or_default();
+            let psnr = metrics["views"][&view.name]["psnr"].as_f64();
+            let scores = psnr.map_or_else(String::new, |psnr| format!("{psnr:.2} dB"));
+            pictures.push(picture(&self.label(row, None), scores, &run.render(gpu, view)?));
+            if pictures.len() > MAX_PICTURES {
+                break;
+            }
+        }
+        let reference = view.reference.as_ref();
+        pictures.extend(reference.map(|image| picture("reference", String::new(), image)));
+        Ok(Some(Comparison { title: format!("Test view {}", view.name), pictures }))
+    }
+
+    fn html(&self, failures: &[Failure], pictures: Option<Comparison>) -> String {
         let report = Report {
             title: self.title(),
             intro: self.notes(failures),
             tables: vec![self.table()],
             plots: self.plots(),
-            comparisons: vec![],
+            comparisons: pictures.into_iter().collect(),
         };
         report.html()
     }
@@ -203,7 +257,7 @@ impl Leaderboard {
     }
 
     fn notes(&self, failures: &[Failure]) -> Vec<String> {
-        let mut notes = vec![];
+        let mut notes = vec![self.settings.clone()];
         if self.baseline_row().is_some() {
             let curve = self.baseline.unwrap_or_default();
             notes.push(format!("Gains are differences to the row of the curve {curve}."));
@@ -235,7 +289,9 @@ impl Leaderboard {
     /// PSNR against every setting whose values are numbers; where there is none, a bar per row.
     fn plots(&self) -> Vec<String> {
         let psnr = column("psnr");
-        let numeric = self.keys.iter().filter_map(|key| self.against(key, &psnr.name));
+        // The same line has the same number in every plot.
+        let mut lines = vec![];
+        let numeric = self.keys.iter().filter_map(|key| self.against(key, &psnr.name, &mut lines));
         let plots: Vec<String> = numeric.collect();
         let has_scores = self.rows.iter().any(|row| row.mean("psnr").is_some());
         if !plots.is_empty() || !has_scores {
@@ -244,13 +300,14 @@ impl Leaderboard {
         let bar = |row: &Row| Bar {
             name: self.label(row, None),
             value: row.mean("psnr").unwrap_or(f64::NAN),
+            spread: row.extremes("psnr"),
         };
         let rows: Vec<Bar> = self.rows.iter().map(bar).collect();
         vec![bars(&psnr.name, psnr.digits, &rows)]
     }
 
     /// A line for every combination of the other settings; none where `key` is no number, or lines are too many.
-    fn against(&self, key: &str, y_name: &str) -> Option<String> {
+    fn against(&self, key: &str, y_name: &str, known: &mut Vec<String>) -> Option<String> {
         let is_special = |value: &str| key == OFFSET && value == ADAPTIVE;
         let values = self.rows.iter().filter_map(|row| row.point.value(key));
         let numbers: Vec<f64> = values
@@ -277,9 +334,17 @@ impl Leaderboard {
                 // What has no such setting is level.
                 None => vec![(low, psnr), (high, psnr)],
             };
+            let spread = row.extremes("psnr").filter(|_| points.len() == 1);
+            let spreads = spread.map(|[low, high]| (points[0].0, low, high));
             match lines.iter_mut().find(|line| line.name == name) {
-                Some(line) => line.points.extend(points),
-                None => lines.push(Series { name, points }),
+                Some(line) => {
+                    line.points.extend(points);
+                    line.spreads.extend(spreads);
+                }
+                None => {
+                    let spreads = spreads.into_iter().collect();
+                    lines.push(Series { name, points, spreads, ..Series::default() });
+                }
             }
         }
         // A lone point shows nothing of the setting.
@@ -288,6 +353,13 @@ impl Leaderboard {
             line.points.sort_by(|a, b| a.0.total_cmp(&b.0));
         }
         lines.sort_by(|a, b| a.name.cmp(&b.name));
+        for line in &mut lines {
+            let place = known.iter().position(|name| *name == line.name);
+            line.line = Some(place.unwrap_or(known.len()));
+            if place.is_none() {
+                known.push(line.name.clone());
+            }
+        }
         let is_legible = (1..=MAX_LINES).contains(&lines.len());
         is_legible.then(|| plot_points(key, y_name, &lines, &marks))
     }
@@ -325,6 +397,14 @@ impl Row {
         deviation(&self.values(score))
     }
 
+    /// The least and the greatest of at least two runs.
+    fn extremes(&self, score: &str) -> Option<[f64; 2]> {
+        let values = self.values(score);
+        let least = values.iter().copied().min_by(f64::total_cmp)?;
+        let greatest = values.iter().copied().max_by(f64::total_cmp)?;
+        (values.len() > 1).then_some([least, greatest])
+    }
+
     /// A run's targets knew references.
     fn knows_references(&self) -> bool {
         self.metrics.iter().any(|metrics| metrics.get(WITH_REFERENCE).is_some())
@@ -343,6 +423,32 @@ impl Row {
     fn values(&self, score: &str) -> Vec<f64> {
         self.metrics.iter().filter_map(|metrics| metrics["mean"][score].as_f64()).collect()
     }
+}
+
+/// Whether a run's point is a row's but for the seed.
+fn is_point(of_run: &Point, of_row: &Point) -> bool {
+    let mut point = of_run.clone();
+    point.values.retain(|(key, _)| key != SEED);
+    point == *of_row
+}
+
+/// A sentence on what the runs are, and what all were given.
+fn settings(runs: &[Run], seeds: &[&str], shared: &[String]) -> String {
+    let mut steps: Vec<u64> = runs.iter().map(|run| run.config.steps).collect();
+    steps.sort_unstable();
+    steps.dedup();
+    let steps: Vec<String> = steps.iter().map(u64::to_string).collect();
+    let mut text = format!("{} runs of {} steps", runs.len(), steps.join(" or "));
+    if seeds.len() > 1 {
+        let seeds = seeds.join(", ");
+        text += &format!(
+            "; scores are means over the seeds {seeds}, and bars their least and greatest"
+        );
+    }
+    if !shared.is_empty() {
+        text += &format!("; all with {}", shared.join(" "));
+    }
+    text + ". The folder of each run has its config.toml."
 }
 
 /// The axes but for the seed along which the runs differ; all of them where there is one run.

@@ -8,11 +8,10 @@ use crate::cli::batch::Run;
 use crate::cli::batch::point::SEED;
 use crate::cli::batch::runner::Failure;
 use crate::dataset::{Dataset, View};
-use crate::eval::Player;
 use crate::gpu::Gpu;
 use crate::image::Image;
 use crate::report::{Comparison, Picture, Report, Trace, traces};
-use crate::run::{self, Progress, energy_counters};
+use crate::run::{Progress, energy_counters};
 
 /// Points on the way this much worse than the best are left out: they would flatten all others.
 const SHOWN_DECIBELS: f64 = 3.0;
@@ -190,20 +189,10 @@ impl Page<'_> {
             let seconds = metrics["seconds"].as_f64().unwrap_or(f64::NAN);
             let text =
                 format!("{:.2} dB, SSIM {:.3}, {seconds:.0} s", score("psnr"), score("ssim"));
-            pictures.push(picture(outcome.preset(), text, &self.render(run, view)?));
+            pictures.push(picture(outcome.preset(), text, &run.render(self.gpu, view)?));
         }
         let target = view.reference.as_ref();
         pictures.extend(target.map(|image| picture(self.target.name(), String::new(), image)));
         Ok(Some(Comparison { title: format!("Test view {}", view.name), pictures }))
-    }
-
-    fn render(&self, run: &Run, view: &View) -> Result<Image> {
-        let config = run::load_config(&run.folder)?;
-        let raw_colors = config.model.raw_colors;
-        let gaussians = run::load_model(&run.folder, raw_colors)?;
-        let networks =
-            run::load_networks(self.gpu, &run.folder, &config.model, gaussians.shape.features)?;
-        let mut player = Player::new(self.gpu, &gaussians, &config, networks)?;
-        Ok(player.render(view)?.output().clone())
     }
 }

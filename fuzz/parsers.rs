@@ -1,0 +1,122 @@
+//! Every parser of files from elsewhere as a function of bytes: what fuzzing and `tests/hostile_bytes.rs` feed.
+//!
+//! A parser may refuse whatever it is given, in one line. It never panics, and what it lets through keeps its promises.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use nightsplat::Result;
+use nightsplat::dataset::{Dataset, LoadOptions};
+use nightsplat::image::Image;
+use nightsplat::scene::ply;
+use nightsplat::tone::{Profile, ToneSettings};
+use nightsplat::train::{TrainConfig, check_checkpoint};
+
+/// A parser, by the name of its fuzz target and of its folder of seeds.
+pub type Parser = (&'static str, fn(&[u8]));
+
+/// All of them.
+pub const PARSERS: [Parser; 15] = [
+    ("colmap_cameras_bin", |bytes| dataset("colmap/binary", "sparse/0/cameras.bin", bytes)),
+    ("colmap_images_bin", |bytes| dataset("colmap/binary", "sparse/0/images.bin", bytes)),
+    ("colmap_points_bin", |bytes| dataset("colmap/binary", "sparse/0/points3D.bin", bytes)),
+    ("colmap_cameras_txt", |bytes| dataset("colmap/text", "sparse/0/cameras.txt", bytes)),
+    ("colmap_images_txt", |bytes| dataset("colmap/text", "sparse/0/images.txt", bytes)),
+    ("colmap_points_txt", |bytes| dataset("colmap/text", "sparse/0/points3D.txt", bytes)),
+    ("transforms_json", |bytes| dataset("lom", "transforms_train.json", bytes)),
+    ("ply", |bytes| {
+        file("ply", bytes, |path| {
+            let gaussians = ply::load(path)?;
+            assert!(gaussians.parameters.iter().all(|value| value.is_finite()));
+            Ok(())
+        })
+    }),
+    ("checkpoint", |bytes| file("safetensors", bytes, check_checkpoint)),
+    ("config_toml", |bytes| file("toml", bytes, |path| TrainConfig::load(path)?.check())),
+    ("curve_toml", |bytes| file("toml", bytes, curve)),
+    ("curve_csv", |bytes| file("csv", bytes, curve)),
+    ("curve_cube", |bytes| file("cube", bytes, curve)),
+    ("exr", |bytes| file("exr", bytes, image)),
+    ("jpeg", |bytes| file("jpg", bytes, image)),
+];
+
+fn curve(path: &Path) -> Result<()> {
+    if path.extension().is_some_and(|extension| extension == "toml") {
+        said(Profile::load(path).map(drop));
+    }
+    let settings = ToneSettings::load(path)?;
+    // What is plotted, shown and trained with.
+    let statistics = settings.plain_statistics();
+    for t in [0.0, 0.1, 0.5, 1.0, 2.0, 1e6] {
+        let value = settings.value(t, &statistics);
+        assert!((0.0..=1.0).contains(&value), "{value} at {t}");
+    }
+    Ok(())
+}
+
+fn image(path: &Path) -> Result<()> {
+    let (width, height) = Image::size_of(path)?;
+    // As a dataset asks before anything is decoded.
+    if u64::from(width) * u64::from(height) > 1 << 22 {
+        return Ok(());
+    }
+    let image = Image::load(path)?;
+    assert_eq!(image.data.len(), 3 * image.pixel_count());
+    Image::load_as_stored(path).map(drop)
+}
+
+/// Writes the bytes as a file of that extension and reads it.
+fn file(extension: &str, bytes: &[u8], read: impl FnOnce(&Path) -> Result<()>) {
+    let path = FOLDER.with(|folder| folder.path().join("file").with_extension(extension));
+    fs::write(&path, bytes).unwrap();
+    said(read(&path));
+}
+
+/// Puts the bytes in the place of one file of a dataset and loads that.
+fn dataset(set: &str, place: &str, bytes: &[u8]) {
+    let root = FOLDER.with(|folder| folder.path().join(set));
+    if !root.exists() {
+        copy(&fixtures().join(set), &root);
+    }
+    let original = fs::read(root.join(place)).unwrap_or_default();
+    fs::write(root.join(place), bytes).unwrap();
+    // Listings and headers, then the photographs.
+    let options = LoadOptions::default();
+    said(Dataset::sizes(&root, &options).map(drop));
+    said(Dataset::load(&root, &options).map(|dataset| {
+        assert!(dataset.points.iter().all(|point| point.position.is_finite()));
+        let cameras = dataset.views.iter().map(|view| view.camera);
+        for camera in cameras {
+            assert!(camera.focal.is_finite() && camera.view_from_world.is_finite());
+        }
+    }));
+    fs::write(root.join(place), original).unwrap();
+}
+
+/// An error is one line.
+fn said(outcome: Result<()>) {
+    if let Err(error) = outcome {
+        let message = error.to_string();
+        assert!(!message.is_empty() && !message.contains('\n'), "{message:?}");
+    }
+}
+
+thread_local! {
+    static FOLDER: tempfile::TempDir = tempfile::tempdir().unwrap();
+}
+
+/// The small sets that are committed with the tests.
+fn fixtures() -> PathBuf {
+    let tests = Path::new(env!("CARGO_MANIFEST_DIR"))
+        .ancestors()
+        .map(|folder| folder.join("tests/fixtures"));
+    tests.into_iter().find(|folder| folder.exists()).unwrap()
+}
+
+fn copy(from: &Path, to: &Path) {
+    fs::create_dir_all(to).unwrap();
+    for entry in fs::read_dir(from).unwrap().flatten() {
+        let (from, to) = (entry.path(), to.join(entry.file_name()));
+        if from.is_dir() { copy(&from, &to) } else { drop(fs::copy(from, to).unwrap()) }
+    }
+}
