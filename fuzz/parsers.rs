@@ -13,10 +13,10 @@ use nightsplat::tone::{Profile, ToneSettings};
 use nightsplat::train::{TrainConfig, check_checkpoint};
 
 /// A parser, by the name of its fuzz target and of its folder of seeds.
-pub type Parser = (&'static str, fn(&[u8]));
+pub(crate) type Parser = (&'static str, fn(&[u8]));
 
 /// All of them.
-pub const PARSERS: [Parser; 15] = [
+pub(crate) const PARSERS: [Parser; 15] = [
     ("colmap_cameras_bin", |bytes| dataset("colmap/binary", "sparse/0/cameras.bin", bytes)),
     ("colmap_images_bin", |bytes| dataset("colmap/binary", "sparse/0/images.bin", bytes)),
     ("colmap_points_bin", |bytes| dataset("colmap/binary", "sparse/0/points3D.bin", bytes)),
@@ -29,7 +29,7 @@ pub const PARSERS: [Parser; 15] = [
             let gaussians = ply::load(path)?;
             assert!(gaussians.parameters.iter().all(|value| value.is_finite()));
             Ok(())
-        })
+        });
     }),
     ("checkpoint", |bytes| file("safetensors", bytes, check_checkpoint)),
     ("config_toml", |bytes| file("toml", bytes, |path| TrainConfig::load(path)?.check())),
@@ -117,6 +117,10 @@ fn copy(from: &Path, to: &Path) {
     fs::create_dir_all(to).unwrap();
     for entry in fs::read_dir(from).unwrap().flatten() {
         let (from, to) = (entry.path(), to.join(entry.file_name()));
-        if from.is_dir() { copy(&from, &to) } else { drop(fs::copy(from, to).unwrap()) }
+        if from.is_dir() {
+            copy(&from, &to);
+        } else {
+            fs::copy(from, to).unwrap();
+        }
     }
 }

@@ -204,6 +204,6 @@ fn growth_stops_at_the_memory_that_it_may_have_and_at_the_same_number_every_time
     assert!(counts[0] == counts[1] && counts[0] < 9000, "{counts:?}");
     config.max_vram = None;
     config.max_ram = "260M".parse().ok();
-    let (foreseen, trained) = self::foreseen(&gpu, &config);
+    let (foreseen, trained) = foreseen(&gpu, &config);
     assert!(trained.trainer.gaussian_count() <= foreseen.most_gaussians.max(counts[0]));
 }
