@@ -316,6 +316,7 @@ fn bench_checks_and_times_every_kernel_of_a_step_and_names_the_others() {
     let everywhere: Vec<&str> = everywhere.collect();
     let elsewhere = [
         "conv3x3_half",
+        "conv_strided",
         "decode",
         "expose",
         "expose_backward",
@@ -324,6 +325,7 @@ fn bench_checks_and_times_every_kernel_of_a_step_and_names_the_others() {
         "first_not_finite",
         "mask_gradient",
         "mask_render",
+        "max_pool",
         "tone_mix",
         "tone_profile",
         "tone_table",

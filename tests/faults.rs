@@ -77,10 +77,11 @@ fn memory_that_runs_out_anywhere_leaves_a_checkpoint_and_no_finished_run() {
     let mut numbers: Vec<usize> = sites.into_values().flatten().collect();
     numbers.sort_unstable();
     numbers.dedup();
-    // All of them take minutes.
+    // All of them take minutes: some of those before the first step, and the last.
     if std::env::var_os("NIGHTSPLAT_ALL_SITES").is_none() {
-        let every = numbers.len() / 10;
-        numbers = numbers.into_iter().rev().step_by(every.max(1)).collect();
+        let (early, late) = numbers.split_at(numbers.len().saturating_sub(8));
+        let some = early.iter().step_by((early.len() / 4).max(1));
+        numbers = some.chain(late).copied().collect();
     }
     let mut resumed = 0;
     for index in numbers {
@@ -108,7 +109,7 @@ fn memory_that_runs_out_anywhere_leaves_a_checkpoint_and_no_finished_run() {
             resumed += 1;
         }
     }
-    assert!(resumed > 5);
+    assert!(resumed >= 3, "{resumed} runs went on from what was saved");
 }
 
 #[test]

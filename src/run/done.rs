@@ -40,7 +40,8 @@ pub(super) fn save(
 /// None for a configuration that [`TrainConfig::check`] accepts.
 pub fn done_steps(run: &Path, config: &TrainConfig, dataset: &Dataset) -> Result<Option<u64>> {
     let text = std::fs::read_to_string(run.join(DONE)).unwrap_or_default();
-    let done = serde_json::from_str::<Done>(&text).ok().filter(|_| run.join("model.ply").is_file());
+    let is_whole = ["model.ply", "metrics.json"].iter().all(|file| run.join(file).is_file());
+    let done = serde_json::from_str::<Done>(&text).ok().filter(|_| is_whole);
     let Some(done) = done else { return Ok(None) };
     let is_same = done.configuration == config.checksum()?
         && done.dataset == Fingerprint::of(dataset)?.checksum();

@@ -81,12 +81,14 @@ impl Trainer {
         }
         let mut reports = vec![];
         match self.train_stretch(until, &mut reports) {
-            Err(error) if !reports.is_empty() => {
-                self.failed = Some(error);
-                Ok(reports)
-            }
-            done => done.map(|()| reports),
+            Err(error) if !reports.is_empty() => self.failed = Some(error),
+            done => done?,
         }
+        // A model that is broken is nobody's, and neither are its steps.
+        if self.step >= self.checked + FINITE_STEPS {
+            self.check_finite()?;
+        }
+        Ok(reports)
     }
 
     fn train_stretch(&mut self, until: u64, reports: &mut Vec<StepReport>) -> Result<()> {
@@ -124,11 +126,7 @@ impl Trainer {
             self.ends.density_due = Some(self.renderer.intersections()?);
         }
         sent?;
-        self.control()?;
-        if self.step >= self.checked + FINITE_STEPS {
-            self.check_finite()?;
-        }
-        Ok(())
+        self.control()
     }
 
     /// Does what is due behind the last step: each is done, or the model is as it was and it stays due.

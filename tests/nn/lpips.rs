@@ -31,8 +31,10 @@ fn the_distance_is_pytorch_s() {
         let mixed = Image { data: mix, ..a.clone() };
         for (other, expected) in [(&b, far), (&mixed, near), (&a, 0.0)] {
             let distance = lpips.distance(&gpu(), &a, other).unwrap();
+            // Pictures that are nearly alike differ by little more than both sides round their activations.
+            let bound = 1e-4 * expected + 1e-5 * far;
             assert!(
-                (distance - expected).abs() <= 1e-4 * expected.max(1e-6),
+                (distance - expected).abs() <= bound,
                 "{width}x{height}: {distance}, not {expected}"
             );
             let turned = lpips.distance(&gpu(), other, &a).unwrap();
