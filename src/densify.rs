@@ -220,6 +220,7 @@ impl Densifier {
     }
 
     /// What a round takes beside the Gaussians, for each, in bytes.
+    #[cfg(feature = "io")]
     pub(crate) fn bytes_per_gaussian(&self) -> usize {
         5 * size_of::<u32>() + self.sort.bytes_per_item()
     }

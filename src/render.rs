@@ -195,12 +195,14 @@ impl Renderer {
     }
 
     /// What each Gaussian takes beside its own numbers, in bytes.
+    #[cfg(feature = "io")]
     pub(crate) fn bytes_per_gaussian(&self) -> usize {
         self.frame.bytes_per_gaussian() + self.depth_sort.bytes_per_item()
     }
 
     /// What the buffers take that follow the numbers of Gaussians and intersections, those of the sorts left out, which come
     /// with the first render; in bytes.
+    #[cfg(feature = "io")]
     pub(crate) fn reserved_bytes(&self) -> usize {
         let Frame { splats, tiles, .. } = &self.frame;
         splats.len() * self.frame.bytes_per_gaussian()
@@ -208,11 +210,13 @@ impl Renderer {
     }
 
     /// What each intersection of a view takes, in bytes.
+    #[cfg(feature = "io")]
     pub(crate) fn bytes_per_intersection(&self) -> usize {
         self.frame.bytes_per_intersection() + self.tile_sort.bytes_per_item()
     }
 
     /// How many intersections there is room for.
+    #[cfg(feature = "io")]
     pub(crate) fn intersection_capacity(&self) -> u32 {
         self.frame.intersection_capacity()
     }

@@ -167,12 +167,14 @@ impl Frame {
     }
 
     /// What each Gaussian takes, in bytes.
+    #[cfg(feature = "io")]
     pub(super) fn bytes_per_gaussian(&self) -> usize {
         let numbers = (4 + self.channels) * size_of::<f32>() + size_of::<UVec2>();
         size_of::<ProjectedSplat>() + numbers + self.record_vectors() * size_of::<Vec3>()
     }
 
     /// What each intersection takes, in bytes.
+    #[cfg(feature = "io")]
     pub(super) fn bytes_per_intersection(&self) -> usize {
         3 * size_of::<u32>() + self.record_vectors() * size_of::<Vec3>()
     }
