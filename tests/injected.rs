@@ -4,44 +4,12 @@
 
 use std::fs;
 use std::io::{BufRead, BufReader};
-use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use nightsplat::dataset::synthetic::{self, SyntheticOptions};
-
 mod common;
 use common::command::{command, refused_with, run, succeed};
-
-/// A folder with a set of nine small views in `set`, and runs beside it.
-struct Place(tempfile::TempDir);
-
-impl Place {
-    fn new() -> Self {
-        let place = Self(tempfile::tempdir().unwrap());
-        let options = SyntheticOptions { views: 9, width: 40, height: 30, seed: 2 };
-        synthetic::write(place.path("set"), &options).unwrap();
-        place
-    }
-
-    fn path(&self, name: &str) -> PathBuf {
-        self.0.path().join(name)
-    }
-
-    /// The arguments that train `set` into `name`.
-    fn train(&self, name: &str, options: &str) -> String {
-        let (set, out) = (self.path("set"), self.path(name));
-        format!(
-            "train {} --out {} --curve ap3 --model plain --sh-degree 1 --plan none {options}",
-            set.display(),
-            out.display()
-        )
-    }
-
-    fn model(&self, name: &str) -> Vec<u8> {
-        fs::read(self.path(name).join("model.ply")).unwrap()
-    }
-}
+use common::place::Place;
 
 /// A command that is at work, in a group of its own as a shell would start it.
 fn begun(arguments: &str) -> Child {

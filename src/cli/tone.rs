@@ -353,10 +353,10 @@ impl CurveOnSet {
     }
 }
 
-/// A photograph with those of its pixels that are no numbers.
+/// A photograph with those of its pixels that do not count.
 fn loaded(listed: &Listed, inverted: bool) -> Result<(Image, Vec<usize>)> {
-    let (photograph, gaps) = Image::load_with_gaps(&listed.input)?;
-    let (photograph, gaps) = listed.turned(photograph, listed.hidden(gaps, inverted)?);
+    let photograph = Image::load(&listed.input)?;
+    let (photograph, gaps) = listed.turned(photograph, listed.hidden(inverted)?);
     if gaps.len() == photograph.pixel_count() {
         return Err(Error::input(
             &listed.input,

@@ -3,8 +3,7 @@
 use std::io::Cursor;
 use std::path::Path;
 
-use ::image::ImageReader;
-
+use super::codec::{Source, reader};
 use super::exr_file;
 use crate::{Error, Result};
 
@@ -23,8 +22,7 @@ pub(super) fn check(path: &Path, bytes: &[u8]) -> Result<()> {
     let excess = if bytes.starts_with(&exr_file::MAGIC) {
         excess_of_exr(bytes)
     } else {
-        let reader = ImageReader::new(Cursor::new(bytes)).with_guessed_format().ok();
-        let size = reader.and_then(|reader| reader.into_dimensions().ok());
+        let size = reader(Cursor::new(bytes)).ok().and_then(|reader| reader.into_dimensions().ok());
         size.and_then(|(width, height)| excess_of_size(width.into(), height.into()))
     };
     match excess {
@@ -41,7 +39,8 @@ fn excess_of_size(width: u64, height: u64) -> Option<String> {
 }
 
 fn excess_of_exr(bytes: &[u8]) -> Option<String> {
-    let meta = exr::meta::MetaData::read_from_buffered(Cursor::new(bytes), false).ok()?;
+    let bytes: Box<dyn Source> = Box::new(Cursor::new(bytes));
+    let meta = exr::meta::MetaData::read_from_buffered(bytes, false).ok()?;
     let size = |header: &exr::meta::header::Header| {
         [header.layer_size.width(), header.layer_size.height()].map(|side| side as u64)
     };

@@ -1,10 +1,12 @@
 //! Photographs from and to files: PNG, JPEG, WebP, TIFF and EXR in, PNG and EXR out.
 
-use std::io::Cursor;
+use std::fs::File;
+use std::io::{BufRead, BufReader, Cursor, Seek};
 use std::path::Path;
 
 use ::image::{
-    DynamicImage, ExtendedColorType, ImageDecoder, ImageEncoder, ImageFormat, ImageReader,
+    ColorType, DynamicImage, ExtendedColorType, ImageDecoder, ImageEncoder, ImageFormat,
+    ImageReader,
     codecs::{jpeg::JpegEncoder, png::PngEncoder},
 };
 
@@ -14,6 +16,28 @@ use super::files::{HEIC_REMEDY, is_raw};
 use super::{Image, budget, exr_file, from_interleaved, jpeg, linear_from_srgb, srgb_from_linear};
 use crate::output::write_whole;
 use crate::{Error, Result};
+
+/// A file or memory, behind one type: every decoder is compiled anew for each that it reads from.
+pub(super) trait Source: BufRead + Seek {}
+
+impl<T: BufRead + Seek> Source for T {}
+
+/// The reader of a picture, of the format that its content is of.
+pub(super) fn reader<'a>(
+    source: impl Source + 'a,
+) -> std::io::Result<ImageReader<Box<dyn Source + 'a>>> {
+    let source: Box<dyn Source> = Box::new(source);
+    ImageReader::new(source).with_guessed_format()
+}
+
+fn bytes_of(path: &Path) -> Result<Vec<u8>> {
+    std::fs::read(path).map_err(|error| Error::input(path, format!("cannot be read: {error}")))
+}
+
+fn file_reader(path: &Path) -> Result<ImageReader<Box<dyn Source>>> {
+    let opened = File::open(path).and_then(|file| reader(BufReader::new(file)));
+    opened.map_err(|error| Error::input(path, format!("cannot be read: {error}")))
+}
 
 impl Image {
     /// Reads an 8- or 16-bit PNG or TIFF, a JPEG, a WebP or an EXR file as it is stored ([`Image::load_upright`] turns it);
@@ -25,20 +49,9 @@ impl Image {
     /// # Errors
     /// [`Error::Input`] names the file when it cannot be read, is cut short or is of another format.
     pub fn load(path: impl AsRef<Path>) -> Result<Self> {
-        Ok(Self::load_with_gaps(path)?.0)
-    }
-
-    /// As [`Image::load`], with the pixels of which a value is NaN or infinite: indices into a plane, ascending. They are
-    /// black.
-    ///
-    /// # Errors
-    /// As [`Image::load`].
-    pub fn load_with_gaps(path: impl AsRef<Path>) -> Result<(Self, Vec<usize>)> {
-        let path = path.as_ref();
-        let bytes = std::fs::read(path)
-            .map_err(|error| Error::input(path, format!("cannot be read: {error}")))?;
         let encode = |linear: f32| (linear >= 0.0).then(|| srgb_from_linear(linear));
-        Self::decode(path, bytes, encode)
+        let path = path.as_ref();
+        Self::decode(path, bytes_of(path)?, encode)
     }
 
     /// The same for numbers that are no colour, such as depth: EXR values are taken as they are, also negative ones.
@@ -47,16 +60,10 @@ impl Image {
     /// As [`Image::load`].
     pub fn load_as_stored(path: impl AsRef<Path>) -> Result<Self> {
         let path = path.as_ref();
-        let bytes = std::fs::read(path)
-            .map_err(|error| Error::input(path, format!("cannot be read: {error}")))?;
-        Ok(Self::decode(path, bytes, Some)?.0)
+        Self::decode(path, bytes_of(path)?, Some)
     }
 
-    fn decode(
-        path: &Path,
-        bytes: Vec<u8>,
-        from_exr_value: exr_file::FromExrValue,
-    ) -> Result<(Self, Vec<usize>)> {
+    fn decode(path: &Path, bytes: Vec<u8>, from_exr_value: exr_file::FromExrValue) -> Result<Self> {
         budget::check(path, &bytes)?;
         if bytes.starts_with(&exr_file::MAGIC) {
             return exr_file::load(path, bytes, from_exr_value);
@@ -64,18 +71,21 @@ impl Image {
         if bytes.starts_with(&jpeg::MAGIC)
             && let Some(image) = jpeg::load(path, &bytes)?
         {
-            return Ok((image, vec![]));
+            return Ok(image);
         }
         refuse_heic(path, &bytes)?;
         if is_raw(path) {
-            return Ok((load_raw(path, bytes)?, vec![]));
+            return load_raw(path, bytes);
         }
-        let reader = ImageReader::new(Cursor::new(bytes)).with_guessed_format();
+        let reader = reader(Cursor::new(bytes));
         let decoded = reader.map_err(::image::ImageError::from).and_then(ImageReader::decode);
-        Ok((from_decoded(decoded.map_err(|error| not_an_image(path, &error))?), vec![]))
+        let decoded = decoded.map_err(|error| not_an_image(path, &error))?;
+        refuse_floats(path, decoded.color())?;
+        Ok(from_decoded(decoded))
     }
 
-    /// The alpha of a PNG, WebP or TIFF file, in all three planes; none of a file that hides nothing.
+    /// The alpha of a PNG, WebP or TIFF file, and 0 where a value of an EXR file is not finite, in all three planes; none of a
+    /// file that hides nothing.
     ///
     /// # Errors
     /// [`Error::Input`] names the file when it cannot be read.
@@ -83,9 +93,10 @@ impl Image {
         if is_raw(path) {
             return Ok(None);
         }
-        let reader = ImageReader::open(path).and_then(ImageReader::with_guessed_format);
-        let reader =
-            reader.map_err(|error| Error::input(path, format!("cannot be read: {error}")))?;
+        let reader = file_reader(path)?;
+        if reader.format() == Some(ImageFormat::OpenExr) {
+            return exr_file::finite_part(path, bytes_of(path)?);
+        }
         let with_alpha = [ImageFormat::Png, ImageFormat::WebP, ImageFormat::Tiff];
         if !reader.format().is_some_and(|format| with_alpha.contains(&format)) {
             return Ok(None);
@@ -112,13 +123,11 @@ impl Image {
         if is_raw(path) {
             return raw_size(path);
         }
-        let reader = ImageReader::open(path).and_then(ImageReader::with_guessed_format);
-        let reader =
-            reader.map_err(|error| Error::input(path, format!("cannot be read: {error}")))?;
+        let reader = file_reader(path)?;
         if reader.format() != Some(ImageFormat::OpenExr) {
             return reader.into_dimensions().map_err(|error| not_an_image(path, &error));
         }
-        let meta = exr::meta::MetaData::read_from_file(path, false)
+        let meta = exr::meta::MetaData::read_from_buffered(reader.into_inner(), false)
             .map_err(|error| not_an_image(path, &error))?;
         let size = meta.headers.first().map(|header| header.layer_size);
         let size = size.ok_or_else(|| Error::input(path, "this EXR file has no layer"))?;
@@ -229,6 +238,14 @@ fn refuse_heic(path: &Path, bytes: &[u8]) -> Result<()> {
     let is_heic = bytes.get(4..8) == Some(b"ftyp")
         && bytes.get(8..12).is_some_and(|brand| brands.contains(&brand));
     if is_heic { Err(Error::input(path, format!("is HEIC; {HEIC_REMEDY}"))) } else { Ok(()) }
+}
+
+/// A TIFF of floats does not say whether they are linear light: taken for the other, every curve would be wrong.
+fn refuse_floats(path: &Path, color: ColorType) -> Result<()> {
+    let are_floats = matches!(color, ColorType::Rgb32F | ColorType::Rgba32F);
+    let problem = "holds floats and does not say whether they are linear light; save it as EXR, which is, or as \
+                   16-bit TIFF, which is encoded";
+    if are_floats { Err(Error::input(path, problem)) } else { Ok(()) }
 }
 
 #[cfg(feature = "raw")]

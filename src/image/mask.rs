@@ -1,4 +1,4 @@
-//! Which pixels of a photograph count: those that its alpha channel and its mask show.
+//! Which pixels of a photograph count: numbers that its alpha channel and its mask show.
 
 use std::borrow::Cow;
 #[cfg(feature = "io")]
@@ -36,7 +36,7 @@ impl Mask {
         Image { width: self.width, height: self.height, data: self.weights.repeat(3) }
     }
 
-    /// What hides pixels of a photograph, as it is stored: its own alpha, and the file of a mask, which hides what is black, or
+    /// What hides pixels of a photograph, as it is stored: its own alpha, values of EXR that are not finite, and the file of a mask, which hides what is black, or
     /// where it is inverted what is white. None where nothing does.
     ///
     /// # Errors

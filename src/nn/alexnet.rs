@@ -108,7 +108,8 @@ impl AlexNet {
         for (layer, kept) in NETWORK.iter().zip(&mut activations) {
             let Layer { channels: [inputs, outputs], window, .. } = *layer;
             let [within, after] = layer.sizes(size);
-            let mut pooled = gpu.uninit("pooled", (inputs * within.element_product()) as usize)?;
+            let pooled = if layer.is_pooled { inputs * within.element_product() } else { 0 };
+            let mut pooled = gpu.uninit("pooled", pooled as usize)?;
             let mut target =
                 gpu.uninit("activation", (outputs * after.element_product()) as usize)?;
             let product = if window == 3 { products.next() } else { None };

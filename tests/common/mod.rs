@@ -7,6 +7,7 @@ pub(crate) mod chain;
 #[cfg(feature = "cli")]
 pub(crate) mod command;
 pub(crate) mod lpips;
+pub(crate) mod place;
 pub(crate) mod safetensors;
 pub(crate) mod setup;
 pub(crate) mod train;

@@ -9,6 +9,8 @@ mod common;
 mod photographs;
 #[cfg(feature = "cli")]
 mod pose;
+#[cfg(all(feature = "cli", feature = "raw"))]
+mod raw;
 mod real;
 mod synthetic;
 

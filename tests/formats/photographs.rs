@@ -49,37 +49,65 @@ fn tiff_and_webp_are_read_in_the_bits_that_they_have() {
         &deep.map(|value| f32::from(value) / 65_535.0),
     );
     // Of floats, EXR is what is read.
-    fs::write(path("float.tif"), float_tiff(&[0.0, 0.5])).unwrap();
+    fs::write(path("float.tif"), float_tiff(&[[0.0; 3], [0.5; 3]])).unwrap();
     let error = Image::load(path("float.tif")).unwrap_err().to_string();
-    assert!(error.contains("float.tif: is not a readable"), "{error}");
+    assert!(error.contains("float.tif: holds floats") && error.contains("EXR"), "{error}");
 }
 
-/// A TIFF of one row of grey, 32-bit float.
-fn float_tiff(values: &[f32]) -> Vec<u8> {
-    let bytes: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
-    let (count, length) = (values.len() as u32, bytes.len() as u32);
-    // Tag, value: width, height, bits, no compression, black is zero, offset, samples, rows, bytes, float.
-    let entries = [
-        (256, count),
-        (257, 1),
-        (258, 32),
-        (259, 1),
-        (262, 1),
-        (273, 8),
-        (277, 1),
-        (278, 1),
-        (279, length),
-        (339, 3),
+/// A TIFF of one row of colours in 32-bit floats.
+fn float_tiff(pixels: &[[f32; 3]]) -> Vec<u8> {
+    let bytes: Vec<u8> = pixels.iter().flatten().flat_map(|value| value.to_le_bytes()).collect();
+    let (count, length) = (pixels.len() as u32, bytes.len() as u32);
+    // Behind the pixels, for each of the three samples: 32 bits, and that they are floats.
+    let of_samples = [32_u16, 32, 32, 3, 3, 3];
+    let (bits, formats) = (8 + length, 8 + length + 6);
+    // Tag, number, value: size, bits, no compression, RGB, offset, samples, rows, bytes, float.
+    let entries: [(u16, u16, u32); 10] = [
+        (256, 1, count),
+        (257, 1, 1),
+        (258, 3, bits),
+        (259, 1, 1),
+        (262, 1, 2),
+        (273, 1, 8),
+        (277, 1, 3),
+        (278, 1, 1),
+        (279, 1, length),
+        (339, 3, formats),
     ];
-    let mut file = [b"II*\0".as_slice(), &(8 + length).to_le_bytes(), &bytes].concat();
+    let mut file = [b"II*\0".as_slice(), &(8 + length + 12).to_le_bytes(), &bytes].concat();
+    file.extend(of_samples.iter().flat_map(|value| value.to_le_bytes()));
     file.extend((entries.len() as u16).to_le_bytes());
-    for (tag, value) in entries {
-        let tag: u16 = tag;
-        let value: u32 = value;
-        file.extend([&tag.to_le_bytes()[..], &[4, 0, 1, 0, 0, 0], &value.to_le_bytes()].concat());
+    for (tag, number, value) in entries {
+        // Several values are shorts; one is a long.
+        let kind: u16 = if number > 1 { 3 } else { 4 };
+        file.extend([tag, kind, number, 0].iter().flat_map(|half| half.to_le_bytes()));
+        file.extend(value.to_le_bytes());
     }
     file.extend([0; 4]);
     file
+}
+
+#[test]
+fn pixels_of_an_exr_that_are_no_numbers_are_hidden() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    fs::create_dir(root.join("images")).unwrap();
+    let (columns, rows) = (SIZE.0 as usize, SIZE.1 as usize);
+    let green = |x, y| match (x, y) {
+        (7, 4) => f32::NAN,
+        (20, 9) => f32::NEG_INFINITY,
+        _ => 0.01,
+    };
+    for index in 0..9 {
+        let path = root.join("images").join(name(index)).with_extension("exr");
+        let pixel = |x, y| (0.02, if index == 3 { green(x, y) } else { 0.01 }, 0.03);
+        exr::prelude::write_rgb_file(path, columns, rows, pixel).unwrap();
+    }
+    model(9).write_text(&root.join("sparse/0"));
+    let dataset = load(root);
+    let hidden = |name: &str| view(&dataset, name).mask.as_ref().map(Mask::hidden);
+    assert_eq!(hidden("v03"), Some(vec![4 * columns + 7, 9 * columns + 20]));
+    assert_eq!(hidden("v02"), None);
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! Which photographs `tone` reads, and where each goes.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use super::{ToneArgs, is_same_file};
@@ -25,16 +25,13 @@ pub(super) struct Listed {
 }
 
 impl Listed {
-    /// Its pixels that do not count: gaps, and what alpha or mask hides.
-    pub(super) fn hidden(&self, gaps: Vec<usize>, inverted: bool) -> Result<Vec<usize>> {
-        let Some(mask) = Mask::load(&self.input, self.mask.as_deref(), inverted)? else {
-            return Ok(gaps);
-        };
-        let all: BTreeSet<usize> = gaps.into_iter().chain(mask.hidden()).collect();
-        Ok(all.into_iter().collect())
+    /// Its pixels that do not count: those that are no numbers, and what alpha or mask hides.
+    pub(super) fn hidden(&self, inverted: bool) -> Result<Vec<usize>> {
+        let mask = Mask::load(&self.input, self.mask.as_deref(), inverted)?;
+        Ok(mask.as_ref().map(Mask::hidden).unwrap_or_default())
     }
 
-    /// Turned upright, as its pixels that are no numbers are, unless cameras may say how it is stored.
+    /// Turned upright, as its pixels that do not count are, unless cameras may say how it is stored.
     pub(super) fn turned(&self, image: Image, gaps: Vec<usize>) -> (Image, Vec<usize>) {
         let orientation = match self.split {
             None => Orientation::of(&self.input),

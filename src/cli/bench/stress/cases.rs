@@ -327,12 +327,12 @@ pub const CASES: &[Case] = &[
     case("EXR of denormals", "trains as black", Trains, |_| {
         Hostile::exr(|value, _, _| 1e-40 * value)
     }),
-    case("EXR with NaN", "they count as black, and a warning counts them", Trains, |_| {
+    case("EXR with NaN", "their pixels do not count, and a warning counts them", Trains, |_| {
         Hostile::exr(|value, x, y| if (x + y) % 5 == 0 { f32::NAN } else { value })
     }),
     quick(case(
         "EXR with infinity and below 0",
-        "both count as black, and a warning counts them",
+        "the ones do not count, the others are black, and a warning counts them",
         Trains,
         |_| {
             Hostile::exr(|value, x, y| match (x + y) % 5 {
