@@ -5,7 +5,7 @@ use std::io::{BufRead, BufReader, Cursor, Seek};
 use std::path::Path;
 
 use ::image::{
-    ColorType, DynamicImage, ExtendedColorType, ImageDecoder, ImageEncoder, ImageFormat,
+    DynamicImage, ExtendedColorType, ImageDecoder, ImageEncoder, ImageError, ImageFormat,
     ImageReader,
     codecs::{jpeg::JpegEncoder, png::PngEncoder},
 };
@@ -78,10 +78,8 @@ impl Image {
             return load_raw(path, bytes);
         }
         let reader = reader(Cursor::new(bytes));
-        let decoded = reader.map_err(::image::ImageError::from).and_then(ImageReader::decode);
-        let decoded = decoded.map_err(|error| not_an_image(path, &error))?;
-        refuse_floats(path, decoded.color())?;
-        Ok(from_decoded(decoded))
+        let decoded = reader.map_err(ImageError::from).and_then(ImageReader::decode);
+        Ok(from_decoded(decoded.map_err(|error| undecodable(path, &error))?))
     }
 
     /// The alpha of a PNG, WebP or TIFF file, and 0 where a value of an EXR file is not finite, in all three planes; none of a
@@ -240,12 +238,17 @@ fn refuse_heic(path: &Path, bytes: &[u8]) -> Result<()> {
     if is_heic { Err(Error::input(path, format!("is HEIC; {HEIC_REMEDY}"))) } else { Ok(()) }
 }
 
-/// A TIFF of floats does not say whether they are linear light: taken for the other, every curve would be wrong.
-fn refuse_floats(path: &Path, color: ColorType) -> Result<()> {
-    let are_floats = matches!(color, ColorType::Rgb32F | ColorType::Rgba32F);
-    let problem = "holds floats and does not say whether they are linear light; save it as EXR, which is, or as \
-                   16-bit TIFF, which is encoded";
-    if are_floats { Err(Error::input(path, problem)) } else { Ok(()) }
+/// What is damaged is told from what is whole and not read, such as a TIFF of floats, which does not say whether they are linear
+/// light.
+fn undecodable(path: &Path, error: &ImageError) -> Error {
+    match error {
+        ImageError::Unsupported(kind) => {
+            let problem =
+                format!("is not read ({kind}); save it with 8 or 16 bits, or linear light as EXR");
+            Error::input(path, problem)
+        }
+        damage => not_an_image(path, damage),
+    }
 }
 
 #[cfg(feature = "raw")]
