@@ -30,10 +30,21 @@ pub struct Report {
     pub intro: Vec<String>,
     /// Rows of pictures, in order.
     pub comparisons: Vec<Comparison>,
+    /// What is so, in words, in order.
+    pub facts: Vec<Facts>,
     /// Tables of numbers, in order.
     pub tables: Vec<Table>,
     /// Plots, in order.
     pub plots: Vec<String>,
+}
+
+/// A table of words.
+#[derive(Clone, Debug, Default)]
+pub struct Facts {
+    /// The caption.
+    pub title: String,
+    /// A name and what is said of it, in each row.
+    pub rows: Vec<[String; 2]>,
 }
 
 /// Pictures of one view side by side.
@@ -57,7 +68,7 @@ pub struct Picture {
 }
 
 impl Report {
-    /// The page as HTML: pictures, tables, plots.
+    /// The page as HTML: pictures, facts, tables, plots.
     pub fn html(&self) -> String {
         self.page(&(self.pictures_html() + &self.tables_html() + &self.plots_html()))
     }
@@ -68,7 +79,8 @@ impl Report {
     }
 
     fn tables_html(&self) -> String {
-        self.tables.iter().map(Table::html).collect()
+        let facts = self.facts.iter().map(Facts::html);
+        facts.chain(self.tables.iter().map(Table::html)).collect()
     }
 
     fn plots_html(&self) -> String {
@@ -95,6 +107,19 @@ impl Report {
             let _ = writeln!(html, "<p>{}</p>", escape(paragraph));
         }
         html + body + "</body>\n</html>\n"
+    }
+}
+
+impl Facts {
+    fn html(&self) -> String {
+        let row = |[name, said]: &[String; 2]| {
+            format!("<tr><th scope=\"row\">{}</th><td>{}</td></tr>\n", escape(name), escape(said))
+        };
+        let rows: String = self.rows.iter().map(row).collect();
+        let title = escape(&self.title);
+        format!(
+            "<table class=\"facts\">\n<caption>{title}</caption>\n<tbody>\n{rows}</tbody>\n</table>\n"
+        )
     }
 }
 

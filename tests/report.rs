@@ -2,8 +2,8 @@
 
 use nightsplat::image::Image;
 use nightsplat::report::{
-    Bar, Best, Column, Comparison, Distribution, Mark, Picture, Report, Series, Table, Trace, bars,
-    distributions, plot, plot_in_groups, plot_points, svg_file, traces,
+    Bar, Best, Column, Comparison, Distribution, Facts, Mark, Picture, Report, Series, Table,
+    Trace, bars, distributions, plot, plot_in_groups, plot_points, svg_file, traces,
 };
 
 fn column(name: &str, digits: usize, best: Best) -> Column {
@@ -79,6 +79,7 @@ fn page(text: &str) -> String {
     Report {
         title: text.into(),
         intro: vec![text.into()],
+        facts: vec![Facts { title: text.into(), rows: vec![[text.into(), text.into()]] }],
         tables: vec![table()],
         plots: vec![plot(text, text, &series)],
         comparisons: vec![Comparison {
@@ -104,8 +105,9 @@ fn the_page_refers_to_nothing_outside_itself() {
 fn every_text_is_escaped() {
     let html = page("<b onload=\"x('&')\">");
     assert!(!html.contains("<b onload"));
-    // Title, heading, paragraph, two captions with alternative texts, row title, plot label, axes, legend and its title.
-    assert_eq!(html.matches("&lt;b onload=&quot;x(&#39;&amp;&#39;)&quot;&gt;").count(), 14);
+    // Title, heading, paragraph, a fact with its caption, two captions with alternative texts, row title, plot label, axes, legend
+    // and its title.
+    assert_eq!(html.matches("&lt;b onload=&quot;x(&#39;&amp;&#39;)&quot;&gt;").count(), 17);
 }
 
 #[test]

@@ -102,6 +102,7 @@ pub fn run(args: &AblateArgs) -> Result<()> {
         )],
         plots: vec![plot("step", "loss", &comparison::loss_series(&runs, epoch))],
         comparisons: test_views.map(|view| comparison::of_view(view, &dark, &runs)).collect(),
+        facts: vec![],
         tables: vec![table.clone()],
     };
     let known = config.tone.knows_references().map(|known| eval::with_reference(&known));

@@ -177,6 +177,7 @@ fn report(
             ),
             format!("{STEPS} steps each, on {}.", gpu.properties().name),
         ],
+        facts: vec![],
         tables: vec![comparison::score_table("target", dark, runs)],
         plots: vec![luminances],
         comparisons: test_views.map(|view| comparison::of_view(view, dark, runs)).collect(),

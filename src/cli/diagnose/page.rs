@@ -5,7 +5,7 @@ use crate::dataset::{Dataset, View};
 use crate::diagnose::{Diagnosis, Plan};
 use crate::image::Image;
 use crate::report::{
-    Best, Column, Comparison, Distribution, Picture, Report, Table, distributions,
+    Best, Column, Comparison, Distribution, Facts, Picture, Report, Table, distributions,
 };
 use crate::tone::{Exposure, LuminanceHistogram, luminance, soft};
 
@@ -36,13 +36,19 @@ pub(super) fn html(dataset: &Dataset, diagnosis: &Diagnosis, plan: &Plan) -> Str
         diagnosis.test_views,
         dataset.points.len()
     )];
-    let decided = plan.decisions().into_iter();
-    intro.extend(decided.map(|(part, value, why)| format!("{part}: {value}. {why}")));
     intro.extend(diagnosis.remarks.iter().map(|remark| format!("Note: {remark}.")));
-    intro.extend(scene_text(&diagnosis.scene).lines().map(str::to_owned));
+    let decided = plan.decisions().into_iter();
+    let decided = decided.map(|(part, value, why)| [format!("{part}: {value}"), why.to_owned()]);
+    let text = scene_text(&diagnosis.scene);
+    let measured = text.lines().filter_map(|line| line.split_once(' '));
+    let measured = measured.map(|(name, text)| [name.to_owned(), text.trim().to_owned()]);
     Report {
         title: format!("Diagnosis of {}", dataset.root.display()),
         intro,
+        facts: vec![
+            Facts { title: "The plan".to_owned(), rows: decided.collect() },
+            Facts { title: "The set".to_owned(), rows: measured.collect() },
+        ],
         tables: vec![table(diagnosis)],
         plots: vec![distributions(&[dark, lifted])],
         comparisons: rows,

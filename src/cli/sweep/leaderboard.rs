@@ -245,6 +245,7 @@ impl Leaderboard {
         let report = Report {
             title: self.title(),
             intro: self.notes(failures),
+            facts: vec![],
             tables: vec![self.table()],
             plots: self.plots(),
             comparisons: pictures.into_iter().collect(),

@@ -104,6 +104,7 @@ impl Page {
         let report = Report {
             title: format!("Tone curve {}", self.curve),
             intro,
+            facts: vec![],
             tables: vec![table(output)],
             plots: vec![distributions(&drawn)],
             comparisons: self.comparison.into_iter().collect(),

@@ -35,6 +35,7 @@ impl Page<'_> {
         let report = Report {
             title: format!("Time and quality of {}", self.dataset.root.display()),
             intro: self.intro(),
+            facts: vec![],
             tables: std::iter::once(outcome::table(self.outcomes))
                 .chain(outcome::marginal_table(self.outcomes))
                 .collect(),
