@@ -314,7 +314,7 @@ fn load_view(
         });
     let mask = hidden.transpose()?.flatten();
     if mask.as_ref().is_some_and(Mask::hides_all) {
-        problems.push(format!("{name}: its mask hides every pixel"));
+        problems.push(format!("{name}: no pixel is a number that its mask shows"));
         (image, reference) = (None, None);
     }
     let depth = depth.and_then(|path| {

@@ -16,8 +16,8 @@ pub struct Bar {
     pub spread: Option<[f64; 2]>,
 }
 
-/// SVG user units.
-const WIDTH: f64 = 720.0;
+/// SVG user units: narrow enough for a phone to show it whole.
+const WIDTH: f64 = 480.0;
 const ROW: f64 = 22.0;
 const TOP: f64 = 24.0;
 const RIGHT: f64 = 64.0;
@@ -35,7 +35,7 @@ pub fn bars(value_name: &str, digits: usize, bars: &[Bar]) -> String {
     let zero = axis.place(0.0);
 
     let mut svg = format!(
-        "<svg viewBox=\"0 0 {WIDTH} {}\" role=\"img\" aria-label=\"{name}\" font-size=\"12\" fill=\"var(--quiet)\">\n\
+        "<svg class=\"half\" viewBox=\"0 0 {WIDTH} {}\" role=\"img\" aria-label=\"{name}\" font-size=\"12\" fill=\"var(--quiet)\">\n\
          <text x=\"{left}\" y=\"14\">{name}</text>\n",
         TOP + ROW * bars.len() as f64,
         name = escape(value_name)

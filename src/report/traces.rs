@@ -25,7 +25,7 @@ pub struct Trace {
 /// The drawing area, SVG user units.
 const WIDTH: f64 = 420.0;
 const HEIGHT: f64 = 290.0;
-const LEFT: f64 = 44.0;
+const LEFT: f64 = 54.0;
 const RIGHT: f64 = 14.0;
 const TOP: f64 = 30.0;
 const BOTTOM: f64 = 34.0;
@@ -46,7 +46,7 @@ pub fn traces(x_name: &str, y_name: &str, of: &[Trace], front: &[(f64, f64)]) ->
          font-size=\"12\" fill=\"var(--quiet)\">\n<text x=\"0\" y=\"14\">{y}</text>\
          <text x=\"{}\" y=\"{}\" text-anchor=\"end\">{x}</text>\n",
         WIDTH - RIGHT,
-        HEIGHT - 2.0,
+        HEIGHT - 5.0,
         x = escape(x_name),
         y = escape(y_name),
     );
@@ -135,7 +135,7 @@ impl Labels {
 
     /// The left end of the base line of a name beside (x, y), where nothing else stands if there is such a place.
     fn place(&mut self, x: f64, y: f64, name: &str, ends_line: bool) -> (f64, f64) {
-        let width = 6.8 * name.chars().count() as f64;
+        let width = 7.4 * name.chars().count() as f64;
         // A line comes from the left; a front leaves to the right.
         let mut order = [x + 8.0, x - 8.0 - width];
         if !ends_line {

@@ -247,7 +247,8 @@ pub(crate) fn variants() -> Vec<Setup> {
         let mut setup = Setup::new(count, size, shape, count as u64);
         setup.options.sh_degree = used;
         setup.settings.raw_colors = channels > 4;
-        setup.settings.tile = Some(tile);
+        // Tiles that do not suit its subgroups a device replaces by its own.
+        setup.settings.tile = Some(tile).filter(|&tile| gpu().properties().suits_tile(tile));
         setup
     };
     rows.map(build).to_vec()

@@ -240,7 +240,7 @@ fn a_mask_of_another_shape_is_refused_and_one_that_hides_all_leaves_the_view_out
     let dataset = load(root);
     assert!(!names(&dataset, Split::Train).contains(&"v00"));
     assert!(
-        dataset.skipped.join("\n").contains("v00: its mask hides every pixel"),
+        dataset.skipped.join("\n").contains("v00: no pixel is a number that its mask shows"),
         "{:?}",
         dataset.skipped
     );

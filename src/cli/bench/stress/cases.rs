@@ -346,7 +346,10 @@ pub const CASES: &[Case] = &[
     case("EXR with 1e38", "trains", Trains, |_| {
         Hostile::exr(|value, x, y| if (x + y) % 5 == 0 { 1e38 } else { value })
     }),
-    case("EXR of NaN", "counts as black, and a warning says so", Trains, |_| {
-        Hostile::exr(|_, _, _| f32::NAN)
-    }),
+    case(
+        "EXR of NaN",
+        "refused: no pixel is a number",
+        Refusal("no photograph is left to train on"),
+        |_| Hostile::exr(|_, _, _| f32::NAN),
+    ),
 ];
