@@ -93,7 +93,9 @@ impl Image {
         }
         let reader = file_reader(path)?;
         if reader.format() == Some(ImageFormat::OpenExr) {
-            return exr_file::finite_part(path, bytes_of(path)?);
+            let bytes = bytes_of(path)?;
+            budget::check(path, &bytes)?;
+            return exr_file::finite_part(path, bytes);
         }
         let with_alpha = [ImageFormat::Png, ImageFormat::WebP, ImageFormat::Tiff];
         if !reader.format().is_some_and(|format| with_alpha.contains(&format)) {
