@@ -8,6 +8,7 @@ use ::image::{
     DynamicImage, ExtendedColorType, ImageDecoder, ImageEncoder, ImageError, ImageFormat,
     ImageReader,
     codecs::{jpeg::JpegEncoder, png::PngEncoder},
+    error::UnsupportedErrorKind,
 };
 
 #[cfg(not(feature = "raw"))]
@@ -244,7 +245,9 @@ fn refuse_heic(path: &Path, bytes: &[u8]) -> Result<()> {
 /// light.
 fn undecodable(path: &Path, error: &ImageError) -> Error {
     match error {
-        ImageError::Unsupported(kind) => {
+        ImageError::Unsupported(kind)
+            if !matches!(kind.kind(), UnsupportedErrorKind::Format(_)) =>
+        {
             let problem =
                 format!("is not read ({kind}); save it with 8 or 16 bits, or linear light as EXR");
             Error::input(path, problem)
