@@ -67,7 +67,7 @@ fn plain(setup: &Setup, depth: f64) -> Gaussian {
 
 #[test]
 fn gaussians_out_of_range_leave_no_trace() {
-    let mut setup = Setup::new(16, SIZE, 1, 5);
+    let mut setup = Setup::new(17, SIZE, 1, 5);
     let (base, nan, infinity) = (plain(&setup, 3.0), f64::NAN, f64::INFINITY);
     let scale = |s| Gaussian { log_scale: DVec3::splat(s), ..base.clone() };
     let at = |mean| Gaussian { mean, ..base.clone() };
@@ -89,6 +89,8 @@ fn gaussians_out_of_range_leave_no_trace() {
         opacity(-infinity),
         opacity(nan),
         scale(nan),
+        // A determinant of 1e35, which its own square would not be.
+        scale(18.0),
         scale(40.0),
         scale(1000.0),
     ];
@@ -100,7 +102,7 @@ fn gaussians_out_of_range_leave_no_trace() {
     assert_eq!(gpu().read(&rendered.renderer.frame().counts).unwrap(), [0]);
     let gradients = rendered.backward(&vec![1.0; rendered.render.len()]);
     assert!(gradients.parameters.iter().all(|&g| g == 0.0));
-    assert_eq!(gradients.visit_counts, [Rendered::VISITS_BEFORE; 16]);
+    assert_eq!(gradients.visit_counts, [Rendered::VISITS_BEFORE; 17]);
 }
 
 #[test]
