@@ -77,6 +77,12 @@ DEFECTS = [
      "return y > 0.0 ? min(y, 1.0) : 0.0;", "return y;", "--test pseudo_gt tone_map"),
     ("guard: a loss that is not finite raises a flag", "shaders-glsl/loss/loss_log.comp",
      "if (!is_finite(first) || !is_finite(second)) word |= STATUS_NOT_FINITE;", "", "--test loss not_finite"),
+    ("guard: variances of SSIM are not negative", "shaders-glsl/loss/ssim_forward.comp",
+     "max(moments[SQUARES] - (a * a + b * b), 0.0)", "(moments[SQUARES] - (a * a + b * b))", "--test loss bright"),
+    ("guard: a constant depth has no correlation", "shaders-glsl/loss/depth_correlation.comp",
+     "deviation + EPSILON", "deviation", "--test loss constant_depth"),
+    ("guard: exposures stay within what centres them", "shaders-glsl/exposure/exposure_center.comp",
+     "clamp(x, -BOUND, BOUND) * QUANTA", "x * QUANTA", "--test view_exposures centred"),
 ]
 
 
