@@ -210,6 +210,7 @@ mod tests {
         let schedule = Schedule::paper();
         let steps: Vec<u64> = (0..=6_000).filter(|&step| schedule.densifies_at(step)).collect();
         assert_eq!((steps[0], steps[1], *steps.last().unwrap()), (600, 800, 4_800));
+        assert!(!Schedule { densify_after: 600, ..schedule }.densifies_at(600));
     }
 
     #[test]
