@@ -97,8 +97,7 @@ impl<'a> Reconstruction<'a> {
                 is_one_camera.as_ref(),
                 "--ImageReader.camera_model".as_ref(),
                 self.args.camera_model.as_ref(),
-                self.use_gpu(command, ["FeatureExtraction.use_gpu", "SiftExtraction.use_gpu"])
-                    .as_ref(),
+                self.named(command, ["FeatureExtraction", "SiftExtraction"], "use_gpu").as_ref(),
                 self.gpu(),
             ],
         )
@@ -106,9 +105,13 @@ impl<'a> Reconstruction<'a> {
 
     fn compare(&self) -> crate::Result<()> {
         let command = self.matcher.command();
-        let use_gpu = self.use_gpu(command, ["FeatureMatching.use_gpu", "SiftMatching.use_gpu"]);
+        let use_gpu = self.named(command, ["FeatureMatching", "SiftMatching"], "use_gpu");
+        // Few features survive the dark: once it is known how two photographs lie to each other, more of them find their twins.
+        // Without it a small set is placed by luck.
+        let guided = self.named(command, ["FeatureMatching", "SiftMatching"], "guided_matching");
         let database = ["--database_path".as_ref(), self.database.as_ref()];
-        self.colmap.run(command, &[&database[..], &[use_gpu.as_ref(), self.gpu()]].concat())
+        let options = [use_gpu.as_ref(), self.gpu(), guided.as_ref(), "1".as_ref()];
+        self.colmap.run(command, &[&database[..], &options].concat())
     }
 
     fn place(&self, photographs: &Path) -> crate::Result<()> {
@@ -131,10 +134,11 @@ impl<'a> Reconstruction<'a> {
         }
     }
 
-    /// The option by its name in this version of COLMAP: before 3.12 it was another.
-    fn use_gpu(&self, command: &str, [new, old]: [&str; 2]) -> String {
-        let is_new = self.colmap.helps_with(&[command, "-h"], new);
-        format!("--{}", if is_new { new } else { old })
+    /// The option by its name in this version of COLMAP: before 3.12 its group was another.
+    fn named(&self, command: &str, [new, old]: [&str; 2], option: &str) -> String {
+        let own = format!("{new}.{option}");
+        let is_new = self.colmap.helps_with(&[command, "-h"], &own);
+        if is_new { format!("--{own}") } else { format!("--{old}.{option}") }
     }
 
     fn gpu(&self) -> &'static OsStr {
