@@ -211,7 +211,7 @@ fn assert_adam_stays_with_f64(steps: u64) {
         if moved == 0.0 {
             continue;
         }
-        println!(
+        eprintln!(
             "plane {plane}: moved by {moved:.2e}, off by {:.3} units a step",
             error / unit / steps as f64
         );

@@ -151,7 +151,7 @@ fn a_tiny_scene_trains_to_the_ledger_of_this_driver() {
 }
 
 /// Devices round differently; Adam, which divides by how large gradients are, lifts that. Of lavapipe of two versions and
-/// SwiftShader the losses of 60 steps differ by up to 8e-4, the scores by up to .007 dB.
+/// `SwiftShader` the losses of 60 steps differ by up to 8e-4, the scores by up to .007 dB.
 #[test]
 fn every_device_trains_a_tiny_scene_to_the_same_losses_and_score() {
     const FIRST: f64 = 1e-5;
