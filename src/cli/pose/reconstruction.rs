@@ -7,6 +7,8 @@ use anyhow::Result;
 
 use super::tool::Tool;
 use super::{PoseArgs, create, lifted};
+use crate::dataset::Dataset;
+use crate::image::files::photographs_in;
 
 /// Which photographs COLMAP compares.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -42,8 +44,14 @@ pub(super) struct Reconstruction<'a> {
     glomap: Option<Tool<'a>>,
     args: &'a PoseArgs,
     matcher: Matcher,
+    is_guided: bool,
     database: PathBuf,
     models: PathBuf,
+}
+
+/// How many photographs the largest of some models places.
+fn placed_in(models: &Path) -> Result<usize> {
+    Ok(Dataset::largest_model(models)?.map_or(0, |(_, placed)| placed.len()))
 }
 
 impl<'a> Reconstruction<'a> {
@@ -62,14 +70,37 @@ impl<'a> Reconstruction<'a> {
             is_apart.then(|| colmap.beside(&args.glomap, "glomap").found("")).transpose()?;
         let (database, models) = (work.join("database.db"), work.join("sparse"));
         create(&models)?;
-        Ok(Self { colmap, glomap, args, matcher, database, models })
+        Ok(Self { colmap, glomap, args, matcher, is_guided: false, database, models })
     }
 
-    /// The folder that holds the models, a folder each; none where the photographs show too little.
+    /// The folder that holds the models, a folder each; none where the photographs show too little. Where one in ten or more is
+    /// left without a camera, they are compared once more, guided: what a small set comes to is luck otherwise, and for a large
+    /// one it would take twice as long.
     ///
     /// # Errors
     /// A program fails.
-    pub(super) fn models(self, lifted: &Path, say: impl Fn(&str) -> Result<()>) -> Result<PathBuf> {
+    pub(super) fn models(
+        mut self,
+        lifted: &Path,
+        say: impl Fn(&str) -> Result<()>,
+    ) -> Result<PathBuf> {
+        self.attempt(lifted, &say)?;
+        let all = photographs_in(lifted)?.len();
+        let placed = placed_in(&self.models)?;
+        if 10 * placed >= 9 * all {
+            return Ok(self.models);
+        }
+        say(&format!("{placed} of {all} have a camera: compared once more, guided"))?;
+        let first = self.models.clone();
+        self.is_guided = true;
+        self.database.set_file_name("guided.db");
+        self.models.set_file_name("guided");
+        create(&self.models)?;
+        self.attempt(lifted, &say)?;
+        Ok(if placed_in(&self.models)? > placed { self.models } else { first })
+    }
+
+    fn attempt(&self, lifted: &Path, say: &impl Fn(&str) -> Result<()>) -> Result<()> {
         self.extract(lifted)?;
         say("features extracted")?;
         self.compare()?;
@@ -79,8 +110,7 @@ impl<'a> Reconstruction<'a> {
             Err(_) if NOTHING.iter().any(|words| self.colmap.said(words)) => {}
             outcome => outcome?,
         }
-        say("cameras placed")?;
-        Ok(self.models)
+        say("cameras placed")
     }
 
     fn extract(&self, photographs: &Path) -> crate::Result<()> {
@@ -106,12 +136,13 @@ impl<'a> Reconstruction<'a> {
     fn compare(&self) -> crate::Result<()> {
         let command = self.matcher.command();
         let use_gpu = self.named(command, ["FeatureMatching", "SiftMatching"], "use_gpu");
-        // Few features survive the dark: once it is known how two photographs lie to each other, more of them find their twins.
-        // Without it a small set is placed by luck.
+        // Once it is known how two photographs lie to each other, more of their features find their twins.
         let guided = self.named(command, ["FeatureMatching", "SiftMatching"], "guided_matching");
-        let database = ["--database_path".as_ref(), self.database.as_ref()];
-        let options = [use_gpu.as_ref(), self.gpu(), guided.as_ref(), "1".as_ref()];
-        self.colmap.run(command, &[&database[..], &options].concat())
+        let guided: [&OsStr; 2] = [guided.as_ref(), "1".as_ref()];
+        let mut options = vec!["--database_path".as_ref(), self.database.as_ref()];
+        options.extend([use_gpu.as_ref(), self.gpu()]);
+        options.extend(guided.into_iter().filter(|_| self.is_guided));
+        self.colmap.run(command, &options)
     }
 
     fn place(&self, photographs: &Path) -> crate::Result<()> {
