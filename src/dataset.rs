@@ -69,8 +69,11 @@ pub struct View {
     pub image: Option<Image>,
     /// Where it is read from, if its own size is larger or it is not kept.
     pub original: Option<Original>,
-    /// The normal-light photograph to score against, of the camera's size; test views only.
+    /// The normal-light photograph to score against, of the camera's size; test views only. As with the photograph, it is
+    /// here or read anew ([`View::loaded_reference`]).
     pub reference: Option<Image>,
+    /// Where it is read from, if it is not kept.
+    pub reference_file: Option<Original>,
     /// Which of its pixels count, of the camera's size; none where all do.
     pub mask: Option<Mask>,
     /// Depth from elsewhere, (H, W) of the camera's size, in units and with an offset of its own; larger is farther.
@@ -79,6 +82,21 @@ pub struct View {
 }
 
 impl View {
+    /// One that has a camera, a photograph or none, and nothing else.
+    pub fn new(name: &str, split: Split, camera: Camera, image: Option<Image>) -> Self {
+        Self {
+            name: name.to_owned(),
+            split,
+            camera,
+            image,
+            original: None,
+            reference: None,
+            reference_file: None,
+            mask: None,
+            depth: None,
+        }
+    }
+
     /// Whether the view is trained on.
     pub fn is_train(&self) -> bool {
         self.split == Split::Train
@@ -110,15 +128,36 @@ impl View {
         self.image.is_some() || self.original.is_some()
     }
 
+    /// Whether there is a reference image, kept or to be read anew.
+    pub fn has_reference(&self) -> bool {
+        self.reference.is_some() || self.reference_file.is_some()
+    }
+
     /// The photograph at the size of the view's camera; none where the view has none.
     ///
     /// # Errors
     /// [`Error::Input`] where it was not kept and its file can no longer be read.
     pub fn loaded(&self) -> Result<Option<Cow<'_, Image>>> {
+        self.kept_or_read(self.image.as_ref(), self.original.as_ref())
+    }
+
+    /// The reference image, of the same size; none where the view has none.
+    ///
+    /// # Errors
+    /// As [`View::loaded`].
+    pub fn loaded_reference(&self) -> Result<Option<Cow<'_, Image>>> {
+        self.kept_or_read(self.reference.as_ref(), self.reference_file.as_ref())
+    }
+
+    fn kept_or_read<'a>(
+        &self,
+        kept: Option<&'a Image>,
+        file: Option<&Original>,
+    ) -> Result<Option<Cow<'a, Image>>> {
         let size = (self.camera.width, self.camera.height);
-        match (&self.image, &self.original) {
+        match (kept, file) {
             (Some(image), _) => Ok(Some(Cow::Borrowed(image))),
-            (None, Some(original)) => original.load_at(size).map(Cow::Owned).map(Some),
+            (None, Some(file)) => file.load_at(size).map(Cow::Owned).map(Some),
             (None, None) => Ok(None),
         }
     }

@@ -18,7 +18,7 @@ use crate::metrics::{self, Scores};
 use crate::render::{RenderOptions, RenderSettings, Renderer};
 use crate::scene::{Feature, Features, Gaussians};
 use crate::tone::{ToneCurve, ToneSettings};
-use crate::train::{Networks, Rendered, TrainConfig, targets_of_test_views};
+use crate::train::{Networks, Rendered, TestTargets, TrainConfig};
 use crate::{Error, Result};
 
 /// What test views are scored against.
@@ -59,12 +59,14 @@ impl Against {
 }
 
 /// What the test views of a dataset are scored against.
-#[derive(Clone, Debug, Default)]
+#[derive(Debug, Default)]
 pub struct Yardstick {
     /// Which kind that is.
     pub against: Against,
-    /// By the view's name, where it is no reference image.
-    targets: BTreeMap<String, Image>,
+    /// What makes them, where they are no reference images.
+    targets: Option<TestTargets>,
+    /// What it made, by view, of photographs that are kept as well.
+    made: BTreeMap<String, Image>,
 }
 
 impl Yardstick {
@@ -75,16 +77,14 @@ impl Yardstick {
     /// Every photograph is as good as black, one can no longer be read, or the device is out of memory or lost.
     pub fn of(gpu: &Gpu, tone: &ToneSettings, dataset: &Dataset) -> Result<Self> {
         let against = Self::kind(tone, dataset);
-        let targets = match against {
-            Against::References => BTreeMap::new(),
-            _ => targets_of_test_views(gpu, tone, dataset)?.into_iter().collect(),
-        };
-        Ok(Self { against, targets })
+        let is_made = against != Against::References;
+        let targets = is_made.then(|| TestTargets::new(gpu, tone, dataset)).transpose()?;
+        Ok(Self { against, targets, made: BTreeMap::new() })
     }
 
     /// Which kind it will be.
     pub fn kind(tone: &ToneSettings, dataset: &Dataset) -> Against {
-        let has_references = dataset.test_views().any(|view| view.reference.is_some());
+        let has_references = dataset.test_views().any(View::has_reference);
         let has_photographs = dataset.test_views().any(View::has_photograph);
         match tone.curve {
             _ if has_references || !has_photographs => Against::References,
@@ -95,18 +95,29 @@ impl Yardstick {
 
     /// How many of the dataset's test views it has something for.
     pub fn view_count(&self, dataset: &Dataset) -> usize {
-        dataset.test_views().filter(|view| self.target(view).is_some()).count()
+        let has_target = match self.against {
+            Against::References => View::has_reference,
+            _ => View::has_photograph,
+        };
+        dataset.test_views().filter(|view| has_target(view)).count()
     }
 
-    fn target<'a>(&'a self, view: &'a View) -> Option<&'a Image> {
-        match self.against {
-            Against::References => view.reference.as_ref(),
-            _ => self.targets.get(&view.name),
+    /// What a view is held to, in 8 bits.
+    fn target(&mut self, view: &View) -> Result<Option<Image>> {
+        let Some(targets) = &mut self.targets else {
+            return Ok(view.loaded_reference()?.map(|reference| quantized(&reference)));
+        };
+        if let Some(made) = self.made.get(&view.name) {
+            return Ok(Some(made.clone()));
         }
+        let target = targets.of(view)?.map(|target| quantized(&target));
+        let kept = target.as_ref().filter(|_| view.image.is_some());
+        self.made.extend(kept.map(|target| (view.name.clone(), target.clone())));
+        Ok(target)
     }
 }
 
-/// What a test view scores, and the pictures behind it.
+/// What a test view scores.
 #[derive(Clone, Debug)]
 pub struct ViewScore {
     /// The view's name.
@@ -115,12 +126,60 @@ pub struct ViewScore {
     pub scores: Scores,
     /// Those of R_0, where the model has a denoiser.
     pub r0: Option<Scores>,
-    /// What was scored, in 8 bits as it is saved.
-    pub render: Image,
-    /// What it was scored against, in 8 bits as it is saved.
-    pub reference: Image,
-    /// What that is.
+    /// Those of [`Compared::aligned`], where it was asked.
+    pub aligned: Option<Scores>,
+    /// What it was scored against.
     pub against: Against,
+}
+
+/// The two pictures that a view's scores compare, in 8 bits as they are saved.
+#[derive(Debug)]
+pub struct Compared<'a> {
+    /// The view.
+    pub view: &'a View,
+    /// What the model shows of it.
+    pub render: Image,
+    /// What it should be.
+    pub target: Image,
+}
+
+impl Compared<'_> {
+    /// LPIPS over the pixels that count.
+    ///
+    /// # Errors
+    /// The view is too small for it, or the device is out of memory or lost.
+    pub fn lpips(&self, gpu: &Gpu, lpips: &Lpips) -> Result<f64> {
+        let Self { view, render, target } = self;
+        let mask = view.mask.as_ref().map(|mask| mask.resized(render.width, render.height));
+        lpips.distance(gpu, &metrics::counted(render, target, mask.as_deref()), target)
+    }
+
+    /// The scores behind the gain and bias of each channel that bring the render nearest to what it should be.
+    ///
+    /// # Errors
+    /// None for what [`score_by`] shows.
+    pub fn aligned(&self) -> Result<Scores> {
+        let affine = Affine::least_squares(&self.render, &self.target)?;
+        Scores::of(&quantized(&affine.applied(&self.render)), &self.target)
+    }
+
+    /// Writes `renders/NAME.png` and `references/NAME.png` below `folder`; what is no reference image, to `targets`.
+    ///
+    /// # Errors
+    /// The folder cannot be written.
+    pub fn save(&self, folder: &Path, against: Against) -> Result<()> {
+        let targets = match against {
+            Against::References => "references",
+            _ => "targets",
+        };
+        for (name, image) in [("renders", &self.render), (targets, &self.target)] {
+            let folder = folder.join(name);
+            std::fs::create_dir_all(&folder)
+                .map_err(|error| Error::output(&folder, format!("cannot be made ({error})")))?;
+            image.save_png8(folder.join(format!("{}.png", self.view.name)))?;
+        }
+        Ok(())
+    }
 }
 
 /// A finished model on the device, ready to be rendered.
@@ -288,57 +347,42 @@ impl FromStr for Layer {
 /// bits first, so that what is scored is what is saved.
 ///
 /// # Errors
-/// Those of `render`.
+/// Those of `render`; a reference image that is not kept can no longer be read.
 pub fn score(
     dataset: &Dataset,
     render: impl FnMut(&View) -> Result<Rendered>,
 ) -> Result<Vec<ViewScore>> {
-    score_by(&Yardstick::default(), dataset, render)
+    score_by(&mut Yardstick::default(), dataset, render, |_, _| Ok(()))
 }
 
-/// As [`score`], by any yardstick.
+/// As [`score`], by any yardstick; `look` sees the pictures of each view, which are gone behind it.
 ///
 /// # Errors
-/// As there.
+/// As there, and those of `look`; a photograph that is not kept can no longer be read, or the device is out of memory or lost.
 pub fn score_by(
-    yardstick: &Yardstick,
+    yardstick: &mut Yardstick,
     dataset: &Dataset,
     mut render: impl FnMut(&View) -> Result<Rendered>,
+    mut look: impl FnMut(&mut ViewScore, &Compared<'_>) -> Result<()>,
 ) -> Result<Vec<ViewScore>> {
     let (mut scored, against) = (vec![], yardstick.against);
     for view in dataset.test_views() {
-        let Some(reference) = yardstick.target(view) else { continue };
-        let (rendered, reference) = (render(view)?, quantized(reference));
-        let render = quantized(rendered.output());
-        let mask = view.mask.as_ref();
-        let scores = Scores::of_counted(&render, &reference, mask)?;
-        let r0 = rendered.denoised.is_some();
-        let of_r0 = || Scores::of_counted(&quantized(&rendered.colors), &reference, mask);
-        let r0 = r0.then(of_r0).transpose()?;
-        let name = view.name.clone();
-        scored.push(ViewScore { name, scores, r0, render, reference, against });
+        let Some(target) = yardstick.target(view)? else { continue };
+        let rendered = render(view)?;
+        let compared = Compared { view, render: quantized(rendered.output()), target };
+        let of = |render: &Image| Scores::of_counted(render, &compared.target, view.mask.as_ref());
+        let has_denoiser = rendered.denoised.is_some();
+        let mut score = ViewScore {
+            name: view.name.clone(),
+            scores: of(&compared.render)?,
+            r0: has_denoiser.then(|| of(&quantized(&rendered.colors))).transpose()?,
+            aligned: None,
+            against,
+        };
+        look(&mut score, &compared)?;
+        scored.push(score);
     }
     Ok(scored)
-}
-
-/// Adds LPIPS to the scores of what was shown, over the pixels that count.
-///
-/// # Errors
-/// A view is too small for it, or the device is out of memory or lost.
-pub fn add_lpips(
-    scored: &mut [ViewScore],
-    dataset: &Dataset,
-    gpu: &Gpu,
-    lpips: &Lpips,
-) -> Result<()> {
-    for ViewScore { name, scores, render, reference, .. } in scored {
-        let view = dataset.views.iter().find(|view| view.name == *name);
-        let mask = view.and_then(|view| view.mask.as_ref());
-        let mask = mask.map(|mask| mask.resized(render.width, render.height).into_owned());
-        let shown = metrics::counted(render, reference, mask.as_ref());
-        scores.lpips = Some(lpips.distance(gpu, &shown, reference)?);
-    }
-    Ok(())
 }
 
 /// `metrics.json`: means and views, and what the run took; null where that, or a mean, is not known.
@@ -396,26 +440,17 @@ pub fn add_reference(metrics: &mut Value, tone: &ToneSettings) {
 /// theirs was trained on: at the neutral one, the mean of the training views. Beside it stand the scores behind the affine
 /// of each channel that brings each render nearest to its reference image, which is what others report; they know the
 /// reference and compare with nothing else here.
-///
-/// # Errors
-/// None for what [`score`] gives.
-pub fn add_exposure(metrics: &mut Value, scored: &[ViewScore]) -> Result<()> {
-    let aligned = |view: &ViewScore| -> Result<(String, Scores)> {
-        let affine = Affine::least_squares(&view.render, &view.reference)?;
-        let render = quantized(&affine.applied(&view.render));
-        Ok((view.name.clone(), Scores::of(&render, &view.reference)?))
-    };
-    let aligned = scored.iter().map(aligned).collect::<Result<Vec<_>>>()?;
-    let scores: Vec<Scores> = aligned.iter().map(|(_, scores)| *scores).collect();
+pub fn add_exposure(metrics: &mut Value, scored: &[ViewScore]) {
+    let aligned = || scored.iter().filter_map(|view| Some((&view.name, view.aligned?)));
+    let scores: Vec<Scores> = aligned().map(|(_, scores)| scores).collect();
     let views: Map<String, Value> =
-        aligned.into_iter().map(|(name, scores)| (name, entry(&scores, None))).collect();
+        aligned().map(|(name, scores)| (name.clone(), entry(&scores, None))).collect();
     metrics["exposure"] = json!("neutral: the mean of the training views'");
     metrics["aligned_with_reference"] = json!({
         "what": "behind the least-squares gain and bias of each channel of each test view against its reference image",
         "mean": Scores::mean(&scores).map(|mean| entry(&mean, None)),
         "views": views,
     });
-    Ok(())
 }
 
 /// The mean scores, and those of R_0 where the model has a denoiser.
@@ -423,29 +458,6 @@ pub fn means(scored: &[ViewScore]) -> (Option<Scores>, Option<Scores>) {
     let all: Vec<Scores> = scored.iter().map(|view| view.scores).collect();
     let r0: Vec<Scores> = scored.iter().filter_map(|view| view.r0).collect();
     (Scores::mean(&all), Scores::mean(&r0))
-}
-
-/// Writes `renders/NAME.png` and `references/NAME.png` below `folder`; what is no reference image, to `targets`.
-///
-/// # Errors
-/// The folder cannot be written.
-pub fn save_images(folder: &Path, scored: &[ViewScore]) -> Result<()> {
-    let against = match scored.first().map(|view| view.against) {
-        None | Some(Against::References) => "references",
-        Some(_) => "targets",
-    };
-    for (name, image) in [
-        ("renders", (|view| &view.render) as fn(&ViewScore) -> &Image),
-        (against, |view| &view.reference),
-    ] {
-        let folder = folder.join(name);
-        std::fs::create_dir_all(&folder)
-            .map_err(|error| Error::output(&folder, format!("cannot be made ({error})")))?;
-        for view in scored {
-            image(view).save_png8(folder.join(format!("{}.png", view.name)))?;
-        }
-    }
-    Ok(())
 }
 
 /// A score as JSON, that of R_0 in it; infinite PSNR, of equal images, has no JSON number and is null.
@@ -465,7 +477,7 @@ fn entry(scores: &Scores, r0: Option<&Scores>) -> Value {
 }
 
 /// Clamped to [0, 1] and rounded to multiples of 1/255. A NaN becomes 0.
-fn quantized(image: &Image) -> Image {
+pub(crate) fn quantized(image: &Image) -> Image {
     let data = image.data.iter().map(|&v| (v.clamp(0.0, 1.0) * 255.0).round().max(0.0) / 255.0);
     Image { width: image.width, height: image.height, data: data.collect() }
 }

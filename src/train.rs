@@ -46,7 +46,7 @@ pub use config::{Background, CheckConfig, DensityConfig, TrainConfig};
 use ends::Ends;
 pub use exposures::{ExposureConfig, Learning};
 use held_out::HeldOut;
-pub use held_out::{NotFinite, StopConfig, targets_of_test_views};
+pub use held_out::{NotFinite, StopConfig, TestTargets};
 use masks::Masks;
 pub use memory::MemoryEstimate;
 use model::Model;

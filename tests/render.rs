@@ -89,7 +89,7 @@ fn gaussians_out_of_range_leave_no_trace() {
         opacity(-infinity),
         opacity(nan),
         scale(nan),
-        // A determinant of 1e35, which its own square would not be.
+        // A determinant of 1e35: finite, and its square is not.
         scale(18.0),
         scale(40.0),
         scale(1000.0),

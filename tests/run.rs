@@ -371,6 +371,31 @@ fn whatever_the_cache_leaves_on_disk_the_model_has_the_same_bits() {
     refused(&train(folder.path(), "no", "--cache much"), 2, &["much", "4G"]);
 }
 
+/// Reference images, and the targets where there are none, are read and made anew for every score.
+#[test]
+fn whatever_the_cache_leaves_on_disk_views_score_the_same() {
+    let folder = folder();
+    let path = |name: &str| folder.path().join(name);
+    let scores = |out: &str, cache: &str| {
+        let options = "--steps 6 --eval-every 3 --progress none --model plain --overwrite";
+        succeed(&train(folder.path(), out, &format!("{options} --cache {cache}")));
+        let trained = json(path(out).join("metrics.json"))["views"].clone();
+        let printed = succeed(&format!("eval {} --json --save-images", path(out).display()));
+        let scored: Value = serde_json::from_str(&printed).unwrap();
+        assert_eq!(scored["views"], trained);
+        let on_the_way = load_progress(&path(out));
+        (trained, on_the_way.iter().map(|at| (at.step, at.psnr, at.ssim)).collect::<Vec<_>>())
+    };
+    let against_references = scores("all", "1G");
+    assert_eq!(against_references, scores("none", "0"));
+    assert_eq!(file_count(path("none/eval/references")), 2);
+    fs::remove_dir_all(path("set/high")).unwrap();
+    let against_targets = scores("all", "1G");
+    assert_eq!(against_targets, scores("none", "0"));
+    assert!(against_targets != against_references);
+    assert_eq!(file_count(path("none/eval/targets")), 2);
+}
+
 #[test]
 fn views_that_a_device_cannot_train_on_are_refused_from_their_headers_with_the_size_that_it_can() {
     let bindable = nightsplat::gpu::testing::gpu().properties().max_storage_buffer_range;

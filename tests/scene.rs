@@ -282,16 +282,7 @@ mod colors {
     use super::*;
 
     fn view(split: Split, position: DVec3) -> View {
-        View {
-            name: String::new(),
-            split,
-            camera: camera(position),
-            image: None,
-            original: None,
-            reference: None,
-            depth: None,
-            mask: None,
-        }
+        View::new("", split, camera(position), None)
     }
 
     fn point(position: DVec3, views: &[u32]) -> Point {

@@ -81,7 +81,7 @@ pub fn run(args: &AblateArgs) -> Result<()> {
         let held = if args.resume { HeldRun::Resume } else { held_unless(args.overwrite) };
         let session = Session { held, requests: requests.clone(), ..Session::default() };
         let trained = progress::train_in(&gpu, config, &dataset, &out, &session)?;
-        runs.push(Run::new(title.clone(), trained));
+        runs.push(Run::new(title.clone(), trained, &dataset)?);
     }
     let dark = eval::score(&dataset, |view| {
         // A test view without its dark photograph shows nothing.
@@ -89,7 +89,6 @@ pub fn run(args: &AblateArgs) -> Result<()> {
         Ok(view.loaded()?.map_or_else(black, Cow::into_owned).into())
     })?;
     let table = comparison::score_table("model", &dark, &runs);
-    let test_views = dataset.test_views().filter(|view| view.reference.is_some());
     let epoch = dataset.train_views().count();
     let mut page = Report {
         title: format!("What each part buys: {}", dataset.root.display()),
@@ -101,9 +100,9 @@ pub fn run(args: &AblateArgs) -> Result<()> {
             gpu.properties().name
         )],
         plots: vec![plot("step", "loss", &comparison::loss_series(&runs, epoch))],
-        comparisons: test_views.map(|view| comparison::of_view(view, &dark, &runs)).collect(),
-        facts: vec![],
+        comparisons: comparison::of_views(&dataset, &dark, &runs)?,
         tables: vec![table.clone()],
+        ..Report::default()
     };
     let known = config.tone.knows_references().map(|known| eval::with_reference(&known));
     let against = Yardstick::kind(&config.tone, &dataset).label();

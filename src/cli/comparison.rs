@@ -1,6 +1,9 @@
 //! Runs of one dataset side by side: the tables, curves and pictures of `demo` and `ablate`.
 
-use crate::dataset::View;
+use std::collections::BTreeMap;
+
+use crate::Result;
+use crate::dataset::{Dataset, View};
 use crate::eval::{self, ViewScore};
 use crate::image::Image;
 use crate::metrics::Scores;
@@ -11,6 +14,8 @@ use crate::run::{Spent, Trained};
 pub(super) struct Run {
     title: String,
     scored: Vec<ViewScore>,
+    /// What it shows of those that have a reference image, by name.
+    renders: BTreeMap<String, Image>,
     gaussians: usize,
     spent: Spent,
     /// Of every step.
@@ -18,9 +23,17 @@ pub(super) struct Run {
 }
 
 impl Run {
-    pub(super) fn new(title: String, trained: Trained) -> Self {
-        let Trained { trainer, scored, losses, spent } = trained;
-        Self { title, scored, gaussians: trainer.gaussian_count(), losses, spent }
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub(super) fn new(title: String, trained: Trained, dataset: &Dataset) -> Result<Self> {
+        let Trained { mut trainer, scored, losses, spent } = trained;
+        let mut renders = BTreeMap::new();
+        for view in pictured(dataset) {
+            let render = trainer.render(&view.camera)?;
+            renders.insert(view.name.clone(), render.output().clone());
+        }
+        let gaussians = trainer.gaussian_count();
+        Ok(Self { title, scored, renders, gaussians, spent, losses })
     }
 }
 
@@ -81,21 +94,39 @@ pub(super) fn loss_series(runs: &[Run], epoch: usize) -> Vec<Series> {
     runs.iter().map(of_run).collect()
 }
 
-/// One test view: what came in, what each run made of it, and what it should be.
-pub(super) fn of_view(view: &View, dark: &[ViewScore], runs: &[Run]) -> Comparison {
-    let picture = |caption: &str, scored: &[ViewScore]| {
+/// The test views that are shown.
+fn pictured(dataset: &Dataset) -> impl Iterator<Item = &View> {
+    dataset.test_views().filter(|view| view.has_reference())
+}
+
+/// Every test view that has a reference image: what came in, what each run made of it, and what it should be.
+///
+/// # Errors
+/// A photograph that is not kept can no longer be read.
+pub(super) fn of_views(
+    dataset: &Dataset,
+    dark: &[ViewScore],
+    runs: &[Run],
+) -> Result<Vec<Comparison>> {
+    pictured(dataset).map(|view| of_view(view, dark, runs)).collect()
+}
+
+fn of_view(view: &View, dark: &[ViewScore], runs: &[Run]) -> Result<Comparison> {
+    let picture = |caption: &str, scored: &[ViewScore], image: &Image| {
         let scored = scored.iter().find(|scored| scored.name == view.name)?;
         let Scores { psnr, ssim, .. } = scored.scores;
         let scores = format!("{psnr:.2} dB, SSIM {ssim:.3}");
-        Some(Picture { caption: caption.to_owned(), scores, image: scored.render.clone() })
+        Some(Picture { caption: caption.to_owned(), scores, image: image.clone() })
     };
-    let reference = |image: &Image| Picture {
+    let photograph = view.loaded()?;
+    let photograph = photograph.and_then(|image| picture("dark photograph", dark, &image));
+    let mut pictures: Vec<Picture> = photograph.into_iter().collect();
+    let of_run = |run: &Run| picture(&run.title, &run.scored, run.renders.get(&view.name)?);
+    pictures.extend(runs.iter().filter_map(of_run));
+    pictures.extend(view.loaded_reference()?.map(|image| Picture {
         caption: "normal-light reference".to_owned(),
         scores: String::new(),
-        image: image.clone(),
-    };
-    let mut pictures: Vec<Picture> = picture("dark photograph", dark).into_iter().collect();
-    pictures.extend(runs.iter().filter_map(|run| picture(&run.title, &run.scored)));
-    pictures.extend(view.reference.as_ref().map(reference));
-    Comparison { title: format!("Test view {}", view.name), pictures }
+        image: image.into_owned(),
+    }));
+    Ok(Comparison { title: format!("Test view {}", view.name), pictures })
 }

@@ -61,7 +61,7 @@ pub fn run(args: &DemoArgs) -> Result<()> {
     let dark = dark_scores(&dataset)?;
     let page = args.out.join("index.html");
     let luminances = luminances(&gpu, &dataset)?;
-    write_whole(&page, report(&gpu, &dataset, &dark, &runs, luminances).html().as_bytes())?;
+    write_whole(&page, report(&gpu, &dataset, &dark, &runs, luminances)?.html().as_bytes())?;
     let mut out = std::io::stdout().lock();
     let table = table::of(&comparison::score_table("target", &dark, &runs));
     write!(out, "{table}\n{}\n", page.display())?;
@@ -105,7 +105,7 @@ fn train_with(curve: ToneCurve, gpu: &Gpu, dataset: &Dataset, out: &Path) -> cra
     let config = config(curve, dataset, gpu);
     let folder = out.join(curve.name());
     let trained = progress::train(gpu, &config, dataset, &folder, HeldRun::Replace)?;
-    Ok(Run::new(title(curve), trained))
+    Run::new(title(curve), trained, dataset)
 }
 
 /// What the dark photographs themselves score: the least that a model must beat.
@@ -130,8 +130,10 @@ fn title(curve: ToneCurve) -> String {
 
 /// How the luminance of the photographs with a reference image is distributed, before and after each curve.
 fn luminances(gpu: &Gpu, dataset: &Dataset) -> crate::Result<String> {
-    let pairs: Vec<_> =
-        dataset.views.iter().filter_map(|v| v.image.as_ref().zip(v.reference.as_ref())).collect();
+    let mut pairs = vec![];
+    for view in &dataset.views {
+        pairs.extend(view.loaded()?.zip(view.loaded_reference()?));
+    }
     let mut photographs = Distribution::new("photograph");
     let mut references = Distribution::new("reference");
     for (photograph, reference) in &pairs {
@@ -160,11 +162,10 @@ fn report(
     dark: &[ViewScore],
     runs: &[Run],
     luminances: String,
-) -> Report {
+) -> crate::Result<Report> {
     let train_views = dataset.train_views().count();
     let size = dataset.views.first().map_or([0; 2], |view| [view.camera.width, view.camera.height]);
-    let test_views = dataset.test_views().filter(|view| view.reference.is_some());
-    Report {
+    Ok(Report {
         title: "3D Gaussian Splatting from dark photographs".to_owned(),
         intro: vec![
             format!(
@@ -177,9 +178,9 @@ fn report(
             ),
             format!("{STEPS} steps each, on {}.", gpu.properties().name),
         ],
-        facts: vec![],
         tables: vec![comparison::score_table("target", dark, runs)],
         plots: vec![luminances],
-        comparisons: test_views.map(|view| comparison::of_view(view, dark, runs)).collect(),
-    }
+        comparisons: comparison::of_views(dataset, dark, runs)?,
+        ..Report::default()
+    })
 }

@@ -122,7 +122,9 @@ fn text(device: &str, dataset: &Dataset, diagnosis: &Diagnosis, plan: &Plan) -> 
     );
     text += &table::aligned(&rows(diagnosis));
     text.push('\n');
-    text += &scene_text(&diagnosis.scene);
+    for (name, figures) in scene_facts(&diagnosis.scene) {
+        text += &format!("{name:<12}{figures}\n");
+    }
     for remark in remarks {
         text += &format!("note: {remark}\n");
     }
@@ -194,35 +196,39 @@ fn values(view: &ViewDiagnosis) -> [Option<f64>; 13] {
     ]
 }
 
-fn scene_text(scene: &SceneDiagnosis) -> String {
+/// What was measured of all views together: a name and figures in each row.
+fn scene_facts(scene: &SceneDiagnosis) -> [(&'static str, String); 5] {
     let noise = match scene.noise {
         Some(Noise { gain, read }) => format!(
-            "noise       gain {gain:.2e}, read {read:.2e} of white in linear light; {:.3} in a target, averaged over its views",
+            "gain {gain:.2e}, read {read:.2e} of white in linear light; {:.3} in a target, averaged over its views",
             scene.target_noise
         ),
-        None => "noise       not measurable: no part of the photographs is flat and not cut off"
-            .to_owned(),
+        None => "not measurable: no part of the photographs is flat and not cut off".to_owned(),
     };
+    let brightness = format!(
+        "mean {:.4}, p10 {:.4}, p90 {:.4}, cubic mean {:.4}; lift {:.1}, {:.0} times too little light",
+        scene.mean_luminance, scene.p10, scene.p90, scene.cubic_mean, scene.lift, scene.darkening
+    );
+    let exposure = format!(
+        "spread {:.2} stops between the views, light uneven by {:.1} stops within",
+        scene.exposure_spread, scene.unevenness
+    );
     let blur = scene.blur.map_or_else(|| "-".to_owned(), |blur| format!("{blur:.1} pixels"));
-    format!(
-        "brightness  mean {:.4}, p10 {:.4}, p90 {:.4}, cubic mean {:.4}; lift {:.1}, {:.0} times too little light\n\
-         exposure    spread {:.2} stops between the views, light uneven by {:.1} stops within\n\
-         {noise}\n\
-         detail      blur {blur}, {:.0} code values in use, {:.2} % white, {:.1} % black\n\
-         cameras     a place is seen by {:.0} views, overlap {:.2}, {} points\n",
-        scene.mean_luminance,
-        scene.p10,
-        scene.p90,
-        scene.cubic_mean,
-        scene.lift,
-        scene.darkening,
-        scene.exposure_spread,
-        scene.unevenness,
+    let detail = format!(
+        "blur {blur}, {:.0} code values in use, {:.2} % white, {:.1} % black",
         scene.code_values,
         100.0 * scene.clipped_fraction,
-        100.0 * scene.zero_fraction,
-        scene.views_per_point,
-        scene.overlap,
-        scene.points
-    )
+        100.0 * scene.zero_fraction
+    );
+    let cameras = format!(
+        "a place is seen by {:.0} views, overlap {:.2}, {} points",
+        scene.views_per_point, scene.overlap, scene.points
+    );
+    [
+        ("brightness", brightness),
+        ("exposure", exposure),
+        ("noise", noise),
+        ("detail", detail),
+        ("cameras", cameras),
+    ]
 }

@@ -7,6 +7,7 @@ use anyhow::Result;
 
 use super::finished_run::FinishedRun;
 use super::{progress_bar, table};
+use crate::dataset::View;
 use crate::eval::{self, ViewScore, Yardstick};
 use crate::gpu::DeviceChoice;
 use crate::lpips::Lpips;
@@ -51,24 +52,30 @@ pub fn run(args: &EvalArgs) -> Result<()> {
     let FinishedRun { gpu, config, dataset, gaussian_count, mut player } =
         FinishedRun::open(&args.run, args.dataset.as_deref(), args.device.as_ref())?;
     let lpips = args.lpips.as_ref().map(|weights| Lpips::load(&gpu, weights)).transpose()?;
-    let yardstick = Yardstick::of(&gpu, &config.tone, &dataset)?;
+    let mut yardstick = Yardstick::of(&gpu, &config.tone, &dataset)?;
     let bar = progress_bar(yardstick.view_count(&dataset));
-    let mut scored = eval::score_by(&yardstick, &dataset, |view| {
+    let render = |view: &View| {
         bar.set_message(printable(&view.name).into_owned());
-        player.render(view).inspect(|_| bar.inc(1))
+        player.render(view)
+    };
+    let scored = eval::score_by(&mut yardstick, &dataset, render, |score, compared| {
+        let lpips = lpips.as_ref().map(|lpips| compared.lpips(&gpu, lpips));
+        score.scores.lpips = lpips.transpose()?;
+        if config.exposure.learn == Learning::On {
+            score.aligned = Some(compared.aligned()?);
+        }
+        if args.save_images {
+            compared.save(&args.run.join("eval"), score.against)?;
+        }
+        bar.inc(1);
+        Ok(())
     })?;
     bar.finish_and_clear();
-    if let Some(lpips) = &lpips {
-        eval::add_lpips(&mut scored, &dataset, &gpu, lpips)?;
-    }
     if scored.is_empty() {
         let root = dataset.root.display();
         tracing::warn!(
             "{root}: no test view has a reference image or a photograph, so there is nothing to score"
         );
-    }
-    if args.save_images {
-        eval::save_images(&args.run.join("eval"), &scored)?;
     }
     let mut out = std::io::stdout().lock();
     if args.json {
@@ -84,7 +91,7 @@ pub fn run(args: &EvalArgs) -> Result<()> {
             }
         }
         if config.exposure.learn == Learning::On {
-            eval::add_exposure(&mut metrics, &scored)?;
+            eval::add_exposure(&mut metrics, &scored);
         }
         writeln!(out, "{metrics:#}")?;
     } else {

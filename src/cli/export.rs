@@ -192,7 +192,7 @@ fn bookmarks(
         let view = views[place * all / count];
         let pictures = [
             view.loaded()?.map(|image| ("photograph".to_owned(), image.into_owned())),
-            view.reference.clone().map(|image| ("reference".to_owned(), image)),
+            view.loaded_reference()?.map(|image| ("reference".to_owned(), image.into_owned())),
             rendered(view)?,
         ];
         Ok(Bookmark {

@@ -84,8 +84,8 @@ fn resolved(groups: &[(Lens, Vec<Source>)], options: &LoadOptions) -> LoadOption
     let mut shrunk: Vec<&Lens> = vec![];
     for (lens, group) in groups {
         let (width, height) = options.loaded_size(lens.width, lens.height);
-        let photographs = group.iter().filter(|source| source.input.is_some()).count() as u64;
-        bytes += photographs * pixels(width, height) * BYTES_PER_PIXEL;
+        let pictures = group.iter().flat_map(|source| [&source.input, &source.reference]).flatten();
+        bytes += pictures.count() as u64 * pixels(width, height) * BYTES_PER_PIXEL;
         let free = LoadOptions { max_resolution: 0, ..options.clone() };
         if free.loaded_size(lens.width, lens.height) != (width, height) {
             shrunk.push(lens);
@@ -301,6 +301,8 @@ fn load_view(
     let is_kept = options.keep.is_none();
     let original = input.clone().filter(|_| is_shrunk || !is_kept);
     let original = original.map(|path| Original { path, lens: *lens });
+    let file = |path| Original { path, lens: *lens };
+    let reference_file = reference.clone().filter(|_| !is_kept).map(file);
     let paths = [input.clone(), reference.clone()];
     let (mut image, mut reference) = (image(input)?, image(reference)?);
     // Of what was read: a file that does not decode is named once.
@@ -331,8 +333,10 @@ fn load_view(
     };
     let camera = camera.resized(size.0, size.1);
     let original = original.filter(|_| image.is_some());
-    let image = image.filter(|_| is_kept);
-    let view = View { name: name.clone(), split, camera, image, original, reference, mask, depth };
+    let reference_file = reference_file.filter(|_| reference.is_some());
+    let (image, reference) = (image.filter(|_| is_kept), reference.filter(|_| is_kept));
+    let view = View::new(&name, split, camera, image);
+    let view = View { original, reference, reference_file, mask, depth, ..view };
     let view = (split == Split::Test || view.has_photograph()).then_some(view);
     Ok(Loaded { name, view, problems })
 }

@@ -44,8 +44,9 @@ impl Image {
     /// Reads an 8- or 16-bit PNG or TIFF, a JPEG, a WebP or an EXR file as it is stored ([`Image::load_upright`] turns it);
     /// the content decides, not the file's name.
     ///
-    /// Alpha is dropped, grey is repeated, camera RAW (feature `raw`) is linear light. Of an EXR file the first layer's R, G and B (or Y) are taken as linear
-    /// light; values that are negative or not finite become 0, with a warning that counts them.
+    /// Alpha is dropped, grey is repeated, camera RAW (feature `raw`) is linear light. Of an EXR file the first layer's R, G and B
+    /// (or Y) are taken as linear light; values that are negative or not finite become 0, with a warning that counts them
+    /// ([`super::Mask::load`] hides the pixels of the latter).
     ///
     /// # Errors
     /// [`Error::Input`] names the file when it cannot be read, is cut short or is of another format.

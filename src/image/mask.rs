@@ -36,8 +36,8 @@ impl Mask {
         Image { width: self.width, height: self.height, data: self.weights.repeat(3) }
     }
 
-    /// What hides pixels of a photograph, as it is stored: its own alpha, values of EXR that are not finite, and the file of a mask, which hides what is black, or
-    /// where it is inverted what is white. None where nothing does.
+    /// What hides pixels of a photograph, as it is stored: its own alpha, values of EXR that are not finite, and the file of a
+    /// mask, which hides what is black, or where it is inverted what is white. None where nothing does.
     ///
     /// # Errors
     /// [`Error::Input`] names a file that cannot be read, or a mask of another shape than its photograph.

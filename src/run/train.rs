@@ -10,7 +10,7 @@ use super::{Event, Requests, RunDirectory, directory, done, generations};
 use crate::attributes::{ATTRIBUTES, AttributeSpec};
 use crate::dataset::{Dataset, View};
 use crate::diagnose::Plan;
-use crate::eval::{self, ViewScore, Yardstick};
+use crate::eval::{self, Compared, ViewScore, Yardstick};
 use crate::gpu::Gpu;
 use crate::train::{Learning, MemoryEstimate, StepReport, TrainConfig, Trainer};
 use crate::{Error, Result, Stop};
@@ -125,7 +125,7 @@ pub fn train_in(
         metrics[TARGET_EXPOSURE] = serde_json::json!(exposure);
     }
     if config.exposure.learn == Learning::On {
-        eval::add_exposure(&mut metrics, &scored)?;
+        eval::add_exposure(&mut metrics, &scored);
     }
     directory.save_metrics(&metrics)?;
     done::save(out, config, trainer.fingerprint(), steps)?;
@@ -363,14 +363,22 @@ impl<'a> Course<'a> {
         directory: &RunDirectory,
         observe: &mut impl FnMut(Event<'_>),
     ) -> Result<Vec<ViewScore>> {
-        let yardstick = match self.yardstick.take() {
+        let mut yardstick = match self.yardstick.take() {
             Some(known) => known,
             None => Yardstick::of(self.gpu, &self.config.tone, self.dataset)?,
         };
+        let (step, mut is_first) = (trainer.steps_done(), true);
         let render = |view: &View| trainer.render(&view.camera);
-        let scored = eval::score_by(&yardstick, self.dataset, render)?;
+        let scored = eval::score_by(&mut yardstick, self.dataset, render, |score, compared| {
+            if self.config.exposure.learn == Learning::On {
+                score.aligned = Some(compared.aligned()?);
+            }
+            if std::mem::take(&mut is_first) {
+                self.tell_events_pictures(step, score, compared)?;
+            }
+            Ok(())
+        })?;
         self.yardstick = Some(yardstick);
-        let step = trainer.steps_done();
         observe(Event::Evaluated { step, scored: &scored });
         self.tell_events_scores(step, &scored)?;
         if let Some(scores) = eval::means(&scored).0.filter(|_| self.config.eval_every > 0) {
@@ -409,7 +417,22 @@ impl Course<'_> {
         events.flush()
     }
 
-    /// Writes scores and the first test view.
+    /// Writes how the model shows a test view, and what it should be.
+    fn tell_events_pictures(
+        &mut self,
+        step: u64,
+        ViewScore { name, against, .. }: &ViewScore,
+        Compared { render, target, .. }: &Compared<'_>,
+    ) -> Result<()> {
+        let Some(events) = &mut self.events else { return Ok(()) };
+        for (what, image) in [("render", render), (against.name(), target)] {
+            let size = [image.width, image.height];
+            events.picture(step, &format!("view {name}/{what}"), size, &image.to_png8()?)?;
+        }
+        Ok(())
+    }
+
+    /// Writes the mean scores.
     fn tell_events_scores(&mut self, step: u64, scored: &[ViewScore]) -> Result<()> {
         let (Some(events), Some(first)) = (&mut self.events, scored.first()) else { return Ok(()) };
         let group = format!("test views against {}", first.against.name());
@@ -421,11 +444,6 @@ impl Course<'_> {
             ];
             events
                 .scalars(step, &values.map(|(name, value)| (format!("{group}/{name}"), value)))?;
-        }
-        let pictures = [("render", &first.render), (first.against.name(), &first.reference)];
-        for (name, image) in pictures {
-            let tag = format!("view {}/{name}", first.name);
-            events.picture(step, &tag, [image.width, image.height], &image.to_png8()?)?;
         }
         events.flush()
     }

@@ -136,23 +136,33 @@ fn target(pseudo_gt: &mut PseudoGt, view: &View, scene: &Scene) -> Result<Option
     Ok(Some(target.resized(view.camera.width, view.camera.height)))
 }
 
-/// What `tone` makes of the test views' photographs in the scene of the training photographs, by name: the targets that
-/// they would have were they trained on.
-///
-/// # Errors
-/// Every training photograph is as good as black where their exposure is asked for; a photograph can no longer be read;
-/// the device is out of memory or lost.
-pub fn targets_of_test_views(
-    gpu: &Gpu,
-    tone: &ToneSettings,
-    dataset: &Dataset,
-) -> Result<Vec<(String, Image)>> {
-    let mut pseudo_gt = PseudoGt::new(gpu, tone)?;
-    let (scene, _) = measured(&mut pseudo_gt, dataset)?;
-    let targets = dataset.test_views().map(|view| {
-        Ok(target(&mut pseudo_gt, view, &scene)?.map(|target| (view.name.clone(), target)))
-    });
-    Ok(targets.collect::<Result<Vec<_>>>()?.into_iter().flatten().collect())
+/// The targets that the test views would have were they trained on: what `tone` makes of their photographs in the scene of
+/// the training photographs.
+#[derive(Debug)]
+pub struct TestTargets {
+    pseudo_gt: PseudoGt,
+    scene: Scene,
+}
+
+impl TestTargets {
+    /// Measures the training photographs.
+    ///
+    /// # Errors
+    /// Every training photograph is as good as black where their exposure is asked for; a photograph can no longer be read;
+    /// the device is out of memory or lost.
+    pub fn new(gpu: &Gpu, tone: &ToneSettings, dataset: &Dataset) -> Result<Self> {
+        let mut pseudo_gt = PseudoGt::new(gpu, tone)?;
+        let (scene, _) = measured(&mut pseudo_gt, dataset)?;
+        Ok(Self { pseudo_gt, scene })
+    }
+
+    /// That of a view, of its camera's size; none where it has no photograph.
+    ///
+    /// # Errors
+    /// The photograph can no longer be read, or the device is out of memory or lost.
+    pub fn of(&mut self, view: &View) -> Result<Option<Image>> {
+        target(&mut self.pseudo_gt, view, &self.scene)
+    }
 }
 
 impl Trainer {

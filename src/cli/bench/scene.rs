@@ -40,16 +40,8 @@ impl Scene {
     fn dataset(&self) -> Dataset {
         let Camera { width, height, .. } = self.camera;
         let depth = (0..width * height).map(|i| (i / width) as f32 / height as f32);
-        let view = View {
-            name: "view".to_owned(),
-            split: Split::Train,
-            camera: self.camera,
-            image: Some(self.low.clone()),
-            original: None,
-            reference: None,
-            mask: None,
-            depth: Some(depth.collect()),
-        };
+        let view = View::new("view", Split::Train, self.camera, Some(self.low.clone()));
+        let view = View { depth: Some(depth.collect()), ..view };
         let point = |mean: &Vec3| Point { position: mean.as_dvec3(), views: vec![0] };
         let points = self.gaussians.means().iter().map(point).collect();
         Dataset { root: PathBuf::new(), views: vec![view], points, skipped: vec![] }

@@ -1,6 +1,6 @@
 //! The page of `diagnose`: photographs dark and lifted with their histograms, the plan, every figure.
 
-use super::{COLUMNS, DIGITS, scene_text, sizes, values};
+use super::{COLUMNS, DIGITS, scene_facts, sizes, values};
 use crate::dataset::{Dataset, View};
 use crate::diagnose::{Diagnosis, Plan};
 use crate::image::Image;
@@ -39,9 +39,8 @@ pub(super) fn html(dataset: &Dataset, diagnosis: &Diagnosis, plan: &Plan) -> Str
     intro.extend(diagnosis.remarks.iter().map(|remark| format!("Note: {remark}.")));
     let decided = plan.decisions().into_iter();
     let decided = decided.map(|(part, value, why)| [format!("{part}: {value}"), why.to_owned()]);
-    let text = scene_text(&diagnosis.scene);
-    let measured = text.lines().filter_map(|line| line.split_once(' '));
-    let measured = measured.map(|(name, text)| [name.to_owned(), text.trim().to_owned()]);
+    let measured = scene_facts(&diagnosis.scene).into_iter();
+    let measured = measured.map(|(name, figures)| [name.to_owned(), figures]);
     Report {
         title: format!("Diagnosis of {}", dataset.root.display()),
         intro,

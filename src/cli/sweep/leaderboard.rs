@@ -214,7 +214,7 @@ impl Leaderboard {
         dataset: &Dataset,
         gpu: &Gpu,
     ) -> Result<Option<Comparison>> {
-        let Some(view) = dataset.test_views().find(|view| view.reference.is_some()) else {
+        let Some(view) = dataset.test_views().find(|view| view.has_reference()) else {
             return Ok(None);
         };
         let picture = |caption: &str, scores: String, image: &Image| Picture {
@@ -236,8 +236,8 @@ impl Leaderboard {
                 break;
             }
         }
-        let reference = view.reference.as_ref();
-        pictures.extend(reference.map(|image| picture("reference", String::new(), image)));
+        let reference = view.loaded_reference()?;
+        pictures.extend(reference.map(|image| picture("reference", String::new(), &image)));
         Ok(Some(Comparison { title: format!("Test view {}", view.name), pictures }))
     }
 
@@ -245,10 +245,10 @@ impl Leaderboard {
         let report = Report {
             title: self.title(),
             intro: self.notes(failures),
-            facts: vec![],
             tables: vec![self.table()],
             plots: self.plots(),
             comparisons: pictures.into_iter().collect(),
+            ..Report::default()
         };
         report.html()
     }

@@ -104,10 +104,10 @@ impl Page {
         let report = Report {
             title: format!("Tone curve {}", self.curve),
             intro,
-            facts: vec![],
             tables: vec![table(output)],
             plots: vec![distributions(&drawn)],
             comparisons: self.comparison.into_iter().collect(),
+            ..Report::default()
         };
         write_whole(path, report.html().as_bytes())
     }

@@ -7,7 +7,7 @@ use crate::Result;
 use crate::cli::batch::Run;
 use crate::cli::batch::point::SEED;
 use crate::cli::batch::runner::Failure;
-use crate::dataset::{Dataset, View};
+use crate::dataset::Dataset;
 use crate::gpu::Gpu;
 use crate::image::Image;
 use crate::report::{Comparison, Picture, Report, Trace, traces};
@@ -35,12 +35,12 @@ impl Page<'_> {
         let report = Report {
             title: format!("Time and quality of {}", self.dataset.root.display()),
             intro: self.intro(),
-            facts: vec![],
             tables: std::iter::once(outcome::table(self.outcomes))
                 .chain(outcome::marginal_table(self.outcomes))
                 .collect(),
             plots: self.plots(),
             comparisons: self.pictures()?.into_iter().collect(),
+            ..Report::default()
         };
         Ok(report.html_plots_first())
     }
@@ -55,7 +55,7 @@ impl Page<'_> {
         };
         let mut intro = vec![format!(
             "Scores are means over {} test views {}. Time is that of the steps, without loading and scoring; on {}, {processors} processors. {energy}",
-            self.dataset.test_views().filter(|view| view.reference.is_some()).count(),
+            self.dataset.test_views().filter(|view| view.has_reference()).count(),
             self.target.described(),
             self.gpu.properties().name,
         )];
@@ -167,8 +167,9 @@ impl Page<'_> {
 
     /// The first scored view as it came in, as each preset shows it, and as it should be.
     fn pictures(&self) -> Result<Option<Comparison>> {
-        let has_reference = |view: &&View| view.reference.is_some();
-        let Some(view) = self.dataset.test_views().find(has_reference) else { return Ok(None) };
+        let Some(view) = self.dataset.test_views().find(|view| view.has_reference()) else {
+            return Ok(None);
+        };
         let picture = |caption: &str, scores: String, image: &Image| Picture {
             caption: caption.to_owned(),
             scores,
@@ -192,8 +193,8 @@ impl Page<'_> {
                 format!("{:.2} dB, SSIM {:.3}, {seconds:.0} s", score("psnr"), score("ssim"));
             pictures.push(picture(outcome.preset(), text, &run.render(self.gpu, view)?));
         }
-        let target = view.reference.as_ref();
-        pictures.extend(target.map(|image| picture(self.target.name(), String::new(), image)));
+        let target = view.loaded_reference()?;
+        pictures.extend(target.map(|image| picture(self.target.name(), String::new(), &image)));
         Ok(Some(Comparison { title: format!("Test view {}", view.name), pictures }))
     }
 }

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use crate::cli::tone::{self, ToneArgs};
-use crate::dataset::Dataset;
+use crate::dataset::{Dataset, View};
 use crate::tone::ToneSettings;
 use crate::{Error, Result};
 
@@ -22,10 +22,10 @@ impl Target {
     /// # Errors
     /// There is no test view with a photograph of any kind.
     pub(super) fn of(dataset: &Dataset) -> Result<Self> {
-        if dataset.test_views().any(|view| view.reference.is_some()) {
+        if dataset.test_views().any(View::has_reference) {
             return Ok(Self::References);
         }
-        if dataset.test_views().any(|view| view.has_photograph()) {
+        if dataset.test_views().any(View::has_photograph) {
             return Ok(Self::PseudoGt);
         }
         let problem = "has no held-out view to score; list one in transforms_test.json or test.txt, or add photographs: \

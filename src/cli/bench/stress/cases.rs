@@ -332,7 +332,7 @@ pub const CASES: &[Case] = &[
     }),
     quick(case(
         "EXR with infinity and below 0",
-        "the ones do not count, the others are black, and a warning counts them",
+        "infinite ones do not count, negative ones are black, and a warning counts them",
         Trains,
         |_| {
             Hostile::exr(|value, x, y| match (x + y) % 5 {

@@ -89,9 +89,10 @@ impl Hostile {
             gaussians.dc_mut()[i] = Vec3::new(0.2, -0.4, 0.1);
             made(&mut gaussians, i);
         }
+        let photograph = scene::dark(camera.width, camera.height);
         let dataset = Dataset {
             root: PathBuf::from("a hostile set"),
-            views: vec![view(camera, scene::dark(camera.width, camera.height))],
+            views: vec![View::new("view", Split::Train, camera, Some(photograph))],
             points: vec![Point { position: DVec3::Z, views: vec![0] }],
             skipped: vec![],
         };
@@ -150,19 +151,6 @@ impl Hostile {
         self.config.exposure.start = Some(path);
         self.files = Some(files);
         Ok(self)
-    }
-}
-
-fn view(camera: Camera, image: Image) -> View {
-    View {
-        name: "view".to_owned(),
-        split: Split::Train,
-        camera,
-        image: Some(image),
-        original: None,
-        reference: None,
-        mask: None,
-        depth: None,
     }
 }
 

@@ -1,0 +1,38 @@
+#!/usr/bin/env bash
+# Builds the image of Containerfile and trains the demo's scene in it, on the software device that it brings:
+#     scripts/test-container.sh
+# Wants root and buildah, no daemon and no rights beyond a chroot. A base image that cannot be pulled is made by debootstrap, of
+# the same packages.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+export BUILDAH_ISOLATION=chroot STORAGE_DRIVER=${STORAGE_DRIVER:-vfs}
+
+base=$(sed -n 's/^FROM \(.*\) AS build$/\1/p' Containerfile)
+if ! buildah inspect --type image "$base" > /dev/null 2>&1 && ! buildah pull "$base"; then
+    suite=${base#*:}
+    root=$(mktemp -d)
+    trap 'rm -rf "$root"' EXIT
+    # By the rules of sid: debootstrap may be older than the suite.
+    debootstrap --variant=minbase "${suite%-slim}" "$root" "" /usr/share/debootstrap/scripts/sid
+    # What this machine trusts beside the usual, such as a proxy, its packages have to be fetched through.
+    mkdir -p "$root/usr/local/share/ca-certificates"
+    find /usr/local/share/ca-certificates -name '*.crt' -exec cp {} "$root/usr/local/share/ca-certificates/" \;
+    # A mirror may stand still for longer than its index is said to hold.
+    echo 'Acquire::Check-Valid-Until "false";' > "$root/etc/apt/apt.conf.d/99-mirror"
+    made=$(buildah from scratch)
+    buildah add --quiet "$made" "$root" /
+    buildah commit --quiet "$made" "$base"
+    buildah rm "$made"
+fi
+
+buildah build --pull=never --tag nightsplat .
+container=$(buildah from --pull=never nightsplat)
+inside() {
+    echo "\$ nightsplat $*"
+    buildah run "$container" -- nightsplat "$@"
+}
+inside doctor
+inside demo --out demo
+inside eval demo/ap3
+buildah rm "$container" > /dev/null
+echo "the image builds, and trains the demo's scene"
