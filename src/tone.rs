@@ -44,7 +44,7 @@ pub use self::file::CurveChoice;
 pub use self::histogram::LuminanceHistogram;
 pub(crate) use self::histogram::{BIN_SHIFT, FIRST_PREFIX};
 #[cfg(feature = "fit")]
-pub(crate) use self::law::{Numbers, law};
+pub(crate) use self::law::{Numbers, PhotographCurve, law};
 pub(crate) use self::law::{clamped, curve_at, tone_curve};
 pub use self::lift::{Lift, Measured, Scene};
 pub use self::profile::Profile;

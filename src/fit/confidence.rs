@@ -40,14 +40,16 @@ pub(super) fn of(
     let [mut psi2, mut slope] = [0.0; 2];
     let mut normal = DMatrix::<f64>::zeros(inner.len(), inner.len());
     for group in groups {
+        let curve = model.curve(values, &group.exposure);
+        let slopes = model.slopes(values, &group.exposure);
         for column in &group.histogram.columns {
-            let y = model.value(values, &group.exposure, column.x);
+            let y = curve.at(column.x);
             for cell in &column.cells {
                 let size = (cell.y() - y).abs();
                 psi2 += cell.count() * size.min(limit).powi(2);
                 slope += if size <= limit { cell.count() } else { 0.0 };
             }
-            let gradient = model.gradient(values, &group.exposure, column.x);
+            let gradient: Vec<f64> = slopes.at(column.x).collect();
             for (row, &i) in inner.iter().enumerate() {
                 for (at, &j) in inner.iter().enumerate() {
                     normal[(row, at)] += column.count * gradient[i] * gradient[j];

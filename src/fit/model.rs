@@ -2,8 +2,8 @@
 
 use super::{FitOptions, Pair};
 use crate::tone::{
-    Constant, Dual, Family, Law, Numbers, Real, Statistics, ToneSettings, White, clamped, curve_at,
-    law,
+    Constant, Dual, Family, Law, Numbers, PhotographCurve, Real, Statistics, ToneSettings, White,
+    clamped, curve_at, law,
 };
 use crate::{Error, Result};
 
@@ -132,36 +132,16 @@ impl Model {
         settings
     }
 
-    /// The curve at t = x / p90, clamped.
-    pub(super) fn value(&self, values: &[f64], exposure: &Exposure, t: f64) -> f64 {
-        clamped(self.raw_value(values, exposure, t))
+    /// What a photograph of this exposure gets with these values.
+    pub(super) fn curve(&self, values: &[f64], exposure: &Exposure) -> Curve<f64> {
+        self.curve_of(&Numbers::from(&self.settings(values)), exposure)
     }
 
-    /// The curve at t = x / p90, before it is clamped.
-    pub(super) fn raw_value(&self, values: &[f64], exposure: &Exposure, t: f64) -> f64 {
-        self.at(&Numbers::from(&self.settings(values)), exposure, t)
-    }
-
-    /// The derivatives of the clamped curve by every value; those that are no numbers count as 0.
-    pub(super) fn gradient(&self, values: &[f64], exposure: &Exposure, t: f64) -> Vec<f64> {
-        self.derivatives(values, exposure, t, clamped)
-    }
-
-    /// The derivatives of the curve before it is clamped.
-    pub(super) fn raw_gradient(&self, values: &[f64], exposure: &Exposure, t: f64) -> Vec<f64> {
-        self.derivatives(values, exposure, t, |y| y)
-    }
-
-    fn derivatives(
-        &self,
-        values: &[f64],
-        exposure: &Exposure,
-        t: f64,
-        of: impl Fn(Dual) -> Dual,
-    ) -> Vec<f64> {
-        let settings = self.settings(values);
-        let derivative = |&place: &Place| {
-            let mut numbers = Numbers::<Dual>::from(&settings);
+    /// The same with its derivatives by every value.
+    pub(super) fn slopes(&self, values: &[f64], exposure: &Exposure) -> Slopes {
+        let numbers = Numbers::<Dual>::from(&self.settings(values));
+        let by = |&place: &Place| {
+            let mut numbers = numbers;
             let variable = match place {
                 Place::Shape(index) => &mut numbers.constants[index],
                 Place::Theta => &mut numbers.theta,
@@ -170,23 +150,63 @@ impl Model {
                 Place::BaseGain => &mut numbers.base_gain,
             };
             variable.derivative = 1.0;
-            let derivative = of(self.at(&numbers, exposure, t)).derivative;
-            if derivative.is_finite() { derivative } else { 0.0 }
+            self.curve_of(&numbers, exposure)
         };
-        self.places.iter().map(derivative).collect()
+        Slopes(self.places.iter().map(by).collect())
     }
 
-    /// The curve at t = x / p90, for any number.
-    fn at<T: Real>(&self, numbers: &Numbers<T>, exposure: &Exposure, t: f64) -> T {
+    fn curve_of<T: Real>(&self, numbers: &Numbers<T>, exposure: &Exposure) -> Curve<T> {
         let family = self.family;
         let curve = law(family, family.white, numbers, &exposure.statistics);
         let white = match family.white {
             White::ChannelMeans => curve.constants[exposure.channel],
             _ => curve.white,
         };
-        let t = T::of(t * exposure.p90()) / white;
-        curve_at(family.curve.constant(), t, [curve.offset, curve.gain], &curve.constants)
+        let number = family.curve.constant();
+        Curve { number, p90: exposure.p90(), curve: PhotographCurve { white, ..curve } }
     }
+}
+
+/// The curve of a photograph, or of one of its channels, as a function of t = x / p90.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Curve<T> {
+    /// A `CURVE_*`.
+    number: u32,
+    p90: f64,
+    curve: PhotographCurve<T>,
+}
+
+impl<T: Real> Curve<T> {
+    /// At t, clamped.
+    pub(super) fn at(&self, t: f64) -> T {
+        clamped(self.raw_at(t))
+    }
+
+    /// At t, before it is clamped.
+    pub(super) fn raw_at(&self, t: f64) -> T {
+        let PhotographCurve { white, offset, gain, constants } = &self.curve;
+        curve_at(self.number, T::of(t * self.p90) / *white, [*offset, *gain], constants)
+    }
+}
+
+/// The derivatives of a curve by every value of its model; those that are no numbers count as 0.
+#[derive(Clone, Debug)]
+pub(super) struct Slopes(Vec<Curve<Dual>>);
+
+impl Slopes {
+    /// Of the clamped curve at t.
+    pub(super) fn at(&self, t: f64) -> impl Iterator<Item = f64> {
+        self.0.iter().map(move |curve| counted(curve.at(t)))
+    }
+
+    /// Of the curve at t before it is clamped.
+    pub(super) fn raw_at(&self, t: f64) -> impl Iterator<Item = f64> {
+        self.0.iter().map(move |curve| counted(curve.raw_at(t)))
+    }
+}
+
+fn counted(number: Dual) -> f64 {
+    if number.derivative.is_finite() { number.derivative } else { 0.0 }
 }
 
 /// The PSNR over all pixels and channels of what `settings` makes of the dark photograph, dB.
@@ -196,8 +216,8 @@ pub fn psnr(settings: &ToneSettings, pair: &Pair) -> f64 {
     let [mut count, mut squares] = [0.0; 2];
     for (channel, histogram) in pair.channels.iter().enumerate() {
         let exposure = Exposure::of(pair.statistics, channel);
-        let value = |x: f64| clamped(model.at(&numbers, &exposure, x / exposure.p90()));
-        squares += histogram.residuals(value)[1];
+        let curve = model.curve_of(&numbers, &exposure);
+        squares += histogram.residuals(|x| curve.at(x / exposure.p90()))[1];
         count += histogram.count();
     }
     -10.0 * (squares.max(0.0) / count).log10()
@@ -226,7 +246,7 @@ mod tests {
             for x in [0.0, 0.004, 0.03, 0.13, 0.3, 0.9] {
                 for channel in 0..3 {
                     let exposure = Exposure::of(statistics, channel);
-                    let found = clamped(model.at(&numbers, &exposure, x / exposure.p90()));
+                    let found = model.curve_of(&numbers, &exposure).at(x / exposure.p90());
                     let expected = if family.curve == ToneCurve::PerChannel {
                         clamped(x as f32 / parameters.constants[channel])
                     } else {
@@ -255,14 +275,12 @@ mod tests {
                 Model::new(family, &FitOptions { adapt: true, ..FitOptions::default() }).unwrap();
             let values: Vec<f64> = model.free.iter().map(|constant| constant.start).collect();
             for t in [0.05, 0.17, 0.61] {
-                for (index, exact) in
-                    model.raw_gradient(&values, &exposure, t).into_iter().enumerate()
-                {
+                for (index, exact) in model.slopes(&values, &exposure).raw_at(t).enumerate() {
                     let h = 1e-6 * values[index].abs().max(1e-3);
                     let at = |shift: f64| {
                         let mut values = values.clone();
                         values[index] += shift;
-                        model.raw_value(&values, &exposure, t)
+                        model.curve(&values, &exposure).raw_at(t)
                     };
                     let difference = (at(h) - at(-h)) / (2.0 * h);
                     let what = model.free[index].name;

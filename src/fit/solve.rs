@@ -3,7 +3,7 @@
 use levenberg_marquardt::{LeastSquaresProblem, LevenbergMarquardt};
 use nalgebra::{DMatrix, DVector, Dyn, Owned};
 
-use super::model::{Exposure, Model};
+use super::model::{Curve, Exposure, Model, Slopes};
 use super::{Channels, FitOptions, Histogram, Pair, Weighting};
 use crate::random::Stream;
 use crate::tone::Statistics;
@@ -62,8 +62,8 @@ pub(super) fn pair_residuals(
         parts.flat_map(|(exposure, parts)| parts.into_iter().map(move |part| (exposure, part)))
     {
         let pooled = if model.differs_by_photograph() { exposure } else { Exposure::POOLED };
-        let [sum, squares] =
-            histogram.residuals(|x| model.value(values, &pooled, x / exposure.p90()));
+        let curve = model.curve(values, &pooled);
+        let [sum, squares] = histogram.residuals(|x| curve.at(x / exposure.p90()));
         found.0 += histogram.count();
         found.1 = [found.1[0] + sum, found.1[1] + squares];
     }
@@ -196,19 +196,24 @@ impl<'a> Solver<'a> {
     /// The size of every cell's residual, with its count.
     pub(super) fn sizes(&self, values: &[f64]) -> Vec<(f64, f64)> {
         let mut sizes = vec![];
-        for group in &self.groups {
+        for (group, curve) in self.groups.iter().zip(self.curves(values)) {
             for column in &group.histogram.columns {
-                let y = self.model.value(values, &group.exposure, column.x);
+                let y = curve.at(column.x);
                 sizes.extend(column.cells.iter().map(|cell| ((cell.y() - y).abs(), cell.count())));
             }
         }
         sizes
     }
 
+    /// The curve of every group.
+    fn curves(&self, values: &[f64]) -> Vec<Curve<f64>> {
+        self.groups.iter().map(|group| self.model.curve(values, &group.exposure)).collect()
+    }
+
     /// A row per column, towards the family's own curve as far as the options say: within one the model has one value, so the weighted mean is all that counts. Without values
     /// every cell weighs by its count.
     fn rows(&self, weight: &dyn Fn(f64) -> f64, values: &[f64]) -> Vec<Row> {
-        let mut rows = vec![];
+        let (mut rows, curves) = (vec![], self.curves(values));
         for (index, group) in self.groups.iter().enumerate() {
             for column in &group.histogram.columns {
                 let t = column.x;
@@ -221,7 +226,7 @@ impl<'a> Solver<'a> {
                     });
                     continue;
                 }
-                let model = self.model.value(values, &group.exposure, t);
+                let model = curves[index].at(t);
                 let weighted = column
                     .cells
                     .iter()
@@ -233,12 +238,12 @@ impl<'a> Solver<'a> {
         }
         let total: f64 = rows.iter().map(|row| row.weight).sum();
         let start: Vec<f64> = self.model.free.iter().map(|constant| constant.start).collect();
+        let own = self.curves(&start);
         let prior = self.options.prior / self.pairs.len() as f64;
         for row in &mut rows {
             row.weight /= total;
             if prior > 0.0 {
-                let own = self.model.value(&start, &self.groups[row.group].exposure, row.t);
-                row.y = (row.y + prior * own) / (1.0 + prior);
+                row.y = (row.y + prior * own[row.group].at(row.t)) / (1.0 + prior);
             }
         }
         rows
@@ -307,8 +312,8 @@ impl<'a> Solver<'a> {
 
     /// Of every point of the grid, by how much the clamped curve falls to the next, and passes 1.
     fn broken(&self, values: &[f64]) -> Vec<[f64; 2]> {
-        let raw: Vec<f64> =
-            self.grid.iter().map(|&t| self.model.raw_value(values, &self.exposure, t)).collect();
+        let curve = self.model.curve(values, &self.exposure);
+        let raw: Vec<f64> = self.grid.iter().map(|&t| curve.raw_at(t)).collect();
         let next = raw.iter().skip(1).chain(raw.last());
         let fall = |raw: f64, next: f64| (raw.clamp(0.0, 1.0) - next.clamp(0.0, 1.0)).max(0.0);
         raw.iter().zip(next).map(|(&raw, &next)| [fall(raw, next), (raw - 1.0).max(0.0)]).collect()
@@ -364,15 +369,13 @@ impl Problem<'_> {
     }
 
     fn all_residuals(&self) -> DVector<f64> {
-        let Solver { model, ref groups, options, .. } = *self.solver;
-        let residual = |row: &Row| {
-            row.weight.sqrt()
-                * (model.value(&self.values, &groups[row.group].exposure, row.t) - row.y)
-        };
+        let curves = self.solver.curves(&self.values);
+        let residual = |row: &Row| row.weight.sqrt() * (curves[row.group].at(row.t) - row.y);
         let mut residuals: Vec<f64> = self.rows.iter().map(residual).collect();
         if self.is_constrained() {
             let broken = self.solver.broken(&self.values);
-            let excess = |excess: f64| if options.bounded { excess } else { 0.0 };
+            let bounded = self.solver.options.bounded;
+            let excess = |excess: f64| if bounded { excess } else { 0.0 };
             let broken = broken.into_iter().flat_map(|[fall, above]| [fall, excess(above)]);
             residuals.extend(broken.map(|amount| self.strength * amount));
         }
@@ -410,27 +413,26 @@ impl LeastSquaresProblem<f64, Dyn, Dyn> for Problem<'_> {
             (values[index] - low) * (high - values[index]) / (high - low)
         };
         let slopes: Vec<f64> = (0..values.len()).map(slope).collect();
-        let mut set = |row: usize, factor: f64, gradient: Vec<f64>| {
-            for (index, derivative) in gradient.into_iter().enumerate() {
+        let mut set = |row: usize, factor: f64, gradient: &mut dyn Iterator<Item = f64>| {
+            for (index, derivative) in gradient.enumerate() {
                 jacobian[(row, index)] += factor * derivative * slopes[index];
             }
         };
+        let of_group = |group: &Group| model.slopes(values, &group.exposure);
+        let of_groups: Vec<Slopes> = groups.iter().map(of_group).collect();
         for (index, row) in self.rows.iter().enumerate() {
-            set(
-                index,
-                row.weight.sqrt(),
-                model.gradient(values, &groups[row.group].exposure, row.t),
-            );
+            set(index, row.weight.sqrt(), &mut of_groups[row.group].at(row.t));
         }
         if constrained > 0 {
+            let on_grid = model.slopes(values, exposure);
             for (index, [fall, excess]) in self.solver.broken(values).into_iter().enumerate() {
                 let row = self.rows.len() + 2 * index;
                 if fall > 0.0 {
-                    set(row, self.strength, model.gradient(values, exposure, grid[index]));
-                    set(row, -self.strength, model.gradient(values, exposure, grid[index + 1]));
+                    set(row, self.strength, &mut on_grid.at(grid[index]));
+                    set(row, -self.strength, &mut on_grid.at(grid[index + 1]));
                 }
                 if options.bounded && excess > 0.0 {
-                    set(row + 1, self.strength, model.raw_gradient(values, exposure, grid[index]));
+                    set(row + 1, self.strength, &mut on_grid.raw_at(grid[index]));
                 }
             }
         }

@@ -143,9 +143,13 @@ fn parse(bytes: &[u8]) -> Result<Gaussians, String> {
         ));
     }
 
-    let mut gaussians = Gaussians::zeros(header.count, header.shape()?);
-    for property in properties(gaussians.shape) {
-        let offset = header.offset(&property.name)?;
+    // Before there is memory for them: a vertex that lacks everything takes no byte of the file, however many there are.
+    let shape = header.shape()?;
+    let offset_of = |property: Property| Ok((header.offset(&property.name)?, property));
+    let properties =
+        properties(shape).into_iter().map(offset_of).collect::<Result<Vec<_>, String>>()?;
+    let mut gaussians = Gaussians::zeros(header.count, shape);
+    for (offset, property) in properties {
         let (begin, stride) = property.address(&gaussians);
         for (gaussian, vertex) in body[..expected].chunks_exact(header.stride).enumerate() {
             let [a, b, c, d] = [0, 1, 2, 3].map(|byte| vertex[offset + byte]);
