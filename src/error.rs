@@ -166,14 +166,14 @@ pub enum Error {
 }
 
 impl Error {
-    /// An [`Error::Input`].
+    /// An [`Error::Input`]. What the file holds may be a part of the problem: it becomes one line of a length that can be read.
     pub fn input(path: impl AsRef<Path>, problem: impl Into<String>) -> Self {
-        Self::Input { path: path.as_ref().to_owned(), problem: problem.into() }
+        Self::Input { path: path.as_ref().to_owned(), problem: in_a_line(problem.into()) }
     }
 
     /// An [`Error::Output`].
     pub fn output(path: impl AsRef<Path>, problem: impl Into<String>) -> Self {
-        Self::Output { path: path.as_ref().to_owned(), problem: problem.into() }
+        Self::Output { path: path.as_ref().to_owned(), problem: in_a_line(problem.into()) }
     }
 
     /// The process's exit code, by what a scheduler can do about it: 2 for misuse, 3 for data that cannot be used, 4 for the
@@ -195,6 +195,19 @@ impl Error {
             | Self::ParameterNotFinite { .. }
             | Self::Disagrees { .. } => 1,
         }
+    }
+}
+
+/// Line breaks spelled out, and what is beyond a thousand characters left out.
+fn in_a_line(text: String) -> String {
+    const MOST: usize = 1000;
+    if text.len() <= MOST && !text.contains('\n') {
+        return text;
+    }
+    let line = text.replace('\n', "\\n");
+    match line.char_indices().nth(MOST) {
+        Some((end, _)) => format!("{} ...", &line[..end]),
+        None => line,
     }
 }
 
@@ -227,5 +240,18 @@ impl std::fmt::Display for Stop {
             Self::Terminated => "told to end",
             Self::TimeUp => "its time was up",
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_file_says_becomes_one_line_that_ends() {
+        let said = |problem: &str| Error::input("file", problem).to_string();
+        assert_eq!(said("is no\nnumber"), r"file: is no\nnumber");
+        let endless = said(&"ö\n".repeat(5000));
+        assert!(endless.chars().count() < 1020 && endless.ends_with(" ..."), "{endless}");
     }
 }
