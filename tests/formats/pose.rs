@@ -98,6 +98,24 @@ fn the_dark_photographs_get_the_cameras_of_the_largest_model() {
     refused(&format!("{arguments} --overwrite"), 1, &["exists already; choose another folder"]);
 }
 
+/// One photograph in nine has no camera, so all are compared once more.
+#[cfg(unix)]
+#[test]
+fn a_second_comparison_that_fails_costs_nothing_of_the_first() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    let (photos, out) = (photographed(root), root.join("scene"));
+    model(8).write_binary(&root.join("models/0"));
+    let once = root.join("once");
+    let first = format!("touch {0}; cp -r {1}/models/* $output", once.display(), root.display());
+    let colmap = stub(root, &format!("mapper) [ -e {} ] && exit 9; {first};;", once.display()));
+    let arguments =
+        format!("pose {} --out {} --colmap {}", photos.display(), out.display(), colmap.display());
+    let (stdout, stderr) = run(&arguments, 0);
+    assert!(stdout.contains("8 of 9 photographs"), "{stdout}");
+    assert!(stderr.contains("are those of the first comparison"), "{stderr}");
+}
+
 #[cfg(unix)]
 #[test]
 fn cameras_are_placed_all_at_once_by_colmap_where_it_can_or_by_glomap() {

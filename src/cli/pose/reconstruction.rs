@@ -96,7 +96,14 @@ impl<'a> Reconstruction<'a> {
         self.database.set_file_name("guided.db");
         self.models.set_file_name("guided");
         create(&self.models)?;
-        self.attempt(lifted, &say)?;
+        match self.attempt(lifted, &say) {
+            // What the first comparison came to is there.
+            Err(error) if placed > 0 => {
+                tracing::warn!("{error}; the cameras are those of the first comparison");
+                return Ok(first);
+            }
+            outcome => outcome?,
+        }
         Ok(if placed_in(&self.models)? > placed { self.models } else { first })
     }
 
