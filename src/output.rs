@@ -13,7 +13,8 @@ pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
     write_whole_with(path, |path| std::fs::write(path, bytes))
 }
 
-/// As [`write_whole`], for what writes the file itself, under the name that it is given.
+/// As [`write_whole`], for what writes the file itself, under the name that it is given. What a link leads to is written, and
+/// the link stays; a device or a pipe is written to, and not replaced.
 ///
 /// # Errors
 /// As there.
@@ -21,14 +22,21 @@ pub fn write_whole_with(
     path: &Path,
     write: impl FnOnce(&Path) -> std::io::Result<()>,
 ) -> Result<()> {
-    let mut partial = path.as_os_str().to_owned();
+    let failed = |error| {
+        Error::output(path, format!("cannot be written ({error}); check the folder and the disk"))
+    };
+    if path.metadata().is_ok_and(|there| !there.is_file() && !there.is_dir()) {
+        return write(path).map_err(failed);
+    }
+    let target = path.canonicalize().unwrap_or_else(|_| path.to_owned());
+    let mut partial = target.as_os_str().to_owned();
     partial.push(".partial");
     let partial = Path::new(&partial);
-    let written = write(partial).and_then(|()| std::fs::rename(partial, path));
+    let written = write(partial).and_then(|()| std::fs::rename(partial, &target));
     written.map_err(|error| {
         // The first failure is the one worth reporting; a leftover of it is not.
         let _ = std::fs::remove_file(partial);
-        Error::output(path, format!("cannot be written ({error}); check the folder and the disk"))
+        failed(error)
     })
 }
 
@@ -52,6 +60,25 @@ pub fn csv_field(text: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[cfg(unix)]
+    #[test]
+    fn a_link_and_a_pipe_stay_what_they_are() {
+        let folder = tempfile::tempdir().unwrap();
+        let [file, link, pipe] = ["file", "link", "pipe"].map(|name| folder.path().join(name));
+        std::fs::write(&file, "before").unwrap();
+        std::os::unix::fs::symlink(&file, &link).unwrap();
+        write_whole(&link, b"after").unwrap();
+        assert!(link.is_symlink() && std::fs::read(&file).unwrap() == b"after");
+
+        assert!(std::process::Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+        let reader = pipe.clone();
+        let reader = std::thread::spawn(move || std::fs::read(reader).unwrap());
+        write_whole(&pipe, b"whole").unwrap();
+        assert!(!pipe.metadata().unwrap().is_file(), "the pipe was replaced");
+        assert_eq!(reader.join().unwrap(), b"whole");
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 3);
+    }
 
     #[test]
     fn what_would_act_on_a_terminal_is_spelled_out() {

@@ -54,6 +54,27 @@ impl Sweep {
     }
 }
 
+/// As when a new version is installed while a sweep is under way.
+#[cfg(target_os = "linux")]
+#[test]
+fn a_sweep_outlives_the_file_of_its_program() {
+    let sweep = Sweep::new("--steps 2 --curves linear,ase");
+    let program = sweep.folder.path().with_extension("program");
+    fs::copy(command("").get_program(), &program).unwrap();
+    let mut sweeping = Command::new(&program)
+        .args(sweep.arguments.split_whitespace())
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    while !sweep.path("sweep.toml").exists() {
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    fs::remove_file(&program).unwrap();
+    assert!(sweeping.wait().unwrap().success());
+    assert_eq!(sweep.left().len(), 0);
+}
+
 #[test]
 fn a_finished_point_is_never_trained_twice_and_a_killed_one_is() {
     let sweep = Sweep::new("--steps 2 --seeds 2,1 --curves linear,ase");

@@ -108,7 +108,9 @@ fn write(gaussians: &Gaussians, path: &Path, comments: &[&str]) -> std::io::Resu
             file.write_all(&number.to_le_bytes())?;
         }
     }
-    file.into_inner().map_err(std::io::IntoInnerError::into_error)?.sync_all()
+    let file = file.into_inner().map_err(std::io::IntoInnerError::into_error)?;
+    // A pipe has no disk to wait for.
+    if file.metadata()?.is_file() { file.sync_all() } else { Ok(()) }
 }
 
 /// Reads Gaussians from a binary little-endian PLY; properties that are not ours are skipped.
