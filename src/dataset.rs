@@ -17,7 +17,6 @@ mod points;
 mod similarity;
 mod split;
 pub mod synthetic;
-mod text_file;
 mod transforms;
 mod undistort;
 mod unused;

@@ -14,6 +14,7 @@
 //! Data flows one way: a module uses only modules above it in this list, which `tests/architecture.rs` reads and asserts.
 //!
 //! - [`error`]: what can go wrong, sorted by what the user can do about it
+//! - [`input`]: files that users name, read whole
 //! - [`output`]: files that are never seen half-written
 //! - [`hash`]: whether numbers and bytes are what they were
 //! - [`random`]: counter-based random numbers
@@ -68,6 +69,7 @@ pub mod fit;
 pub mod gpu;
 pub mod hash;
 pub mod image;
+pub mod input;
 pub mod kernels;
 pub mod loss;
 #[cfg(feature = "io")]

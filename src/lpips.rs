@@ -6,6 +6,7 @@ use glam::UVec2;
 
 use crate::gpu::Gpu;
 use crate::image::Image;
+use crate::input;
 use crate::nn::{AlexNet, LAYERS, TensorFile, published};
 use crate::{Error, Result};
 
@@ -28,8 +29,7 @@ impl Lpips {
     /// [`Error::Input`] names what is missing, of another shape or not finite; the device is out of memory.
     pub fn load(gpu: &Gpu, path: impl AsRef<Path>) -> Result<Self> {
         let path = path.as_ref();
-        let bytes = std::fs::read(path)
-            .map_err(|error| Error::input(path, format!("cannot be read ({error})")))?;
+        let bytes = input::bytes(path)?;
         let file = TensorFile::of(&bytes).map_err(|error| {
             Error::input(path, format!("is no whole safetensors file ({error})"))
         })?;

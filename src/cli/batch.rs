@@ -12,6 +12,7 @@ use crate::diagnose::Plan;
 use crate::eval::Player;
 use crate::gpu::Gpu;
 use crate::image::Image;
+use crate::input;
 use crate::output::write_whole;
 use crate::run;
 use crate::train::TrainConfig;
@@ -149,8 +150,7 @@ pub(super) fn claim(
 ) -> Result<()> {
     let path = folder.join(format!("{what}.toml"));
     if path.exists() {
-        let found = std::fs::read_to_string(&path)
-            .map_err(|error| Error::input(&path, format!("cannot be read: {error}")))?;
+        let found = input::text(&path)?;
         if found != manifest {
             let differs = difference(&found, manifest);
             let problem = format!("holds another {what} ({differs}); choose another --out");

@@ -4,10 +4,10 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 use super::listing::ListedView;
-use super::text_file::read_text;
 use super::{LoadOptions, Split, names};
 use crate::Result;
 use crate::image::files::Files;
+use crate::input;
 
 /// Every eighth of the name-sorted views is held out where nothing else says which.
 pub(super) const TEST_EVERY: usize = 8;
@@ -33,7 +33,7 @@ pub(super) fn split(
         }
         return Ok(());
     }
-    let text = read_text(&path)?;
+    let text = input::text(&path)?;
     let known: BTreeSet<String> = undecided.iter().map(|frame| frame.name.clone()).collect();
     let lines = text.lines().map(str::trim).filter(|line| !line.is_empty());
     let (mut held_out, mut unknown) = (BTreeSet::new(), BTreeSet::new());

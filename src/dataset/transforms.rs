@@ -12,10 +12,10 @@ use super::Split;
 use super::colmap::SUPPORTED;
 use super::listing::{ListedView, Listing};
 use super::names::below_first;
-use super::text_file::read_text;
 use crate::camera::{Distortion, Lens};
 use crate::image::Image;
 use crate::image::files::{Files, stem};
+use crate::input;
 use crate::{Error, Result};
 
 #[derive(Deserialize)]
@@ -92,7 +92,7 @@ pub(super) fn read(
     files: &Files,
     listing: &mut Listing,
 ) -> Result<()> {
-    let text = read_text(path)?;
+    let text = input::text(path)?;
     let transforms: Transforms = serde_json::from_str(&nan_as_null(&text)).map_err(|error| {
         let remedy = if error.is_eof() {
             "it is cut short, copy it again"

@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{Diagnosis, SceneDiagnosis};
 use crate::dataset::{Dataset, View};
+use crate::input;
 use crate::scene::{Features, Shape, width};
 use crate::tone::ToneCurve;
 use crate::train::{Learning, Part, TrainConfig};
@@ -189,8 +190,7 @@ impl Plan {
     /// # Errors
     /// [`Error::Input`]: the file cannot be read, holds no plan, or that of another dataset.
     pub fn load(path: &Path, dataset: &Dataset) -> Result<Self> {
-        let text = std::fs::read_to_string(path)
-            .map_err(|error| Error::input(path, format!("cannot be read: {error}")))?;
+        let text = input::text(path)?;
         let plan: Self = toml::from_str(&text).map_err(|error| {
             let line = error.span().map(|span| text[..span.start].matches('\n').count() + 1);
             let place = line.map(|line| format!(" (line {line})")).unwrap_or_default();

@@ -13,6 +13,7 @@ use std::path::Path;
 use super::Affine;
 use crate::image::files::stem;
 use crate::image::{MIDDLE_GREY, linear_from_srgb, srgb_from_linear};
+use crate::input;
 use crate::output::write_whole;
 use crate::{Error, Result};
 
@@ -63,8 +64,7 @@ pub fn save(path: &Path, exposures: &[(String, Affine)]) -> Result<()> {
 /// # Errors
 /// The file cannot be read, has a column that there is not, a line that is no line of it, or a view twice.
 pub fn load(path: &Path) -> Result<Vec<KnownExposure>> {
-    let text = std::fs::read_to_string(path)
-        .map_err(|error| Error::input(path, format!("cannot be read ({error})")))?;
+    let text = input::text(path)?;
     let refused = |problem: String| Error::input(path, problem);
     let mut lines = text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty());
     let header = lines.next().map_or("", |(_, line)| line);

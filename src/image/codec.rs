@@ -15,6 +15,7 @@ use ::image::{
 use super::files::RAW_REMEDY;
 use super::files::{HEIC_REMEDY, is_raw};
 use super::{Image, budget, exr_file, from_interleaved, jpeg, linear_from_srgb, srgb_from_linear};
+use crate::input;
 use crate::output::write_whole;
 use crate::{Error, Result};
 
@@ -32,7 +33,7 @@ pub(super) fn reader<'a>(
 }
 
 fn bytes_of(path: &Path) -> Result<Vec<u8>> {
-    std::fs::read(path).map_err(|error| Error::input(path, format!("cannot be read: {error}")))
+    input::bytes(path)
 }
 
 fn file_reader(path: &Path) -> Result<ImageReader<Box<dyn Source>>> {

@@ -9,6 +9,7 @@ use serde_json::Value;
 
 use super::parameters::{Parameters, Tensor};
 use crate::gpu::Gpu;
+use crate::input;
 use crate::output::write_whole;
 use crate::{Error, Result};
 
@@ -106,8 +107,7 @@ pub fn save(path: &Path, networks: &[&Parameters], gpu: &Gpu) -> Result<()> {
 /// # Errors
 /// The file is missing or damaged, a value is not finite, or the file holds a network of another configuration.
 pub fn load(path: &Path, networks: &mut [&mut Parameters], gpu: &Gpu) -> Result<()> {
-    let bytes = std::fs::read(path)
-        .map_err(|error| Error::input(path, format!("cannot be read ({error})")))?;
+    let bytes = input::bytes(path)?;
     let damaged = |error| Error::input(path, format!("is no whole safetensors file ({error})"));
     let file = TensorFile::of(&bytes).map_err(damaged)?;
     let settings = file.note(SETTINGS);

@@ -12,6 +12,7 @@ use std::path::Path;
 
 use super::{FEATURES, Feature, Features, Gaussians, MAX_SH_DEGREE, Shape, width};
 use crate::attributes::{ATTRIBUTES, Attribute, AttributeSpec, Ply, planes, rest_coefficients};
+use crate::input;
 use crate::output::write_whole_with;
 use crate::{Error, Result};
 
@@ -120,8 +121,7 @@ fn write(gaussians: &Gaussians, path: &Path, comments: &[&str]) -> std::io::Resu
 /// needed property is missing or not finite.
 pub fn load(path: impl AsRef<Path>) -> Result<Gaussians> {
     let path = path.as_ref();
-    let bytes =
-        fs::read(path).map_err(|error| Error::input(path, format!("cannot be read: {error}")))?;
+    let bytes = input::bytes(path)?;
     parse(&bytes).map_err(|problem| Error::input(path, problem))
 }
 

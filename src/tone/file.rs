@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use super::{Profile, Table, ToneCurve, ToneSettings};
+use crate::input;
 use crate::{Error, Result};
 
 /// What `--curve` names.
@@ -74,8 +75,7 @@ impl ToneSettings {
     /// # Errors
     /// [`Error::Input`] names the file and what is wrong in it.
     pub fn load(path: &Path) -> Result<Self> {
-        let text = std::fs::read_to_string(path)
-            .map_err(|error| Error::input(path, format!("cannot be read: {error}")))?;
+        let text = input::text(path)?;
         let wrong = |problem: String| Error::input(path, format!("is no tone curve: {problem}"));
         let settings = match extension(path).as_str() {
             "csv" => Self::of_table(Table::from_csv(&text).map_err(wrong)?),
@@ -93,8 +93,7 @@ impl Profile {
     /// # Errors
     /// [`Error::Input`] names the file and what is wrong in it.
     pub fn load(path: &Path) -> Result<Self> {
-        let text = std::fs::read_to_string(path)
-            .map_err(|error| Error::input(path, format!("cannot be read: {error}")))?;
+        let text = input::text(path)?;
         let wrong =
             |problem: String| Error::input(path, format!("is no camera profile: {problem}"));
         let profile: Self =

@@ -18,6 +18,7 @@ use crate::dataset::Fingerprint;
 use crate::densify::DeviceGaussians;
 use crate::gpu::{Buffer, Gpu};
 use crate::hash::{self, Hasher};
+use crate::input;
 use crate::nn::TensorFile;
 use crate::optimizer::{AdamBuffers, Moments};
 use crate::output::write_whole_with;
@@ -82,8 +83,7 @@ impl Header {
 /// # Errors
 /// [`Error::Input`] says that it is not, or that the file cannot be read.
 pub fn check_checkpoint(path: &Path) -> Result<()> {
-    let bytes = std::fs::read(path)
-        .map_err(|error| Error::input(path, format!("cannot be read ({error})")))?;
+    let bytes = input::bytes(path)?;
     let damaged = |problem: &str| Error::input(path, format!("is no whole checkpoint ({problem})"));
     let file = TensorFile::of(&bytes).map_err(|error| damaged(&error.to_string()))?;
     let header = file.note(HEADER).and_then(|header| serde_json::from_str::<Header>(header).ok());
@@ -166,8 +166,7 @@ impl Trainer {
     /// The file is missing, damaged or beyond the end of this run, or it was made with other settings; the trainer is
     /// then as it was.
     pub fn restore(&mut self, path: &Path) -> Result<()> {
-        let bytes = std::fs::read(path)
-            .map_err(|error| Error::input(path, format!("cannot be read ({error})")))?;
+        let bytes = input::bytes(path)?;
         let damaged =
             |problem: String| Error::input(path, format!("is no whole checkpoint ({problem})"));
         let file = TensorFile::of(&bytes).map_err(|error| damaged(error.to_string()))?;

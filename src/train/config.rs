@@ -14,6 +14,7 @@ use crate::camera::frame::{FRAME_EXTENT, Frame};
 use crate::dataset::{Dataset, DepthOptions, LoadOptions};
 use crate::densify::DensityControl;
 use crate::gpu::Gpu;
+use crate::input;
 use crate::loss::LossConfig;
 use crate::nn::Form;
 use crate::optimizer::Schedule;
@@ -239,8 +240,7 @@ impl TrainConfig {
     /// # Errors
     /// The file cannot be read, or says something that no run has.
     pub fn load(path: &Path) -> Result<Self> {
-        let text = std::fs::read_to_string(path)
-            .map_err(|error| Error::input(path, format!("cannot be read: {error}")))?;
+        let text = input::text(path)?;
         let config =
             Self::from_toml(&text).and_then(|config| config.check_finite().map(|()| config));
         config.map_err(|problem| Error::input(path, problem.to_string()))

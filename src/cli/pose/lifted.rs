@@ -9,7 +9,7 @@ use crate::image::files::{photographs_in, stem};
 use crate::image::{Image, exif_segment};
 use crate::pseudo_gt::PseudoGt;
 use crate::tone::{ToneSettings, all_black};
-use crate::{Error, Result};
+use crate::{Result, input};
 
 /// Lifts the photographs into `folder`, as stored, and returns the gain of the scene. A JPEG stays one and keeps its Exif,
 /// so that COLMAP finds the focal length; everything else becomes PNG.
@@ -50,8 +50,7 @@ fn is_jpeg(path: &Path) -> bool {
 }
 
 fn exif_of(path: &Path) -> Result<Option<Vec<u8>>> {
-    let bytes = std::fs::read(path)
-        .map_err(|error| Error::input(path, format!("cannot be read: {error}")))?;
+    let bytes = input::bytes(path)?;
     Ok(exif_segment(&bytes))
 }
 

@@ -7,6 +7,7 @@ use glam::DVec3;
 
 use super::{MODELS, ModelImage, ModelPoint, lens, pose};
 use crate::camera::Lens;
+use crate::input;
 use crate::{Error, Result};
 
 pub(super) fn cameras(path: &Path) -> Result<BTreeMap<u32, Lens>> {
@@ -58,7 +59,7 @@ pub(super) fn points(path: &Path) -> Result<BTreeMap<u64, ModelPoint>> {
 }
 
 fn bytes(path: &Path) -> Result<Vec<u8>> {
-    std::fs::read(path).map_err(|error| Error::input(path, format!("cannot be read: {error}")))
+    input::bytes(path)
 }
 
 struct Reader<'a> {

@@ -6,13 +6,13 @@ use std::str::FromStr;
 
 use glam::DVec3;
 
-use super::super::text_file::read_text;
 use super::{ModelImage, ModelPoint, lens, pose};
 use crate::camera::Lens;
+use crate::input;
 use crate::{Error, Result};
 
 pub(super) fn cameras(path: &Path) -> Result<BTreeMap<u32, Lens>> {
-    let text = read_text(path)?;
+    let text = input::text(path)?;
     let camera = |(number, line)| {
         let mut fields = Fields::new(path, number, line);
         let (id, model): (u32, String) = (fields.next("camera id")?, fields.next("model")?);
@@ -25,7 +25,7 @@ pub(super) fn cameras(path: &Path) -> Result<BTreeMap<u32, Lens>> {
 }
 
 pub(super) fn images(path: &Path) -> Result<Vec<ModelImage>> {
-    let text = read_text(path)?;
+    let text = input::text(path)?;
     let mut lines = lines(&text);
     let mut images = Vec::new();
     while let Some((number, line)) = lines.next() {
@@ -57,7 +57,7 @@ pub(super) fn images(path: &Path) -> Result<Vec<ModelImage>> {
 }
 
 pub(super) fn points(path: &Path) -> Result<BTreeMap<u64, ModelPoint>> {
-    let text = read_text(path)?;
+    let text = input::text(path)?;
     let point = |(number, line)| {
         let mut fields = Fields::new(path, number, line);
         let id: u64 = fields.next("point id")?;

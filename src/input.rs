@@ -1,0 +1,76 @@
+//! Files that users name: read whole, texts as editors leave them.
+
+use std::fs::File;
+use std::io::Read;
+use std::path::Path;
+
+use crate::{Error, Result};
+
+/// What a device or a pipe may bring, in bytes: those that do not end are no files of ours.
+const MOST: u64 = 1 << 28;
+
+/// What is in a file.
+///
+/// # Errors
+/// [`Error::Input`] where it cannot be read, or does not end.
+pub fn bytes(path: &Path) -> Result<Vec<u8>> {
+    let cannot = |error: std::io::Error| Error::input(path, format!("cannot be read: {error}"));
+    if path.metadata().is_ok_and(|there| there.is_file()) {
+        return std::fs::read(path).map_err(cannot);
+    }
+    let mut bytes = vec![];
+    let file = File::open(path).map_err(cannot)?;
+    file.take(MOST + 1).read_to_end(&mut bytes).map_err(cannot)?;
+    if bytes.len() as u64 > MOST {
+        return Err(Error::input(path, "does not end; name a file"));
+    }
+    Ok(bytes)
+}
+
+/// The text of a file, UTF-8, or UTF-16 behind its mark: a byte-order mark is no text.
+///
+/// # Errors
+/// As [`bytes`]; it is no text.
+pub fn text(path: &Path) -> Result<String> {
+    let cannot = |what: String| Error::input(path, format!("cannot be read: {what}"));
+    let bytes = bytes(path)?;
+    let wide = |to_unit: fn([u8; 2]) -> u16| {
+        let units: Vec<u16> =
+            bytes[2..].chunks_exact(2).map(|pair| to_unit([pair[0], pair[1]])).collect();
+        String::from_utf16(&units).map_err(|error| cannot(error.to_string()))
+    };
+    match bytes.as_slice() {
+        [0xFF, 0xFE, ..] => wide(u16::from_le_bytes),
+        [0xFE, 0xFF, ..] => wide(u16::from_be_bytes),
+        [0xEF, 0xBB, 0xBF, text @ ..] => utf8(text).map_err(cannot),
+        text => utf8(text).map_err(cannot),
+    }
+}
+
+fn utf8(text: &[u8]) -> Result<String, String> {
+    std::str::from_utf8(text).map(str::to_owned).map_err(|error| error.to_string())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[cfg(unix)]
+    #[test]
+    fn what_does_not_end_is_refused_and_what_does_is_read() {
+        let error = bytes(Path::new("/dev/zero")).unwrap_err().to_string();
+        assert!(error.contains("/dev/zero: does not end"), "{error}");
+        assert_eq!(bytes(Path::new("/dev/null")).unwrap(), b"");
+        assert!(bytes(Path::new("/")).unwrap_err().to_string().contains("cannot be read"));
+    }
+
+    #[test]
+    fn a_mark_of_the_byte_order_is_no_text() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("text");
+        for marked in [&b"ab"[..], b"\xEF\xBB\xBFab", b"\xFF\xFEa\0b\0", b"\xFE\xFF\0a\0b"] {
+            std::fs::write(&path, marked).unwrap();
+            assert_eq!(text(&path).unwrap(), "ab");
+        }
+    }
+}
