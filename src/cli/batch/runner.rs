@@ -131,7 +131,10 @@ fn attempt(run: &Run, waits: bool, requests: &Requests) -> Result<Outcome> {
         .stderr(output);
     // A signal of the terminal is for us: what it asks of a process is asked once.
     #[cfg(unix)]
-    std::os::unix::process::CommandExt::process_group(&mut command, 0);
+    {
+        use std::os::unix::process::CommandExt;
+        command.process_group(0).arg0("nightsplat");
+    }
     let mut child = command.spawn().map_err(unusable)?;
     let status = ended(&mut child, requests).map_err(unusable)?;
     if status.success() && run.is_finished()? {
