@@ -80,10 +80,7 @@ fn dataset(set: &str, place: &str, bytes: &[u8]) {
     }
     let original = fs::read(root.join(place)).unwrap_or_default();
     fs::write(root.join(place), bytes).unwrap();
-    // Listings and headers, then the photographs.
-    let options = LoadOptions::default();
-    said(Dataset::sizes(&root, &options).map(drop));
-    said(Dataset::load(&root, &options).map(|dataset| {
+    said(Dataset::load(&root, &LoadOptions::default()).map(|dataset| {
         assert!(dataset.points.iter().all(|point| point.position.is_finite()));
         let cameras = dataset.views.iter().map(|view| view.camera);
         for camera in cameras {

@@ -3,12 +3,13 @@
 //! Axes are those of `OpenCV` (x right, y down, z forward); pixel units, the image's corner at (0, 0), pixel centres at +0.5.
 
 pub mod frame;
+mod patch;
 mod path;
 
-use glam::{DAffine3, DVec2, DVec3, UVec2};
+use glam::{DAffine3, DVec2, DVec3};
 
-use crate::kernels;
 pub use frame::Frame;
+pub use patch::Patch;
 pub use path::CameraPath;
 
 /// An undistorted pinhole camera with its pose.
@@ -56,20 +57,6 @@ impl Camera {
             focal: self.focal * scale,
             principal_point: self.principal_point * scale,
             view_from_world: self.view_from_world,
-        }
-    }
-}
-
-/// The camera as the kernels take it.
-impl From<&Camera> for kernels::Camera {
-    fn from(camera: &Camera) -> Self {
-        let DAffine3 { matrix3: rotation, translation } = camera.view_from_world;
-        let columns = [rotation.x_axis, rotation.y_axis, rotation.z_axis, translation];
-        Self {
-            view_from_world: columns.map(|column| column.as_vec3().to_array()),
-            focal: camera.focal.as_vec2(),
-            principal_point: camera.principal_point.as_vec2(),
-            size: UVec2::new(camera.width, camera.height),
         }
     }
 }

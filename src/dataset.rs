@@ -270,20 +270,6 @@ impl Dataset {
         Ok(dataset)
     }
 
-    /// Width and height at which each photograph to train on would be loaded, by name, without reading a pixel.
-    ///
-    /// # Errors
-    /// As [`Dataset::load`], but for what is wrong with pixels.
-    pub fn sizes(root: &Path, options: &LoadOptions) -> Result<Vec<(String, [u32; 2])>> {
-        options.check()?;
-        let files = Files::default();
-        let Listing { mut frames, mut skipped, .. } = list(root, &files)?;
-        split(root, &mut frames, options.test_every, &files)?;
-        let sources = sources(root, &frames, options, &files, &mut skipped);
-        let training = sources.iter().filter(|source| source.split == Split::Train);
-        training.map(|source| pixels::loaded_size(source, options)).collect()
-    }
-
     /// What says which views are held out, in words.
     pub fn split_rule(root: &Path, options: &LoadOptions) -> String {
         let has_test = transforms::find(root).iter().any(|(_, split)| *split == Some(Split::Test));

@@ -208,10 +208,9 @@ impl Player {
         networks: Option<Networks>,
     ) -> Result<Self> {
         let shape = gaussians.shape;
-        let RenderSettings { raw_colors, near, tile, .. } = config.render_settings();
-        let tile = tile.filter(|&tile| gpu.properties().suits_tile(tile));
-        let settings =
-            RenderSettings { shape, raw_colors, near, tile, ..RenderSettings::default() };
+        let own = config.render_settings();
+        let tile = own.tile.filter(|&tile| gpu.properties().suits_tile(tile));
+        let settings = RenderSettings { shape, tile, ..own };
         let frame = config.frame.unwrap_or_default();
         let gaussians = match frame {
             Frame::WORLD => Cow::Borrowed(gaussians),
@@ -242,9 +241,8 @@ impl Player {
     /// The device is out of memory or lost.
     pub fn render_camera(&mut self, camera: &Camera) -> Result<Rendered> {
         let (camera, options) = (&self.frame.camera(camera), self.options());
-        self.renderer.reserve(self.count, [camera])?;
-        let networks = self.networks.as_mut();
-        Rendered::new(&mut self.renderer, &self.parameters, camera, &options, networks)
+        let (gaussians, networks) = ((&self.parameters, self.count), self.networks.as_mut());
+        Rendered::new(&mut self.renderer, gaussians, camera, &options, networks)
     }
 
     /// One layer of what a camera sees; a feature of one channel is repeated.

@@ -10,13 +10,13 @@
 
 mod frame;
 mod limits;
+mod pictures;
 mod settings;
 
-use glam::UVec2;
+use glam::{UVec2, Vec2};
 
-use crate::camera::Camera;
+use crate::camera::{Camera, Patch};
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Statistic, Threads};
-use crate::image::Image;
 use crate::kernels::project::DEPTH_BITS;
 use crate::kernels::splat::MAX_CHANNELS;
 use crate::kernels::{
@@ -145,7 +145,7 @@ impl Renderer {
         })
     }
 
-    /// Makes room for `gaussian_count` Gaussians and the images of `cameras`.
+    /// Makes room for `gaussian_count` Gaussians and the images of `cameras`, or their patches.
     ///
     /// # Errors
     /// The device is out of memory.
@@ -154,25 +154,30 @@ impl Renderer {
         gaussian_count: usize,
         cameras: impl IntoIterator<Item = &'a Camera>,
     ) -> Result<()> {
-        self.reserve_with_headroom([gaussian_count; 2], cameras)
+        let mut sizes = vec![];
+        for camera in cameras {
+            sizes.extend(self.patches(camera).iter().map(|patch| patch.size));
+        }
+        self.reserve_with_headroom([gaussian_count; 2], sizes)
     }
 
-    /// The same for a number of Gaussians, and where that needs more memory, for another number that may follow.
+    /// The same for images of these sizes and a number of Gaussians, and where that needs more memory, for another number
+    /// that may follow.
     ///
     /// # Errors
-    /// The device is out of memory.
-    pub fn reserve_with_headroom<'a>(
+    /// The device is out of memory, or cannot follow so many tiles.
+    pub fn reserve_with_headroom(
         &mut self,
         [gaussian_count, capacity]: [usize; 2],
-        cameras: impl IntoIterator<Item = &'a Camera>,
+        sizes: impl IntoIterator<Item = UVec2>,
     ) -> Result<()> {
         let (mut pixels, mut tiles) = (0, 0);
-        for camera in cameras {
-            let UVec2 { x, y } = self.tiles(camera);
-            pixels = pixels.max(camera.width as usize * camera.height as usize);
+        for size in sizes {
+            let UVec2 { x, y } = self.tiles(size);
+            pixels = pixels.max(size.x as usize * size.y as usize);
             tiles = tiles.max(x as usize * y as usize);
             if x as usize * y as usize > most_tiles(&self.gpu) {
-                return Err(self.too_many_tiles(camera));
+                return Err(self.too_many_tiles(size));
             }
         }
         self.frame.reserve(&self.gpu, [gaussian_count, capacity], pixels, tiles)
@@ -272,58 +277,6 @@ impl Renderer {
         (&self.frame.render, &mut self.frame.status)
     }
 
-    /// Renders to the host; grows the memory as the view demands.
-    ///
-    /// # Errors
-    /// The image exceeds what was reserved, or the device is out of memory or lost.
-    pub fn render_image(
-        &mut self,
-        gaussians: &Buffer<f32>,
-        camera: &Camera,
-        options: &RenderOptions,
-    ) -> Result<Image> {
-        let mut data = self.render_channels(gaussians, camera, options)?;
-        let Camera { width, height, .. } = *camera;
-        data.truncate(3 * width as usize * height as usize);
-        Ok(Image { width, height, data })
-    }
-
-    /// Renders every channel to the host, (channels, H, W); grows the memory as the view demands.
-    ///
-    /// # Errors
-    /// As [`Renderer::render_image`].
-    pub fn render_channels(
-        &mut self,
-        gaussians: &Buffer<f32>,
-        camera: &Camera,
-        options: &RenderOptions,
-    ) -> Result<Vec<f32>> {
-        let gpu = self.gpu.clone();
-        loop {
-            let mut status = None;
-            gpu.run("render", |pass| {
-                self.forward(pass, gaussians, camera, options)?;
-                status = Some(pass.download(&self.frame.status)?);
-                self.clear_status(pass);
-                Ok(())
-            })?;
-            let words = status.map_or_else(|| Ok(vec![]), |status| status.wait())?;
-            let status = Status::from_words(&words);
-            if status.crowd > 0 {
-                let Camera { width, height, .. } = camera;
-                return Err(self.too_crowded(format!("a {width}x{height} render"), status.crowd));
-            }
-            if !status.overflowed {
-                break;
-            }
-            self.grow(status.intersections)?;
-        }
-        let mut data = gpu.read(&self.frame.render)?;
-        let pixels = camera.width as usize * camera.height as usize;
-        data.truncate(self.settings.channels() * pixels);
-        Ok(data)
-    }
-
     /// What to say of a view whose [`Status::crowd`] is too large for this device.
     pub fn too_crowded(&self, view: String, splats: u32) -> Error {
         let ([width, height], device) = (self.tile, self.gpu.properties().name.clone());
@@ -331,9 +284,9 @@ impl Renderer {
         Error::Crowded { view, splats, tile, device, limit }
     }
 
-    fn too_many_tiles(&self, camera: &Camera) -> Error {
-        let (Camera { width, height, .. }, [tile_width, tile_height]) = (camera, self.tile);
-        let (count, most) = (self.tiles(camera).element_product(), most_tiles(&self.gpu));
+    fn too_many_tiles(&self, size: UVec2) -> Error {
+        let (UVec2 { x: width, y: height }, [tile_width, tile_height]) = (size, self.tile);
+        let (count, most) = (self.tiles(size).element_product(), most_tiles(&self.gpu));
         let device = &self.gpu.properties().name;
         Error::Usage(format!(
             "a {width}x{height} view has {count} tiles of {tile_width}x{tile_height} pixels, {device} follows {most}; \
@@ -346,7 +299,7 @@ impl Renderer {
         pass.fill(&mut self.frame.status, 0);
     }
 
-    /// Records the render of `gaussians` (planes of all attributes) as `camera` sees them.
+    /// Records the render of `gaussians` (planes of all attributes) as a camera sees them, or a patch of what it sees.
     ///
     /// # Errors
     /// The image exceeds what was reserved, or a pass exceeds what the device launches.
@@ -354,10 +307,10 @@ impl Renderer {
         &mut self,
         pass: &mut Recorder<'_>,
         gaussians: &Buffer<f32>,
-        camera: &Camera,
+        patch: impl Into<Patch>,
         options: &RenderOptions,
     ) -> Result<()> {
-        let view = self.view(camera)?;
+        let view = self.view(&patch.into())?;
         self.record_project(pass, gaussians, &view, options.sh_degree)?;
         self.record_bins(pass, &view)?;
         let mut background = [0.0; MAX_CHANNELS as usize];
@@ -396,13 +349,13 @@ impl Renderer {
         &mut self,
         pass: &mut Recorder<'_>,
         gaussians: &Buffer<f32>,
-        camera: &Camera,
+        patch: impl Into<Patch>,
         options: &RenderOptions,
         damping: Damping,
         d_render: &Buffer<f32>,
         gradients: Gradients<'_>,
     ) -> Result<()> {
-        let view = self.view(camera)?;
+        let view = self.view(&patch.into())?;
         let gaussian_count = self.frame.gaussian_count;
         let frame = &mut self.frame;
         pass.dispatch(
@@ -434,6 +387,7 @@ impl Renderer {
             &self.project_backward,
             &project_backward::Params {
                 camera: view.camera,
+                half_view: view.half_view,
                 gaussian_count,
                 sh_degree: options.sh_degree,
                 damping_weight: damping.weight,
@@ -527,28 +481,27 @@ impl Renderer {
     }
 
     /// Columns and rows of tiles.
-    fn tiles(&self, camera: &Camera) -> UVec2 {
-        let [tile_width, tile_height] = self.tile;
-        UVec2::new(camera.width.div_ceil(tile_width), camera.height.div_ceil(tile_height))
+    fn tiles(&self, size: UVec2) -> UVec2 {
+        (size + UVec2::from(self.tile) - 1) / UVec2::from(self.tile)
     }
 
-    fn view(&self, camera: &Camera) -> Result<View> {
-        let pixels = camera.width as usize * camera.height as usize;
-        let tiles = self.tiles(camera);
-        if self.settings.channels() * pixels > self.frame.render.len()
+    fn view(&self, patch: &Patch) -> Result<View> {
+        let tiles = self.tiles(patch.size);
+        if self.settings.channels() * patch.pixel_count() > self.frame.render.len()
             || (tiles.x * tiles.y) as usize > self.frame.tile_ranges.len()
         {
-            let (width, height) = (camera.width, camera.height);
+            let UVec2 { x: width, y: height } = patch.size;
             let what = format!("a {width}x{height} image exceeds what the renderer reserved");
             return Err(Error::Usage(what));
         }
-        Ok(View { camera: camera.into(), tiles })
+        Ok(View { camera: patch.into(), half_view: patch.half_view(), tiles })
     }
 }
 
-/// A camera as the kernels take it, and the columns and rows of tiles of its image.
+/// A patch as the kernels take it, and the columns and rows of tiles of its image.
 struct View {
     camera: kernels::Camera,
+    half_view: Vec2,
     tiles: UVec2,
 }
 

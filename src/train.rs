@@ -13,6 +13,7 @@ mod model;
 mod networks;
 mod overrides;
 mod parts;
+mod patches;
 mod paths;
 mod precision;
 mod preset;
@@ -161,7 +162,7 @@ impl Trainer {
     /// # Errors
     /// The configuration makes no sense, or the device is out of memory or lost.
     pub fn new(gpu: &Gpu, config: TrainConfig, dataset: &Dataset) -> Result<Self> {
-        Self::begin(gpu, config, dataset, None)
+        Self::on_patches(gpu, config, dataset, None)
     }
 
     /// The same from Gaussians that there are already.
@@ -174,7 +175,28 @@ impl Trainer {
         dataset: &Dataset,
         gaussians: &Gaussians,
     ) -> Result<Self> {
-        Self::begin(gpu, config, dataset, Some(gaussians))
+        Self::on_patches(gpu, config, dataset, Some(gaussians))
+    }
+
+    /// Begins anew on smaller patches where the first Gaussians show that the device could not follow them on these.
+    fn on_patches(
+        gpu: &Gpu,
+        mut config: TrainConfig,
+        dataset: &Dataset,
+        gaussians: Option<&Gaussians>,
+    ) -> Result<Self> {
+        loop {
+            let mut trainer = Self::begin(gpu, config.clone(), dataset, gaussians)?;
+            config.patch_pixels = match trainer.fewer_patch_pixels()? {
+                None => {
+                    trainer.views.say_what_is_cut(gpu);
+                    break Ok(trainer);
+                }
+                fewer => fewer,
+            };
+            drop(trainer);
+            gpu.free_unused();
+        }
     }
 
     fn begin(
@@ -394,7 +416,7 @@ impl Trainer {
         let model = &mut self.model;
         let [decoded, decoded_photograph] = &mut self.decoded;
 
-        self.renderer.forward(pass, &model.gaussians.parameters, &view.camera, &options)?;
+        self.renderer.forward(pass, &model.gaussians.parameters, view.patch, &options)?;
         let (render, status) = self.renderer.render_and_status();
         let (d_render, size) = (&mut self.d_render, view.size());
         let input = view.input.decoded(pass, decoded)?;
@@ -448,7 +470,7 @@ impl Trainer {
         self.renderer.backward(
             pass,
             &model.gaussians.parameters,
-            &view.camera,
+            view.patch,
             &options,
             damping,
             &self.d_render,
@@ -499,8 +521,7 @@ impl Trainer {
     /// As [`Trainer::render`], of a camera in the frame.
     fn render_of_degree(&mut self, camera: &Camera, sh_degree: u32) -> Result<Rendered> {
         let options = RenderOptions { sh_degree, background: [0.0; 3] };
-        self.renderer.reserve(self.model.count(), [camera])?;
-        let gaussians = &self.model.gaussians.parameters;
+        let gaussians = (&self.model.gaussians.parameters, self.model.count());
         let networks = self.networks.as_mut().map(|terms| &mut terms.networks);
         Rendered::new(&mut self.renderer, gaussians, camera, &options, networks)
     }
@@ -511,7 +532,8 @@ impl Trainer {
 
     fn reserve(&mut self) -> Result<()> {
         let Self { model, views, renderer, .. } = self;
-        renderer.reserve_with_headroom([model.count(), model.capacity()], views.cameras())
+        let sizes = views.all().map(TrainView::size);
+        renderer.reserve_with_headroom([model.count(), model.capacity()], sizes)
     }
 
     fn report(&self, step: u64, losses: &StepLosses, milliseconds: f64) -> StepReport {

@@ -1,23 +1,18 @@
 // A pinhole camera: what a point in its view projects to, and how that changes.
 
-// The Jacobian of the projection is taken no farther outside the image than this fraction of its width and height:
-// beyond, the affine approximation of a splat explodes.
-const float JACOBIAN_MARGIN = 0.15;
-
 // It looks along +z, x to the right and y down.
 struct Camera {
     mat4x3 view_from_world;
     vec2  focal;            // pixels
     vec2  principal_point;  // pixels
     uvec2 size;             // pixels
+    vec2  least_slope;      // where the Jacobian of the projection is taken at the least
+    vec2  most_slope;       // and at the most: beyond, the affine approximation of a splat explodes
 };
 
-// x / z and y / z, clamped to the image and its margin.
+// x / z and y / z, no farther than the Jacobian is taken.
 vec2 clamped_slope(vec3 mean_in_view, Camera camera) {
-    vec2 margin = JACOBIAN_MARGIN * vec2(camera.size);
-    vec2 low = -(camera.principal_point + margin) / camera.focal;
-    vec2 high = (vec2(camera.size) - camera.principal_point + margin) / camera.focal;
-    return clamp(mean_in_view.xy / mean_in_view.z, low, high);
+    return clamp(mean_in_view.xy / mean_in_view.z, camera.least_slope, camera.most_slope);
 }
 
 // The rotation of a unit quaternion (w, x, y, z).

@@ -17,6 +17,7 @@ layout(local_size_x = 64) in;
 
 layout(push_constant, scalar) uniform Params {
     Camera camera;
+    vec2  half_view;       // half the view, pixels, by the share that the render is of its pixels
     uint  gaussian_count;
     uint  sh_degree;       // in use; at most SH_DEGREE
     float damping_weight;  // 0 to 1: how much of the gradient statistic is damped near the camera
@@ -191,7 +192,7 @@ void main() {
     if (status[0] == 0) {
         float nearness = min(1.0, z / damping_depth);
         float damping = damping_weight * nearness * nearness + 1.0 - damping_weight;
-        grad_norm_sums[i] += damping * length(0.5 * vec2(camera.size) * d_mean2d);
+        grad_norm_sums[i] += damping * length(half_view * d_mean2d);
         visit_counts[i] += 1;
     }
 }

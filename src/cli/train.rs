@@ -87,6 +87,9 @@ pub(crate) struct TrainOptions {
     /// Shrink photographs whose longest side is still larger to so many pixels; 0 or none: take them as they are. Brightness is measured, and the curve applied, at their own size [default: {max_resolution}]
     #[arg(long, value_name = "N|none", value_parser = max_resolution)]
     max_resolution: Option<u32>,
+    /// Train on photographs of more than so many pixels patch by patch; steps then take less memory, and more of them see each photograph once [default: as many as the device can bind]
+    #[arg(long, value_name = "N")]
+    patch_pixels: Option<u64>,
     /// Memory for photographs, such as 4G, on the device and decoded on the host; the rest waits on disk, which takes time and changes no bit [default: a quarter of the memory of each]
     #[arg(long, value_name = "SIZE")]
     cache: Option<CacheSize>,
@@ -363,6 +366,7 @@ impl TrainOptions {
         }
         set(&mut config.downscale, &self.downscale);
         set(&mut config.max_resolution, &self.max_resolution);
+        config.patch_pixels = self.patch_pixels.or(config.patch_pixels);
         config.cache = self.cache.or(config.cache);
         config.max_vram = self.max_vram.or(config.max_vram);
         config.max_ram = self.max_ram.or(config.max_ram);
@@ -467,9 +471,8 @@ struct Planned {
     dataset: Dataset,
 }
 
-/// Loads the dataset, whose sizes are looked at first, and plans the run, where no option says everything. A run that goes on keeps to its plan.
+/// Loads the dataset and plans the run, where no option says everything. A run that goes on keeps to its plan.
 fn planned(args: &TrainArgs, config: TrainConfig, gpu: &Gpu) -> crate::Result<Planned> {
-    config.check_sizes(gpu)?;
     let is_resumed = args.resume && args.out.join("config.toml").is_file();
     let given = args.plan.clone().filter(|path| path != Path::new("none"));
     let file = given.or_else(|| run::plan_of(&args.out).filter(|_| is_resumed));

@@ -207,12 +207,6 @@ fn check_excess(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Result
     Ok(())
 }
 
-/// A view's name, and the size at which it is loaded.
-pub(super) fn loaded_size(source: &Source, options: &LoadOptions) -> Result<(String, [u32; 2])> {
-    let lens = fitted_lens(source)?;
-    Ok((source.name.clone(), options.loaded_size(lens.width, lens.height).into()))
-}
-
 fn disagreement(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Error {
     let (w, h) = (lens.width, lens.height);
     let (seen_width, seen_height) = Orientation::of(path).size((width, height));

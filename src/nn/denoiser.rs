@@ -233,6 +233,11 @@ impl Denoiser {
         float_bytes(pixels * per_pixel + partials + norm)
     }
 
+    /// Whether the device binds every map of a view of `size`.
+    pub fn fits_on(gpu: &Gpu, settings: DenoiserSettings, size: UVec2) -> bool {
+        Extent::of(settings, size).check(gpu, settings, size).is_ok()
+    }
+
     /// Takes the memory for views up to `size`, unless it is there already.
     ///
     /// # Errors
@@ -242,11 +247,8 @@ impl Denoiser {
         if needed.fits(self.reserved) {
             return Ok(());
         }
-        let (gpu, channels) = (&self.gpu, self.settings.channels);
-        let map = self.settings.channels().max(RGB as usize) * needed.pixels;
-        check_binding(gpu, &format!("the denoiser's {channels} feature maps"), size, map)?;
-        let sums = format!("the sums of the gradients of the denoiser's {channels} channels");
-        check_binding(gpu, &sums, size, needed.partials)?;
+        let gpu = &self.gpu;
+        needed.check(gpu, self.settings, size)?;
         // The old memory goes first: both together may not fit.
         self.recorded = None;
         let extent = needed.max(std::mem::take(&mut self.reserved));
@@ -490,6 +492,16 @@ impl Extent {
 
     fn fits(self, reserved: Self) -> bool {
         self.pixels <= reserved.pixels && self.partials <= reserved.partials
+    }
+
+    /// # Errors
+    /// The device does not bind what a view of `size` takes.
+    fn check(self, gpu: &Gpu, settings: DenoiserSettings, size: UVec2) -> Result<()> {
+        let channels = settings.channels;
+        let map = settings.channels().max(RGB as usize) * self.pixels;
+        check_binding(gpu, &format!("the denoiser's {channels} feature maps"), size, map)?;
+        let sums = format!("the sums of the gradients of the denoiser's {channels} channels");
+        check_binding(gpu, &sums, size, self.partials)
     }
 
     fn max(self, other: Self) -> Self {

@@ -108,6 +108,11 @@ impl Tonemapper {
         self.convs.len() as u32
     }
 
+    /// Whether the device binds every map of a view of `size`.
+    pub fn fits_on(gpu: &Gpu, size: UVec2) -> bool {
+        check_maps(gpu, size).is_ok()
+    }
+
     /// Takes the memory for views up to `size`, unless it is there already.
     ///
     /// # Errors
@@ -117,8 +122,7 @@ impl Tonemapper {
             return Ok(());
         }
         let [pixels, partials] = lengths(size);
-        let map = CHANNELS as usize * pixels;
-        check_binding(&self.gpu, "the tonemapper's feature maps", size, map)?;
+        check_maps(&self.gpu, size)?;
         let extent = [pixels.max(self.reserved[0]), partials.max(self.reserved[1])];
         // The old memory goes first: both together may not fit.
         (self.recorded, self.reserved) = (None, [0; 2]);
@@ -237,6 +241,13 @@ impl Tonemapper {
 /// Pixels, and partial sums of the largest layer's gradient.
 fn lengths(size: UVec2) -> [usize; 2] {
     [size.x as usize * size.y as usize, partial_count(size, [CHANNELS, CHANNELS])]
+}
+
+/// # Errors
+/// The device does not bind what a view of `size` takes.
+fn check_maps(gpu: &Gpu, size: UVec2) -> Result<()> {
+    let [pixels, _] = lengths(size);
+    check_binding(gpu, "the tonemapper's feature maps", size, CHANNELS as usize * pixels)
 }
 
 impl Memory {

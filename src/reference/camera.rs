@@ -3,7 +3,6 @@
 use glam::{DMat3, DVec2, DVec3, DVec4};
 
 use crate::kernels;
-use crate::kernels::camera::JACOBIAN_MARGIN;
 
 /// A view as the parameters of the projecting kernels describe it.
 #[derive(Clone, Debug)]
@@ -18,6 +17,10 @@ pub struct Camera {
     pub principal_point: DVec2,
     /// Pixels.
     pub size: DVec2,
+    /// Where the Jacobian of the projection is taken at the least, x / z and y / z.
+    pub least_slope: DVec2,
+    /// And at the most.
+    pub most_slope: DVec2,
 }
 
 impl From<&kernels::Camera> for Camera {
@@ -30,6 +33,8 @@ impl From<&kernels::Camera> for Camera {
             focal: camera.focal.as_dvec2(),
             principal_point: camera.principal_point.as_dvec2(),
             size: camera.size.as_dvec2(),
+            least_slope: camera.least_slope.as_dvec2(),
+            most_slope: camera.most_slope.as_dvec2(),
         }
     }
 }
@@ -45,12 +50,10 @@ impl Camera {
         -(self.rotation.transpose() * self.translation)
     }
 
-    /// x / z and y / z, clamped to the image and its margin.
+    /// x / z and y / z, no farther than the Jacobian is taken.
     pub fn clamped_slope(&self, mean_in_view: DVec3) -> DVec2 {
-        let margin = JACOBIAN_MARGIN * self.size;
-        let low = -(self.principal_point + margin) / self.focal;
-        let high = (self.size - self.principal_point + margin) / self.focal;
-        (mean_in_view.truncate() / mean_in_view.z).max(low).min(high)
+        let slope = mean_in_view.truncate() / mean_in_view.z;
+        slope.max(self.least_slope).min(self.most_slope)
     }
 }
 

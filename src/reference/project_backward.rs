@@ -182,7 +182,7 @@ impl<'a> Scene<'a> {
         let (weight, depth) = (f64::from(damping_weight), self.camera.view(gaussian.mean).z);
         let nearness = (depth / f64::from(damping_depth)).min(1.0);
         let damping = weight * nearness * nearness + 1.0 - weight;
-        damping * (0.5 * self.camera.size * d_splat.mean2d).length()
+        damping * (self.params.half_view.as_dvec2() * d_splat.mean2d).length()
     }
 
     /// The record of Gaussian `i`.

@@ -1,5 +1,7 @@
 //! How far kernels get on a device that ends loops after so many turns.
 
+use glam::UVec2;
+
 use super::RenderSettings;
 use crate::gpu::{Gpu, Properties};
 use crate::{Error, Result};
@@ -11,6 +13,17 @@ pub(super) fn splats_per_turn(gpu: &Gpu) -> u32 {
 }
 
 impl RenderSettings {
+    /// Whether a view of this size is rendered and trained on at once: this device can, and nobody asked for less.
+    pub(crate) fn takes_at_once(&self, gpu: &Gpu, size: UVec2) -> bool {
+        let pixels = u64::from(size.x) * u64::from(size.y);
+        self.patch_pixels.is_none_or(|most| pixels <= most) && self.suits(gpu, size)
+    }
+
+    /// Whether this device can render and train on a view of this size.
+    pub(crate) fn suits(&self, gpu: &Gpu, size: UVec2) -> bool {
+        self.check_size(gpu, "", size.to_array()).is_ok()
+    }
+
     /// Refuses a view that this device cannot render and train on, from its size alone.
     ///
     /// # Errors

@@ -21,12 +21,21 @@ pub struct RenderSettings {
     pub observes: bool,
     /// The tile that one subgroup owns, in pixels; none: what is fastest on the device.
     pub tile: Option<[u32; 2]>,
+    /// The most pixels that are rendered at once; none: as many as the device can bind.
+    pub patch_pixels: Option<u64>,
 }
 
 impl Default for RenderSettings {
     fn default() -> Self {
-        let [raw_colors, observes] = [false; 2];
-        Self { near: 0.2, max_alpha: 0.99, shape: 3.into(), raw_colors, observes, tile: None }
+        Self {
+            near: 0.2,
+            max_alpha: 0.99,
+            shape: 3.into(),
+            raw_colors: false,
+            observes: false,
+            tile: None,
+            patch_pixels: None,
+        }
     }
 }
 

@@ -205,8 +205,9 @@ fn with_tile_and_frame(
         config.tile = config.tile.or(tile);
         config.frame = Some(recorded.frame.unwrap_or_default());
     }
-    let sizes = dataset.views.iter().map(|view| [view.camera.width, view.camera.height]);
-    config.tile = Some(config.render_settings().tile_for(gpu, sizes)?);
+    let patches = dataset.views.iter().flat_map(|view| config.patches(gpu, &view.camera));
+    let sizes: Vec<[u32; 2]> = patches.map(|patch| patch.size.to_array()).collect();
+    config.tile = Some(config.render_settings().tile_for(gpu, sizes.into_iter())?);
     config.frame.get_or_insert_with(|| dataset.frame());
     Ok(config)
 }

@@ -13,7 +13,6 @@ use super::streams;
 use crate::camera::frame::{FRAME_EXTENT, Frame};
 use crate::dataset::{Dataset, DepthOptions, LoadOptions};
 use crate::densify::DensityControl;
-use crate::gpu::Gpu;
 use crate::input;
 use crate::loss::LossConfig;
 use crate::nn::Form;
@@ -27,6 +26,9 @@ use crate::{Error, Result};
 
 /// No rate of use is near it, and a step of it overflows nothing.
 const MOST_RATE: f64 = 100.0;
+
+/// Pixels of a patch; smaller ones have more border than content.
+pub(super) const LEAST_PATCH: u64 = 256;
 
 /// What is seen where no splat is.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -70,6 +72,10 @@ pub struct TrainConfig {
     pub downscale: f64,
     /// The longest side of a view, pixels; photographs beyond it shrink to it. 0: no limit.
     pub max_resolution: u32,
+    /// The most pixels that a step takes: larger photographs are trained on in patches. Left out: as many as the device can
+    /// bind.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub patch_pixels: Option<u64>,
     /// Every so many views by name are held out in place of the dataset's own split; 0: none.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub test_every: Option<usize>,
@@ -182,6 +188,7 @@ impl Default for TrainConfig {
             steps: 5000,
             downscale: 1.0,
             max_resolution: 1600,
+            patch_pixels: None,
             test_every: None,
             cache: None,
             max_vram: None,
@@ -304,17 +311,6 @@ impl TrainConfig {
         }
     }
 
-    /// Refuses photographs that the device could not train on at the size that is asked for. Only their headers are read.
-    ///
-    /// # Errors
-    /// [`Error::Usage`] names the first such view and the option that helps; [`Error::Input`] is what is wrong with the
-    /// dataset's listing.
-    pub fn check_sizes(&self, gpu: &Gpu) -> Result<()> {
-        let settings = self.render_settings();
-        let sizes = Dataset::sizes(&self.dataset, &self.load_options())?;
-        sizes.into_iter().try_for_each(|(view, size)| settings.check_size(gpu, &view, size))
-    }
-
     /// The same run of another copy of its dataset; what lay in its folder lies there, too.
     pub fn move_dataset(&mut self, dataset: &Path) {
         let from = std::mem::replace(&mut self.dataset, dataset.to_owned());
@@ -333,6 +329,7 @@ impl TrainConfig {
             raw_colors: self.model.raw_colors,
             observes: self.model.network.form == Form::Identity,
             tile: self.tile,
+            patch_pixels: self.patch_pixels,
             near: (self.near * FRAME_EXTENT) as f32,
             ..RenderSettings::default()
         }
@@ -404,6 +401,12 @@ impl TrainConfig {
             ),
             ("`TrainConfig::max_minutes`", self.max_minutes, minutes(self.max_minutes), "0 to 1e9"),
             ("`TrainConfig::steps`", self.steps as f64, self.steps >= 1, "at least 1"),
+            (
+                "`TrainConfig::patch_pixels`",
+                self.patch_pixels.unwrap_or_default() as f64,
+                self.patch_pixels.is_none_or(|pixels| pixels >= LEAST_PATCH),
+                "at least 256",
+            ),
             (
                 "`TrainConfig::sh_degree`",
                 f64::from(self.sh_degree),

@@ -245,7 +245,7 @@ impl Trainer {
             let target = view.image(&self.gpu, &*view.kept_target(&self.gpu)?)?;
             let exposure = affines.as_ref().and_then(|affines| affines.get(view.place));
             let neutral = exposure.map_or(target.clone(), |own| own.inverse().applied(&target));
-            some.push(Shown { camera: view.camera, target: neutral, mask: None });
+            some.push(Shown { camera: view.patch.pinhole(), target: neutral, mask: None });
         }
         Ok(some)
     }

@@ -5,6 +5,7 @@ use glam::UVec2;
 
 use super::views::Views;
 use crate::Result;
+use crate::camera::Camera;
 use crate::dataset::Dataset;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::{ToneParameters, mask_gradient, mask_render};
@@ -32,10 +33,11 @@ impl Masks {
     ) -> Result<Self> {
         let (mut weights, mut largest) = (vec![], 0);
         for view in views.all() {
-            let size = view.size();
+            let (size, Camera { width, height, .. }) = (view.size(), view.patch.camera);
             let own = dataset.views.iter().find(|own| own.name == view.name);
             let mask = own.and_then(|own| own.mask.as_ref());
-            let mask = mask.map(|mask| gpu.buffer("mask", &mask.resized(size.x, size.y).weights));
+            let mask = mask.map(|mask| mask.resized(width, height));
+            let mask = mask.map(|mask| gpu.buffer("mask", &view.patch.cut(&mask.weights)));
             largest = largest.max(if mask.is_some() { value_count(size) } else { 0 });
             weights.push(mask.transpose()?);
         }

@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use super::{CacheSize, Trainer};
 use crate::Result;
-use crate::camera::Camera;
+use crate::camera::Patch;
 use crate::render::RenderOptions;
 
 /// What the program, the driver and its compiled kernels take on the host, about.
@@ -77,11 +77,11 @@ impl Trainer {
 
     /// How many intersections the first Gaussians have in the largest view; there is room for them then.
     fn intersections_of_largest_view(&mut self) -> Result<u32> {
-        let pixels = |camera: &&Camera| u64::from(camera.width) * u64::from(camera.height);
-        let Some(camera) = self.views.cameras().max_by_key(pixels).copied() else { return Ok(0) };
+        let largest = self.views.all().map(|view| view.patch).max_by_key(Patch::pixel_count);
+        let Some(patch) = largest else { return Ok(0) };
         let options = RenderOptions { sh_degree: 0, background: [0.0; 3] };
         let gaussians = &self.model.gaussians.parameters;
-        self.renderer.render_channels(gaussians, &camera, &options)?;
+        self.renderer.render_patch(gaussians, &patch, &options)?;
         self.renderer.intersections()
     }
 

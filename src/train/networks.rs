@@ -111,20 +111,29 @@ impl Networks {
         self.denoiser.as_ref().map_or(&self.colors, Denoiser::denoised)
     }
 
-    /// R_K of a whole render, (channels, H, W); none without a denoiser.
+    /// R_K of a whole render, (channels, H, W); R_0 without a denoiser.
     ///
     /// # Errors
     /// The device is out of memory or lost.
-    pub fn denoised_image(&mut self, render: &Buffer<f32>, size: UVec2) -> Result<Option<Image>> {
-        if self.denoiser.is_none() {
-            return Ok(None);
-        }
+    pub fn denoised_image(&mut self, render: &[f32], size: UVec2) -> Result<Image> {
         self.reserve(size)?;
         let gpu = self.gpu.clone();
-        gpu.run("denoise", |pass| self.denoise(pass, render, size, &Window::whole(size)))?;
+        let render = gpu.buffer("render", render)?;
+        gpu.run("denoise", |pass| self.denoise(pass, &render, size, &Window::whole(size)))?;
         let mut data = gpu.read(self.denoised())?;
         data.truncate(COLOR_CHANNELS * size.x as usize * size.y as usize);
-        Ok(Some(Image { width: size.x, height: size.y, data }))
+        Ok(Image { width: size.x, height: size.y, data })
+    }
+
+    /// Whether the device binds their maps of a view of `size`.
+    pub(super) fn fits(&self, size: UVec2) -> bool {
+        self.denoiser.as_ref().is_none_or(|own| Denoiser::fits_on(&self.gpu, own.settings(), size))
+            && (self.tonemapper.is_none() || Tonemapper::fits_on(&self.gpu, size))
+    }
+
+    /// How far the denoiser looks, in pixels, beside its norms, which look at all that it is given.
+    pub(super) fn margin(&self) -> u32 {
+        self.denoiser.as_ref().map_or(0, Denoiser::margin)
     }
 
     /// Writes the weights of every network.

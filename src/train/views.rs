@@ -12,7 +12,7 @@ use super::cache::{Cache, CacheSize, Kept};
 use super::precision::Darkroom;
 use super::{TrainConfig, streams};
 use crate::Result;
-use crate::camera::{Camera, Frame};
+use crate::camera::{Camera, Frame, Patch};
 use crate::dataset::{Dataset, Point, View};
 use crate::exposure::Affine;
 use crate::gpu::{Buffer, Gpu};
@@ -25,18 +25,18 @@ use crate::random::Stream;
 use crate::scene::{COLOR_CHANNELS, Feature, Gaussians, Shape, init, width};
 use crate::tone::{Exposure, Measured, Scene, Statistics, ToneCurve, ToneSettings, all_black};
 
-/// One training view.
+/// One training view: a photograph, or a patch of one that is too large to be trained on at once.
 #[derive(Debug)]
 pub(super) struct TrainView {
     pub(super) name: String,
     /// Its place among the training views of all levels.
     pub(super) number: usize,
-    /// Its place among those of its level.
+    /// Its photograph's place among those that are trained on.
     pub(super) place: usize,
     /// Index into the dataset's views.
     index: usize,
-    /// In the frame.
-    pub(super) camera: Camera,
+    /// What it is of its photograph, in the frame.
+    pub(super) patch: Patch,
     /// Depth from elsewhere, (H, W), where the dataset's is of another size.
     depth: Option<Vec<f32>>,
     /// What the loss applies `tone` to, planar (3, H, W), sRGB-encoded: the dark photograph, or the target itself.
@@ -106,7 +106,7 @@ impl Views {
         let mut cache = Cache::new(gpu, budget, config.spool.clone());
         let mut views = vec![];
         views.resize_with(config.schedule.resolution_levels(), Vec::<TrainView>::new);
-        let (count, mut gains) = (measured.len(), BTreeMap::new());
+        let mut gains = BTreeMap::new();
         for (place, ((index, view), measured)) in photographs(dataset).zip(&measured).enumerate() {
             let lift = settings.lift(&scene, measured);
             gains.extend(lift.gain.map(|gain| (view.name.clone(), gain)));
@@ -122,31 +122,41 @@ impl Views {
                     None => None,
                 };
                 let is_baked = target.is_some();
-                let mut upload = |name, data| cache.keep(darkroom.upload(name, data)?);
-                let kept = (is_baked && keeps_photographs).then(|| upload("low", &photograph.data));
-                let name = if is_baked { "target" } else { "low" };
-                let input = upload(name, &target.as_ref().unwrap_or(&photograph).data)?;
                 let none = ToneSettings::new(ToneCurve::None).parameters(&Statistics::default());
-                let depth = view.depth.as_ref().filter(|_| level > 0);
-                views.push(TrainView {
-                    name: view.name.clone(),
-                    number: level * count + place,
-                    place,
-                    index,
-                    camera: frame.camera(&view.camera).resized(size.x, size.y),
-                    depth: depth.map(|depth| resized_plane(depth, &image, size)),
-                    input,
-                    photograph: kept.transpose()?,
-                    tone: gpu.buffer("tone", &[if is_baked { none } else { lift.parameters }])?,
-                    is_baked,
-                    target: None,
-                });
+                let tone = if is_baked { none } else { lift.parameters };
+                let camera = frame.camera(&view.camera).resized(size.x, size.y);
+                let depth = view.depth.as_ref().map(|depth| resized_plane(depth, &image, size));
+                for patch in config.patches(gpu, &camera) {
+                    let mut upload = |name, image: &Image| {
+                        cache.keep(darkroom.upload(name, &patch.cut(&image.data))?)
+                    };
+                    let kept = (is_baked && keeps_photographs).then(|| upload("low", &photograph));
+                    let name = if is_baked { "target" } else { "low" };
+                    let input = upload(name, target.as_ref().unwrap_or(&photograph))?;
+                    let is_own = level > 0 || !patch.is_whole();
+                    let depth = depth.as_ref().filter(|_| is_own);
+                    views.push(TrainView {
+                        name: view.name.clone(),
+                        number: 0,
+                        place,
+                        index,
+                        patch,
+                        depth: depth.map(|depth| patch.cut(depth).into_owned()),
+                        input,
+                        photograph: kept.transpose()?,
+                        tone: gpu.buffer("tone", &[tone])?,
+                        is_baked,
+                        target: None,
+                    });
+                }
             }
         }
+        views.iter_mut().flatten().enumerate().for_each(|(number, view)| view.number = number);
+        let views = Self { levels: views, left_out: BTreeSet::new(), cache };
         // The targets of a profile are as bright as its references.
         let exposure = scene.exposure.clone().filter(|_| settings.profile.is_none());
         let exposure = exposure.map(|scene| TargetExposure::new(scene, gains));
-        Ok((Self { levels: views, left_out: BTreeSet::new(), cache }, scene, exposure))
+        Ok((views, scene, exposure))
     }
 
     /// Brings to the device what steps need of their views, as many steps as fit there side by side but one at least; the
@@ -233,30 +243,28 @@ impl Views {
 
     /// Trains on a view no more; false where there is no other.
     pub(super) fn leave_out(&mut self, place: usize) -> bool {
-        let has_others = self.left_out.len() + 1 < self.whole().len();
+        let has_others = self.left_out.len() + 1 < self.photographs().count();
         has_others && self.left_out.insert(place)
     }
 
     /// The names of the views that are trained on no more.
     pub(super) fn left_out(&self) -> Vec<String> {
-        let views = self.whole().iter().filter(|view| self.left_out.contains(&view.place));
+        let views = self.photographs().filter(|view| self.left_out.contains(&view.place));
         views.map(|view| view.name.clone()).collect()
     }
 
     /// Leaves these views out, and no other.
     pub(super) fn set_left_out(&mut self, names: &[String]) {
-        let views = self.whole().iter().filter(|view| names.contains(&view.name));
+        let views = self.photographs().filter(|view| names.contains(&view.name));
         self.left_out = views.map(|view| view.place).collect();
     }
 
     /// The views of all levels, by number.
-    pub(super) fn all(&self) -> Vec<&TrainView> {
-        let mut views: Vec<&TrainView> = self.levels.iter().flatten().collect();
-        views.sort_by_key(|view| view.number);
-        views
+    pub(super) fn all(&self) -> impl Iterator<Item = &TrainView> {
+        self.levels.iter().flatten()
     }
 
-    /// The views, unshrunk.
+    /// The views, unshrunk, those of a photograph side by side.
     pub(super) fn whole(&self) -> &[TrainView] {
         self.levels.first().map_or(&[], Vec::as_slice)
     }
@@ -270,15 +278,16 @@ impl Views {
         [inputs, photographs].map(Option::unwrap_or_default)
     }
 
-    pub(super) fn cameras(&self) -> impl Iterator<Item = &Camera> {
-        self.levels.iter().flatten().map(|view| &view.camera)
+    /// One view of every photograph, unshrunk.
+    pub(super) fn photographs(&self) -> impl Iterator<Item = &TrainView> {
+        self.whole().iter().filter(|view| view.patch.is_first())
     }
 
     /// Warns of every view in which none of the first Gaussians, given in the frame, has its mean: most often its pose is wrong.
     pub(super) fn say_what_shows_nothing(&self, gaussians: &Gaussians) {
         let means: Vec<DVec3> = gaussians.means().iter().map(|mean| mean.as_dvec3()).collect();
-        for TrainView { name, camera, .. } in self.whole() {
-            if !means.iter().any(|&mean| camera.sees(mean).is_some()) {
+        for TrainView { name, patch, .. } in self.photographs() {
+            if !means.iter().any(|&mean| patch.camera.sees(mean).is_some()) {
                 tracing::warn!(
                     "view {name} shows nothing: none of the {} first Gaussians lies in it; check its pose",
                     means.len()
@@ -289,12 +298,12 @@ impl Views {
 
     /// The names of the training photographs.
     pub(super) fn names(&self) -> impl Iterator<Item = &str> {
-        self.levels.first().into_iter().flatten().map(|view| view.name.as_str())
+        self.photographs().map(|view| view.name.as_str())
     }
 
     /// Width and height of every view, unshrunk.
     pub(super) fn sizes(&self) -> Vec<UVec2> {
-        self.levels.first().into_iter().flatten().map(TrainView::size).collect()
+        self.whole().iter().map(TrainView::size).collect()
     }
 
     /// One Gaussian per point of the dataset, or per random point where there is none, coloured as the targets of the
@@ -310,7 +319,8 @@ impl Views {
         let frame = config.frame.unwrap_or_default();
         let random;
         let points = if dataset.points.is_empty() {
-            let cameras: Vec<Camera> = self.cameras().cloned().collect();
+            let firsts = self.all().filter(|view| view.patch.is_first());
+            let cameras: Vec<Camera> = firsts.map(|view| view.patch.camera).collect();
             let count = config.random_points.min(config.max_gaussians);
             let seed = Stream::new(config.seed, streams::POINTS).bits(0);
             tracing::info!("no points in the dataset: {count} random ones");
@@ -331,13 +341,12 @@ impl Views {
         }
         let kept = &kept[..kept.len().min(fitting)];
         let colors = init::colors_from_views(kept, &dataset.views, |index| {
-            let view = self.levels.iter().flatten().find(|view| view.index == index);
-            let target = view.map(|view| {
-                let target = view.target_image(gpu, pseudo_gt)?;
-                let exposure = exposures.and_then(|exposures| exposures.get(view.place));
-                Ok(exposure.map_or(target.clone(), |own| own.inverse().applied(&target)))
-            });
-            target.transpose()
+            let Some(view) = self.photographs().find(|view| view.index == index) else {
+                return Ok(None);
+            };
+            let target = self.put_together(gpu, view.place, |view| view.target(gpu, pseudo_gt))?;
+            let exposure = exposures.and_then(|exposures| exposures.get(view.place));
+            Ok(Some(exposure.map_or(target.clone(), |own| own.inverse().applied(&target))))
         })?;
         let positions: Vec<DVec3> =
             kept.iter().map(|point| frame.from_world(point.position)).collect();
@@ -347,8 +356,9 @@ impl Views {
         if config.model.network.form == Form::Identity {
             let low = if shape.features.illumination {
                 init::colors_from_views(kept, &dataset.views, |index| {
-                    let view = self.levels.iter().flatten().find(|view| view.index == index);
-                    view.map(|view| view.image(gpu, &*view.whole_photograph(gpu)?)).transpose()
+                    let view = self.photographs().find(|view| view.index == index);
+                    let low = |view: &TrainView| view.whole_photograph(gpu);
+                    view.map(|view| self.put_together(gpu, view.place, low)).transpose()
                 })?
             } else {
                 vec![]
@@ -429,7 +439,7 @@ fn resized_plane(plane: &[f32], image: &Image, size: UVec2) -> Vec<f32> {
 impl TrainView {
     /// Width and height in pixels.
     pub(super) fn size(&self) -> UVec2 {
-        UVec2::new(self.camera.width, self.camera.height)
+        self.patch.size
     }
 
     /// The dark photograph, planar (3, H, W); only there where it is the input, or was kept.
@@ -453,14 +463,10 @@ impl TrainView {
         Ok(Arc::new(target))
     }
 
-    fn target_image(&self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<Image> {
-        self.image(gpu, &*self.target(gpu, pseudo_gt)?)
-    }
-
     /// Pixels of the view on the host.
     pub(super) fn image(&self, gpu: &Gpu, pixels: &Buffer<f32>) -> Result<Image> {
         let data = gpu.read(pixels)?;
-        let Camera { width, height, .. } = self.camera;
+        let UVec2 { x: width, y: height } = self.size();
         Ok(Image { width, height, data })
     }
 }

@@ -102,7 +102,11 @@ impl Setup {
         let camera::Camera { width, height, focal, principal_point, view_from_world } = self.camera;
         let size = UVec2::new(width, height).as_dvec2();
         let DAffine3 { matrix3: rotation, translation } = view_from_world;
-        Camera { rotation, translation, focal, principal_point, size }
+        // As far outside the view as a fraction of its size.
+        let margin = 0.15 * size;
+        let least_slope = -(principal_point + margin) / focal;
+        let most_slope = (size - principal_point + margin) / focal;
+        Camera { rotation, translation, focal, principal_point, size, least_slope, most_slope }
     }
 
     pub(crate) fn get(&self, i: usize) -> Gaussian {

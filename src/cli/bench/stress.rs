@@ -15,7 +15,7 @@ use glam::DVec2;
 use serde_json::{Value, json};
 
 use super::table;
-use crate::camera::Camera;
+use crate::camera::{Camera, Patch};
 use crate::gpu::{CheckReport, Gpu};
 use crate::kernels;
 use crate::reference::blend_forward::blend_pixel;
@@ -276,7 +276,7 @@ fn render_error(
     let render = trainer.render(camera)?.colors;
     let settings = config.render_settings();
     let sh_degree = config.schedule.sh_degree(config.steps, config.sh_degree);
-    let camera = reference::camera::Camera::from(&kernels::Camera::from(camera));
+    let camera = reference::camera::Camera::from(&kernels::Camera::from(&Patch::from(camera)));
     let Gaussians { count, shape, .. } = *gaussians;
     let planes = Planes { count, feature_count: 0, sh_degree: shape.sh_degree };
     let (near, alpha_max) = (settings.near.into(), settings.max_alpha.into());

@@ -240,14 +240,14 @@ impl Pass {
     ) -> crate::Result<[f64; 3]> {
         let Self { camera, parameters, d_render, .. } = self;
         let times = bench.gpu.profile("tune", |pass| {
-            renderer.forward(pass, parameters, camera, &OPTIONS)?;
+            renderer.forward(pass, parameters, &*camera, &OPTIONS)?;
             let gradients = Gradients {
                 parameters: &mut self.gradients,
                 grad_norm_sums: &mut self.grad_norm_sums,
                 visit_counts: &mut self.visit_counts,
             };
             let damping = Damping { weight: 0.0, depth: 0.0 };
-            renderer.backward(pass, parameters, camera, &OPTIONS, damping, d_render, gradients)
+            renderer.backward(pass, parameters, &*camera, &OPTIONS, damping, d_render, gradients)
         })?;
         let of = |name| stages::of_kernels(&times, &[name]);
         Ok([of("blend_forward"), of("blend_backward"), total(&times)])

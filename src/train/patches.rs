@@ -1,0 +1,143 @@
+//! Photographs that are too large to be trained on at once are trained on patch by patch.
+//!
+//! A patch is a view of its own: a step takes one of them. What is measured of a photograph, its target, and what is learned
+//! of its exposure belong to all of it.
+
+use std::sync::Arc;
+
+use glam::UVec2;
+
+use super::config::LEAST_PATCH;
+use super::memory::MARGIN;
+use super::views::{TrainView, Views};
+use super::{TrainConfig, Trainer};
+use crate::Result;
+use crate::camera::{Camera, Patch};
+use crate::gpu::{Buffer, Gpu};
+use crate::image::Image;
+use crate::nn::{Denoiser, Tonemapper};
+use crate::scene::COLOR_CHANNELS;
+
+impl TrainConfig {
+    /// What a view is trained on in: all of it where the device and [`TrainConfig::patch_pixels`] allow it.
+    pub(crate) fn patches(&self, gpu: &Gpu, camera: &Camera) -> Vec<Patch> {
+        let (settings, model) = (self.render_settings(), &self.model);
+        // Networks that see crops bind no more than those.
+        let sees_all = model.denoiser_crop == 0;
+        let denoiser = (sees_all && model.denoiser).then_some(model.network);
+        let tonemapper = sees_all && model.tonemapper;
+        camera.patches(|size| {
+            settings.takes_at_once(gpu, size)
+                && denoiser.is_none_or(|denoiser| Denoiser::fits_on(gpu, denoiser, size))
+                && (!tonemapper || Tonemapper::fits_on(gpu, size))
+        })
+    }
+}
+
+impl Trainer {
+    /// How large patches are to be where the first Gaussians meet too many tiles of those that there are; none where they do
+    /// not, or smaller ones are no remedy.
+    pub(super) fn fewer_patch_pixels(&mut self) -> Result<Option<u64>> {
+        let of_photograph = |patch: &Patch| Patch::from(&patch.camera).pixel_count();
+        let patches = || self.views.whole().iter().map(|view| (view.place, view.patch));
+        let largest = patches().max_by_key(|(_, patch)| of_photograph(patch));
+        let Some((largest, _)) = largest else { return Ok(None) };
+        let patches: Vec<Patch> =
+            patches().filter(|&(place, _)| place == largest).map(|(_, patch)| patch).collect();
+        let gaussians = &self.model.gaussians.parameters;
+        let mut met = 0;
+        for patch in &patches {
+            met = met.max(self.renderer.count_intersections(gaussians, patch)?);
+        }
+        let share = f64::from(self.renderer.most_intersections()) / (MARGIN * f64::from(met));
+        let pixels = patches.iter().map(Patch::pixel_count).max().unwrap_or_default();
+        let fewer = (share.min(1.0) * pixels as f64) as u64;
+        Ok((share < 1.0 && fewer >= LEAST_PATCH).then_some(fewer))
+    }
+}
+
+impl Views {
+    /// Says which photographs are trained on in patches.
+    pub(super) fn say_what_is_cut(&self, gpu: &Gpu) {
+        let mut cut = self.photographs().filter(|view| !view.patch.is_whole());
+        let Some(TrainView { name, place, patch, .. }) = cut.next() else { return };
+        let own = self.whole().iter().filter(|view| view.place == *place).count();
+        let (Camera { width, height, .. }, UVec2 { x, y }) = (patch.camera, patch.size);
+        tracing::warn!(
+            "{} of {} photographs are trained on in patches, as {} or patch_pixels takes no more at once: {name}, \
+             {width}x{height}, in {own} of about {x}x{y}",
+            1 + cut.count(),
+            self.photographs().count(),
+            gpu.properties().name
+        );
+    }
+
+    /// An image of a photograph, unshrunk, from what its views have of it, (3, h, w) each.
+    pub(super) fn put_together(
+        &self,
+        gpu: &Gpu,
+        place: usize,
+        of: impl Fn(&TrainView) -> Result<Arc<Buffer<f32>>>,
+    ) -> Result<Image> {
+        let mut image = Image { width: 0, height: 0, data: vec![] };
+        for view in self.whole().iter().filter(|view| view.place == place) {
+            let (patch, data) = (&view.patch, gpu.read(&*of(view)?)?);
+            let Camera { width, height, .. } = patch.camera;
+            if patch.is_whole() {
+                return Ok(Image { width, height, data });
+            }
+            (image.width, image.height) = (width, height);
+            image.data.resize(COLOR_CHANNELS * image.pixel_count(), 0.0);
+            patch.paste((patch, &data), (&Patch::from(&patch.camera), &mut image.data));
+        }
+        Ok(image)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::{DAffine3, DVec2};
+
+    use super::*;
+    use crate::gpu::testing::gpu;
+    use crate::train::Part;
+
+    fn camera(width: u32, height: u32) -> Camera {
+        let size = DVec2::new(width.into(), height.into());
+        Camera {
+            width,
+            height,
+            focal: size,
+            principal_point: 0.5 * size,
+            view_from_world: DAffine3::IDENTITY,
+        }
+    }
+
+    #[test]
+    fn what_a_device_binds_says_how_many_patches_a_photograph_has() {
+        let gpu = gpu();
+        if gpu.properties().max_storage_buffer_range != 1 << 27 {
+            eprintln!("not run: this device binds {}", gpu.properties().max_storage_buffer_range);
+            return;
+        }
+        let mut config = TrainConfig::default();
+        let count = |config: &TrainConfig, width, height| {
+            let patches = config.patches(&gpu, &camera(width, height));
+            patches.iter().for_each(|patch| assert!(patch.pixel_count() <= 1 << 24));
+            patches.len()
+        };
+        // Colours alone: 12 bytes a pixel.
+        assert_eq!(count(&config, 4000, 2655), 1);
+        assert_eq!(count(&config, 8000, 5310), 4);
+        assert_eq!(count(&config, 65_535, 65_535), 400);
+        // And features: 44 bytes; then networks with maps of the whole.
+        config.model.set_parts(&Part::ALL);
+        config.model.denoiser_crop = 256;
+        assert_eq!(count(&config, 4000, 2655), 4);
+        config.model.denoiser_crop = 0;
+        assert_eq!(count(&config, 4000, 2655), 6);
+        // What fits in no patch stays whole, and is refused by what it does not fit.
+        config.patch_pixels = Some(100);
+        assert_eq!(count(&config, 400, 300), 1);
+    }
+}
