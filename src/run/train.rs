@@ -157,6 +157,8 @@ fn begin(
     out: &Path,
     held: HeldRun,
 ) -> Result<(RunDirectory, Trainer)> {
+    // A tile that does not suit the device is said before there is a directory.
+    config.render_settings().tile_on(gpu)?;
     match held {
         HeldRun::Refuse => RunDirectory::check(out, false)?,
         HeldRun::Replace => RunDirectory::check(out, true)?,

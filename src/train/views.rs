@@ -121,33 +121,22 @@ impl Views {
                     None if settings.needs_baking() => Some(pseudo_gt.lifted(&photograph, &lift)?),
                     None => None,
                 };
-                let is_baked = target.is_some();
-                let none = ToneSettings::new(ToneCurve::None).parameters(&Statistics::default());
-                let tone = if is_baked { none } else { lift.parameters };
                 let camera = frame.camera(&view.camera).resized(size.x, size.y);
-                let depth = view.depth.as_ref().map(|depth| resized_plane(depth, &image, size));
-                for patch in config.patches(gpu, &camera) {
-                    let mut upload = |name, image: &Image| {
-                        cache.keep(darkroom.upload(name, &patch.cut(&image.data))?)
-                    };
-                    let kept = (is_baked && keeps_photographs).then(|| upload("low", &photograph));
-                    let name = if is_baked { "target" } else { "low" };
-                    let input = upload(name, target.as_ref().unwrap_or(&photograph))?;
-                    let is_own = level > 0 || !patch.is_whole();
-                    let depth = depth.as_ref().filter(|_| is_own);
-                    views.push(TrainView {
-                        name: view.name.clone(),
-                        number: 0,
-                        place,
-                        index,
-                        patch,
-                        depth: depth.map(|depth| patch.cut(depth).into_owned()),
-                        input,
-                        photograph: kept.transpose()?,
-                        tone: gpu.buffer("tone", &[tone])?,
-                        is_baked,
-                        target: None,
-                    });
+                let patches = config.patches(gpu, &camera);
+                let is_as_loaded = level == 0 && patches.len() == 1;
+                let depth = view.depth.as_ref().filter(|_| !is_as_loaded);
+                let print = Print {
+                    name: &view.name,
+                    place,
+                    index,
+                    keeps_photograph: target.is_some() && keeps_photographs,
+                    photograph,
+                    target,
+                    depth: depth.map(|depth| resized_plane(depth, &image, size)),
+                    tone: lift.parameters,
+                };
+                for patch in patches {
+                    views.push(print.view(gpu, patch, &mut darkroom, &mut cache)?);
                 }
             }
         }
@@ -366,6 +355,55 @@ impl Views {
             begin_as_identity(&mut gaussians, &colors, &low);
         }
         Ok(gaussians)
+    }
+}
+
+/// A photograph at the size of a level.
+struct Print<'a> {
+    name: &'a str,
+    place: usize,
+    index: usize,
+    photograph: Image,
+    /// None where the loss makes it.
+    target: Option<Image>,
+    /// Whether the photograph stays beside the target.
+    keeps_photograph: bool,
+    /// Where it is not the dataset's.
+    depth: Option<Vec<f32>>,
+    tone: ToneParameters,
+}
+
+impl Print<'_> {
+    fn view(
+        &self,
+        gpu: &Gpu,
+        patch: Patch,
+        darkroom: &mut Darkroom,
+        cache: &mut Cache,
+    ) -> Result<TrainView> {
+        let mut upload =
+            |name, image: &Image| cache.keep(darkroom.upload(name, &patch.cut(&image.data))?);
+        let photograph = self.keeps_photograph.then(|| upload("low", &self.photograph));
+        let (input, tone) = match &self.target {
+            Some(target) => {
+                let none = ToneSettings::new(ToneCurve::None).parameters(&Statistics::default());
+                (upload("target", target)?, none)
+            }
+            None => (upload("low", &self.photograph)?, self.tone),
+        };
+        Ok(TrainView {
+            name: self.name.to_owned(),
+            number: 0,
+            place: self.place,
+            index: self.index,
+            patch,
+            depth: self.depth.as_ref().map(|depth| patch.cut(depth).into_owned()),
+            input,
+            photograph: photograph.transpose()?,
+            tone: gpu.buffer("tone", &[tone])?,
+            is_baked: self.target.is_some(),
+            target: None,
+        })
     }
 }
 
