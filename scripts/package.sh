@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Packs a built program for those who do not build it: scripts/package.sh TARGET BINARY
 # leaves dist/nightsplat-VERSION-TARGET.tar.gz (.zip for Windows) with completions, man pages and licences, and its checksum.
+# GLIBC names the newest glibc that it may need; without it that is said, and all.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 target=${1:?name the target, such as x86_64-unknown-linux-gnu}
@@ -21,6 +22,11 @@ case $target in
 *-linux-gnu)
     newest=$(objdump -T "$binary" | grep -o 'GLIBC_[0-9.]*' | sort -Vu | tail -1)
     echo "$name needs $newest"
+    most=GLIBC_${GLIBC:-${newest#GLIBC_}}
+    if [ "$(printf '%s\n' "$newest" "$most" | sort -V | tail -1)" != "$most" ]; then
+        echo "$name must not need more than $most" >&2
+        exit 1
+    fi
     ;;
 esac
 

@@ -62,7 +62,8 @@ def resident(pid):
 
 
 def long(folder):
-    """Memory over many steps: on a software device that of the device is the process's own."""
+    """Memory over many steps: on a software device that of the device is the process's own. A debug build grows here:
+    it loads the validation layer, which keeps part of what it allocates for each command buffer."""
     data, out = synth(folder / "set", 32, 8), folder / "long"
     arguments = [command(), "train", data, "--out", out, "--steps", STEPS, "--max-gaussians", 1000, *PLAIN]
     child = subprocess.Popen([str(a) for a in arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)

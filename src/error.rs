@@ -47,7 +47,7 @@ pub enum Error {
     /// A buffer did not fit into device memory.
     #[error(
         "out of device memory: buffer `{buffer}` needs {bytes} bytes; lower `TrainConfig::max_gaussians`, \
-         `TrainConfig::max_resolution` or `TrainConfig::cache`"
+         `TrainConfig::patch_pixels` or `TrainConfig::cache`"
     )]
     OutOfMemory {
         /// The buffer's name.
@@ -60,7 +60,7 @@ pub enum Error {
     /// A buffer exceeds what one binding may hold on this device.
     #[error(
         "buffer `{buffer}` needs {bytes} bytes, {device} binds {limit} at most; lower `TrainConfig::max_gaussians` or \
-         `TrainConfig::max_resolution`"
+         `TrainConfig::patch_pixels`"
     )]
     BufferTooLarge {
         /// The buffer's name.

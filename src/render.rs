@@ -290,7 +290,7 @@ impl Renderer {
         let device = &self.gpu.properties().name;
         Error::Usage(format!(
             "a {width}x{height} view has {count} tiles of {tile_width}x{tile_height} pixels, {device} follows {most}; \
-             lower `TrainConfig::max_resolution` or take a larger `tile`"
+             lower `TrainConfig::patch_pixels` or take a larger `tile`"
         ))
     }
 
