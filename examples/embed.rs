@@ -35,7 +35,7 @@ fn main() -> Result<(), Box<dyn Error>> {
 
 fn render(host: &Host, gpu: &Gpu) -> Result<Image, Box<dyn Error>> {
     let (camera, gaussians) = (camera(), ring()?);
-    let parameters = gpu.buffer("parameters", &gaussians.parameters)?;
+    let parameters = gaussians.upload(gpu)?;
     let settings = RenderSettings { shape: gaussians.shape, ..RenderSettings::default() };
     let mut renderer = Renderer::new(gpu, settings)?;
     // Memory is taken before anything is recorded.

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """The campaigns that take longer than tests may: each prints what it found, and the first that fails ends the script.
 
-    scripts/stress.py [table] [conditioning] [long] [kills] [fuzz] [guards]
+    scripts/stress.py [table] [conditioning] [cameras] [long] [kills] [fuzz] [guards]
 
 Without a name all of them run. NIGHTSPLAT names the command (default: target/release/nightsplat, built first), STEPS and
 KILLS how many steps and kills (100000 and 200), FUZZ_SECONDS what each fuzz target gets (600).
@@ -52,6 +52,11 @@ def table(_):
 def conditioning(_):
     """Adam over 100 000 steps, percentiles and means of 33 megapixels."""
     run("cargo", "test", "--release", "--test", "conditioning", "--", "--include-ignored", "--nocapture")
+
+
+def cameras(_):
+    """COLMAP on real dark photographs, and a training with what it finds."""
+    run("cargo", "test", "--release", "--test", "formats", "--", "--ignored", "--nocapture", "real_dark_photographs")
 
 
 def resident(pid):
@@ -124,7 +129,7 @@ def guards(_):
     run(sys.executable, ROOT / "scripts" / "plant-defects.py", "guard:")
 
 
-CAMPAIGNS = {campaign.__name__: campaign for campaign in (table, conditioning, long, kills, fuzz, guards)}
+CAMPAIGNS = {campaign.__name__: campaign for campaign in (table, conditioning, cameras, long, kills, fuzz, guards)}
 
 
 def main():

@@ -12,6 +12,7 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
+use crate::batches::{Batch, Batches};
 use crate::gpu::{Buffer, Gpu, Pipeline, Threads};
 use crate::kernels::fate::{
     TALLY_CANDIDATES, TALLY_CLONED, TALLY_PRUNED, TALLY_SPLIT, TALLY_WORDS,
@@ -65,7 +66,7 @@ pub struct DensifySettings {
     pub seed: u64,
 }
 
-/// Gaussians on the device with their optimiser state, as planes (include/gaussian.glsl).
+/// Gaussians on the device with their optimiser state, as planes (include/gaussian.glsl) in [`Batches`].
 #[derive(Debug)]
 pub struct DeviceGaussians {
     /// The number of Gaussians.
@@ -78,6 +79,15 @@ pub struct DeviceGaussians {
     pub parameters: Buffer<f32>,
     /// As many each.
     pub moments: Moments,
+}
+
+impl DeviceGaussians {
+    /// How their planes lie in the buffers.
+    pub fn batches(&self, gpu: &Gpu) -> Batches {
+        let [count, columns, features] =
+            [self.count, self.column_count, self.feature_count].map(|n| n as usize);
+        Batches::new(gpu, count, [columns, features])
+    }
 }
 
 /// What the steps since the last round have gathered, per Gaussian, and a buffer to work with.
@@ -205,18 +215,11 @@ impl Densifier {
         round: Round,
     ) -> Result<DensifyReport> {
         check(gaussians, &inputs)?;
-        let limit = self.limit(gaussians.column_count).min(round.most);
+        let limit = self.settings.max_gaussians.min(round.most);
         let tally = self.decide(gaussians, &inputs, limit, round)?;
         let report = report(gaussians.count, &tally);
         self.scatter(gaussians, &mut inputs, &report, limit, round.step)?;
         Ok(report)
-    }
-
-    /// The most Gaussians there may be: the setting, or what one binding holds where that is less.
-    pub(crate) fn limit(&self, column_count: u32) -> usize {
-        let floats = self.gpu.properties().max_storage_buffer_range / size_of::<f32>() as u64;
-        let bindable = floats.min(u64::from(u32::MAX)) as usize / column_count.max(1) as usize;
-        self.settings.max_gaussians.min(bindable)
     }
 
     /// What a round takes beside the Gaussians, for each, in bytes.
@@ -238,45 +241,54 @@ impl Densifier {
             self.scratch = Scratch::new(&self.gpu, grad_norm_sums.len())?;
         }
         let DensifySettings { gradient_threshold, split_scale, min_opacity, .. } = self.settings;
-        let score = densify_score::Params {
-            gaussian_count: count,
+        let score = |batch: Batch| densify_score::Params {
+            gaussian_count: batch.gaussian_count(),
             column_count,
             feature_count,
             gradient_threshold: gradient_threshold as f32,
             min_raw_opacity: (min_opacity / (1.0 - min_opacity)).ln() as f32,
+            first_gaussian: batch.first_gaussian(),
         };
-        let decide = densify_decide::Params {
+        let decide = |batch: Batch| densify_decide::Params {
             gaussian_count: count,
+            first_gaussian: batch.first_gaussian(),
+            batch_count: batch.gaussian_count(),
             max_gaussians: limit.min(u32::MAX as usize) as u32,
             rounds_left: round.rounds_left.clamp(1, u64::from(u32::MAX)) as u32,
             split_log_scale: split_scale.ln() as f32,
         };
+        let batches = gaussians.batches(&self.gpu);
         let Self { scratch, sort, scan, .. } = self;
-        let threads = Threads::Exactly([count, 1, 1]);
         self.gpu.write(&mut scratch.count, &[count])?;
         let mut download = None;
         self.gpu.run("densify_decide", |pass| {
             pass.fill(&mut scratch.tally, 0);
-            let buffers = densify_score::Buffers {
-                parameters,
-                grad_norm_sums,
-                visit_counts,
-                keys: &mut scratch.keys,
-                ids: &mut scratch.ids,
-                tally: &mut scratch.tally,
-            };
-            pass.dispatch(&self.score, &score, buffers, threads)?;
+            for batch in batches.iter() {
+                let buffers = densify_score::Buffers {
+                    parameters: &batch.of_planes(parameters)?,
+                    grad_norm_sums: &batch.of_rows(grad_norm_sums, 1)?,
+                    visit_counts: &batch.of_rows(visit_counts, 1)?,
+                    keys: &mut batch.of_rows(&scratch.keys, 1)?,
+                    ids: &mut batch.of_rows(&scratch.ids, 1)?,
+                    tally: &mut scratch.tally,
+                };
+                let threads = Threads::Exactly([batch.gaussian_count(), 1, 1]);
+                pass.dispatch(&self.score, &score(batch), buffers, threads)?;
+            }
             let counted = Count { counts: &scratch.count, index: 0 };
             sort.record(pass, counted, &mut scratch.keys, &mut scratch.ids, u32::BITS)?;
-            let buffers = densify_decide::Buffers {
-                parameters,
-                sorted_keys: &scratch.keys,
-                sorted_ids: &scratch.ids,
-                tally: &mut scratch.tally,
-                fates: &mut scratch.fates,
-                offspring_counts: &mut scratch.offspring_counts,
-            };
-            pass.dispatch(&self.decide, &decide, buffers, threads)?;
+            for batch in batches.iter() {
+                let buffers = densify_decide::Buffers {
+                    parameters: &batch.of_planes(parameters)?,
+                    sorted_keys: &scratch.keys,
+                    sorted_ids: &scratch.ids,
+                    tally: &mut scratch.tally,
+                    fates: &mut scratch.fates,
+                    offspring_counts: &mut scratch.offspring_counts,
+                };
+                let threads = Threads::Exactly([count, 1, 1]);
+                pass.dispatch(&self.decide, &decide(batch), buffers, threads)?;
+            }
             let Scratch { offspring_counts, offsets, total, .. } = scratch;
             scan.record(pass, counted, offspring_counts, offsets, total)?;
             download = Some(pass.download(&scratch.tally)?);
@@ -298,40 +310,63 @@ impl Densifier {
         if report.split + report.cloned + report.pruned == 0 {
             return Ok(());
         }
-        let DeviceGaussians { count, column_count, feature_count, .. } = *gaussians;
-        let new_gaussian_count = report.count as u32;
+        let DeviceGaussians { column_count, feature_count, .. } = *gaussians;
         let seed = self.settings.seed;
-        let params = densify_scatter::Params {
-            gaussian_count: count,
-            new_gaussian_count,
+        let scatter = |from: Batch, to: Batch| densify_scatter::Params {
+            gaussian_count: from.gaussian_count(),
+            new_gaussian_count: to.gaussian_count(),
             column_count,
             feature_count,
             seed: (seed ^ (seed >> 32)) as u32,
             step: step as u32,
+            first_gaussian: from.first_gaussian(),
+            first_new_gaussian: to.first_gaussian(),
         };
-        let moments_params = densify_moments::Params {
-            gaussian_count: count,
-            new_gaussian_count,
+        let carry = |from: Batch, to: Batch| densify_moments::Params {
+            gaussian_count: from.gaussian_count(),
+            new_gaussian_count: to.gaussian_count(),
             column_count,
             feature_count,
+            first_new_gaussian: to.first_gaussian(),
         };
         let mut room = self.room(gaussians, inputs, report.count, limit)?;
         let DensifyInputs { grad_norm_sums, visit_counts, gradients: spare } = inputs;
         let Scratch { fates, offsets, .. } = &self.scratch;
-        let Moments { first, second } = &mut gaussians.moments;
-        let threads = Threads::Exactly([count, 1, 1]);
+        let old = gaussians.batches(&self.gpu);
+        let new = Batches::new(
+            &self.gpu,
+            report.count,
+            [column_count, feature_count].map(|n| n as usize),
+        );
+        // Every batch hands what comes of it to each of the new ones that it belongs to.
+        let pairs = || old.iter().flat_map(|from| new.iter().map(move |to| (from, to)));
+        let DeviceGaussians { parameters, moments: Moments { first, second }, .. } =
+            &mut *gaussians;
         self.gpu.run("densify_scatter", |pass| {
             take(&mut room.planes, spare);
-            let parameters = &mut gaussians.parameters;
-            let buffers =
-                densify_scatter::Buffers { parameters, fates, offsets, new_parameters: spare };
-            pass.dispatch(&self.scatter, &params, buffers, threads)?;
+            for (from, to) in pairs() {
+                let buffers = densify_scatter::Buffers {
+                    parameters: &from.of_planes(parameters)?,
+                    fates: &from.of_rows(fates, 1)?,
+                    offsets: &from.of_rows(offsets, 1)?,
+                    new_parameters: &mut to.of_planes(spare)?,
+                };
+                let threads = Threads::Exactly([from.gaussian_count(), 1, 1]);
+                pass.dispatch(&self.scatter, &scatter(from, to), buffers, threads)?;
+            }
             std::mem::swap(parameters, spare);
             for moments in [first, second] {
                 take(&mut room.planes, spare);
-                let buffers =
-                    densify_moments::Buffers { moments, fates, offsets, new_moments: spare };
-                pass.dispatch(&self.moments, &moments_params, buffers, threads)?;
+                for (from, to) in pairs() {
+                    let buffers = densify_moments::Buffers {
+                        moments: &from.of_planes(moments)?,
+                        fates: &from.of_rows(fates, 1)?,
+                        offsets: &from.of_rows(offsets, 1)?,
+                        new_moments: &mut to.of_planes(spare)?,
+                    };
+                    let threads = Threads::Exactly([from.gaussian_count(), 1, 1]);
+                    pass.dispatch(&self.moments, &carry(from, to), buffers, threads)?;
+                }
                 std::mem::swap(moments, spare);
             }
             take(&mut room.planes, spare);
@@ -340,7 +375,7 @@ impl Densifier {
         if let Some((sums, counts)) = room.statistics {
             (**grad_norm_sums, **visit_counts) = (sums, counts);
         }
-        gaussians.count = new_gaussian_count;
+        gaussians.count = report.count as u32;
         Ok(())
     }
 
@@ -357,7 +392,7 @@ impl Densifier {
         let planes = [inputs.gradients, parameters, &moments.first, &moments.second];
         let planes = planes.map(|plane| {
             let is_short = plane.len() < count * columns;
-            is_short.then(|| self.gpu.uninit("planes", capacity * columns)).transpose()
+            is_short.then(|| self.gpu.uninit_in_windows("planes", capacity * columns)).transpose()
         });
         let [a, b, c, d] = planes;
         let statistics = if inputs.grad_norm_sums.len() < count {

@@ -218,7 +218,7 @@ impl Player {
         };
         Ok(Self {
             frame,
-            parameters: gpu.buffer("parameters", &gaussians.parameters)?,
+            parameters: gaussians.upload(gpu)?,
             count: gaussians.count,
             sh_degree: shape.sh_degree,
             features: shape.features,

@@ -15,6 +15,7 @@ mod settings;
 
 use glam::{UVec2, Vec2};
 
+use crate::batches::Batches;
 use crate::camera::{Camera, Patch};
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Statistic, Threads};
 use crate::kernels::project::DEPTH_BITS;
@@ -23,6 +24,7 @@ use crate::kernels::{
     self, blend_backward, blend_forward, emit, order_counts, project, project_backward,
     reduce_records,
 };
+use crate::scene::width;
 use crate::sort::{Count, RadixSort};
 use crate::{Error, Result};
 
@@ -75,7 +77,7 @@ pub struct Gradients<'a> {
 /// let gaussians = ply::load("run/model.ply")?;
 /// let settings = RenderSettings { shape: gaussians.shape, ..RenderSettings::default() };
 /// let mut renderer = Renderer::new(&gpu, settings)?;
-/// let parameters = gpu.buffer("parameters", &gaussians.parameters)?;
+/// let parameters = gaussians.upload(&gpu)?;
 /// renderer.reserve(gaussians.count, [&camera])?;
 /// let options = RenderOptions { sh_degree: gaussians.shape.sh_degree, background: [0.0; 3] };
 /// renderer.render_image(&parameters, &camera, &options)?.save_png8("view.png")?;
@@ -299,7 +301,8 @@ impl Renderer {
         pass.fill(&mut self.frame.status, 0);
     }
 
-    /// Records the render of `gaussians` (planes of all attributes) as a camera sees them, or a patch of what it sees.
+    /// Records the render of `gaussians` (planes of all attributes, in [`Batches`]) as a camera sees them, or a patch of what it
+    /// sees.
     ///
     /// # Errors
     /// The image exceeds what was reserved, or a pass exceeds what the device launches.
@@ -356,7 +359,7 @@ impl Renderer {
         gradients: Gradients<'_>,
     ) -> Result<()> {
         let view = self.view(&patch.into())?;
-        let gaussian_count = self.frame.gaussian_count;
+        let channels = self.settings.channels();
         let frame = &mut self.frame;
         pass.dispatch(
             &self.blend_backward,
@@ -373,39 +376,45 @@ impl Renderer {
             },
             Threads::Workgroups([view.tile_count(), 1, 1]),
         )?;
-        pass.dispatch(
-            &self.reduce_records,
-            &reduce_records::Params { gaussian_count },
-            reduce_records::Buffers {
-                emitted: &frame.emitted,
-                records: &frame.records,
-                d_splats: &mut frame.d_splats,
-            },
-            Threads::Exactly([gaussian_count, 1, 1]),
-        )?;
-        pass.dispatch(
-            &self.project_backward,
-            &project_backward::Params {
-                camera: view.camera,
-                half_view: view.half_view,
-                gaussian_count,
-                sh_degree: options.sh_degree,
-                damping_weight: damping.weight,
-                damping_depth: damping.depth,
-            },
-            project_backward::Buffers {
-                parameters: gaussians,
-                splats: &frame.splats,
-                colors: &frame.colors,
-                tile_counts: &frame.tile_counts,
-                d_splats: &frame.d_splats,
-                status: &mut frame.status,
-                gradients: gradients.parameters,
-                grad_norm_sums: gradients.grad_norm_sums,
-                visit_counts: gradients.visit_counts,
-            },
-            Threads::Exactly([gaussian_count, 1, 1]),
-        )
+        for batch in self.batches().iter() {
+            let gaussian_count = batch.gaussian_count();
+            let threads = Threads::Exactly([gaussian_count, 1, 1]);
+            let frame = &mut self.frame;
+            pass.dispatch(
+                &self.reduce_records,
+                &reduce_records::Params { gaussian_count },
+                reduce_records::Buffers {
+                    emitted: &batch.of_rows(&frame.emitted, 1)?,
+                    records: &frame.records,
+                    d_splats: &mut batch.of_rows(&frame.d_splats, frame.record_vectors())?,
+                },
+                threads,
+            )?;
+            pass.dispatch(
+                &self.project_backward,
+                &project_backward::Params {
+                    camera: view.camera,
+                    half_view: view.half_view,
+                    gaussian_count,
+                    sh_degree: options.sh_degree,
+                    damping_weight: damping.weight,
+                    damping_depth: damping.depth,
+                },
+                project_backward::Buffers {
+                    parameters: &batch.of_planes(gaussians)?,
+                    splats: &batch.of_rows(&frame.splats, 1)?,
+                    colors: &batch.of_rows(&frame.colors, channels)?,
+                    tile_counts: &batch.of_rows(&frame.tile_counts, 1)?,
+                    d_splats: &batch.of_rows(&frame.d_splats, frame.record_vectors())?,
+                    status: &mut frame.status,
+                    gradients: &mut batch.of_planes(gradients.parameters)?,
+                    grad_norm_sums: &mut batch.of_rows(gradients.grad_norm_sums, 1)?,
+                    visit_counts: &mut batch.of_rows(gradients.visit_counts, 1)?,
+                },
+                threads,
+            )?;
+        }
+        Ok(())
     }
 
     fn record_project(
@@ -415,26 +424,34 @@ impl Renderer {
         view: &View,
         sh_degree: u32,
     ) -> Result<()> {
-        let frame = &mut self.frame;
-        let gaussian_count = frame.gaussian_count;
-        pass.dispatch(
-            &self.project,
-            &project::Params {
-                camera: view.camera,
-                near: self.settings.near,
-                gaussian_count,
-                sh_degree,
-            },
-            project::Buffers {
-                parameters: gaussians,
-                splats: &mut frame.splats,
-                colors: &mut frame.colors,
-                depth_keys: &mut frame.depth_keys,
-                ids: &mut frame.ids,
-                tile_counts: &mut frame.tile_counts,
-            },
-            Threads::Exactly([gaussian_count, 1, 1]),
-        )
+        let (frame, channels) = (&self.frame, self.settings.channels());
+        self.batches().iter().try_for_each(|batch| {
+            pass.dispatch(
+                &self.project,
+                &project::Params {
+                    camera: view.camera,
+                    near: self.settings.near,
+                    gaussian_count: batch.gaussian_count(),
+                    sh_degree,
+                    first_gaussian: batch.first_gaussian(),
+                },
+                project::Buffers {
+                    parameters: &batch.of_planes(gaussians)?,
+                    splats: &mut batch.of_rows(&frame.splats, 1)?,
+                    colors: &mut batch.of_rows(&frame.colors, channels)?,
+                    depth_keys: &mut batch.of_rows(&frame.depth_keys, 1)?,
+                    ids: &mut batch.of_rows(&frame.ids, 1)?,
+                    tile_counts: &mut batch.of_rows(&frame.tile_counts, 1)?,
+                },
+                Threads::Exactly([batch.gaussian_count(), 1, 1]),
+            )
+        })
+    }
+
+    /// How those that render lie in the buffers of their planes.
+    fn batches(&self) -> Batches {
+        let (count, shape) = (self.frame.gaussian_count as usize, self.settings.shape);
+        Batches::new(&self.gpu, count, [width(shape), shape.features.width()])
     }
 
     /// From projected splats to each tile's list of them, front to back.

@@ -4,6 +4,8 @@ use std::ops::Range;
 
 use glam::{DVec3, Vec3};
 
+use crate::Result;
+
 mod features;
 #[cfg(feature = "io")]
 pub mod init;
@@ -13,7 +15,9 @@ pub mod ply;
 
 pub use crate::attributes::{ATTRIBUTES, Attribute, rest_coefficients};
 use crate::attributes::{column_count, planes};
+use crate::batches::Batches;
 use crate::camera::Frame;
+use crate::gpu::{Buffer, Gpu};
 pub use features::{COLOR_CHANNELS, FEATURES, Feature, FeatureSpec, Features};
 
 pub use crate::kernels::sh::MAX_SH_DEGREE;
@@ -59,6 +63,15 @@ impl Gaussians {
     pub fn zeros(count: usize, shape: impl Into<Shape>) -> Self {
         let shape = shape.into();
         Self { count, shape, parameters: vec![0.0; count * width(shape)] }
+    }
+
+    /// A copy on the device: what renders, whole planes in [`Batches`].
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub fn upload(&self, gpu: &Gpu) -> Result<Buffer<f32>> {
+        let columns = [width(self.shape), self.shape.features.width()];
+        Batches::new(gpu, self.count, columns).upload(gpu, "parameters", &self.parameters)
     }
 
     /// Where an attribute lies in [`Gaussians::parameters`].

@@ -34,11 +34,11 @@ use crate::exposure::Exposures;
 use crate::gpu::{Buffer, CheckReport, Gpu, PassTime, Recorder};
 use crate::loss::{LogSlot, LossLog, Losses, StepLosses, Term, TermInputs};
 use crate::nn::Form;
-use crate::optimizer::{Adam, AdamBuffers, FiniteCheck, Learnable};
+use crate::optimizer::{Adam, FiniteCheck, Learnable};
 use crate::pseudo_gt::PseudoGt;
 use crate::random::Stream;
 use crate::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer};
-use crate::scene::{COLOR_CHANNELS, Gaussians, width};
+use crate::scene::{COLOR_CHANNELS, Gaussians};
 use crate::{Error, Result};
 
 pub use cache::CacheSize;
@@ -480,21 +480,9 @@ impl Trainer {
                 visit_counts: &mut model.visit_counts,
             },
         )?;
-        // Coefficients that are not in use yet have no gradient and no moments: nothing to update.
-        let (columns, features) = (model.gaussians.column_count, model.gaussians.feature_count);
-        let columns = if options.sh_degree == 0 { width(0) as u32 + features } else { columns };
-        self.adam.record(
-            pass,
-            step,
-            &schedule.learning_rates(step, self.extent),
-            [model.gaussians.count, columns, features],
-            AdamBuffers {
-                parameters: &mut model.gaussians.parameters,
-                gradients: &model.gradients,
-                moments: &mut model.gaussians.moments,
-            },
-            self.renderer.status(),
-        )?;
+        let rates = schedule.learning_rates(step, self.extent);
+        let (degree, status) = (options.sh_degree, self.renderer.status());
+        model.update((&self.gpu, pass), &self.adam, step, &rates, degree, status)?;
         learnables(&mut self.networks, &mut self.exposures).try_for_each(|learnable| {
             self.adam.update(pass, step, learnable, self.renderer.status())
         })?;

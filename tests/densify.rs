@@ -104,21 +104,18 @@ impl Host {
     }
 
     fn densify(&self, gpu: &Gpu, settings: DensifySettings, round: Round) -> (Self, DensifyReport) {
-        let upload = |name: &str, data: &[f32]| gpu.buffer(name, data).unwrap();
+        let planes = |data: &[f32]| gpu.buffer("planes", data).unwrap();
         let mut gaussians = DeviceGaussians {
             count: self.count as u32,
             column_count: COLUMNS as u32,
             feature_count: FEATURES as u32,
-            parameters: upload("parameters", &self.parameters),
-            moments: Moments {
-                first: upload("first", &self.first),
-                second: upload("second", &self.second),
-            },
+            parameters: planes(&self.parameters),
+            moments: Moments { first: planes(&self.first), second: planes(&self.second) },
         };
         let inputs = DensifyInputs {
-            grad_norm_sums: &mut upload("grad_norm_sums", &self.grad_norm_sums),
+            grad_norm_sums: &mut planes(&self.grad_norm_sums),
             visit_counts: &mut gpu.buffer("visit_counts", &self.visit_counts).unwrap(),
-            gradients: &mut upload("gradients", &vec![f32::NAN; self.count * COLUMNS]),
+            gradients: &mut planes(&vec![f32::NAN; self.count * COLUMNS]),
         };
         let mut densifier = Densifier::new(gpu, settings).unwrap();
         let report = densifier.densify(&mut gaussians, inputs, round).unwrap();
@@ -152,6 +149,7 @@ impl Host {
             feature_count,
             gradient_threshold: settings.gradient_threshold as f32,
             min_raw_opacity: (settings.min_opacity / (1.0 - settings.min_opacity)).ln() as f32,
+            first_gaussian: 0,
         };
         let slices = densify_score::Slices {
             parameters: &self.parameters,
@@ -169,6 +167,8 @@ impl Host {
         let (mut fates, mut offspring_counts) = (vec![0; n], vec![0; n]);
         let params = densify_decide::Params {
             gaussian_count,
+            first_gaussian: 0,
+            batch_count: gaussian_count,
             max_gaussians: settings.max_gaussians.min(u32::MAX as usize) as u32,
             rounds_left: round.rounds_left as u32,
             split_log_scale: settings.split_scale.ln() as f32,
@@ -201,6 +201,8 @@ impl Host {
             feature_count,
             seed: settings.seed as u32,
             step: round.step as u32,
+            first_gaussian: 0,
+            first_new_gaussian: 0,
         };
         let slices = densify_scatter::Slices {
             parameters: &self.parameters,
@@ -216,6 +218,7 @@ impl Host {
                 new_gaussian_count,
                 column_count,
                 feature_count,
+                first_new_gaussian: 0,
             };
             let slices = densify_moments::Slices {
                 moments,
@@ -487,20 +490,18 @@ fn a_buffer_that_is_too_short_is_refused() {
     let mut densifier = Densifier::new(&gpu, SETTINGS).unwrap();
     for (short, columns) in [(0, 14), (1, 14), (2, 14), (3, 14), (4, 14), (5, 13)] {
         let len = |index: usize, len: usize| if index == short { len - 1 } else { len };
+        let planes = |index| gpu.zeros("planes", len(index, 28)).unwrap();
         let mut gaussians = DeviceGaussians {
             count: 2,
             column_count: columns,
             feature_count: 0,
-            parameters: gpu.zeros("parameters", len(0, 28)).unwrap(),
-            moments: Moments {
-                first: gpu.zeros("first", len(1, 28)).unwrap(),
-                second: gpu.zeros("second", len(2, 28)).unwrap(),
-            },
+            parameters: planes(0),
+            moments: Moments { first: planes(1), second: planes(2) },
         };
         let inputs = DensifyInputs {
             grad_norm_sums: &mut gpu.zeros("grad_norm_sums", len(3, 2)).unwrap(),
             visit_counts: &mut gpu.zeros("visit_counts", len(4, 2)).unwrap(),
-            gradients: &mut gpu.zeros("gradients", 28).unwrap(),
+            gradients: &mut planes(6),
         };
         assert!(densifier.densify(&mut gaussians, inputs, LAST).is_err(), "{short}");
     }

@@ -13,7 +13,9 @@
 layout(local_size_x = 64) in;
 
 layout(push_constant) uniform Params {
-    uint  gaussian_count;
+    uint  gaussian_count;   // of all batches
+    uint  first_gaussian;   // how many lie before those of this dispatch
+    uint  batch_count;      // how many these are
     uint  max_gaussians;
     uint  rounds_left;      // this one included; at least 1
     float split_log_scale;  // ln of the largest standard deviation of a clone
@@ -21,7 +23,7 @@ layout(push_constant) uniform Params {
 
 layout(constant_id = 0) const bool CONSERVING = false;  // every candidate is split
 
-layout(binding = 0) readonly  buffer Parameters { float parameters[]; };      // planes
+layout(binding = 0) readonly  buffer Parameters { float parameters[]; };      // planes of the batch
 layout(binding = 1) readonly  buffer SortedKeys { uint sorted_keys[]; };      // (gaussian_count), KEY_*
 layout(binding = 2) readonly  buffer SortedIds  { uint sorted_ids[]; };       // (gaussian_count)
 layout(binding = 3) buffer Tally { uint tally[]; };                           // TALLY_*
@@ -37,7 +39,7 @@ uint room() {
 
 bool is_small(uint i) {
     if (CONSERVING) return false;
-    vec3 log_scales = LOAD_VEC3(parameters, LOG_SCALES_COLUMN, gaussian_count, i);
+    vec3 log_scales = LOAD_VEC3(parameters, LOG_SCALES_COLUMN, batch_count, i - first_gaussian);
     return max(log_scales.x, max(log_scales.y, log_scales.z)) <= split_log_scale;
 }
 
@@ -45,6 +47,8 @@ void main() {
     uint place = THREAD_INDEX;
     if (place >= gaussian_count) return;
     uint i = sorted_ids[place], key = sorted_keys[place];
+    // Unsigned: what lies before the batch wraps beyond its end.
+    if (i - first_gaussian >= batch_count) return;
     uint first_without = room();
     uint end = tally[TALLY_CANDIDATES] > first_without ? sorted_keys[first_without] : KEY_KEEP;
     uint fate = key == KEY_PRUNE ? FATE_PRUNE : FATE_KEEP;

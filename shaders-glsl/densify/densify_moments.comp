@@ -7,8 +7,8 @@
 //! Densify moments: one thread per Gaussian writes the moments of what comes of it to the new planes.
 //!
 //! One that stays keeps its moments, a new one begins with zero: moments inherited in the proportion of the gradient
-//! were measured to cost 0.45 dB, because two halves need large steps to part. Reference:
-//! `src/reference/densify_moments.rs`.
+//! were measured to cost 0.45 dB, because two halves need large steps to part. A dispatch goes from one batch of Gaussians
+//! to one batch of the new. Reference: `src/reference/densify_moments.rs`.
 
 layout(local_size_x = 64) in;
 
@@ -17,6 +17,7 @@ layout(push_constant) uniform Params {
     uint new_gaussian_count;
     uint column_count;
     uint feature_count;
+    uint first_new_gaussian;  // how many of the new lie before those of this dispatch
 };
 
 layout(binding = 0) readonly  buffer Moments    { float moments[]; };     // planes
@@ -29,7 +30,9 @@ void main() {
     if (i >= gaussian_count) return;
     uint fate = fates[i];
     for (uint copy_index = 0; copy_index < offspring(fate); ++copy_index) {
-        uint to = offsets[i] + copy_index;
+        // Unsigned: what lies before the batch wraps beyond its end.
+        uint to = offsets[i] + copy_index - first_new_gaussian;
+        if (to >= new_gaussian_count) continue;
         bool begins = is_new(fate, copy_index);
         for (uint plane = 0; plane < PLANE_COUNT; ++plane) {
             uint column = plane_column(plane, feature_count, column_count);

@@ -10,8 +10,8 @@
 //!
 //! The paper's: a new one is at a position drawn from the normal distribution that its parent is (the clone too: the
 //! LITA-GS variant of Kerbl et al. 2023), after a split at 1/1.6 of its scale; draws depend on seed, step, Gaussian and
-//! copy alone. Conserving: the two of a split lie along the parent's longest axis and cover together what it covered.
-//! Reference: `src/reference/densify_scatter.rs`.
+//! copy alone. Conserving: the two of a split lie along the parent's longest axis and cover together what it covered. A
+//! dispatch goes from one batch of Gaussians to one batch of the new. Reference: `src/reference/densify_scatter.rs`.
 
 layout(local_size_x = 64) in;
 
@@ -22,6 +22,8 @@ layout(push_constant) uniform Params {
     uint feature_count;
     uint seed;
     uint step;
+    uint first_gaussian;      // how many lie before those of this dispatch
+    uint first_new_gaussian;  // and how many of the new
 };
 
 layout(constant_id = 0) const bool CONSERVING = false;
@@ -50,7 +52,7 @@ struct Shape {
 
 // A draw from the normal distribution that Gaussian i is.
 Shape drawn(uint i, Shape parent, mat3 axes, bool is_split, uint copy_index) {
-    uint key = random_bits(random_bits(random_bits(seed) + step) + 2 * i + copy_index);
+    uint key = random_bits(random_bits(random_bits(seed) + step) + 2 * (first_gaussian + i) + copy_index);
     Shape child = parent;
     child.mean += axes * (exp(parent.log_scales) * random_normal3(key));
     if (is_split) child.log_scales -= PAPER_LOG_SPLIT_FACTOR;
@@ -84,7 +86,9 @@ void main() {
     parent.raw_opacity = parameters[RAW_OPACITIES_COLUMN * gaussian_count + i];
     mat3 axes = rotation(unit_quat(LOAD_VEC4(parameters, QUATS_COLUMN, gaussian_count, i)));
     for (uint copy_index = 0; copy_index < offspring(fate); ++copy_index) {
-        uint to = offsets[i] + copy_index;
+        // Unsigned: what lies before the batch wraps beyond its end.
+        uint to = offsets[i] + copy_index - first_new_gaussian;
+        if (to >= new_gaussian_count) continue;
         copy(i, to);
         if (!is_new(fate, copy_index)) continue;
         Shape child;

@@ -18,6 +18,7 @@ layout(push_constant) uniform Params {
     uint  feature_count;
     float gradient_threshold;  // mean norm in normalised device units; exceeded, not met
     float min_raw_opacity;     // before the sigmoid
+    uint  first_gaussian;      // how many lie before those of this dispatch
 };
 
 layout(binding = 0) readonly  buffer Parameters   { float parameters[]; };      // planes
@@ -46,7 +47,7 @@ void main() {
     uint key = KEY_PRUNE;
     if (is_sound(i)) key = mean_gradient > gradient_threshold ? KEY_TOP - floatBitsToUint(mean_gradient) : KEY_KEEP;
     keys[i] = key;
-    ids[i] = i;
+    ids[i] = first_gaussian + i;
     uint candidates = subgroupAdd(key < KEY_KEEP ? 1u : 0u);
     uint pruned = subgroupAdd(key == KEY_PRUNE ? 1u : 0u);
     if (subgroupElect()) {

@@ -20,6 +20,7 @@ layout(push_constant, scalar) uniform Params {
     float near;       // world units
     uint  gaussian_count;
     uint  sh_degree;  // in use; at most SH_DEGREE
+    uint  first_gaussian;  // how many lie before those of this dispatch
 };
 
 layout(constant_id = 0) const uint SH_DEGREE = 3;  // stored
@@ -61,7 +62,7 @@ vec3 sh_color(uint i, vec3 direction) {
 void main() {
     uint i = THREAD_INDEX;
     if (i >= gaussian_count) return;
-    ids[i] = i;
+    ids[i] = first_gaussian + i;
     depth_keys[i] = CULLED;
     tile_counts[i] = 0;
 

@@ -9,13 +9,16 @@ use gpu_allocator::vulkan::{Allocation, AllocationCreateDesc, AllocationScheme};
 use gpu_allocator::{AllocationError, MemoryLocation};
 
 use super::recorder::HOST_SUBMITS;
-use super::{Bound, Gpu, Recorder, Retired, Shared, lock};
+use super::{Bound, Gpu, Properties, Recorder, Retired, Shared, lock};
 use crate::{Error, Result};
 
-/// An array of `T` in device memory. Dropping it frees the memory once no submission uses it.
+/// An array of `T` in device memory, or a window of one. Dropping the last of them frees the memory once no submission uses
+/// it.
 #[derive(Debug)]
 pub struct Buffer<T> {
-    memory: Memory,
+    memory: Arc<Memory>,
+    /// Where it begins in the memory, in elements.
+    first: usize,
     len: usize,
     element: PhantomData<T>,
 }
@@ -60,16 +63,36 @@ impl<T: bytemuck::Pod> Buffer<T> {
         self.memory.raw
     }
 
-    /// The size of the elements, in bytes.
-    pub(super) fn size(&self) -> u64 {
-        (self.len * size_of::<T>()) as u64
-    }
-
     /// What a dispatch binds.
     pub(crate) fn bound(&self) -> Bound {
-        Bound { raw: self.handle(), size: self.size() }
+        let [offset, size] = [self.first, self.len].map(|n| (n * size_of::<T>()) as u64);
+        Bound { raw: self.handle(), offset, size }
+    }
+
+    /// Some of its elements: the same memory, so that what is done to the one is done to the other.
+    ///
+    /// # Errors
+    /// The buffer does not hold them, or no binding can begin there: at multiples of 256 bytes every device's can.
+    pub(crate) fn window(&self, first: usize, len: usize) -> Result<Self> {
+        let holds = first.checked_add(len).is_some_and(|end| end <= self.len);
+        if !holds || !(first * size_of::<T>()).is_multiple_of(WINDOW_ALIGNMENT) {
+            let (name, own) = (self.name(), self.len);
+            let what = format!("buffer `{name}` holds {own} elements, not {len} from {first} on");
+            return Err(Error::Usage(what));
+        }
+        let memory = Arc::clone(&self.memory);
+        Ok(Self { memory, first: self.first + first, len, element: PhantomData })
     }
 }
+
+/// What is made and bound for so many bytes: Vulkan has no empty buffers, an empty array still binds; and whole quads, for
+/// kernels that read four values at a time.
+pub(super) fn whole_quads(bytes: u64) -> u64 {
+    bytes.max(1).next_multiple_of(16)
+}
+
+/// Vulkan lets no device ask for more of where a binding begins, in bytes.
+const WINDOW_ALIGNMENT: usize = 256;
 
 impl Gpu {
     /// A buffer of `len` elements whose contents are undefined.
@@ -78,8 +101,26 @@ impl Gpu {
     /// The buffer exceeds the binding limit or the memory of the device.
     pub fn uninit<T: bytemuck::Pod>(&self, name: &str, len: usize) -> Result<Buffer<T>> {
         let bytes = (len as u64).saturating_mul(size_of::<T>() as u64);
+        let Properties { name: device, max_storage_buffer_range: limit, .. } = self.properties();
+        if bytes > *limit {
+            let (buffer, device, limit) = (name.to_owned(), device.clone(), *limit);
+            return Err(Error::BufferTooLarge { buffer, bytes, device, limit });
+        }
+        self.uninit_in_windows(name, len)
+    }
+
+    /// The same where passes bind windows alone: only memory limits its length.
+    ///
+    /// # Errors
+    /// The device is out of memory.
+    pub(crate) fn uninit_in_windows<T: bytemuck::Pod>(
+        &self,
+        name: &str,
+        len: usize,
+    ) -> Result<Buffer<T>> {
+        let bytes = (len as u64).saturating_mul(size_of::<T>() as u64);
         let memory = Memory::new(&self.shared, name, bytes, MemoryLocation::GpuOnly)?;
-        Ok(Buffer { memory, len, element: PhantomData })
+        Ok(Buffer { memory: Arc::new(memory), first: 0, len, element: PhantomData })
     }
 
     /// A buffer of `len` elements of zero bits.
@@ -125,7 +166,7 @@ impl Gpu {
             mapped[..bytes.len()].copy_from_slice(bytes);
         }
         self.run("write", |pass| {
-            pass.copy_raw(staging.raw, buffer.handle(), bytes.len() as u64);
+            pass.copy_raw(staging.bound(), buffer.bound(), bytes.len() as u64);
             Ok(())
         })?;
         Ok(())
@@ -151,26 +192,25 @@ impl Recorder<'_> {
     /// # Errors
     /// The device is out of memory, or the recording is [`Gpu::record_into`]'s: only the host knows when the copy is there.
     pub fn download<T: bytemuck::Pod>(&mut self, buffer: &Buffer<T>) -> Result<Download<T>> {
-        self.download_raw(buffer.name(), buffer.handle(), buffer.len)
+        self.download_bound(buffer.name(), buffer.bound())
     }
 
-    /// The same for a buffer of which only the handle is at hand.
-    pub(super) fn download_raw<T: bytemuck::Pod>(
+    /// The same for a buffer of which only that is at hand what a pass binds.
+    pub(super) fn download_bound<T: bytemuck::Pod>(
         &mut self,
         name: &str,
-        raw: vk::Buffer,
-        len: usize,
+        bound: Bound,
     ) -> Result<Download<T>> {
         if self.value() == HOST_SUBMITS {
             return Err(Error::Usage(format!(
                 "`{name}` cannot be downloaded where the host submits; once that is done, `Gpu::read` it"
             )));
         }
-        let bytes = (len * size_of::<T>()) as u64;
-        let host = Memory::new(self.shared(), name, bytes, MemoryLocation::GpuToCpu)?;
-        if bytes > 0 {
-            self.copy_raw(raw, host.raw, bytes);
+        let host = Memory::new(self.shared(), name, bound.size, MemoryLocation::GpuToCpu)?;
+        if bound.size > 0 {
+            self.copy_raw(bound, host.bound(), bound.size);
         }
+        let len = bound.size as usize / size_of::<T>();
         Ok(Download { host, len, value: self.value(), element: PhantomData })
     }
 }
@@ -193,17 +233,11 @@ impl<T: bytemuck::Pod> Download<T> {
 
 impl Memory {
     fn new(shared: &Arc<Shared>, name: &str, bytes: u64, location: MemoryLocation) -> Result<Self> {
-        let limit = shared.properties.max_storage_buffer_range;
-        if bytes > limit && location == MemoryLocation::GpuOnly {
-            let device = shared.properties.name.clone();
-            return Err(Error::BufferTooLarge { buffer: name.to_owned(), bytes, device, limit });
-        }
         let usage = vk::BufferUsageFlags::STORAGE_BUFFER
             | vk::BufferUsageFlags::INDIRECT_BUFFER
             | vk::BufferUsageFlags::TRANSFER_SRC
             | vk::BufferUsageFlags::TRANSFER_DST;
-        // Vulkan has no empty buffers, an empty array still binds; whole quads, for kernels that read four values at a time.
-        let size = bytes.max(1).next_multiple_of(16);
+        let size = whole_quads(bytes);
         let info = vk::BufferCreateInfo::default().size(size).usage(usage);
         fn out_of_memory<E>(name: &str, bytes: u64) -> impl Fn(E) -> Error
         where
@@ -251,6 +285,11 @@ impl Memory {
             bound.map_err(out_of_memory(&memory.name, bytes))?;
             Ok(memory)
         }
+    }
+
+    /// From its begin.
+    fn bound(&self) -> Bound {
+        Bound { raw: self.raw, offset: 0, size: vk::WHOLE_SIZE }
     }
 }
 

@@ -193,11 +193,7 @@ impl Recorder<'_> {
         wanted: impl Fn(&Binding) -> bool,
     ) -> Result<Vec<Download<u32>>> {
         let wanted = bindings.iter().zip(bound).filter(|(binding, _)| wanted(binding));
-        wanted
-            .map(|(binding, bound)| {
-                self.download_raw(binding.name, bound.raw, bound.size as usize / size_of::<u32>())
-            })
-            .collect()
+        wanted.map(|(binding, bound)| self.download_bound(binding.name, *bound)).collect()
     }
 
     /// Submits what is recorded, waits for it, and begins anew.

@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use ash::{khr, vk};
 
+use super::buffer::whole_quads;
 use super::pipeline::Objects;
 use super::{Bound, Recorder, Retired, Shared};
 use crate::Result;
@@ -102,7 +103,10 @@ impl Recorder<'_> {
     ) -> Result<()> {
         let infos: Vec<_> = bound
             .iter()
-            .map(|b| [vk::DescriptorBufferInfo::default().buffer(b.raw).range(vk::WHOLE_SIZE)])
+            .map(|&Bound { raw, offset, size }| {
+                let info = vk::DescriptorBufferInfo::default().buffer(raw).offset(offset);
+                [info.range(whole_quads(size))]
+            })
             .collect();
         let mut writes: Vec<_> = pipeline
             .interface

@@ -24,6 +24,8 @@ pub struct Binding {
 pub struct Bound {
     /// The Vulkan buffer.
     pub raw: vk::Buffer,
+    /// Where its elements begin, in bytes.
+    pub offset: u64,
     /// Bytes of its elements.
     pub size: u64,
 }

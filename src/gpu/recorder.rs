@@ -11,7 +11,7 @@ use ash::vk::Handle as _;
 use super::checked::Checked;
 use super::descriptors::Sets;
 use super::pipeline::Objects;
-use super::{Bound, Buffer, Gpu, Interface, Pipeline, Reference, Shared};
+use super::{Binding, Bound, Buffer, Gpu, Interface, Pipeline, Properties, Reference, Shared};
 use crate::{Error, Result};
 
 /// How many invocations a dispatch needs; the kernel knows its workgroup size.
@@ -119,6 +119,7 @@ impl<'g> Recorder<'g> {
         threads: Threads<'_>,
     ) -> Result<()> {
         let Interface { name, bindings, .. } = *pipeline.interface;
+        self.check_sizes(bindings, bound)?;
         let uses = bindings.iter().zip(bound).map(|(b, bound)| (bound.raw, b.writable));
         let indirect = match threads {
             Threads::Indirect(arguments) => Some((arguments.handle(), false)),
@@ -149,27 +150,31 @@ impl<'g> Recorder<'g> {
         if buffer.is_empty() {
             return;
         }
-        self.synchronize([(buffer.handle(), true)].into_iter());
+        let Bound { raw, offset, size } = buffer.bound();
+        self.synchronize([(raw, true)].into_iter());
         // SAFETY: recording; the buffer is live. Sizes of our element types are multiples of four.
         unsafe {
-            let (raw, whole) = (buffer.handle(), vk::WHOLE_SIZE);
-            self.shared.device.cmd_fill_buffer(self.commands, raw, 0, whole, word);
+            self.shared.device.cmd_fill_buffer(self.commands, raw, offset, size, word);
         }
     }
 
     /// Copies the first elements of `source` to `target`, as many as both hold.
     pub fn copy<T: bytemuck::Pod>(&mut self, source: &Buffer<T>, target: &mut Buffer<T>) {
-        let bytes = source.size().min(target.size());
+        let (source, target) = (source.bound(), target.bound());
+        let bytes = source.size.min(target.size);
         if bytes > 0 {
-            self.copy_raw(source.handle(), target.handle(), bytes);
+            self.copy_raw(source, target, bytes);
         }
     }
 
-    pub(super) fn copy_raw(&mut self, source: vk::Buffer, target: vk::Buffer, size: u64) {
-        self.synchronize([(source, false), (target, true)].into_iter());
-        let region = [vk::BufferCopy { src_offset: 0, dst_offset: 0, size }];
-        // SAFETY: recording; both buffers hold `size` bytes.
-        unsafe { self.shared.device.cmd_copy_buffer(self.commands, source, target, &region) };
+    pub(super) fn copy_raw(&mut self, source: Bound, target: Bound, size: u64) {
+        self.synchronize([(source.raw, false), (target.raw, true)].into_iter());
+        let region =
+            [vk::BufferCopy { src_offset: source.offset, dst_offset: target.offset, size }];
+        // SAFETY: recording; both buffers hold `size` bytes from their offsets on.
+        unsafe {
+            self.shared.device.cmd_copy_buffer(self.commands, source.raw, target.raw, &region);
+        }
     }
 
     /// Makes everything recorded so far visible to the host and to whatever the host records next.
@@ -232,6 +237,19 @@ impl<'g> Recorder<'g> {
             }
             Threads::Workgroups(n) => n,
             Threads::Indirect(_) => [0; 3],
+        }
+    }
+
+    /// A buffer that is bound in windows may be longer than a binding; one that is bound may not.
+    fn check_sizes(&self, bindings: &[Binding], bound: &[Bound]) -> Result<()> {
+        let Properties { name: device, max_storage_buffer_range: limit, .. } =
+            &self.shared.properties;
+        match bindings.iter().zip(bound).find(|(_, bound)| bound.size > *limit) {
+            Some((Binding { name, .. }, &Bound { size: bytes, .. })) => {
+                let (buffer, device, limit) = ((*name).to_owned(), device.clone(), *limit);
+                Err(Error::BufferTooLarge { buffer, bytes, device, limit })
+            }
+            None => Ok(()),
         }
     }
 

@@ -1,12 +1,12 @@
 //! One validated device for all tests of a process.
 
 use std::cell::Cell;
-use std::sync::OnceLock;
 use std::sync::atomic::Ordering;
+use std::sync::{Arc, OnceLock};
 
 use ash::vk;
 
-use super::{DeviceChoice, Gpu};
+use super::{DeviceChoice, Gpu, Shared};
 
 static GPU: OnceLock<Gpu> = OnceLock::new();
 
@@ -15,29 +15,34 @@ static GPU: OnceLock<Gpu> = OnceLock::new();
 ///
 /// # Panics
 /// There is no device or no validation layer: a test without them proves nothing.
-#[expect(clippy::panic, reason = "a test without a device must fail")]
 pub fn gpu() -> Gpu {
-    let open = || {
-        super::validation::fail_at_exit();
-        let choice = std::env::var("NIGHTSPLAT_DEVICE").unwrap_or_default();
-        let choice: DeviceChoice = choice.parse().unwrap_or_else(|error| panic!("{error}"));
-        Gpu::with_validation(&choice).unwrap_or_else(|error| panic!("{error}"))
-    };
-    GPU.get_or_init(open).clone()
+    GPU.get_or_init(|| open(|_| ())).clone()
 }
 
 /// Another device with validation, whose passes bind descriptor sets wherever it is.
 ///
 /// # Panics
 /// As [`gpu`].
-#[expect(clippy::panic, reason = "a test without a device must fail")]
 pub fn gpu_that_binds_sets() -> Gpu {
+    open(|shared| shared.descriptors = super::descriptors::Descriptors::InSets)
+}
+
+/// Another device with validation, which takes it that no binding spans more bytes than these.
+///
+/// # Panics
+/// As [`gpu`].
+pub fn gpu_that_binds(bytes: u64) -> Gpu {
+    open(|shared| shared.properties.max_storage_buffer_range = bytes)
+}
+
+#[expect(clippy::panic, reason = "a test without a device must fail")]
+fn open(adapt: impl FnOnce(&mut Shared)) -> Gpu {
     super::validation::fail_at_exit();
     let choice = std::env::var("NIGHTSPLAT_DEVICE").unwrap_or_default();
     let choice: DeviceChoice = choice.parse().unwrap_or_else(|error| panic!("{error}"));
     let mut gpu = Gpu::with_validation(&choice).unwrap_or_else(|error| panic!("{error}"));
-    if let Some(shared) = std::sync::Arc::get_mut(&mut gpu.shared) {
-        shared.descriptors = super::descriptors::Descriptors::InSets;
+    if let Some(shared) = Arc::get_mut(&mut gpu.shared) {
+        adapt(shared);
     }
     gpu
 }

@@ -9,7 +9,8 @@ use crate::kernels::fate::{
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
         let n = params.gaussian_count as usize;
-        let log_scales = Attribute::LogScales.column(0) * n;
+        let (first, of_batch) = (params.first_gaussian as usize, params.batch_count as usize);
+        let log_scales = Attribute::LogScales.column(0) * of_batch;
         let kept = params.gaussian_count - slices.tally[TALLY_PRUNED as usize];
         let room = params.max_gaussians.saturating_sub(kept).div_ceil(params.rounds_left);
         let end = if slices.tally[TALLY_CANDIDATES as usize] > room {
@@ -19,8 +20,11 @@ impl Reference for Kernel {
         };
         for place in 0..n {
             let (i, key) = (slices.sorted_ids[place] as usize, slices.sorted_keys[place]);
-            let largest =
-                (0..3).map(|k| slices.parameters[log_scales + 3 * i + k]).fold(f32::MIN, f32::max);
+            if !(first..first + of_batch).contains(&i) {
+                continue;
+            }
+            let log_scales = &slices.parameters[log_scales + 3 * (i - first)..][..3];
+            let largest = log_scales.iter().copied().fold(f32::MIN, f32::max);
             let fate = if key < end {
                 let is_small = !constants.conserving && largest <= params.split_log_scale;
                 if is_small { FATE_CLONE } else { FATE_SPLIT }

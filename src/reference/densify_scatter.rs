@@ -35,11 +35,12 @@ pub(super) struct Copy {
     pub(super) is_new: bool,
 }
 
-/// The copies of all `count` Gaussians.
+/// The copies of all `count` Gaussians that belong to a batch of the new: how many lie before it, and how many it is of.
 pub(super) fn copies<'a>(
     count: usize,
     fates: &'a [u32],
     offsets: &'a [u32],
+    [first_new, new_count]: [u32; 2],
 ) -> impl Iterator<Item = Copy> + use<'a> {
     (0..count).flat_map(move |of| {
         let fate = fates[of];
@@ -48,9 +49,9 @@ pub(super) fn copies<'a>(
             FATE_KEEP => 1,
             _ => 0,
         };
-        (0..count).map(move |index| {
-            let to = offsets[of] as usize + index as usize;
-            Copy { of, index, to, is_new: fate == FATE_SPLIT || index > 0 }
+        (0..count).filter_map(move |index| {
+            let to = (offsets[of] + index).checked_sub(first_new).filter(|&to| to < new_count)?;
+            Some(Copy { of, index, to: to as usize, is_new: fate == FATE_SPLIT || index > 0 })
         })
     })
 }
@@ -118,7 +119,8 @@ impl Reference for Kernel {
         let (n, new_n) = (params.gaussian_count as usize, params.new_gaussian_count as usize);
         let [features, columns] = [params.feature_count, params.column_count].map(|n| n as usize);
         let step_key = random_bits(random_bits(params.seed).wrapping_add(params.step));
-        for Copy { of: i, index, to, is_new } in copies(n, slices.fates, slices.offsets) {
+        let new = [params.first_new_gaussian, params.new_gaussian_count];
+        for Copy { of: i, index, to, is_new } in copies(n, slices.fates, slices.offsets, new) {
             for (column, width) in planes(features, columns) {
                 for k in 0..width {
                     slices.new_parameters[column * new_n + width * to + k] =
@@ -133,7 +135,8 @@ impl Reference for Kernel {
             let child = if constants.conserving {
                 half_of(&parent, rotation, index)
             } else {
-                let key = random_bits(step_key.wrapping_add(2 * i as u32 + index));
+                let draw = 2 * (params.first_gaussian + i as u32) + index;
+                let key = random_bits(step_key.wrapping_add(draw));
                 drawn(&parent, rotation, slices.fates[i] == FATE_SPLIT, key)
             };
             let [means, log_scales, raw_opacities] = changed(new_n);
@@ -151,7 +154,9 @@ impl Reference for Kernel {
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let (n, new_n) = (params.gaussian_count as usize, params.new_gaussian_count as usize);
         let mut bounds = vec![0.0; slices.new_parameters.len()];
-        for Copy { of: i, to, .. } in copies(n, slices.fates, slices.offsets).filter(|c| c.is_new) {
+        let new = [params.first_new_gaussian, params.new_gaussian_count];
+        let copies = copies(n, slices.fates, slices.offsets, new);
+        for Copy { of: i, to, .. } in copies.filter(|copy| copy.is_new) {
             let parent = shape(slices.parameters, n, i);
             let [means, log_scales, raw_opacities] = changed(new_n);
             let scale: f64 =

@@ -30,7 +30,7 @@ impl Reference for Kernel {
                 KEY_KEEP
             };
             slices.keys[i] = key;
-            slices.ids[i] = i as u32;
+            slices.ids[i] = params.first_gaussian + i as u32;
             slices.tally[TALLY_CANDIDATES as usize] += u32::from(key < KEY_KEEP);
             slices.tally[TALLY_PRUNED as usize] += u32::from(key == KEY_PRUNE);
         }

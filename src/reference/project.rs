@@ -226,7 +226,7 @@ impl Reference for Kernel {
         let scene = Scene::new(params, constants);
         let channels = constants.channels as usize;
         for i in 0..scene.planes.count {
-            ids[i] = i as u32;
+            ids[i] = params.first_gaussian + i as u32;
             depth_keys[i] = CULLED;
             tile_counts[i] = 0;
             let gaussian = scene.planes.load(parameters, i);

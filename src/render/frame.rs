@@ -134,7 +134,7 @@ impl Frame {
             let partitions = (count as u32).div_ceil(RANKS_PER_PARTITION).max(1);
             self.sums = gpu.uninit("sums", partitions as usize)?;
             self.emitted = gpu.uninit("emitted", count)?;
-            self.d_splats = gpu.uninit("d_splats", self.record_vectors() * count)?;
+            self.d_splats = gpu.uninit_in_windows("d_splats", self.record_vectors() * count)?;
         }
         if self.render.len() < self.channels * pixels {
             self.render = gpu.uninit("render", self.channels * pixels)?;
@@ -144,7 +144,8 @@ impl Frame {
             self.tile_ranges = gpu.uninit("tile_ranges", tiles)?;
         }
         if self.tiles.is_empty() {
-            self.set_intersection_capacity(gpu, TILES_PER_GAUSSIAN * count.max(1024) as u32)?;
+            let guess = (count.max(1024) as u32).saturating_mul(TILES_PER_GAUSSIAN);
+            self.set_intersection_capacity(gpu, guess.min(self.most_intersections(gpu)))?;
         }
         Ok(())
     }
@@ -180,7 +181,7 @@ impl Frame {
     }
 
     /// The vectors of a gradient record.
-    fn record_vectors(&self) -> usize {
+    pub(super) fn record_vectors(&self) -> usize {
         (RECORD_HEAD as usize + self.channels).div_ceil(3)
     }
 

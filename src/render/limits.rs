@@ -4,6 +4,7 @@ use glam::UVec2;
 
 use super::RenderSettings;
 use crate::gpu::{Gpu, Properties};
+use crate::kernels::ProjectedSplat;
 use crate::{Error, Result};
 
 /// How many splats the blending kernels take in one turn of their inner loop. A device that ends loops after so many turns
@@ -17,6 +18,13 @@ impl RenderSettings {
     pub(crate) fn takes_at_once(&self, gpu: &Gpu, size: UVec2) -> bool {
         let pixels = u64::from(size.x) * u64::from(size.y);
         self.patch_pixels.is_none_or(|most| pixels <= most) && self.suits(gpu, size)
+    }
+
+    /// The most Gaussians that this device can render and train: some passes read the splat and the colour of any of them,
+    /// which one binding has to hold. What else there is of them is bound in [`Batches`](crate::batches::Batches).
+    pub fn most_gaussians(&self, gpu: &Gpu) -> usize {
+        let bytes = size_of::<ProjectedSplat>().max(self.channels() * size_of::<f32>()) as u64;
+        (gpu.properties().max_storage_buffer_range / bytes).min(u32::MAX.into()) as usize
     }
 
     /// Whether this device can render and train on a view of this size.

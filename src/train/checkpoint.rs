@@ -14,6 +14,7 @@ use serde::{Deserialize, Serialize};
 use super::ends::Ends;
 use super::model::Model;
 use super::{TrainConfig, Trainer, learnables};
+use crate::batches::Batches;
 use crate::dataset::Fingerprint;
 use crate::densify::DeviceGaussians;
 use crate::gpu::{Buffer, Gpu};
@@ -99,6 +100,26 @@ struct State<'a> {
     name: String,
     shape: Vec<usize>,
     buffer: &'a mut Buffer<f32>,
+    /// How it lies in the buffer, where that is not as in the file.
+    batches: Option<Batches>,
+}
+
+impl State<'_> {
+    fn read(&self, gpu: &Gpu) -> Result<Vec<f32>> {
+        if let Some(batches) = self.batches {
+            return batches.read(gpu, self.buffer);
+        }
+        let mut values = gpu.read(self.buffer)?;
+        values.truncate(self.shape.iter().product());
+        Ok(values)
+    }
+
+    fn write(self, gpu: &Gpu, values: &[f32]) -> Result<()> {
+        match self.batches {
+            Some(batches) => batches.write(gpu, self.buffer, values),
+            None => gpu.write(self.buffer, values),
+        }
+    }
 }
 
 impl Trainer {
@@ -118,10 +139,9 @@ impl Trainer {
             checksum: None,
         };
         let mut downloads = vec![];
-        for State { name, shape, buffer } in self.state() {
-            let mut values = gpu.read(buffer)?;
-            values.truncate(shape.iter().product());
-            downloads.push((name, shape, values));
+        for state in self.state() {
+            let values = state.read(&gpu)?;
+            downloads.push((state.name, state.shape, values));
         }
         for (name, _, values) in &downloads {
             self.refuse_values(name, values)?;
@@ -269,17 +289,20 @@ impl Trainer {
         self.state()
             .into_iter()
             .zip(values)
-            .try_for_each(|(state, values)| gpu.write(state.buffer, &values))
+            .try_for_each(|(state, values)| state.write(gpu, &values))
     }
 
     /// Everything that the next step depends on but the visit counts, which are integers.
     fn state(&mut self) -> Vec<State<'_>> {
         let Model { gaussians, grad_norm_sums, .. } = &mut self.model;
+        let batches = Some(gaussians.batches(&self.gpu));
         let DeviceGaussians { count, column_count, parameters, moments, .. } = gaussians;
         let (count, columns) = (*count as usize, *column_count as usize);
         let name = "density.grad_norm_sums".to_owned();
-        let mut state = vec![State { name, shape: vec![count], buffer: grad_norm_sums }];
-        state.extend(optimized("gaussians", &[columns, count], parameters, moments));
+        let shape = vec![count];
+        let mut state = vec![State { name, shape, buffer: grad_norm_sums, batches: None }];
+        let of_gaussians = optimized("gaussians", &[columns, count], parameters, moments);
+        state.extend(of_gaussians.map(|state| State { batches, ..state }));
         for learnable in learnables(&mut self.networks, &mut self.exposures) {
             let name = learnable.name();
             let AdamBuffers { parameters, moments, .. } = learnable.buffers();
@@ -298,7 +321,10 @@ fn optimized<'a>(
     Moments { first, second }: &'a mut Moments,
 ) -> [State<'a>; 3] {
     [("parameters", parameters), ("first_moments", first), ("second_moments", second)].map(
-        |(name, buffer)| State { name: format!("{owner}.{name}"), shape: shape.to_vec(), buffer },
+        |(name, buffer)| {
+            let (name, shape) = (format!("{owner}.{name}"), shape.to_vec());
+            State { name, shape, buffer, batches: None }
+        },
     )
 }
 

@@ -45,8 +45,7 @@ impl Trainer {
         let count = self.model.count();
         let each = met / count.max(1) as f64;
         let bindable = f64::from(self.renderer.most_intersections()) / each;
-        let bindable =
-            self.densifier.limit(self.model.gaussians.column_count).min(bindable as usize);
+        let bindable = self.most_renderable().min(bindable as usize);
         let bounds = [
             (bindable, "all that the device can bind at once"),
             (self.fitting_in_vram(each), "all that fits into max_vram"),
@@ -54,6 +53,12 @@ impl Trainer {
         ];
         let (room, why) = bounds.into_iter().min_by_key(|(room, _)| *room).unwrap_or(bounds[0]);
         (room.max(count), why)
+    }
+
+    /// The most Gaussians there may be, by the setting and by what passes of the renderer bind.
+    pub(super) fn most_renderable(&self) -> usize {
+        let renderable = self.config.render_settings().most_gaussians(&self.gpu);
+        self.config.max_gaussians.min(renderable)
     }
 }
 

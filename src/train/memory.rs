@@ -93,7 +93,7 @@ impl Trainer {
             .filter(|round| self.densifies_at(round * interval));
         // A Gaussian becomes two at most.
         let doubled = (0..rounds.count()).try_fold(count, |count, _| count.checked_mul(2));
-        let limit = self.densifier.limit(self.model.gaussians.column_count);
+        let limit = self.most_renderable();
         let each = MARGIN * met / count.max(1) as f64;
         let limit = limit.min(self.fitting_in_vram(each)).min(self.fitting_in_ram(each));
         limit.min(doubled.unwrap_or(usize::MAX)).max(count)

@@ -4,9 +4,10 @@ use glam::Vec3;
 
 use super::Trainer;
 use crate::Result;
+use crate::batches::Batches;
 use crate::densify::{Densifier, DensifyInputs, DensifyReport, DeviceGaussians, Round};
-use crate::gpu::{Buffer, Gpu};
-use crate::optimizer::Moments;
+use crate::gpu::{Buffer, Gpu, Recorder};
+use crate::optimizer::{Adam, AdamBuffers, FiniteCheck, LearningRates, Moments};
 use crate::scene::{ATTRIBUTES, Gaussians, Shape, rest_coefficients, width};
 
 impl Trainer {
@@ -36,14 +37,24 @@ impl Model {
     /// # Errors
     /// The device is out of memory or lost.
     pub(super) fn upload(gpu: &Gpu, gaussians: &Gaussians) -> Result<Self> {
-        let on_device = DeviceGaussians {
-            count: gaussians.count as u32,
-            column_count: width(gaussians.shape) as u32,
-            feature_count: gaussians.shape.features.width() as u32,
-            parameters: gpu.buffer("parameters", &gaussians.parameters)?,
-            moments: Moments::zeros(gpu, gaussians.parameters.len())?,
+        let Gaussians { count, shape, ref parameters } = *gaussians;
+        let (column_count, feature_count) = (width(shape), shape.features.width());
+        let batches = Batches::new(gpu, count, [column_count, feature_count]);
+        let zeros = |name| batches.zeros(gpu, name);
+        let gaussians = DeviceGaussians {
+            count: count as u32,
+            column_count: column_count as u32,
+            feature_count: feature_count as u32,
+            parameters: batches.upload(gpu, "parameters", parameters)?,
+            moments: Moments { first: zeros("first_moments")?, second: zeros("second_moments")? },
         };
-        Self::new(gpu, on_device, gaussians.shape)
+        Ok(Self {
+            shape,
+            gradients: zeros("gradients")?,
+            grad_norm_sums: gpu.zeros("grad_norm_sums", count)?,
+            visit_counts: gpu.zeros("visit_counts", count)?,
+            gaussians,
+        })
     }
 
     /// A model of zeros, to be overwritten.
@@ -52,17 +63,6 @@ impl Model {
     /// The device is out of memory or lost.
     pub(super) fn zeros(gpu: &Gpu, count: usize, shape: Shape) -> Result<Self> {
         Self::upload(gpu, &Gaussians { count, shape, parameters: vec![0.0; count * width(shape)] })
-    }
-
-    fn new(gpu: &Gpu, gaussians: DeviceGaussians, shape: Shape) -> Result<Self> {
-        let count = gaussians.count as usize;
-        Ok(Self {
-            shape,
-            gradients: gpu.zeros("gradients", gaussians.parameters.len())?,
-            grad_norm_sums: gpu.zeros("grad_norm_sums", count)?,
-            visit_counts: gpu.zeros("visit_counts", count)?,
-            gaussians,
-        })
     }
 
     pub(super) fn shape(&self) -> Shape {
@@ -76,6 +76,39 @@ impl Model {
     /// How many Gaussians the buffers have room for.
     pub(super) fn capacity(&self) -> usize {
         self.grad_norm_sums.len()
+    }
+
+    /// Records a step of Adam, over the columns that the SH degree in use leaves: coefficients beyond have no gradient and no
+    /// moments, so there is nothing to update. Nothing changes while the first element of `status` is not zero.
+    ///
+    /// # Errors
+    /// A pass exceeds what the device launches.
+    pub(super) fn update(
+        &mut self,
+        (gpu, pass): (&Gpu, &mut Recorder<'_>),
+        adam: &Adam,
+        step: u64,
+        rates: &LearningRates,
+        sh_degree: u32,
+        status: &Buffer<u32>,
+    ) -> Result<()> {
+        let gaussians = &self.gaussians;
+        let features = gaussians.feature_count;
+        let columns =
+            if sh_degree == 0 { width(0) as u32 + features } else { gaussians.column_count };
+        gaussians.batches(gpu).iter().try_for_each(|batch| {
+            let Moments { first, second } = &gaussians.moments;
+            let buffers = AdamBuffers {
+                parameters: &mut batch.of_planes(&gaussians.parameters)?,
+                gradients: &batch.of_planes(&self.gradients)?,
+                moments: &mut Moments {
+                    first: batch.of_planes(first)?,
+                    second: batch.of_planes(second)?,
+                },
+            };
+            let shape = [batch.gaussian_count(), columns, features];
+            adam.record(pass, step, rates, shape, buffers, status)
+        })
     }
 
     /// One round of density control; the statistics begin anew.
@@ -108,20 +141,39 @@ impl Model {
     /// The device was lost.
     pub(super) fn drop_degrees_above(&mut self, gpu: &Gpu, degree: u32) -> Result<()> {
         let kept = rest_coefficients(degree);
+        let batches = self.gaussians.batches(gpu);
         let DeviceGaussians { count, parameters, moments, .. } = &mut self.gaussians;
         let (count, shape) = (*count as usize, self.shape);
         for buffer in [parameters, &mut moments.first, &mut moments.second] {
-            let mut values = gpu.read(buffer)?;
-            let spare = values.split_off(count * width(shape));
-            let mut gaussians = Gaussians { count, shape, parameters: values };
+            let mut gaussians = Gaussians { count, shape, parameters: batches.read(gpu, buffer)? };
             let coefficients = rest_coefficients(shape.sh_degree).max(1);
             for own in gaussians.rest_mut().chunks_mut(coefficients) {
                 own.iter_mut().skip(kept).for_each(|rest| *rest = Vec3::ZERO);
             }
-            gaussians.parameters.extend(spare);
-            gpu.write(buffer, &gaussians.parameters)?;
+            batches.write(gpu, buffer, &gaussians.parameters)?;
         }
         Ok(())
+    }
+
+    /// Where the first parameter is that is NaN or infinite, among the planes of all Gaussians.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub(super) fn first_not_finite(
+        &self,
+        gpu: &Gpu,
+        finite: &mut FiniteCheck,
+    ) -> Result<Option<usize>> {
+        let batches = self.gaussians.batches(gpu);
+        let mut before = 0;
+        for batch in batches.iter() {
+            let planes = batch.of_planes(&self.gaussians.parameters)?;
+            if let Some(at) = finite.first(gpu, &planes, planes.len())? {
+                return Ok(Some(batches.place_of(before + at)));
+            }
+            before += planes.len();
+        }
+        Ok(None)
     }
 
     /// The attribute and the Gaussian that the parameter at an index belongs to.
@@ -145,8 +197,7 @@ impl Model {
     }
 
     fn planes(&self, gpu: &Gpu, buffer: &Buffer<f32>) -> Result<Gaussians> {
-        let mut parameters = gpu.read(buffer)?;
-        parameters.truncate(self.count() * width(self.shape));
+        let parameters = self.gaussians.batches(gpu).read(gpu, buffer)?;
         Ok(Gaussians { count: self.count(), shape: self.shape, parameters })
     }
 }

@@ -153,8 +153,7 @@ impl Trainer {
     /// [`Error::ParameterNotFinite`] names the last step and the plane.
     fn check_finite(&mut self) -> Result<()> {
         self.checked = self.step;
-        let count = self.model.count() * self.model.gaussians.column_count as usize;
-        match self.finite.first(&self.gpu, &self.model.gaussians.parameters, count)? {
+        match self.model.first_not_finite(&self.gpu, &mut self.finite)? {
             Some(at) => Err(self.not_finite("gaussians.parameters", at)),
             None => Ok(()),
         }

@@ -22,7 +22,7 @@ use crate::loss::ViewSource;
 use crate::nn::Form;
 use crate::pseudo_gt::PseudoGt;
 use crate::random::Stream;
-use crate::scene::{COLOR_CHANNELS, Feature, Gaussians, Shape, init, width};
+use crate::scene::{COLOR_CHANNELS, Feature, Gaussians, Shape, init};
 use crate::tone::{Exposure, Measured, Scene, Statistics, ToneCurve, ToneSettings, all_black};
 
 /// One training view: a photograph, or a patch of one that is too large to be trained on at once.
@@ -320,10 +320,7 @@ impl Views {
             &dataset.points
         };
         let kept = &points[..points.len().min(config.max_gaussians)];
-        let columns = width(config.render_settings().shape);
-        let bindable =
-            gpu.properties().max_storage_buffer_range / (columns * size_of::<f32>()) as u64;
-        let fitting = usize::try_from(bindable).unwrap_or(usize::MAX);
+        let fitting = config.render_settings().most_gaussians(gpu);
         if kept.len() > fitting {
             let (of, device) = (kept.len(), &gpu.properties().name);
             tracing::warn!("{fitting} of {of} points begin as Gaussians: {device} binds no more");

@@ -103,8 +103,7 @@ fn rasteriser(
     bench.gpu.reset_peak_memory();
     let shape = Shape { sh_degree: MAX_SH_DEGREE, features };
     let camera = scene::camera(width, height);
-    let parameters = scene::gaussians(&camera, gaussians, shape).parameters;
-    let parameters = bench.gpu.buffer("parameters", &parameters)?;
+    let parameters = scene::gaussians(&camera, gaussians, shape).upload(&bench.gpu)?;
     let settings = RenderSettings { shape, ..RenderSettings::default() };
     let mut renderer = Renderer::new(&bench.gpu, settings)?;
     renderer.reserve(gaussians, [&camera])?;

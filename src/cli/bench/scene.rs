@@ -109,7 +109,7 @@ fn lita(gpu: &Gpu) -> Result<Trainer> {
 fn intersections(gpu: &Gpu, Scene { camera, gaussians, .. }: &Scene) -> Result<u32> {
     let mut renderer = Renderer::new(gpu, RenderSettings::default())?;
     renderer.reserve(gaussians.count, [camera])?;
-    let parameters = gpu.buffer("parameters", &gaussians.parameters)?;
+    let parameters = gaussians.upload(gpu)?;
     let options = RenderOptions { sh_degree: 0, background: [0.0; 3] };
     gpu.run("render", |pass| renderer.forward(pass, &parameters, camera, &options))?;
     Ok(Status::from_words(&gpu.read(renderer.status())?).intersections)

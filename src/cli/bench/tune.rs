@@ -127,7 +127,7 @@ impl Case {
         let shape = Shape { sh_degree: MAX_SH_DEGREE, features };
         let camera = scene::camera(width, height);
         let scene = scene::gaussians(&camera, gaussians, shape);
-        let parameters = gpu.buffer("parameters", &scene.parameters)?;
+        let parameters = scene.upload(gpu)?;
         let suits = |tile: &[u32; 2]| gpu.properties().suits_tile(*tile);
         let (mut candidates, mut first) = (vec![], None);
         for tile in TILES.into_iter().filter(suits) {
