@@ -361,7 +361,7 @@ fn colmap_finds_the_cameras_of_a_dark_set() {
 }
 
 #[test]
-#[ignore = "eight minutes: of `make stress`"]
+#[ignore = "two minutes: of `make stress`"]
 fn real_dark_photographs_train_with_the_cameras_that_colmap_finds_as_with_those_supplied() {
     let Some(chair) = shared("data/lom/chair") else { return };
     if !is_installed("colmap") {
