@@ -204,7 +204,7 @@ impl TermInputs<'_> {
 }
 
 /// A term of the render.
-pub trait LossTerm: std::fmt::Debug {
+pub trait LossTerm: std::fmt::Debug + Send {
     /// Takes scratch memory for these views, and what it compares each of them with.
     ///
     /// # Errors
@@ -229,15 +229,21 @@ pub trait LossTerm: std::fmt::Debug {
 pub struct Losses(Vec<Box<dyn LossTerm>>);
 
 impl Losses {
-    /// The terms, ready for these views.
+    /// The terms; [`Losses::prepare`] makes them ready for views.
     ///
     /// # Errors
-    /// A weight makes no sense, or the device is out of memory or lost.
-    pub fn new(gpu: &Gpu, config: &LossConfig, views: &[ViewSource<'_>]) -> Result<Self> {
+    /// A weight makes no sense, or the device refuses a pipeline.
+    pub fn new(gpu: &Gpu, config: &LossConfig) -> Result<Self> {
         let build = config.specs().filter_map(|spec| spec.on_render);
-        let mut terms = build.map(|build| build(gpu, config)).collect::<Result<Vec<_>>>()?;
-        terms.iter_mut().try_for_each(|term| term.prepare(views))?;
-        Ok(Self(terms))
+        Ok(Self(build.map(|build| build(gpu, config)).collect::<Result<_>>()?))
+    }
+
+    /// Computes what stays the same of these views, and makes room for them.
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub fn prepare(&mut self, views: &[ViewSource<'_>]) -> Result<()> {
+        self.0.iter_mut().try_for_each(|term| term.prepare(views))
     }
 
     /// Records every term of a step: dL/d render, (channels, H, W), and the values in the log.

@@ -37,7 +37,7 @@ use crate::nn::Form;
 use crate::optimizer::{Adam, FiniteCheck, Learnable};
 use crate::pseudo_gt::PseudoGt;
 use crate::random::Stream;
-use crate::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer};
+use crate::render::{Damping, Gradients, RenderOptions, Renderer};
 use crate::scene::{COLOR_CHANNELS, Gaussians};
 use crate::{Error, Result};
 
@@ -207,13 +207,14 @@ impl Trainer {
     ) -> Result<Self> {
         config.check()?;
         config.leave_out_what_is_missing(dataset);
-        let settings = config.render_settings();
         let frame = *config.frame.get_or_insert_with(|| dataset.frame());
         let density = growth::settings(&config, dataset.extent() * frame.scale);
         thread::scope(|scope| {
             // The driver compiles on another thread while the views are uploaded and looked at.
-            let kernels = scope.spawn(move || Kernels::new(gpu, settings, density));
-            Self::assemble(gpu, config, dataset, gaussians, settings, kernels)
+            let own = config.clone();
+            let beside = scope
+                .spawn(move || Ok((Kernels::new(gpu, &own, density)?, Fingerprint::of(dataset)?)));
+            Self::assemble(gpu, config, dataset, gaussians, beside)
         })
     }
 
@@ -222,12 +223,12 @@ impl Trainer {
         config: TrainConfig,
         dataset: &Dataset,
         gaussians: Option<&Gaussians>,
-        settings: RenderSettings,
-        kernels: ScopedJoinHandle<'_, Result<Kernels>>,
+        beside: ScopedJoinHandle<'_, Result<(Kernels, Fingerprint)>>,
     ) -> Result<Self> {
         if let Some(CacheSize(bytes)) = config.max_vram {
             gpu.limit_memory(bytes);
         }
+        let settings = config.render_settings();
         let mut pseudo_gt = PseudoGt::new(gpu, &config.tone)?;
         let frame = config.frame.unwrap_or_default();
         let (mut views, scene, target_exposure) =
@@ -258,21 +259,19 @@ impl Trainer {
         views.say_what_shows_nothing(&gaussians);
         let pixels = sizes.iter().map(|size| size.x as usize * size.y as usize).max();
         let values = settings.channels() * pixels.unwrap_or_default();
-        let sources = views.sources(gpu, &pseudo_gt, dataset);
-        let losses = Losses::new(gpu, &config.loss(), &sources)?;
-        drop(sources);
         let masks = Masks::new(gpu, dataset, &views, config.loss().tone_curve)?;
         let exposures = starts.map(|starts| Exposures::new(gpu, config.exposure.rates, &starts));
         let mut exposures = exposures.transpose()?;
         if let Some(exposures) = &mut exposures {
             sizes.iter().try_for_each(|&size| exposures.reserve(size))?;
         }
-        let Kernels { renderer, adam, finite, densifier } =
-            kernels.join().unwrap_or_else(|panic| resume_unwind(panic))?;
+        let (Kernels { renderer, mut losses, adam, finite, densifier }, fingerprint) =
+            beside.join().unwrap_or_else(|panic| resume_unwind(panic))?;
+        losses.prepare(&views.sources(gpu, &pseudo_gt, dataset))?;
         let [inputs, photographs] = views.decoded_lens();
         let mut trainer = Self {
             gpu: gpu.clone(),
-            fingerprint: Fingerprint::of(dataset)?,
+            fingerprint,
             frame,
             extent: dataset.extent() * frame.scale,
             target_exposure,
@@ -541,15 +540,17 @@ impl Trainer {
 /// What needs nothing but the device and settings.
 struct Kernels {
     renderer: Renderer,
+    losses: Losses,
     adam: Adam,
     finite: FiniteCheck,
     densifier: Densifier,
 }
 
 impl Kernels {
-    fn new(gpu: &Gpu, settings: RenderSettings, density: DensifySettings) -> Result<Self> {
+    fn new(gpu: &Gpu, config: &TrainConfig, density: DensifySettings) -> Result<Self> {
         Ok(Self {
-            renderer: Renderer::new(gpu, settings)?,
+            renderer: Renderer::new(gpu, config.render_settings())?,
+            losses: Losses::new(gpu, &config.loss())?,
             adam: Adam::new(gpu)?,
             finite: FiniteCheck::new(gpu)?,
             densifier: Densifier::new(gpu, density)?,

@@ -2,7 +2,9 @@
 
 use std::sync::Arc;
 
-use rayon::slice::ParallelSliceMut;
+use rayon::iter::{IndexedParallelIterator, ParallelIterator};
+use rayon::slice::ParallelSlice;
+use rustc_hash::{FxHashMap, FxHashSet};
 use serde::{Deserialize, Serialize};
 
 use crate::Result;
@@ -71,6 +73,9 @@ pub(super) struct Darkroom {
 /// The bits that a code may have.
 const CODE_BITS: [u32; 2] = [8, 16];
 
+/// Words of codes that a thread packs in one go.
+const WORDS_AT_ONCE: usize = 1 << 12;
+
 /// Codes are worth decoding where they and what they stand for take at most this much of the values' memory.
 const WORTH: f64 = 0.75;
 
@@ -88,7 +93,8 @@ impl Darkroom {
         }
         if let Some(palette) = palette(values, self.bits) {
             let which = usize::from(palette.len() > 1 << CODE_BITS[0]);
-            let code = |value: f32| palette.partition_point(|&own| own < value.to_bits());
+            let codes: FxHashMap<u32, usize> = palette.iter().copied().zip(0..).collect();
+            let code = |value: f32| codes.get(&value.to_bits()).copied().unwrap_or_default();
             let palette: Vec<f32> = palette.iter().map(|&bits| f32::from_bits(bits)).collect();
             let palette = Arc::new(self.gpu.buffer("palette", &palette)?);
             return self.coded(name, values, which, palette, code);
@@ -122,7 +128,7 @@ impl Darkroom {
         values: &[f32],
         which: usize,
         palette: Arc<Buffer<f32>>,
-        code: impl Fn(f32) -> usize,
+        code: impl Fn(f32) -> usize + Sync,
     ) -> Result<Photograph> {
         let code_bits = CODE_BITS[which];
         let decoder = match &self.decoders[which] {
@@ -134,7 +140,9 @@ impl Darkroom {
             let codes = values.iter().zip((0..).step_by(code_bits as usize));
             codes.fold(0, |word, (&value, shift)| word | (code(value) as u32) << shift)
         };
-        let words: Vec<u32> = values.chunks(32 / code_bits as usize).map(word).collect();
+        let words =
+            values.par_chunks(32 / code_bits as usize).with_min_len(WORDS_AT_ONCE).map(word);
+        let words: Vec<u32> = words.collect();
         Ok(Photograph::Coded(Coded {
             decoder,
             value_count: values.len(),
@@ -147,23 +155,26 @@ impl Darkroom {
 /// The bits of all different values, ascending, where codes for them are worth it.
 fn palette(values: &[f32], bits: PhotographBits) -> Option<Vec<u32>> {
     let most = 1 << if bits == PhotographBits::Eight { CODE_BITS[0] } else { CODE_BITS[1] };
-    // Where a sample holds too many, sorting the rest can be saved.
-    let sample = different(values.iter().step_by(16));
-    if sample.len() > most {
-        return None;
-    }
-    let palette = different(values.iter());
+    let palette = different(values, most)?;
     let code_bytes = if palette.len() > 1 << CODE_BITS[0] { 2 } else { 1 };
     let bytes = values.len() * code_bytes + size_of_val(palette.as_slice());
     let is_worth_it = bytes as f64 <= WORTH * size_of_val(values) as f64;
-    (palette.len() <= most && is_worth_it).then_some(palette)
+    is_worth_it.then_some(palette)
 }
 
-fn different<'a>(values: impl Iterator<Item = &'a f32>) -> Vec<u32> {
-    let mut bits: Vec<u32> = values.map(|value| value.to_bits()).collect();
-    bits.par_sort_unstable();
-    bits.dedup();
-    bits
+/// The bits of all different values, ascending; none where there are more than so many.
+fn different(values: &[f32], most: usize) -> Option<Vec<u32>> {
+    let mut found = FxHashSet::default();
+    let mut last = None;
+    for bits in values.iter().map(|value| value.to_bits()) {
+        // In the dark, neighbours are often alike.
+        if last.replace(bits) != Some(bits) && found.insert(bits) && found.len() > most {
+            return None;
+        }
+    }
+    let mut different: Vec<u32> = found.into_iter().collect();
+    different.sort_unstable();
+    Some(different)
 }
 
 impl Photograph {
