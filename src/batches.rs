@@ -72,12 +72,7 @@ impl Batches {
     /// # Errors
     /// The device is out of memory or lost.
     pub fn zeros(&self, gpu: &Gpu, name: &str) -> Result<Buffer<f32>> {
-        let mut buffer = self.uninit(gpu, name)?;
-        gpu.run(name, |pass| {
-            pass.fill(&mut buffer, 0);
-            Ok(())
-        })?;
-        Ok(buffer)
+        gpu.zeroed(self.uninit(gpu, name)?)
     }
 
     /// Overwrites the planes in a buffer with others, which are of all Gaussians.

@@ -65,7 +65,7 @@ impl Gaussians {
         Self { count, shape, parameters: vec![0.0; count * width(shape)] }
     }
 
-    /// A copy on the device: what renders, whole planes in [`Batches`].
+    /// A copy on the device, planes in [`Batches`]: what a [`Renderer`](crate::render::Renderer) takes.
     ///
     /// # Errors
     /// The device is out of memory or lost.

@@ -128,8 +128,16 @@ impl Gpu {
     /// # Errors
     /// As [`Gpu::uninit`], or the device was lost.
     pub fn zeros<T: bytemuck::Pod>(&self, name: &str, len: usize) -> Result<Buffer<T>> {
-        let mut buffer = self.uninit(name, len)?;
-        self.run(name, |pass| {
+        self.zeroed(self.uninit(name, len)?)
+    }
+
+    /// A buffer with zero bits in the place of what it held.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub(crate) fn zeroed<T: bytemuck::Pod>(&self, mut buffer: Buffer<T>) -> Result<Buffer<T>> {
+        let name = buffer.name().to_owned();
+        self.run(&name, |pass| {
             pass.fill(&mut buffer, 0);
             Ok(())
         })?;
