@@ -42,6 +42,11 @@ impl Batches {
         Self { count, columns, features, size }
     }
 
+    /// The same Gaussians with so many words each in the place of their floats.
+    pub(crate) fn with_columns(self, columns: usize) -> Self {
+        Self { columns, ..self }
+    }
+
     /// One after the other; of no Gaussians an empty one.
     pub fn iter(&self) -> impl Iterator<Item = Batch> + use<> {
         let Self { count, columns, size, .. } = *self;

@@ -8,17 +8,22 @@
 //! plane set into the buffer that is free, which the gradients of the last step leave: no memory beyond what training
 //! holds, and buffers grow with headroom, so most rounds allocate nothing.
 
+mod gaussians;
+
+pub use gaussians::DeviceGaussians;
+
+use std::iter;
 use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
 use crate::batches::{Batch, Batches};
 use crate::gpu::{Buffer, Gpu, Pipeline, Threads};
+use crate::halves::Bits;
 use crate::kernels::fate::{
     TALLY_CANDIDATES, TALLY_CLONED, TALLY_PRUNED, TALLY_SPLIT, TALLY_WORDS,
 };
 use crate::kernels::{densify_decide, densify_moments, densify_scatter, densify_score};
-use crate::optimizer::Moments;
 use crate::sort::{Count, RadixSort, Scan};
 use crate::{Error, Result};
 
@@ -64,30 +69,6 @@ pub struct DensifySettings {
     pub max_gaussians: usize,
     /// Where the drawn positions come from.
     pub seed: u64,
-}
-
-/// Gaussians on the device with their optimiser state, as planes (include/gaussian.glsl) in [`Batches`].
-#[derive(Debug)]
-pub struct DeviceGaussians {
-    /// The number of Gaussians.
-    pub count: u32,
-    /// Floats per Gaussian: [`crate::scene::width`].
-    pub column_count: u32,
-    /// How many of these are features.
-    pub feature_count: u32,
-    /// `count * column_count` floats, and room behind them.
-    pub parameters: Buffer<f32>,
-    /// As many each.
-    pub moments: Moments,
-}
-
-impl DeviceGaussians {
-    /// How their planes lie in the buffers.
-    pub fn batches(&self, gpu: &Gpu) -> Batches {
-        let [count, columns, features] =
-            [self.count, self.column_count, self.feature_count].map(|n| n as usize);
-        Batches::new(gpu, count, [columns, features])
-    }
 }
 
 /// What the steps since the last round have gathered, per Gaussian, and a buffer to work with.
@@ -236,14 +217,15 @@ impl Densifier {
         limit: usize,
         round: Round,
     ) -> Result<Vec<u32>> {
-        let DeviceGaussians { count, column_count, feature_count, ref parameters, .. } = *gaussians;
+        let DeviceGaussians { count, feature_count, ref parameters, .. } = *gaussians;
+        let columns = gaussians.parameter_columns();
         if self.scratch.keys.len() < count as usize {
             self.scratch = Scratch::new(&self.gpu, grad_norm_sums.len())?;
         }
         let DensifySettings { gradient_threshold, split_scale, min_opacity, .. } = self.settings;
         let score = |batch: Batch| densify_score::Params {
             gaussian_count: batch.gaussian_count(),
-            column_count,
+            column_count: columns as u32,
             feature_count,
             gradient_threshold: gradient_threshold as f32,
             min_raw_opacity: (min_opacity / (1.0 - min_opacity)).ln() as f32,
@@ -265,7 +247,7 @@ impl Densifier {
             pass.fill(&mut scratch.tally, 0);
             for batch in batches.iter() {
                 let buffers = densify_score::Buffers {
-                    parameters: &batch.of_planes(parameters)?,
+                    parameters: &batch.of_rows(parameters, columns)?,
                     grad_norm_sums: &batch.of_rows(grad_norm_sums, 1)?,
                     visit_counts: &batch.of_rows(visit_counts, 1)?,
                     keys: &mut batch.of_rows(&scratch.keys, 1)?,
@@ -279,7 +261,7 @@ impl Densifier {
             sort.record(pass, counted, &mut scratch.keys, &mut scratch.ids, u32::BITS)?;
             for batch in batches.iter() {
                 let buffers = densify_decide::Buffers {
-                    parameters: &batch.of_planes(parameters)?,
+                    parameters: &batch.of_rows(parameters, columns)?,
                     sorted_keys: &scratch.keys,
                     sorted_ids: &scratch.ids,
                     tally: &mut scratch.tally,
@@ -311,11 +293,12 @@ impl Densifier {
             return Ok(());
         }
         let DeviceGaussians { column_count, feature_count, .. } = *gaussians;
+        let parameter_columns = gaussians.parameter_columns();
         let seed = self.settings.seed;
         let scatter = |from: Batch, to: Batch| densify_scatter::Params {
             gaussian_count: from.gaussian_count(),
             new_gaussian_count: to.gaussian_count(),
-            column_count,
+            column_count: parameter_columns as u32,
             feature_count,
             seed: (seed ^ (seed >> 32)) as u32,
             step: step as u32,
@@ -329,7 +312,8 @@ impl Densifier {
             feature_count,
             first_new_gaussian: to.first_gaussian(),
         };
-        let mut room = self.room(gaussians, inputs, report.count, limit)?;
+        let Room { mut planes, mut words, statistics } =
+            self.room(gaussians, inputs, report.count, limit)?;
         let DensifyInputs { grad_norm_sums, visit_counts, gradients: spare } = inputs;
         let Scratch { fates, offsets, .. } = &self.scratch;
         let old = gaussians.batches(&self.gpu);
@@ -340,39 +324,41 @@ impl Densifier {
         );
         // Every batch hands what comes of it to each of the new ones that it belongs to.
         let pairs = || old.iter().flat_map(|from| new.iter().map(move |to| (from, to)));
-        let DeviceGaussians { parameters, moments: Moments { first, second }, .. } =
-            &mut *gaussians;
+        let DeviceGaussians { parameters, moments, .. } = &mut *gaussians;
         self.gpu.run("densify_scatter", |pass| {
-            take(&mut room.planes, spare);
+            let target = words.as_mut().unwrap_or_else(|| {
+                take(&mut planes, spare);
+                spare
+            });
             for (from, to) in pairs() {
                 let buffers = densify_scatter::Buffers {
-                    parameters: &from.of_planes(parameters)?,
+                    parameters: &from.of_rows(parameters, parameter_columns)?,
                     fates: &from.of_rows(fates, 1)?,
                     offsets: &from.of_rows(offsets, 1)?,
-                    new_parameters: &mut to.of_planes(spare)?,
+                    new_parameters: &mut to.of_rows(target, parameter_columns)?,
                 };
                 let threads = Threads::Exactly([from.gaussian_count(), 1, 1]);
                 pass.dispatch(&self.scatter, &scatter(from, to), buffers, threads)?;
             }
-            std::mem::swap(parameters, spare);
-            for moments in [first, second] {
-                take(&mut room.planes, spare);
+            std::mem::swap(parameters, target);
+            for (_, moments) in moments.planes_mut() {
+                take(&mut planes, spare);
                 for (from, to) in pairs() {
                     let buffers = densify_moments::Buffers {
-                        moments: &from.of_planes(moments)?,
+                        moments: &from.of_planes(moments)?.words(),
                         fates: &from.of_rows(fates, 1)?,
                         offsets: &from.of_rows(offsets, 1)?,
-                        new_moments: &mut to.of_planes(spare)?,
+                        new_moments: &mut to.of_planes(spare)?.words(),
                     };
                     let threads = Threads::Exactly([from.gaussian_count(), 1, 1]);
                     pass.dispatch(&self.moments, &carry(from, to), buffers, threads)?;
                 }
                 std::mem::swap(moments, spare);
             }
-            take(&mut room.planes, spare);
+            take(&mut planes, spare);
             Ok(())
         })?;
-        if let Some((sums, counts)) = room.statistics {
+        if let Some((sums, counts)) = statistics {
             (**grad_norm_sums, **visit_counts) = (sums, counts);
         }
         gaussians.count = report.count as u32;
@@ -382,33 +368,43 @@ impl Densifier {
     /// What takes the place of buffers that are too short for `count` Gaussians, all of it before one of them goes.
     fn room(
         &self,
-        DeviceGaussians { column_count, parameters, moments, .. }: &DeviceGaussians,
+        gaussians: &DeviceGaussians,
         inputs: &DensifyInputs<'_>,
         count: usize,
         limit: usize,
     ) -> Result<Room> {
+        let DeviceGaussians { column_count, parameters, moments, rest, .. } = gaussians;
         let (columns, capacity) = (*column_count as usize, capacity(count, limit));
+        let buffer = |columns| self.gpu.uninit_in_windows("planes", capacity * columns);
+        // Parameters with halves are too short to take turns with floats.
+        let (turns, words) = match rest {
+            Bits::Single => (Some(parameters), None),
+            Bits::Half => (None, Some(buffer(gaussians.parameter_columns())?)),
+        };
         // In the order in which they are free.
-        let planes = [inputs.gradients, parameters, &moments.first, &moments.second];
+        let planes = iter::once(&*inputs.gradients).chain(turns);
+        let planes = planes.chain(moments.planes().into_iter().map(|(_, plane)| plane));
         let planes = planes.map(|plane| {
             let is_short = plane.len() < count * columns;
-            is_short.then(|| self.gpu.uninit_in_windows("planes", capacity * columns)).transpose()
+            is_short.then(|| buffer(columns)).transpose()
         });
-        let [a, b, c, d] = planes;
+        let planes = planes.collect::<Result<Vec<_>>>()?.into_iter();
         let statistics = if inputs.grad_norm_sums.len() < count {
             let sums = self.gpu.uninit("grad_norm_sums", capacity)?;
             Some((sums, self.gpu.uninit("visit_counts", capacity)?))
         } else {
             None
         };
-        Ok(Room { planes: [a?, b?, c?, d?].into_iter(), statistics })
+        Ok(Room { planes, words, statistics })
     }
 }
 
 /// Buffers for more Gaussians.
 struct Room {
     /// Those that a plane set is to take in turn, where its own is too short.
-    planes: std::array::IntoIter<Option<Buffer<f32>>, 4>,
+    planes: std::vec::IntoIter<Option<Buffer<f32>>>,
+    /// What parameters with halves go to.
+    words: Option<Buffer<f32>>,
     statistics: Option<(Buffer<f32>, Buffer<u32>)>,
 }
 
@@ -438,11 +434,13 @@ fn report(count: u32, tally: &[u32]) -> DensifyReport {
 
 /// A kernel that runs beyond a buffer reads its neighbours: refuse before anything is recorded.
 fn check(gaussians: &DeviceGaussians, inputs: &DensifyInputs<'_>) -> Result<()> {
-    let DeviceGaussians { count, column_count, feature_count, parameters, moments } = gaussians;
+    let DeviceGaussians { count, column_count, feature_count, parameters, moments, .. } = gaussians;
     let (count, columns) = (*count as usize, *column_count as usize);
     let DensifyInputs { grad_norm_sums, visit_counts, .. } = inputs;
-    let planes =
-        [parameters, &moments.first, &moments.second].map(|b| (b.name(), b.len(), count * columns));
+    let words = count * gaussians.parameter_columns();
+    let parameters = iter::once((parameters.name(), parameters.len(), words));
+    let moments =
+        moments.planes().into_iter().map(|(name, plane)| (name, plane.len(), count * columns));
     let per_gaussian = [
         (grad_norm_sums.name(), grad_norm_sums.len(), count),
         (visit_counts.name(), visit_counts.len(), count),
@@ -450,7 +448,7 @@ fn check(gaussians: &DeviceGaussians, inputs: &DensifyInputs<'_>) -> Result<()> 
     if columns < crate::scene::width(0) + *feature_count as usize {
         return Err(Error::Usage(format!("density control: {columns} floats make no Gaussian")));
     }
-    match planes.into_iter().chain(per_gaussian).find(|(_, len, needed)| len < needed) {
+    match parameters.chain(moments).chain(per_gaussian).find(|(_, len, needed)| len < needed) {
         Some((name, len, needed)) => Err(Error::Usage(format!(
             "buffer `{name}` holds {len} elements, density control needs {needed}"
         ))),

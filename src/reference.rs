@@ -7,6 +7,7 @@
 #![expect(clippy::needless_range_loop, reason = "keeps each line comparable to the shader")]
 
 mod adam;
+mod adam_rest;
 pub mod blend_backward;
 pub mod blend_forward;
 mod blending;

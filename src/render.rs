@@ -18,6 +18,7 @@ use glam::{UVec2, Vec2};
 use crate::batches::Batches;
 use crate::camera::{Camera, Patch};
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Statistic, Threads};
+use crate::halves::Bits;
 use crate::kernels::project::DEPTH_BITS;
 use crate::kernels::splat::MAX_CHANNELS;
 use crate::kernels::{
@@ -111,6 +112,7 @@ impl Renderer {
         let [tile_width, tile_height] = settings.tile_on(gpu)?;
         let channels = settings.channels() as u32;
         let (alpha_max, sh_degree) = (settings.max_alpha, settings.shape.sh_degree);
+        let half_rest = settings.rest == Bits::Half;
         let (raw_colors, partition_size) = (settings.raw_colors, RANKS_PER_PARTITION);
         let shaping_channels = settings.shaping_channels();
         let (skips_groups, splats_per_turn) = (!gpu.properties().is_cpu, splats_per_turn(gpu));
@@ -125,7 +127,7 @@ impl Renderer {
             settings,
             tile: [tile_width, tile_height],
             longest_run: longest_run(gpu),
-            project: gpu.pipeline(&constants!(project, sh_degree, raw_colors))?,
+            project: gpu.pipeline(&constants!(project, sh_degree, raw_colors, half_rest))?,
             order_counts: gpu.pipeline(&order_counts::Constants { partition_size })?,
             emit: gpu.pipeline(&constants!(emit, partition_size))?,
             blend_forward: gpu.pipeline(&constants!(
@@ -140,7 +142,12 @@ impl Renderer {
                 splats_per_turn
             ))?,
             reduce_records: gpu.pipeline(&constants!(reduce_records))?,
-            project_backward: gpu.pipeline(&constants!(project_backward, sh_degree, raw_colors))?,
+            project_backward: gpu.pipeline(&constants!(
+                project_backward,
+                sh_degree,
+                raw_colors,
+                half_rest
+            ))?,
             depth_sort: RadixSort::new(gpu, 0)?,
             tile_sort: RadixSort::new(gpu, 0)?,
             frame: Frame::new(gpu, settings.channels())?,
@@ -376,6 +383,7 @@ impl Renderer {
             },
             Threads::Workgroups([view.tile_count(), 1, 1]),
         )?;
+        let parameter_columns = self.parameter_columns();
         for batch in self.batches().iter() {
             let gaussian_count = batch.gaussian_count();
             let threads = Threads::Exactly([gaussian_count, 1, 1]);
@@ -401,7 +409,7 @@ impl Renderer {
                     damping_depth: damping.depth,
                 },
                 project_backward::Buffers {
-                    parameters: &batch.of_planes(gaussians)?,
+                    parameters: &batch.of_rows(gaussians, parameter_columns)?,
                     splats: &batch.of_rows(&frame.splats, 1)?,
                     colors: &batch.of_rows(&frame.colors, channels)?,
                     tile_counts: &batch.of_rows(&frame.tile_counts, 1)?,
@@ -436,7 +444,7 @@ impl Renderer {
                     first_gaussian: batch.first_gaussian(),
                 },
                 project::Buffers {
-                    parameters: &batch.of_planes(gaussians)?,
+                    parameters: &batch.of_rows(gaussians, self.parameter_columns())?,
                     splats: &mut batch.of_rows(&frame.splats, 1)?,
                     colors: &mut batch.of_rows(&frame.colors, channels)?,
                     depth_keys: &mut batch.of_rows(&frame.depth_keys, 1)?,
@@ -449,6 +457,12 @@ impl Renderer {
     }
 
     /// How those that render lie in the buffers of their planes.
+    /// Words per Gaussian of what is rendered.
+    fn parameter_columns(&self) -> usize {
+        let RenderSettings { shape, rest, .. } = self.settings;
+        rest.columns([width(shape), shape.features.width()])
+    }
+
     fn batches(&self) -> Batches {
         let (count, shape) = (self.frame.gaussian_count as usize, self.settings.shape);
         Batches::new(&self.gpu, count, [width(shape), shape.features.width()])

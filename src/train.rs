@@ -37,7 +37,7 @@ use crate::nn::Form;
 use crate::optimizer::{Adam, FiniteCheck, Learnable};
 use crate::pseudo_gt::PseudoGt;
 use crate::random::Stream;
-use crate::render::{Damping, Gradients, RenderOptions, Renderer};
+use crate::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer};
 use crate::scene::{COLOR_CHANNELS, Gaussians};
 use crate::{Error, Result};
 
@@ -279,7 +279,7 @@ impl Trainer {
             ends: Ends::default(),
             step: 0,
             views,
-            model: Model::upload(gpu, &gaussians)?,
+            model: Model::upload(gpu, &gaussians, &config.precision)?,
             renderer,
             losses,
             networks: NetworkTerms::new(gpu, &config, &sizes, !masks.is_empty())?,
@@ -549,7 +549,10 @@ struct Kernels {
 impl Kernels {
     fn new(gpu: &Gpu, config: &TrainConfig, density: DensifySettings) -> Result<Self> {
         Ok(Self {
-            renderer: Renderer::new(gpu, config.render_settings())?,
+            renderer: Renderer::new(
+                gpu,
+                RenderSettings { rest: config.precision.rest, ..config.render_settings() },
+            )?,
             losses: Losses::new(gpu, &config.loss())?,
             adam: Adam::new(gpu)?,
             finite: FiniteCheck::new(gpu)?,

@@ -9,6 +9,7 @@ use nightsplat::densify::{
 };
 use nightsplat::gpu::testing::gpu;
 use nightsplat::gpu::{Gpu, Reference};
+use nightsplat::halves::Bits;
 use nightsplat::kernels::fate::{KEY_KEEP, KEY_PRUNE};
 use nightsplat::kernels::{densify_decide, densify_moments, densify_scatter, densify_score};
 use nightsplat::optimizer::Moments;
@@ -29,6 +30,10 @@ const CONSERVING: DensifySettings =
     DensifySettings { control: DensityControl::Conserving, ..SETTINGS };
 const STEP: u64 = 600;
 const LAST: Round = Round { step: STEP, rounds_left: 1, most: usize::MAX };
+
+fn room_for(gpu: &Gpu, count: usize) -> DeviceGaussians {
+    DeviceGaussians::new(gpu, count, [COLUMNS, FEATURES], [Bits::Single; 2]).unwrap()
+}
 
 /// Gaussians, their moments and their statistics in host memory.
 #[derive(Clone, Debug, PartialEq)]
@@ -105,13 +110,10 @@ impl Host {
 
     fn densify(&self, gpu: &Gpu, settings: DensifySettings, round: Round) -> (Self, DensifyReport) {
         let planes = |data: &[f32]| gpu.buffer("planes", data).unwrap();
-        let mut gaussians = DeviceGaussians {
-            count: self.count as u32,
-            column_count: COLUMNS as u32,
-            feature_count: FEATURES as u32,
-            parameters: planes(&self.parameters),
-            moments: Moments { first: planes(&self.first), second: planes(&self.second) },
-        };
+        let mut gaussians = room_for(gpu, self.count);
+        gaussians.parameters = planes(&self.parameters);
+        gaussians.moments =
+            Moments::Single { first: planes(&self.first), second: planes(&self.second) };
         let inputs = DensifyInputs {
             grad_norm_sums: &mut planes(&self.grad_norm_sums),
             visit_counts: &mut gpu.buffer("visit_counts", &self.visit_counts).unwrap(),
@@ -120,6 +122,7 @@ impl Host {
         let mut densifier = Densifier::new(gpu, settings).unwrap();
         let report = densifier.densify(&mut gaussians, inputs, round).unwrap();
         assert_eq!(report.count, gaussians.count as usize);
+        let Moments::Single { first, second } = &gaussians.moments else { panic!() };
         let read = |buffer| {
             let mut planes = gpu.read(buffer).unwrap();
             planes.truncate(report.count * COLUMNS);
@@ -129,8 +132,8 @@ impl Host {
         let host = Self {
             count: report.count,
             parameters: read(&gaussians.parameters),
-            first: read(&gaussians.moments.first),
-            second: read(&gaussians.moments.second),
+            first: read(first),
+            second: read(second),
             grad_norm_sums: vec![0.0; report.count],
             visit_counts: vec![0; report.count],
         };
@@ -212,7 +215,7 @@ impl Host {
         };
         densify_scatter::Kernel::run(&params, &densify_scatter::Constants { conserving }, slices);
         let carry = |moments: &[f32]| {
-            let mut new_moments = vec![0.0; count * COLUMNS];
+            let mut new_moments = vec![0.0_f32; count * COLUMNS];
             let params = densify_moments::Params {
                 gaussian_count,
                 new_gaussian_count,
@@ -221,10 +224,10 @@ impl Host {
                 first_new_gaussian: 0,
             };
             let slices = densify_moments::Slices {
-                moments,
+                moments: bytemuck::cast_slice(moments),
                 fates: &fates,
                 offsets: &offsets,
-                new_moments: &mut new_moments,
+                new_moments: bytemuck::cast_slice_mut(&mut new_moments),
             };
             densify_moments::Kernel::run(&params, &densify_moments::Constants::default(), slices);
             new_moments
@@ -495,8 +498,9 @@ fn a_buffer_that_is_too_short_is_refused() {
             count: 2,
             column_count: columns,
             feature_count: 0,
+            rest: Bits::Single,
             parameters: planes(0),
-            moments: Moments { first: planes(1), second: planes(2) },
+            moments: Moments::Single { first: planes(1), second: planes(2) },
         };
         let inputs = DensifyInputs {
             grad_norm_sums: &mut gpu.zeros("grad_norm_sums", len(3, 2)).unwrap(),
@@ -570,13 +574,8 @@ fn buffers_that_suffice_are_kept_and_others_grow_with_headroom() {
     let mut host = Host::calm(100);
     (0..10).for_each(|i| host.pull_at(i));
     let plane = |name: &str| gpu.zeros(name, 200 * COLUMNS).unwrap();
-    let mut gaussians = DeviceGaussians {
-        count: 100,
-        column_count: COLUMNS as u32,
-        feature_count: FEATURES as u32,
-        parameters: plane("parameters"),
-        moments: Moments { first: plane("first"), second: plane("second") },
-    };
+    let mut gaussians = room_for(&gpu, 200);
+    gaussians.count = 100;
     gpu.write(&mut gaussians.parameters, &host.parameters).unwrap();
     let mut gradients = plane("gradients");
     let mut visit_counts = gpu.buffer("visit_counts", &[1; 300]).unwrap();
@@ -592,7 +591,8 @@ fn buffers_that_suffice_are_kept_and_others_grow_with_headroom() {
         let report = densifier.densify(&mut gaussians, inputs, LAST).unwrap();
         assert_eq!(report.count, count);
         let DeviceGaussians { parameters, moments, .. } = &gaussians;
-        for buffer in [parameters, &moments.first, &moments.second, &gradients] {
+        let Moments::Single { first, second } = moments else { panic!("{moments:?}") };
+        for buffer in [parameters, first, second, &gradients] {
             assert_eq!(buffer.len(), capacity * COLUMNS);
         }
     }

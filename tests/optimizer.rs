@@ -50,8 +50,10 @@ impl Planes {
         let upload = |name: &str, data: &[f32]| gpu.buffer(name, data).unwrap();
         let mut parameters = upload("parameters", &self.parameters);
         let gradients = upload("gradients", &self.gradients);
-        let mut moments =
-            Moments { first: upload("first", &self.first), second: upload("second", &self.second) };
+        let mut moments = Moments::Single {
+            first: upload("first", &self.first),
+            second: upload("second", &self.second),
+        };
         let status = gpu.buffer("status", &[status]).unwrap();
         let adam = Adam::new(gpu).unwrap();
         gpu.run("adam", |pass| {
@@ -71,8 +73,9 @@ impl Planes {
         })
         .unwrap();
         self.parameters = gpu.read(&parameters).unwrap();
-        self.first = gpu.read(&moments.first).unwrap();
-        self.second = gpu.read(&moments.second).unwrap();
+        let Moments::Single { first, second } = &moments else { panic!("{moments:?}") };
+        self.first = gpu.read(first).unwrap();
+        self.second = gpu.read(second).unwrap();
     }
 
     /// The same step by the reference.
@@ -84,6 +87,7 @@ impl Planes {
             column_count,
             feature_count: FEATURES,
             second_correction: (1.0 / (1.0 - 0.999f64.powi(step)).sqrt()) as f32,
+            step: step as u32,
             rates: RATES.0.map(rate),
         };
         let slices = adam::Slices {
@@ -91,6 +95,7 @@ impl Planes {
             gradients: &self.gradients,
             first_moments: &mut self.first,
             second_moments: &mut self.second,
+            both_moments: &mut [],
             status: &[0],
         };
         adam::Kernel::run(&params, &adam::Constants::default(), slices);

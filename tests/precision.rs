@@ -18,7 +18,7 @@ fn alone() -> MutexGuard<'static, ()> {
 }
 
 fn config(tone: ToneSettings, photographs: PhotographBits) -> TrainConfig {
-    let precision = PrecisionConfig { photographs };
+    let precision = PrecisionConfig { photographs, ..PrecisionConfig::default() };
     TrainConfig { steps: 4, sh_degree: 0, tone, precision, ..TrainConfig::default() }
 }
 

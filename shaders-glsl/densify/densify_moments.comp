@@ -20,10 +20,10 @@ layout(push_constant) uniform Params {
     uint first_new_gaussian;  // how many of the new lie before those of this dispatch
 };
 
-layout(binding = 0) readonly  buffer Moments    { float moments[]; };     // planes
+layout(binding = 0) readonly  buffer Moments    { uint moments[]; };      // planes, of whatever a word holds
 layout(binding = 1) readonly  buffer Fates      { uint fates[]; };        // (gaussian_count), FATE_*
 layout(binding = 2) readonly  buffer Offsets    { uint offsets[]; };      // (gaussian_count), first output
-layout(binding = 3) writeonly buffer NewMoments { float new_moments[]; }; // planes
+layout(binding = 3) writeonly buffer NewMoments { uint new_moments[]; };  // planes
 
 void main() {
     uint i = THREAD_INDEX;
@@ -39,7 +39,7 @@ void main() {
             uint width = plane_column(plane + 1, feature_count, column_count) - column;
             uint source = column * gaussian_count + width * i;
             uint target = column * new_gaussian_count + width * to;
-            for (uint k = 0; k < width; ++k) new_moments[target + k] = begins ? 0.0 : moments[source + k];
+            for (uint k = 0; k < width; ++k) new_moments[target + k] = begins ? 0 : moments[source + k];
         }
     }
 }

@@ -2,13 +2,14 @@
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
 #include "gaussian.glsl"
+#include "adam_step.glsl"
 
 //! Adam over the planes of include/gaussian.glsl: beta 0.9 and 0.999, epsilon 1e-15.
 //!
 //! m = b1 m + (1 - b1) g, v = b2 v + (1 - b2) g^2, p -= rate / (1 - b1^t) m / (sqrt(v) / sqrt(1 - b2^t) + epsilon).
 //! A thread takes four floats in a row, of one plane or of two. A gradient that is not finite counts as zero, so that it
 //! poisons neither moment; log scales stay within bounds whose exp is finite. Nothing changes while status[0] is set.
-//! Kingma and Ba 2015. Reference: `src/reference/adam.rs`.
+//! Moments are two floats, or both in one word. Kingma and Ba 2015. Reference: `src/reference/adam.rs`.
 
 layout(local_size_x = 256) in;
 
@@ -17,20 +18,19 @@ layout(push_constant) uniform Params {
     uint  column_count;         // columns that take part, from the first
     uint  feature_count;        // of these, from FEATURES_COLUMN on
     float second_correction;    // 1 / sqrt(1 - b2^t)
+    uint  step;                 // t
     float rates[PLANE_COUNT];   // learning rates / (1 - b1^t), one per plane
 };
 
+layout(constant_id = 0) const bool HALF_MOMENTS = false;
+
 layout(binding = 0)           buffer Parameters    { vec4 parameters[]; };      // planes
 layout(binding = 1) readonly  buffer Gradients     { vec4 gradients[]; };       // planes
-layout(binding = 2)           buffer FirstMoments  { vec4 first_moments[]; };   // planes
-layout(binding = 3)           buffer SecondMoments { vec4 second_moments[]; };  // planes
-layout(binding = 4) readonly  buffer Status        { uint status[]; };
+layout(binding = 2)           buffer FirstMoments  { vec4 first_moments[]; };   // planes; none with half moments
+layout(binding = 3)           buffer SecondMoments { vec4 second_moments[]; };  // as many
+layout(binding = 4)           buffer BothMoments   { vec4 both_moments[]; };    // planes of their bits; half moments alone
+layout(binding = 5) readonly  buffer Status        { uint status[]; };
 
-const float BETA1 = 0.9;
-const float BETA2 = 0.999;
-const float EPSILON = 1e-15;
-// Its square is finite: an infinite second moment would freeze its parameter for good.
-const float GRADIENT_BOUND = 1e18;
 // The largest scale leaves the determinant of a projected covariance finite at the near plane, (f / 0.2)^2 times its square.
 const float LOG_SCALE_MIN = -30.0;
 const float LOG_SCALE_MAX = 13.0;
@@ -45,12 +45,6 @@ vec4 rates_at(uvec4 i) {
     return rate;
 }
 
-// Positive phrasing: an infinite or NaN gradient fails the test.
-vec4 tame(vec4 gradient) {
-    vec4 bounded = clamp(gradient, -GRADIENT_BOUND, GRADIENT_BOUND);
-    return mix(vec4(0.0), bounded, lessThan(abs(gradient), vec4(3e38)));
-}
-
 void main() {
     uint quad = THREAD_INDEX;
     uint end = column_count * gaussian_count;
@@ -59,13 +53,21 @@ void main() {
     // The last quad can reach into a column that takes no part.
     bvec4 takes_part = lessThan(i, uvec4(end));
     vec4 gradient = tame(gradients[quad]);
-    vec4 m = BETA1 * first_moments[quad] + (1.0 - BETA1) * gradient;
-    vec4 v = BETA2 * second_moments[quad] + (1.0 - BETA2) * gradient * gradient;
-    vec4 value = parameters[quad] - rates_at(i) * m / (sqrt(v) * second_correction + EPSILON);
+    Moments moments;
+    if (HALF_MOMENTS) moments = from_halves(floatBitsToUint(both_moments[quad]));
+    else moments = Moments(first_moments[quad], second_moments[quad]);
+    moments = updated(moments, gradient);
+    vec4 before = parameters[quad];
+    vec4 value = before - adam_step(moments, rates_at(i), second_correction);
     // Unsigned: what lies before the plane wraps beyond its end.
     bvec4 is_log_scale = lessThan(i - LOG_SCALES_COLUMN * gaussian_count, uvec4(3 * gaussian_count));
     value = mix(value, clamp(value, LOG_SCALE_MIN, LOG_SCALE_MAX), is_log_scale);
-    first_moments[quad] = mix(first_moments[quad], m, takes_part);
-    second_moments[quad] = mix(second_moments[quad], v, takes_part);
-    parameters[quad] = mix(parameters[quad], value, takes_part);
+    parameters[quad] = mix(before, value, takes_part);
+    if (HALF_MOMENTS) {
+        vec4 halves = uintBitsToFloat(in_halves(moments, chance_of(before, moments, step)));
+        both_moments[quad] = mix(both_moments[quad], halves, takes_part);
+    } else {
+        first_moments[quad] = mix(first_moments[quad], moments.first, takes_part);
+        second_moments[quad] = mix(second_moments[quad], moments.second, takes_part);
+    }
 }

@@ -25,8 +25,9 @@ layout(push_constant, scalar) uniform Params {
 
 layout(constant_id = 0) const uint SH_DEGREE = 3;  // stored
 layout(constant_id = 5) const bool RAW_COLORS = false;
+layout(constant_id = 6) const bool HALF_REST = false;  // SH above degree 0 as include/half.glsl has it
 
-layout(binding = 0) readonly  buffer Parameters { float parameters[]; };    // (columns x gaussian_count)
+layout(binding = 0) readonly  buffer Parameters { float parameters[]; };    // planes
 layout(binding = 1) writeonly buffer Splats     { ProjectedSplat splats[]; };
 layout(binding = 2) writeonly buffer Colors     { float colors[]; };        // (gaussian_count, CHANNELS)
 layout(binding = 3) writeonly buffer DepthKeys  { uint depth_keys[]; };
@@ -40,6 +41,8 @@ const uint CULLED = (1u << DEPTH_BITS) - 1;  // the depth key of what is not see
 const float NEAREST = 1e-4;
 const uint FEATURE_COUNT = CHANNELS - 3;
 
+#include "rest.glsl"
+
 // Depth is positive, so its bits sort like its value.
 uint depth_key(float depth) {
     float nearest = max(near, NEAREST);
@@ -51,10 +54,7 @@ vec3 sh_color(uint i, vec3 direction) {
     float basis[16];
     sh_basis(sh_degree, direction, basis);
     vec3 color = basis[0] * LOAD_VEC3(parameters, DC_COLUMN, gaussian_count, i);
-    uint rest = (FEATURES_COLUMN + FEATURE_COUNT) * gaussian_count + 3 * (sh_count(SH_DEGREE) - 1) * i;
-    for (uint k = 1; k < sh_count(sh_degree); k++, rest += 3) {
-        color += basis[k] * vec3(parameters[rest], parameters[rest + 1], parameters[rest + 2]);
-    }
+    for (uint k = 1; k < sh_count(sh_degree); k++) color += basis[k] * rest_coefficient(i, k);
     if (RAW_COLORS) return color;
     return max(color + 0.5, vec3(0.0));
 }

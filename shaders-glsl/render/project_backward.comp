@@ -26,8 +26,9 @@ layout(push_constant, scalar) uniform Params {
 
 layout(constant_id = 0) const uint SH_DEGREE = 3;  // stored
 layout(constant_id = 5) const bool RAW_COLORS = false;
+layout(constant_id = 6) const bool HALF_REST = false;  // SH above degree 0 as include/half.glsl has it
 
-layout(binding = 0) readonly  buffer Parameters { float parameters[]; };  // (columns x gaussian_count)
+layout(binding = 0) readonly  buffer Parameters { float parameters[]; };  // planes
 layout(binding = 1) readonly  buffer Splats     { ProjectedSplat splats[]; };
 layout(binding = 2) readonly  buffer Colors     { float colors[]; };      // (gaussian_count, CHANNELS)
 layout(binding = 3) readonly  buffer TileCounts { uint tile_counts[]; };
@@ -38,6 +39,8 @@ layout(binding = 7) buffer GradNormSums { float grad_norm_sums[]; };
 layout(binding = 8) buffer VisitCounts  { uint visit_counts[]; };
 
 const uint FEATURE_COUNT = CHANNELS - 3;
+
+#include "rest.glsl"
 
 #define STORE_VEC3(column, i, v) { \
     uint at = (column) * gaussian_count + 3 * (i); \
@@ -71,8 +74,7 @@ vec3 sh_backward(uint i, vec3 offset, vec3 d_color) {
     vec3 d_direction = vec3(0.0);
     uint rest = (FEATURES_COLUMN + FEATURE_COUNT) * gaussian_count + 3 * (sh_count(SH_DEGREE) - 1) * i;
     for (uint k = 1; k < sh_count(SH_DEGREE); k++, rest += 3) {
-        vec3 coefficient = vec3(parameters[rest], parameters[rest + 1], parameters[rest + 2]);
-        d_direction += dot(coefficient, d_color) * basis_gradient[k];
+        d_direction += dot(rest_coefficient(i, k), d_color) * basis_gradient[k];
         for (uint c = 0; c < 3; c++) gradients[rest + c] = basis[k] * d_color[c];
     }
     return small * ((d_direction - direction * dot(direction, d_direction)) / distance);

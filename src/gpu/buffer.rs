@@ -85,6 +85,14 @@ impl<T: bytemuck::Pod> Buffer<T> {
     }
 }
 
+impl Buffer<f32> {
+    /// The same memory as words: for what keeps bits, and for what keeps other numbers than floats in the place of some.
+    pub(crate) fn words(&self) -> Buffer<u32> {
+        let memory = Arc::clone(&self.memory);
+        Buffer { memory, first: self.first, len: self.len, element: PhantomData }
+    }
+}
+
 /// What is made and bound for so many bytes: Vulkan has no empty buffers, an empty array still binds; and whole quads, for
 /// kernels that read four values at a time.
 pub(super) fn whole_quads(bytes: u64) -> u64 {

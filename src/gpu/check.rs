@@ -20,6 +20,8 @@ pub enum Tolerance {
     Roundings(f64),
     /// A bound for each number; the numbers beyond the list are exact.
     Each(Vec<f64>),
+    /// Two 16-bit floats in a word, each the reference's or a neighbour of it.
+    Halves,
     /// One partial sum per workgroup, of which only the sum counts: how it is parted is the device's choice.
     Sum(f64),
 }
@@ -156,9 +158,14 @@ impl Versions<'_> {
             if self.device[i] == expected {
                 continue;
             }
+            if let Tolerance::Halves = tolerance {
+                let (device, reference) = farthest_halves(self.device[i], expected);
+                comparison.add(i, device, reference, 1.0);
+                continue;
+            }
             let (device, reference) = (number(self.device[i]), number(expected));
             let bound = match tolerance {
-                Tolerance::Exact | Tolerance::Sum(_) => 0.0,
+                Tolerance::Exact | Tolerance::Sum(_) | Tolerance::Halves => 0.0,
                 Tolerance::Roundings(n) => n * ROUNDING * reference.abs() + flushed(1),
                 Tolerance::Each(bounds) => bounds
                     .get(i)
@@ -168,6 +175,17 @@ impl Versions<'_> {
         }
         comparison
     }
+}
+
+/// Of two words with two halves each those that are farther apart, by their places among all halves in order.
+fn farthest_halves(device: u32, reference: u32) -> (f64, f64) {
+    let place = |half: u32| {
+        // Zero is next to the smallest that is not subnormal.
+        let magnitude = f64::from((half & 0x7fff).saturating_sub(0x3ff));
+        if half & 0x8000 == 0 { magnitude } else { -magnitude }
+    };
+    let [low, high] = [0, 16].map(|shift| (place(device >> shift), place(reference >> shift)));
+    if (low.0 - low.1).abs() > (high.0 - high.1).abs() { low } else { high }
 }
 
 /// What `count` numbers can lose where the device flushes subnormal ones.

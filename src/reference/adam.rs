@@ -1,26 +1,60 @@
+use super::random::random_bits;
 use super::rounding::Rounded;
 use crate::attributes::{Attribute, planes};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::adam::{
-    BETA1, BETA2, Constants, EPSILON, GRADIENT_BOUND, Kernel, LOG_SCALE_MAX, LOG_SCALE_MIN, Params,
-    Slices, Tolerances,
+    Constants, Kernel, LOG_SCALE_MAX, LOG_SCALE_MIN, Params, Slices, Tolerances,
 };
+use crate::kernels::adam_step::{BETA1, BETA2, EPSILON, GRADIENT_BOUND};
 use crate::tone::Real;
 
-/// The parameter and both moments after the step. A compiler folds 1 - beta in double precision.
-fn updated<T: Real>(params: &Params, column: usize, [p, g, m, v]: [f32; 4]) -> [T; 3] {
+/// The parameter and both moments after a step at `rate`. A compiler folds 1 - beta in double precision.
+pub(super) fn stepped<T: Real>(
+    [rate, second_correction]: [f32; 2],
+    [p, g, m, v]: [f32; 4],
+) -> [T; 3] {
     let of = |x: f32| T::of(x.into());
-    let planes = planes(params.feature_count as usize, params.column_count as usize);
-    let plane = planes.iter().rposition(|(first, width)| *width > 0 && column >= *first);
-    let plane = plane.unwrap_or_default();
-    let bound = GRADIENT_BOUND as f32;
-    let g = if g.is_finite() { g.clamp(-bound, bound) } else { 0.0 };
+    let g = tame(g);
     let [old, new] = [BETA1, 1.0 - BETA1].map(|beta| of(beta as f32));
     let m = old * of(m) + new * of(g);
     let [old, new] = [BETA2, 1.0 - BETA2].map(|beta| of(beta as f32));
     let v = old * of(v) + new * of(g) * of(g);
-    let divisor = v.sqrt() * of(params.second_correction) + of(EPSILON as f32);
-    let p = of(p) - of(params.rates[plane]) * m / divisor;
+    let divisor = v.sqrt() * of(second_correction) + of(EPSILON as f32);
+    [of(p) - of(rate) * m / divisor, m, v]
+}
+
+fn tame(gradient: f32) -> f32 {
+    let bound = GRADIENT_BOUND as f32;
+    if gradient.is_finite() { gradient.clamp(-bound, bound) } else { 0.0 }
+}
+
+/// Both moments from a word.
+pub(super) fn from_halves(word: u32) -> [f32; 2] {
+    [word & 0xffff_0000, word << 16].map(f32::from_bits)
+}
+
+/// Both moments after the step as the device has them, where no product and sum are fused, and the chance of its rounding.
+pub(super) fn moments_after(step: u32, [p, g, m, v]: [f32; 4]) -> ([f32; 2], u32) {
+    let g = tame(g);
+    let m = BETA1 as f32 * m + (1.0 - BETA1) as f32 * g;
+    let v = BETA2 as f32 * v + (1.0 - BETA2) as f32 * g * g;
+    ([m, v], random_bits((p.to_bits() ^ v.to_bits()).wrapping_add(random_bits(step))))
+}
+
+/// Both moments in a word.
+pub(super) fn in_halves([m, v]: [f32; 2], chance: u32) -> u32 {
+    let first = m.to_bits().wrapping_add(chance & 0xffff);
+    let second = v.to_bits().wrapping_add(chance >> 16);
+    first & 0xffff_0000 | second >> 16
+}
+
+/// The parameter and both moments after the step.
+fn updated<T: Real>(params: &Params, column: usize, before: [f32; 4]) -> [T; 3] {
+    let of = |x: f32| T::of(x.into());
+    let planes = planes(params.feature_count as usize, params.column_count as usize);
+    let plane = planes.iter().rposition(|(first, width)| *width > 0 && column >= *first);
+    let plane = plane.unwrap_or_default();
+    let [p, m, v] = stepped::<T>([params.rates[plane], params.second_correction], before);
     let [low, high] = [LOG_SCALE_MIN, LOG_SCALE_MAX].map(|bound| of(bound as f32));
     let bounded = match plane == Attribute::LogScales as usize {
         // Phrased so that a NaN stays one.
@@ -31,36 +65,61 @@ fn updated<T: Real>(params: &Params, column: usize, [p, g, m, v]: [f32; 4]) -> [
     [bounded, m, v]
 }
 
+/// Parameter `i`, its gradient and both moments.
+fn before(
+    constants: &Constants,
+    i: usize,
+    parameters: &[f32],
+    gradients: &[f32],
+    [first, second]: [&[f32]; 2],
+    both: &[f32],
+) -> [f32; 4] {
+    let [m, v] =
+        if constants.half_moments { from_halves(both[i].to_bits()) } else { [first[i], second[i]] };
+    [parameters[i], gradients[i], m, v]
+}
+
 impl Reference for Kernel {
-    fn run(
-        params: &Params,
-        _: &Constants,
-        Slices { parameters, gradients, first_moments, second_moments, status }: Slices<'_>,
-    ) {
+    fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
+        let Slices { parameters, gradients, first_moments, second_moments, both_moments, status } =
+            slices;
         if status[0] != 0 {
             return;
         }
         let gaussian_count = params.gaussian_count as usize;
         for i in 0..params.column_count as usize * gaussian_count {
-            let before = [parameters[i], gradients[i], first_moments[i], second_moments[i]];
-            [parameters[i], first_moments[i], second_moments[i]] =
-                updated(params, i / gaussian_count, before);
+            let moments = [&*first_moments, &*second_moments];
+            let before = before(constants, i, parameters, gradients, moments, both_moments);
+            let [parameter, first, second] = updated(params, i / gaussian_count, before);
+            parameters[i] = parameter;
+            if constants.half_moments {
+                let (moments, chance) = moments_after(params.step, before);
+                both_moments[i] = f32::from_bits(in_halves(moments, chance));
+            } else {
+                (first_moments[i], second_moments[i]) = (first, second);
+            }
         }
     }
 
-    /// Twice the running error: the reference rounds too.
-    fn tolerances(params: &Params, _: &Constants, slices: Slices<'_>) -> Tolerances {
-        let Slices { parameters, gradients, first_moments, second_moments, status } = slices;
+    /// Twice the running error: the reference rounds too. Half moments are rounded alike everywhere.
+    fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
+        let Slices { parameters, gradients, first_moments, second_moments, both_moments, status } =
+            slices;
         let count = if status[0] == 0 { params.column_count * params.gaussian_count } else { 0 };
         let bounds = |which: usize| {
             let of = |i: usize| {
-                let before = [parameters[i], gradients[i], first_moments[i], second_moments[i]];
+                let moments = [&*first_moments, &*second_moments];
+                let before = before(constants, i, parameters, gradients, moments, both_moments);
                 let column = i / params.gaussian_count as usize;
                 2.0 * updated::<Rounded>(params, column, before)[which].error
             };
             Tolerance::Each((0..count as usize).map(of).collect())
         };
-        let [parameters, first_moments, second_moments] = [0, 1, 2].map(bounds);
-        Tolerances { parameters, first_moments, second_moments }
+        let parameters = bounds(0);
+        if constants.half_moments {
+            return Tolerances { parameters, ..Tolerances::default() };
+        }
+        let [first_moments, second_moments] = [1, 2].map(bounds);
+        Tolerances { parameters, first_moments, second_moments, ..Tolerances::default() }
     }
 }

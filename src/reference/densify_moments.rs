@@ -13,7 +13,7 @@ impl Reference for Kernel {
                 for k in 0..width {
                     let moment = slices.moments[column * n + width * copy.of + k];
                     slices.new_moments[column * new_n + width * copy.to + k] =
-                        if copy.is_new { 0.0 } else { moment };
+                        if copy.is_new { 0 } else { moment };
                 }
             }
         }

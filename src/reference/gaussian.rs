@@ -1,10 +1,12 @@
 //! One Gaussian's attributes in the planes of [`attributes`](crate::attributes).
 
+use std::borrow::Cow;
 use std::ops::Range;
 
 use glam::{DVec3, DVec4};
 
 use crate::attributes::{column_count, planes};
+use crate::halves::Halves;
 
 /// A Gaussian, or the gradient of one, in f64.
 #[derive(Clone, Debug, PartialEq)]
@@ -59,6 +61,17 @@ impl Planes {
             let first = column * self.count + width * i;
             first..first + width
         })
+    }
+
+    /// The floats that an array stands for, which may hold its last plane in halves.
+    pub(super) fn floats(self, parameters: &[f32], half_rest: bool) -> Cow<'_, [f32]> {
+        let columns = column_count(self.feature_count, self.sh_degree);
+        match half_rest {
+            true => {
+                Halves::new(self.count, [columns, self.feature_count]).unpack(parameters).into()
+            }
+            false => parameters.into(),
+        }
     }
 
     /// Gaussian `i` of the array.

@@ -224,12 +224,13 @@ impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
         let Slices { parameters, splats, colors, depth_keys, ids, tile_counts } = slices;
         let scene = Scene::new(params, constants);
+        let parameters = scene.planes.floats(parameters, constants.half_rest);
         let channels = constants.channels as usize;
         for i in 0..scene.planes.count {
             ids[i] = params.first_gaussian + i as u32;
             depth_keys[i] = CULLED;
             tile_counts[i] = 0;
-            let gaussian = scene.planes.load(parameters, i);
+            let gaussian = scene.planes.load(&parameters, i);
             let Some(projection) = scene.project(&gaussian) else { continue };
             splats[i] = projection.stored();
             let values = projection.color.to_array().into_iter().chain(gaussian.features);
@@ -246,11 +247,12 @@ impl Reference for Kernel {
     /// A Gaussian at the border of being culled may be; one whose ellipse borders on a tile may cover it.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let scene = Scene::new(params, constants);
+        let parameters = scene.planes.floats(slices.parameters, constants.half_rest);
         let (n, channels) = (scene.planes.count, constants.channels as usize);
         let [mut splats, mut colors, mut depth_keys, mut tile_counts] =
             [8 * n, channels * n, n, n].map(|len| vec![0.0; len]);
         for i in 0..n {
-            let gaussian = scene.planes.load(slices.parameters, i);
+            let gaussian = scene.planes.load(&parameters, i);
             let Some(errors) = scene.errors(&gaussian) else {
                 splats[8 * i..][..8].fill(f64::INFINITY);
                 colors[channels * i..][..channels].fill(f64::INFINITY);

@@ -201,10 +201,11 @@ impl Reference for Kernel {
         // Of all Gaussians, as the device may look at them in any order.
         let before = status[0];
         let scene = Scene::new(params, constants);
+        let parameters = scene.planes.floats(parameters, constants.half_rest);
         gradients[..scene.planes.len()].fill(0.0);
         for i in (0..scene.planes.count).filter(|&i| tile_counts[i] > 0) {
             let d_splat = scene.d_splat(colors, &scene.record(d_splats, i), i);
-            let gaussian = scene.planes.load(parameters, i);
+            let gaussian = scene.planes.load(&parameters, i);
             let gradient = scene.backward(&gaussian, &Splat::from(&splats[i]), &d_splat);
             let mut is_finite = (8.0 * d_splat.color.as_vec3()).is_finite();
             scene.planes.store(&gradient, i, |at, value| {
@@ -225,12 +226,13 @@ impl Reference for Kernel {
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         const OFF: f64 = 256.0 * UNIT;
         let scene = Scene::new(params, constants);
+        let parameters = scene.planes.floats(slices.parameters, constants.half_rest);
         let one = Planes { count: 1, ..scene.planes };
         let far = scene.camera.center().length();
         let [mut gradients, mut grad_norm_sums] =
             [scene.planes.len(), scene.planes.count].map(|len| vec![0.0; len]);
         for i in (0..scene.planes.count).filter(|&i| slices.tile_counts[i] > 0) {
-            let gaussian = scene.planes.load(slices.parameters, i);
+            let gaussian = scene.planes.load(&parameters, i);
             let splat = Splat::from(&slices.splats[i]);
             let mut inputs = vec![0.0; one.len()];
             one.store(&gaussian, 0, |at, value| inputs[at] = value);

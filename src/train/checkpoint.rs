@@ -193,7 +193,8 @@ impl Trainer {
         let header = self.header_of(path, &file)?;
         let visits: Vec<u32> = values(&file, VISIT_COUNTS, Dtype::U32, None).map_err(damaged)?;
         let gpu = self.gpu.clone();
-        let mut restored = Model::zeros(&gpu, visits.len(), self.model.shape())?;
+        let mut restored =
+            Model::zeros(&gpu, visits.len(), self.model.shape(), &self.config.precision)?;
         gpu.write(&mut restored.visit_counts, &visits)?;
         let fresh = std::mem::replace(&mut self.model, restored);
         if let Err(error) = self.read_state(&gpu, &file, &header, &damaged) {
@@ -295,37 +296,44 @@ impl Trainer {
     /// Everything that the next step depends on but the visit counts, which are integers.
     fn state(&mut self) -> Vec<State<'_>> {
         let Model { gaussians, grad_norm_sums, .. } = &mut self.model;
-        let batches = Some(gaussians.batches(&self.gpu));
-        let DeviceGaussians { count, column_count, parameters, moments, .. } = gaussians;
-        let (count, columns) = (*count as usize, *column_count as usize);
+        let batches = gaussians.batches(&self.gpu);
+        let [of_parameters, of_moments] =
+            [gaussians.parameter_columns(), gaussians.column_count as usize].map(|columns| {
+                (vec![columns, gaussians.count as usize], batches.with_columns(columns))
+            });
         let name = "density.grad_norm_sums".to_owned();
-        let shape = vec![count];
+        let shape = vec![gaussians.count as usize];
         let mut state = vec![State { name, shape, buffer: grad_norm_sums, batches: None }];
-        let of_gaussians = optimized("gaussians", &[columns, count], parameters, moments);
-        state.extend(of_gaussians.map(|state| State { batches, ..state }));
+        let DeviceGaussians { parameters, moments, .. } = gaussians;
+        state.extend(optimized("gaussians", parameters, moments).enumerate().map(
+            |(place, (name, buffer))| {
+                let (shape, batches) = if place == 0 { &of_parameters } else { &of_moments };
+                State { name, shape: shape.clone(), buffer, batches: Some(*batches) }
+            },
+        ));
         for learnable in learnables(&mut self.networks, &mut self.exposures) {
             let name = learnable.name();
             let AdamBuffers { parameters, moments, .. } = learnable.buffers();
-            let len = parameters.len();
-            state.extend(optimized(name, &[len], parameters, moments));
+            let shape = vec![parameters.len()];
+            state.extend(optimized(name, parameters, moments).map(|(name, buffer)| State {
+                name,
+                shape: shape.clone(),
+                buffer,
+                batches: None,
+            }));
         }
         state
     }
 }
 
-/// What Adam works on.
+/// What Adam works on, by the names of the tensors: the parameters, and then their moments.
 fn optimized<'a>(
     owner: &str,
-    shape: &[usize],
     parameters: &'a mut Buffer<f32>,
-    Moments { first, second }: &'a mut Moments,
-) -> [State<'a>; 3] {
-    [("parameters", parameters), ("first_moments", first), ("second_moments", second)].map(
-        |(name, buffer)| {
-            let (name, shape) = (format!("{owner}.{name}"), shape.to_vec());
-            State { name, shape, buffer, batches: None }
-        },
-    )
+    moments: &'a mut Moments,
+) -> impl Iterator<Item = (String, &'a mut Buffer<f32>)> {
+    let all = std::iter::once(("parameters", parameters)).chain(moments.planes_mut());
+    all.map(move |(name, buffer)| (format!("{owner}.{name}"), buffer))
 }
 
 /// A tensor's elements, or what is wrong with it.

@@ -8,12 +8,11 @@ use serde::Serialize;
 use super::{CacheSize, Trainer};
 use crate::Result;
 use crate::camera::Patch;
+use crate::densify::DeviceGaussians;
 use crate::render::RenderOptions;
 
 /// What the program, the driver and its compiled kernels take on the host, about.
 const PROGRAM: f64 = 256.0 * 1024.0 * 1024.0;
-/// Parameters, two moments, and the gradients: a float of every column each.
-const PLANE_SETS: f64 = 4.0;
 /// What density control gathers for each Gaussian, in bytes.
 const STATISTICS: f64 = 8.0;
 /// Plane sets that a checkpoint or a model is made from on the host.
@@ -102,7 +101,7 @@ impl Trainer {
     /// What is on the device now, less what follows the numbers of Gaussians and intersections, in bytes.
     pub(super) fn measure_fixed_bytes(&self) -> f64 {
         self.gpu.free_unused();
-        let model = self.model.capacity() as f64 * self.per_gaussian().model();
+        let model = self.model.capacity() as f64 * self.per_gaussian().model;
         (self.gpu.memory_in_use() as f64 - model - self.renderer.reserved_bytes() as f64).max(0.0)
     }
 
@@ -138,8 +137,15 @@ impl Trainer {
     }
 
     fn per_gaussian(&self) -> PerGaussian {
+        let DeviceGaussians { column_count, moments, .. } = &self.model.gaussians;
+        let [plane, parameters] =
+            [*column_count as usize, self.model.gaussians.parameter_columns()]
+                .map(|columns| (columns * size_of::<f32>()) as f64);
+        // Beside the moments, gradients are planes.
+        let planes = 1 + moments.planes().len();
         PerGaussian {
-            plane: f64::from(self.model.gaussians.column_count) * size_of::<f32>() as f64,
+            plane,
+            model: parameters + planes as f64 * plane + STATISTICS,
             working: (self.renderer.bytes_per_gaussian() + self.densifier.bytes_per_gaussian())
                 as f64,
         }
@@ -150,18 +156,16 @@ impl Trainer {
 struct PerGaussian {
     /// A float of every column.
     plane: f64,
+    /// Parameters, gradients, moments, and what density control gathers.
+    model: f64,
     /// In the renderer and in density control.
     working: f64,
 }
 
 impl PerGaussian {
-    fn model(&self) -> f64 {
-        PLANE_SETS * self.plane + STATISTICS
-    }
-
     /// So many in training.
     fn steady(&self, count: f64) -> f64 {
-        count * (self.model() + self.working)
+        count * (self.model + self.working)
     }
 
     /// So many on their way to the host, one plane set after the other.
@@ -185,7 +189,7 @@ impl PerGaussian {
 
     /// So many come to be from so many: both are there for a moment.
     fn growing(&self, before: f64, count: f64) -> f64 {
-        (before + count) * self.model() + before * self.working
+        (before + count) * self.model + before * self.working
     }
 }
 

@@ -2,13 +2,14 @@
 
 use glam::Vec3;
 
-use super::Trainer;
+use super::{PrecisionConfig, Trainer};
 use crate::Result;
 use crate::batches::Batches;
 use crate::densify::{Densifier, DensifyInputs, DensifyReport, DeviceGaussians, Round};
 use crate::gpu::{Buffer, Gpu, Recorder};
-use crate::optimizer::{Adam, AdamBuffers, FiniteCheck, LearningRates, Moments};
-use crate::scene::{ATTRIBUTES, Gaussians, Shape, rest_coefficients, width};
+use crate::halves::Bits;
+use crate::optimizer::{Adam, AdamBuffers, FiniteCheck, LearningRates};
+use crate::scene::{ATTRIBUTES, Attribute, Gaussians, Shape, rest_coefficients, width};
 
 impl Trainer {
     /// The gradient of every parameter that the last step left, in the frame.
@@ -16,7 +17,9 @@ impl Trainer {
     /// # Errors
     /// The device was lost.
     pub fn gradients(&self) -> Result<Gaussians> {
-        self.model.planes(&self.gpu, &self.model.gradients)
+        let Model { gaussians, shape, gradients, .. } = &self.model;
+        let parameters = gaussians.batches(&self.gpu).read(&self.gpu, gradients)?;
+        Ok(Gaussians { count: self.model.count(), shape: *shape, parameters })
     }
 }
 
@@ -36,21 +39,20 @@ pub(super) struct Model {
 impl Model {
     /// # Errors
     /// The device is out of memory or lost.
-    pub(super) fn upload(gpu: &Gpu, gaussians: &Gaussians) -> Result<Self> {
+    pub(super) fn upload(
+        gpu: &Gpu,
+        gaussians: &Gaussians,
+        precision: &PrecisionConfig,
+    ) -> Result<Self> {
         let Gaussians { count, shape, ref parameters } = *gaussians;
         let (column_count, feature_count) = (width(shape), shape.features.width());
         let batches = Batches::new(gpu, count, [column_count, feature_count]);
-        let zeros = |name| batches.zeros(gpu, name);
-        let gaussians = DeviceGaussians {
-            count: count as u32,
-            column_count: column_count as u32,
-            feature_count: feature_count as u32,
-            parameters: batches.upload(gpu, "parameters", parameters)?,
-            moments: Moments { first: zeros("first_moments")?, second: zeros("second_moments")? },
-        };
+        let bits = [precision.rest, precision.moments];
+        let mut gaussians = DeviceGaussians::new(gpu, count, [column_count, feature_count], bits)?;
+        gaussians.write(gpu, parameters)?;
         Ok(Self {
             shape,
-            gradients: zeros("gradients")?,
+            gradients: batches.zeros(gpu, "gradients")?,
             grad_norm_sums: gpu.zeros("grad_norm_sums", count)?,
             visit_counts: gpu.zeros("visit_counts", count)?,
             gaussians,
@@ -61,8 +63,13 @@ impl Model {
     ///
     /// # Errors
     /// The device is out of memory or lost.
-    pub(super) fn zeros(gpu: &Gpu, count: usize, shape: Shape) -> Result<Self> {
-        Self::upload(gpu, &Gaussians { count, shape, parameters: vec![0.0; count * width(shape)] })
+    pub(super) fn zeros(
+        gpu: &Gpu,
+        count: usize,
+        shape: Shape,
+        precision: &PrecisionConfig,
+    ) -> Result<Self> {
+        Self::upload(gpu, &Gaussians::zeros(count, shape), precision)
     }
 
     pub(super) fn shape(&self) -> Shape {
@@ -93,21 +100,24 @@ impl Model {
         status: &Buffer<u32>,
     ) -> Result<()> {
         let gaussians = &self.gaussians;
-        let features = gaussians.feature_count;
-        let columns =
-            if sh_degree == 0 { width(0) as u32 + features } else { gaussians.column_count };
+        let DeviceGaussians { column_count, feature_count, rest, .. } = *gaussians;
+        let first = width(0) as u32 + feature_count;
+        let of_floats = if sh_degree == 0 || rest == Bits::Half { first } else { column_count };
         gaussians.batches(gpu).iter().try_for_each(|batch| {
-            let Moments { first, second } = &gaussians.moments;
-            let buffers = AdamBuffers {
-                parameters: &mut batch.of_planes(&gaussians.parameters)?,
-                gradients: &batch.of_planes(&self.gradients)?,
-                moments: &mut Moments {
-                    first: batch.of_planes(first)?,
-                    second: batch.of_planes(second)?,
-                },
-            };
-            let shape = [batch.gaussian_count(), columns, features];
-            adam.record(pass, step, rates, shape, buffers, status)
+            let words = gaussians.parameter_columns();
+            let parameters = &mut batch.of_rows(&gaussians.parameters, words)?;
+            let gradients = &batch.of_planes(&self.gradients)?;
+            let moments = &mut gaussians.moments.of_batch(&batch)?;
+            let count = batch.gaussian_count();
+            let buffers = AdamBuffers { parameters, gradients, moments };
+            adam.record(pass, step, rates, [count, of_floats, feature_count], buffers, status)?;
+            if sh_degree == 0 || rest == Bits::Single {
+                return Ok(());
+            }
+            let buffers = AdamBuffers { parameters, gradients, moments };
+            let rate = rates[Attribute::Rest];
+            let halves = [count, first, column_count - first];
+            adam.record_halves(pass, step, rate, halves, buffers, status)
         })
     }
 
@@ -141,18 +151,23 @@ impl Model {
     /// The device was lost.
     pub(super) fn drop_degrees_above(&mut self, gpu: &Gpu, degree: u32) -> Result<()> {
         let kept = rest_coefficients(degree);
-        let batches = self.gaussians.batches(gpu);
-        let DeviceGaussians { count, parameters, moments, .. } = &mut self.gaussians;
-        let (count, shape) = (*count as usize, self.shape);
-        for buffer in [parameters, &mut moments.first, &mut moments.second] {
-            let mut gaussians = Gaussians { count, shape, parameters: batches.read(gpu, buffer)? };
+        let shape = self.shape;
+        let drop = |parameters: Vec<f32>| {
+            let mut gaussians = Gaussians { count: self.count(), shape, parameters };
             let coefficients = rest_coefficients(shape.sh_degree).max(1);
             for own in gaussians.rest_mut().chunks_mut(coefficients) {
                 own.iter_mut().skip(kept).for_each(|rest| *rest = Vec3::ZERO);
             }
-            batches.write(gpu, buffer, &gaussians.parameters)?;
-        }
-        Ok(())
+            gaussians.parameters
+        };
+        let batches = self.gaussians.batches(gpu);
+        let parameters = drop(self.gaussians.read(gpu)?);
+        let moments = self.gaussians.moments.planes();
+        let moments = moments.into_iter().map(|(_, plane)| Ok(drop(batches.read(gpu, plane)?)));
+        let moments = moments.collect::<Result<Vec<_>>>()?;
+        self.gaussians.write(gpu, &parameters)?;
+        let mut planes = self.gaussians.moments.planes_mut().into_iter().zip(&moments);
+        planes.try_for_each(|((_, plane), moments)| batches.write(gpu, plane, moments))
     }
 
     /// Where the first parameter is that is NaN or infinite, among the planes of all Gaussians.
@@ -164,10 +179,11 @@ impl Model {
         gpu: &Gpu,
         finite: &mut FiniteCheck,
     ) -> Result<Option<usize>> {
-        let batches = self.gaussians.batches(gpu);
+        let (batches, words) =
+            (self.gaussians.parameter_batches(gpu), self.gaussians.parameter_columns());
         let mut before = 0;
         for batch in batches.iter() {
-            let planes = batch.of_planes(&self.gaussians.parameters)?;
+            let planes = batch.of_rows(&self.gaussians.parameters, words)?;
             if let Some(at) = finite.first(gpu, &planes, planes.len())? {
                 return Ok(Some(batches.place_of(before + at)));
             }
@@ -193,11 +209,7 @@ impl Model {
     /// # Errors
     /// The device was lost.
     pub(super) fn download(&self, gpu: &Gpu) -> Result<Gaussians> {
-        self.planes(gpu, &self.gaussians.parameters)
-    }
-
-    fn planes(&self, gpu: &Gpu, buffer: &Buffer<f32>) -> Result<Gaussians> {
-        let parameters = self.gaussians.batches(gpu).read(gpu, buffer)?;
+        let parameters = self.gaussians.read(gpu)?;
         Ok(Gaussians { count: self.count(), shape: self.shape, parameters })
     }
 }

@@ -1,0 +1,79 @@
+#version 460
+#extension GL_GOOGLE_include_directive : require
+#include "kernel.glsl"
+#include "adam_step.glsl"
+#include "half.glsl"
+
+//! Adam over SH coefficients above degree 0 that are kept as 16-bit floats (include/half.glsl), as adam.comp otherwise.
+//!
+//! A thread takes four coefficients of a Gaussian. They are stepped as floats and then rounded up or down by chance, of
+//! which the mean is what they were. Reference: `src/reference/adam_rest.rs`.
+
+layout(local_size_x = 256) in;
+
+layout(push_constant) uniform Params {
+    uint  gaussian_count;
+    uint  first_column;       // columns before the coefficients', of parameters, gradients and moments alike
+    uint  coefficient_count;  // of each Gaussian
+    float rate;               // learning rate / (1 - b1^t)
+    float second_correction;  // 1 / sqrt(1 - b2^t)
+    uint  step;               // t
+};
+
+layout(constant_id = 0) const bool HALF_MOMENTS = false;
+
+layout(binding = 0)           buffer Parameters    { uint parameters[]; };       // planes, halves behind first_column
+layout(binding = 1) readonly  buffer Gradients     { float gradients[]; };       // planes
+layout(binding = 2)           buffer FirstMoments  { float first_moments[]; };   // planes; none with half moments
+layout(binding = 3)           buffer SecondMoments { float second_moments[]; };  // as many
+layout(binding = 4)           buffer BothMoments   { uint both_moments[]; };     // planes; half moments alone
+layout(binding = 5) readonly  buffer Status        { uint status[]; };
+
+// The two halves of a word, or none beyond a Gaussian's.
+vec2 halves_at(uint word, bool takes_part) {
+    return takes_part ? unpackHalf2x16(parameters[word]) : vec2(0.0);
+}
+
+void main() {
+    uint quads = (coefficient_count + 3) / 4;
+    uint i = THREAD_INDEX / max(quads, 1);
+    if (i >= gaussian_count || status[0] != 0) return;
+    uint first = 4 * (THREAD_INDEX % max(quads, 1));
+    uint count = min(coefficient_count - first, 4);
+    uint plane = first_column * gaussian_count;
+    uint at = plane + coefficient_count * i + first;
+    uint word = plane + words_of(coefficient_count) * i + first / 2;
+
+    vec4 gradient = vec4(0.0);
+    Moments moments = Moments(vec4(0.0), vec4(0.0));
+    uvec4 both = uvec4(0);
+    [[unroll]] for (uint k = 0; k < 4; ++k) {
+        if (k >= count) continue;
+        gradient[k] = gradients[at + k];
+        if (HALF_MOMENTS) {
+            both[k] = both_moments[at + k];
+        } else {
+            moments.first[k] = first_moments[at + k];
+            moments.second[k] = second_moments[at + k];
+        }
+    }
+    if (HALF_MOMENTS) moments = from_halves(both);
+    moments = updated(moments, tame(gradient));
+
+    vec4 value = vec4(halves_at(word, true), halves_at(word + 1, count > 2));
+    uvec4 chance = chance_of(value, moments, step);
+    value -= adam_step(moments, vec4(rate), second_correction);
+    value = rounded_by_chance(value, chance);
+    parameters[word] = packHalf2x16(value.xy);
+    if (count > 2) parameters[word + 1] = packHalf2x16(value.zw);
+    if (HALF_MOMENTS) both = in_halves(moments, chance);
+    [[unroll]] for (uint k = 0; k < 4; ++k) {
+        if (k >= count) continue;
+        if (HALF_MOMENTS) {
+            both_moments[at + k] = both[k];
+        } else {
+            first_moments[at + k] = moments.first[k];
+            second_moments[at + k] = moments.second[k];
+        }
+    }
+}
