@@ -25,7 +25,7 @@ use crate::kernels::{
     self, blend_backward, blend_forward, emit, order_counts, project, project_backward,
     reduce_records,
 };
-use crate::scene::width;
+use crate::scene::{Shape, width};
 use crate::sort::{Count, RadixSort};
 use crate::{Error, Result};
 
@@ -111,9 +111,8 @@ impl Renderer {
     pub fn new(gpu: &Gpu, settings: RenderSettings) -> Result<Self> {
         let [tile_width, tile_height] = settings.tile_on(gpu)?;
         let channels = settings.channels() as u32;
-        let (alpha_max, sh_degree) = (settings.max_alpha, settings.shape.sh_degree);
-        let half_rest = settings.rest == Bits::Half;
-        let (raw_colors, partition_size) = (settings.raw_colors, RANKS_PER_PARTITION);
+        let (alpha_max, partition_size) = (settings.max_alpha, RANKS_PER_PARTITION);
+        let (project, project_backward) = projections(gpu, &settings, [tile_width, tile_height])?;
         let shaping_channels = settings.shaping_channels();
         let (skips_groups, splats_per_turn) = (!gpu.properties().is_cpu, splats_per_turn(gpu));
         // What every kernel that includes `splat.glsl` is specialised with, and what some are beside it.
@@ -127,7 +126,7 @@ impl Renderer {
             settings,
             tile: [tile_width, tile_height],
             longest_run: longest_run(gpu),
-            project: gpu.pipeline(&constants!(project, sh_degree, raw_colors, half_rest))?,
+            project,
             order_counts: gpu.pipeline(&order_counts::Constants { partition_size })?,
             emit: gpu.pipeline(&constants!(emit, partition_size))?,
             blend_forward: gpu.pipeline(&constants!(
@@ -142,16 +141,26 @@ impl Renderer {
                 splats_per_turn
             ))?,
             reduce_records: gpu.pipeline(&constants!(reduce_records))?,
-            project_backward: gpu.pipeline(&constants!(
-                project_backward,
-                sh_degree,
-                raw_colors,
-                half_rest
-            ))?,
+            project_backward,
             depth_sort: RadixSort::new(gpu, 0)?,
             tile_sort: RadixSort::new(gpu, 0)?,
             frame: Frame::new(gpu, settings.channels())?,
         })
+    }
+
+    /// Renders Gaussians of another SH degree from now on.
+    ///
+    /// # Errors
+    /// The driver refuses a kernel; the renderer is as it was.
+    pub fn set_sh_degree(&mut self, sh_degree: u32) -> Result<()> {
+        if sh_degree == self.settings.shape.sh_degree {
+            return Ok(());
+        }
+        let shape = Shape { sh_degree, ..self.settings.shape };
+        let settings = RenderSettings { shape, ..self.settings };
+        (self.project, self.project_backward) = projections(&self.gpu, &settings, self.tile)?;
+        self.settings = settings;
+        Ok(())
     }
 
     /// Makes room for `gaussian_count` Gaussians and the images of `cameras`, or their patches.
@@ -527,6 +536,36 @@ impl Renderer {
         }
         Ok(View { camera: patch.into(), half_view: patch.half_view(), tiles })
     }
+}
+
+/// The kernels that read the Gaussians: of all kernels these alone know their SH degree.
+fn projections(
+    gpu: &Gpu,
+    settings: &RenderSettings,
+    [tile_width, tile_height]: [u32; 2],
+) -> Result<(Pipeline<project::Kernel>, Pipeline<project_backward::Kernel>)> {
+    let (channels, alpha_max) = (settings.channels() as u32, settings.max_alpha);
+    let (sh_degree, raw_colors) = (settings.shape.sh_degree, settings.raw_colors);
+    let half_rest = settings.rest == Bits::Half;
+    let project = project::Constants {
+        channels,
+        alpha_max,
+        tile_width,
+        tile_height,
+        sh_degree,
+        raw_colors,
+        half_rest,
+    };
+    let project_backward = project_backward::Constants {
+        channels,
+        alpha_max,
+        tile_width,
+        tile_height,
+        sh_degree,
+        raw_colors,
+        half_rest,
+    };
+    Ok((gpu.pipeline(&project)?, gpu.pipeline(&project_backward)?))
 }
 
 /// A patch as the kernels take it, and the columns and rows of tiles of its image.

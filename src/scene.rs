@@ -98,6 +98,28 @@ impl Gaussians {
         self.moved(|mean| ((mean - offset) * frame.scale).as_vec3(), frame.scale.ln())
     }
 
+    /// The same with room for another SH degree: coefficients that come are zero, those beyond it go.
+    pub fn with_sh_degree(&self, sh_degree: u32) -> Self {
+        let mut other = Self::zeros(self.count, Shape { sh_degree, ..self.shape });
+        let before = self.plane(Attribute::Rest).start;
+        other.parameters[..before].copy_from_slice(&self.parameters[..before]);
+        let [own, new] = [self.shape.sh_degree, sh_degree].map(rest_coefficients);
+        let kept = own.min(new);
+        let pairs = other.rest_mut().chunks_mut(new.max(1)).zip(self.rest().chunks(own.max(1)));
+        pairs.for_each(|(new, own)| new[..kept].copy_from_slice(&own[..kept]));
+        other
+    }
+
+    /// The least SH degree that there has to be room for.
+    pub(crate) fn sh_degree_in_use(&self) -> u32 {
+        let own = rest_coefficients(self.shape.sh_degree);
+        let used = |rest: &[Vec3]| rest.iter().rposition(|c| *c != Vec3::ZERO).map_or(0, |k| k + 1);
+        let used = self.rest().chunks(own.max(1)).map(used).max().unwrap_or_default();
+        (0..=self.shape.sh_degree)
+            .find(|&degree| rest_coefficients(degree) >= used)
+            .unwrap_or_default()
+    }
+
     fn moved(&self, position: impl Fn(DVec3) -> Vec3, log_scale: f64) -> Self {
         let mut moved = self.clone();
         for mean in moved.means_mut() {

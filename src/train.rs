@@ -38,7 +38,7 @@ use crate::optimizer::{Adam, FiniteCheck, Learnable};
 use crate::pseudo_gt::PseudoGt;
 use crate::random::Stream;
 use crate::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer};
-use crate::scene::{COLOR_CHANNELS, Gaussians};
+use crate::scene::{COLOR_CHANNELS, Gaussians, Shape};
 use crate::{Error, Result};
 
 pub use cache::CacheSize;
@@ -279,7 +279,7 @@ impl Trainer {
             ends: Ends::default(),
             step: 0,
             views,
-            model: Model::upload(gpu, &gaussians, &config.precision)?,
+            model: Model::upload(gpu, &gaussians, first_sh_degree(&config), &config.precision)?,
             renderer,
             losses,
             networks: NetworkTerms::new(gpu, &config, &sizes, !masks.is_empty())?,
@@ -298,6 +298,8 @@ impl Trainer {
             pace: Pace::default(),
             config,
         };
+        // Gaussians that are given may have what the first step does not use.
+        trainer.renderer.set_sh_degree(trainer.model.shape().sh_degree)?;
         trainer.reserve()?;
         trainer.fixed_bytes = trainer.measure_fixed_bytes();
         Ok(trainer)
@@ -395,6 +397,7 @@ impl Trainer {
     /// As [`Trainer::advance`]; a step that overflows its memory is not counted, the next [`Trainer::advance`] redoes it.
     pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
         let step = self.step + 1;
+        self.make_room_for_degree()?;
         self.views.bring(&self.config, step..=step)?;
         let times = self.gpu.clone().profile("step", |pass| self.record_step(pass, step, 0))?;
         if self.gpu.read(self.renderer.status())?.first() == Some(&0) {
@@ -548,17 +551,21 @@ struct Kernels {
 
 impl Kernels {
     fn new(gpu: &Gpu, config: &TrainConfig, density: DensifySettings) -> Result<Self> {
+        let (rest, own) = (config.precision.rest, config.render_settings());
+        let shape = Shape { sh_degree: first_sh_degree(config), ..own.shape };
         Ok(Self {
-            renderer: Renderer::new(
-                gpu,
-                RenderSettings { rest: config.precision.rest, ..config.render_settings() },
-            )?,
+            renderer: Renderer::new(gpu, RenderSettings { rest, shape, ..own })?,
             losses: Losses::new(gpu, &config.loss())?,
             adam: Adam::new(gpu)?,
             finite: FiniteCheck::new(gpu)?,
             densifier: Densifier::new(gpu, density)?,
         })
     }
+}
+
+/// The SH degree of the first step.
+fn first_sh_degree(config: &TrainConfig) -> u32 {
+    config.schedule.sh_degree(1, config.sh_degree)
 }
 
 /// Everything that is learned beside the Gaussians: Adam trains it, and checkpoints keep it.

@@ -60,7 +60,7 @@ fn config() -> TrainConfig {
     };
     (config.schedule.densify_after, config.schedule.densify_interval) = (4, 5);
     config.schedule.densify_before = 25;
-    config.schedule.sh_degree_interval = 8;
+    config.schedule.sh_degree_interval = 7;
     config.density.gradient_threshold = 1e-6;
     // Small ones, which meet few tiles: as many as there are, a binding holds on each of the devices.
     config.start.scale = 0.2;

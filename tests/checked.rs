@@ -241,7 +241,7 @@ fn a_wrong_wiring_is_named_where_it_arises() {
         ("project", 12, 0x0040_0000, "splats"),
         ("blend_forward", 2, 1, "render"),
         ("ssim_backward", 8, 0x0080_0000, "d_render"),
-        ("adam", 4, 0x0080_0000, "parameters"),
+        ("adam", 5, 0x0080_0000, "parameters"),
         ("sort_upsweep", 2, 1, "table"),
     ] {
         let report = with_wrong_param(&gpu, kernel, word, bits);

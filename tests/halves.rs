@@ -23,7 +23,6 @@ const ALL: [[Bits; 2]; 4] = [
     [Bits::Half, Bits::Single],
     [Bits::Half, Bits::Half],
 ];
-const RATE: f64 = 1e-3;
 
 fn wave(len: usize, scale: f32, phase: f32) -> Vec<f32> {
     (0..len).map(|i| scale * (i as f32 * 0.7 + phase).sin()).collect()
@@ -34,6 +33,7 @@ struct Learned {
     gaussians: DeviceGaussians,
     gradients: Buffer<f32>,
     adam: Adam,
+    rate: f64,
     status: Buffer<u32>,
 }
 
@@ -43,7 +43,7 @@ impl Learned {
         gaussians.write(gpu, &wave(count * columns, 0.7, 0.0)).unwrap();
         let gradients = gpu.buffer("gradients", &wave(count * columns, 1e-3, 1.0)).unwrap();
         let (adam, status) = (Adam::new(gpu).unwrap(), gpu.zeros("status", 1).unwrap());
-        Self { gaussians, gradients, adam, status }
+        Self { gaussians, gradients, adam, rate: 1e-3, status }
     }
 
     /// As [`nightsplat::train::Trainer`] does: floats, and what is in halves.
@@ -51,9 +51,10 @@ impl Learned {
         let DeviceGaussians { count, column_count, feature_count, rest, .. } = self.gaussians;
         let first = 14 + feature_count;
         let floats = if rest == Bits::Half { first } else { column_count };
-        let rates = LearningRates::uniform(RATE);
+        let rate = self.rate;
+        let rates = LearningRates::uniform(rate);
         gpu.run("adam", |pass| {
-            let Self { gaussians, gradients, adam, status } = self;
+            let Self { gaussians, gradients, adam, status, .. } = self;
             let DeviceGaussians { parameters, moments, .. } = gaussians;
             let buffers = AdamBuffers { parameters, gradients, moments };
             adam.record(pass, step, &rates, [count, floats, feature_count], buffers, status)?;
@@ -63,7 +64,7 @@ impl Learned {
             let DeviceGaussians { parameters, moments, .. } = gaussians;
             let buffers = AdamBuffers { parameters, gradients, moments };
             let halves = [count, first, column_count - first];
-            adam.record_halves(pass, step, RATE, halves, buffers, status)
+            adam.record_halves(pass, step, rate, halves, buffers, status)
         })
         .unwrap();
     }
@@ -130,20 +131,12 @@ fn coefficients_in_halves_move_by_less_than_their_unit() {
     learned.gaussians.write(&gpu, &vec![0.75; count * width(3)]).unwrap();
     let gradients: Vec<f32> = (0..count * width(3)).map(|i| 1e-3 + 1e-8 * i as f32).collect();
     gpu.write(&mut learned.gradients, &gradients).unwrap();
-    let rates = 2.4e-5;
-    for step in 1..=40 {
-        gpu.run("adam", |pass| {
-            let Learned { gaussians, gradients, adam, status } = &mut learned;
-            let DeviceGaussians { parameters, moments, .. } = gaussians;
-            let buffers = AdamBuffers { parameters, gradients, moments };
-            adam.record_halves(pass, step, rates, [count as u32, 14, 45], buffers, status)
-        })
-        .unwrap();
-    }
+    learned.rate = 2.4e-5;
+    (1..=40).for_each(|step| learned.step(&gpu, step));
     let rest = &learned.gaussians.read(&gpu).unwrap()[14 * count..];
     let mean = rest.iter().map(|&value| f64::from(value)).sum::<f64>() / rest.len() as f64;
     let moved = 0.75 - mean;
-    assert!((moved / (40.0 * rates) - 1.0).abs() < 0.02, "moved by {moved}");
+    assert!((moved / (40.0 * learned.rate) - 1.0).abs() < 0.02, "moved by {moved}");
     let unit = 1.0 / 2048.0;
     assert!(rest.iter().all(|value| value.rem_euclid(unit) == 0.0), "these are no halves");
 }
@@ -152,6 +145,7 @@ fn coefficients_in_halves_move_by_less_than_their_unit() {
 fn coefficients_beyond_halves_and_gradients_that_are_not_finite_leave_finite_halves() {
     let gpu = gpu();
     let mut learned = Learned::new(&gpu, [4, width(1), 0], [Bits::Half, Bits::Half]);
+    learned.rate = 1e3;
     let mut planes = vec![1e6; 4 * width(1)];
     planes[14 * 4..14 * 4 + 9]
         .copy_from_slice(&[0.0, -0.0, 1e-7, -1e-7, 7e4, -7e4, 1e-5, 6e-5, 1.0]);

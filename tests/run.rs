@@ -319,7 +319,7 @@ fn tensorboard_gets_its_events_and_changes_no_bit() {
 }
 
 #[test]
-fn a_parts_option_without_the_part_is_said_with_both_names() {
+fn options_of_what_a_run_has_not_are_said_with_what_switches_it_on() {
     let folder = folder();
     let said = |out: &str, options: &str| run(&train(folder.path(), out, options), 0).1;
     let plain = said("a", "--steps 1 --model plain --denoiser-channels 8 --depth-is-disparity");
@@ -333,6 +333,14 @@ fn a_parts_option_without_the_part_is_said_with_both_names() {
         assert!(plain.contains(part), "no `{part}` in: {plain}");
     }
     let with = said("b", "--steps 1 --parts denoiser --denoiser-channels 4 --denoiser-crop 16");
+    assert!(!with.contains("no effect"), "{with}");
+    let gains = "--steps 1 --set stop.growth_gain=0.3 --set stop.degree_gain=0.02";
+    let without = said("c", gains);
+    for gain in ["stop.growth_gain has no effect", "stop.degree_gain has no effect", "stop.views=N"]
+    {
+        assert!(without.contains(gain), "no `{gain}` in: {without}");
+    }
+    let with = said("d", &format!("{gains} --set stop.views=1"));
     assert!(!with.contains("no effect"), "{with}");
 }
 

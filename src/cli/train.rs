@@ -256,7 +256,7 @@ impl TrainOptions {
         self.model.model.is_some() || self.model.parts.is_some()
     }
 
-    /// A line for each option that says something of a part which `config` has not.
+    /// A line for each option that says something of what `config` has not.
     fn idle(&self, config: &TrainConfig) -> Vec<String> {
         let (model, networks) = (&self.model, [Part::Denoiser, Part::Tonemapper]);
         let options: [(&str, bool, &[Part]); 7] = [
@@ -282,6 +282,12 @@ impl TrainOptions {
         if self.check_stops && config.check.every == 0 {
             lines.push("--check-stops has no effect, as no step is checked; --check-every N says which are".to_owned());
         }
+        let stop = &config.stop;
+        let gains = [("growth_gain", stop.growth_gain), ("degree_gain", stop.degree_gain)];
+        let idle = gains.into_iter().filter(|(_, gain)| stop.views == 0 && *gain > 0.0);
+        lines.extend(idle.map(|(gain, _)| {
+            format!("stop.{gain} has no effect, as no views are held out; --set stop.views=N keeps N of them from training")
+        }));
         lines
     }
 

@@ -23,7 +23,7 @@ use crate::input;
 use crate::nn::TensorFile;
 use crate::optimizer::{AdamBuffers, Moments};
 use crate::output::write_whole_with;
-use crate::scene::Gaussians;
+use crate::scene::{Gaussians, Shape, width};
 use crate::{Error, Result};
 
 /// The key of the metadata that holds a [`Header`] as JSON: several keys would come in another order every time.
@@ -193,8 +193,7 @@ impl Trainer {
         let header = self.header_of(path, &file)?;
         let visits: Vec<u32> = values(&file, VISIT_COUNTS, Dtype::U32, None).map_err(damaged)?;
         let gpu = self.gpu.clone();
-        let mut restored =
-            Model::zeros(&gpu, visits.len(), self.model.shape(), &self.config.precision)?;
+        let mut restored = self.model.zeros_like(&gpu, visits.len(), self.sh_degree_of(&file))?;
         gpu.write(&mut restored.visit_counts, &visits)?;
         let fresh = std::mem::replace(&mut self.model, restored);
         if let Err(error) = self.read_state(&gpu, &file, &header, &damaged) {
@@ -203,7 +202,19 @@ impl Trainer {
         }
         self.views.set_left_out(&header.left_out);
         (self.step, self.ends) = (header.step, header.ends);
+        self.renderer.set_sh_degree(self.model.shape().sh_degree)?;
         self.reserve()
+    }
+
+    /// The SH degree that the Gaussians of a checkpoint have room for, by the columns of what Adam keeps of them.
+    fn sh_degree_of(&self, file: &TensorFile<'_>) -> u32 {
+        let whole = self.model.whole_shape();
+        let columns = self.model.gaussians.moments.planes().first().and_then(|(name, _)| {
+            file.tensor(&format!("gaussians.{name}"))?.0.shape.first().copied()
+        });
+        let fits = |&sh_degree: &u32| Some(width(Shape { sh_degree, ..whole })) == columns;
+        // Where none does, reading the tensor says so.
+        (0..=whole.sh_degree).find(fits).unwrap_or(self.model.shape().sh_degree)
     }
 
     /// The header of a checkpoint that this run can go on from.
@@ -248,11 +259,14 @@ impl Trainer {
     /// # Errors
     /// [`Error::ParameterNotFinite`] names step and plane.
     pub(crate) fn refuse_not_finite(&self, gaussians: &Gaussians) -> Result<()> {
-        self.refuse_values("gaussians.parameters", &gaussians.parameters)
+        match first_not_finite(&gaussians.parameters) {
+            Some(at) => Err(self.not_finite_in(at, width(gaussians.shape))),
+            None => Ok(()),
+        }
     }
 
     fn refuse_values(&self, name: &str, values: &[f32]) -> Result<()> {
-        match values.par_iter().position_first(|value| !value.is_finite()) {
+        match first_not_finite(values) {
             Some(at) => Err(self.not_finite(name, at)),
             None => Ok(()),
         }
@@ -260,10 +274,19 @@ impl Trainer {
 
     /// What to say of a value of the state, by its tensor's name.
     pub(super) fn not_finite(&self, name: &str, at: usize) -> Error {
-        let (plane, gaussian) = match name.strip_prefix("gaussians.") {
-            Some(_) => self.model.place_of(at),
-            None => (name.to_owned(), at),
-        };
+        let DeviceGaussians { column_count, .. } = self.model.gaussians;
+        match name.strip_prefix("gaussians.") {
+            Some("parameters") => self.not_finite_in(at, self.model.gaussians.parameter_columns()),
+            Some(_) => self.not_finite_in(at, column_count as usize),
+            None => {
+                Error::ParameterNotFinite { step: self.step, plane: name.to_owned(), gaussian: at }
+            }
+        }
+    }
+
+    /// The same of Gaussians with so many columns.
+    fn not_finite_in(&self, at: usize, columns: usize) -> Error {
+        let (plane, gaussian) = self.model.place_of(at, columns);
         Error::ParameterNotFinite { step: self.step, plane, gaussian }
     }
 
@@ -324,6 +347,10 @@ impl Trainer {
         }
         state
     }
+}
+
+fn first_not_finite(values: &[f32]) -> Option<usize> {
+    values.par_iter().position_first(|value| !value.is_finite())
 }
 
 /// What Adam works on, by the names of the tensors: the parameters, and then their moments.

@@ -59,6 +59,24 @@ impl Trainer {
         self.config.schedule.sh_degree(step, highest)
     }
 
+    /// Makes room for the SH degree of the next step.
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub(super) fn make_room_for_degree(&mut self) -> Result<()> {
+        let degree = self.sh_degree(self.step + 1);
+        if degree > self.model.shape().sh_degree { self.set_sh_degree(degree) } else { Ok(()) }
+    }
+
+    /// Model and renderer have another SH degree from now on.
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub(super) fn set_sh_degree(&mut self, degree: u32) -> Result<()> {
+        self.model.set_sh_degree(&self.gpu, degree)?;
+        self.renderer.set_sh_degree(degree)
+    }
+
     /// The most Gaussians that the held-out views leave room for, decided anew before a round of density control.
     ///
     /// # Errors
@@ -122,7 +140,7 @@ impl Trainer {
             self.step,
             degree - 1
         );
-        self.model.drop_degrees_above(&self.gpu, degree - 1)?;
+        self.set_sh_degree(degree - 1)?;
         self.ends.sh_degree = Some(degree - 1);
         Ok(())
     }

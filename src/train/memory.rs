@@ -10,6 +10,7 @@ use crate::Result;
 use crate::camera::Patch;
 use crate::densify::DeviceGaussians;
 use crate::render::RenderOptions;
+use crate::scene::{Shape, width};
 
 /// What the program, the driver and its compiled kernels take on the host, about.
 const PROGRAM: f64 = 256.0 * 1024.0 * 1024.0;
@@ -101,7 +102,7 @@ impl Trainer {
     /// What is on the device now, less what follows the numbers of Gaussians and intersections, in bytes.
     pub(super) fn measure_fixed_bytes(&self) -> f64 {
         self.gpu.free_unused();
-        let model = self.model.capacity() as f64 * self.per_gaussian().model;
+        let model = self.model.capacity() as f64 * self.per_gaussian_of(self.model.shape()).model;
         (self.gpu.memory_in_use() as f64 - model - self.renderer.reserved_bytes() as f64).max(0.0)
     }
 
@@ -136,11 +137,15 @@ impl Trainer {
         intersections * self.renderer.bytes_per_intersection() as f64
     }
 
+    /// Once every SH degree is in use.
     fn per_gaussian(&self) -> PerGaussian {
-        let DeviceGaussians { column_count, moments, .. } = &self.model.gaussians;
-        let [plane, parameters] =
-            [*column_count as usize, self.model.gaussians.parameter_columns()]
-                .map(|columns| (columns * size_of::<f32>()) as f64);
+        self.per_gaussian_of(self.model.whole_shape())
+    }
+
+    fn per_gaussian_of(&self, shape: Shape) -> PerGaussian {
+        let DeviceGaussians { rest, moments, .. } = &self.model.gaussians;
+        let columns = [width(shape), rest.columns([width(shape), shape.features.width()])];
+        let [plane, parameters] = columns.map(|columns| (columns * size_of::<f32>()) as f64);
         // Beside the moments, gradients are planes.
         let planes = 1 + moments.planes().len();
         PerGaussian {

@@ -1,15 +1,13 @@
 //! The Gaussians in training, on the device.
 
-use glam::Vec3;
-
 use super::{PrecisionConfig, Trainer};
 use crate::Result;
-use crate::batches::Batches;
+use crate::attributes::planes;
 use crate::densify::{Densifier, DensifyInputs, DensifyReport, DeviceGaussians, Round};
 use crate::gpu::{Buffer, Gpu, Recorder};
 use crate::halves::Bits;
 use crate::optimizer::{Adam, AdamBuffers, FiniteCheck, LearningRates};
-use crate::scene::{ATTRIBUTES, Attribute, Gaussians, Shape, rest_coefficients, width};
+use crate::scene::{ATTRIBUTES, Attribute, Gaussians, Shape, width};
 
 impl Trainer {
     /// The gradient of every parameter that the last step left, in the frame.
@@ -17,18 +15,23 @@ impl Trainer {
     /// # Errors
     /// The device was lost.
     pub fn gradients(&self) -> Result<Gaussians> {
-        let Model { gaussians, shape, gradients, .. } = &self.model;
-        let parameters = gaussians.batches(&self.gpu).read(&self.gpu, gradients)?;
-        Ok(Gaussians { count: self.model.count(), shape: *shape, parameters })
+        let Model { gaussians, gradients, .. } = &self.model;
+        let planes = gaussians.batches(&self.gpu).read(&self.gpu, gradients)?;
+        Ok(self.model.whole(planes))
     }
 }
 
 /// Planes of every attribute with their moments and gradients, and the statistics of density control. Buffers are as long
 /// as the Gaussians need or longer.
+///
+/// SH coefficients come with their degree: before it is in use there is no memory for them, and no pass over it.
 #[derive(Debug)]
 pub(super) struct Model {
     pub(super) gaussians: DeviceGaussians,
+    /// Of the planes.
     shape: Shape,
+    /// The SH degree that the Gaussians have wherever they are seen.
+    sh_degree: u32,
     /// As many as parameters.
     pub(super) gradients: Buffer<f32>,
     /// One per Gaussian each.
@@ -37,39 +40,90 @@ pub(super) struct Model {
 }
 
 impl Model {
+    /// With room for the SH degree `in_use`, or what more of it the Gaussians have.
+    ///
     /// # Errors
     /// The device is out of memory or lost.
     pub(super) fn upload(
         gpu: &Gpu,
         gaussians: &Gaussians,
+        in_use: u32,
         precision: &PrecisionConfig,
     ) -> Result<Self> {
-        let Gaussians { count, shape, ref parameters } = *gaussians;
-        let (column_count, feature_count) = (width(shape), shape.features.width());
-        let batches = Batches::new(gpu, count, [column_count, feature_count]);
+        let sh_degree = gaussians.shape.sh_degree;
+        let gaussians = gaussians.with_sh_degree(in_use.max(gaussians.sh_degree_in_use()));
+        let Gaussians { count, shape, parameters } = gaussians;
+        let dimensions = [width(shape), shape.features.width()];
         let bits = [precision.rest, precision.moments];
-        let mut gaussians = DeviceGaussians::new(gpu, count, [column_count, feature_count], bits)?;
-        gaussians.write(gpu, parameters)?;
+        let mut gaussians = DeviceGaussians::new(gpu, count, dimensions, bits)?;
+        gaussians.write(gpu, &parameters)?;
         Ok(Self {
             shape,
-            gradients: batches.zeros(gpu, "gradients")?,
+            sh_degree,
+            gradients: gaussians.batches(gpu).zeros(gpu, "gradients")?,
             grad_norm_sums: gpu.zeros("grad_norm_sums", count)?,
             visit_counts: gpu.zeros("visit_counts", count)?,
             gaussians,
         })
     }
 
-    /// A model of zeros, to be overwritten.
+    /// As many others of the same make, to be overwritten.
     ///
     /// # Errors
     /// The device is out of memory or lost.
-    pub(super) fn zeros(
-        gpu: &Gpu,
-        count: usize,
-        shape: Shape,
-        precision: &PrecisionConfig,
-    ) -> Result<Self> {
-        Self::upload(gpu, &Gaussians::zeros(count, shape), precision)
+    pub(super) fn zeros_like(&self, gpu: &Gpu, count: usize, in_use: u32) -> Result<Self> {
+        let DeviceGaussians { rest, ref moments, .. } = self.gaussians;
+        let precision =
+            PrecisionConfig { rest, moments: moments.bits(), ..PrecisionConfig::default() };
+        Self::upload(gpu, &Gaussians::zeros(count, self.whole_shape()), in_use, &precision)
+    }
+
+    /// What the Gaussians are made of wherever they are seen.
+    pub(super) fn whole_shape(&self) -> Shape {
+        Shape { sh_degree: self.sh_degree, ..self.shape }
+    }
+
+    /// Gaussians of that shape, of planes as they are on the device.
+    fn whole(&self, parameters: Vec<f32>) -> Gaussians {
+        let own = Gaussians { count: self.count(), shape: self.shape, parameters };
+        if self.shape.sh_degree == self.sh_degree {
+            own
+        } else {
+            own.with_sh_degree(self.sh_degree)
+        }
+    }
+
+    /// Makes room for another SH degree; coefficients beyond it go, with what Adam keeps of them.
+    ///
+    /// # Errors
+    /// The device is out of memory or lost; the model is as it was.
+    pub(super) fn set_sh_degree(&mut self, gpu: &Gpu, sh_degree: u32) -> Result<()> {
+        let (count, own) = (self.count(), self.shape);
+        let new = Shape { sh_degree, ..own };
+        let columns = width(new);
+        // Longer buffers with what they held, one after the other.
+        let words = self.gaussians.rest.columns([columns, new.features.width()]);
+        lengthen(gpu, &mut self.gaussians.parameters, count * words)?;
+        self.planes_mut().try_for_each(|plane| lengthen(gpu, plane, count * columns))?;
+        let parameters = self.gaussians.read(gpu)?;
+        let batches = self.gaussians.batches(gpu);
+        let planes = self.planes_mut().map(|plane| batches.read(gpu, plane));
+        let planes = planes.collect::<Result<Vec<_>>>()?;
+
+        (self.shape, self.gaussians.column_count) = (new, columns as u32);
+        let resized = |parameters| {
+            Gaussians { count, shape: own, parameters }.with_sh_degree(sh_degree).parameters
+        };
+        self.gaussians.write(gpu, &resized(parameters))?;
+        let batches = self.gaussians.batches(gpu);
+        let mut pairs = self.planes_mut().zip(planes);
+        pairs.try_for_each(|(plane, values)| batches.write(gpu, plane, &resized(values)))
+    }
+
+    /// What has a float of every column beside the parameters.
+    fn planes_mut(&mut self) -> impl Iterator<Item = &mut Buffer<f32>> {
+        let moments = self.gaussians.moments.planes_mut().into_iter().map(|(_, plane)| plane);
+        std::iter::once(&mut self.gradients).chain(moments)
     }
 
     pub(super) fn shape(&self) -> Shape {
@@ -145,31 +199,6 @@ impl Model {
         Ok(report)
     }
 
-    /// Makes every SH coefficient above a degree zero, and what Adam keeps of them.
-    ///
-    /// # Errors
-    /// The device was lost.
-    pub(super) fn drop_degrees_above(&mut self, gpu: &Gpu, degree: u32) -> Result<()> {
-        let kept = rest_coefficients(degree);
-        let shape = self.shape;
-        let drop = |parameters: Vec<f32>| {
-            let mut gaussians = Gaussians { count: self.count(), shape, parameters };
-            let coefficients = rest_coefficients(shape.sh_degree).max(1);
-            for own in gaussians.rest_mut().chunks_mut(coefficients) {
-                own.iter_mut().skip(kept).for_each(|rest| *rest = Vec3::ZERO);
-            }
-            gaussians.parameters
-        };
-        let batches = self.gaussians.batches(gpu);
-        let parameters = drop(self.gaussians.read(gpu)?);
-        let moments = self.gaussians.moments.planes();
-        let moments = moments.into_iter().map(|(_, plane)| Ok(drop(batches.read(gpu, plane)?)));
-        let moments = moments.collect::<Result<Vec<_>>>()?;
-        self.gaussians.write(gpu, &parameters)?;
-        let mut planes = self.gaussians.moments.planes_mut().into_iter().zip(&moments);
-        planes.try_for_each(|((_, plane), moments)| batches.write(gpu, plane, moments))
-    }
-
     /// Where the first parameter is that is NaN or infinite, among the planes of all Gaussians.
     ///
     /// # Errors
@@ -192,24 +221,32 @@ impl Model {
         Ok(None)
     }
 
-    /// The attribute and the Gaussian that the parameter at an index belongs to.
-    pub(super) fn place_of(&self, parameter: usize) -> (String, usize) {
-        let none = Gaussians { count: self.count(), shape: self.shape, parameters: vec![] };
-        let planes = ATTRIBUTES.iter().map(|spec| (spec, none.plane(spec.attribute)));
-        let within = planes.into_iter().find(|(_, plane)| plane.contains(&parameter));
-        within.map_or_else(
-            || ("parameters".to_owned(), parameter),
-            |(spec, plane)| {
-                let width = plane.len() / self.count().max(1);
-                (spec.name.to_owned(), (parameter - plane.start) / width.max(1))
-            },
+    /// The attribute and the Gaussian that the number at an index of planes of so many columns belongs to.
+    pub(super) fn place_of(&self, index: usize, columns: usize) -> (String, usize) {
+        let (count, features) = (self.count().max(1), self.shape.features.width());
+        let mut planes = ATTRIBUTES.iter().zip(planes(features, columns));
+        let within = |(column, width): (usize, usize)| {
+            (column * count..(column + width) * count).contains(&index)
+        };
+        planes.find(|(_, plane)| within(*plane)).map_or_else(
+            || ("parameters".to_owned(), index),
+            |(spec, (column, width))| (spec.name.to_owned(), (index - column * count) / width),
         )
     }
 
     /// # Errors
     /// The device was lost.
     pub(super) fn download(&self, gpu: &Gpu) -> Result<Gaussians> {
-        let parameters = self.gaussians.read(gpu)?;
-        Ok(Gaussians { count: self.count(), shape: self.shape, parameters })
+        Ok(self.whole(self.gaussians.read(gpu)?))
     }
+}
+
+/// A buffer that holds as much, and has so much room.
+fn lengthen(gpu: &Gpu, buffer: &mut Buffer<f32>, len: usize) -> Result<()> {
+    if buffer.len() < len {
+        let mut longer = gpu.uninit_in_windows(buffer.name(), len)?;
+        gpu.write(&mut longer, &gpu.read(buffer)?)?;
+        *buffer = longer;
+    }
+    Ok(())
 }

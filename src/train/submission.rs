@@ -94,10 +94,13 @@ impl Trainer {
     fn train_stretch(&mut self, until: u64, reports: &mut Vec<StepReport>) -> Result<()> {
         // A run that goes on from where memory was out has that before it.
         self.control()?;
+        self.make_room_for_degree()?;
         let (begin, mut next) = (Instant::now(), self.step + 1);
         let until = until.min(self.config.steps);
-        // Density control may change the number of Gaussians, and what is decided of the SH degree the next step.
-        let changes = |&step: &u64| self.densifies_at(step) || self.decides_degree_at(step);
+        // Density control may change the number of Gaussians, and another SH degree their memory.
+        let rises = |step| self.sh_degree(step + 1) > self.sh_degree(step);
+        let changes =
+            |&step: &u64| self.densifies_at(step) || rises(step) || self.decides_degree_at(step);
         let last = (next..until).find(changes).unwrap_or(until);
         let (mut in_flight, mut sent) = (VecDeque::new(), Ok(()));
         loop {
