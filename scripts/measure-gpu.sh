@@ -13,6 +13,7 @@
 #     doctor.txt    the devices, and what the driver says of them
 #     bench.json    kernels, stages and a step, checked against the references
 #     tune.json     every tile at 500x375 and 1920x1080, with registers and spills; many.json: a million Gaussians at 1080p
+#     tune-N.json   the same with subgroups of N lanes, where the device leaves the choice
 #     lom.txt       training at the paper's protocol, plain and with every part: scores, or how far it came
 #     gsplat.json   the rasteriser of gsplat, where the variable GSPLAT names a folder to import it from
 #     tests.txt     every test binary, and the end of what those said that failed
@@ -173,6 +174,11 @@ run() {
     ! command -v nvidia-smi > /dev/null || step nvidia-smi doctor.txt 20 nvidia-smi
     step bench bench.json 60 "$nightsplat" bench --json ${BENCH:-}
     NIGHTSPLAT_TUNE=$work/tiles.json step tune tune.json 120 "$nightsplat" bench --tune --json ${TUNE:---gaussians 100000}
+    local size
+    for size in $(sed -n 's/.*NIGHTSPLAT_SUBGROUP: or \([0-9, ]*\)).*/\1/p' "$out/doctor.txt" | head -n 1 | tr -d ,); do
+        NIGHTSPLAT_SUBGROUP=$size NIGHTSPLAT_TUNE=$work/tiles-$size.json \
+            step "tune-$size" "tune-$size.json" 60 "$nightsplat" bench --tune --json ${TUNE:---gaussians 100000}
+    done
     # From here on with the tiles that were the fastest.
     export NIGHTSPLAT_TUNE=$work/tiles.json
     step many many.json 60 "$nightsplat" bench --json --unchecked ${MANY:---gaussians 1000000 --width 1920 --height 1080}

@@ -23,6 +23,7 @@ mod pipeline;
 mod recorder;
 mod requirements;
 mod statistics;
+mod subgroups;
 mod submission;
 #[doc(hidden)]
 pub mod testing;
@@ -50,6 +51,7 @@ pub use pipeline::Pipeline;
 pub use recorder::{HostRecording, Recorder, Threads};
 pub use requirements::{REQUIREMENTS, Requirement, required_device_features};
 pub use statistics::Statistic;
+pub use subgroups::SUBGROUP_VARIABLE;
 pub use submission::{PassTime, Submission};
 pub use tuning::{TUNE_VARIABLE, TunedTile};
 

@@ -43,6 +43,17 @@ fn a_schedulers_variables_that_name_no_device_are_one_line() {
 }
 
 #[test]
+fn a_subgroup_that_the_device_does_not_have_is_one_line_with_those_that_it_has() {
+    let printed: Value = serde_json::from_str(&succeed("doctor --json")).unwrap();
+    let chosen = &printed["devices"][printed["chosen"].as_u64().unwrap() as usize];
+    let sizes = chosen["subgroup_sizes"].as_array().unwrap();
+    assert!(sizes.contains(&chosen["subgroup_size"]), "{chosen}");
+    let said =
+        ["NIGHTSPLAT_SUBGROUP on", "`48` is no size", &format!("{} lanes", sizes.last().unwrap())];
+    refused_with("bench", &[("NIGHTSPLAT_SUBGROUP", "48")], 2, &said);
+}
+
+#[test]
 fn an_empty_list_of_gpus_leaves_the_software_device() {
     let printed: Value = serde_json::from_str(&succeed("doctor --json")).unwrap();
     let is_software = |device: &Value| device["kind"] == "software";

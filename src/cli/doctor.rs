@@ -6,7 +6,9 @@ use anyhow::Result;
 use serde::Serialize;
 
 use crate::Error;
-use crate::gpu::{CooperativeMatrix, DeviceChoice, DeviceReport, SchedulerVariables, devices};
+use crate::gpu::{
+    CooperativeMatrix, DeviceChoice, DeviceReport, SUBGROUP_VARIABLE, SchedulerVariables, devices,
+};
 
 /// List the Vulkan devices, what training requires, and whether each device offers it.
 #[derive(Clone, Copy, Debug, clap::Args)]
@@ -68,11 +70,17 @@ fn table(devices: &[DeviceReport], chosen: Option<usize>, reason: Option<&str>) 
     let mut text = String::new();
     for (index, device) in devices.iter().enumerate() {
         let DeviceReport { name, kind, api_version, uuid, pci, subgroup_size, memory, .. } = device;
+        let others = device.subgroup_sizes.iter().filter(|size| *size != subgroup_size);
+        let others = others.map(ToString::to_string).collect::<Vec<_>>().join(", ");
+        let others = match others.as_str() {
+            "" => String::new(),
+            others => format!(" ({SUBGROUP_VARIABLE}: or {others})"),
+        };
         let pci = pci.map_or_else(String::new, |address| format!(", pci:{address}"));
         let requirements = &device.requirements;
         let gib = *memory as f64 / f64::from(1 << 30);
         text += &format!(
-            "{index}  {name}\n   {kind}, Vulkan {api_version}, subgroups of {subgroup_size}, {gib:.1} GiB\n   uuid:{uuid}{pci}\n"
+            "{index}  {name}\n   {kind}, Vulkan {api_version}, subgroups of {subgroup_size}{others}, {gib:.1} GiB\n   uuid:{uuid}{pci}\n"
         );
         let width = requirements.iter().map(|requirement| requirement.name.len()).max();
         let width = width.unwrap_or(0);
@@ -113,6 +121,7 @@ mod tests {
             uuid: "00-11".to_owned(),
             pci: is_recent.then_some("65:1.2".parse().unwrap()),
             subgroup_size: 32,
+            subgroup_sizes: if is_recent { vec![16, 32] } else { vec![32] },
             memory: 3 << 29,
             limits: DeviceLimits::default(),
             cooperative_matrix: is_recent.then_some(CooperativeMatrix { m: 8, n: 16, k: 32 }),
@@ -128,6 +137,7 @@ mod tests {
             "0  Abacus\n   discrete, Vulkan 1.3.0, subgroups of 32, 1.5 GiB\n   uuid:00-11\n"
         ));
         assert!(text.contains("   uuid:00-11, pci:0000:65:01.2\n"), "{text}");
+        assert!(text.contains("subgroups of 32 (NIGHTSPLAT_SUBGROUP: or 16), 1.5 GiB"), "{text}");
         assert!(
             text.contains("   yes  Vulkan 1.3  it is needed\n   no   shiny       it is needed\n")
         );

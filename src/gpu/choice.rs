@@ -352,6 +352,7 @@ mod tests {
             uuid: format!("{digit:02x}000000-0000-0000-0000-0000000000{digit:02x}"),
             pci,
             subgroup_size: 32,
+            subgroup_sizes: vec![32],
             memory: 0,
             limits: DeviceLimits::default(),
             cooperative_matrix: None,

@@ -128,14 +128,13 @@ impl Gpu {
                 owned.tuning_path = tuning::path(cache_folder(), vendor_id, device_id);
             }
             let matrix = cooperative::offered(&owned.entry, &owned.instance, physical, &offered);
-            create_device(&owned.instance, physical, &offered, matrix.is_some()).map(
-                |(device, queue)| {
-                    let mut properties = properties(&owned.instance, physical, &offered);
-                    properties.cooperative_matrix = matrix;
-                    properties.tells_statistics = tells_statistics(&offered);
-                    (physical, properties, device, queue)
-                },
-            )
+            let properties = Properties {
+                cooperative_matrix: matrix,
+                tells_statistics: tells_statistics(&offered),
+                ..properties(&owned.instance, physical, &offered)?
+            };
+            create_device(&owned.instance, physical, &offered, matrix.is_some())
+                .map(|(device, queue)| (physical, properties, device, queue))
         });
         match opened {
             Ok((physical, properties, device, queue)) => {
@@ -180,7 +179,7 @@ impl Gpu {
         let offered = Offered::gather(&instance, physical).map_err(loader_error)?;
         offered.check()?;
         let queue = Queue { raw: vk::Queue::from_raw(host.queue), family: host.queue_family };
-        let properties = properties(&instance, physical, &offered);
+        let properties = properties(&instance, physical, &offered)?;
         Self::assemble(&instance, physical, properties, device, queue, None)
     }
 
@@ -379,7 +378,7 @@ fn properties(
     instance: &ash::Instance,
     physical: vk::PhysicalDevice,
     offered: &Offered,
-) -> Properties {
+) -> Result<Properties> {
     let mut driver = vk::PhysicalDeviceDriverProperties::default();
     let mut properties = vk::PhysicalDeviceProperties2::default().push_next(&mut driver);
     // SAFETY: the chain points at a live local.
@@ -387,7 +386,7 @@ fn properties(
     let limits = offered.properties.limits;
     let text =
         |text: Result<&CStr, _>| text.map(|t| t.to_string_lossy().into_owned()).unwrap_or_default();
-    Properties {
+    Ok(Properties {
         name: offered.device_name(),
         driver: format!(
             "{} {}",
@@ -395,10 +394,8 @@ fn properties(
             text(driver.driver_info_as_c_str())
         ),
         memory: device_memory(instance, physical),
-        subgroup_size: offered.subgroup_size,
-        subgroup_size_is_selectable: offered
-            .required_subgroup_size_stages
-            .contains(vk::ShaderStageFlags::COMPUTE),
+        subgroup_size: offered.lanes()?,
+        subgroup_size_is_selectable: offered.subgroups.are_selectable,
         max_storage_buffer_range: u64::from(limits.max_storage_buffer_range),
         max_workgroups: max_workgroups(&limits),
         max_loop_iterations: match driver.driver_id {
@@ -411,7 +408,7 @@ fn properties(
         cooperative_matrix: None,
         pushes_descriptors: offered.pushes_descriptors(),
         tells_statistics: false,
-    }
+    })
 }
 
 /// Mesa's software device ends all loops of an invocation after so many turns in total (`LP_MAX_TGSI_LOOP_ITERATIONS`).

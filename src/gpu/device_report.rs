@@ -24,8 +24,10 @@ pub struct DeviceReport {
     pub uuid: String,
     /// Where it sits on the PCI bus, if it does and says so.
     pub pci: Option<PciAddress>,
-    /// Lanes of a subgroup.
+    /// Lanes of a subgroup in our kernels.
     pub subgroup_size: u32,
+    /// What it could be, by `NIGHTSPLAT_SUBGROUP`.
+    pub subgroup_sizes: Vec<u32>,
     /// Bytes of device-local memory.
     pub memory: u64,
     /// What bounds a scene and a view.
@@ -114,7 +116,9 @@ pub(super) fn report(
         vendor: offered.properties.vendor_id,
         uuid: hyphenated(&offered.uuid),
         pci: offered.pci,
-        subgroup_size: offered.subgroup_size,
+        // What the variable asks of another device is no matter here.
+        subgroup_size: offered.lanes().unwrap_or(offered.subgroups.own),
+        subgroup_sizes: offered.subgroups.all(),
         memory: device_memory(instance, physical),
         limits: DeviceLimits {
             max_storage_buffer_range: u64::from(limits.max_storage_buffer_range),

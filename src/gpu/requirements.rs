@@ -7,6 +7,7 @@ use ash::{ext, khr, vk};
 
 use super::choice::PciAddress;
 use super::descriptors::{MAX_BUFFERS, PUSH_VARIABLE};
+use super::subgroups::{SIZES, SubgroupSizes};
 use crate::{Error, Result};
 
 /// The subgroup operations that our kernels use.
@@ -28,10 +29,9 @@ pub(super) struct Offered {
     pub(super) uuid: [u8; vk::UUID_SIZE],
     pub(super) pci: Option<PciAddress>,
     pub(super) max_allocation: u64,
-    pub(super) subgroup_size: u32,
+    pub(super) subgroups: SubgroupSizes,
     pub(super) subgroup_operations: vk::SubgroupFeatureFlags,
     pub(super) subgroup_stages: vk::ShaderStageFlags,
-    pub(super) required_subgroup_size_stages: vk::ShaderStageFlags,
     pub(super) max_push_descriptors: u32,
     pub(super) extensions: BTreeSet<String>,
     pub(super) vulkan12: vk::PhysicalDeviceVulkan12Features<'static>,
@@ -121,7 +121,7 @@ pub const REQUIREMENTS: &[Requirement] = &[
     Requirement {
         name: "subgroup size 4 to 128",
         why: "a ballot fits four words, a tile at most 32 rows of lanes",
-        offered: |o| (4..=128).contains(&o.subgroup_size),
+        offered: |o| SIZES.contains(&o.subgroups.own),
     },
     Requirement {
         name: "maxComputeWorkGroupInvocations >= 256",
@@ -201,10 +201,17 @@ impl Offered {
                 function: pci.pci_function,
             }),
             max_allocation: vulkan11.max_memory_allocation_size,
-            subgroup_size: vulkan11.subgroup_size,
+            subgroups: SubgroupSizes {
+                own: vulkan11.subgroup_size,
+                are_selectable: vulkan13_properties
+                    .required_subgroup_size_stages
+                    .contains(vk::ShaderStageFlags::COMPUTE),
+                least: vulkan13_properties.min_subgroup_size,
+                most: vulkan13_properties.max_subgroup_size,
+                most_in_workgroup: vulkan13_properties.max_compute_workgroup_subgroups,
+            },
             subgroup_operations: vulkan11.subgroup_supported_operations,
             subgroup_stages: vulkan11.subgroup_supported_stages,
-            required_subgroup_size_stages: vulkan13_properties.required_subgroup_size_stages,
             max_push_descriptors: push.max_push_descriptors,
             extensions,
             // The chain pointers die with this function.
@@ -269,10 +276,15 @@ mod tests {
         let (vulkan12, vulkan13) = required_device_features();
         Offered {
             properties,
-            subgroup_size: 4,
+            subgroups: SubgroupSizes {
+                own: 4,
+                are_selectable: false,
+                least: 4,
+                most: 4,
+                most_in_workgroup: 64,
+            },
             subgroup_operations: SUBGROUP_OPERATIONS,
             subgroup_stages: vk::ShaderStageFlags::COMPUTE,
-            required_subgroup_size_stages: vk::ShaderStageFlags::empty(),
             uuid: [0; 16],
             pci: None,
             max_allocation: 1 << 30,
@@ -301,7 +313,7 @@ mod tests {
             ("subgroupSizeControl", |o| o.vulkan13.subgroup_size_control = vk::FALSE),
             ("computeFullSubgroups", |o| o.vulkan13.compute_full_subgroups = vk::FALSE),
             ("subgroup operations", |o| o.subgroup_operations = vk::SubgroupFeatureFlags::BASIC),
-            ("subgroup size", |o| o.subgroup_size = 2),
+            ("subgroup size", |o| o.subgroups.own = 2),
             ("maxComputeWorkGroupInvocations", |o| {
                 o.properties.limits.max_compute_work_group_invocations = 128;
             }),

@@ -1,0 +1,112 @@
+//! How many lanes a subgroup of our kernels has, where the device leaves that open.
+
+use std::ops::RangeInclusive;
+
+use super::requirements::Offered;
+use crate::{Error, Result};
+
+/// Names another size than the built-in one of the device.
+pub const SUBGROUP_VARIABLE: &str = "NIGHTSPLAT_SUBGROUP";
+
+const AMD: u32 = 0x1002;
+/// What our kernels are written for.
+pub(super) const SIZES: RangeInclusive<u32> = 4..=128;
+/// Invocations of our largest workgroups.
+const WORKGROUP: u32 = 256;
+
+/// What a device says of its subgroups.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct SubgroupSizes {
+    /// What it takes where nothing is asked for.
+    pub(super) own: u32,
+    /// Kernels can ask for another.
+    pub(super) are_selectable: bool,
+    pub(super) least: u32,
+    pub(super) most: u32,
+    /// The most subgroups of a workgroup.
+    pub(super) most_in_workgroup: u32,
+}
+
+impl SubgroupSizes {
+    /// All that kernels can be compiled for.
+    pub(super) fn all(self) -> Vec<u32> {
+        if !self.are_selectable {
+            return vec![self.own];
+        }
+        let powers = (0..u32::BITS).map(|power| 1 << power);
+        let fit = |&size: &u32| {
+            SIZES.contains(&size)
+                && (self.least..=self.most).contains(&size)
+                && WORKGROUP / size <= self.most_in_workgroup
+        };
+        powers.filter(fit).collect()
+    }
+
+    /// AMD's drivers report 64, which RDNA issues as two halves of 32 one behind the other: half as many lanes that wait for
+    /// the last splat of a tile are the better choice for kernels that part ways (AMD, RDNA whitepaper, 2019). GCN and CDNA
+    /// have 64 alone. Everywhere else the driver knows.
+    fn built_in(self, vendor: u32) -> u32 {
+        if vendor == AMD && self.all().contains(&32) { 32 } else { self.own }
+    }
+}
+
+impl Offered {
+    /// The lanes of our kernels: the built-in number, or that of the variable.
+    ///
+    /// # Errors
+    /// The variable names what the device does not have.
+    pub(super) fn lanes(&self) -> Result<u32> {
+        let wanted = std::env::var(SUBGROUP_VARIABLE).ok().filter(|value| !value.is_empty());
+        lanes(self.subgroups, self.properties.vendor_id, wanted.as_deref()).map_err(|problem| {
+            Error::Usage(format!("{SUBGROUP_VARIABLE} on {}: {problem}", self.device_name()))
+        })
+    }
+}
+
+fn lanes(sizes: SubgroupSizes, vendor: u32, wanted: Option<&str>) -> Result<u32, String> {
+    let Some(wanted) = wanted else { return Ok(sizes.built_in(vendor)) };
+    let all = sizes.all();
+    wanted.parse().ok().filter(|size| all.contains(size)).ok_or_else(|| {
+        let all: Vec<String> = all.iter().map(u32::to_string).collect();
+        format!("`{wanted}` is no size of its subgroups, which are of {} lanes", all.join(" or "))
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const NVIDIA: u32 = 0x10de;
+    const INTEL: u32 = 0x8086;
+
+    fn sizes(own: u32, [least, most]: [u32; 2]) -> SubgroupSizes {
+        SubgroupSizes { own, are_selectable: true, least, most, most_in_workgroup: 32 }
+    }
+
+    #[test]
+    fn the_built_in_size_is_the_drivers_but_for_rdna() {
+        for (vendor, sizes, expected) in [
+            (NVIDIA, sizes(32, [32, 32]), 32),
+            (AMD, sizes(64, [32, 64]), 32),
+            (AMD, sizes(64, [64, 64]), 64),
+            (AMD, SubgroupSizes { are_selectable: false, ..sizes(64, [32, 64]) }, 64),
+            (INTEL, sizes(32, [8, 32]), 32),
+        ] {
+            assert_eq!(lanes(sizes, vendor, None), Ok(expected), "{vendor:x} {sizes:?}");
+        }
+    }
+
+    #[test]
+    fn a_size_that_is_asked_for_is_one_that_the_device_has() {
+        let intel = sizes(32, [8, 32]);
+        assert_eq!(lanes(intel, INTEL, Some("16")), Ok(16));
+        assert_eq!(SubgroupSizes { most_in_workgroup: 16, ..intel }.all(), [16, 32]);
+        for wanted in ["48", "64", "4", "0", "-8", "all"] {
+            let problem = lanes(intel, INTEL, Some(wanted)).unwrap_err();
+            assert!(problem.contains(wanted) && problem.contains("8 or 16 or 32"), "{problem}");
+        }
+        let fixed = SubgroupSizes { are_selectable: false, ..intel };
+        assert!(lanes(fixed, INTEL, Some("16")).is_err());
+        assert_eq!(lanes(fixed, INTEL, Some("32")), Ok(32));
+    }
+}
