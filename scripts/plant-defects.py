@@ -56,6 +56,8 @@ DEFECTS = [
      "--test halves beyond"),
     ("a split's first half stays what its parent was", "shaders-glsl/include/fate.glsl",
      "return fate == FATE_SPLIT || copy_index > 0;", "return copy_index > 0;", "--test densify"),
+    ("what is wide for how near a camera is is split", "shaders-glsl/densify/densify_score.comp",
+     "mean_gradient > gradient_threshold && is_far_enough(i);", "mean_gradient > gradient_threshold;", "--test densify"),
     # The guards of the kernels, each taken out: docs/extremes.md is their table.
     ("guard: what is not before the near plane is culled", "shaders-glsl/render/project.comp",
      "if (!(mean_in_view.z > near && opacity > ALPHA_MIN)) return;", "if (!(opacity > ALPHA_MIN)) return;",

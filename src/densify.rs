@@ -15,6 +15,7 @@ pub use gaussians::DeviceGaussians;
 use std::iter;
 use std::str::FromStr;
 
+use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 use crate::batches::{Batch, Batches};
@@ -113,6 +114,8 @@ pub struct DensifyReport {
 pub struct Densifier {
     gpu: Gpu,
     settings: DensifySettings,
+    /// Where they stand, three numbers each.
+    cameras: Buffer<f32>,
     score: Pipeline<densify_score::Kernel>,
     decide: Pipeline<densify_decide::Kernel>,
     scatter: Pipeline<densify_scatter::Kernel>,
@@ -151,11 +154,12 @@ impl Scratch {
 }
 
 impl Densifier {
-    /// The kernels on this device.
+    /// The kernels on this device. What is wide for how near one of `cameras` is, world units, is not split; the paper's
+    /// control splits it all the same.
     ///
     /// # Errors
     /// A setting makes no sense, or the device refuses a pipeline.
-    pub fn new(gpu: &Gpu, settings: DensifySettings) -> Result<Self> {
+    pub fn new(gpu: &Gpu, settings: DensifySettings, cameras: &[DVec3]) -> Result<Self> {
         let DensifySettings { gradient_threshold, split_scale, min_opacity, .. } = settings;
         for (name, value, upper) in [
             ("gradient threshold", gradient_threshold, f64::INFINITY),
@@ -170,9 +174,13 @@ impl Densifier {
             }
         }
         let conserving = settings.control == DensityControl::Conserving;
+        let cameras = if conserving { cameras } else { &[] };
+        let cameras: Vec<f32> =
+            cameras.iter().flat_map(|camera| camera.as_vec3().to_array()).collect();
         Ok(Self {
             gpu: gpu.clone(),
             settings,
+            cameras: gpu.buffer("cameras", &cameras)?,
             score: gpu.pipeline(&densify_score::Constants::default())?,
             decide: gpu.pipeline(&densify_decide::Constants { conserving })?,
             scatter: gpu.pipeline(&densify_scatter::Constants { conserving })?,
@@ -223,6 +231,7 @@ impl Densifier {
             self.scratch = Scratch::new(&self.gpu, grad_norm_sums.len())?;
         }
         let DensifySettings { gradient_threshold, split_scale, min_opacity, .. } = self.settings;
+        let camera_count = self.cameras.len() as u32 / 3;
         let score = |batch: Batch| densify_score::Params {
             gaussian_count: batch.gaussian_count(),
             column_count: columns as u32,
@@ -230,6 +239,7 @@ impl Densifier {
             gradient_threshold: gradient_threshold as f32,
             min_raw_opacity: (min_opacity / (1.0 - min_opacity)).ln() as f32,
             first_gaussian: batch.first_gaussian(),
+            camera_count,
         };
         let decide = |batch: Batch| densify_decide::Params {
             gaussian_count: count,
@@ -240,7 +250,7 @@ impl Densifier {
             split_log_scale: split_scale.ln() as f32,
         };
         let batches = gaussians.batches(&self.gpu);
-        let Self { scratch, sort, scan, .. } = self;
+        let Self { scratch, sort, scan, cameras, .. } = self;
         self.gpu.write(&mut scratch.count, &[count])?;
         let mut download = None;
         self.gpu.run("densify_decide", |pass| {
@@ -253,6 +263,7 @@ impl Densifier {
                     keys: &mut batch.of_rows(&scratch.keys, 1)?,
                     ids: &mut batch.of_rows(&scratch.ids, 1)?,
                     tally: &mut scratch.tally,
+                    cameras,
                 };
                 let threads = Threads::Exactly([batch.gaussian_count(), 1, 1]);
                 pass.dispatch(&self.score, &score(batch), buffers, threads)?;

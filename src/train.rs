@@ -29,7 +29,7 @@ use glam::DVec3;
 
 use crate::camera::{Camera, Frame};
 use crate::dataset::{Dataset, Fingerprint};
-use crate::densify::{Densifier, DensifySettings};
+use crate::densify::Densifier;
 use crate::exposure::Exposures;
 use crate::gpu::{Buffer, CheckReport, Gpu, PassTime, Recorder};
 use crate::loss::{LogSlot, LossLog, Losses, StepLosses, Term, TermInputs};
@@ -207,13 +207,12 @@ impl Trainer {
     ) -> Result<Self> {
         config.check()?;
         config.leave_out_what_is_missing(dataset);
-        let frame = *config.frame.get_or_insert_with(|| dataset.frame());
-        let density = growth::settings(&config, dataset.extent() * frame.scale);
+        config.frame.get_or_insert_with(|| dataset.frame());
         thread::scope(|scope| {
             // The driver compiles on another thread while the views are uploaded and looked at.
             let own = config.clone();
             let beside = scope
-                .spawn(move || Ok((Kernels::new(gpu, &own, density)?, Fingerprint::of(dataset)?)));
+                .spawn(move || Ok((Kernels::new(gpu, &own, dataset)?, Fingerprint::of(dataset)?)));
             Self::assemble(gpu, config, dataset, gaussians, beside)
         })
     }
@@ -550,7 +549,7 @@ struct Kernels {
 }
 
 impl Kernels {
-    fn new(gpu: &Gpu, config: &TrainConfig, density: DensifySettings) -> Result<Self> {
+    fn new(gpu: &Gpu, config: &TrainConfig, dataset: &Dataset) -> Result<Self> {
         let (rest, own) = (config.precision.rest, config.render_settings());
         let shape = Shape { sh_degree: first_sh_degree(config), ..own.shape };
         Ok(Self {
@@ -558,7 +557,7 @@ impl Kernels {
             losses: Losses::new(gpu, &config.loss())?,
             adam: Adam::new(gpu)?,
             finite: FiniteCheck::new(gpu)?,
-            densifier: Densifier::new(gpu, density)?,
+            densifier: growth::densifier(gpu, config, dataset)?,
         })
     }
 }

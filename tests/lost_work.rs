@@ -103,7 +103,8 @@ fn a_run_saves_when_asked_and_when_its_checkpoint_is_old_and_goes_on() {
 #[test]
 fn a_run_whose_time_is_up_is_to_be_run_again_and_a_finished_one_is_not() {
     let place = Place::new();
-    // The clock is looked at where the ledger is written: however fast the device, that is before the last step.
+    // The clock is looked at where the ledger is written: however fast the device, that is before the last step. A slow one
+    // looks more often.
     let stops = "--resume --hash-every 40 --max-minutes 0.000001";
     let train = place.train("run", &format!("--steps 120 {stops}"));
     let mut rounds = 0;
@@ -118,7 +119,7 @@ fn a_run_whose_time_is_up_is_to_be_run_again_and_a_finished_one_is_not() {
         }
         assert!(!place.path("run/done.json").exists() && rounds < 300);
     }
-    assert_eq!(rounds, 2);
+    assert!(rounds >= 2, "{rounds}");
     succeed(&place.train("straight", "--steps 120"));
     assert!(place.read("run/model.ply") == place.read("straight/model.ply"));
     // Again: nothing is done, and nothing is touched.

@@ -36,3 +36,6 @@ const float SPLIT_ACROSS        = 0.993;
 const float SPLIT_ACROSS_SLOPE  = -0.063;
 const float SPLIT_OPACITY       = 0.565;
 const float SPLIT_OPACITY_SLOPE = 0.2;
+// A Gaussian whose largest standard deviation exceeds this share of the way to the nearest camera is not split: the halves
+// stand so much nearer and farther than it that their projections do not add up to its own (docs/benchmarks.md).
+const float WIDEST_SPLIT = 0.8;

@@ -5,7 +5,9 @@ use glam::UVec2;
 use super::memory::MARGIN;
 use super::{TrainConfig, Trainer, streams};
 use crate::Result;
-use crate::densify::{DensifySettings, DensityControl, Round};
+use crate::dataset::Dataset;
+use crate::densify::{Densifier, DensifySettings, DensityControl, Round};
+use crate::gpu::Gpu;
 use crate::random::Stream;
 
 impl Trainer {
@@ -62,14 +64,20 @@ impl Trainer {
     }
 }
 
-/// Density control in world units.
-pub(super) fn settings(config: &TrainConfig, extent: f64) -> DensifySettings {
-    DensifySettings {
+/// Density control in the frame, for the cameras of the training views.
+///
+/// # Errors
+/// A setting makes no sense, or the device refuses a pipeline.
+pub(super) fn densifier(gpu: &Gpu, config: &TrainConfig, dataset: &Dataset) -> Result<Densifier> {
+    let frame = config.frame.unwrap_or_default();
+    let cameras = dataset.train_views().map(|view| frame.from_world(view.camera.center()));
+    let settings = DensifySettings {
         control: config.density.control,
         gradient_threshold: config.density.gradient_threshold,
-        split_scale: config.density.split_scale * extent,
+        split_scale: config.density.split_scale * dataset.extent() * frame.scale,
         min_opacity: config.density.min_opacity,
         max_gaussians: config.max_gaussians,
         seed: Stream::new(config.seed, streams::DENSITY).bits(0),
-    }
+    };
+    Densifier::new(gpu, settings, &cameras.collect::<Vec<_>>())
 }

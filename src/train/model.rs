@@ -98,13 +98,13 @@ impl Model {
     /// # Errors
     /// The device is out of memory or lost; the model is as it was.
     pub(super) fn set_sh_degree(&mut self, gpu: &Gpu, sh_degree: u32) -> Result<()> {
-        let (count, own) = (self.count(), self.shape);
+        let (count, room, own) = (self.count(), self.capacity(), self.shape);
         let new = Shape { sh_degree, ..own };
         let columns = width(new);
-        // Longer buffers with what they held, one after the other.
+        // Longer buffers with what they held, one after the other, and with room for as many Gaussians as before.
         let words = self.gaussians.rest.columns([columns, new.features.width()]);
-        lengthen(gpu, &mut self.gaussians.parameters, count * words)?;
-        self.planes_mut().try_for_each(|plane| lengthen(gpu, plane, count * columns))?;
+        lengthen(gpu, &mut self.gaussians.parameters, room * words)?;
+        self.planes_mut().try_for_each(|plane| lengthen(gpu, plane, room * columns))?;
         let parameters = self.gaussians.read(gpu)?;
         let batches = self.gaussians.batches(gpu);
         let planes = self.planes_mut().map(|plane| batches.read(gpu, plane));
@@ -249,4 +249,36 @@ fn lengthen(gpu: &Gpu, buffer: &mut Buffer<f32>, len: usize) -> Result<()> {
         *buffer = longer;
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::testing::gpu;
+    use crate::scene::Features;
+
+    /// Else the next round of density control would have to make that room again.
+    #[test]
+    fn another_sh_degree_keeps_the_room_and_what_the_planes_hold() {
+        let gpu = gpu();
+        let shape = Shape { sh_degree: 3, features: Features::NONE };
+        for rest in [Bits::Single, Bits::Half] {
+            let precision = PrecisionConfig { rest, ..PrecisionConfig::default() };
+            let mut given = Gaussians::zeros(10, shape);
+            // What is in use of the degree 3 is none, and room is for that.
+            given.parameters[..140].fill(0.5);
+            let mut model = Model::upload(&gpu, &given, 0, &precision).unwrap();
+            assert_eq!(model.gaussians.parameters.len(), 140);
+            model.set_sh_degree(&gpu, 2).unwrap();
+            let words = rest.columns([width(Shape { sh_degree: 2, ..shape }), 0]);
+            assert_eq!(model.gaussians.parameters.len(), 10 * words);
+            assert_eq!(model.download(&gpu).unwrap(), given);
+
+            // As after a round that left room for half as many again.
+            model.gaussians.count = 6;
+            model.set_sh_degree(&gpu, 3).unwrap();
+            let lens = model.planes_mut().map(|plane| plane.len()).collect::<Vec<_>>();
+            assert_eq!((model.capacity(), lens), (10, vec![590; 3]));
+        }
+    }
 }

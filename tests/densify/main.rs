@@ -2,246 +2,20 @@
 
 #![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
 
-use glam::{Quat, Vec3};
+mod host;
+
+use glam::{DAffine3, DVec2, DVec3, Quat, Vec3};
+use nightsplat::camera::Camera;
 use nightsplat::densify::{
-    Densifier, DensifyInputs, DensifyReport, DensifySettings, DensityControl, DeviceGaussians,
-    Round,
+    Densifier, DensifyInputs, DensifyReport, DensifySettings, DeviceGaussians, Round,
 };
 use nightsplat::gpu::testing::gpu;
-use nightsplat::gpu::{Gpu, Reference};
 use nightsplat::halves::Bits;
-use nightsplat::kernels::fate::{KEY_KEEP, KEY_PRUNE};
-use nightsplat::kernels::{densify_decide, densify_moments, densify_scatter, densify_score};
 use nightsplat::optimizer::Moments;
+use nightsplat::render::{RenderOptions, RenderSettings, Renderer};
+use nightsplat::scene::{Features, Shape};
 
-/// Four features and SH of degree 1.
-const COLUMNS: usize = 27;
-const FEATURES: usize = 4;
-const REST: usize = 14 + FEATURES;
-const SETTINGS: DensifySettings = DensifySettings {
-    control: DensityControl::Paper,
-    gradient_threshold: 2e-4,
-    split_scale: 0.05,
-    min_opacity: 0.005,
-    max_gaussians: usize::MAX,
-    seed: 10,
-};
-const CONSERVING: DensifySettings =
-    DensifySettings { control: DensityControl::Conserving, ..SETTINGS };
-const STEP: u64 = 600;
-const LAST: Round = Round { step: STEP, rounds_left: 1, most: usize::MAX };
-
-fn room_for(gpu: &Gpu, count: usize) -> DeviceGaussians {
-    DeviceGaussians::new(gpu, count, [COLUMNS, FEATURES], [Bits::Single; 2]).unwrap()
-}
-
-/// Gaussians, their moments and their statistics in host memory.
-#[derive(Clone, Debug, PartialEq)]
-struct Host {
-    count: usize,
-    parameters: Vec<f32>,
-    first: Vec<f32>,
-    second: Vec<f32>,
-    grad_norm_sums: Vec<f32>,
-    visit_counts: Vec<u32>,
-}
-
-impl Host {
-    /// Opaque Gaussians of scale 0.01 that nothing pulls at.
-    fn calm(count: usize) -> Self {
-        let wave = |phase: f32| -> Vec<f32> {
-            (0..count * COLUMNS).map(|i| (i as f32 * 0.7 + phase).sin()).collect()
-        };
-        let mut parameters = wave(0.0);
-        parameters[7 * count..10 * count].fill(0.01f32.ln());
-        parameters[10 * count..11 * count].fill(2.0);
-        let (first, second) = (wave(1.0), wave(2.0));
-        Self {
-            count,
-            parameters,
-            first,
-            second,
-            grad_norm_sums: vec![0.0; count],
-            visit_counts: vec![4; count],
-        }
-    }
-
-    /// Large and small, faint and opaque ones under gradients of all sizes, some never seen.
-    fn mixed(count: usize) -> Self {
-        let mut host = Self::calm(count);
-        for i in 0..count {
-            host.parameters[7 * count + 3 * i] =
-                if i % 3 == 0 { 0.2f32.ln() } else { 0.01f32.ln() };
-            host.parameters[10 * count + i] = if i % 7 == 0 { -6.0 } else { 1.0 };
-            host.visit_counts[i] = i as u32 % 5;
-            host.grad_norm_sums[i] = (i * 37 % 101) as f32 * 2e-5;
-        }
-        host
-    }
-
-    fn pull_at(&mut self, i: usize) {
-        self.grad_norm_sums[i] = 1.0;
-    }
-
-    fn quat_mut(&mut self, i: usize) -> &mut [f32] {
-        let first = 3 * self.count + 4 * i;
-        &mut self.parameters[first..first + 4]
-    }
-
-    fn log_scales_mut(&mut self, i: usize) -> &mut [f32] {
-        let first = 7 * self.count + 3 * i;
-        &mut self.parameters[first..first + 3]
-    }
-
-    fn mean(&self, i: usize) -> Vec3 {
-        Vec3::from_slice(&self.parameters[3 * i..])
-    }
-
-    /// All floats of one Gaussian, column by column.
-    fn row(&self, planes: &[f32], i: usize) -> Vec<f32> {
-        [(0, 3), (3, 4), (7, 3), (10, 1), (11, 3), (14, FEATURES), (REST, COLUMNS - REST)]
-            .into_iter()
-            .flat_map(|(column, width)| {
-                let first = column * self.count + width * i;
-                planes[first..first + width].to_vec()
-            })
-            .collect()
-    }
-
-    fn densify(&self, gpu: &Gpu, settings: DensifySettings, round: Round) -> (Self, DensifyReport) {
-        let planes = |data: &[f32]| gpu.buffer("planes", data).unwrap();
-        let mut gaussians = room_for(gpu, self.count);
-        gaussians.parameters = planes(&self.parameters);
-        gaussians.moments =
-            Moments::Single { first: planes(&self.first), second: planes(&self.second) };
-        let inputs = DensifyInputs {
-            grad_norm_sums: &mut planes(&self.grad_norm_sums),
-            visit_counts: &mut gpu.buffer("visit_counts", &self.visit_counts).unwrap(),
-            gradients: &mut planes(&vec![f32::NAN; self.count * COLUMNS]),
-        };
-        let mut densifier = Densifier::new(gpu, settings).unwrap();
-        let report = densifier.densify(&mut gaussians, inputs, round).unwrap();
-        assert_eq!(report.count, gaussians.count as usize);
-        let Moments::Single { first, second } = &gaussians.moments else { panic!() };
-        let read = |buffer| {
-            let mut planes = gpu.read(buffer).unwrap();
-            planes.truncate(report.count * COLUMNS);
-            assert_eq!(planes.len(), report.count * COLUMNS);
-            planes
-        };
-        let host = Self {
-            count: report.count,
-            parameters: read(&gaussians.parameters),
-            first: read(first),
-            second: read(second),
-            grad_norm_sums: vec![0.0; report.count],
-            visit_counts: vec![0; report.count],
-        };
-        (host, report)
-    }
-
-    /// The same by the references, with sort and prefix sums on the host.
-    fn reference(&self, settings: DensifySettings, round: Round) -> Self {
-        let n = self.count;
-        let (gaussian_count, column_count, feature_count) =
-            (n as u32, COLUMNS as u32, FEATURES as u32);
-        let (mut keys, mut ids, mut tally) = (vec![0; n], vec![0; n], vec![0; 4]);
-        let params = densify_score::Params {
-            gaussian_count,
-            column_count,
-            feature_count,
-            gradient_threshold: settings.gradient_threshold as f32,
-            min_raw_opacity: (settings.min_opacity / (1.0 - settings.min_opacity)).ln() as f32,
-            first_gaussian: 0,
-        };
-        let slices = densify_score::Slices {
-            parameters: &self.parameters,
-            grad_norm_sums: &self.grad_norm_sums,
-            visit_counts: &self.visit_counts,
-            keys: &mut keys,
-            ids: &mut ids,
-            tally: &mut tally,
-        };
-        densify_score::Kernel::run(&params, &densify_score::Constants::default(), slices);
-        assert_eq!(tally[0] as usize, keys.iter().filter(|&&key| key < KEY_KEEP).count());
-        assert_eq!(tally[1] as usize, keys.iter().filter(|&&key| key == KEY_PRUNE).count());
-        ids.sort_by_key(|&id| keys[id as usize]);
-        keys.sort_unstable();
-        let (mut fates, mut offspring_counts) = (vec![0; n], vec![0; n]);
-        let params = densify_decide::Params {
-            gaussian_count,
-            first_gaussian: 0,
-            batch_count: gaussian_count,
-            max_gaussians: settings.max_gaussians.min(u32::MAX as usize) as u32,
-            rounds_left: round.rounds_left as u32,
-            split_log_scale: settings.split_scale.ln() as f32,
-        };
-        let slices = densify_decide::Slices {
-            parameters: &self.parameters,
-            sorted_keys: &keys,
-            sorted_ids: &ids,
-            tally: &mut tally,
-            fates: &mut fates,
-            offspring_counts: &mut offspring_counts,
-        };
-        let conserving = settings.control == DensityControl::Conserving;
-        densify_decide::Kernel::run(&params, &densify_decide::Constants { conserving }, slices);
-        let mut count = 0;
-        let offsets: Vec<u32> = offspring_counts
-            .iter()
-            .map(|offspring| {
-                count += offspring;
-                count - offspring
-            })
-            .collect();
-        let new_gaussian_count = count;
-        let count = count as usize;
-        let mut new_parameters = vec![0.0; count * COLUMNS];
-        let params = densify_scatter::Params {
-            gaussian_count,
-            new_gaussian_count,
-            column_count,
-            feature_count,
-            seed: settings.seed as u32,
-            step: round.step as u32,
-            first_gaussian: 0,
-            first_new_gaussian: 0,
-        };
-        let slices = densify_scatter::Slices {
-            parameters: &self.parameters,
-            fates: &fates,
-            offsets: &offsets,
-            new_parameters: &mut new_parameters,
-        };
-        densify_scatter::Kernel::run(&params, &densify_scatter::Constants { conserving }, slices);
-        let carry = |moments: &[f32]| {
-            let mut new_moments = vec![0.0_f32; count * COLUMNS];
-            let params = densify_moments::Params {
-                gaussian_count,
-                new_gaussian_count,
-                column_count,
-                feature_count,
-                first_new_gaussian: 0,
-            };
-            let slices = densify_moments::Slices {
-                moments: bytemuck::cast_slice(moments),
-                fates: &fates,
-                offsets: &offsets,
-                new_moments: bytemuck::cast_slice_mut(&mut new_moments),
-            };
-            densify_moments::Kernel::run(&params, &densify_moments::Constants::default(), slices);
-            new_moments
-        };
-        Self {
-            count,
-            parameters: new_parameters,
-            first: carry(&self.first),
-            second: carry(&self.second),
-            grad_norm_sums: vec![0.0; count],
-            visit_counts: vec![0; count],
-        }
-    }
-}
+use host::{COLUMNS, CONSERVING, FEATURES, Host, LAST, SETTINGS, room_for};
 
 #[test]
 fn density_control_matches_its_references() {
@@ -249,11 +23,12 @@ fn density_control_matches_its_references() {
     let limited = DensifySettings { max_gaussians: 1100, ..CONSERVING };
     let sizes = [0, 1, 2, 63, 64, 65, 1000];
     let cases = [SETTINGS, CONSERVING, limited].into_iter().flat_map(|s| sizes.map(|n| (s, n)));
+    let cameras = [DVec3::new(0.3, -0.2, 0.6), DVec3::new(-0.9, 0.4, -0.3)];
     for (settings, count) in cases {
         let before = Host::mixed(count);
         let round = Round { rounds_left: 3, ..LAST };
-        let (actual, report) = before.densify(&gpu, settings, round);
-        let expected = before.reference(settings, round);
+        let (actual, report) = before.densify_seen_from(&cameras, &gpu, settings, round);
+        let expected = before.reference(&cameras, settings, round);
         assert_eq!(actual.count, expected.count, "{report:?}");
         assert_eq!((&actual.first, &actual.second), (&expected.first, &expected.second));
         for (i, (a, b)) in actual.parameters.iter().zip(&expected.parameters).enumerate() {
@@ -482,7 +257,7 @@ fn settings_that_make_no_sense_are_refused() {
         DensifySettings { split_scale: f64::INFINITY, ..SETTINGS },
         DensifySettings { min_opacity: 1.0, ..SETTINGS },
     ] {
-        assert!(Densifier::new(&gpu, settings).is_err(), "{settings:?}");
+        assert!(Densifier::new(&gpu, settings, &[]).is_err(), "{settings:?}");
     }
 }
 
@@ -490,7 +265,7 @@ fn settings_that_make_no_sense_are_refused() {
 #[test]
 fn a_buffer_that_is_too_short_is_refused() {
     let gpu = gpu();
-    let mut densifier = Densifier::new(&gpu, SETTINGS).unwrap();
+    let mut densifier = Densifier::new(&gpu, SETTINGS, &[]).unwrap();
     for (short, columns) in [(0, 14), (1, 14), (2, 14), (3, 14), (4, 14), (5, 13)] {
         let len = |index: usize, len: usize| if index == short { len - 1 } else { len };
         let planes = |index| gpu.zeros("planes", len(index, 28)).unwrap();
@@ -579,7 +354,7 @@ fn buffers_that_suffice_are_kept_and_others_grow_with_headroom() {
     gpu.write(&mut gaussians.parameters, &host.parameters).unwrap();
     let mut gradients = plane("gradients");
     let mut visit_counts = gpu.buffer("visit_counts", &[1; 300]).unwrap();
-    let mut densifier = Densifier::new(&gpu, CONSERVING).unwrap();
+    let mut densifier = Densifier::new(&gpu, CONSERVING, &[]).unwrap();
     for (pulled, count, capacity) in [(10, 110, 200), (110, 220, 330)] {
         let mut sums = vec![0.0; 300];
         sums[..pulled].fill(1.0);
@@ -595,5 +370,69 @@ fn buffers_that_suffice_are_kept_and_others_grow_with_headroom() {
         for buffer in [parameters, first, second, &gradients] {
             assert_eq!(buffer.len(), capacity * COLUMNS);
         }
+    }
+}
+
+/// A Gaussian before a camera at the origin, wide in depth.
+fn in_depth(width: f32) -> Host {
+    let mut host = Host::calm(1);
+    host.pull_at(0);
+    host.parameters[..3].copy_from_slice(&[0.0, 0.0, 3.0]);
+    host.quat_mut(0).copy_from_slice(&[1.0, 0.0, 0.0, 0.0]);
+    host.log_scales_mut(0).copy_from_slice(&[0.3f32.ln(), 0.3f32.ln(), width.ln()]);
+    host
+}
+
+#[test]
+fn what_is_wide_for_how_near_a_camera_is_stays_whole() {
+    let gpu = gpu();
+    for (width, split) in [(0.1, 1), (2.399, 1), (2.401, 0), (400.0, 0)] {
+        let before = in_depth(width);
+        let round = |settings, cameras: &[DVec3]| {
+            before.densify_seen_from(cameras, &gpu, settings, LAST).1.split
+        };
+        let cameras = [DVec3::new(90.0, 0.0, 0.0), DVec3::ZERO];
+        assert_eq!(round(CONSERVING, &cameras), split, "{width}");
+        assert_eq!((round(CONSERVING, &[]), round(SETTINGS, &cameras)), (1, 1), "{width}");
+    }
+}
+
+/// How far a round may be from conserving what a camera sees, and what it would be beyond that.
+#[test]
+fn halves_that_stand_too_near_a_camera_would_change_its_view() {
+    let gpu = gpu();
+    let camera = Camera {
+        width: 64,
+        height: 48,
+        focal: DVec2::splat(60.0),
+        principal_point: DVec2::new(32.0, 24.0),
+        view_from_world: DAffine3::IDENTITY,
+    };
+    let features = Features { depth: true, noise: true, ..Features::NONE };
+    assert_eq!(features.width(), FEATURES);
+    let shape = Shape { sh_degree: 1, features };
+    let settings = RenderSettings { shape, ..RenderSettings::default() };
+    let options = RenderOptions { sh_degree: 0, background: [0.0; 3] };
+    let mut renderer = Renderer::new(&gpu, settings).unwrap();
+    let mut image = |host: &Host| {
+        let planes = gpu.buffer("planes", &host.parameters).unwrap();
+        renderer.reserve(host.count, [&camera]).unwrap();
+        renderer.render_image(&planes, &camera, &options).unwrap().data
+    };
+    let mut lost = |width: f32, cameras: &[DVec3]| {
+        let before = in_depth(width);
+        let (after, _) = before.densify_seen_from(cameras, &gpu, CONSERVING, LAST);
+        let (before, after) = (image(&before), image(&after));
+        let squares = before.iter().zip(&after).map(|(a, b)| f64::from(a - b).powi(2));
+        let power: f64 = before.iter().map(|value| f64::from(*value).powi(2)).sum();
+        (squares.sum::<f64>() / power).sqrt()
+    };
+    // The difference in parts of the view: of halves by themselves, of the widest that are made, and what that keeps out.
+    for (width, least, most) in
+        [(0.3, 0.0, 0.1), (2.39, 0.4, 0.6), (3.0, 0.7, 1.0), (5.0, 2.0, 4.0)]
+    {
+        let lost = [lost(width, &[]), lost(width, &[DVec3::ZERO])];
+        assert!((least..most).contains(&lost[0]), "{width}: {}", lost[0]);
+        assert_eq!(lost[1], if width > 2.4 { 0.0 } else { lost[0] });
     }
 }
