@@ -154,7 +154,7 @@ fn foreseen(gpu: &Gpu, config: &TrainConfig) -> (MemoryEstimate, Trained) {
     (foreseen.unwrap(), trained)
 }
 
-/// Grows to all that it may have in its second round.
+/// Grows to all that it may have in its second round, and comes to its SH degree.
 fn growing() -> TrainConfig {
     let mut config = TrainConfig {
         steps: 60,
@@ -165,6 +165,7 @@ fn growing() -> TrainConfig {
     };
     config.schedule.densify_after = 2;
     config.schedule.densify_interval = 10;
+    config.schedule.sh_degree_interval = 20;
     config.schedule.resolution_steps = [0, 0];
     config.density.control = DensityControl::Paper;
     config.density.gradient_threshold = 1e-9;
@@ -176,15 +177,20 @@ fn growing() -> TrainConfig {
 fn memory_is_foreseen_to_a_fifth() {
     // Without validation, which takes memory of its own.
     let gpu = Gpu::new(&DeviceChoice::Best).unwrap();
-    let (foreseen, trained) = foreseen(&gpu, &growing());
-    assert_eq!(trained.trainer.gaussian_count(), 9000);
-    assert_eq!(foreseen.most_gaussians, 9000);
-    let close = |foreseen: u64, came: u64| (0.8..=1.2).contains(&(foreseen as f64 / came as f64));
-    let (spent, own) = (&trained.spent, foreseen);
-    assert!(close(own.most_device, spent.device_bytes), "{own:?}, and {spent:?} came");
-    if let Some(host) = spent.host_bytes {
-        // Other tests of this process have left their peak; what is foreseen is no less than what is there.
-        assert!(own.most_host as f64 <= 1.2 * host as f64, "{own:?}, and {spent:?} came");
+    // With every SH degree, and with none above 0.
+    for sh_degree_interval in [20, 1000] {
+        let mut config = growing();
+        config.schedule.sh_degree_interval = sh_degree_interval;
+        let (own, trained) = foreseen(&gpu, &config);
+        assert_eq!(trained.trainer.gaussian_count(), 9000);
+        assert_eq!(own.most_gaussians, 9000);
+        let spent = &trained.spent;
+        let share = own.most_device as f64 / spent.device_bytes as f64;
+        assert!((0.8..=1.2).contains(&share), "{own:?}, and {spent:?} came");
+        if let Some(host) = spent.host_bytes {
+            // Other tests of this process have left their peak; what is foreseen is no less than what is there.
+            assert!(own.most_host as f64 <= 1.2 * host as f64, "{own:?}, and {spent:?} came");
+        }
     }
 }
 

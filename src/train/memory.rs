@@ -63,7 +63,7 @@ impl Trainer {
             // On a software device, its buffers are the process's memory.
             let still_to_come = (device - self.gpu.memory_in_use() as f64).max(0.0);
             let shared = if self.gpu.properties().is_cpu { still_to_come } else { 0.0 };
-            resident().unwrap_or(PROGRAM) + shared + HOST_PLANE_SETS * per.plane * gaussians
+            resident().unwrap_or(PROGRAM) + shared + HOST_PLANE_SETS * self.host_plane() * gaussians
         };
         Ok(MemoryEstimate {
             gaussians: count,
@@ -115,7 +115,7 @@ impl Trainer {
     /// How many fit into what the process may have on the host: their copies there, and on a software device themselves.
     pub(super) fn fitting_in_ram(&self, each: f64) -> usize {
         let Some(CacheSize(limit)) = self.config.max_ram else { return usize::MAX };
-        let copies = HOST_PLANE_SETS * self.per_gaussian().plane;
+        let copies = HOST_PLANE_SETS * self.host_plane();
         let rest = limit as f64 - PROGRAM;
         if self.gpu.properties().is_cpu {
             return self.fitting(rest - self.fixed_bytes, each, copies);
@@ -137,9 +137,16 @@ impl Trainer {
         intersections * self.renderer.bytes_per_intersection() as f64
     }
 
-    /// Once every SH degree is in use.
+    /// Once every SH degree is in use that the run comes to.
     fn per_gaussian(&self) -> PerGaussian {
-        self.per_gaussian_of(self.model.whole_shape())
+        let now = self.model.shape();
+        let sh_degree = self.sh_degree(self.config.steps).max(now.sh_degree);
+        self.per_gaussian_of(Shape { sh_degree, ..now })
+    }
+
+    /// What a plane set takes of each on the host, where it has every SH degree.
+    fn host_plane(&self) -> f64 {
+        self.per_gaussian_of(self.model.whole_shape()).plane
     }
 
     fn per_gaussian_of(&self, shape: Shape) -> PerGaussian {
