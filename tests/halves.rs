@@ -90,6 +90,7 @@ impl Learned {
 
 #[test]
 fn steps_on_halves_match_their_references() {
+    let _alone = alone();
     let gpu = gpu();
     for bits in ALL {
         for (sh_degree, channels) in [(0, 4), (1, 3), (2, 5), (3, 3), (3, 11)] {
@@ -107,6 +108,7 @@ fn steps_on_halves_match_their_references() {
 /// A mean that keeps .999 of itself stays where it is if it is rounded to the nearest of 8 bits.
 #[test]
 fn moments_in_halves_fade_as_those_of_floats() {
+    let _alone = alone();
     let gpu = gpu();
     let mean = |learned: &Learned| {
         let moments = learned.moments(&gpu);
@@ -125,6 +127,7 @@ fn moments_in_halves_fade_as_those_of_floats() {
 /// A step of a twentieth of what two neighbours differ by.
 #[test]
 fn coefficients_in_halves_move_by_less_than_their_unit() {
+    let _alone = alone();
     let gpu = gpu();
     let count = 300;
     let mut learned = Learned::new(&gpu, [count, width(3), 0], [Bits::Half, Bits::Single]);
@@ -143,6 +146,7 @@ fn coefficients_in_halves_move_by_less_than_their_unit() {
 
 #[test]
 fn coefficients_beyond_halves_and_gradients_that_are_not_finite_leave_finite_halves() {
+    let _alone = alone();
     let gpu = gpu();
     let mut learned = Learned::new(&gpu, [4, width(1), 0], [Bits::Half, Bits::Half]);
     learned.rate = 1e3;
@@ -163,6 +167,7 @@ fn coefficients_beyond_halves_and_gradients_that_are_not_finite_leave_finite_hal
 /// Halves stand for floats: what those give is given, forward and backward.
 #[test]
 fn a_render_of_halves_is_that_of_the_floats_they_stand_for() {
+    let _alone = alone();
     let gpu = gpu();
     for (degree, channels) in [(1, 3), (2, 11), (3, 3)] {
         let shape = Shape { sh_degree: degree, features: features(channels) };
@@ -208,7 +213,8 @@ fn a_render_of_halves_is_that_of_the_floats_they_stand_for() {
     }
 }
 
-/// The device is shared, and so is the peak of its memory: one training at a time.
+/// The device is shared, and so is the peak of its memory: one test at a time. A checked render beside the start of a training
+/// also ended the process on lavapipe, in two runs of forty, for a reason that is not found yet.
 fn alone() -> MutexGuard<'static, ()> {
     static ALONE: Mutex<()> = Mutex::new(());
     ALONE.lock().unwrap_or_else(PoisonError::into_inner)
