@@ -111,6 +111,7 @@ impl Gaussians {
     }
 
     /// The least SH degree that there has to be room for.
+    #[cfg(feature = "io")]
     pub(crate) fn sh_degree_in_use(&self) -> u32 {
         let own = rest_coefficients(self.shape.sh_degree);
         let used = |rest: &[Vec3]| rest.iter().rposition(|c| *c != Vec3::ZERO).map_or(0, |k| k + 1);
