@@ -82,7 +82,7 @@ impl Kernel {
             kernel.add(variable, &defaults, structs);
         }
         if kernel.subgroup_size_id.is_some() {
-            kernel.workgroup_size = [0, 1, 1];
+            kernel.workgroup_size[0] = 0;
         }
         kernel.buffers.sort_by_key(|buffer| buffer.binding);
         kernel.constants.sort_by_key(|constant| constant.id);

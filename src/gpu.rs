@@ -53,7 +53,7 @@ pub use requirements::{REQUIREMENTS, Requirement, required_device_features};
 pub use statistics::Statistic;
 pub use subgroups::SUBGROUP_VARIABLE;
 pub use submission::{PassTime, Submission};
-pub use tuning::{TUNE_VARIABLE, TunedTile};
+pub use tuning::{TUNE_VARIABLE, Tile, TunedTile};
 
 use crate::{Error, Result};
 

@@ -17,7 +17,7 @@ use glam::{UVec2, Vec2};
 
 use crate::batches::Batches;
 use crate::camera::{Camera, Patch};
-use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Statistic, Threads};
+use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Statistic, Threads, Tile};
 use crate::halves::Bits;
 use crate::kernels::project::DEPTH_BITS;
 use crate::kernels::splat::MAX_CHANNELS;
@@ -88,7 +88,7 @@ pub struct Gradients<'a> {
 pub struct Renderer {
     gpu: Gpu,
     settings: RenderSettings,
-    tile: [u32; 2],
+    tile: Tile,
     /// The most splats of one tile that the blending kernels follow.
     longest_run: u32,
     project: Pipeline<project::Kernel>,
@@ -109,10 +109,11 @@ impl Renderer {
     /// # Errors
     /// The driver refuses a kernel, or the tile does not suit the device.
     pub fn new(gpu: &Gpu, settings: RenderSettings) -> Result<Self> {
-        let [tile_width, tile_height] = settings.tile_on(gpu)?;
+        let tile = settings.tile_on(gpu)?;
+        let Tile { size: [tile_width, tile_height], subgroups: subgroups_per_tile } = tile;
         let channels = settings.channels() as u32;
         let (alpha_max, partition_size) = (settings.max_alpha, RANKS_PER_PARTITION);
-        let (project, project_backward) = projections(gpu, &settings, [tile_width, tile_height])?;
+        let (project, project_backward) = projections(gpu, &settings, tile.size)?;
         let shaping_channels = settings.shaping_channels();
         let (skips_groups, splats_per_turn) = (!gpu.properties().is_cpu, splats_per_turn(gpu));
         // What every kernel that includes `splat.glsl` is specialised with, and what some are beside it.
@@ -124,7 +125,7 @@ impl Renderer {
         Ok(Self {
             gpu: gpu.clone(),
             settings,
-            tile: [tile_width, tile_height],
+            tile,
             longest_run: longest_run(gpu),
             project,
             order_counts: gpu.pipeline(&order_counts::Constants { partition_size })?,
@@ -132,13 +133,15 @@ impl Renderer {
             blend_forward: gpu.pipeline(&constants!(
                 blend_forward,
                 skips_groups,
-                splats_per_turn
+                splats_per_turn,
+                subgroups_per_tile
             ))?,
             blend_backward: gpu.pipeline(&constants!(
                 blend_backward,
                 shaping_channels,
                 skips_groups,
-                splats_per_turn
+                splats_per_turn,
+                subgroups_per_tile
             ))?,
             reduce_records: gpu.pipeline(&constants!(reduce_records))?,
             project_backward,
@@ -158,7 +161,7 @@ impl Renderer {
         }
         let shape = Shape { sh_degree, ..self.settings.shape };
         let settings = RenderSettings { shape, ..self.settings };
-        (self.project, self.project_backward) = projections(&self.gpu, &settings, self.tile)?;
+        (self.project, self.project_backward) = projections(&self.gpu, &settings, self.tile.size)?;
         self.settings = settings;
         Ok(())
     }
@@ -297,13 +300,13 @@ impl Renderer {
 
     /// What to say of a view whose [`Status::crowd`] is too large for this device.
     pub fn too_crowded(&self, view: String, splats: u32) -> Error {
-        let ([width, height], device) = (self.tile, self.gpu.properties().name.clone());
-        let (tile, limit) = (format!("{width}x{height}"), self.longest_run);
-        Error::Crowded { view, splats, tile, device, limit }
+        let [width, height] = self.tile.size;
+        let (tile, device) = (format!("{width}x{height}"), self.gpu.properties().name.clone());
+        Error::Crowded { view, splats, tile, device, limit: self.longest_run }
     }
 
     fn too_many_tiles(&self, size: UVec2) -> Error {
-        let (UVec2 { x: width, y: height }, [tile_width, tile_height]) = (size, self.tile);
+        let (UVec2 { x: width, y: height }, [tile_width, tile_height]) = (size, self.tile.size);
         let (count, most) = (self.tiles(size).element_product(), most_tiles(&self.gpu));
         let device = &self.gpu.properties().name;
         Error::Usage(format!(
@@ -522,7 +525,8 @@ impl Renderer {
 
     /// Columns and rows of tiles.
     fn tiles(&self, size: UVec2) -> UVec2 {
-        (size + UVec2::from(self.tile) - 1) / UVec2::from(self.tile)
+        let tile = UVec2::from(self.tile.size);
+        (size + tile - 1) / tile
     }
 
     fn view(&self, patch: &Patch) -> Result<View> {

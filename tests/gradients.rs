@@ -1,12 +1,13 @@
 //! The backward pass: central differences of the f64 chain, the renderer against the chain, the same bits always.
 
-use glam::{DVec2, DVec3};
+use glam::{DVec2, DVec3, DVec4};
+use nightsplat::gpu::testing::gpu;
 use nightsplat::reference::gaussian::Gaussian;
 use nightsplat::scene::Shape;
 
 mod common;
 use common::chain::Chain;
-use common::setup::{Gradients, Rendered, Setup, features, variants};
+use common::setup::{Gradients, Rendered, Setup, features, tile_of, variants};
 
 const SIZE: [u32; 2] = [26, 19];
 
@@ -112,6 +113,27 @@ fn the_gradient_holds_through_capped_alphas_and_done_pixels() {
 }
 
 #[test]
+fn the_gradient_holds_where_one_part_of_a_tile_is_done_before_another() {
+    for (channels, subgroups) in [(3, 2), (3, 4), (11, 4)] {
+        let shape = Shape { sh_degree: 0, features: features(channels) };
+        let mut setup = Setup::new(90, [32, 35], shape, 52);
+        // Of the uppermost part nothing is left behind the first ones; what lies below goes on for several batches.
+        for i in 0..12 {
+            let mean = setup.at_pixel(DVec2::new(16.0, 2.0), 0.8 + 0.01 * i as f64);
+            let log_scale = DVec3::new(0.5, 0.03, 0.03).map(f64::ln);
+            let quat = DVec4::new(1.0, 0.0, 0.0, 0.0);
+            setup.set(i, &Gaussian { mean, quat, log_scale, raw_opacity: 6.0, ..setup.get(i) });
+        }
+        let tile = tile_of(([16, 16], subgroups));
+        setup.settings.tile = Some(tile).filter(|&tile| gpu().properties().suits_tile(tile));
+        let chain = Chain::new(&setup);
+        let transmittances = chain.run(&chain.parameters()).transmittances;
+        assert!(transmittances[2 * 32 + 16] < 5e-4 && transmittances[14 * 32 + 16] > 5e-4);
+        chain.assert_agrees_with_the_device(&format!("{channels} channels, {tile}"));
+    }
+}
+
+#[test]
 fn the_renderer_gives_what_the_chain_gives() {
     for setup in variants() {
         let name = format!("{} Gaussians, {:?}", setup.count, setup.settings);
@@ -135,18 +157,22 @@ fn an_overflow_leaves_no_gradient_and_no_statistics() {
 #[test]
 fn the_same_frame_gives_the_same_bits_every_time() {
     let shape = Shape { sh_degree: 2, features: features(4) };
-    let setup = Setup::new(777, [131, 77], shape, 8);
+    let mut setup = Setup::new(777, [131, 77], shape, 8);
     let mut d_render = vec![0.0; 4 * setup.pixels()];
     (0..).zip(&mut d_render).for_each(|(i, d)| *d = ((i % 17) as f32 - 8.0) / 8.0);
-    let bits = || -> Vec<u32> {
+    let bits = |setup: &Setup| -> Vec<u32> {
         let mut rendered = setup.render();
         let Gradients { parameters, grad_norm_sums, visit_counts } = rendered.backward(&d_render);
         let Rendered { render, transmittances, .. } = rendered;
         let floats = [render, transmittances, parameters, grad_norm_sums].concat();
         floats.into_iter().map(f32::to_bits).chain(visit_counts).collect()
     };
-    let first = bits();
-    for repetition in 1..25 {
-        assert!(bits() == first, "repetition {repetition}");
+    let tiles = [([16, 8], 1), ([16, 16], 4)].map(tile_of);
+    for tile in tiles.into_iter().filter(|&tile| gpu().properties().suits_tile(tile)) {
+        setup.settings.tile = Some(tile);
+        let first = bits(&setup);
+        for repetition in 1..25 {
+            assert!(bits(&setup) == first, "{tile}: repetition {repetition}");
+        }
     }
 }

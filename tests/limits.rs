@@ -6,8 +6,8 @@
 use std::collections::HashSet;
 
 use glam::{DVec3, UVec2, Vec2, Vec3};
-use nightsplat::gpu::Threads;
 use nightsplat::gpu::testing::gpu;
+use nightsplat::gpu::{Threads, Tile};
 use nightsplat::kernels::status::STATUS_CROWDED;
 use nightsplat::kernels::{ProjectedSplat, blend_forward, emit, order_counts, reduce_records};
 use nightsplat::reference::gaussian::Gaussian;
@@ -298,14 +298,19 @@ fn a_tile_that_does_not_suit_the_device_is_refused_in_one_line_and_others_render
     let lanes = gpu().properties().subgroup_size;
     let mut setup = Setup::new(5, [50, 40], 1, 5);
     for tile in [[0, 8], [1, 1], [lanes + 1, 1], [lanes, 33], [64 * lanes, 1], [1 << 20, 1 << 20]] {
-        setup.settings.tile = Some(tile);
+        setup.settings.tile = Some(tile.into());
         let message = Renderer::new(&gpu(), setup.settings).unwrap_err().to_string();
         let [width, height] = tile;
         assert!(message.starts_with(&format!("{width}x{height} tiles do not suit")), "{message}");
         assert!(message.contains("take a tile") && !message.contains('\n'), "{message}");
     }
+    for subgroups in [0, 3, 8] {
+        setup.settings.tile = Some(Tile { size: [lanes, 24], subgroups });
+        let message = Renderer::new(&gpu(), setup.settings).unwrap_err().to_string();
+        assert!(message.contains("1, 2 or 4 subgroups") && !message.contains('\n'), "{message}");
+    }
     for tile in [[lanes, 1], [1, lanes], [lanes, 32]] {
-        setup.settings.tile = Some(tile);
+        setup.settings.tile = Some(tile.into());
         setup.render();
     }
 }

@@ -109,7 +109,7 @@ fn the_paper_s_denoiser_has_a_noise_map_and_its_terms_fall() {
 /// What a model shows of the first test view before it has trained.
 fn first_render(config: &TrainConfig, dataset: &Dataset) -> Rendered {
     // Tiles of another size add up in another order.
-    let config = TrainConfig { tile: Some([8, 8]), ..config.clone() };
+    let config = TrainConfig { tile: Some([8, 8].into()), ..config.clone() };
     let camera = dataset.test_views().next().unwrap().camera;
     Trainer::new(&gpu(), config, dataset).unwrap().render(&camera).unwrap()
 }

@@ -7,6 +7,7 @@ use std::path::Path;
 
 use glam::{DAffine3, DMat3, DVec2, DVec3, DVec4, Vec2, Vec3};
 use nightsplat::camera::Camera;
+use nightsplat::gpu::Tile;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::ProjectedSplat;
 use nightsplat::kernels::splat::ALPHA_MIN;
@@ -19,7 +20,7 @@ use nightsplat::scene::{Features, Shape};
 #[macro_use]
 mod common;
 use common::chain::Chain;
-use common::setup::{Rendered, Setup};
+use common::setup::{Rendered, Setup, tile_of};
 use common::{Random, assert_close, fixture, safetensors, shared};
 
 const SIZE: [u32; 2] = [50, 40];
@@ -178,16 +179,17 @@ fn intersections(rendered: &Rendered<'_>) -> Vec<(u32, u32)> {
     tiles.into_iter().zip(owners).collect()
 }
 
-/// Those of the tiles that a subgroup of this device can own.
-fn suited<const N: usize>(tiles: [[u32; 2]; N]) -> impl Iterator<Item = [u32; 2]> {
-    tiles.into_iter().filter(|&tile| gpu().properties().suits_tile(tile))
+/// Those of the tiles that subgroups of this device can own.
+fn suited<const N: usize>(tiles: [([u32; 2], u32); N]) -> impl Iterator<Item = Tile> {
+    tiles.into_iter().map(tile_of).filter(|&tile| gpu().properties().suits_tile(tile))
 }
 
 #[test]
 fn counting_and_emitting_agree() {
-    for tile @ [width, height] in suited([[16, 16], [16, 8], [8, 8]]) {
+    for tile in suited([([16, 16], 1), ([16, 8], 1), ([8, 8], 1)]) {
         let mut setup = needles(5000);
         setup.settings.tile = Some(tile);
+        let [width, height] = tile.size;
         let all = intersections(&setup.render());
         assert!(all.len() > 20_000, "{}", all.len());
         let tile_count = setup.camera.width.div_ceil(width) * setup.camera.height.div_ceil(height);
@@ -199,7 +201,7 @@ fn counting_and_emitting_agree() {
 #[test]
 fn no_visible_pixel_is_missed() {
     let mut setup = needles(2000);
-    setup.settings.tile = Some([16, 8]);
+    setup.settings.tile = Some([16, 8].into());
     let rendered = setup.render();
     let seen: HashSet<_> = intersections(&rendered).into_iter().collect();
     let splats = gpu().read(&rendered.renderer.frame().splats).unwrap();
@@ -245,7 +247,9 @@ fn neither_tiles_nor_the_order_of_gaussians_change_a_bit() {
     (0..setup.count).for_each(|i| reversed.set(i, &setup.get(setup.count - 1 - i)));
     let mut first: Option<(Vec<f32>, Vec<f32>)> = None;
     for setup in [&mut setup, &mut reversed] {
-        for tile in suited([[16, 16], [16, 8], [8, 8], [32, 4], [64, 4]]) {
+        let alone = [[16, 16], [16, 8], [8, 8], [32, 4], [64, 4]].map(|size| (size, 1));
+        let shares = [([16, 16], 2), ([16, 16], 4), ([32, 16], 4), ([8, 8], 2)];
+        for tile in suited(alone).chain(suited(shares)) {
             setup.settings.tile = Some(tile);
             let Rendered { render, transmittances, .. } = setup.render();
             let (first_render, first_transmittances) =

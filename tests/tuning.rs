@@ -9,6 +9,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use common::command::{command, refused, succeed};
+use nightsplat::gpu::Tile;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::render::RenderSettings;
 use nightsplat::run;
@@ -39,14 +40,14 @@ impl Place {
     }
 
     /// What a new run says on standard error, and the tile it records.
-    fn train(&self, run: &str, more: &str) -> (String, [u32; 2]) {
+    fn train(&self, run: &str, more: &str) -> (String, Tile) {
         let (set, out) = (self.path("set"), self.path(run));
         let (set, out) = (set.display(), out.display());
         let (_, stderr) = self.run(&format!("train {set} --out {out} --sh-degree 0 {more}"));
         (stderr, self.recorded(run))
     }
 
-    fn recorded(&self, run: &str) -> [u32; 2] {
+    fn recorded(&self, run: &str) -> Tile {
         run::load_config(&self.path(run)).unwrap().tile.unwrap()
     }
 
@@ -56,20 +57,20 @@ impl Place {
 }
 
 /// A file of this device that names one tile for everything.
-fn tuning(tile: [u32; 2]) -> Value {
+fn tuning(tile: Tile) -> Value {
     let properties = gpu().properties().clone();
     let tiles = json!([{ "channels": 3, "tile": tile }]);
     json!({ "device": properties.name, "driver": properties.driver, "tiles": tiles })
 }
 
 /// What is taken where nothing was measured.
-fn built_in() -> [u32; 2] {
+fn built_in() -> Tile {
     RenderSettings::default().tile_on(&gpu()).unwrap()
 }
 
 /// A tile that suits the device and is not the built-in one.
-fn unusual() -> [u32; 2] {
-    [gpu().properties().subgroup_size, 4]
+fn unusual() -> Tile {
+    Tile { size: [16, 16], subgroups: 2 }
 }
 
 #[test]
@@ -80,15 +81,15 @@ fn tuning_times_every_tile_that_suits_the_device_and_keeps_the_fastest() {
     let cases = printed["cases"].as_array().unwrap();
     assert_eq!(cases.iter().map(|case| &case["channels"]).collect::<Vec<_>>(), [3, 11]);
     for tile in cases.iter().flat_map(|case| case["tiles"].as_array().unwrap()) {
-        let size = serde_json::from_value(tile["tile"].clone()).unwrap();
-        assert!(gpu().properties().suits_tile(size), "{tile}");
+        let own: Tile = serde_json::from_value(tile["tile"].clone()).unwrap();
+        assert!(gpu().properties().suits_tile(own), "{tile}");
         assert_eq!(tile["agrees"], true, "{tile}");
         assert!(tile["rasteriser_ms"].as_f64().unwrap() > 0.0, "{tile}");
     }
     let kept: Value = serde_json::from_slice(&fs::read(place.path("tiles.json")).unwrap()).unwrap();
     assert_eq!(kept["tiles"], printed["tiles"]);
     assert_eq!(kept["driver"], gpu().properties().driver.as_str());
-    let chosen: [u32; 2] = serde_json::from_value(kept["tiles"][0]["tile"].clone()).unwrap();
+    let chosen: Tile = serde_json::from_value(kept["tiles"][0]["tile"].clone()).unwrap();
     assert_eq!(place.train("run", "--steps 1").1, chosen);
 }
 
@@ -99,7 +100,7 @@ fn the_kept_tile_is_taken_unless_another_is_asked_for_and_a_resumed_run_stays_wi
     assert_eq!(place.train("none", "--steps 1").1, built_in());
     place.write(&tuning(unusual()));
     assert_eq!(place.train("kept", "--steps 2 --checkpoint-every 2").1, unusual());
-    let [width, height] = built_in();
+    let [width, height] = built_in().size;
     let asked = format!("--steps 1 --set tile=[{width},{height}]");
     assert_eq!(place.train("asked", &asked).1, built_in());
     place.write(&tuning(built_in()));
@@ -140,7 +141,7 @@ fn a_file_of_another_driver_and_a_damaged_one_are_ignored_with_one_line() {
     said("driver", "of another year");
     fs::write(place.path("tiles.json"), "{\"device\": ").unwrap();
     said("damaged", "is damaged");
-    place.write(&tuning([3, 3]));
+    place.write(&tuning([3, 3].into()));
     said("unsuitable", "3x3 tiles do not suit");
 }
 
@@ -148,7 +149,7 @@ fn a_file_of_another_driver_and_a_damaged_one_are_ignored_with_one_line() {
 fn a_tile_that_does_not_suit_the_device_is_refused_with_the_remedy() {
     let place = Place::new();
     let (set, out) = (place.path("set"), place.path("run"));
-    for tile in ["[3,3]", "[0,8]", "[4096,4096]", "[4294967295,4294967295]"] {
+    for tile in ["[3,3]", "[0,8]", "[4096,4096]", "[4294967295,4294967295]", "[16,16,3]"] {
         let arguments =
             format!("train {} --out {} --set tile={tile}", set.display(), out.display());
         refused(&arguments, 2, &["tiles do not suit", "lanes", "take a tile of"]);

@@ -19,7 +19,7 @@ const uint RECORD_HEAD = 6;
 const uint RECORD = RECORD_HEAD + CHANNELS;
 // The vectors of three that hold a record: a load or a store of three numbers costs hardly more than one of one.
 const uint RECORD_VECTORS = (RECORD + 2) / 3;
-// The tile that one subgroup owns, in pixels; at most 32 rows of lanes.
+// In pixels; a subgroup owns at most 32 rows of lanes.
 layout(constant_id = 3) const uint TILE_WIDTH = 16;
 layout(constant_id = 4) const uint TILE_HEIGHT = 16;
 

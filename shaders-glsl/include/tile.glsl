@@ -1,18 +1,33 @@
-// A tile owned by one subgroup: lane l of group g owns pixel g * SUBGROUP_SIZE + l, counted row by row.
+// The part of a tile that a subgroup owns: lane l of group g owns pixel g * SUBGROUP_SIZE + l, counted row by row.
 //
-// A tile's state lives in registers, one array element per group. Loops over groups are therefore unrolled: every
-// index is a constant.
+// Its state lives in registers, one array element per group. Loops over groups are therefore unrolled: every index is a
+// constant.
+
+// The parts of a tile, one above the other: more warps, of less state each, where a device has room for them.
+layout(constant_id = 9) const uint SUBGROUPS_PER_TILE = 1;
+layout(local_size_x_id = 100, local_size_y_id = 9) in;
+// A variable, as the reflection of kernels compares no constants; drivers do.
+bool tile_is_shared() {
+    uint subgroups = SUBGROUPS_PER_TILE;
+    return subgroups > 1;
+}
 
 // Whether the groups that a splat misses are jumped over. A GPU jumps where its whole subgroup agrees; a software device
 // may only mask its lanes, does the work all the same, and is faster without the test.
 layout(constant_id = 6) const bool SKIPS_GROUPS = true;
 
-const uint GROUPS = TILE_WIDTH * TILE_HEIGHT / SUBGROUP_SIZE;
+const uint PART_HEIGHT = TILE_HEIGHT / SUBGROUPS_PER_TILE;
+const uint GROUPS = TILE_WIDTH * PART_HEIGHT / SUBGROUP_SIZE;
 
 // How many splats of a batch one turn of the loop over it blends: some devices give an invocation but so many turns.
 layout(constant_id = 7) const uint SPLATS_PER_TURN = 1;
 
-// The lane's pixel of group 0, relative to the tile.
+// The first pixel of a tile.
+uvec2 tile_origin(uint tile, uint tile_columns) {
+    return uvec2(tile % tile_columns * TILE_WIDTH, tile / tile_columns * TILE_HEIGHT);
+}
+
+// The lane's pixel of group 0, relative to the part.
 uvec2 lane_pixel() {
     return uvec2(gl_SubgroupInvocationID % TILE_WIDTH, gl_SubgroupInvocationID / TILE_WIDTH);
 }
@@ -22,11 +37,11 @@ uvec2 group_offset(uint group) {
     return uvec2(group * SUBGROUP_SIZE % TILE_WIDTH, group * SUBGROUP_SIZE / TILE_WIDTH);
 }
 
-// The groups of pixels, one bit each, that the splat's ellipse meets in the tile at `origin`. In all others it is below
+// The groups of pixels, one bit each, that the splat's ellipse meets in the part at `origin`. In all others it is below
 // alpha 1/255: to skip them changes the time alone.
 uint splat_groups(ProjectedSplat splat, uvec2 origin) {
     uint groups = 0;
-    for (uint row = 0; row < TILE_HEIGHT; row++) {
+    for (uint row = 0; row < PART_HEIGHT; row++) {
         float y = float(origin.y + row);
         ivec2 columns = splat_columns(splat, y, y) - int(origin.x);
         columns = ivec2(max(columns.x, 0), min(columns.y, int(TILE_WIDTH) - 1));

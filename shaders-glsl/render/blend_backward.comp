@@ -6,14 +6,13 @@ layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 #include "tile.glsl"
 #include "subgroup_sum.glsl"
 
-//! Blend backward: one subgroup owns a tile and records the gradient of every intersection in its slot.
+//! Blend backward: a tile's subgroups, most often one, record the gradient of every intersection in its slot.
 //!
 //! Walks front to back again, as the forward pass did, with the light still to come, L_i = sum_{k >= i} c_k alpha_k T_k +
 //! T background, which starts as the render itself: dC / dalpha_i = (c_i T_i - L_i) / (1 - alpha_i). Of both, the product
 //! with dL/dC is all that is needed: one number a pixel, however many channels. No atomics: a slot is written by the one
-//! tile it belongs to, and the sum over a Gaussian's slots comes in a fixed order.
+//! tile it belongs to, and the sums over a tile's parts and over a Gaussian's slots come in a fixed order.
 
-layout(local_size_x_id = 100) in;
 // So many channels, from the first, move and shape the splats; of the others only the colours learn.
 layout(constant_id = 8) const uint SHAPING_CHANNELS = 3;
 
@@ -29,11 +28,27 @@ layout(binding = 6) readonly  buffer DRender { float d_render[]; };  // (CHANNEL
 // (slots, RECORD_VECTORS): mean2d 2, conic 3, opacity 1, colour CHANNELS, zeros
 layout(binding = 7) writeonly buffer Records { vec3 records[]; };
 
+// What every part but the first adds to the records of a batch; a tile of one part has room for one that is not used.
+shared float shares[(SUBGROUPS_PER_TILE - 1 + 1 / SUBGROUPS_PER_TILE) * RECORD * SUBGROUP_SIZE];
+shared uint are_alive[SUBGROUPS_PER_TILE];
+
+// Whether any lane of any part says so; every lane has to ask.
+bool tile_any(bool says) {
+    bool any = subgroupAny(says);
+    if (tile_is_shared()) {
+        if (subgroupElect()) are_alive[gl_SubgroupID] = uint(any);
+        barrier();
+        for (uint part = 0; part < SUBGROUPS_PER_TILE; part++) any = any || are_alive[part] != 0;
+    }
+    return any;
+}
+
 void main() {
     uint tile = WORKGROUP_INDEX;
     uint lane = gl_SubgroupInvocationID;
-    uvec2 origin = uvec2(tile % tile_columns * TILE_WIDTH, tile / tile_columns * TILE_HEIGHT);
+    uvec2 origin = tile_origin(tile, tile_columns);
     if (origin.y >= size.y) return;
+    origin.y += gl_SubgroupID * PART_HEIGHT;
     uvec2 first_pixel = origin + lane_pixel();
 
     float transmittance[GROUPS];    // zero once the pixel is done
@@ -56,7 +71,7 @@ void main() {
     for (; first < range.y; first += SUBGROUP_SIZE) {
         bool alive = false;
         [[unroll]] for (uint g = 0; g < GROUPS; g++) alive = alive || transmittance[g] > 0.0;
-        if (!subgroupAny(alive)) break;
+        if (!tile_any(alive)) break;
 
         uint batch = min(SUBGROUP_SIZE, range.y - first);
         uint slot = sorted_slots[first + min(lane, batch - 1)];
@@ -77,6 +92,8 @@ void main() {
             [[unroll]] for (uint k = 0; k < SPLATS_PER_TURN; k++) {
                 uint j = turn + k;
                 uint groups = subgroupShuffle(my_groups, j);
+                // What misses all of the part leaves nothing to sum.
+                if (SKIPS_GROUPS && groups == 0) continue;
                 vec2 offset = subgroupShuffle(mine.mean2d, j) - (vec2(first_pixel) + 0.5);
                 vec3 conic = subgroupShuffle(mine.conic, j);
                 float opacity = subgroupShuffle(mine.opacity, j);
@@ -136,22 +153,33 @@ void main() {
             turn += SPLATS_PER_TURN;
             if (turn >= batch) break;
         }
-        if (lane < batch) {
-            float record[3 * RECORD_VECTORS];
-            [[unroll]] for (uint k = 0; k < 3 * RECORD_VECTORS; k++) record[k] = 0.0;
-            record[0] = my_d_mean2d.x;
-            record[1] = my_d_mean2d.y;
-            record[2] = my_d_conic.x;
-            record[3] = my_d_conic.y;
-            record[4] = my_d_conic.z;
-            record[5] = my_d_opacity;
-            [[unroll]] for (uint c = 0; c < CHANNELS; c++) record[RECORD_HEAD + c] = my_d_color[c];
+        float record[3 * RECORD_VECTORS];
+        [[unroll]] for (uint k = 0; k < 3 * RECORD_VECTORS; k++) record[k] = 0.0;
+        record[0] = my_d_mean2d.x;
+        record[1] = my_d_mean2d.y;
+        record[2] = my_d_conic.x;
+        record[3] = my_d_conic.y;
+        record[4] = my_d_conic.z;
+        record[5] = my_d_opacity;
+        [[unroll]] for (uint c = 0; c < CHANNELS; c++) record[RECORD_HEAD + c] = my_d_color[c];
+        if (tile_is_shared()) {
+            if (gl_SubgroupID > 0) {
+                uint share = (gl_SubgroupID - 1) * RECORD * SUBGROUP_SIZE + lane;
+                [[unroll]] for (uint k = 0; k < RECORD; k++) shares[share + k * SUBGROUP_SIZE] = record[k];
+            }
+            barrier();
+        }
+        if (gl_SubgroupID == 0 && lane < batch) {
+            for (uint part = 1; part < SUBGROUPS_PER_TILE; part++) {
+                uint share = (part - 1) * RECORD * SUBGROUP_SIZE + lane;
+                [[unroll]] for (uint k = 0; k < RECORD; k++) record[k] += shares[share + k * SUBGROUP_SIZE];
+            }
             [[unroll]] for (uint k = 0; k < RECORD_VECTORS; k++)
                 records[RECORD_VECTORS * slot + k] = vec3(record[3 * k], record[3 * k + 1], record[3 * k + 2]);
         }
     }
     // Behind a tile that is done every gradient is zero.
-    for (uint i = first + lane; i < range.y; i += SUBGROUP_SIZE) {
+    for (uint i = first + gl_LocalInvocationIndex; i < range.y; i += SUBGROUP_SIZE * SUBGROUPS_PER_TILE) {
         uint at = RECORD_VECTORS * sorted_slots[i];
         [[unroll]] for (uint k = 0; k < RECORD_VECTORS; k++) records[at + k] = vec3(0.0);
     }

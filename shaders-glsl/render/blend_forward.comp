@@ -6,13 +6,12 @@ layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 #include "tile.glsl"
 #include "status.glsl"
 
-//! Blend forward: one subgroup owns a tile, finds its run of the sorted intersections and composites it front to back.
+//! Blend forward: a subgroup owns a tile or a part of one, finds the tile's run of the sorted intersections and composites
+//! it front to back.
 //!
 //! C = sum_i c_i alpha_i T_i + T background, T_i = prod_{j < i} (1 - alpha_j). Each lane loads one splat of a batch and
 //! finds the groups of pixels that its ellipse meets; the batch is then broadcast splat by splat. The tile's state stays
 //! in registers: no shared memory, no barrier.
-
-layout(local_size_x_id = 100) in;
 
 layout(push_constant, scalar) uniform Params {
     uvec2 size;
@@ -37,8 +36,9 @@ layout(binding = 9)           buffer Status     { uint status[]; };
 void main() {
     uint tile = WORKGROUP_INDEX;
     uint lane = gl_SubgroupInvocationID;
-    uvec2 origin = uvec2(tile % tile_columns * TILE_WIDTH, tile / tile_columns * TILE_HEIGHT);
+    uvec2 origin = tile_origin(tile, tile_columns);
     if (origin.y >= size.y) return;
+    origin.y += gl_SubgroupID * PART_HEIGHT;
     uvec2 first_pixel = origin + lane_pixel();
 
     // Negative once the pixel is done; the magnitude is the transmittance.
@@ -51,7 +51,7 @@ void main() {
     }
 
     uvec2 range = tile_run(tile, longest_run);
-    if (subgroupElect()) tile_ranges[tile] = range;
+    if (gl_SubgroupID == 0 && subgroupElect()) tile_ranges[tile] = range;
     for (uint first = range.x; first < range.y; first += SUBGROUP_SIZE) {
         bool alive = false;
         [[unroll]] for (uint g = 0; g < GROUPS; g++) alive = alive || transmittance[g] > 0.0;

@@ -12,7 +12,7 @@ const AMD: u32 = 0x1002;
 /// What our kernels are written for.
 pub(super) const SIZES: RangeInclusive<u32> = 4..=128;
 /// Invocations of our largest workgroups.
-const WORKGROUP: u32 = 256;
+pub(super) const WORKGROUP: u32 = 256;
 
 /// What a device says of its subgroups.
 #[derive(Clone, Copy, Debug)]

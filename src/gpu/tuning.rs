@@ -1,9 +1,11 @@
 //! The fastest tiles of this device, as `nightsplat bench --tune` found them: a small file in the user's cache folder.
 
+use std::fmt;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
+use super::subgroups::WORKGROUP;
 use super::{Gpu, Properties};
 use crate::output::write_whole;
 use crate::{Error, Result};
@@ -11,14 +13,69 @@ use crate::{Error, Result};
 /// Names a file in place of the one in the user's cache folder, or is `off`: no file.
 pub const TUNE_VARIABLE: &str = "NIGHTSPLAT_TUNE";
 
+/// The pixels that a workgroup of the rasteriser owns. In files it is two numbers, or three where more than one subgroup
+/// share it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "Vec<u32>", into = "Vec<u32>")]
+pub struct Tile {
+    /// Width and height, in pixels.
+    pub size: [u32; 2],
+    /// Each owns a part, one above the other: 1, 2 or 4.
+    pub subgroups: u32,
+}
+
+impl Tile {
+    /// As high as all its parts.
+    fn part(self) -> Option<[u32; 2]> {
+        let [width, height] = self.size;
+        let divides = [1, 2, 4].contains(&self.subgroups) && height.is_multiple_of(self.subgroups);
+        divides.then(|| [width, height / self.subgroups])
+    }
+}
+
+/// Of one subgroup.
+impl From<[u32; 2]> for Tile {
+    fn from(size: [u32; 2]) -> Self {
+        Self { size, subgroups: 1 }
+    }
+}
+
+impl TryFrom<Vec<u32>> for Tile {
+    type Error = String;
+
+    fn try_from(numbers: Vec<u32>) -> Result<Self, String> {
+        match numbers[..] {
+            [width, height] => Ok([width, height].into()),
+            [width, height, subgroups] => Ok(Self { size: [width, height], subgroups }),
+            _ => Err("a tile is its width and height in pixels, and how many subgroups own it"
+                .to_owned()),
+        }
+    }
+}
+
+impl From<Tile> for Vec<u32> {
+    fn from(Tile { size: [width, height], subgroups }: Tile) -> Self {
+        let numbers = [width, height, subgroups];
+        numbers[..if subgroups == 1 { 2 } else { 3 }].to_vec()
+    }
+}
+
+/// `16x8`, or `16x16x4` of four subgroups.
+impl fmt::Display for Tile {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let numbers: Vec<_> = Vec::from(*self).iter().map(u32::to_string).collect();
+        out.write_str(&numbers.join("x"))
+    }
+}
+
 /// The fastest tile for renders of so many channels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TunedTile {
     /// Values per pixel.
     pub channels: usize,
-    /// Width and height, in pixels.
-    pub tile: [u32; 2],
+    /// The tile.
+    pub tile: Tile,
 }
 
 /// What was measured, and where.
@@ -31,18 +88,22 @@ struct Tuning {
 }
 
 impl Properties {
-    /// Whether a subgroup can own tiles of so many pixels across and down: they have 1 to 32 rows of its lanes.
-    pub fn suits_tile(&self, [width, height]: [u32; 2]) -> bool {
-        let pixels = u64::from(width) * u64::from(height);
+    /// Whether subgroups can own such tiles: every part has 1 to 32 rows of lanes, and all lanes make one workgroup.
+    pub fn suits_tile(&self, tile: impl Into<Tile>) -> bool {
+        let tile = tile.into();
         let lanes = u64::from(self.subgroup_size);
-        pixels.is_multiple_of(lanes) && (1..=32).contains(&(pixels / lanes))
+        tile.part().is_some_and(|[width, height]| {
+            let pixels = u64::from(width) * u64::from(height);
+            let is_workgroup = lanes * u64::from(tile.subgroups) <= u64::from(WORKGROUP);
+            pixels.is_multiple_of(lanes) && (1..=32).contains(&(pixels / lanes)) && is_workgroup
+        })
     }
 }
 
 impl Gpu {
     /// The tile that was fastest on this device and driver for the nearest number of channels; none where nothing was
     /// measured, or the device is lent or opened to be validated.
-    pub fn tuned_tile(&self, channels: usize) -> Option<[u32; 2]> {
+    pub fn tuned_tile(&self, channels: usize) -> Option<Tile> {
         let path = self.tuning_path()?;
         let tiles = self.shared.tuned_tiles.get_or_init(|| load(path, self.properties()));
         let far = |tuned: &&TunedTile| tuned.channels.abs_diff(channels);
@@ -100,8 +161,8 @@ fn tiles(bytes: &[u8], properties: &Properties) -> Result<Vec<TunedTile>, String
         return Err(format!("was measured on {device}, {driver}; this is {name}, {own}"));
     }
     let unsuitable = tiles.iter().find(|tuned| !properties.suits_tile(tuned.tile));
-    unsuitable.map_or(Ok(()), |TunedTile { tile: [width, height], .. }| {
-        Err(damaged(format!("{width}x{height} tiles do not suit {subgroup_size} lanes")))
+    unsuitable.map_or(Ok(()), |TunedTile { tile, .. }| {
+        Err(damaged(format!("{tile} tiles do not suit {subgroup_size} lanes")))
     })?;
     Ok(tiles)
 }
@@ -131,21 +192,44 @@ mod tests {
 
     #[test]
     fn a_tile_has_one_to_thirty_two_rows_of_lanes() {
-        let suits = |tile| properties().suits_tile(tile);
+        let suits = |size: [u32; 2]| properties().suits_tile(size);
         assert!(suits([8, 1]) && suits([16, 16]) && suits([32, 8]));
         assert!(!suits([0, 8]) && !suits([3, 3]) && !suits([32, 16]) && !suits([u32::MAX; 2]));
     }
 
     #[test]
+    fn subgroups_share_a_tile_of_equal_parts() {
+        let suits = |size, subgroups| properties().suits_tile(Tile { size, subgroups });
+        assert!(suits([16, 16], 2) && suits([16, 16], 4) && suits([16, 32], 2) && suits([8, 2], 2));
+        assert!(!suits([16, 6], 4) && !suits([4, 4], 4) && !suits([16, 128], 4));
+        assert!(!suits([16, 16], 0) && !suits([15, 24], 3) && !suits([16, 16], 8));
+        let wide = Properties { subgroup_size: 128, ..properties() };
+        assert!(wide.suits_tile(Tile { size: [16, 16], subgroups: 2 }));
+        assert!(!wide.suits_tile(Tile { size: [32, 16], subgroups: 4 }), "512 lanes");
+    }
+
+    #[test]
+    fn a_tile_is_read_as_it_is_written() {
+        for (tile, text) in
+            [(Tile::from([16, 8]), "[16,8]"), (Tile { size: [16, 16], subgroups: 4 }, "[16,16,4]")]
+        {
+            assert_eq!(serde_json::to_string(&tile).unwrap(), text);
+            assert_eq!(serde_json::from_str::<Tile>(text).unwrap(), tile);
+        }
+        assert_eq!(Tile { size: [16, 16], subgroups: 4 }.to_string(), "16x16x4");
+        assert!(serde_json::from_str::<Tile>("[16]").is_err());
+    }
+
+    #[test]
     fn only_an_undamaged_file_of_this_device_and_driver_is_taken() {
         let text = |device: &str, driver: &str, tile: [u32; 2]| {
-            let tiles = vec![TunedTile { channels: 3, tile }];
+            let tiles = vec![TunedTile { channels: 3, tile: tile.into() }];
             let tuning = Tuning { device: device.to_owned(), driver: driver.to_owned(), tiles };
             serde_json::json!(tuning).to_string()
         };
         let read = |text: &str| tiles(text.as_bytes(), &properties());
         let whole = text("Abacus 3000", "beads 1.0", [16, 4]);
-        assert_eq!(read(&whole).unwrap(), [TunedTile { channels: 3, tile: [16, 4] }]);
+        assert_eq!(read(&whole).unwrap(), [TunedTile { channels: 3, tile: [16, 4].into() }]);
         let refused = |text: &str, part: &str| {
             let problem = read(text).unwrap_err();
             assert!(problem.contains(part) && !problem.contains('\n'), "{problem}");

@@ -38,7 +38,7 @@ impl RenderSettings {
     /// [`Error::Usage`] names the view, the limit, and the longest side that it leaves; the tile does not suit the device.
     pub fn check_size(&self, gpu: &Gpu, view: &str, [width, height]: [u32; 2]) -> Result<()> {
         let Properties { name: device, max_storage_buffer_range: bindable, .. } = gpu.properties();
-        let [tile_width, tile_height] = self.tile_for(gpu, std::iter::once([width, height]))?;
+        let [tile_width, tile_height] = self.tile_for(gpu, std::iter::once([width, height]))?.size;
         let bytes_per_pixel = (self.channels() * size_of::<f32>()) as u64;
         let bytes = u64::from(width) * u64::from(height) * bytes_per_pixel;
         let tiles = u64::from(width.div_ceil(tile_width)) * u64::from(height.div_ceil(tile_height));

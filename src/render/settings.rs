@@ -1,7 +1,7 @@
 //! What a renderer is made for, and the tile that suits a device.
 
 use super::limits::most_tiles;
-use crate::gpu::Gpu;
+use crate::gpu::{Gpu, Tile};
 use crate::halves::Bits;
 use crate::scene::{Features, Shape};
 use crate::{Error, Result};
@@ -23,8 +23,8 @@ pub struct RenderSettings {
     /// The gradient of noise and illumination moves and shapes no Gaussian; that of depth and structure, which are there for
     /// it, does.
     pub observes: bool,
-    /// The tile that one subgroup owns, in pixels; none: what is fastest on the device.
-    pub tile: Option<[u32; 2]>,
+    /// The tile that a workgroup owns; none: what is fastest on the device.
+    pub tile: Option<Tile>,
     /// The most pixels that are rendered at once; none: as many as the device can bind.
     pub patch_pixels: Option<u64>,
 }
@@ -56,20 +56,24 @@ impl RenderSettings {
     /// there ([`Gpu::tuned_tile`]), else what such devices are known to like.
     ///
     /// # Errors
-    /// The tile has no whole number of rows of lanes, or more than 32.
-    pub fn tile_on(&self, gpu: &Gpu) -> Result<[u32; 2]> {
+    /// A subgroup's part has no whole number of rows of lanes, or more than 32.
+    pub fn tile_on(&self, gpu: &Gpu) -> Result<Tile> {
         let built_in = match self.channels() {
             _ if !gpu.properties().is_cpu => GPU_TILE,
             0..=CPU_TILE_CHANNELS => CPU_TILE,
             _ => CPU_SMALL_TILE,
         };
-        let tile = self.tile.or_else(|| gpu.tuned_tile(self.channels())).unwrap_or(built_in);
+        let tile = self.tile.or_else(|| gpu.tuned_tile(self.channels())).unwrap_or(built_in.into());
         if gpu.properties().suits_tile(tile) {
             return Ok(tile);
         }
-        let ([width, height], lanes) = (tile, gpu.properties().subgroup_size);
-        let remedy = format!("1 to 32 times {lanes} pixels; without `tile` the device chooses");
-        let problem = format!("{width}x{height} tiles do not suit {lanes} lanes");
+        let lanes = gpu.properties().subgroup_size;
+        let of = match tile.subgroups {
+            1 => "",
+            _ => " of each of 1, 2 or 4 subgroups",
+        };
+        let remedy = format!("1 to 32 times {lanes} pixels{of}; without `tile` the device chooses");
+        let problem = format!("{tile} tiles do not suit {lanes} lanes");
         Err(Error::Usage(format!("{problem}; take a tile of {remedy}")))
     }
 
@@ -82,14 +86,14 @@ impl RenderSettings {
         &self,
         gpu: &Gpu,
         sizes: impl Iterator<Item = [u32; 2]> + Clone,
-    ) -> Result<[u32; 2]> {
+    ) -> Result<Tile> {
         let mut tile = self.tile_on(gpu)?;
-        let count = |[width, height]: [u32; 2], tile: [u32; 2]| {
-            width.div_ceil(tile[0]) as usize * height.div_ceil(tile[1]) as usize
+        let count = |[width, height]: [u32; 2], tile: Tile| {
+            width.div_ceil(tile.size[0]) as usize * height.div_ceil(tile.size[1]) as usize
         };
         let most = most_tiles(gpu);
         while self.tile.is_none() && sizes.clone().any(|size| count(size, tile) > most) {
-            let higher = [tile[0], 2 * tile[1]];
+            let higher = Tile { size: [tile.size[0], 2 * tile.size[1]], ..tile };
             if !gpu.properties().suits_tile(higher) {
                 break;
             }

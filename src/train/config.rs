@@ -13,6 +13,7 @@ use super::streams;
 use crate::camera::frame::{FRAME_EXTENT, Frame};
 use crate::dataset::{Dataset, DepthOptions, LoadOptions};
 use crate::densify::DensityControl;
+use crate::gpu::Tile;
 use crate::input;
 use crate::loss::LossConfig;
 use crate::nn::Form;
@@ -121,9 +122,10 @@ pub struct TrainConfig {
     pub check: CheckConfig,
     /// The device: `uuid:` or `pci:` and which, `cpu`, its index, or a part of its name; empty: the best.
     pub device: String,
-    /// The tile that one subgroup renders, in pixels; left out, it is the fastest known on the device, and recorded.
+    /// The tile that a workgroup renders: width and height in pixels and, where more than one subgroup share it, their
+    /// number; left out, it is the fastest known on the device, and recorded.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub tile: Option<[u32; 2]>,
+    pub tile: Option<Tile>,
     /// Nothing nearer to a camera is seen, in units of the extent, which is taken as the power of two of which it is 0.75 to
     /// 1.5 times.
     pub near: f64,

@@ -2,8 +2,8 @@
 
 use glam::{DAffine3, DMat3, DVec2, DVec3, UVec2, Vec2};
 use nightsplat::camera;
-use nightsplat::gpu::Buffer;
 use nightsplat::gpu::testing::gpu;
+use nightsplat::gpu::{Buffer, Tile};
 use nightsplat::reference::camera::Camera;
 use nightsplat::reference::gaussian::{Gaussian, Planes};
 use nightsplat::reference::sh::sh_count;
@@ -233,18 +233,25 @@ pub(crate) fn features(channels: usize) -> Features {
     features
 }
 
+/// A tile of so many pixels that so many subgroups share.
+pub(crate) fn tile_of((size, subgroups): ([u32; 2], u32)) -> Tile {
+    Tile { size, subgroups }
+}
+
 /// Every size, channel count, tile and SH degree (stored, in use) that a kernel may trip over; colours are raw in those
 /// with many channels.
 pub(crate) fn variants() -> Vec<Setup> {
-    type Row = (usize, [u32; 2], [u32; 2], usize, [u32; 2]);
-    let rows: [Row; 7] = [
-        (0, [33, 17], [0, 0], 3, [16, 8]),
-        (1, [16, 16], [0, 0], 3, [16, 16]),
-        (63, [50, 37], [1, 1], 4, [16, 8]),
-        (64, [64, 48], [2, 1], 11, [16, 4]),
-        (65, [65, 31], [3, 0], 3, [8, 8]),
-        (65, [40, 41], [3, 2], 11, [8, 8]),
-        (300, [131, 77], [3, 3], 3, [16, 8]),
+    type Row = (usize, [u32; 2], [u32; 2], usize, ([u32; 2], u32));
+    let rows: [Row; 9] = [
+        (0, [33, 17], [0, 0], 3, ([16, 8], 1)),
+        (1, [16, 16], [0, 0], 3, ([16, 16], 1)),
+        (63, [50, 37], [1, 1], 4, ([16, 8], 1)),
+        (64, [64, 48], [2, 1], 11, ([16, 4], 1)),
+        (65, [65, 31], [3, 0], 3, ([8, 8], 1)),
+        (65, [40, 41], [3, 2], 11, ([8, 8], 1)),
+        (300, [131, 77], [3, 3], 3, ([16, 8], 1)),
+        (300, [70, 53], [1, 1], 3, ([16, 16], 4)),
+        (120, [51, 37], [2, 2], 11, ([16, 16], 2)),
     ];
     let build = |(count, size, [stored, used], channels, tile): Row| {
         let shape = Shape { sh_degree: stored, features: features(channels) };
@@ -252,7 +259,8 @@ pub(crate) fn variants() -> Vec<Setup> {
         setup.options.sh_degree = used;
         setup.settings.raw_colors = channels > 4;
         // Tiles that do not suit its subgroups a device replaces by its own.
-        setup.settings.tile = Some(tile).filter(|&tile| gpu().properties().suits_tile(tile));
+        setup.settings.tile =
+            Some(tile_of(tile)).filter(|&tile| gpu().properties().suits_tile(tile));
         setup
     };
     rows.map(build).to_vec()

@@ -7,12 +7,14 @@ use serde_json::{Map, Value, json};
 
 use super::{Bench, median, scene, stages, table, total};
 use crate::camera::Camera;
-use crate::gpu::{Buffer, Statistic, TUNE_VARIABLE, TunedTile};
+use crate::gpu::{Buffer, Statistic, TUNE_VARIABLE, Tile, TunedTile};
 use crate::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer, Status};
 use crate::scene::{Features, MAX_SH_DEGREE, Shape};
 
 /// From the few pixels of a narrow subgroup to 32 rows of a wide one.
-const TILES: [[u32; 2]; 7] = [[8, 4], [8, 8], [16, 4], [16, 8], [16, 16], [32, 8], [32, 16]];
+const SIZES: [[u32; 2]; 7] = [[8, 4], [8, 8], [16, 4], [16, 8], [16, 16], [32, 8], [32, 16]];
+/// So many subgroups share a tile. On a processor one has it: there a barrier ends one loop over all lanes and begins another.
+const SUBGROUPS: [u32; 3] = [1, 2, 4];
 
 /// Colour alone, and every feature: 3 and 11 channels.
 const FEATURES: [Features; 2] = [Features::NONE, Features::ALL];
@@ -31,7 +33,7 @@ struct Case {
 
 /// What one tile took.
 struct Measured {
-    tile: [u32; 2],
+    tile: Tile,
     intersections: u32,
     /// Largest and mean difference from the render of the first tile.
     differences: (f32, f64),
@@ -83,9 +85,7 @@ pub(super) fn run(
     if !bench.gpu.properties().tells_statistics {
         writeln!(out, "registers and spills: the driver does not tell them")?;
     }
-    let tile = |TunedTile { channels, tile: [width, height] }: &TunedTile| {
-        format!("{width}x{height} at {channels} channels")
-    };
+    let tile = |TunedTile { channels, tile }: &TunedTile| format!("{tile} at {channels} channels");
     let fastest = chosen.iter().map(tile).collect::<Vec<_>>().join(", ");
     match file {
         Some(file) => writeln!(out, "fastest: {fastest}; kept in {}", file.display())?,
@@ -97,7 +97,7 @@ pub(super) fn run(
 /// The tile whose times, each relative to the least of its size, have the least sum over the sizes.
 fn fastest(cases: &[Case], channels: usize) -> Option<TunedTile> {
     let cases = || cases.iter().filter(|case| case.channels == channels);
-    let cost = |tile: [u32; 2]| {
+    let cost = |tile: Tile| {
         let relative = |case: &Case| {
             let own = case.tiles.iter().find(|measured| measured.tile == tile && measured.agrees());
             own.map_or(f64::INFINITY, |own| own.rasteriser / case.least())
@@ -128,9 +128,11 @@ impl Case {
         let camera = scene::camera(width, height);
         let scene = scene::gaussians(&camera, gaussians, shape);
         let parameters = scene.upload(gpu)?;
-        let suits = |tile: &[u32; 2]| gpu.properties().suits_tile(*tile);
+        let subgroups = if gpu.properties().is_cpu { &SUBGROUPS[..1] } else { &SUBGROUPS };
+        let sharing = |size| subgroups.iter().map(move |&subgroups| Tile { size, subgroups });
+        let tiles = SIZES.into_iter().flat_map(sharing);
         let (mut candidates, mut first) = (vec![], None);
-        for tile in TILES.into_iter().filter(suits) {
+        for tile in tiles.filter(|&tile| gpu.properties().suits_tile(tile)) {
             let settings = RenderSettings { shape, tile: Some(tile), ..RenderSettings::default() };
             let mut renderer = Renderer::new(gpu, settings)?;
             renderer.reserve(gaussians, [&camera])?;
@@ -180,14 +182,14 @@ impl Case {
         let head = ["tile", "blend forward", "backward", "rasteriser, ms", "intersections", ""];
         let mut rows = vec![head.map(str::to_owned).to_vec()];
         rows.extend(self.tiles.iter().map(|measured| {
-            let Measured { tile: [width, height], intersections, .. } = measured;
+            let Measured { tile, intersections, .. } = measured;
             let note = match measured.agrees() {
                 false => "renders otherwise",
                 true if measured.rasteriser == self.least() => "fastest",
                 true => "",
             };
             let times = [measured.forward, measured.backward, measured.rasteriser];
-            let mut row = vec![format!("{width}x{height}")];
+            let mut row = vec![tile.to_string()];
             row.extend(times.map(|milliseconds| format!("{milliseconds:.3}")));
             row.extend([intersections.to_string(), note.to_owned()]);
             row
@@ -301,8 +303,7 @@ impl Measured {
             statistics.iter().filter(is_meant).map(count).collect::<Vec<_>>().join(", ")
         };
         let [forward, backward] = self.statistics.as_ref()?.each_ref().map(counts);
-        let [width, height] = self.tile;
-        Some(format!("{width}x{height}: forward {forward}; backward {backward}\n"))
+        Some(format!("{}: forward {forward}; backward {backward}\n", self.tile))
     }
 }
 
@@ -320,8 +321,8 @@ mod tests {
     use super::*;
 
     fn case(channels: usize, times: &[([u32; 2], f64, f32)]) -> Case {
-        let measured = |&(tile, rasteriser, difference)| Measured {
-            tile,
+        let measured = |&(size, rasteriser, difference): &([u32; 2], _, _)| Measured {
+            tile: size.into(),
             intersections: 0,
             differences: (difference, 0.0),
             forward: 0.0,
@@ -340,8 +341,8 @@ mod tests {
             case(3, &[(small, 30.0, 0.0), (large, 20.0, 0.0), (wrong, 10.0, f32::NAN)]),
             case(11, &[(small, 5.0, 0.0), (large, 6.0, 0.0)]),
         ];
-        assert_eq!(fastest(&cases, 3), Some(TunedTile { channels: 3, tile: large }));
-        assert_eq!(fastest(&cases, 11), Some(TunedTile { channels: 11, tile: small }));
+        assert_eq!(fastest(&cases, 3), Some(TunedTile { channels: 3, tile: large.into() }));
+        assert_eq!(fastest(&cases, 11), Some(TunedTile { channels: 11, tile: small.into() }));
     }
 
     #[test]
