@@ -5,7 +5,7 @@
 use std::path::PathBuf;
 
 use nightsplat::Error;
-use nightsplat::tone::{CurveChoice, Family, TableInput, ToneCurve, ToneSettings};
+use nightsplat::tone::{CurveChoice, Family, Table, TableInput, ToneCurve, ToneSettings};
 use nightsplat::train::TrainConfig;
 
 /// A curve read from a file of that name and text.
@@ -153,4 +153,22 @@ fn a_rounded_curve_is_the_same_to_the_kernels_and_short() {
         assert!(short.to_string().len() <= 12, "{short}");
     }
     assert_eq!(short.clone().rounded(), short);
+}
+
+/// Between knots 0.1 and 0.4 the slopes are weighted harmonic means of the secants 3, 2/3 and 1/6: 1.2203390 and 2/7.
+#[test]
+fn between_its_knots_a_table_is_the_monotone_cubic() {
+    let table = |y: [f64; 4]| Table {
+        input: TableInput::T,
+        x: vec![0.0, 0.1, 0.4, 1.0],
+        y: vec![y.to_vec()],
+    };
+    let is_near =
+        |actual: f64, expected: f64| assert!((actual - expected).abs() < 1e-8, "{actual}");
+    is_near(table([0.0, 0.3, 0.5, 0.6]).value(0.25, 0), 0.435_048_426_150);
+    for x in [0.03, 0.2, 0.25, 0.9] {
+        is_near(table([0.0, 0.1, 0.4, 1.0]).value(x, 0), x);
+    }
+    // Level at a peak, and half way between two levels half way up.
+    is_near(table([0.0, 0.6, 0.4, 0.5]).value(0.25, 0), 0.5);
 }

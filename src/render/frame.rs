@@ -195,3 +195,41 @@ impl Frame {
         self.tiles.len() as u32
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_flag_is_read_from_its_own_bit() {
+        let read = |flags| Status::from_words(&[flags, 5, 7]);
+        let flags = |status: Status| {
+            [status.overflowed, status.not_finite, status.gradient_not_finite, status.crowd == 7]
+        };
+        let all = [STATUS_OVERFLOWED, STATUS_NOT_FINITE, STATUS_GRADIENT, STATUS_CROWDED];
+        for (own, flag) in all.into_iter().enumerate() {
+            assert_eq!(flags(read(flag)), [0, 1, 2, 3].map(|at| at == own));
+        }
+        assert_eq!((flags(read(0)), read(0).intersections), ([false; 4], 5));
+    }
+
+    /// The device counts what it allocates; rows of sixteen bytes, and numbers for whole partitions, are the rest.
+    #[cfg(feature = "io")]
+    #[test]
+    fn gaussians_and_intersections_take_the_bytes_that_are_foreseen() {
+        let gpu = Gpu::new(&crate::gpu::DeviceChoice::Best).unwrap();
+        for channels in [3, 11] {
+            let mut frame = Frame::new(&gpu, channels).unwrap();
+            let before = gpu.memory_in_use();
+            let (gaussians, intersections) = (100_000, 30_000);
+            frame.reserve(&gpu, [gaussians; 2], 0, 0).unwrap();
+            frame.set_intersection_capacity(&gpu, intersections).unwrap();
+            gpu.run("nothing", |_| Ok(())).unwrap();
+            gpu.free_unused();
+            let taken = (gpu.memory_in_use() - before) as f64;
+            let foreseen = gaussians * frame.bytes_per_gaussian()
+                + intersections as usize * frame.bytes_per_intersection();
+            assert!((taken / foreseen as f64 - 1.0).abs() < 0.01, "{taken} {foreseen}");
+        }
+    }
+}

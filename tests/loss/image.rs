@@ -381,6 +381,20 @@ fn l1_and_ssim_are_those_of_pytorch() {
 }
 
 #[test]
+fn the_gradient_of_both_is_that_of_each_by_its_weight() {
+    let gpu = gpu();
+    for (size, interior) in interiors() {
+        let images = images(size);
+        let [l1, ssim, both] = [0.0, 1.0, 0.3].map(|weight| {
+            evaluate_interior(&gpu, CURVE_AP3, weight, size, interior, TONE, &images).d_render
+        });
+        let expected: Vec<f32> =
+            l1.iter().zip(&ssim).map(|(l1, ssim)| 0.7 * l1 + 0.3 * ssim).collect();
+        assert_close("d_render", &both, &expected, 1e-6);
+    }
+}
+
+#[test]
 fn an_image_compared_with_itself_costs_nothing() {
     let gpu = gpu();
     let [_, low] = images([40, 30]);

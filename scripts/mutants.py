@@ -1,0 +1,294 @@
+#!/usr/bin/env python3
+"""Plants every mutant that cargo-mutants lists for some modules, builds them all at once, and shows which no test catches.
+
+    scripts/mutants.py [--minutes N] [--jobs N] [--tests LIST] [MODULE ...]
+
+A mutated function becomes a choice between its bodies by the environment variable NIGHTSPLAT_MUTANT, so that a mutant costs
+the tests that reach it and no build. It happens in a copy of the tree, target/mutants; what is known so far is kept there in
+JSON, and another run goes on with it. Mutants come in an order drawn by chance: a run that is cut off is a fair sample.
+
+  caught       a test that reaches it failed, or ran four times as long as it should
+  missed       all tests that reach it passed, or as many of them as fit in two minutes
+  unreached    no test of those that are run calls the function
+  unviable     it does not compile
+  unplanted    a body that cannot be chosen when it runs: of a constant function, or of an unnamed type
+
+Needs `cargo install cargo-mutants --locked`. Exit code 1 if a mutant was missed.
+"""
+
+import argparse
+import concurrent.futures
+import json
+import os
+import random
+import re
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter, defaultdict
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+WORK = ROOT / "target" / "mutants"
+TREE = WORK / "tree"
+MODULES = ["optimizer", "densify", "loss", "render", "tone"]
+TESTS = ("batches curve_files curves densify embedding exposure fit gradients halves limits loss masks not_finite optimizer "
+         "parts patches precision pseudo_gt render tone tone_command training view_exposures window")
+# Of the tests that reach a mutant, those that take together so many seconds are run, the quickest first.
+MOST_SECONDS = 120
+
+CHOICE = """//! Which mutant is in place of the code, and what was reached.
+
+use std::io::Write;
+use std::sync::OnceLock;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+static REACHED: [AtomicBool; SITES] = [const { AtomicBool::new(false) }; SITES];
+
+/// The mutant in place; notes that its function was reached.
+pub fn mutant(site: usize) -> u32 {
+    static MUTANT: OnceLock<u32> = OnceLock::new();
+    if !REACHED[site].swap(true, Ordering::Relaxed) {
+        if let Ok(path) = std::env::var("NIGHTSPLAT_REACHED") {
+            let file = std::fs::OpenOptions::new().create(true).append(true).open(path);
+            file.unwrap().write_all(format!("{site}\\n").as_bytes()).unwrap();
+        }
+    }
+    *MUTANT.get_or_init(|| {
+        std::env::var("NIGHTSPLAT_MUTANT").map_or(0, |number| number.parse().unwrap())
+    })
+}
+"""
+
+
+def listed(modules):
+    """The mutants of some modules, numbered from 1."""
+    files = subprocess.run(["git", "ls-files", "src"], cwd=ROOT, check=True, capture_output=True, text=True).stdout.split()
+    own = [file for file in files if re.match(rf"src/({'|'.join(modules)})(\.rs$|/.*\.rs$)", file)]
+    files = [argument for file in own for argument in ("-f", file)]
+    try:
+        run = subprocess.run(["cargo-mutants", "mutants", "--list", "--json", *files], cwd=ROOT, capture_output=True, text=True)
+    except FileNotFoundError:
+        sys.exit("cargo-mutants is not installed: `cargo install cargo-mutants --locked`")
+    if run.returncode != 0:
+        sys.exit(run.stderr)
+    return [dict(mutant, number=number) for number, mutant in enumerate(json.loads(run.stdout), 1)]
+
+
+def offset(lines, place):
+    """Where a place lies in the text of a file."""
+    return sum(len(line) for line in lines[:place["line"] - 1]) + place["column"] - 1
+
+
+def body_at(text):
+    """Where the body of a function begins in its text: at the first brace outside of parentheses."""
+    depth = 0
+    for at, char in enumerate(text):
+        depth += (char in "([") - (char in ")]")
+        if char == "{" and depth == 0:
+            return at
+    return None
+
+
+def planted(source, mutants, site):
+    """The text of a file with all its mutants, and the number of its first site; notes where each lies and its site."""
+    lines = source.splitlines(keepends=True)
+    functions = defaultdict(list)
+    for mutant in mutants:
+        functions[tuple(offset(lines, mutant["function"]["span"][end]) for end in ("start", "end"))].append(mutant)
+    text, last = "", 0
+    for (start, end), own in sorted(functions.items()):
+        function = source[start:end]
+        body = start + body_at(function)
+        text += source[last:body] + f"{{\nmatch crate::mutant::mutant({site}) {{\n"
+        for mutant in own:
+            begin, stop = (offset(lines, mutant["span"][end]) for end in ("start", "end"))
+            arm = source[body:begin] + " " + mutant["replacement"] + " " + source[stop:end]
+            first = text.count("\n") + 1
+            text += f"{mutant['number']} => {arm}\n"
+            mutant.update(site=site, lines=[first, text.count("\n")])
+        text += f"_ => {source[body:end]}\n}}\n}}"
+        last, site = end, site + 1
+    return text + source[last:], site
+
+
+def plant(mutants):
+    """Writes the copy of the tree with these mutants."""
+    files = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, check=True, capture_output=True, text=True).stdout.split("\0")
+    for file in filter(None, files):
+        (TREE / file).parent.mkdir(parents=True, exist_ok=True)
+        text = (ROOT / file).read_bytes()
+        if not (TREE / file).exists() or (TREE / file).read_bytes() != text:
+            shutil.copy2(ROOT / file, TREE / file)
+    by_file, site = defaultdict(list), 0
+    for mutant in mutants:
+        by_file[mutant["file"]].append(mutant)
+    for file, own in by_file.items():
+        text, site = planted((ROOT / file).read_text(), own, site)
+        (TREE / file).write_text(text)
+    (TREE / "src/mutant.rs").write_text(CHOICE.replace("SITES", str(site)))
+    library = (ROOT / "src/lib.rs").read_text()
+    first = re.search(r"^(?!//|#!|\s*$)", library, re.M).start()
+    (TREE / "src/lib.rs").write_text(library[:first] + "#[doc(hidden)]\npub mod mutant;\n" + library[first:])
+
+
+def messages(*arguments):
+    """What cargo says of the copy."""
+    run = subprocess.run(["cargo", *arguments, "--message-format=json"], cwd=TREE, capture_output=True, text=True)
+    said = [json.loads(line) for line in run.stdout.splitlines() if line.startswith("{")]
+    return run, said
+
+
+def viable(mutants):
+    """Those that compile, planted."""
+    while True:
+        plant(mutants)
+        run, said = messages("check", "--lib")
+        if run.returncode == 0:
+            return mutants
+        broken = set()
+        for error in (message["message"] for message in said if message.get("message")):
+            spans = list(error["spans"]) if error["level"] == "error" else []
+            # What a macro made is where it was called.
+            for span in spans:
+                spans += [span["expansion"]["span"]] if span["expansion"] else []
+                line = span["line_start"]
+                broken |= {mutant["number"] for mutant in mutants if mutant["file"] == span["file_name"]
+                           and mutant["lines"][0] <= line <= mutant["lines"][1]}
+        if not broken:
+            sys.exit(run.stderr[-4000:])
+        print(f"{len(broken)} of {len(mutants)} mutants do not compile", flush=True)
+        mutants = [mutant for mutant in mutants if mutant["number"] not in broken]
+
+
+def built(tests):
+    """The test programs, by name."""
+    names = [argument for test in tests for argument in ("--test", test)]
+    run, said = messages("test", "--no-run", "--lib", *names)
+    if run.returncode != 0:
+        sys.exit(run.stderr[-4000:])
+    programs = [message for message in said if message.get("executable") and message["profile"]["test"]]
+    return {message["target"]["name"]: message["executable"] for message in programs}
+
+
+def run_tests(program, names, seconds, **variables):
+    """Whether tests pass in time; and how long they took."""
+    begin = time.monotonic()
+    try:
+        run = subprocess.run([program, "--exact", "--test-threads", "1", *names], cwd=TREE, timeout=seconds, env=dict(os.environ, **variables),
+                             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+        passes = run.returncode == 0
+    except subprocess.TimeoutExpired:
+        passes = False
+    return passes, time.monotonic() - begin
+
+
+def reach(programs, jobs):
+    """Of every test: its program, how long it takes, and the sites that it reaches."""
+    kept = WORK / "reach.json"
+    known = json.loads(kept.read_text()) if kept.exists() else {}
+
+    def one(program, name):
+        key = f"{program} {name}"
+        if key not in known:
+            file = WORK / f"reached-{abs(hash(key))}"
+            file.unlink(missing_ok=True)
+            passes, seconds = run_tests(programs[program], [name], 300, NIGHTSPLAT_REACHED=str(file))
+            sites = sorted({int(line) for line in file.read_text().split()}) if file.exists() else []
+            file.unlink(missing_ok=True)
+            known[key] = {"program": program, "name": name, "passes": passes, "seconds": seconds, "sites": sites}
+
+    with concurrent.futures.ThreadPoolExecutor(jobs) as pool:
+        for program, path in programs.items():
+            tests = subprocess.run([path, "--list"], cwd=TREE, check=True, capture_output=True, text=True).stdout
+            names = [line.removesuffix(": test") for line in tests.splitlines() if line.endswith(": test")]
+            list(pool.map(lambda name: one(program, name), names))
+            print(f"{program}: {len(names)} tests", flush=True)
+            kept.write_text(json.dumps(known))
+    return list(known.values())
+
+
+def verdict(mutant, tests, programs):
+    """What becomes of a mutant, and of which test."""
+    own = sorted((test for test in tests if mutant["site"] in test["sites"] and test["passes"]), key=lambda test: test["seconds"])
+    if not own:
+        return "unreached", None
+    spent = 0.0
+    while own and spent < MOST_SECONDS:
+        # Those of a program that are quick together.
+        program, group, seconds = own[0]["program"], [], 0.0
+        for test in own:
+            if test["program"] == program and (not group or seconds + test["seconds"] < 2 + spent):
+                group.append(test)
+                seconds += test["seconds"]
+        own = [test for test in own if test not in group]
+        names = [test["name"] for test in group]
+        passes, took = run_tests(programs[program], names, 4 * seconds + 20, NIGHTSPLAT_MUTANT=str(mutant["number"]))
+        if not passes:
+            return "caught", f"{program}: {names[0]}" + (f" or {len(names) - 1} more" if len(names) > 1 else "")
+        spent += took
+    return "missed", f"{len(own)} slow tests were not run" if own else None
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("modules", nargs="*", default=MODULES, metavar="MODULE", help="of src/, " + ", ".join(MODULES) + " where none is named")
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="ends after so many")
+    parser.add_argument("--jobs", type=int, default=2, help="tests that run side by side")
+    parser.add_argument("--tests", default=TESTS, help="test programs beside the library's own tests")
+    options = parser.parse_args()
+    end = time.monotonic() + 60 * options.minutes
+    WORK.mkdir(parents=True, exist_ok=True)
+
+    everything = listed(options.modules)
+    unplanted = [mutant for mutant in everything if not mutant["function"] or "impl " in (mutant["function"]["return_type"] or "")
+                 or "StructField" == mutant["genre"] or is_constant(mutant)]
+    candidates = [mutant for mutant in everything if mutant not in unplanted]
+    mutants = viable(candidates)
+    programs = built(options.tests.split())
+    tests = reach(programs, options.jobs)
+    slow = [test["name"] for test in tests if not test["passes"]]
+    print(f"not counted on, as they fail alone: {', '.join(slow) or 'none'}")
+
+    kept, lock = WORK / "verdicts.json", threading.Lock()
+    verdicts = json.loads(kept.read_text()) if kept.exists() else {}
+    random.Random(1).shuffle(mutants)
+
+    def judge(mutant):
+        name = mutant["name"]
+        if name not in verdicts and time.monotonic() < end:
+            own = verdict(mutant, tests, programs)
+            with lock:
+                verdicts[name] = own
+                kept.write_text(json.dumps(verdicts, indent=1))
+            if verdicts[name][0] == "missed":
+                print("missed:", name, verdicts[name][1] or "", flush=True)
+
+    with concurrent.futures.ThreadPoolExecutor(options.jobs) as pool:
+        list(pool.map(judge, mutants))
+
+    counts = defaultdict(Counter)
+    numbers = {mutant["number"] for mutant in mutants}
+    for mutant in everything:
+        module = re.match(r"src/(\w+)", mutant["file"])[1]
+        what = verdicts.get(mutant["name"], ("not run",))[0] if mutant["number"] in numbers else \
+            "unplanted" if mutant in unplanted else "unviable"
+        counts[module][what] += 1
+    columns = ["caught", "missed", "unreached", "unviable", "unplanted", "not run"]
+    print(f"{'':12}" + "".join(f"{column:>11}" for column in columns))
+    for module, count in counts.items():
+        print(f"{module:12}" + "".join(f"{count[column]:11}" for column in columns))
+    sys.exit(any(count["missed"] for count in counts.values()))
+
+
+def is_constant(mutant):
+    """Whether its function is one that the compiler runs."""
+    start = mutant["function"]["span"]["start"]
+    line = (ROOT / mutant["file"]).read_text().splitlines()[start["line"] - 1]
+    return "const " in line[start["column"] - 1:].split("(")[0]
+
+
+if __name__ == "__main__":
+    main()
