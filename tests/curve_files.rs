@@ -155,6 +155,18 @@ fn a_rounded_curve_is_the_same_to_the_kernels_and_short() {
     assert_eq!(short.clone().rounded(), short);
 }
 
+#[test]
+fn a_cube_begins_where_its_domain_does() {
+    let table = Table::from_cube(
+        "LUT_1D_SIZE 3\nDOMAIN_MIN 0.2 0.2 0.2\nDOMAIN_MAX 0.6 0.6 0.6\n0 0 0\n0.5 0.5 0.5\n1 1 1\n",
+    );
+    let x = table.unwrap().x;
+    assert!(
+        x.iter().zip([0.2, 0.4, 0.6]).all(|(x, expected)| (x - expected).abs() < 1e-12),
+        "{x:?}"
+    );
+}
+
 /// Between knots 0.1 and 0.4 the slopes are weighted harmonic means of the secants 3, 2/3 and 1/6: 1.2203390 and 2/7.
 #[test]
 fn between_its_knots_a_table_is_the_monotone_cubic() {

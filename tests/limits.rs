@@ -261,17 +261,21 @@ fn crowd(count: usize) -> Setup {
 
 #[test]
 fn a_hundred_thousand_splats_on_one_pixel_are_blended_as_the_references_say() {
-    let setup = crowd(100_000);
-    let (_, report) = gpu().checked(|| {
-        let mut rendered = setup.render();
-        rendered.backward(&vec![1.0; 3 * setup.pixels()])
-    });
-    report.agree().unwrap();
-    let passed: HashSet<_> = report.passes.iter().map(|pass| pass.kernel).collect();
-    assert!(
-        ["emit", "blend_forward", "blend_backward", "reduce_records"].map(|k| passed.contains(k))
-            == [true; 4]
-    );
+    let mut setup = crowd(100_000);
+    // Where four subgroups share a tile, each turns over its parts as well.
+    let shared = Tile { size: [16, 16], subgroups: 4 };
+    for tile in [None, Some(shared).filter(|&tile| gpu().properties().suits_tile(tile))] {
+        setup.settings.tile = tile;
+        let (_, report) = gpu().checked(|| {
+            let mut rendered = setup.render();
+            rendered.backward(&vec![1.0; 3 * setup.pixels()])
+        });
+        report.agree().unwrap();
+        let passed: HashSet<_> = report.passes.iter().map(|pass| pass.kernel).collect();
+        for kernel in ["emit", "blend_forward", "blend_backward", "reduce_records"] {
+            assert!(passed.contains(kernel), "{kernel} of {tile:?}");
+        }
+    }
 }
 
 #[test]

@@ -13,8 +13,10 @@ use crate::scene::{Features, MAX_SH_DEGREE, Shape};
 
 /// From the few pixels of a narrow subgroup to 32 rows of a wide one.
 const SIZES: [[u32; 2]; 7] = [[8, 4], [8, 8], [16, 4], [16, 8], [16, 16], [32, 8], [32, 16]];
-/// So many subgroups share a tile. On a processor one has it: there a barrier ends one loop over all lanes and begins another.
+/// So many subgroups share a tile of as many pixels or more. On a processor one has it: there a barrier ends one loop over
+/// all lanes and begins another.
 const SUBGROUPS: [u32; 3] = [1, 2, 4];
+const SHARED_PIXELS: u32 = 256;
 
 /// Colour alone, and every feature: 3 and 11 channels.
 const FEATURES: [Features; 2] = [Features::NONE, Features::ALL];
@@ -130,9 +132,13 @@ impl Case {
         let parameters = scene.upload(gpu)?;
         let subgroups = if gpu.properties().is_cpu { &SUBGROUPS[..1] } else { &SUBGROUPS };
         let sharing = |size| subgroups.iter().map(move |&subgroups| Tile { size, subgroups });
-        let tiles = SIZES.into_iter().flat_map(sharing);
+        let is_tried = |tile: &Tile| {
+            let pixels = tile.size[0] * tile.size[1];
+            let is_large = tile.subgroups == 1 || pixels >= SHARED_PIXELS;
+            is_large && gpu.properties().suits_tile(*tile)
+        };
         let (mut candidates, mut first) = (vec![], None);
-        for tile in tiles.filter(|&tile| gpu.properties().suits_tile(tile)) {
+        for tile in SIZES.into_iter().flat_map(sharing).filter(is_tried) {
             let settings = RenderSettings { shape, tile: Some(tile), ..RenderSettings::default() };
             let mut renderer = Renderer::new(gpu, settings)?;
             renderer.reserve(gaussians, [&camera])?;
