@@ -1,11 +1,12 @@
 #!/usr/bin/env python3
 """Plants every mutant that cargo-mutants lists for some modules, builds them all at once, and shows which no test catches.
 
-    scripts/mutants.py [--minutes N] [--jobs N] [--tests LIST] [MODULE ...]
+    scripts/mutants.py [--minutes N] [--jobs N] [--seed N] [--tests LIST] [MODULE ...]
 
 A mutated function becomes a choice between its bodies by the environment variable NIGHTSPLAT_MUTANT, so that a mutant costs
 the tests that reach it and no build. It happens in a copy of the tree, target/mutants; what is known so far is kept there in
-JSON, and another run goes on with it. Mutants come in an order drawn by chance: a run that is cut off is a fair sample.
+JSON, and another run goes on with it as long as no file of the tree changes. Mutants come in an order drawn by chance: a run
+that is cut off is a fair sample.
 
   caught       a test that reaches it failed, or ran four times as long as it should
   missed       all tests that reach it passed, or as many of them as fit in two minutes
@@ -18,6 +19,7 @@ Needs `cargo install cargo-mutants --locked`. Exit code 1 if a mutant was missed
 
 import argparse
 import concurrent.futures
+import hashlib
 import json
 import os
 import random
@@ -38,6 +40,9 @@ TESTS = ("batches curve_files curves densify embedding exposure faults fit gradi
          "parts patches precision pseudo_gt render tone tone_command training view_exposures window")
 # Of the tests that reach a mutant, those that take together so many seconds are run, the quickest first.
 MOST_SECONDS = 120
+# Tests of a program run together as long as that takes no more than this beside what was spent before: a mutant that quick
+# tests catch costs little, and the slow ones are started seldom.
+START_SECONDS = 2
 
 CHOICE = """//! Which mutant is in place of the code, and what was reached.
 
@@ -114,10 +119,25 @@ def planted(source, mutants, site):
     return text + source[last:], site
 
 
+def tracked():
+    """The files of the tree, as git knows them."""
+    run = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, check=True, capture_output=True, text=True)
+    return [file for file in run.stdout.split("\0") if (ROOT / file).is_file()]
+
+
+def kept_in():
+    """Where what is known of the tree as it is now is kept."""
+    digest = hashlib.sha256()
+    for file in tracked():
+        digest.update(file.encode() + b"\0" + (ROOT / file).read_bytes())
+    folder = WORK / digest.hexdigest()[:16]
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
 def plant(mutants):
     """Writes the copy of the tree with these mutants."""
-    files = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, check=True, capture_output=True, text=True).stdout.split("\0")
-    for file in filter(None, files):
+    for file in tracked():
         (TREE / file).parent.mkdir(parents=True, exist_ok=True)
         text = (ROOT / file).read_bytes()
         if not (TREE / file).exists() or (TREE / file).read_bytes() != text:
@@ -185,9 +205,8 @@ def run_tests(program, names, seconds, **variables):
     return passes, time.monotonic() - begin
 
 
-def reach(programs, jobs):
-    """Of every test: its program, how long it takes, and the sites that it reaches."""
-    kept = WORK / "reach.json"
+def reach(programs, jobs, kept):
+    """Of every test: its program, how long it takes, and the sites that it reaches; kept in a file."""
     known = json.loads(kept.read_text()) if kept.exists() else {}
 
     def one(program, name):
@@ -217,10 +236,9 @@ def verdict(mutant, tests, programs):
         return "unreached", None
     spent = 0.0
     while own and spent < MOST_SECONDS:
-        # Those of a program that are quick together.
         program, group, seconds = own[0]["program"], [], 0.0
         for test in own:
-            if test["program"] == program and (not group or seconds + test["seconds"] < 2 + spent):
+            if test["program"] == program and (not group or seconds + test["seconds"] < START_SECONDS + spent):
                 group.append(test)
                 seconds += test["seconds"]
         own = [test for test in own if test not in group]
@@ -237,10 +255,11 @@ def main():
     parser.add_argument("modules", nargs="*", default=MODULES, metavar="MODULE", help="of src/, " + ", ".join(MODULES) + " where none is named")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="ends after so many")
     parser.add_argument("--jobs", type=int, default=2, help="tests that run side by side")
+    parser.add_argument("--seed", type=int, default=1, help="of the order that they come in")
     parser.add_argument("--tests", default=TESTS, help="test programs beside the library's own tests")
     options = parser.parse_args()
     end = time.monotonic() + 60 * options.minutes
-    WORK.mkdir(parents=True, exist_ok=True)
+    known = kept_in()
 
     everything = listed(options.modules)
     unplanted = [mutant for mutant in everything if not mutant["function"] or "impl " in (mutant["function"]["return_type"] or "")
@@ -248,13 +267,13 @@ def main():
     candidates = [mutant for mutant in everything if mutant not in unplanted]
     mutants = viable(candidates)
     programs = built(options.tests.split())
-    tests = reach(programs, options.jobs)
+    tests = reach(programs, options.jobs, known / "reach.json")
     failing = [test["name"] for test in tests if not test["passes"]]
     print(f"not counted on, as they fail without a mutant: {', '.join(failing) or 'none'}")
 
-    kept, lock = WORK / "verdicts.json", threading.Lock()
+    kept, lock = known / "verdicts.json", threading.Lock()
     verdicts = json.loads(kept.read_text()) if kept.exists() else {}
-    random.Random(1).shuffle(mutants)
+    random.Random(options.seed).shuffle(mutants)
 
     def judge(mutant):
         name = mutant["name"]

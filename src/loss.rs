@@ -336,3 +336,29 @@ fn check_weight(of: &str, weight: f64) -> Result<()> {
     }
     Err(Error::Usage(format!("the weight of {of} is {weight}; it must be 0 or more")))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::testing::gpu;
+
+    /// Another plane would still train, on the wrong thing.
+    #[test]
+    fn a_term_reads_the_first_channel_of_its_feature() {
+        let gpu = gpu();
+        let (image, tone) = (gpu.zeros("image", 1).unwrap(), gpu.uninit("tone", 1).unwrap());
+        let features = Features { depth: true, structure: true, noise: true, illumination: true };
+        let inputs = TermInputs {
+            step: 1,
+            view: 0,
+            size: UVec2::ONE,
+            features,
+            render: &image,
+            colors: &image,
+            low: &image,
+            tone: &tone,
+        };
+        let all = [Feature::Depth, Feature::Structure, Feature::Noise, Feature::Illumination];
+        assert_eq!(all.map(|feature| inputs.plane(feature)), [3, 4, 5, 8]);
+    }
+}

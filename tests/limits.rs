@@ -11,7 +11,7 @@ use nightsplat::gpu::{Threads, Tile};
 use nightsplat::kernels::status::STATUS_CROWDED;
 use nightsplat::kernels::{ProjectedSplat, blend_forward, emit, order_counts, reduce_records};
 use nightsplat::reference::gaussian::Gaussian;
-use nightsplat::render::{Renderer, Status};
+use nightsplat::render::{RenderSettings, Renderer, Status};
 
 #[macro_use]
 mod common;
@@ -240,6 +240,25 @@ fn a_view_has_at_most_the_tiles_that_a_subgroup_of_gaussians_that_cover_them_all
         [d_splats]
     );
     assert!(sums.iter().all(|&sum| sum == Vec3::splat(tiles as f32)), "{sums:?}");
+}
+
+/// What the refusal of a view names as the longest side is one that fits, and not much less than could.
+#[test]
+fn a_refused_view_names_a_longest_side_that_fits() {
+    let gpu = gpu();
+    let settings = RenderSettings::default();
+    for size in [[1 << 16, 1 << 15], [1 << 15, 1 << 17], [1 << 18, 1 << 18]] {
+        let refused = settings.check_size(&gpu, "night.png", size).unwrap_err().to_string();
+        let view = format!("view night.png is {}x{}: it", size[0], size[1]);
+        assert!(refused.starts_with(&view), "{refused}");
+        let longest: f64 = refused.rsplit(' ').next().unwrap().parse().unwrap();
+        let shrunk = |longest: f64| {
+            let share = longest / f64::from(size[0].max(size[1]));
+            size.map(|side| (f64::from(side) * share).round() as u32)
+        };
+        settings.check_size(&gpu, "", shrunk(longest)).unwrap();
+        assert!(settings.check_size(&gpu, "", shrunk(1.05 * longest)).is_err(), "{refused}");
+    }
 }
 
 /// So many faint splats, one behind the other, on one pixel.

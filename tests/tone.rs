@@ -6,7 +6,9 @@ use std::path::{Path, PathBuf};
 
 use nightsplat::Error;
 use nightsplat::image::Image;
-use nightsplat::tone::{Statistics, ToneCurve, ToneParameters, ToneSettings, percentile};
+use nightsplat::tone::{
+    GainChoice, Statistics, ToneCurve, ToneParameters, ToneSettings, percentile,
+};
 
 mod common;
 use common::{fixture, shared};
@@ -359,4 +361,16 @@ fn a_curve_alone_reaches_its_known_psnr_on_the_test_views() {
             assert!(error < 0.0075, "{scene} {curve} c = {gain_c}: {score}");
         }
     }
+}
+
+/// A gain of one's own ends what asking the photographs for one began, and nothing else.
+#[test]
+fn a_gain_replaces_the_choice_of_one_and_leaves_what_was_lifted_first() {
+    let ap3 = ToneSettings::new(ToneCurve::Ap3);
+    let auto = ap3.clone().with_gain(GainChoice::Auto);
+    assert!(auto.auto_gain && auto.lift_first);
+    let own = |settings: ToneSettings| settings.with_gain(GainChoice::C(2.0));
+    assert_eq!(own(auto), ToneSettings { gain_c: 2.0, ..ap3.clone() });
+    let lifted = ToneSettings { lift_first: true, ..ap3 };
+    assert_eq!(own(lifted.clone()), ToneSettings { gain_c: 2.0, ..lifted });
 }

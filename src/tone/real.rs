@@ -191,3 +191,19 @@ impl Real for Dual {
         self.chain(self.value.atan(), 1.0 / (1.0 + self.value * self.value))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::Real;
+
+    /// As a difference from 1 it would be off by a thousandth of itself where it is small.
+    #[test]
+    fn one_minus_exp_is_exact_to_a_few_roundings_where_it_is_small_too() {
+        for i in 0..4000 {
+            let x = 1e-8 * 1.006_f32.powi(i);
+            let (single, double) = (x.one_minus_exp(), f64::from(x).one_minus_exp());
+            let bound = if x < 0.01 { 2e-7 } else { 1e-5 };
+            assert!((f64::from(single) / double - 1.0).abs() < bound, "{x}: {single} {double}");
+        }
+    }
+}

@@ -7,7 +7,8 @@ mod host;
 use glam::{DAffine3, DVec2, DVec3, Quat, Vec3};
 use nightsplat::camera::Camera;
 use nightsplat::densify::{
-    Densifier, DensifyInputs, DensifyReport, DensifySettings, DeviceGaussians, Round,
+    Densifier, DensifyInputs, DensifyReport, DensifySettings, DensityControl, DeviceGaussians,
+    Round,
 };
 use nightsplat::gpu::testing::gpu;
 use nightsplat::halves::Bits;
@@ -244,8 +245,20 @@ fn the_same_pass_leaves_the_same_bits_and_another_step_or_seed_other_ones() {
     assert!(first == bits(10, 600));
     assert!(first != bits(10, 800));
     assert!(first != bits(11, 600));
-    // Seeds that differ above 32 bits are other seeds.
+    // Seeds that differ above 32 bits are other seeds, even where the bits below are set, too.
     assert!(first != bits(10 | 1 << 40, 600));
+    assert!(first != bits(10 | 10 << 32, 600));
+}
+
+#[test]
+fn a_density_control_is_told_by_its_name() {
+    for (name, control) in
+        [("conserving", DensityControl::Conserving), ("paper", DensityControl::Paper)]
+    {
+        assert_eq!(name.parse::<DensityControl>().unwrap(), control);
+    }
+    let refused = "Paper".parse::<DensityControl>().unwrap_err().to_string();
+    assert_eq!(refused, "unknown density control `Paper`; conserving or paper");
 }
 
 #[test]
@@ -266,13 +279,23 @@ fn settings_that_make_no_sense_are_refused() {
 fn a_buffer_that_is_too_short_is_refused() {
     let gpu = gpu();
     let mut densifier = Densifier::new(&gpu, SETTINGS, &[]).unwrap();
-    for (short, columns) in [(0, 14), (1, 14), (2, 14), (3, 14), (4, 14), (5, 13)] {
+    let needs = |has, needed| format!("holds {has} elements, density control needs {needed}");
+    let no_gaussian = |columns| format!("density control: {columns} floats make no Gaussian");
+    for (short, [columns, features], why) in [
+        (0, [14, 0], needs(27, 28)),
+        (1, [14, 0], needs(27, 28)),
+        (2, [14, 0], needs(27, 28)),
+        (3, [14, 0], needs(1, 2)),
+        (4, [14, 0], needs(1, 2)),
+        (5, [13, 0], no_gaussian(13)),
+        (5, [16, 3], no_gaussian(16)),
+    ] {
         let len = |index: usize, len: usize| if index == short { len - 1 } else { len };
-        let planes = |index| gpu.zeros("planes", len(index, 28)).unwrap();
+        let planes = |index| gpu.zeros("planes", len(index, 2 * columns as usize)).unwrap();
         let mut gaussians = DeviceGaussians {
             count: 2,
             column_count: columns,
-            feature_count: 0,
+            feature_count: features,
             rest: Bits::Single,
             parameters: planes(0),
             moments: Moments::Single { first: planes(1), second: planes(2) },
@@ -282,7 +305,8 @@ fn a_buffer_that_is_too_short_is_refused() {
             visit_counts: &mut gpu.zeros("visit_counts", len(4, 2)).unwrap(),
             gradients: &mut planes(6),
         };
-        assert!(densifier.densify(&mut gaussians, inputs, LAST).is_err(), "{short}");
+        let refused = densifier.densify(&mut gaussians, inputs, LAST).unwrap_err().to_string();
+        assert!(refused.contains(&why), "{short}: {refused}");
     }
 }
 

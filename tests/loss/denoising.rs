@@ -211,19 +211,25 @@ fn what_does_not_fit_is_refused() {
     }
     let mut loss = DenoisingLoss::new(&gpu, WEIGHTS).unwrap();
     loss.reserve(UVec2::splat(8)).unwrap();
-    let image = gpu.zeros("image", 192).unwrap();
     let whole = |size: [u32; 2]| (size.into(), Interior::whole(size.into()));
     let outside = Interior { origin: UVec2::splat(1), size: UVec2::splat(8) };
-    for (size, interior) in
-        [whole([0, 8]), whole([9, 8]), whole([100, 100]), (UVec2::splat(8), outside)]
-    {
-        let [mut d_denoised, mut d_render] = [0; 2].map(|_| gpu.zeros("d", 192).unwrap());
+    // Buffers of 8 x 8 pixels, and some that are longer than the scratch memory is for.
+    for (len, (size, interior), why) in [
+        (192, whole([0, 8]), "0 x 8"),
+        (192, whole([9, 8]), "9 x 8"),
+        (190, whole([8, 8]), "holds 190 values, the view has 192"),
+        (30_000, whole([100, 100]), "100 x 100"),
+        (192, (UVec2::splat(8), outside), "interior"),
+    ] {
+        let image = gpu.zeros("image", len).unwrap();
+        let [mut d_denoised, mut d_render] = [0; 2].map(|_| gpu.zeros("d", len).unwrap());
         let logged = log_step(&gpu, |pass, log| {
             let inputs = DenoisingInputs { size, interior, denoised: &image, render: &image };
             let gradients =
                 DenoisingGradients { d_denoised: &mut d_denoised, d_render: &mut d_render };
             loss.record(pass, inputs, gradients, log)
         });
-        assert!(logged.is_err(), "{size} {interior:?}");
+        let refused = logged.err().unwrap().to_string();
+        assert!(refused.contains(why), "{size} {interior:?}: {refused}");
     }
 }

@@ -331,9 +331,12 @@ fn what_does_not_fit_is_refused() {
     }
     let mut loss = DepthLoss::new(&gpu, DepthSettings { weight: 0.1, box_side: 4 }).unwrap();
     loss.reserve(UVec2::splat(16)).unwrap();
-    let plane = gpu.buffer("plane", &vec![0.5f32; 256]).unwrap();
-    for (size, plane_index) in [([0, 8], 0), ([16, 16], 1), ([17, 16], 0), ([256, 256], 0)] {
-        let mut d_render = gpu.zeros("d_render", 256).unwrap();
+    // Narrower than any box, with more chunks than all boxes of the view reserved for.
+    let strip = [3, 16 * chunk_size()];
+    let long = 3 * strip[1] as usize;
+    let mut refuses = |len: usize, size: [u32; 2], plane_index, why: &str| {
+        let plane = gpu.buffer("plane", &vec![0.5f32; len]).unwrap();
+        let mut d_render = gpu.zeros("d_render", len).unwrap();
         let inputs = DepthInputs {
             size: size.into(),
             render: &plane,
@@ -343,6 +346,35 @@ fn what_does_not_fit_is_refused() {
             step: 0,
         };
         let logged = log_step(&gpu, |pass, log| loss.record(pass, inputs, &mut d_render, log));
-        assert!(logged.is_err(), "{size:?} {plane_index}");
+        let refused = logged.err().unwrap().to_string();
+        assert!(refused.contains(why), "{size:?} {plane_index}: {refused}");
+    };
+    refuses(256, [0, 8], 0, "no scratch memory for a view of 0 x 8");
+    refuses(256, [16, 16], 1, "holds 256 values, the view has 512");
+    refuses(256, [17, 16], 0, "no scratch memory for a view of 17 x 16");
+    refuses(long, [256, 256], 0, "no scratch memory for a view of 256 x 256");
+    refuses(long, strip, 0, "no scratch memory for a view of 3 x");
+}
+
+/// Chunks there are enough of, but not regions.
+#[test]
+fn more_boxes_than_were_reserved_for_are_refused() {
+    let gpu = gpu();
+    let mut loss = DepthLoss::new(&gpu, DepthSettings { weight: 0.1, box_side: 4 }).unwrap();
+    for size in [[16, 16], [3, 64 * chunk_size()]] {
+        loss.reserve(size.into()).unwrap();
     }
+    let plane = gpu.buffer("plane", &[0.5f32; 512]).unwrap();
+    let mut d_render = gpu.zeros("d_render", 512).unwrap();
+    let inputs = DepthInputs {
+        size: [32, 16].into(),
+        render: &plane,
+        plane: 0,
+        depth: &plane,
+        stream: Stream::new(0, 0),
+        step: 0,
+    };
+    let logged = log_step(&gpu, |pass, log| loss.record(pass, inputs, &mut d_render, log));
+    let refused = logged.err().unwrap().to_string();
+    assert!(refused.contains("no scratch memory for a view of 32 x 16"), "{refused}");
 }
