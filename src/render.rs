@@ -11,12 +11,13 @@
 mod frame;
 mod limits;
 mod pictures;
+mod room;
 mod settings;
 
 use glam::{UVec2, Vec2};
 
 use crate::batches::Batches;
-use crate::camera::{Camera, Patch};
+use crate::camera::Patch;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Statistic, Threads, Tile};
 use crate::halves::Bits;
 use crate::kernels::project::DEPTH_BITS;
@@ -33,7 +34,7 @@ use crate::{Error, Result};
 pub use frame::Frame;
 use frame::RANKS_PER_PARTITION;
 pub use frame::Status;
-use limits::{longest_run, most_tiles, splats_per_turn};
+use limits::{longest_run, splats_per_turn};
 pub use settings::RenderSettings;
 
 /// What changes from render to render.
@@ -166,101 +167,12 @@ impl Renderer {
         Ok(())
     }
 
-    /// Makes room for `gaussian_count` Gaussians and the images of `cameras`, or their patches.
-    ///
-    /// # Errors
-    /// The device is out of memory.
-    pub fn reserve<'a>(
-        &mut self,
-        gaussian_count: usize,
-        cameras: impl IntoIterator<Item = &'a Camera>,
-    ) -> Result<()> {
-        let mut sizes = vec![];
-        for camera in cameras {
-            sizes.extend(self.patches(camera).iter().map(|patch| patch.size));
-        }
-        self.reserve_with_headroom([gaussian_count; 2], sizes)
-    }
-
-    /// The same for images of these sizes and a number of Gaussians, and where that needs more memory, for another number
-    /// that may follow.
-    ///
-    /// # Errors
-    /// The device is out of memory, or cannot follow so many tiles.
-    pub fn reserve_with_headroom(
-        &mut self,
-        [gaussian_count, capacity]: [usize; 2],
-        sizes: impl IntoIterator<Item = UVec2>,
-    ) -> Result<()> {
-        let (mut pixels, mut tiles) = (0, 0);
-        for size in sizes {
-            let UVec2 { x, y } = self.tiles(size);
-            pixels = pixels.max(size.x as usize * size.y as usize);
-            tiles = tiles.max(x as usize * y as usize);
-            if x as usize * y as usize > most_tiles(&self.gpu) {
-                return Err(self.too_many_tiles(size));
-            }
-        }
-        self.frame.reserve(&self.gpu, [gaussian_count, capacity], pixels, tiles)
-    }
-
-    /// Makes room for `intersections`, and half as many again where the device can bind them; what room there is stays.
-    ///
-    /// # Errors
-    /// The device is out of memory, or cannot bind so many.
-    pub fn grow(&mut self, intersections: u32) -> Result<()> {
-        let headroom =
-            intersections.saturating_add(intersections / 2).min(self.most_intersections());
-        let capacity = headroom.max(intersections);
-        self.set_intersection_capacity(capacity.max(self.frame.intersection_capacity()))
-    }
-
-    /// The most intersections of a view whose records the device can bind at once.
-    pub fn most_intersections(&self) -> u32 {
-        self.frame.most_intersections(&self.gpu)
-    }
-
-    /// What each Gaussian takes beside its own numbers, in bytes.
-    #[cfg(feature = "io")]
-    pub(crate) fn bytes_per_gaussian(&self) -> usize {
-        self.frame.bytes_per_gaussian() + self.depth_sort.bytes_per_item()
-    }
-
-    /// What the buffers take that follow the numbers of Gaussians and intersections, those of the sorts left out, which come
-    /// with the first render; in bytes.
-    #[cfg(feature = "io")]
-    pub(crate) fn reserved_bytes(&self) -> usize {
-        let Frame { splats, tiles, .. } = &self.frame;
-        splats.len() * self.frame.bytes_per_gaussian()
-            + tiles.len() * self.frame.bytes_per_intersection()
-    }
-
-    /// What each intersection of a view takes, in bytes.
-    #[cfg(feature = "io")]
-    pub(crate) fn bytes_per_intersection(&self) -> usize {
-        self.frame.bytes_per_intersection() + self.tile_sort.bytes_per_item()
-    }
-
-    /// How many intersections there is room for.
-    #[cfg(feature = "io")]
-    pub(crate) fn intersection_capacity(&self) -> u32 {
-        self.frame.intersection_capacity()
-    }
-
     /// How many intersections the last render had; waits for it.
     ///
     /// # Errors
     /// The device was lost.
     pub fn intersections(&self) -> Result<u32> {
         Ok(self.gpu.read(&self.frame.counts)?[0])
-    }
-
-    /// Makes room for exactly so many intersections.
-    ///
-    /// # Errors
-    /// The device is out of memory.
-    pub fn set_intersection_capacity(&mut self, intersections: u32) -> Result<()> {
-        self.frame.set_intersection_capacity(&self.gpu, intersections)
     }
 
     /// The last render, planar (channels, H, W): RGB, then the features.
@@ -303,16 +215,6 @@ impl Renderer {
         let [width, height] = self.tile.size;
         let (tile, device) = (format!("{width}x{height}"), self.gpu.properties().name.clone());
         Error::Crowded { view, splats, tile, device, limit: self.longest_run }
-    }
-
-    fn too_many_tiles(&self, size: UVec2) -> Error {
-        let (UVec2 { x: width, y: height }, [tile_width, tile_height]) = (size, self.tile.size);
-        let (count, most) = (self.tiles(size).element_product(), most_tiles(&self.gpu));
-        let device = &self.gpu.properties().name;
-        Error::Usage(format!(
-            "a {width}x{height} view has {count} tiles of {tile_width}x{tile_height} pixels, {device} follows {most}; \
-             lower `TrainConfig::patch_pixels` or take a larger `tile`"
-        ))
     }
 
     /// Lowers every flag of the status.

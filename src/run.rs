@@ -14,15 +14,15 @@ mod requests;
 mod tensorboard;
 mod train;
 
-pub use directory::{
-    Progress, RunDirectory, is_finished, load_config, load_metrics, load_progress, plan_of,
-    stopped_at,
-};
+pub use directory::{Progress, RunDirectory, load_progress};
 #[cfg(feature = "cli")]
 pub(crate) use directory::{SPENT, TARGET_EXPOSURE};
 pub use done::done_steps;
 pub use events::Event;
-pub use load::{load_exposures, load_model, load_networks, other_views};
+pub use load::{
+    is_finished, load_config, load_exposures, load_metrics, load_model, load_networks, other_views,
+    plan_of, stopped_at,
+};
 pub use meter::{Spent, energy_counters};
 pub use requests::Requests;
 pub use train::{HeldRun, Session, Trained, train, train_in};

@@ -23,7 +23,7 @@
 //! in it, it holds `.lock`.
 
 use std::fs::File;
-use std::io::{BufWriter, Read, Write};
+use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
 use glam::DVec3;
@@ -99,7 +99,7 @@ const TENSORBOARD: &str = "tensorboard";
 const HASHES: &str = "hashes.csv";
 
 /// What was decided for the photographs, and why.
-const PLAN: &str = "plan.toml";
+pub(super) const PLAN: &str = "plan.toml";
 
 /// Where `metrics.json` holds the [`crate::train::TargetExposure`].
 pub(crate) const TARGET_EXPOSURE: &str = "target_exposure";
@@ -448,22 +448,6 @@ pub(super) fn view_lines(dataset: &Dataset) -> Vec<String> {
     dataset.views.iter().map(line).collect()
 }
 
-/// The step of the model of a run that did not come to its end; none of a finished one, and where none is known.
-pub fn stopped_at(run: &Path) -> Option<u64> {
-    if is_finished(run) {
-        return None;
-    }
-    // The header of a safetensors file, length first, is JSON with a note in which the checkpoint says what it is.
-    let mut file = File::open(generations::newest(run)?).ok()?;
-    let mut length = [0; 8];
-    file.read_exact(&mut length).ok()?;
-    let mut header = String::new();
-    file.take(u64::from_le_bytes(length)).read_to_string(&mut header).ok()?;
-    let header: serde_json::Value = serde_json::from_str(&header).ok()?;
-    let note = header["__metadata__"]["checkpoint"].as_str()?;
-    serde_json::from_str::<serde_json::Value>(note).ok()?["step"].as_u64()
-}
-
 /// Whether a directory holds a run, be it of another version: a configuration with what every one has.
 fn is_run(path: &Path) -> bool {
     let text = std::fs::read_to_string(path.join("config.toml")).unwrap_or_default();
@@ -474,36 +458,6 @@ fn is_run(path: &Path) -> bool {
 fn held(path: &Path, file: &str) -> Error {
     let problem = format!("already holds a run ({file}); pass `HeldRun::Replace` to replace it");
     Error::output(path, problem)
-}
-
-/// Whether a directory holds a run that reached its end.
-pub fn is_finished(run: &Path) -> bool {
-    run.join("metrics.json").exists()
-}
-
-/// What `metrics.json` says; null where it does not exist.
-pub fn load_metrics(run: &Path) -> serde_json::Value {
-    let text = std::fs::read(run.join("metrics.json")).ok();
-    text.and_then(|text| serde_json::from_slice(&text).ok()).unwrap_or_default()
-}
-
-/// The configuration of a finished or unfinished run.
-///
-/// # Errors
-/// The directory holds none.
-pub fn load_config(run: &Path) -> Result<TrainConfig> {
-    let path = run.join("config.toml");
-    if !path.is_file() {
-        let problem =
-            "is no run directory: it has no config.toml; name what `nightsplat train` wrote";
-        return Err(Error::input(run, problem));
-    }
-    Ok(TrainConfig::load(&path)?.with_paths_from(run))
-}
-
-/// The plan that a run keeps to; none where it keeps to none.
-pub fn plan_of(run: &Path) -> Option<PathBuf> {
-    Some(run.join(PLAN)).filter(|path| path.is_file())
 }
 
 fn remove(run: &Path, files: &[&str]) -> Result<()> {
@@ -528,7 +482,7 @@ fn remove_events(run: &Path) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::run::load_model;
+    use crate::run::{load_config, load_model};
 
     #[test]
     fn a_run_is_only_replaced_when_asked() {

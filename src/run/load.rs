@@ -1,15 +1,64 @@
 //! What a run directory holds, read back.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
+use std::fs::File;
+use std::io::Read;
+use std::path::{Path, PathBuf};
 
-use super::directory::{EXPOSURES, NETWORKS, VIEWS, view_lines};
+use super::directory::{EXPOSURES, NETWORKS, PLAN, VIEWS, view_lines};
+use super::generations;
 use crate::dataset::Dataset;
 use crate::exposure::{Affine, table};
 use crate::gpu::Gpu;
 use crate::scene::{Features, Gaussians, ply};
-use crate::train::{ModelConfig, Networks};
+use crate::train::{ModelConfig, Networks, TrainConfig};
 use crate::{Error, Result};
+
+/// Whether a directory holds a run that reached its end.
+pub fn is_finished(run: &Path) -> bool {
+    run.join("metrics.json").exists()
+}
+
+/// What `metrics.json` says; null where it does not exist.
+pub fn load_metrics(run: &Path) -> serde_json::Value {
+    let text = std::fs::read(run.join("metrics.json")).ok();
+    text.and_then(|text| serde_json::from_slice(&text).ok()).unwrap_or_default()
+}
+
+/// The configuration of a finished or unfinished run.
+///
+/// # Errors
+/// The directory holds none.
+pub fn load_config(run: &Path) -> Result<TrainConfig> {
+    let path = run.join("config.toml");
+    if !path.is_file() {
+        let problem =
+            "is no run directory: it has no config.toml; name what `nightsplat train` wrote";
+        return Err(Error::input(run, problem));
+    }
+    Ok(TrainConfig::load(&path)?.with_paths_from(run))
+}
+
+/// The plan that a run keeps to; none where it keeps to none.
+pub fn plan_of(run: &Path) -> Option<PathBuf> {
+    Some(run.join(PLAN)).filter(|path| path.is_file())
+}
+
+/// The step of the model of a run that did not come to its end; none of a finished one, and where none is known.
+pub fn stopped_at(run: &Path) -> Option<u64> {
+    if is_finished(run) {
+        return None;
+    }
+    // The header of a safetensors file, length first, is JSON with a note in which the checkpoint says what it is.
+    let mut file = File::open(generations::newest(run)?).ok()?;
+    let mut length = [0; 8];
+    file.read_exact(&mut length).ok()?;
+    let mut header = String::new();
+    file.take(u64::from_le_bytes(length)).read_to_string(&mut header).ok()?;
+    let header: serde_json::Value = serde_json::from_str(&header).ok()?;
+    let note = header["__metadata__"]["checkpoint"].as_str()?;
+    serde_json::from_str::<serde_json::Value>(note).ok()?["step"].as_u64()
+}
 
 /// The trained Gaussians of a run.
 ///

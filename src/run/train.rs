@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use super::directory::{Progress, SPENT, TARGET_EXPOSURE};
 use super::meter::{Meter, Spent};
 use super::tensorboard::EventFile;
-use super::{Event, Requests, RunDirectory, directory, done, generations};
+use super::{Event, Requests, RunDirectory, done, generations, load};
 use crate::attributes::{ATTRIBUTES, AttributeSpec};
 use crate::dataset::{Dataset, View};
 use crate::diagnose::Plan;
@@ -186,7 +186,7 @@ fn begin(
     let replaces = match held {
         HeldRun::Refuse => false,
         HeldRun::Replace => true,
-        HeldRun::Resume => !directory::is_finished(out),
+        HeldRun::Resume => !load::is_finished(out),
     };
     Ok((RunDirectory::create_locked(out, lock, config, replaces)?, trainer))
 }
@@ -202,7 +202,7 @@ fn with_tile_and_frame(
 ) -> Result<TrainConfig> {
     let mut config = config.clone();
     if let Some(run) = resumed {
-        let recorded = directory::load_config(run)?;
+        let recorded = load::load_config(run)?;
         let tile = recorded.tile.filter(|&tile| gpu.properties().suits_tile(tile));
         config.tile = config.tile.or(tile);
         config.frame = Some(recorded.frame.unwrap_or_default());

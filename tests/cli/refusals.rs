@@ -1,0 +1,231 @@
+//! What the binary says of bad input.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use crate::common::command::{command, refused, refused_with, run};
+use crate::{common, copied_set, fixture};
+
+/// Training on `root` must fail in one line and leave no run that looks complete.
+fn refuses_to_train(root: &Path, options: &str, code: i32, parts: &[&str]) {
+    let run = root.join("run");
+    refused(&format!("train {} --out {} {options}", root.display(), run.display()), code, parts);
+    for name in ["metrics.json", "model.ply"] {
+        assert!(!run.join(name).exists(), "{name} was left behind");
+    }
+}
+
+/// Training on `root` must succeed and say all of `parts` on standard error.
+fn trains_and_says(root: &Path, parts: &[&str]) {
+    let out = root.join("run");
+    let (_, stderr) =
+        run(&format!("train {} --out {} --steps 1", root.display(), out.display()), 0);
+    assert!(out.join("metrics.json").exists(), "{stderr}");
+    for part in parts {
+        assert!(stderr.contains(part), "no `{part}` in: {stderr}");
+    }
+}
+
+fn edit(path: PathBuf, change: impl FnOnce(String) -> String) {
+    let text = fs::read_to_string(&path).unwrap();
+    fs::write(path, change(text)).unwrap();
+}
+
+#[test]
+fn a_set_that_is_not_there_or_has_no_photographs_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let nowhere = folder.path().join("nowhere");
+    let run = folder.path().join("run");
+    refused(
+        &format!("train {} --out {}", nowhere.display(), run.display()),
+        3,
+        &["nowhere", "not a folder"],
+    );
+    assert!(!run.exists());
+    refuses_to_train(folder.path(), "", 3, &["holds no dataset", "transforms"]);
+    let set = copied_set();
+    fs::remove_dir_all(set.path().join("low")).unwrap();
+    refuses_to_train(set.path(), "", 3, &["no photograph is left to train on"]);
+}
+
+#[test]
+fn a_listing_cut_short_is_named() {
+    let set = copied_set();
+    edit(set.path().join("transforms_train.json"), |text| text[..text.len() / 2].to_owned());
+    refuses_to_train(set.path(), "", 3, &["transforms_train.json", "cut short"]);
+}
+
+#[test]
+fn absent_and_broken_photographs_are_left_out_by_name() {
+    let set = copied_set();
+    fs::remove_file(set.path().join("low/003.png")).unwrap();
+    fs::write(set.path().join("low/004.png"), "no image").unwrap();
+    trains_and_says(set.path(), &["low/003.png", "absent", "low/004.png", "not a readable"]);
+}
+
+#[test]
+fn two_views_of_one_name_are_refused() {
+    let set = copied_set();
+    edit(set.path().join("transforms_train.json"), |text| {
+        text.replace("low/002.png", "low/001.png")
+    });
+    refuses_to_train(set.path(), "", 3, &["two views are named 001"]);
+}
+
+/// The fixture's set as COLMAP leaves one, after a change of its cameras and images.
+fn colmap_set(
+    cameras: impl FnOnce(String) -> String,
+    images: impl FnOnce(String) -> String,
+) -> tempfile::TempDir {
+    let set = copied_set();
+    let model = set.path().join("sparse/0");
+    fs::create_dir(set.path().join("sparse")).unwrap();
+    fs::rename(set.path().join("colmap_sparse/0"), &model).unwrap();
+    fs::rename(set.path().join("low"), set.path().join("images")).unwrap();
+    for split in ["train", "test", "val"] {
+        fs::remove_file(set.path().join(format!("transforms_{split}.json"))).unwrap();
+    }
+    edit(model.join("cameras.txt"), cameras);
+    edit(model.join("images.txt"), images);
+    set
+}
+
+#[test]
+fn a_colmap_model_trains_and_what_is_wrong_with_one_is_named() {
+    let same = |text: String| text;
+    trains_and_says(colmap_set(same, same).path(), &[]);
+
+    let set = colmap_set(|text| text.replace(" PINHOLE ", " FISHEYE "), same);
+    refuses_to_train(set.path(), "", 3, &["FISHEYE"]);
+
+    // Every pose: no view is left. One pose: the others go on.
+    let spoil = |count: usize| {
+        move |text: String| {
+            let mut left = count;
+            let line = |line: &str| {
+                let mut fields: Vec<&str> = line.split(' ').collect();
+                if line.ends_with(".png") && left > 0 {
+                    left -= 1;
+                    fields[5] = "NaN";
+                }
+                fields.join(" ") + "\n"
+            };
+            text.lines().map(line).collect()
+        }
+    };
+    refuses_to_train(colmap_set(same, spoil(9)).path(), "", 3, &["pose is not finite"]);
+    trains_and_says(colmap_set(same, spoil(1)).path(), &["000.png", "pose is not finite"]);
+
+    let set = colmap_set(|text| text.replace(" 64 48 ", " 64 64 "), same);
+    refuses_to_train(set.path(), "", 3, &["is 64x48 but its camera is 64x64"]);
+
+    let set = colmap_set(same, same);
+    // A count of ten thousand points, and then nothing.
+    let mut points = 10_000_u64.to_le_bytes().to_vec();
+    points.extend([0; 20]);
+    fs::remove_file(set.path().join("sparse/0/points3D.txt")).unwrap();
+    fs::write(set.path().join("sparse/0/points3D.bin"), points).unwrap();
+    refuses_to_train(set.path(), "", 3, &["points3D.bin", "cut short"]);
+}
+
+#[test]
+fn a_run_directory_is_neither_replaced_unasked_nor_made_where_it_cannot_be() {
+    let fixture = fixture();
+    let before = fs::read(fixture.path("run/metrics.json")).unwrap();
+    refused(
+        &format!("train {} --out {}", fixture.set(), fixture.run()),
+        1,
+        &["already holds a run", "--overwrite"],
+    );
+    assert_eq!(before, fs::read(fixture.path("run/metrics.json")).unwrap());
+    let file = fixture.path("set/low/000.png");
+    refused(
+        &format!("train {} --out {}/run", fixture.set(), file.display()),
+        1,
+        &["cannot be written"],
+    );
+}
+
+#[test]
+fn misuse_is_said_in_one_line_with_exit_code_2() {
+    let set = fixture().set();
+    let train =
+        |options: &str, parts: &[&str]| refuses_to_train(Path::new(&set), options, 2, parts);
+    train("--curve sepia", &["sepia", "linear, ase, ap3", "--help"]);
+    train("--steps 0", &["--steps"]);
+    train("--sh-degree 4", &["--sh-degree", "0 to 3"]);
+    train("--downscale 0.5", &["downscale"]);
+    train("--background blue", &["blue", "black or random"]);
+    train("--stepz 3", &["--stepz"]);
+    refused("train", 2, &["--out", "required"]);
+    refused("evaluate x", 2, &["evaluate"]);
+    refused("render x --split none --out y", 2, &["none", "train, test, all"]);
+    refused("bench --repeats 0", 2, &["--repeats"]);
+    refused("train photos --out run --steps -3", 2, &["--steps", "-3"]);
+}
+
+#[test]
+fn a_configuration_with_an_unknown_key_names_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let config = folder.path().join("config.toml");
+    fs::write(&config, "steps = 3\nstepz = 4\n").unwrap();
+    let arguments = format!("--config {}", config.display());
+    refuses_to_train(
+        Path::new(&fixture().set()),
+        &arguments,
+        3,
+        &["config.toml", "stepz", "(line 2)"],
+    );
+}
+
+#[test]
+fn no_device_and_an_unknown_one_are_said_with_the_remedy() {
+    let set = fixture().set();
+    refuses_to_train(Path::new(&set), "--device voodoo", 4, &["voodoo", "there are: "]);
+    refuses_to_train(Path::new(&set), "--device 99", 4, &["number 99", "there are: "]);
+    let nothing =
+        [("VK_DRIVER_FILES", "/nonexistent.json"), ("VK_ICD_FILENAMES", "/nonexistent.json")];
+    for arguments in ["doctor", "bench", "demo --out /nonexistent/demo"] {
+        refused_with(arguments, &nothing, 4, &["no Vulkan device", "install"]);
+    }
+}
+
+#[test]
+fn what_validation_says_fails_the_command() {
+    if !cfg!(debug_assertions) {
+        return common::not_run("commands are validated in debug builds alone");
+    }
+    // Advice on best practices, to which nothing here is held, finds something in every run.
+    let advice = "VK_VALIDATION_FEATURE_ENABLE_BEST_PRACTICES_EXT";
+    let photograph = common::fixture("lom/low/000.png");
+    let out = tempfile::tempdir().unwrap();
+    let arguments = format!("tone {} --out {}", photograph.display(), out.path().display());
+    let output = command(&arguments).env("VK_LAYER_ENABLES", advice).output().unwrap();
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(101), "{stderr}");
+    assert!(stderr.contains("validation failed in\nmain: "), "{stderr}");
+}
+
+#[test]
+fn what_is_no_finished_run_is_refused_by_eval_and_render() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = folder.path().display();
+    for command in ["eval", "render --split all --out x"] {
+        let (command, options) = command.split_once(' ').unwrap_or((command, ""));
+        refused(&format!("{command} {run} {options}"), 3, &["no config.toml", "nightsplat train"]);
+    }
+    let config = fs::read_to_string(fixture().path("run/config.toml")).unwrap();
+    let moved = folder.path().join("moved");
+    fs::write(
+        folder.path().join("config.toml"),
+        config.replace(&fixture().set(), &moved.display().to_string()),
+    )
+    .unwrap();
+    refused(&format!("eval {run}"), 3, &["model.ply", "did not finish"]);
+    let model = fs::read(fixture().path("run/model.ply")).unwrap();
+    fs::write(folder.path().join("model.ply"), &model).unwrap();
+    refused(&format!("eval {run}"), 3, &["config.toml", "moved", "--dataset"]);
+    fs::write(folder.path().join("config.toml"), config).unwrap();
+    fs::write(folder.path().join("model.ply"), &model[..model.len() / 2]).unwrap();
+    refused(&format!("eval {run}"), 3, &["model.ply"]);
+}
