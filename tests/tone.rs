@@ -136,7 +136,8 @@ fn a_value_that_is_no_number_or_negative_maps_into_the_range() {
 
 #[test]
 fn curves_are_found_by_name_and_an_unknown_name_lists_them() {
-    for curve in ToneCurve::ALL {
+    let of_files_and_photographs = [ToneCurve::Table, ToneCurve::Profile, ToneCurve::Auto];
+    for curve in ToneCurve::ALL.into_iter().chain(of_files_and_photographs) {
         assert_eq!(curve.to_string().parse::<ToneCurve>().unwrap(), curve);
     }
     let error = "gama".parse::<ToneCurve>().unwrap_err();
