@@ -165,6 +165,7 @@ mod tests {
 
     use super::*;
     use crate::densify::DensityControl;
+    use crate::halves::Bits;
     use crate::loss::Weights;
     use crate::nn::Form;
     use crate::tone::ToneSettings;
@@ -197,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn paper_is_the_paper_and_balanced_is_what_the_library_defaults_to_but_for_its_end() {
+    fn paper_is_the_paper_and_balanced_is_what_the_library_defaults_to_but_for_its_end_and_bits() {
         let paper = applied(Preset::Paper, "x", ToneCurve::Auto);
         let mut model = ModelConfig::default();
         model.follow_paper();
@@ -214,8 +215,9 @@ mod tests {
         let balanced = applied(Preset::Balanced, "x", ToneCurve::Ase);
         assert_eq!((balanced.tone.curve, balanced.stop.views), (ToneCurve::Ase, 2));
         let defaults = TrainConfig::default();
-        let plain =
-            TrainConfig { tone: defaults.tone.clone(), stop: defaults.stop.clone(), ..balanced };
+        assert_eq!((balanced.precision.rest, balanced.precision.moments), (Bits::Half, Bits::Half));
+        let (tone, stop) = (defaults.tone.clone(), defaults.stop.clone());
+        let plain = TrainConfig { tone, stop, precision: defaults.precision.clone(), ..balanced };
         assert_eq!(plain, TrainConfig { dataset: "data/x".into(), ..defaults });
         assert!(!Preset::Paper.is_planned() && Preset::Balanced.is_planned());
     }
