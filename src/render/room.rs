@@ -2,8 +2,8 @@
 
 use glam::UVec2;
 
+use super::Renderer;
 use super::limits::most_tiles;
-use super::{Frame, Renderer};
 use crate::camera::Camera;
 use crate::{Error, Result};
 
@@ -72,9 +72,9 @@ impl Renderer {
     /// with the first render; in bytes.
     #[cfg(feature = "io")]
     pub(crate) fn reserved_bytes(&self) -> usize {
-        let Frame { splats, tiles, .. } = &self.frame;
-        splats.len() * self.frame.bytes_per_gaussian()
-            + tiles.len() * self.frame.bytes_per_intersection()
+        let frame = &self.frame;
+        frame.splats.len() * frame.bytes_per_gaussian()
+            + frame.tiles.len() * frame.bytes_per_intersection()
     }
 
     /// What each intersection of a view takes, in bytes.
