@@ -59,7 +59,6 @@ mod product_backward;
 pub mod project;
 pub mod project_backward;
 mod random;
-mod reduce_records;
 mod reduce_strips;
 mod relu_backward;
 pub mod residual;

@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! project -> sort by depth -> order_counts -> emit -> sort by tile -> blend_forward
-//!     -> [loss] -> blend_backward -> reduce_records -> project_backward
+//!     -> [loss] -> blend_backward -> project_backward
 //! ```
 //!
 //! Counts stay on the device. Where the intersections of a view exceed the memory reserved for them, a status flag is
@@ -24,7 +24,6 @@ use crate::kernels::project::DEPTH_BITS;
 use crate::kernels::splat::MAX_CHANNELS;
 use crate::kernels::{
     self, blend_backward, blend_forward, emit, order_counts, project, project_backward,
-    reduce_records,
 };
 use crate::scene::{Shape, width};
 use crate::sort::{Count, RadixSort};
@@ -97,7 +96,6 @@ pub struct Renderer {
     emit: Pipeline<emit::Kernel>,
     blend_forward: Pipeline<blend_forward::Kernel>,
     blend_backward: Pipeline<blend_backward::Kernel>,
-    reduce_records: Pipeline<reduce_records::Kernel>,
     project_backward: Pipeline<project_backward::Kernel>,
     depth_sort: RadixSort,
     tile_sort: RadixSort,
@@ -144,7 +142,6 @@ impl Renderer {
                 splats_per_turn,
                 subgroups_per_tile
             ))?,
-            reduce_records: gpu.pipeline(&constants!(reduce_records))?,
             project_backward,
             depth_sort: RadixSort::new(gpu, 0)?,
             tile_sort: RadixSort::new(gpu, 0)?,
@@ -300,18 +297,7 @@ impl Renderer {
         let parameter_columns = self.parameter_columns();
         for batch in self.batches().iter() {
             let gaussian_count = batch.gaussian_count();
-            let threads = Threads::Exactly([gaussian_count, 1, 1]);
             let frame = &mut self.frame;
-            pass.dispatch(
-                &self.reduce_records,
-                &reduce_records::Params { gaussian_count },
-                reduce_records::Buffers {
-                    emitted: &batch.of_rows(&frame.emitted, 1)?,
-                    records: &frame.records,
-                    d_splats: &mut batch.of_rows(&frame.d_splats, frame.record_vectors())?,
-                },
-                threads,
-            )?;
             pass.dispatch(
                 &self.project_backward,
                 &project_backward::Params {
@@ -327,13 +313,14 @@ impl Renderer {
                     splats: &batch.of_rows(&frame.splats, 1)?,
                     colors: &batch.of_rows(&frame.colors, channels)?,
                     tile_counts: &batch.of_rows(&frame.tile_counts, 1)?,
-                    d_splats: &batch.of_rows(&frame.d_splats, frame.record_vectors())?,
+                    emitted: &batch.of_rows(&frame.emitted, 1)?,
+                    records: &frame.records,
                     status: &mut frame.status,
                     gradients: &mut batch.of_planes(gradients.parameters)?,
                     grad_norm_sums: &mut batch.of_rows(gradients.grad_norm_sums, 1)?,
                     visit_counts: &mut batch.of_rows(gradients.visit_counts, 1)?,
                 },
-                threads,
+                Threads::Exactly([gaussian_count, 1, 1]),
             )?;
         }
         Ok(())

@@ -5,7 +5,7 @@
 
 use std::ops::Range;
 
-use glam::{DVec2, DVec3};
+use glam::{DVec2, DVec3, Vec3};
 use nightsplat::attributes::planes;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::adam::{LOG_SCALE_MAX, LOG_SCALE_MIN};
@@ -63,8 +63,15 @@ fn errors_of(count: usize) -> [f64; 2] {
     let splats = gpu().read(&frame.splats).unwrap();
     let splats: Vec<Splat> = splats[..count].iter().map(Splat::from).collect();
     let colors = widen(&gpu().read(&frame.colors).unwrap()[..3 * count]);
-    let sums = gpu().read(&frame.d_splats).unwrap();
-    let sums: &[f32] = bytemuck::cast_slice(&sums[..3 * count]);
+    // The view is one tile, so that every layer has one slot.
+    let slots = gpu().read(&frame.emitted).unwrap();
+    let stored = gpu().read(&frame.records).unwrap();
+    let sums: Vec<f32> = slots[..count]
+        .iter()
+        .flat_map(|slot| {
+            stored[3 * slot.x as usize..3 * slot.y as usize].iter().flat_map(Vec3::to_array)
+        })
+        .collect();
     let (pixels, alpha_max) = (setup.pixels(), f64::from(setup.settings.max_alpha));
     let background: Vec<f64> = widen(&setup.background());
     let largest_color = colors.iter().chain(&background).fold(1.0f64, |most, c| most.max(c.abs()));

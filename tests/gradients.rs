@@ -153,7 +153,7 @@ fn an_overflow_leaves_no_gradient_and_no_statistics() {
     assert_eq!((grad_norm_sums, visit_counts), untouched);
 }
 
-/// Sums have one order, in the subgroups of `blend_backward` and over the slots in `reduce_records`.
+/// Sums have one order, in the subgroups of `blend_backward` and over the slots in `project_backward`.
 #[test]
 fn the_same_frame_gives_the_same_bits_every_time() {
     let shape = Shape { sh_degree: 2, features: features(4) };

@@ -3,20 +3,23 @@
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
+use std::array;
 use std::collections::HashSet;
 
-use glam::{DVec3, UVec2, Vec2, Vec3};
+use glam::{DVec2, DVec3, UVec2, Vec2, Vec3};
+use nightsplat::camera::Patch;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::gpu::{Threads, Tile};
 use nightsplat::kernels::status::STATUS_CROWDED;
-use nightsplat::kernels::{ProjectedSplat, blend_forward, emit, order_counts, reduce_records};
+use nightsplat::kernels::{ProjectedSplat, blend_forward, emit, order_counts, project_backward};
 use nightsplat::reference::gaussian::Gaussian;
 use nightsplat::render::{RenderSettings, Renderer, Status};
+use nightsplat::scene::Shape;
 
 #[macro_use]
 mod common;
 use common::Random;
-use common::setup::Setup;
+use common::setup::{Setup, features};
 
 #[test]
 fn the_most_intersections_that_can_be_counted_are_an_overflow() {
@@ -161,6 +164,42 @@ fn emit_wide(count: u32, size: UVec2, extra: u32) -> (Vec<u32>, Vec<UVec2>, u32)
     (tiles, emitted, per_splat)
 }
 
+/// A record of four channels.
+type Record = [Vec3; 4];
+
+/// Sums the records of Gaussians with one feature, all in one place, whose slots are these: the gradients of the features
+/// are the sums of the last channel.
+fn sums(emitted: Vec<UVec2>, records: &[Record]) -> Vec<f32> {
+    let (count, shape) = (emitted.len(), Shape { sh_degree: 3, features: features(4) });
+    let mut setup = Setup::new(count, [32, 32], shape, 1);
+    for i in 0..count {
+        setup.set(i, &Gaussian { mean: setup.at_pixel(DVec2::splat(16.0), 2.0), ..setup.get(0) });
+    }
+    let rendered = setup.render();
+    let frame = rendered.renderer.frame();
+    let (splats, colors) = (gpu().read(&frame.splats).unwrap(), gpu().read(&frame.colors).unwrap());
+    let (parameters, tile_counts, status) = (setup.parameters.clone(), vec![1; count], vec![0; 3]);
+    let records: Vec<Vec3> = records.concat();
+    let gradients = vec![f32::NAN; parameters.len()];
+    let (grad_norm_sums, visit_counts) = (vec![0.0f32; count], vec![0; count]);
+    let (_, gradients, _, _) = run_kernel!(
+        project_backward,
+        project_backward::Constants { channels: 4, ..Default::default() },
+        project_backward::Params {
+            camera: (&Patch::from(&setup.camera)).into(),
+            half_view: Vec2::splat(16.0),
+            gaussian_count: count as u32,
+            sh_degree: 3,
+            damping_weight: 0.0,
+            damping_depth: 1.0,
+        },
+        Threads::Exactly([count as u32, 1, 1]),
+        [parameters, splats, colors, tile_counts, emitted, records],
+        [status, gradients, grad_norm_sums, visit_counts]
+    );
+    (0..count).map(|i| setup.planes().load(&gradients, i).features[0] as f32).collect()
+}
+
 #[test]
 fn gaussians_that_cover_the_whole_of_a_large_image_fill_their_slots_and_are_summed() {
     // More tiles than a loop of some devices has turns, for every lane of a subgroup.
@@ -168,20 +207,11 @@ fn gaussians_that_cover_the_whole_of_a_large_image_fill_their_slots_and_are_summ
     let (tiles, emitted, per_splat) = emit_wide(9, size, 0);
     assert!(per_splat > 32_000 && tiles.len() == 9 * per_splat as usize);
     assert!(tiles.chunks(per_splat as usize).all(|own| (0..per_splat).eq(own.iter().copied())));
-    let vectors = 3;
     let mut random = Random::new(3);
     let mut number = || random.between(-1.0, 1.0) as f32;
-    let records: Vec<Vec3> =
-        (0..tiles.len() * vectors).map(|_| Vec3::new(number(), number(), number())).collect();
-    let d_splats = vec![Vec3::NAN; 9 * vectors];
-    run_kernel!(
-        reduce_records,
-        reduce_records::Constants::default(),
-        reduce_records::Params { gaussian_count: 9 },
-        Threads::Exactly([9, 1, 1]),
-        [emitted, records],
-        [d_splats]
-    );
+    let mut record = || array::from_fn(|_| Vec3::new(number(), number(), number()));
+    let records: Vec<Record> = tiles.iter().map(|_| record()).collect();
+    sums(emitted, &records);
 }
 
 #[test]
@@ -192,18 +222,9 @@ fn slots_that_no_tile_fills_are_padding_and_leave_no_trace_in_the_sums() {
         let is_padding = |slot: usize| slot as u32 % per_splat >= per_splat - 5;
         assert!((0..tiles.len()).all(|slot| (tiles[slot] == emit::NO_TILE) == is_padding(slot)));
         // No tile has written the records of padding.
-        let record = |slot: usize| [if is_padding(slot) { Vec3::NAN } else { Vec3::ONE }; 3];
-        let records: Vec<Vec3> = (0..tiles.len()).flat_map(record).collect();
-        let d_splats = vec![Vec3::NAN; 11 * 3];
-        let sums = run_kernel!(
-            reduce_records,
-            reduce_records::Constants::default(),
-            reduce_records::Params { gaussian_count: 11 },
-            Threads::Exactly([11, 1, 1]),
-            [emitted, records],
-            [d_splats]
-        );
-        assert!(sums.iter().all(|&sum| sum == Vec3::splat((per_splat - 5) as f32)), "{sums:?}");
+        let record = |slot: usize| [if is_padding(slot) { Vec3::NAN } else { Vec3::ONE }; 4];
+        let records: Vec<Record> = (0..tiles.len()).map(record).collect();
+        assert_eq!(sums(emitted, &records), [(per_splat - 5) as f32; 11]);
     }
 }
 
@@ -229,17 +250,7 @@ fn a_view_has_at_most_the_tiles_that_a_subgroup_of_gaussians_that_cover_them_all
     let tiles = most - 64 - 2 * lanes;
     let slots = (tiles * lanes) as usize;
     let emitted: Vec<_> = (0..lanes).map(|i| UVec2::new(i, i + 1) * tiles).collect();
-    let records = vec![Vec3::ONE; slots * 3];
-    let d_splats = vec![Vec3::NAN; lanes as usize * 3];
-    let sums = run_kernel!(
-        reduce_records,
-        reduce_records::Constants::default(),
-        reduce_records::Params { gaussian_count: lanes },
-        Threads::Exactly([lanes, 1, 1]),
-        [emitted, records],
-        [d_splats]
-    );
-    assert!(sums.iter().all(|&sum| sum == Vec3::splat(tiles as f32)), "{sums:?}");
+    assert_eq!(sums(emitted, &vec![[Vec3::ONE; 4]; slots]), vec![tiles as f32; lanes as usize]);
 }
 
 /// What the refusal of a view names as the longest side is one that fits, and not much less than could.
@@ -291,7 +302,7 @@ fn a_hundred_thousand_splats_on_one_pixel_are_blended_as_the_references_say() {
         });
         report.agree().unwrap();
         let passed: HashSet<_> = report.passes.iter().map(|pass| pass.kernel).collect();
-        for kernel in ["emit", "blend_forward", "blend_backward", "reduce_records"] {
+        for kernel in ["emit", "blend_forward", "blend_backward", "project_backward"] {
             assert!(passed.contains(kernel), "{kernel} of {tile:?}");
         }
     }

@@ -6,14 +6,18 @@
 #include "sh.glsl"
 #include "splat.glsl"
 #include "status.glsl"
+#include "shared_slots.glsl"
 
-//! Project backward: one thread per Gaussian, from the gradients of its splat to those of its attributes.
+//! Project backward: one lane per Gaussian, from the records of its slots to the gradients of its attributes.
 //!
-//! The chain of `project` read backwards; what it needs of the forward pass it computes again. Also keeps the statistics
-//! of density control: the norm of the screen-space gradient in normalised device units, damped near the camera. A gradient
-//! that is not finite raises a flag, so that neither this step nor those recorded behind it change a parameter.
+//! Sums the records, which gives the gradients of the splat, and reads the chain of `project` backwards; what it needs of
+//! the forward pass it computes again. Also keeps the statistics of density control: the norm of the screen-space gradient
+//! in normalised device units, damped near the camera. A gradient that is not finite raises a flag, so that neither this
+//! step nor those recorded behind it change a parameter.
 
-layout(local_size_x = 64) in;
+layout(local_size_x_id = 100) in;
+layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
+#include "subgroup_sum.glsl"
 
 layout(push_constant, scalar) uniform Params {
     Camera camera;
@@ -32,11 +36,12 @@ layout(binding = 0) readonly  buffer Parameters { float parameters[]; };  // pla
 layout(binding = 1) readonly  buffer Splats     { ProjectedSplat splats[]; };
 layout(binding = 2) readonly  buffer Colors     { float colors[]; };      // (gaussian_count, CHANNELS)
 layout(binding = 3) readonly  buffer TileCounts { uint tile_counts[]; };
-layout(binding = 4) readonly  buffer DSplats    { vec3 d_splats[]; };     // (gaussian_count, RECORD_VECTORS)
-layout(binding = 5)           buffer Status     { uint status[]; };
-layout(binding = 6) writeonly buffer Gradients  { float gradients[]; };   // (columns x gaussian_count)
-layout(binding = 7) buffer GradNormSums { float grad_norm_sums[]; };
-layout(binding = 8) buffer VisitCounts  { uint visit_counts[]; };
+layout(binding = 4) readonly  buffer Emitted    { uvec2 emitted[]; };     // first slot, one past the last
+layout(binding = 5) readonly  buffer Records    { vec3 records[]; };      // (slots, RECORD_VECTORS)
+layout(binding = 6)           buffer Status     { uint status[]; };
+layout(binding = 7) writeonly buffer Gradients  { float gradients[]; };   // (columns x gaussian_count)
+layout(binding = 8) buffer GradNormSums { float grad_norm_sums[]; };
+layout(binding = 9) buffer VisitCounts  { uint visit_counts[]; };
 
 const uint FEATURE_COUNT = CHANNELS - 3;
 
@@ -48,6 +53,38 @@ const uint FEATURE_COUNT = CHANNELS - 3;
 #define STORE_VEC4(column, i, v) { \
     uint at = (column) * gaussian_count + 4 * (i); \
     gradients[at] = (v).x; gradients[at + 1] = (v).y; gradients[at + 2] = (v).z; gradients[at + 3] = (v).w; }
+
+// The record of the Gaussian whose slots are these, summed in slot order.
+//
+// The lanes share the slots of a Gaussian that has many: each sums every SUBGROUP_SIZE-th, then a tree the lanes. The same
+// order every time gives the same bits every time.
+void sum_records(uvec2 slots, out vec3 sum[RECORD_VECTORS]) {
+    uint lane = gl_SubgroupInvocationID;
+    bool is_shared = slots.y - slots.x > SHARED_SLOTS;
+    uvec4 sharing = subgroupBallot(is_shared);
+
+    // First every lane its own slots, then all together those that are shared: in one loop, for a device that does not
+    // jump over branches pays for a second one even where nothing is shared.
+    uvec2 walked = is_shared ? uvec2(0) : slots;
+    uint owner = lane, stride = 1;
+    while (true) {
+        vec3 part[RECORD_VECTORS];
+        [[unroll]] for (uint k = 0; k < RECORD_VECTORS; k++) part[k] = vec3(0.0);
+        for (uint slot = walked.x; slot < walked.y; slot += stride) {
+            [[unroll]] for (uint k = 0; k < RECORD_VECTORS; k++) part[k] += records[RECORD_VECTORS * slot + k];
+        }
+        bool is_alone = stride == 1;
+        [[unroll]] for (uint k = 0; k < RECORD_VECTORS; k++) {
+            vec3 of_all = subgroup_sum(part[k]);
+            if (owner == lane) sum[k] = is_alone ? part[k] : of_all;
+        }
+        if (all(equal(sharing, uvec4(0)))) break;
+        owner = subgroupBallotFindLSB(sharing);
+        sharing[owner / 32] &= sharing[owner / 32] - 1;
+        stride = SUBGROUP_SIZE;
+        walked = subgroupShuffle(slots, owner) + uvec2(lane, 0);
+    }
+}
 
 // The gradient of a unit quaternion's rotation matrix.
 vec4 rotation_backward(vec4 q, mat3 d) {
@@ -100,16 +137,18 @@ void store_zero(uint i) {
 
 void main() {
     uint i = THREAD_INDEX;
+    bool is_seen = i < gaussian_count && tile_counts[i] > 0;
+    vec3 sum[RECORD_VECTORS];
+    sum_records(is_seen ? emitted[i] : uvec2(0), sum);
     if (i >= gaussian_count) return;
-    if (tile_counts[i] == 0) {
+    if (!is_seen) {
         store_zero(i);
         return;
     }
     ProjectedSplat splat = splats[i];
     float record[3 * RECORD_VECTORS];
     [[unroll]] for (uint k = 0; k < RECORD_VECTORS; k++) {
-        vec3 part = d_splats[RECORD_VECTORS * i + k];
-        [[unroll]] for (uint c = 0; c < 3; c++) record[3 * k + c] = part[c];
+        [[unroll]] for (uint c = 0; c < 3; c++) record[3 * k + c] = sum[k][c];
     }
     vec2 d_mean2d = vec2(record[0], record[1]);
     vec3 d_conic = vec3(record[2], record[3], record[4]);

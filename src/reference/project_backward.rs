@@ -1,14 +1,15 @@
-//! From the gradients of a splat to those of its Gaussian, in f64.
+//! From the records of a splat to the gradients of its Gaussian, in f64.
 
-use glam::{DMat3, DVec2, DVec3, DVec4, Vec3};
+use glam::{DMat3, DVec2, DVec3, DVec4, UVec2, Vec3};
 
 use super::camera::{Camera, rotation, unit_quat};
 use super::gaussian::{Gaussian, Planes, sigmoid};
-use super::rounding::{UNIT, sensitivity};
+use super::rounding::{Rounded, UNIT, chain, sensitivity};
 use super::sh::{sh_basis, sh_basis_gradient};
 use super::splat::{Splat, stored_record};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::project_backward::{Constants, Kernel, Params, Slices, Tolerances};
+use crate::kernels::shared_slots::SHARED_SLOTS;
 use crate::kernels::splat::{DILATION, RECORD_HEAD};
 use crate::kernels::status::STATUS_GRADIENT;
 
@@ -185,26 +186,41 @@ impl<'a> Scene<'a> {
         damping * (self.params.half_view.as_dvec2() * d_splat.mean2d).length()
     }
 
-    /// The record of Gaussian `i`.
-    fn record(&self, d_splats: &[Vec3], i: usize) -> Vec<f64> {
-        let channels = self.constants.channels;
-        let d_splats: &[f32] = bytemuck::cast_slice(d_splats);
-        let own = &d_splats[stored_record(channels) * i..][..HEAD + channels as usize];
-        own.iter().map(|&d| d.into()).collect()
+    /// The sum of the records of Gaussian `i`. Those of few slots are added up in f32 in the kernel's very order; those of
+    /// many by the lanes of a subgroup, in an order that is the device's.
+    fn record(&self, emitted: &[UVec2], records: &[Vec3], i: usize) -> Vec<Rounded> {
+        let (channels, records) =
+            (self.constants.channels, bytemuck::cast_slice::<_, f32>(records));
+        let slots = emitted[i].x as usize..emitted[i].y as usize;
+        let sum = |k: usize| {
+            let numbers = slots.clone().map(|slot| records[stored_record(channels) * slot + k]);
+            if slots.len() <= SHARED_SLOTS as usize {
+                return Rounded::exact(numbers.fold(0.0, |sum, number| sum + number));
+            }
+            let magnitudes: f64 = numbers.clone().map(|number| f64::from(number.abs())).sum();
+            let sum = Rounded::exact(numbers.map(f64::from).sum::<f64>() as f32);
+            Rounded { error: UNIT * chain(slots.len()) * magnitudes, ..sum }
+        };
+        (0..HEAD + channels as usize).map(sum).collect()
     }
+}
+
+fn values(record: &[Rounded]) -> Vec<f64> {
+    record.iter().map(|number| number.value).collect()
 }
 
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
-        let Slices { parameters, splats, colors, tile_counts, d_splats, status, .. } = slices;
-        let Slices { gradients, grad_norm_sums, visit_counts, .. } = slices;
+        let Slices { parameters, splats, colors, tile_counts, emitted, records, .. } = slices;
+        let Slices { status, gradients, grad_norm_sums, visit_counts, .. } = slices;
         // Of all Gaussians, as the device may look at them in any order.
         let before = status[0];
         let scene = Scene::new(params, constants);
         let parameters = scene.planes.floats(parameters, constants.half_rest);
         gradients[..scene.planes.len()].fill(0.0);
         for i in (0..scene.planes.count).filter(|&i| tile_counts[i] > 0) {
-            let d_splat = scene.d_splat(colors, &scene.record(d_splats, i), i);
+            let record = scene.record(emitted, records, i);
+            let d_splat = scene.d_splat(colors, &values(&record), i);
             let gaussian = scene.planes.load(&parameters, i);
             let gradient = scene.backward(&gaussian, &Splat::from(&splats[i]), &d_splat);
             let mut is_finite = (8.0 * d_splat.color.as_vec3()).is_finite();
@@ -237,13 +253,15 @@ impl Reference for Kernel {
             let mut inputs = vec![0.0; one.len()];
             one.store(&gaussian, 0, |at, value| inputs[at] = value);
             inputs.extend(splat.conic.to_array());
-            inputs.extend(scene.record(slices.d_splats, i));
-            let errors: Vec<f64> = (0..inputs.len())
+            let record = scene.record(slices.emitted, slices.records, i);
+            inputs.extend(values(&record));
+            let mut errors: Vec<f64> = (0..inputs.len())
                 .map(|at| {
                     let beside = if at < 3 { far } else { 0.0 };
                     OFF * (inputs[at].abs() + beside + if at < one.len() { 1.0 } else { 0.0 })
                 })
                 .collect();
+            errors[one.len() + 3..].iter_mut().zip(&record).for_each(|(e, sum)| *e += sum.error);
             let bounds = sensitivity(&inputs, &errors, |inputs| {
                 let (own, rest) = inputs.split_at(one.len());
                 let splat = Splat { conic: DVec3::from_slice(rest), ..splat };
@@ -255,7 +273,7 @@ impl Reference for Kernel {
                 numbers[one.len()] = scene.damped_norm(&gaussian, &d_splat);
                 numbers
             });
-            let d_splat = scene.d_splat(slices.colors, &scene.record(slices.d_splats, i), i);
+            let d_splat = scene.d_splat(slices.colors, &values(&record), i);
             let gradient = scene.backward(&gaussian, &splat, &d_splat);
             scene.planes.store(&gradient, i, |at, value| gradients[at] = OFF * value.abs());
             let mut moved = one.load(&bounds, 0);

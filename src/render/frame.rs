@@ -64,7 +64,6 @@ pub struct Frame {
     /// One per partition of ranks.
     pub sums: Buffer<u32>,
     pub emitted: Buffer<UVec2>,
-    pub d_splats: Buffer<Vec3>,
     // intersections
     pub tiles: Buffer<u32>,
     pub slots: Buffer<u32>,
@@ -96,7 +95,6 @@ impl Frame {
             slots_before: gpu.uninit("slots_before", 0)?,
             sums: gpu.uninit("sums", 1)?,
             emitted: gpu.uninit("emitted", 0)?,
-            d_splats: gpu.uninit("d_splats", 0)?,
             tiles: gpu.uninit("tiles", 0)?,
             slots: gpu.uninit("slots", 0)?,
             owners: gpu.uninit("owners", 0)?,
@@ -134,7 +132,6 @@ impl Frame {
             let partitions = (count as u32).div_ceil(RANKS_PER_PARTITION).max(1);
             self.sums = gpu.uninit("sums", partitions as usize)?;
             self.emitted = gpu.uninit("emitted", count)?;
-            self.d_splats = gpu.uninit_in_windows("d_splats", self.record_vectors() * count)?;
         }
         if self.render.len() < self.channels * pixels {
             self.render = gpu.uninit("render", self.channels * pixels)?;
@@ -171,7 +168,7 @@ impl Frame {
     #[cfg(feature = "io")]
     pub(super) fn bytes_per_gaussian(&self) -> usize {
         let numbers = (4 + self.channels) * size_of::<f32>() + size_of::<UVec2>();
-        size_of::<ProjectedSplat>() + numbers + self.record_vectors() * size_of::<Vec3>()
+        size_of::<ProjectedSplat>() + numbers
     }
 
     /// What each intersection takes, in bytes.

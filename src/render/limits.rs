@@ -65,8 +65,8 @@ impl RenderSettings {
 /// Turns of a kernel's loops beside those that are counted.
 const SOME_TURNS: u32 = 64;
 
-/// How many tiles a view may have: where every Gaussian of a subgroup covers all of them, `reduce_records` makes as many
-/// turns as there are tiles, its lanes taking turns at each; `emit` makes fewer.
+/// How many tiles a view may have: where every Gaussian of a subgroup covers all of them, `project_backward` makes as
+/// many turns as there are tiles, its lanes taking turns at each; `emit` makes fewer.
 pub(super) fn most_tiles(gpu: &Gpu) -> usize {
     let Properties { max_loop_iterations, subgroup_size, .. } = *gpu.properties();
     let turns_of_owners = 2 * subgroup_size;

@@ -96,11 +96,7 @@ pub(super) fn time(bench: &Bench, scene: &Scene, trainers: &mut Trainers) -> Res
     let group = |name, milliseconds, bound| Timing { name, milliseconds, bound };
     let groups = vec![
         group("blend_forward", of_step(&["blend_forward"]), Some(60.0)),
-        group(
-            "backward_with_reduction",
-            of_step(&["blend_backward", "reduce_records"]),
-            Some(130.0),
-        ),
+        group("blend_backward", of_step(&["blend_backward"]), Some(130.0)),
         group("sort_65000_pairs", sort(bench)?, Some(10.0)),
         group("tone_statistics_1920x1080", tone_statistics, Some(60.0)),
         group("pseudo_gt_1920x1080", whole_pseudo_gt, Some(80.0)),
