@@ -20,6 +20,7 @@ mod compensated_sum;
 pub mod conv3x3;
 mod conv3x3_half;
 pub mod conv3x3_weight_gradient;
+mod conv3x3_weight_gradient_half;
 mod conv_strided;
 mod decode;
 mod denoising;

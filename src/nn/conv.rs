@@ -5,7 +5,9 @@ use serde::{Deserialize, Serialize};
 
 use super::conv_shape;
 use crate::gpu::{Buffer, CooperativeMatrix, Gpu, Pipeline, Recorder, Threads};
-use crate::kernels::{conv3x3, conv3x3_half, conv3x3_weight_gradient, reduce_strips};
+use crate::kernels::{
+    conv3x3, conv3x3_half, conv3x3_weight_gradient, conv3x3_weight_gradient_half, reduce_strips,
+};
 use crate::{Error, Result};
 
 /// The most output channels that one subgroup takes.
@@ -17,6 +19,9 @@ const HALF_ROWS: u32 = 4;
 
 /// Rows whose pixels make one partial sum of the gradient of the weights.
 const STRIP_ROWS: u32 = 16;
+/// Of matrices a subgroup takes more channels, and fewer rows: eighteen sums in registers, and as many subgroups.
+const HALF_STRIP_ROWS: u32 = 4;
+const HALF_STRIP_BLOCKS: u32 = 2;
 
 /// What follows the sum of a convolution.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -44,9 +49,15 @@ pub enum Precision {
     /// 32 bits.
     #[default]
     Single,
-    /// 16 bits, by cooperative matrices, where the device offers them, else as `Single`; the gradients of weights stay
-    /// at 32 bits.
+    /// 16 bits, by cooperative matrices, where the device offers them, else as `Single`.
     Half,
+}
+
+impl Precision {
+    /// The matrices that factors are in; none where they have 32 bits.
+    fn matrix(self, gpu: &Gpu) -> Option<CooperativeMatrix> {
+        gpu.properties().cooperative_matrix.filter(|_| self == Self::Half)
+    }
 }
 
 impl std::str::FromStr for Precision {
@@ -68,7 +79,7 @@ pub(super) struct Conv {
     outputs: u32,
     forward: Product,
     data_gradient: Product,
-    weight_gradient: Pipeline<conv3x3_weight_gradient::Kernel>,
+    weight_gradient: WeightGradient,
     reduce: Pipeline<reduce_strips::Kernel>,
 }
 
@@ -96,16 +107,12 @@ impl Conv {
         let forward = Form { activation, transposed: false, accumulate };
         let accumulate = adds == Adds::InputGradient;
         let backward = Form { activation: none, transposed: true, accumulate };
-        let weights = conv3x3_weight_gradient::Constants {
-            rows: STRIP_ROWS,
-            out_block: outputs.min(OUT_BLOCK),
-        };
         Ok(Self {
             inputs,
             outputs,
             forward: Product::new(gpu, outputs, forward, precision)?,
             data_gradient: Product::new(gpu, inputs, backward, precision)?,
-            weight_gradient: gpu.pipeline(&weights)?,
+            weight_gradient: WeightGradient::new(gpu, outputs, precision)?,
             reduce: gpu.pipeline(&reduce_strips::Constants::default())?,
         })
     }
@@ -144,22 +151,13 @@ impl Conv {
         pass: &mut Recorder<'_>,
         size: UVec2,
         offset: u32,
-        Seen { source, d_target }: Seen<'_>,
+        seen: Seen<'_>,
         partials: &mut Buffer<f32>,
         gradients: &mut Buffer<f32>,
     ) -> Result<()> {
-        let (in_channels, out_channels) = (self.inputs, self.outputs);
-        let (strip_count, parameter_count) = (strips(size), layer_len(in_channels, out_channels));
-        pass.dispatch(
-            &self.weight_gradient,
-            &conv3x3_weight_gradient::Params { size, in_channels, out_channels },
-            conv3x3_weight_gradient::Buffers { source, d_target, partials: &mut *partials },
-            Threads::Workgroups([
-                in_channels,
-                out_channels.div_ceil(out_channels.min(OUT_BLOCK)),
-                strip_count,
-            ]),
-        )?;
+        let strip_count = size.y.div_ceil(self.weight_gradient.rows);
+        let parameter_count = layer_len(self.inputs, self.outputs);
+        self.weight_gradient.record(pass, size, [self.inputs, self.outputs], seen, partials)?;
         pass.dispatch(
             &self.reduce,
             &reduce_strips::Params { parameter_count, strip_count, offset },
@@ -195,9 +193,7 @@ enum ProductKernel {
 impl Product {
     pub(super) fn new(gpu: &Gpu, outputs: u32, form: Form, precision: Precision) -> Result<Self> {
         let Form { activation, transposed, accumulate } = form;
-        let matrix = gpu.properties().cooperative_matrix;
-        let matrix =
-            matrix.filter(|_| precision == Precision::Half && activation == Activation::None);
+        let matrix = precision.matrix(gpu).filter(|_| activation == Activation::None);
         if let Some(CooperativeMatrix { m, n, k }) = matrix {
             let (blocks, rows) = (outputs.div_ceil(m).min(HALF_BLOCKS), HALF_ROWS);
             let constants =
@@ -254,16 +250,80 @@ impl Product {
     }
 }
 
+/// A kernel that sums the gradient of a layer's weights over strips, and the channels and rows that a subgroup takes.
+#[derive(Debug)]
+struct WeightGradient {
+    kernel: WeightGradientKernel,
+    inputs: u32,
+    outputs: u32,
+    rows: u32,
+}
+
+#[derive(Debug)]
+enum WeightGradientKernel {
+    Single(Pipeline<conv3x3_weight_gradient::Kernel>),
+    Half(Pipeline<conv3x3_weight_gradient_half::Kernel>),
+}
+
+impl WeightGradient {
+    fn new(gpu: &Gpu, outputs: u32, precision: Precision) -> Result<Self> {
+        if let Some(CooperativeMatrix { m, n, k }) = precision.matrix(gpu) {
+            let (blocks, rows) = (outputs.div_ceil(m).min(HALF_STRIP_BLOCKS), HALF_STRIP_ROWS);
+            let constants = conv3x3_weight_gradient_half::Constants { m, n, k, blocks, rows };
+            let kernel = WeightGradientKernel::Half(gpu.pipeline(&constants)?);
+            return Ok(Self { kernel, inputs: n, outputs: blocks * m, rows });
+        }
+        let (out_block, rows) = (outputs.min(OUT_BLOCK), STRIP_ROWS);
+        let constants = conv3x3_weight_gradient::Constants { rows, out_block };
+        let kernel = WeightGradientKernel::Single(gpu.pipeline(&constants)?);
+        Ok(Self { kernel, inputs: 1, outputs: out_block, rows })
+    }
+
+    fn record(
+        &self,
+        pass: &mut Recorder<'_>,
+        size: UVec2,
+        [in_channels, out_channels]: [u32; 2],
+        Seen { source, d_target }: Seen<'_>,
+        partials: &mut Buffer<f32>,
+    ) -> Result<()> {
+        let threads = Threads::Workgroups([
+            in_channels.div_ceil(self.inputs),
+            out_channels.div_ceil(self.outputs),
+            size.y.div_ceil(self.rows),
+        ]);
+        match &self.kernel {
+            WeightGradientKernel::Single(pipeline) => pass.dispatch(
+                pipeline,
+                &conv3x3_weight_gradient::Params { size, in_channels, out_channels },
+                conv3x3_weight_gradient::Buffers { source, d_target, partials },
+                threads,
+            ),
+            WeightGradientKernel::Half(pipeline) => pass.dispatch(
+                pipeline,
+                &conv3x3_weight_gradient_half::Params { size, in_channels, out_channels },
+                conv3x3_weight_gradient_half::Buffers { source, d_target, partials },
+                threads,
+            ),
+        }
+    }
+}
+
 /// Weights and biases of a layer.
 fn layer_len(inputs: u32, outputs: u32) -> u32 {
     outputs * (9 * inputs + 1)
 }
 
-fn strips(size: UVec2) -> u32 {
-    size.y.div_ceil(STRIP_ROWS)
-}
-
-/// Floats that the partial sums of a layer's gradient take.
-pub(super) fn partial_count(size: UVec2, [inputs, outputs]: [u32; 2]) -> usize {
-    strips(size) as usize * outputs as usize * (9 * inputs as usize + 1)
+/// Floats that the partial sums of a layer's gradient take at most.
+pub(super) fn partial_count(
+    size: UVec2,
+    [inputs, outputs]: [u32; 2],
+    precision: Precision,
+) -> usize {
+    let rows = match precision {
+        Precision::Single => STRIP_ROWS,
+        Precision::Half => HALF_STRIP_ROWS,
+    };
+    let strips = size.y.div_ceil(rows);
+    strips as usize * outputs as usize * (9 * inputs as usize + 1)
 }

@@ -482,11 +482,13 @@ impl Stage {
 
 impl Extent {
     fn of(settings: DenoiserSettings, size: UVec2) -> Self {
-        let channels = settings.channels;
-        let layers = [[RGB, channels], [channels, channels], [channels, RGB]];
+        let DenoiserSettings { channels, precision, .. } = settings;
+        let ends = [[RGB, channels], [channels, RGB]];
+        let ends = ends.map(|layer| partial_count(size, layer, Precision::Single));
+        let inner = partial_count(size, [channels; 2], precision);
         Self {
             pixels: size.x as usize * size.y as usize,
-            partials: layers.map(|layer| partial_count(size, layer)).into_iter().max().unwrap_or(0),
+            partials: inner.max(ends[0]).max(ends[1]),
         }
     }
 

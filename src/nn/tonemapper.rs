@@ -240,7 +240,10 @@ impl Tonemapper {
 
 /// Pixels, and partial sums of the largest layer's gradient.
 fn lengths(size: UVec2) -> [usize; 2] {
-    [size.x as usize * size.y as usize, partial_count(size, [CHANNELS, CHANNELS])]
+    [
+        size.x as usize * size.y as usize,
+        partial_count(size, [CHANNELS, CHANNELS], Precision::Single),
+    ]
 }
 
 /// # Errors

@@ -34,9 +34,9 @@ pub fn weight_gradient(
 }
 
 /// The gradients of every strip; sums of magnitudes, where `term` makes those of the factors.
-fn strips(
+pub(super) fn strips(
     params: &Params,
-    constants: &Constants,
+    rows: u32,
     source: &[f32],
     d_target: &[f32],
     term: impl Fn(f64) -> f64,
@@ -48,7 +48,7 @@ fn strips(
             let values = widen(&values[..of * size[0] * size[1]]);
             values.into_iter().map(&term).collect::<Vec<_>>()
         });
-    let rows = constants.rows as usize;
+    let rows = rows as usize;
     let strip = |strip| {
         let counts = |pixel| pixel / size[0] / rows == strip;
         weight_gradient(size, channels, &source, &d_target, counts)
@@ -59,13 +59,13 @@ fn strips(
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
         let Slices { source, d_target, partials } = slices;
-        let strips = strips(params, constants, source, d_target, |x| x);
+        let strips = strips(params, constants.rows, source, d_target, |x| x);
         partials.iter_mut().zip(strips).for_each(|(partial, sum)| *partial = sum as f32);
     }
 
     /// A rounding for each pixel of the strip.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
-        let magnitudes = strips(params, constants, slices.source, slices.d_target, f64::abs);
+        let magnitudes = strips(params, constants.rows, slices.source, slices.d_target, f64::abs);
         let error = f64::from(constants.rows * params.size.x + 2) * UNIT;
         Tolerances { partials: Tolerance::Each(magnitudes.iter().map(|m| error * m).collect()) }
     }

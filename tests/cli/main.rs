@@ -316,6 +316,7 @@ fn bench_checks_and_times_every_kernel_of_a_step_and_names_the_others() {
     let elsewhere = [
         "adam_rest",
         "conv3x3_half",
+        "conv3x3_weight_gradient_half",
         "conv_strided",
         "decode",
         "expose",

@@ -79,6 +79,45 @@ fn conv3x3_half_matches_its_reference_at_every_magnitude() {
     check_half(matrix, true, [3, 1], 1.0);
 }
 
+/// Runs where the device has cooperative matrices.
+#[test]
+fn conv3x3_weight_gradient_half_matches_its_reference_at_every_magnitude() {
+    let Some(CooperativeMatrix { m, n, k }) = gpu().properties().cooperative_matrix else {
+        let device = gpu();
+        let name = &device.properties().name;
+        return super::common::not_run(format_args!("{name} has no cooperative matrices"));
+    };
+    let mut random = Random::new(2);
+    for (rows, blocks, in_channels, out_channels, magnitudes) in [
+        (4, 2, 8, 17, [1.0, 1.0]),
+        (3, 1, 17, 8, [1e6, 1e-9]),
+        (4, 2, 3, 1, [1e-30, 1e30]),
+        (1, 2, 24, 24, [1e-15, 1e-15]),
+        (16, 2, 64, 40, [1e-3, 1e-3]),
+    ] {
+        for size in SIZES.map(UVec2::from_array) {
+            let pixels = size.element_product();
+            let mut image = |count, most: f64| values(&mut random, count * pixels, -most, most);
+            let source = image(in_channels, magnitudes[0]);
+            let d_target = image(out_channels, magnitudes[1]);
+            let strips = size.y.div_ceil(rows);
+            let partials = vec![f32::NAN; (strips * out_channels * (9 * in_channels + 1)) as usize];
+            run_kernel!(
+                conv3x3_weight_gradient_half,
+                conv3x3_weight_gradient_half::Constants { m, n, k, blocks, rows },
+                conv3x3_weight_gradient_half::Params { size, in_channels, out_channels },
+                Threads::Workgroups([
+                    in_channels.div_ceil(n),
+                    out_channels.div_ceil(blocks * m),
+                    strips
+                ]),
+                [source, d_target],
+                [partials]
+            );
+        }
+    }
+}
+
 #[test]
 fn conv3x3_weight_gradient_and_reduce_strips_match_their_references() {
     let mut random = Random::new(2);
