@@ -167,6 +167,12 @@ fn a_well_lit_set_has_no_curve_and_one_between_a_blend() {
     for (exposure, part) in [(well_lit, "no curve"), (between, "% of a curve"), (dark, "gain")] {
         assert!(exposure.reason().contains(part), "{}", exposure.reason());
     }
+    // One view has no spread; of two, one a half as bright as the other, each is half a stop from their mean.
+    let stops = |views: &[Vec<f32>]| exposure(views).unwrap().reason();
+    let view = scaled(&bright, 0.2);
+    assert!(!stops(&[view.clone()]).contains("give or take"));
+    let two = stops(&[view.clone(), scaled(&view, 0.5)]);
+    assert!(two.contains("give or take 0.5 stops between the views"), "{two}");
     // Half the views well lit: the set is dark on the mean, and every view is brought to the same brightness.
     let half = exposure(&[bright.clone(), scaled(&bright, 0.05)]).unwrap();
     assert!(half.weight() > 0.0 && half.share > 0.95, "{half:?}");

@@ -246,6 +246,15 @@ fn a_view_has_at_most_the_tiles_that_a_subgroup_of_gaussians_that_cover_them_all
     assert!(message.starts_with("a 8192x8192 view has 524288 tiles of 16x8 pixels"), "{message}");
     assert!(!message.contains('\n'), "{message}");
 
+    // A tile grows with the view, but for one that is named.
+    let tile_for = |tile: Option<Tile>| {
+        let settings = RenderSettings { tile, ..RenderSettings::default() };
+        settings.tile_for(&gpu(), [[8192, 4096]].into_iter()).unwrap()
+    };
+    let named = Tile::from([16, 8]);
+    assert_eq!(tile_for(Some(named)), named);
+    assert!(tile_for(None).size[1] > 8, "{:?}", tile_for(None));
+
     let lanes = gpu().properties().subgroup_size;
     let tiles = most - 64 - 2 * lanes;
     let slots = (tiles * lanes) as usize;

@@ -142,3 +142,26 @@ impl LogSlot<'_> {
         )
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::loss::{LossConfig, Weights};
+    use crate::random::Stream;
+    use crate::scene::Features;
+
+    #[test]
+    fn the_total_is_one_of_distances_and_of_what_likenesses_lack() {
+        let config = LossConfig {
+            tone_curve: 0,
+            ssim_weight: 0.25,
+            weights: Weights::default(),
+            depth_box: 1,
+            boxes: Stream::new(0, 0),
+            features: Features::NONE,
+        };
+        let value = |term: Term| if term.is_likeness { 0.75 } else { 0.5 };
+        let losses = StepLosses { status: 0, values: Term::all().map(value).collect() };
+        assert_eq!(config.total(&losses), 0.75 * 0.5 + 0.25 * (1.0 - 0.75));
+    }
+}
