@@ -107,3 +107,37 @@ impl Renderer {
         ))
     }
 }
+
+#[cfg(all(test, feature = "io"))]
+mod tests {
+    use glam::{DAffine3, DVec2};
+
+    use crate::camera::Camera;
+    use crate::gpu::{DeviceChoice, Gpu};
+    use crate::render::{RenderOptions, RenderSettings, Renderer};
+    use crate::scene::width;
+
+    /// With the sorts, whose memory comes with the first render.
+    #[test]
+    fn a_render_takes_the_bytes_that_are_foreseen() {
+        let gpu = Gpu::new(&DeviceChoice::Best).unwrap();
+        let (gaussians, intersections) = (200_000, 300_000);
+        let (principal_point, view_from_world) = (DVec2::new(8.0, 4.0), DAffine3::IDENTITY);
+        let focal = DVec2::splat(16.0);
+        let camera = Camera { width: 16, height: 8, focal, principal_point, view_from_world };
+        let settings = RenderSettings::default();
+        let parameters = gpu.zeros("parameters", gaussians * width(settings.shape)).unwrap();
+        let mut renderer = Renderer::new(&gpu, settings).unwrap();
+        let before = gpu.memory_in_use();
+        renderer.reserve(gaussians, [&camera]).unwrap();
+        renderer.set_intersection_capacity(intersections).unwrap();
+        let options = RenderOptions { sh_degree: 3, background: [0.0; 3] };
+        renderer.render_image(&parameters, &camera, &options).unwrap();
+        assert_eq!(renderer.intersection_capacity(), intersections);
+        gpu.free_unused();
+        let taken = (gpu.memory_in_use() - before) as f64;
+        let foreseen = gaussians * renderer.bytes_per_gaussian()
+            + intersections as usize * renderer.bytes_per_intersection();
+        assert!((taken / foreseen as f64 - 1.0).abs() < 0.02, "{taken} {foreseen}");
+    }
+}
