@@ -275,6 +275,32 @@ fn a_buffer_that_is_too_short_is_refused() {
 }
 
 #[test]
+fn coefficients_in_halves_are_refused_where_a_buffer_is_too_short() {
+    let gpu = gpu();
+    let adam = Adam::new(&gpu).unwrap();
+    // Two Gaussians of 14 columns, and 9 coefficients behind them in 5 words.
+    let fitting = [2 * (14 + 5), 2 * (14 + 9), 2 * (14 + 9)];
+    for (short, fits) in
+        [([0, 0, 0], true), ([1, 0, 0], false), ([0, 1, 0], false), ([0, 0, 1], false)]
+    {
+        let [words, floats, of_moments] = [0, 1, 2].map(|i| fitting[i] - short[i]);
+        let mut parameters = gpu.zeros("parameters", words).unwrap();
+        let gradients = gpu.zeros("gradients", floats).unwrap();
+        let mut moments = Moments::zeros(&gpu, of_moments).unwrap();
+        let status = gpu.zeros("status", 1).unwrap();
+        let result = gpu.run("adam", |pass| {
+            let buffers = AdamBuffers {
+                parameters: &mut parameters,
+                gradients: &gradients,
+                moments: &mut moments,
+            };
+            adam.record_halves(pass, 1, 1e-3, [2, 14, 9], buffers, &status)
+        });
+        assert_eq!(result.is_ok(), fits, "{short:?}");
+    }
+}
+
+#[test]
 fn the_first_value_that_is_not_finite_is_found_wherever_it_stands_and_none_where_there_is_none() {
     let gpu = gpu();
     let mut check = FiniteCheck::new(&gpu).unwrap();

@@ -23,7 +23,9 @@ fn density_control_matches_its_references() {
     let gpu = gpu();
     let limited = DensifySettings { max_gaussians: 1100, ..CONSERVING };
     let sizes = [0, 1, 2, 63, 64, 65, 1000];
-    let cases = [SETTINGS, CONSERVING, limited].into_iter().flat_map(|s| sizes.map(|n| (s, n)));
+    let opaque = DensifySettings { min_opacity: 0.4, ..CONSERVING };
+    let cases = [SETTINGS, CONSERVING, limited, opaque];
+    let cases = cases.into_iter().flat_map(|s| sizes.map(|n| (s, n)));
     let cameras = [DVec3::new(0.3, -0.2, 0.6), DVec3::new(-0.9, 0.4, -0.3)];
     for (settings, count) in cases {
         let before = Host::mixed(count);
