@@ -170,7 +170,7 @@ fn a_well_lit_set_has_no_curve_and_one_between_a_blend() {
     // One view has no spread; of two, one a half as bright as the other, each is half a stop from their mean.
     let stops = |views: &[Vec<f32>]| exposure(views).unwrap().reason();
     let view = scaled(&bright, 0.2);
-    assert!(!stops(&[view.clone()]).contains("give or take"));
+    assert!(!stops(std::slice::from_ref(&view)).contains("give or take"));
     let two = stops(&[view.clone(), scaled(&view, 0.5)]);
     assert!(two.contains("give or take 0.5 stops between the views"), "{two}");
     // Half the views well lit: the set is dark on the mean, and every view is brought to the same brightness.
