@@ -42,7 +42,7 @@ void main() {}
 
 const uint TAPS = 9;
 
-shared float16_t pixels[3 * 3 * N * K];       // (column of taps, row, N, K)
+shared float16_t pixels[3 * 3 * N * K];     // (column of taps, row, N, K)
 shared float16_t d_pixels[BLOCKS * M * K];  // (BLOCKS M, K)
 shared float sums[M * N];
 
