@@ -72,8 +72,7 @@ mod sort_downsweep;
 mod sort_spine;
 mod sort_upsweep;
 pub mod splat;
-pub mod ssim_backward;
-pub mod ssim_forward;
+pub mod ssim;
 mod structure_l1;
 mod tone_map;
 mod tone_mix;
@@ -91,4 +90,8 @@ fn inside(i: usize, [width, height]: [u32; 2], [begin, end]: [UVec2; 2]) -> bool
     let row = i as u32 / width;
     let pixel = UVec2::new(i as u32 % width, row % height);
     pixel.cmpge(begin).all() && pixel.cmplt(end).all()
+}
+
+fn widen(values: &[f32]) -> Vec<f64> {
+    values.iter().map(|&x| f64::from(x)).collect()
 }

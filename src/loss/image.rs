@@ -4,15 +4,14 @@
 //! that of 3DGS: 11 x 11 Gaussian window with sigma 1.5, per channel, zero padding. R_0 is held to the pseudo-GT, and
 //! the tonemapper's output to the dark photograph itself.
 
-use glam::{UVec2, Vec3};
+use glam::UVec2;
 
 use super::log::{LogSlot, PartialSums};
 use super::{
     Interior, LossSpec, LossTerm, Term, TermInputs, ViewSource, holds, no_scratch, value_count,
 };
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
-use crate::kernels::ssim::RADIUS;
-use crate::kernels::{ToneParameters, l1, ssim_backward, ssim_forward};
+use crate::kernels::{ToneParameters, l1, ssim};
 use crate::scene::Feature;
 use crate::{Error, Result};
 
@@ -72,27 +71,41 @@ impl Term {
     };
 }
 
-/// How the SSIM kernels march over a view: the columns of a lane and the rows of a subgroup.
+/// How the SSIM kernel marches over a view: the columns of a lane, the rows of a subgroup, and the floats that its loads and
+/// stores are aligned to.
 #[derive(Clone, Copy, Debug)]
 struct March {
     columns: u32,
     rows: u32,
+    alignment: u32,
 }
 
 impl March {
-    /// What suits the device: on a processor loads and stores cost the most, so that a subgroup is wide and goes far, for
-    /// registers that spill stay in the first-level cache; a GPU needs narrow strips, which stay in registers.
-    fn on(gpu: &Gpu) -> Self {
+    /// What suits the device, the first that fits a view: on a processor loads and stores cost the most, so that a subgroup
+    /// is as wide as the first-level cache holds what its registers do not, and goes far; a GPU needs narrow strips, which
+    /// stay in registers.
+    fn on(gpu: &Gpu) -> Vec<Self> {
         let properties = gpu.properties();
         match properties.is_cpu {
-            true => Self { columns: 16, rows: 128 },
-            false => Self { columns: (GPU_COLUMNS / properties.subgroup_size).max(2), rows: 32 },
+            true => vec![
+                Self { columns: 12, rows: 192, alignment: 4 },
+                Self { columns: 10, rows: 192, alignment: 1 },
+            ],
+            false => {
+                let columns = (GPU_COLUMNS / properties.subgroup_size).max(2);
+                vec![Self { columns, rows: 32, alignment: 1 }]
+            }
         }
+    }
+
+    fn fits(self, size: UVec2) -> bool {
+        size.x.is_multiple_of(self.alignment)
     }
 
     /// The subgroups for a channel of a view of `size`, where one has so many lanes.
     fn subgroups(self, size: UVec2, lanes: u32) -> u32 {
-        let outputs = lanes * self.columns - 2 * RADIUS as u32;
+        let halo = (2 * ssim::RADIUS as u32).next_multiple_of(self.alignment);
+        let outputs = lanes * self.columns - 2 * halo;
         size.x.div_ceil(outputs) * size.y.div_ceil(self.rows)
     }
 }
@@ -151,13 +164,8 @@ enum Kernels {
 #[derive(Debug)]
 struct Ssim {
     weight: f64,
-    march: March,
     lanes: u32,
-    forward: Pipeline<ssim_forward::Kernel>,
-    backward: Pipeline<ssim_backward::Kernel>,
-    /// (channels, H, W), dS/dE\[a\], dS/dE\[aa\], dS/dE\[ab\]: all three channels, or where the device cannot bind as
-    /// much, each in its turn.
-    d_moments: Buffer<Vec3>,
+    kernels: Vec<(March, Pipeline<ssim::Kernel>)>,
 }
 
 impl Loss {
@@ -174,15 +182,15 @@ impl Loss {
         }
         let subgroup_size = gpu.properties().subgroup_size;
         let kernels = if ssim_weight > 0.0 {
-            let march = March::on(gpu);
-            let March { columns, rows } = march;
+            let kernel = |march| {
+                let March { columns, rows, alignment } = march;
+                let constants = ssim::Constants { columns, rows, alignment, tone_curve };
+                Ok((march, gpu.pipeline(&constants)?))
+            };
             Kernels::Ssim(Ssim {
                 weight: ssim_weight,
-                march,
                 lanes: subgroup_size,
-                forward: gpu.pipeline(&ssim_forward::Constants { columns, rows, tone_curve })?,
-                backward: gpu.pipeline(&ssim_backward::Constants { columns, rows, tone_curve })?,
-                d_moments: gpu.uninit("d_moments", 0)?,
+                kernels: March::on(gpu).into_iter().map(kernel).collect::<Result<_>>()?,
             })
         } else {
             let constants = l1::Constants { tone_curve, ..Default::default() };
@@ -207,17 +215,7 @@ impl Loss {
     /// # Errors
     /// The device is out of memory.
     pub fn reserve(&mut self, size: UVec2) -> Result<()> {
-        let values = value_count(size);
-        if values > self.max_values {
-            if let Kernels::Ssim(ssim) = &mut self.kernels {
-                let bindable = self.gpu.properties().max_storage_buffer_range;
-                let takes_all = u64::from(values) * size_of::<Vec3>() as u64 <= bindable;
-                let channels = if takes_all { values } else { values / 3 };
-                ssim.d_moments = self.gpu.uninit("d_moments", channels as usize)?;
-            }
-            self.max_values = values;
-        }
-        // How many channels are taken at once follows from what there is room for now.
+        self.max_values = self.max_values.max(value_count(size));
         let workgroups = self.kernels.workgroups(size) as usize;
         if workgroups > self.l1_partials.len() {
             self.l1_partials = self.gpu.uninit("l1_partials", workgroups)?;
@@ -309,76 +307,41 @@ impl Kernels {
             Self::L1 { values_per_workgroup, .. } => {
                 value_count(size).div_ceil(*values_per_workgroup)
             }
-            Self::Ssim(ssim) => {
-                ssim.channels_at_once(size) * ssim.march.subgroups(size, ssim.lanes)
-            }
+            Self::Ssim(ssim) => 3 * ssim.kernel(size).0.subgroups(size, ssim.lanes),
         }
     }
 }
 
 impl Ssim {
-    /// The channels of a view whose derivatives there is room for: all three or one.
-    fn channels_at_once(&self, size: UVec2) -> u32 {
-        if self.d_moments.len() >= value_count(size) as usize { 3 } else { 1 }
+    /// The last one fits every view.
+    fn kernel(&self, size: UVec2) -> &(March, Pipeline<ssim::Kernel>) {
+        let last = self.kernels.len() - 1;
+        let first = self.kernels.iter().position(|(march, _)| march.fits(size));
+        &self.kernels[first.unwrap_or(last)]
     }
 
     fn record(
-        &mut self,
+        &self,
         pass: &mut Recorder<'_>,
         threads: Threads<'_>,
         LossInputs { size, interior, render, low, tone }: LossInputs<'_>,
         d_render: &mut Buffer<f32>,
-        [l1_partials, ssim_partials]: [&mut Buffer<f32>; 2],
+        [differences, indices]: [&mut Buffer<f32>; 2],
     ) -> Result<()> {
-        let UVec2 { x: width, y: height } = size;
-        let (interior_begin, interior_end) = (interior.origin, interior.end());
         let mean_scale = 1.0 / f64::from(interior.value_count());
-        let at_once = self.channels_at_once(size);
-        for channel_begin in (0..3).step_by(at_once as usize) {
-            let channel_end = channel_begin + at_once;
-            pass.dispatch(
-                &self.forward,
-                &ssim_forward::Params {
-                    width,
-                    height,
-                    interior_begin,
-                    interior_end,
-                    channel_begin,
-                    channel_end,
-                },
-                ssim_forward::Buffers {
-                    render,
-                    low,
-                    tone,
-                    d_moments: &mut self.d_moments,
-                    partials: ssim_partials,
-                },
-                threads,
-            )?;
-            pass.dispatch(
-                &self.backward,
-                &ssim_backward::Params {
-                    width,
-                    height,
-                    interior_begin,
-                    interior_end,
-                    channel_begin,
-                    channel_end,
-                    l1_scale: ((1.0 - self.weight) * mean_scale) as f32,
-                    ssim_scale: (self.weight * mean_scale) as f32,
-                },
-                ssim_backward::Buffers {
-                    render,
-                    low,
-                    tone,
-                    d_moments: &self.d_moments,
-                    d_render,
-                    partials: l1_partials,
-                },
-                threads,
-            )?;
-        }
-        Ok(())
+        pass.dispatch(
+            &self.kernel(size).1,
+            &ssim::Params {
+                width: size.x,
+                height: size.y,
+                interior_begin: interior.origin,
+                interior_end: interior.end(),
+                l1_scale: ((1.0 - self.weight) * mean_scale) as f32,
+                ssim_scale: (self.weight * mean_scale) as f32,
+            },
+            ssim::Buffers { render, low, tone, d_render, differences, indices },
+            threads,
+        )
     }
 }
 

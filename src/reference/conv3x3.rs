@@ -1,7 +1,7 @@
 //! The 3x3 convolution in double precision; the kernel's reference rounds what it returns.
 
 use super::rounding::UNIT;
-use super::ssim_forward::widen;
+use super::widen;
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::conv3x3::{Constants, Kernel, Params, RELU, SIGMOID, Slices, Tolerances};
 

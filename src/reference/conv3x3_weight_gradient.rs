@@ -2,7 +2,7 @@
 
 use super::conv3x3::for_each_tap;
 use super::rounding::UNIT;
-use super::ssim_forward::widen;
+use super::widen;
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::conv3x3_weight_gradient::{Constants, Kernel, Params, Slices, Tolerances};
 

@@ -1,7 +1,7 @@
 use glam::Vec2;
 
 use super::rounding::{UNIT, chain};
-use super::ssim_forward::widen;
+use super::widen;
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::norm_statistics::{Constants, Kernel, Params, Slices, Tolerances};
 

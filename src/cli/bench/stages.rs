@@ -88,7 +88,7 @@ pub(super) fn time(bench: &Bench, scene: &Scene, trainers: &mut Trainers) -> Res
     let gpu = &bench.gpu;
     let steps = repeated(bench, || trainers.plain.profile_step())?;
     let of_step = |names: &[&str]| median(steps.iter().map(|t| of_kernels(t, names)).collect());
-    let loss_kernels = ["ssim_forward", "ssim_backward", "loss_log"];
+    let loss_kernels = ["ssim", "loss_log"];
     let mut without_curve = scene::plain(gpu, scene, ToneCurve::None)?;
     let loss_without_curve =
         bench.median(|| Ok(of_kernels(&without_curve.profile_step()?, &loss_kernels)))?;

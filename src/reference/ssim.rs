@@ -1,0 +1,186 @@
+//! SSIM and the gradient of L1 + SSIM, in any number; the kernel's reference rounds what it returns.
+
+use glam::UVec2;
+
+use super::inside;
+use super::rounding::{Rounded, UNIT, chain, rounded_tone_curve, values};
+use crate::gpu::{Reference, Tolerance};
+use crate::kernels::ssim::{C1, C2, Constants, Kernel, Params, Slices, Tolerances};
+use crate::tone::Real;
+
+/// SSIM at one pixel of one channel and its derivatives with respect to the blurred moments.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Ssim<T = f64> {
+    /// The index itself, at most 1.
+    pub value: T,
+    /// dS/dE\[a\], dS/dE\[aa\], dS/dE\[ab\].
+    pub d_moments: [T; 3],
+}
+
+/// The 11 x 11 Gaussian window (sigma 1.5) over one channel, zero outside it.
+pub fn blur(width: usize, height: usize, plane: &[f64]) -> Vec<f64> {
+    let taps: Vec<f64> = (-5..=5).map(|d| (-f64::from(d * d) / 4.5).exp()).collect();
+    let sum: f64 = taps.iter().sum();
+    let (mut along_x, mut blurred) = (vec![0.0; plane.len()], vec![0.0; plane.len()]);
+    for y in 0..height {
+        for x in 0..width {
+            for from in x.saturating_sub(5)..width.min(x + 6) {
+                along_x[y * width + x] += taps[from + 5 - x] / sum * plane[y * width + from];
+            }
+        }
+    }
+    for y in 0..height {
+        for x in 0..width {
+            for from in y.saturating_sub(5)..height.min(y + 6) {
+                blurred[y * width + x] += taps[from + 5 - y] / sum * along_x[from * width + x];
+            }
+        }
+    }
+    blurred
+}
+
+/// SSIM of every pixel of one channel, `a` against `b`.
+pub fn ssim(width: usize, height: usize, a: &[f64], b: &[f64]) -> Vec<Ssim> {
+    let moment = |of: fn(f64, f64) -> f64| {
+        let plane: Vec<f64> = a.iter().zip(b).map(|(&a, &b)| of(a, b)).collect();
+        blur(width, height, &plane)
+    };
+    let (mean_a, mean_b) = (moment(|a, _| a), moment(|_, b| b));
+    let (aa, bb, ab) = (moment(|a, _| a * a), moment(|_, b| b * b), moment(|a, b| a * b));
+    (0..a.len()).map(|i| ssim_of_moments(mean_a[i], mean_b[i], aa[i], bb[i], ab[i])).collect()
+}
+
+fn ssim_of_moments<T: Real>(a: T, b: T, aa: T, bb: T, ab: T) -> Ssim<T> {
+    let [one, two, c1, c2] = [1.0, 2.0, C1, C2].map(T::of);
+    let a1 = two * a * b + c1;
+    let a2 = two * (ab - a * b) + c2;
+    let b1 = a * a + b * b + c1;
+    // The variances are not negative: only the cancellation of large bright values reaches the floor.
+    let b2 = (aa - a * a + bb - b * b).at_least(T::of(0.0)) + c2;
+    let scale = one / (b1 * b2);
+    let value = a1 * a2 * scale;
+    let d_mean = two * (b * (a2 - a1) * scale - a * value * (one / b1 - one / b2));
+    Ssim { value, d_moments: [d_mean, -value / b2, two * a1 * scale] }
+}
+
+/// The gradient of `l1_scale` sum|a - b| - `ssim_scale` sum SSIM with respect to one channel of the render `a`, sums over
+/// the pixels from `begin` to before `end`.
+pub fn gradient(
+    [width, height]: [usize; 2],
+    interior: [UVec2; 2],
+    [l1_scale, ssim_scale]: [f64; 2],
+    a: &[f64],
+    b: &[f64],
+) -> Vec<f64> {
+    let counts = |i: usize| inside(i, [width as u32, height as u32], interior);
+    let map = ssim(width, height, a, b);
+    let blurred = [0, 1, 2].map(|m| {
+        let derivative = |(i, of): (usize, &Ssim)| if counts(i) { of.d_moments[m] } else { 0.0 };
+        blur(width, height, &map.iter().enumerate().map(derivative).collect::<Vec<_>>())
+    });
+    let at = |i: usize| {
+        let difference = if counts(i) { a[i] - b[i] } else { 0.0 };
+        let sign = if difference == 0.0 { 0.0 } else { difference.signum() };
+        l1_scale * sign - ssim_scale * d_ssim(a[i], b[i], [0, 1, 2].map(|m| blurred[m][i]))
+    };
+    (0..a.len()).map(at).collect()
+}
+
+/// dSSIM/da at one pixel, from the blurred derivatives.
+fn d_ssim<T: Real>(a: T, b: T, [mean, square, product]: [T; 3]) -> T {
+    mean + T::of(2.0) * a * square + b * product
+}
+
+/// One channel, blurred: each number is a sum of 11 sums of 11 products with rounded taps.
+fn rounded_blur(size: [usize; 2], plane: &[Rounded]) -> Vec<Rounded> {
+    let blurred =
+        |of: fn(&Rounded) -> f64| blur(size[0], size[1], &plane.iter().map(of).collect::<Vec<_>>());
+    let values = blurred(|x| x.value);
+    let errors = blurred(|x| x.error + 26.0 * UNIT * (x.value.abs() + x.error));
+    values.into_iter().zip(errors).map(|(value, error)| Rounded { value, error }).collect()
+}
+
+/// What the kernel makes of a value of the render.
+struct Outcome {
+    gradient: Rounded,
+    /// a - b and SSIM; zero where they do not count.
+    difference: Rounded,
+    ssim: Rounded,
+}
+
+fn outcomes(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Vec<Outcome> {
+    let pixels = params.width as usize * params.height as usize;
+    let channel = |channel: usize| {
+        let plane = channel * pixels..(channel + 1) * pixels;
+        let exact = |&x: &f32| Rounded::exact(x);
+        let a: Vec<_> = slices.render[plane.clone()].iter().map(exact).collect();
+        let target = |&x: &f32| rounded_tone_curve(constants.tone_curve, x, &slices.tone[0]);
+        let b: Vec<_> = slices.low[plane].iter().map(target).collect();
+        outcomes_of_channel(params, &a, &b)
+    };
+    (0..3).flat_map(channel).collect()
+}
+
+fn outcomes_of_channel(params: &Params, a: &[Rounded], b: &[Rounded]) -> Vec<Outcome> {
+    let size = [params.width as usize, params.height as usize];
+    let interior = [params.interior_begin, params.interior_end];
+    let counts = |i: usize| inside(i, [params.width, params.height], interior);
+    let moment = |of: fn(Rounded, Rounded) -> Rounded| {
+        let plane: Vec<_> = a.iter().zip(b).map(|(&a, &b)| of(a, b)).collect();
+        rounded_blur(size, &plane)
+    };
+    let means = [moment(|a, _| a), moment(|_, b| b)];
+    let squares = [moment(|a, _| a * a), moment(|_, b| b * b), moment(|a, b| a * b)];
+    let index = |i: usize| {
+        let ([a, b], [aa, bb, ab]) =
+            ([0, 1].map(|m| means[m][i]), [0, 1, 2].map(|m| squares[m][i]));
+        if counts(i) { ssim_of_moments(a, b, aa, bb, ab) } else { Ssim::default() }
+    };
+    let map: Vec<_> = (0..a.len()).map(index).collect();
+    let derivatives = [0, 1, 2]
+        .map(|m| rounded_blur(size, &map.iter().map(|of| of.d_moments[m]).collect::<Vec<_>>()));
+    let [l1_scale, ssim_scale] = [params.l1_scale, params.ssim_scale].map(Rounded::exact);
+    let outcome = |i: usize| {
+        let difference = if counts(i) { a[i] - b[i] } else { Rounded::default() };
+        let own = difference.value;
+        let sign = Rounded {
+            value: if own == 0.0 { 0.0 } else { own.signum() },
+            // Either one where a rounding of the curve decides.
+            error: if difference.error > 0.0 && difference.may_cross(0.0) { 2.0 } else { 0.0 },
+        };
+        let d_ssim = d_ssim(a[i], b[i], [0, 1, 2].map(|m| derivatives[m][i]));
+        let gradient = l1_scale * sign - ssim_scale * d_ssim;
+        Outcome { gradient, difference: difference.abs(), ssim: map[i].value }
+    };
+    (0..a.len()).map(outcome).collect()
+}
+
+impl Reference for Kernel {
+    /// The whole sums go into the first partials: how many there are is the device's choice.
+    fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
+        let outcomes = outcomes(params, constants, &slices);
+        let gradients = values(outcomes.iter().map(|of| of.gradient));
+        slices.d_render.iter_mut().zip(gradients).for_each(|(to, d)| *to = d);
+        let sum = |of: fn(&Outcome) -> f64| outcomes.iter().map(of).sum::<f64>() as f32;
+        for (partials, sum) in [
+            (slices.differences, sum(|of| of.difference.value)),
+            (slices.indices, sum(|of| of.ssim.value)),
+        ] {
+            partials.fill(0.0);
+            partials[0] = sum;
+        }
+    }
+
+    fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
+        let outcomes = outcomes(params, constants, &slices);
+        let chain = chain(0) + f64::from(constants.columns * constants.rows);
+        let sum = |of: fn(&Outcome) -> Rounded| {
+            Tolerance::Sum(Rounded::sum(chain, outcomes.iter().map(of)).bound())
+        };
+        Tolerances {
+            d_render: outcomes.iter().map(|of| of.gradient).collect(),
+            differences: sum(|of| of.difference),
+            indices: sum(|of| of.ssim),
+        }
+    }
+}
