@@ -20,6 +20,7 @@ mod faults;
 mod kernel;
 mod memory;
 mod pipeline;
+mod reconvergence;
 mod recorder;
 mod requirements;
 mod statistics;
@@ -90,6 +91,9 @@ pub struct Properties {
     pub is_cpu: bool,
     /// Products of 16-bit matrices; none where the device does not offer them or a host lends it.
     pub cooperative_matrix: Option<CooperativeMatrix>,
+    /// A subgroup whose lanes agree stays together, whatever the others of its workgroup do: promised, not only so; never of a
+    /// device that a host lends.
+    pub keeps_subgroups: bool,
     /// Passes may push their descriptors; where not, they bind sets.
     pub pushes_descriptors: bool,
     /// Kernels can be asked for their registers and spills; never of a device that a host lends.

@@ -1,5 +1,6 @@
 #version 460
 #extension GL_GOOGLE_include_directive : require
+#extension GL_EXT_subgroup_uniform_control_flow : require
 #include "kernel.glsl"
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 #include "splat.glsl"
@@ -33,7 +34,8 @@ layout(binding = 9)           buffer Status     { uint status[]; };
 
 #include "tile_run.glsl"
 
-void main() {
+// Subgroups that share a tile leave its loops each for itself.
+void main() [[subgroup_uniform_control_flow]] {
     uint tile = WORKGROUP_INDEX;
     uint lane = gl_SubgroupInvocationID;
     uvec2 origin = tile_origin(tile, tile_columns);

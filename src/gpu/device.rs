@@ -19,7 +19,7 @@ use super::memory::{BudgetQuery, MemoryUsage};
 use super::requirements::{OPTIONAL_EXTENSIONS, Offered, required_device_features};
 use super::{
     DeviceChoice, DeviceReport, Gpu, Properties, Queue, SchedulerVariables, Shared, address_space,
-    statistics, tuning, validation,
+    reconvergence, statistics, tuning, validation,
 };
 use crate::{Error, Result};
 
@@ -127,13 +127,14 @@ impl Gpu {
                 let vk::PhysicalDeviceProperties { vendor_id, device_id, .. } = offered.properties;
                 owned.tuning_path = tuning::path(cache_folder(), vendor_id, device_id);
             }
-            let matrix = cooperative::offered(&owned.entry, &owned.instance, physical, &offered);
+            let Owned { entry, instance, .. } = &owned;
             let properties = Properties {
-                cooperative_matrix: matrix,
+                cooperative_matrix: cooperative::offered(entry, instance, physical, &offered),
+                keeps_subgroups: reconvergence::offered(instance, physical, &offered),
                 tells_statistics: tells_statistics(&offered),
-                ..properties(&owned.instance, physical, &offered)?
+                ..properties(instance, physical, &offered)?
             };
-            create_device(&owned.instance, physical, &offered, matrix.is_some())
+            create_device(instance, physical, &offered, &properties)
                 .map(|(device, queue)| (physical, properties, device, queue))
         });
         match opened {
@@ -406,6 +407,7 @@ fn properties(
         timestamp_period: limits.timestamp_period,
         is_cpu: offered.properties.device_type == vk::PhysicalDeviceType::CPU,
         cooperative_matrix: None,
+        keeps_subgroups: false,
         pushes_descriptors: offered.pushes_descriptors(),
         tells_statistics: false,
     })
@@ -418,7 +420,7 @@ fn create_device(
     instance: &ash::Instance,
     physical: vk::PhysicalDevice,
     offered: &Offered,
-    with_cooperative_matrices: bool,
+    properties: &Properties,
 ) -> Result<(ash::Device, Queue)> {
     let family = offered.compute_family.unwrap_or_default();
     let priorities = [1.0];
@@ -434,7 +436,7 @@ fn create_device(
     let mut matrices =
         vk::PhysicalDeviceCooperativeMatrixFeaturesKHR::default().cooperative_matrix(true);
     let mut info = vk::DeviceCreateInfo::default().queue_create_infos(&queues);
-    if with_cooperative_matrices {
+    if properties.cooperative_matrix.is_some() {
         extensions.push(cooperative::EXTENSION.as_ptr());
         // Under the memory model, the atomics of other kernels need its device scope.
         vulkan12 = vulkan12
@@ -443,9 +445,15 @@ fn create_device(
             .vulkan_memory_model_device_scope(true);
         info = info.push_next(&mut matrices);
     }
+    let mut uniform = vk::PhysicalDeviceShaderSubgroupUniformControlFlowFeaturesKHR::default()
+        .shader_subgroup_uniform_control_flow(true);
+    if properties.keeps_subgroups {
+        extensions.push(reconvergence::EXTENSION.as_ptr());
+        info = info.push_next(&mut uniform);
+    }
     let mut executables = vk::PhysicalDevicePipelineExecutablePropertiesFeaturesKHR::default()
         .pipeline_executable_info(true);
-    if tells_statistics(offered) {
+    if properties.tells_statistics {
         extensions.push(statistics::EXTENSION.as_ptr());
         info = info.push_next(&mut executables);
     }

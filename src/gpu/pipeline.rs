@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use ash::vk;
 
-use super::{Gpu, Interface, Kernel, Retired, Shared};
+use super::{Gpu, Interface, Kernel, Retired, Shared, reconvergence};
 use crate::Result;
 
 /// A kernel ready to be dispatched.
@@ -123,8 +123,11 @@ pub(super) unsafe fn raw_pipeline(
     mut constants: Vec<(u32, u32)>,
     flags: vk::PipelineCreateFlags,
 ) -> Result<vk::Pipeline, vk::Result> {
-    let code = ash::util::read_spv(&mut Cursor::new(interface.spirv))
+    let mut code = ash::util::read_spv(&mut Cursor::new(interface.spirv))
         .map_err(|_| vk::Result::ERROR_INITIALIZATION_FAILED)?;
+    if !shared.properties.keeps_subgroups {
+        code = reconvergence::unasked(&code);
+    }
     if let Some(id) = interface.subgroup_size_id {
         constants.push((id, shared.properties.subgroup_size));
     }

@@ -186,6 +186,7 @@ mod tests {
             is_cpu: false,
             cooperative_matrix: None,
             pushes_descriptors: true,
+            keeps_subgroups: false,
             tells_statistics: false,
         }
     }
