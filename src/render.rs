@@ -277,7 +277,7 @@ impl Renderer {
         gradients: Gradients<'_>,
     ) -> Result<()> {
         let view = self.view(&patch.into())?;
-        let channels = self.settings.channels();
+        let color_vectors = self.frame.color_vectors();
         let frame = &mut self.frame;
         pass.dispatch(
             &self.blend_backward,
@@ -311,7 +311,7 @@ impl Renderer {
                 project_backward::Buffers {
                     parameters: &batch.of_rows(gaussians, parameter_columns)?,
                     splats: &batch.of_rows(&frame.splats, 1)?,
-                    colors: &batch.of_rows(&frame.colors, channels)?,
+                    colors: &batch.of_rows(&frame.colors, color_vectors)?,
                     tile_counts: &batch.of_rows(&frame.tile_counts, 1)?,
                     emitted: &batch.of_rows(&frame.emitted, 1)?,
                     records: &frame.records,
@@ -333,7 +333,7 @@ impl Renderer {
         view: &View,
         sh_degree: u32,
     ) -> Result<()> {
-        let (frame, channels) = (&self.frame, self.settings.channels());
+        let (frame, color_vectors) = (&self.frame, self.frame.color_vectors());
         self.batches().iter().try_for_each(|batch| {
             pass.dispatch(
                 &self.project,
@@ -347,7 +347,7 @@ impl Renderer {
                 project::Buffers {
                     parameters: &batch.of_rows(gaussians, self.parameter_columns())?,
                     splats: &mut batch.of_rows(&frame.splats, 1)?,
-                    colors: &mut batch.of_rows(&frame.colors, channels)?,
+                    colors: &mut batch.of_rows(&frame.colors, color_vectors)?,
                     depth_keys: &mut batch.of_rows(&frame.depth_keys, 1)?,
                     ids: &mut batch.of_rows(&frame.ids, 1)?,
                     tile_counts: &mut batch.of_rows(&frame.tile_counts, 1)?,

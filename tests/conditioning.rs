@@ -62,7 +62,7 @@ fn errors_of(count: usize) -> [f64; 2] {
     let frame = rendered.renderer.frame();
     let splats = gpu().read(&frame.splats).unwrap();
     let splats: Vec<Splat> = splats[..count].iter().map(Splat::from).collect();
-    let colors = widen(&gpu().read(&frame.colors).unwrap()[..3 * count]);
+    let colors = widen(bytemuck::cast_slice(&gpu().read(&frame.colors).unwrap()[..count]));
     // The view is one tile, so that every layer has one slot.
     let slots = gpu().read(&frame.emitted).unwrap();
     let stored = gpu().read(&frame.records).unwrap();

@@ -74,7 +74,7 @@ fn tile_runs(sorted_tiles: Vec<u32>, longest_run: u32) -> (Vec<UVec2>, Vec<u32>)
     let (count, size) = (sorted_tiles.len() as u32, UVec2::new(5 * 16, 24 * 16));
     let (counts, sorted_slots, owners) =
         (vec![count], (0..count).collect::<Vec<_>>(), vec![0; count as usize]);
-    let (colors, pixels) = (vec![0.5; 3], size.element_product() as usize);
+    let (colors, pixels) = (vec![Vec3::splat(0.5)], size.element_product() as usize);
     let (render, transmittances) = (vec![0.0; 3 * pixels], vec![0.0; pixels]);
     let (tile_ranges, status) = (vec![UVec2::ONE; 120], vec![0; 3]);
     let params =

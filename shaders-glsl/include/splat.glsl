@@ -19,6 +19,8 @@ const uint RECORD_HEAD = 6;
 const uint RECORD = RECORD_HEAD + CHANNELS;
 // The vectors of three that hold a record: a load or a store of three numbers costs hardly more than one of one.
 const uint RECORD_VECTORS = (RECORD + 2) / 3;
+// Those that hold the values of a splat.
+const uint COLOR_VECTORS = (CHANNELS + 2) / 3;
 // In pixels; a subgroup owns at most 32 rows of lanes.
 layout(constant_id = 3) const uint TILE_WIDTH = 16;
 layout(constant_id = 4) const uint TILE_HEIGHT = 16;

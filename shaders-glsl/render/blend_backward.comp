@@ -23,7 +23,7 @@ layout(binding = 0) readonly  buffer Ranges  { uvec2 tile_ranges[]; };
 layout(binding = 1) readonly  buffer Slots   { uint sorted_slots[]; };
 layout(binding = 2) readonly  buffer Owners  { uint owners[]; };
 layout(binding = 3) readonly  buffer Splats  { ProjectedSplat splats[]; };
-layout(binding = 4) readonly  buffer Colors  { float colors[]; };
+layout(binding = 4) readonly  buffer Colors  { vec3 colors[]; };  // (Gaussians, COLOR_VECTORS)
 layout(binding = 5) readonly  buffer Render  { float render[]; };    // (CHANNELS, H, W)
 layout(binding = 6) readonly  buffer DRender { float d_render[]; };  // (CHANNELS, H, W)
 // (slots, RECORD_VECTORS): mean2d 2, conic 3, opacity 1, colour CHANNELS, zeros
@@ -79,8 +79,8 @@ void main() [[subgroup_uniform_control_flow]] {
         uint slot = sorted_slots[first + min(lane, batch - 1)];
         uint id = owners[slot];
         ProjectedSplat mine = splats[id];
-        float my_color[CHANNELS];
-        [[unroll]] for (uint c = 0; c < CHANNELS; c++) my_color[c] = colors[CHANNELS * id + c];
+        vec3 my_color[COLOR_VECTORS];
+        [[unroll]] for (uint k = 0; k < COLOR_VECTORS; k++) my_color[k] = colors[COLOR_VECTORS * id + k];
         uint my_groups = splat_groups(mine, origin);
         if (lane >= batch) mine.opacity = 0.0;
         vec2 my_d_mean2d = vec2(0.0);
@@ -100,7 +100,7 @@ void main() [[subgroup_uniform_control_flow]] {
                 vec3 conic = subgroupShuffle(mine.conic, j);
                 float opacity = subgroupShuffle(mine.opacity, j);
                 float splat_color[CHANNELS];
-                [[unroll]] for (uint c = 0; c < CHANNELS; c++) splat_color[c] = subgroupShuffle(my_color[c], j);
+                [[unroll]] for (uint c = 0; c < CHANNELS; c++) splat_color[c] = subgroupShuffle(my_color[c / 3][c % 3], j);
                 // Moments of dL/dsigma over the pixels: what every gradient of the ellipse is made of.
                 float moment = 0.0;
                 vec2 moment_x_y = vec2(0.0);

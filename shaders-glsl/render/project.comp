@@ -29,7 +29,7 @@ layout(constant_id = 6) const bool HALF_REST = false;  // SH above degree 0 as i
 
 layout(binding = 0) readonly  buffer Parameters { float parameters[]; };    // planes
 layout(binding = 1) writeonly buffer Splats     { ProjectedSplat splats[]; };
-layout(binding = 2) writeonly buffer Colors     { float colors[]; };        // (gaussian_count, CHANNELS)
+layout(binding = 2) writeonly buffer Colors     { vec3 colors[]; };         // (gaussian_count, COLOR_VECTORS): CHANNELS, zeros
 layout(binding = 3) writeonly buffer DepthKeys  { uint depth_keys[]; };
 layout(binding = 4) writeonly buffer Ids        { uint ids[]; };
 layout(binding = 5) writeonly buffer TileCounts { uint tile_counts[]; };
@@ -98,10 +98,16 @@ void main() {
 
     vec3 center = -transpose(mat3(camera.view_from_world)) * camera.view_from_world[3];
     vec3 offset = mean - center;
-    vec3 color = sh_color(i, normalize(offset * finite_scale(length(offset))));
-    for (uint c = 0; c < 3; c++) colors[CHANNELS * i + c] = color[c];
+    colors[COLOR_VECTORS * i] = sh_color(i, normalize(offset * finite_scale(length(offset))));
     uint features = FEATURES_COLUMN * gaussian_count + FEATURE_COUNT * i;
-    for (uint k = 0; k < FEATURE_COUNT; k++) colors[CHANNELS * i + 3 + k] = parameters[features + k];
+    [[unroll]] for (uint k = 1; k < COLOR_VECTORS; k++) {
+        vec3 three = vec3(0);
+        [[unroll]] for (uint c = 0; c < 3; c++) {
+            uint feature = 3 * (k - 1) + c;
+            if (feature < FEATURE_COUNT) three[c] = parameters[features + feature];
+        }
+        colors[COLOR_VECTORS * i + k] = three;
+    }
 
     uint count = 0;
     uvec2 tile_rows = splat_tile_rows(splat, camera.size.y);

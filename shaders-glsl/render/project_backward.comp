@@ -34,7 +34,7 @@ layout(constant_id = 6) const bool HALF_REST = false;  // SH above degree 0 as i
 
 layout(binding = 0) readonly  buffer Parameters { float parameters[]; };  // planes
 layout(binding = 1) readonly  buffer Splats     { ProjectedSplat splats[]; };
-layout(binding = 2) readonly  buffer Colors     { float colors[]; };      // (gaussian_count, CHANNELS)
+layout(binding = 2) readonly  buffer Colors     { vec3 colors[]; };       // (gaussian_count, COLOR_VECTORS)
 layout(binding = 3) readonly  buffer TileCounts { uint tile_counts[]; };
 layout(binding = 4) readonly  buffer Emitted    { uvec2 emitted[]; };     // first slot, one past the last
 layout(binding = 5) readonly  buffer Records    { vec3 records[]; };      // (slots, RECORD_VECTORS)
@@ -153,10 +153,10 @@ void main() {
     vec2 d_mean2d = vec2(record[0], record[1]);
     vec3 d_conic = vec3(record[2], record[3], record[4]);
     float d_opacity = record[5];
-    vec3 d_color;
+    vec3 color = colors[COLOR_VECTORS * i], d_color;
     for (uint c = 0; c < 3; c++) {
         // A colour clamped at zero passes nothing on.
-        bool passes = colors[CHANNELS * i + c] > 0.0;
+        bool passes = color[c] > 0.0;
         if (RAW_COLORS) passes = true;
         d_color[c] = passes ? record[RECORD_HEAD + c] : 0.0;
     }

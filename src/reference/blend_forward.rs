@@ -1,9 +1,9 @@
 //! The light of one pixel, in f64, by going through everything in its tile.
 
-use glam::{DVec2, UVec2};
+use glam::{DVec2, UVec2, Vec3};
 
 use super::blending::PixelModel;
-use super::splat::{Splat, fragments};
+use super::splat::{Splat, fragments, stored_color};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::ProjectedSplat;
 use crate::kernels::blend_forward::{Constants, Kernel, Params, Slices, Tolerances};
@@ -43,11 +43,13 @@ impl TileList {
         slots: &[u32],
         owners: &[u32],
         splats: &[ProjectedSplat],
-        colors: &[f32],
+        colors: &[Vec3],
     ) -> Self {
         let (channels, ids) =
             (channels as usize, || slots.iter().map(|&slot| owners[slot as usize] as usize));
-        let color = |id| colors[channels * id..][..channels].iter().map(|&c| f64::from(c));
+        let (stored, colors) =
+            (stored_color(channels as u32), bytemuck::cast_slice::<_, f32>(colors));
+        let color = |id| colors[stored * id..][..channels].iter().map(|&c| f64::from(c));
         Self {
             slots: slots.to_vec(),
             splats: ids().map(|id| Splat::from(&splats[id])).collect(),

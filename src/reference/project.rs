@@ -6,7 +6,7 @@ use super::camera::{Camera, rotation, unit_quat};
 use super::gaussian::{Gaussian, Planes, sigmoid};
 use super::rounding::{UNIT, sensitivity};
 use super::sh::sh_basis;
-use super::splat::{Splat, extent_error, splat_level, splat_tile_rows, splat_tiles};
+use super::splat::{Splat, extent_error, splat_level, splat_tile_rows, splat_tiles, stored_color};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::ProjectedSplat;
 use crate::kernels::project::{CULLED, Constants, Kernel, NEAREST, Params, Slices, Tolerances};
@@ -225,7 +225,8 @@ impl Reference for Kernel {
         let Slices { parameters, splats, colors, depth_keys, ids, tile_counts } = slices;
         let scene = Scene::new(params, constants);
         let parameters = scene.planes.floats(parameters, constants.half_rest);
-        let channels = constants.channels as usize;
+        let stored = stored_color(constants.channels);
+        let colors = bytemuck::cast_slice_mut::<_, f32>(colors);
         for i in 0..scene.planes.count {
             ids[i] = params.first_gaussian + i as u32;
             depth_keys[i] = CULLED;
@@ -234,7 +235,8 @@ impl Reference for Kernel {
             let Some(projection) = scene.project(&gaussian) else { continue };
             splats[i] = projection.stored();
             let values = projection.color.to_array().into_iter().chain(gaussian.features);
-            for (color, value) in colors[channels * i..].iter_mut().zip(values) {
+            let values = values.chain(std::iter::repeat(0.0));
+            for (color, value) in colors[stored * i..][..stored].iter_mut().zip(values) {
                 *color = value as f32;
             }
             tile_counts[i] = tile_count(params, constants, &splats[i]);
@@ -248,23 +250,23 @@ impl Reference for Kernel {
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let scene = Scene::new(params, constants);
         let parameters = scene.planes.floats(slices.parameters, constants.half_rest);
-        let (n, channels) = (scene.planes.count, constants.channels as usize);
+        let (n, stored) = (scene.planes.count, stored_color(constants.channels));
         let [mut splats, mut colors, mut depth_keys, mut tile_counts] =
-            [8 * n, channels * n, n, n].map(|len| vec![0.0; len]);
+            [8 * n, stored * n, n, n].map(|len| vec![0.0; len]);
         for i in 0..n {
             let gaussian = scene.planes.load(&parameters, i);
             let Some(errors) = scene.errors(&gaussian) else {
                 splats[8 * i..][..8].fill(f64::INFINITY);
-                colors[channels * i..][..channels].fill(f64::INFINITY);
+                colors[stored * i..][..stored].fill(f64::INFINITY);
                 (depth_keys[i], tile_counts[i]) = (f64::INFINITY, f64::INFINITY);
                 continue;
             };
             let Some(projection) = scene.project(&gaussian) else { continue };
             splats[8 * i..][..8].copy_from_slice(&errors[..8]);
-            colors[channels * i..][..3].copy_from_slice(&errors[8..11]);
-            let stored = projection.stored();
-            let count = tile_count(params, constants, &stored);
-            let [fewest, most] = scene.tile_counts(&stored, &errors);
+            colors[stored * i..][..3].copy_from_slice(&errors[8..11]);
+            let splat = projection.stored();
+            let count = tile_count(params, constants, &splat);
+            let [fewest, most] = scene.tile_counts(&splat, &errors);
             tile_counts[i] = (count - count.min(fewest)).max(most.max(count) - count).into();
             // The keys of positive numbers are as far apart as these in sixteenths of units of the last place.
             let depth = projection.depth as f32;

@@ -6,7 +6,7 @@ use super::camera::{Camera, rotation, unit_quat};
 use super::gaussian::{Gaussian, Planes, sigmoid};
 use super::rounding::{Rounded, UNIT, chain, sensitivity};
 use super::sh::{sh_basis, sh_basis_gradient};
-use super::splat::{Splat, stored_record};
+use super::splat::{Splat, stored_color, stored_record};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::project_backward::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::shared_slots::SHARED_SLOTS;
@@ -145,9 +145,9 @@ impl<'a> Scene<'a> {
     }
 
     /// What arrives at the splat of Gaussian `i` as `record` says, where clamped colours pass nothing on.
-    fn d_splat(&self, colors: &[f32], record: &[f64], i: usize) -> DSplat {
-        let first = self.constants.channels as usize * i;
-        let is_free = |c: usize| self.constants.raw_colors || colors[first + c] > 0.0;
+    fn d_splat(&self, colors: &[Vec3], record: &[f64], i: usize) -> DSplat {
+        let color = colors[stored_color(self.constants.channels) / 3 * i];
+        let is_free = |c: usize| self.constants.raw_colors || color[c] > 0.0;
         let passes = |c: usize| if is_free(c) { record[HEAD + c] } else { 0.0 };
         DSplat {
             mean2d: DVec2::from_slice(record),

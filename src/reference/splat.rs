@@ -11,6 +11,11 @@ pub(super) fn stored_record(channels: u32) -> usize {
     (RECORD_HEAD + channels).next_multiple_of(3) as usize
 }
 
+/// Numbers of a splat's values as they are stored, the same way.
+pub(super) fn stored_color(channels: u32) -> usize {
+    channels.next_multiple_of(3) as usize
+}
+
 /// What of a [`ProjectedSplat`] makes its light.
 #[derive(Clone, Copy, Debug)]
 pub struct Splat {

@@ -56,7 +56,7 @@ pub struct Frame {
     /// `[0]`: the count again, where a pass looks for it
     pub gaussian_counts: Buffer<u32>,
     pub splats: Buffer<ProjectedSplat>,
-    pub colors: Buffer<f32>,
+    pub colors: Buffer<Vec3>,
     pub depth_keys: Buffer<u32>,
     pub ids: Buffer<u32>,
     pub tile_counts: Buffer<u32>,
@@ -124,7 +124,7 @@ impl Frame {
         if self.splats.len() < count {
             let count = capacity.max(count);
             self.splats = gpu.uninit("splats", count)?;
-            self.colors = gpu.uninit("colors", self.channels * count)?;
+            self.colors = gpu.uninit("colors", self.color_vectors() * count)?;
             self.depth_keys = gpu.uninit("depth_keys", count)?;
             self.ids = gpu.uninit("ids", count)?;
             self.tile_counts = gpu.uninit("tile_counts", count)?;
@@ -167,14 +167,20 @@ impl Frame {
     /// What each Gaussian takes, in bytes.
     #[cfg(feature = "io")]
     pub(super) fn bytes_per_gaussian(&self) -> usize {
-        let numbers = (4 + self.channels) * size_of::<f32>() + size_of::<UVec2>();
-        size_of::<ProjectedSplat>() + numbers
+        let color = self.color_vectors() * size_of::<Vec3>();
+        let numbers = 4 * size_of::<f32>() + size_of::<UVec2>();
+        size_of::<ProjectedSplat>() + color + numbers
     }
 
     /// What each intersection takes, in bytes.
     #[cfg(feature = "io")]
     pub(super) fn bytes_per_intersection(&self) -> usize {
         3 * size_of::<u32>() + self.record_vectors() * size_of::<Vec3>()
+    }
+
+    /// The vectors of a splat's values.
+    pub(super) fn color_vectors(&self) -> usize {
+        self.channels.div_ceil(3)
     }
 
     /// The vectors of a gradient record.

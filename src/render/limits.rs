@@ -1,6 +1,6 @@
 //! How far kernels get on a device that ends loops after so many turns.
 
-use glam::UVec2;
+use glam::{UVec2, Vec3};
 
 use super::RenderSettings;
 use crate::gpu::{Gpu, Properties};
@@ -23,7 +23,8 @@ impl RenderSettings {
     /// The most Gaussians that this device can render and train: some passes read the splat and the colour of any of them,
     /// which one binding has to hold. What else there is of them is bound in [`Batches`](crate::batches::Batches).
     pub fn most_gaussians(&self, gpu: &Gpu) -> usize {
-        let bytes = size_of::<ProjectedSplat>().max(self.channels() * size_of::<f32>()) as u64;
+        let bytes =
+            size_of::<ProjectedSplat>().max(self.channels().div_ceil(3) * size_of::<Vec3>()) as u64;
         (gpu.properties().max_storage_buffer_range / bytes).min(u32::MAX.into()) as usize
     }
 
