@@ -9,17 +9,20 @@
 //! That is the paper's form. In the identity form `I_0 = R_0` and `R_{k+1} = I_k - conv_out(f)`, with the last layer zero at
 //! first: R_K begins as the render, and no gradient dies behind a sigmoid or a clamp.
 //!
-//! Activations are kept for one stage at a time: the backward pass computes those of the earlier stages again, from
-//! their inputs `R_k`.
+//! Activations are kept for one stage at a time, or for every stage where [`Denoiser::keep_activations`] finds room: without
+//! it the backward pass computes those of the earlier stages again, from their inputs `R_k`, to the same bits.
+
+mod memory;
 
 use glam::UVec2;
 use serde::{Deserialize, Serialize};
 
-use super::conv::{Activation, Adds, Conv, Precision, Seen, partial_count};
-use super::norm::{Backward, Forward, Norm, NormMemory, Use};
+use self::memory::{Activations, Earlier, Extent, Memory};
+use super::conv::{Activation, Adds, Conv, Precision, Seen};
+use super::norm::{Backward, Forward, Norm, Use};
 use super::parameters::{Layout, Parameters};
 use super::relu::ReluBackward;
-use super::{Form, RGB, check_binding, check_images, float_bytes, out_of_turn, pixel_count};
+use super::{Form, RGB, check_images, out_of_turn, pixel_count};
 use crate::gpu::{Buffer, Gpu, Pipeline, Properties, Recorder, Threads};
 use crate::kernels::{residual, residual_backward};
 use crate::random::Stream;
@@ -100,7 +103,8 @@ pub struct Denoiser {
     kernels: Kernels,
     reserved: Extent,
     memory: Memory,
-    /// The size of the forward pass whose last stage the memory holds.
+    earlier: Earlier,
+    /// The size of the forward pass that the memory holds.
     recorded: Option<UVec2>,
 }
 
@@ -123,33 +127,6 @@ struct Kernels {
     relu_backward: ReluBackward,
     residual: Pipeline<residual::Kernel>,
     residual_backward: Pipeline<residual_backward::Kernel>,
-}
-
-/// What decides how long the buffers are.
-#[derive(Clone, Copy, Debug, Default)]
-struct Extent {
-    pixels: usize,
-    /// Partial sums of the gradient of the inner convolution.
-    partials: usize,
-}
-
-#[derive(Debug)]
-struct Memory {
-    /// f of every repeat, (repeats + 1) x (C, H, W).
-    features: Vec<Buffer<f32>>,
-    /// conv(f) of every repeat, repeats x (C, H, W).
-    convolved: Vec<Buffer<f32>>,
-    norm: NormMemory,
-    /// u, (3, H, W).
-    update: Buffer<f32>,
-    /// `R_1` to `R_K`, each (3, H, W).
-    denoised: Vec<Buffer<f32>>,
-    d_features: Buffer<f32>,
-    d_convolved: Buffer<f32>,
-    d_update: Buffer<f32>,
-    /// `dL/dR_k`, by turns, each (3, H, W).
-    d_denoised: [Buffer<f32>; 2],
-    partials: Buffer<f32>,
 }
 
 impl Denoiser {
@@ -187,6 +164,7 @@ impl Denoiser {
             kernels: Kernels::new(gpu, settings)?,
             reserved,
             memory: Memory::new(gpu, settings, reserved)?,
+            earlier: Earlier::default(),
             recorded: None,
         })
     }
@@ -225,12 +203,12 @@ impl Denoiser {
 
     /// The memory that [`Denoiser::reserve`] takes for a view.
     pub fn bytes(settings: DenoiserSettings, size: UVec2) -> u64 {
-        let Extent { pixels, partials } = Extent::of(settings, size);
-        let maps = 2 * settings.repeats as usize + 3;
-        let images = settings.stages as usize + 4;
-        let norm = NormMemory::floats(pixels, settings.channels(), settings.repeats as usize);
-        let per_pixel = maps * settings.channels() + images * RGB as usize;
-        float_bytes(pixels * per_pixel + partials + norm)
+        Extent::of(settings, size).bytes(settings)
+    }
+
+    /// The memory that [`Denoiser::keep_activations`] takes for a view beside it.
+    pub fn kept_bytes(settings: DenoiserSettings, size: UVec2) -> u64 {
+        Earlier::bytes(settings, Extent::of(settings, size))
     }
 
     /// Whether the device binds every map of a view of `size`.
@@ -258,6 +236,29 @@ impl Denoiser {
         Ok(())
     }
 
+    /// Keeps the activations of every stage in views up to `size` from now on, where that takes no more than `most` bytes and
+    /// the device has them; says whether it does. No bit of a result follows from it.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub fn keep_activations(&mut self, size: UVec2, most: u64) -> Result<bool> {
+        let (settings, needed) = (self.settings, Extent::of(self.settings, size));
+        if needed.fits(self.earlier.extent()) {
+            return Ok(true);
+        }
+        let extent = needed.max(self.earlier.extent());
+        if Earlier::bytes(settings, extent) > most {
+            return Ok(false);
+        }
+        (self.recorded, self.earlier) = (None, Earlier::default());
+        match Earlier::new(&self.gpu, settings, extent) {
+            Ok(earlier) => self.earlier = earlier,
+            Err(Error::OutOfMemory { .. } | Error::BufferTooLarge { .. }) => return Ok(false),
+            Err(other) => return Err(other),
+        }
+        Ok(true)
+    }
+
     /// `R_K` of the last forward pass, (3, H, W), at the beginning of a buffer that is as long as what was reserved.
     pub fn denoised(&self) -> &Buffer<f32> {
         &self.memory.denoised[self.memory.denoised.len() - 1]
@@ -275,23 +276,26 @@ impl Denoiser {
         input: &Buffer<f32>,
         render: &Buffer<f32>,
     ) -> Result<()> {
-        let pixels = pixel_count(size)?;
-        if !Extent::of(self.settings, size).fits(self.reserved) {
+        let (pixels, extent) = (pixel_count(size)?, Extent::of(self.settings, size));
+        if !extent.fits(self.reserved) {
             return Err(out_of_turn("denoiser", size, "reserve memory for that size first"));
         }
         check_images(pixels, [input, render])?;
-        let (kernels, memory) = (&self.kernels, &mut self.memory);
+        let Self { kernels, parameters, earlier, .. } = self;
+        let Memory { activations: shared, denoised, .. } = &mut self.memory;
         for (k, stage) in self.stages.iter().enumerate() {
-            kernels.stage_forward(pass, size, stage, &self.parameters.values, k, input, memory)?;
-            let (before, from_here) = memory.denoised.split_at_mut(k);
+            let (before, from_here) = denoised.split_at_mut(k);
+            let stage_input = before.last().unwrap_or(input);
+            let own = earlier.of(k, extent, shared);
+            kernels.stage_forward(pass, size, stage, &parameters.values, stage_input, own)?;
             let value_count = RGB * pixels as u32;
             pass.dispatch(
                 &kernels.residual,
                 &residual::Params { value_count },
                 residual::Buffers {
                     render,
-                    stage_input: before.last().unwrap_or(input),
-                    update: &memory.update,
+                    stage_input,
+                    update: &own.update,
                     denoised: &mut from_here[0],
                 },
                 Threads::Exactly([value_count, 1, 1]),
@@ -324,19 +328,23 @@ impl Denoiser {
             let remedy = "each backward pass needs a forward pass of its own before it";
             return Err(out_of_turn("denoiser", size, remedy));
         }
-        let Self { kernels, memory, parameters, stages, .. } = self;
+        let Self { kernels, memory, earlier, parameters, stages, settings, .. } = self;
+        let extent = Extent::of(*settings, size);
+        let are_kept = extent.fits(earlier.extent());
         pass.fill(&mut parameters.gradients, 0);
         let last = stages.len() - 1;
         for (k, stage) in stages.iter().enumerate().rev() {
-            if k < last {
-                kernels.stage_forward(pass, size, stage, &parameters.values, k, input, memory)?;
+            let stage_input = if k == 0 { input } else { &memory.denoised[k - 1] };
+            let activations = earlier.of(k, extent, &mut memory.activations);
+            if k < last && !are_kept {
+                let values = &parameters.values;
+                kernels.stage_forward(pass, size, stage, values, stage_input, activations)?;
             }
             // The two images take turns, so that what a stage reads is never what it writes.
             let [even, odd] = &mut memory.d_denoised;
             let (own, other) = if k % 2 == 0 { (even, odd) } else { (odd, even) };
             let d_output = if k == last { d_denoised } else { &*other };
             let d_stage_input = if k == 0 { &mut *d_input } else { own };
-            let stage_input = if k == 0 { input } else { &memory.denoised[k - 1] };
             let value_count = RGB * pixels as u32;
             pass.dispatch(
                 &kernels.residual_backward,
@@ -344,7 +352,7 @@ impl Denoiser {
                 residual_backward::Buffers {
                     render,
                     stage_input,
-                    update: &memory.update,
+                    update: &activations.update,
                     d_denoised: d_output,
                     d_update: &mut memory.d_update,
                     d_stage_input: &mut *d_stage_input,
@@ -353,9 +361,7 @@ impl Denoiser {
                 Threads::Exactly([value_count, 1, 1]),
             )?;
             let maps = Maps {
-                features: &memory.features,
-                convolved: &memory.convolved,
-                norm: &mut memory.norm,
+                activations,
                 d_features: &mut memory.d_features,
                 d_convolved: &mut memory.d_convolved,
                 partials: &mut memory.partials,
@@ -369,9 +375,7 @@ impl Denoiser {
 
 /// What the backward pass of a stage reads and overwrites.
 struct Maps<'a> {
-    features: &'a [Buffer<f32>],
-    convolved: &'a [Buffer<f32>],
-    norm: &'a mut NormMemory,
+    activations: &'a mut Activations,
     d_features: &'a mut Buffer<f32>,
     d_convolved: &'a mut Buffer<f32>,
     partials: &'a mut Buffer<f32>,
@@ -407,20 +411,16 @@ impl Kernels {
         })
     }
 
-    /// The features and the update u of stage `k`.
-    #[expect(clippy::too_many_arguments, reason = "a stage, its place and its input")]
+    /// The activations of a stage.
     fn stage_forward(
         &self,
         pass: &mut Recorder<'_>,
         size: UVec2,
         stage: &Stage,
         values: &Buffer<f32>,
-        k: usize,
-        first: &Buffer<f32>,
-        memory: &mut Memory,
+        input: &Buffer<f32>,
+        Activations { features, convolved, norm, update }: &mut Activations,
     ) -> Result<()> {
-        let Memory { features, convolved, norm, update, denoised, .. } = memory;
-        let input = if k == 0 { first } else { &denoised[k - 1] };
         self.conv_in.forward(pass, size, stage.conv_in, values, input, &mut features[0])?;
         for (repeat, convolved) in convolved.iter_mut().enumerate() {
             let (before, after) = features.split_at_mut(repeat + 1);
@@ -444,7 +444,8 @@ impl Kernels {
         ends: Ends<'_>,
     ) -> Result<()> {
         let Parameters { values, gradients, .. } = parameters;
-        let Maps { features, convolved, norm, d_features, d_convolved, partials } = maps;
+        let Maps { activations, d_features, d_convolved, partials } = maps;
+        let Activations { features, convolved, norm, .. } = activations;
         let last = &features[features.len() - 1];
         let seen = Seen { source: last, d_target: ends.d_update };
         self.conv_out.weight_gradient(pass, size, stage.conv_out, seen, partials, gradients)?;
@@ -477,57 +478,5 @@ impl Kernels {
 impl Stage {
     fn norm_use(&self, size: UVec2, repeat: usize) -> Use {
         Use { pixel_count: size.element_product(), offset: self.norm, repeat: repeat as u32 }
-    }
-}
-
-impl Extent {
-    fn of(settings: DenoiserSettings, size: UVec2) -> Self {
-        let DenoiserSettings { channels, precision, .. } = settings;
-        let ends = [[RGB, channels], [channels, RGB]];
-        let ends = ends.map(|layer| partial_count(size, layer, Precision::Single));
-        let inner = partial_count(size, [channels; 2], precision);
-        Self {
-            pixels: size.x as usize * size.y as usize,
-            partials: inner.max(ends[0]).max(ends[1]),
-        }
-    }
-
-    fn fits(self, reserved: Self) -> bool {
-        self.pixels <= reserved.pixels && self.partials <= reserved.partials
-    }
-
-    /// # Errors
-    /// The device does not bind what a view of `size` takes.
-    fn check(self, gpu: &Gpu, settings: DenoiserSettings, size: UVec2) -> Result<()> {
-        let channels = settings.channels;
-        let map = settings.channels().max(RGB as usize) * self.pixels;
-        check_binding(gpu, &format!("the denoiser's {channels} feature maps"), size, map)?;
-        let sums = format!("the sums of the gradients of the denoiser's {channels} channels");
-        check_binding(gpu, &sums, size, self.partials)
-    }
-
-    fn max(self, other: Self) -> Self {
-        Self { pixels: self.pixels.max(other.pixels), partials: self.partials.max(other.partials) }
-    }
-}
-
-impl Memory {
-    fn new(gpu: &Gpu, settings: DenoiserSettings, extent: Extent) -> Result<Self> {
-        let Extent { pixels, partials } = extent;
-        let repeats = settings.repeats as usize;
-        let map = |name| gpu.uninit(name, settings.channels() * pixels);
-        let image = |name| gpu.uninit(name, RGB as usize * pixels);
-        Ok(Self {
-            features: (0..=repeats).map(|_| map("features")).collect::<Result<_>>()?,
-            convolved: (0..repeats).map(|_| map("convolved")).collect::<Result<_>>()?,
-            norm: NormMemory::new(gpu, pixels, settings.channels(), repeats)?,
-            update: image("update")?,
-            denoised: (0..settings.stages).map(|_| image("denoised")).collect::<Result<_>>()?,
-            d_features: map("d_features")?,
-            d_convolved: map("d_convolved")?,
-            d_update: image("d_update")?,
-            d_denoised: [image("d_denoised")?, image("d_denoised")?],
-            partials: gpu.uninit("partials", partials)?,
-        })
     }
 }
