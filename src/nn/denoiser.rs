@@ -17,8 +17,10 @@ mod memory;
 use glam::UVec2;
 use serde::{Deserialize, Serialize};
 
-use self::memory::{Activations, Earlier, Extent, Memory};
-use super::conv::{Activation, Adds, Conv, Precision, Seen};
+use self::memory::{Activations, Earlier, Extent, Memory, Repeat};
+use super::conv::{Activation, Adds, Conv, Precision, Seen, Strips};
+use super::half::{PackedMap, Way};
+use super::inner::{Inner, Layer, Map};
 use super::norm::{Backward, Forward, Norm, Use};
 use super::parameters::{Layout, Parameters};
 use super::relu::ReluBackward;
@@ -88,6 +90,11 @@ impl DenoiserSettings {
         }
     }
 
+    /// In the precision that the device offers.
+    fn held_on(self, gpu: &Gpu) -> Self {
+        Self { precision: self.precision.on(gpu), ..self }
+    }
+
     fn channels(self) -> usize {
         self.channels as usize
     }
@@ -98,6 +105,8 @@ impl DenoiserSettings {
 pub struct Denoiser {
     gpu: Gpu,
     settings: DenoiserSettings,
+    /// The same in the precision that the device offers.
+    held: DenoiserSettings,
     parameters: Parameters,
     stages: Vec<Stage>,
     kernels: Kernels,
@@ -111,6 +120,7 @@ pub struct Denoiser {
 /// Where the layers of a stage lie in the parameters.
 #[derive(Clone, Copy, Debug)]
 struct Stage {
+    number: usize,
     conv_in: u32,
     conv: u32,
     norm: u32,
@@ -120,8 +130,9 @@ struct Stage {
 #[derive(Debug)]
 struct Kernels {
     channels: u32,
+    repeats: usize,
     conv_in: Conv,
-    conv: Conv,
+    conv: Inner,
     conv_out: Conv,
     norm: Norm,
     relu_backward: ReluBackward,
@@ -142,6 +153,7 @@ impl Denoiser {
         let mut layout = Layout::new(Stream::new(seed, STREAM));
         let channels = settings.channels;
         let stage = |k| Stage {
+            number: k as usize,
             conv_in: layout.conv(&format!("{k}.conv_in"), RGB, channels),
             conv: layout.conv(&format!("{k}.conv"), channels, channels),
             norm: layout.norm(&format!("{k}.norm"), channels),
@@ -152,9 +164,11 @@ impl Denoiser {
         };
         let stages = (0..settings.stages).map(stage).collect();
         let reserved = Extent::default();
+        let held = settings.held_on(gpu);
         Ok(Self {
             gpu: gpu.clone(),
             settings,
+            held,
             parameters: layout.upload(
                 gpu,
                 ("denoiser", Self::LEARNING_RATE),
@@ -163,7 +177,7 @@ impl Denoiser {
             stages,
             kernels: Kernels::new(gpu, settings)?,
             reserved,
-            memory: Memory::new(gpu, settings, reserved)?,
+            memory: Memory::new(gpu, held, reserved)?,
             earlier: Earlier::default(),
             recorded: None,
         })
@@ -213,7 +227,8 @@ impl Denoiser {
 
     /// Whether the device binds every map of a view of `size`.
     pub fn fits_on(gpu: &Gpu, settings: DenoiserSettings, size: UVec2) -> bool {
-        Extent::of(settings, size).check(gpu, settings, size).is_ok()
+        let held = settings.held_on(gpu);
+        Extent::of(held, size).check(gpu, held, size).is_ok()
     }
 
     /// Takes the memory for views up to `size`, unless it is there already.
@@ -221,17 +236,17 @@ impl Denoiser {
     /// # Errors
     /// A map exceeds what the device can bind, or the device is out of memory.
     pub fn reserve(&mut self, size: UVec2) -> Result<()> {
-        let needed = Extent::of(self.settings, size);
+        let needed = Extent::of(self.held, size);
         if needed.fits(self.reserved) {
             return Ok(());
         }
         let gpu = &self.gpu;
-        needed.check(gpu, self.settings, size)?;
+        needed.check(gpu, self.held, size)?;
         // The old memory goes first: both together may not fit.
         self.recorded = None;
         let extent = needed.max(std::mem::take(&mut self.reserved));
-        self.memory = Memory::new(gpu, self.settings, Extent::default())?;
-        self.memory = Memory::new(gpu, self.settings, extent)?;
+        self.memory = Memory::new(gpu, self.held, Extent::default())?;
+        self.memory = Memory::new(gpu, self.held, extent)?;
         self.reserved = extent;
         Ok(())
     }
@@ -242,7 +257,7 @@ impl Denoiser {
     /// # Errors
     /// The device was lost.
     pub fn keep_activations(&mut self, size: UVec2, most: u64) -> Result<bool> {
-        let (settings, needed) = (self.settings, Extent::of(self.settings, size));
+        let (settings, needed) = (self.held, Extent::of(self.held, size));
         if needed.fits(self.earlier.extent()) {
             return Ok(true);
         }
@@ -276,7 +291,7 @@ impl Denoiser {
         input: &Buffer<f32>,
         render: &Buffer<f32>,
     ) -> Result<()> {
-        let (pixels, extent) = (pixel_count(size)?, Extent::of(self.settings, size));
+        let (pixels, extent) = (pixel_count(size)?, Extent::of(self.held, size));
         if !extent.fits(self.reserved) {
             return Err(out_of_turn("denoiser", size, "reserve memory for that size first"));
         }
@@ -287,6 +302,7 @@ impl Denoiser {
             let (before, from_here) = denoised.split_at_mut(k);
             let stage_input = before.last().unwrap_or(input);
             let own = earlier.of(k, extent, shared);
+            kernels.conv.prepare(pass, Way::Forward, stage.inner(&parameters.values))?;
             kernels.stage_forward(pass, size, stage, &parameters.values, stage_input, own)?;
             let value_count = RGB * pixels as u32;
             pass.dispatch(
@@ -328,10 +344,13 @@ impl Denoiser {
             let remedy = "each backward pass needs a forward pass of its own before it";
             return Err(out_of_turn("denoiser", size, remedy));
         }
-        let Self { kernels, memory, earlier, parameters, stages, settings, .. } = self;
-        let extent = Extent::of(*settings, size);
+        let Self { kernels, memory, earlier, parameters, stages, held, .. } = self;
+        let extent = Extent::of(*held, size);
         let are_kept = extent.fits(earlier.extent());
         pass.fill(&mut parameters.gradients, 0);
+        for stage in stages.iter() {
+            kernels.conv.prepare(pass, Way::Backward, stage.inner(&parameters.values))?;
+        }
         let last = stages.len() - 1;
         for (k, stage) in stages.iter().enumerate().rev() {
             let stage_input = if k == 0 { input } else { &memory.denoised[k - 1] };
@@ -364,6 +383,7 @@ impl Denoiser {
                 activations,
                 d_features: &mut memory.d_features,
                 d_convolved: &mut memory.d_convolved,
+                d_packed: &mut memory.d_packed,
                 partials: &mut memory.partials,
             };
             let ends = Ends { stage_input, d_update: &memory.d_update, d_stage_input };
@@ -378,6 +398,7 @@ struct Maps<'a> {
     activations: &'a mut Activations,
     d_features: &'a mut Buffer<f32>,
     d_convolved: &'a mut Buffer<f32>,
+    d_packed: &'a mut PackedMap,
     partials: &'a mut Buffer<f32>,
 }
 
@@ -396,14 +417,15 @@ impl Kernels {
         if precision == Precision::Half && cooperative_matrix.is_none() {
             tracing::warn!("{name} offers no 16-bit matrices: the denoiser is in single precision");
         }
-        let (ends, adds) = (Precision::Single, Adds::InputGradient);
+        let adds = Adds::InputGradient;
         let identity = form == Form::Identity;
         let activation = if identity { Activation::None } else { Activation::Sigmoid };
         Ok(Self {
             channels,
-            conv_in: Conv::new(gpu, [RGB, channels], Activation::Relu, adds, ends)?,
-            conv: Conv::new(gpu, [channels, channels], Activation::None, adds, precision)?,
-            conv_out: Conv::new(gpu, [channels, RGB], activation, Adds::Nothing, ends)?,
+            repeats: settings.repeats as usize,
+            conv_in: Conv::new(gpu, [RGB, channels], Activation::Relu, adds)?,
+            conv: Inner::new(gpu, channels, settings.stages, adds, precision)?,
+            conv_out: Conv::new(gpu, [channels, RGB], activation, Adds::Nothing)?,
             norm: Norm::new(gpu, channels)?,
             relu_backward: ReluBackward::new(gpu)?,
             residual: gpu.pipeline(&residual::Constants { identity })?,
@@ -419,17 +441,18 @@ impl Kernels {
         stage: &Stage,
         values: &Buffer<f32>,
         input: &Buffer<f32>,
-        Activations { features, convolved, norm, update }: &mut Activations,
+        activations: &mut Activations,
     ) -> Result<()> {
-        self.conv_in.forward(pass, size, stage.conv_in, values, input, &mut features[0])?;
-        for (repeat, convolved) in convolved.iter_mut().enumerate() {
-            let (before, after) = features.split_at_mut(repeat + 1);
-            let (shortcut, target) = (&before[repeat], &mut after[0]);
-            self.conv.forward(pass, size, stage.conv, values, shortcut, convolved)?;
+        let first = activations.first_features();
+        self.conv_in.forward(pass, size, stage.conv_in, values, input, first)?;
+        for repeat in 0..self.repeats {
+            let Repeat { shortcut, packed, convolved, norm, target } = activations.repeat(repeat);
+            let map = Map { single: shortcut, packed };
+            self.conv.forward(pass, size, stage.inner(values), map, convolved)?;
             let images = Forward { source: convolved, shortcut, target };
             self.norm.forward(pass, stage.norm_use(size, repeat), values, norm, images)?;
         }
-        let last = &features[features.len() - 1];
+        let (last, update) = activations.ends(self.repeats);
         self.conv_out.forward(pass, size, stage.conv_out, values, last, update)
     }
 
@@ -444,9 +467,8 @@ impl Kernels {
         ends: Ends<'_>,
     ) -> Result<()> {
         let Parameters { values, gradients, .. } = parameters;
-        let Maps { activations, d_features, d_convolved, partials } = maps;
-        let Activations { features, convolved, norm, .. } = activations;
-        let last = &features[features.len() - 1];
+        let Maps { activations, d_features, d_convolved, d_packed, partials } = maps;
+        let last = activations.features(self.repeats);
         let seen = Seen { source: last, d_target: ends.d_update };
         self.conv_out.weight_gradient(pass, size, stage.conv_out, seen, partials, gradients)?;
         self.conv_out.data_gradient(
@@ -457,17 +479,22 @@ impl Kernels {
             ends.d_update,
             d_features,
         )?;
-        for (repeat, source) in convolved.iter().enumerate().rev() {
-            let of = stage.norm_use(size, repeat);
-            let images = Backward { source, d_target: &*d_features, d_source: &mut *d_convolved };
+        for repeat in (0..self.repeats).rev() {
+            let (of, Activations { convolved, norm, .. }) =
+                (stage.norm_use(size, repeat), &mut *activations);
+            let (d_target, d_source) = (&*d_features, &mut *d_convolved);
+            let images = Backward { source: &convolved[repeat], d_target, d_source };
             self.norm.backward(pass, of, values, gradients, norm, images)?;
-            let seen = Seen { source: &features[repeat], d_target: &*d_convolved };
-            self.conv.weight_gradient(pass, size, stage.conv, seen, partials, gradients)?;
+            let source = (activations.features(repeat), &activations.packed[repeat]);
+            let d_target = Map { single: &*d_convolved, packed: &mut *d_packed };
+            let strips = Strips { partials: &mut *partials, gradients: &mut *gradients };
             // Along the shortcut the gradient stays as it is: the convolution's is added to it.
-            self.conv.data_gradient(pass, size, stage.conv, values, d_convolved, d_features)?;
+            let layer = stage.inner(values);
+            self.conv.backward(pass, size, layer, source, d_target, d_features, strips)?;
         }
         let value_count = self.channels * size.element_product();
-        self.relu_backward.record(pass, value_count, &features[0], d_features)?;
+        let first = activations.features(0);
+        self.relu_backward.record(pass, value_count, first, d_features)?;
         let seen = Seen { source: ends.stage_input, d_target: &*d_features };
         self.conv_in.weight_gradient(pass, size, stage.conv_in, seen, partials, gradients)?;
         let d_input = ends.d_stage_input;
@@ -476,6 +503,11 @@ impl Kernels {
 }
 
 impl Stage {
+    /// The layer that is repeated.
+    fn inner(self, values: &Buffer<f32>) -> Layer<'_> {
+        Layer { number: self.number, offset: self.conv, values }
+    }
+
     fn norm_use(&self, size: UVec2, repeat: usize) -> Use {
         Use { pixel_count: size.element_product(), offset: self.norm, repeat: repeat as u32 }
     }

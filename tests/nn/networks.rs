@@ -316,10 +316,30 @@ fn half_precision_stays_near_single_at_every_magnitude() {
         let is_half = gpu.properties().cooperative_matrix.is_some();
         assert_eq!(far.iter().any(|&far| far > 0.0), is_half);
     }
+    assert_each_factor_is_packed_once(half, size, [&first, &second, &d]);
     let mut spoiled = first.clone();
     spoiled[100] = f32::NAN;
     let mut denoiser = Denoiser::new(&gpu, half, 1).unwrap();
     assert!(run_denoiser(&mut denoiser, size, [&spoiled, &second, &d]).output[100].is_nan());
+}
+
+/// Weights are packed once a step for each way, the map before each convolution once and its gradient once.
+fn assert_each_factor_is_packed_once(settings: DenoiserSettings, size: UVec2, images: [&[f32]; 3]) {
+    let gpu = gpu();
+    let mut denoiser = Denoiser::new(&gpu, settings, 1).unwrap();
+    denoiser.reserve(size).unwrap();
+    assert!(denoiser.keep_activations(size, u64::MAX).unwrap());
+    let (_, report) = gpu.checked(|| run_denoiser(&mut denoiser, size, images));
+    report.agree().unwrap();
+    let count = |kernel: &str| {
+        let found = report.kernels().into_iter().find(|(name, ..)| *name == kernel);
+        found.map_or(0, |(_, count, _)| count)
+    };
+    let DenoiserSettings { stages, repeats, .. } = settings;
+    let both_ways = if gpu.properties().cooperative_matrix.is_some() { 2 } else { 0 };
+    assert_eq!(count("pack_weights"), both_ways * stages as usize);
+    assert_eq!(count("pack_map"), both_ways * (stages * repeats) as usize);
+    assert_eq!(count("conv3x3_half"), both_ways * (stages * repeats) as usize);
 }
 
 #[test]
