@@ -12,6 +12,8 @@ mod conv;
 mod denoiser;
 #[cfg(feature = "io")]
 mod file;
+mod half;
+mod inner;
 mod norm;
 mod parameters;
 mod relu;

@@ -300,6 +300,7 @@ impl Trainer {
         // Gaussians that are given may have what the first step does not use.
         trainer.renderer.set_sh_degree(trainer.model.shape().sh_degree)?;
         trainer.reserve()?;
+        trainer.keep_activations(&sizes)?;
         trainer.fixed_bytes = trainer.measure_fixed_bytes();
         Ok(trainer)
     }

@@ -6,11 +6,13 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use glam::UVec2;
 use nightsplat::Error;
 use nightsplat::dataset::Dataset;
 use nightsplat::densify::DensityControl;
 use nightsplat::gpu::testing::{allocations, fail_allocation, lose_at_submission};
 use nightsplat::gpu::{DeviceChoice, Gpu};
+use nightsplat::nn::Denoiser;
 use nightsplat::run::{self, Event, HeldRun, Trained};
 use nightsplat::train::{MemoryEstimate, ModelConfig, Part, TrainConfig};
 
@@ -177,10 +179,12 @@ fn growing() -> TrainConfig {
 fn memory_is_foreseen_to_a_fifth() {
     // Without validation, which takes memory of its own.
     let gpu = Gpu::new(&DeviceChoice::Best).unwrap();
-    // With every SH degree, and with none above 0.
-    for sh_degree_interval in [20, 1000] {
+    // With every SH degree, and with none above 0; with the activations of a denoiser's stages.
+    for (sh_degree_interval, stages) in [(20, 0), (1000, 0), (1000, 3)] {
         let mut config = growing();
         config.schedule.sh_degree_interval = sh_degree_interval;
+        config.model.denoiser = stages > 0;
+        config.model.network.stages = stages.max(1);
         let (own, trained) = foreseen(&gpu, &config);
         assert_eq!(trained.trainer.gaussian_count(), 9000);
         assert_eq!(own.most_gaussians, 9000);
@@ -192,6 +196,29 @@ fn memory_is_foreseen_to_a_fifth() {
             assert!(own.most_host as f64 <= 1.2 * host as f64, "{own:?}, and {spent:?} came");
         }
     }
+}
+
+/// Two fifths of what a step takes are activations here.
+#[test]
+fn activations_are_kept_within_a_fraction_of_max_vram_and_change_no_bit_of_the_model() {
+    let gpu = Gpu::new(&DeviceChoice::Best).unwrap();
+    let mut config = growing();
+    (config.steps, config.max_gaussians) = (12, 100);
+    config.model.denoiser = true;
+    config.model.network.stages = 3;
+    let kept = Denoiser::kept_bytes(config.model.network, UVec2::new(100, 75));
+    let vram = 4 * kept - 4;
+    let mut run = |max_vram: Option<u64>| {
+        config.max_vram = max_vram.map(|bytes| bytes.to_string().parse().unwrap());
+        let (foreseen, Trained { trainer, spent, .. }) = foreseen(&gpu, &config);
+        gpu.limit_memory(u64::MAX);
+        let model = trainer.gaussians().unwrap();
+        (foreseen.device, spent.device_bytes, model)
+    };
+    let (free, held) = (run(None), run(Some(vram)));
+    assert!(free.0 >= held.0 + kept, "{} and {} foreseen, {kept} kept", free.0, held.0);
+    assert!(held.1 <= vram, "{} of {vram}", held.1);
+    assert!(free.2 == held.2, "what is kept changed the model");
 }
 
 #[test]

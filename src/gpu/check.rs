@@ -180,8 +180,13 @@ impl Versions<'_> {
 /// Of two words with two halves each those that are farther apart, by their places among all halves in order.
 fn farthest_halves(device: u32, reference: u32) -> (f64, f64) {
     let place = |half: u32| {
+        let bits = half & 0x7fff;
+        // No number is farther than a NaN, and every NaN is the same.
+        if bits > 0x7c00 {
+            return f64::from(u16::MAX);
+        }
         // Zero is next to the smallest that is not subnormal.
-        let magnitude = f64::from((half & 0x7fff).saturating_sub(0x3ff));
+        let magnitude = f64::from(bits.saturating_sub(0x3ff));
         if half & 0x8000 == 0 { magnitude } else { -magnitude }
     };
     let [low, high] = [0, 16].map(|shift| (place(device >> shift), place(reference >> shift)));

@@ -16,7 +16,7 @@ pub struct CooperativeMatrix {
     pub k: u32,
 }
 
-/// The largest side that a kernel's shared memory has room for.
+/// The largest side that kernels take: channels and pixels are rounded up to it.
 const MAX_SIDE: u32 = 16;
 
 /// The extension a device is created with to use [`CooperativeMatrix`].
@@ -40,13 +40,15 @@ pub(super) fn offered(
     }
     let functions = khr::cooperative_matrix::Instance::new(entry, instance);
     let mut feature = vk::PhysicalDeviceCooperativeMatrixFeaturesKHR::default();
-    let mut features = vk::PhysicalDeviceFeatures2::default().push_next(&mut feature);
+    let mut halves = vk::PhysicalDevice16BitStorageFeatures::default();
+    let mut features =
+        vk::PhysicalDeviceFeatures2::default().push_next(&mut feature).push_next(&mut halves);
     // SAFETY: the chain points at a live local; the extension is there.
     let shapes = unsafe {
         instance.get_physical_device_features2(physical, &mut features);
         functions.get_physical_device_cooperative_matrix_properties(physical)
     };
-    if feature.cooperative_matrix == vk::FALSE {
+    if [feature.cooperative_matrix, halves.storage_buffer16_bit_access].contains(&vk::FALSE) {
         return None;
     }
     let (half, single) = (vk::ComponentTypeKHR::FLOAT16, vk::ComponentTypeKHR::FLOAT32);
@@ -58,9 +60,8 @@ pub(super) fn offered(
                 && [shape.c_type, shape.result_type] == [single; 2]
                 && shape.scope == vk::ScopeKHR::SUBGROUP
                 && [shape.m_size, shape.n_size, shape.k_size].iter().all(|&side| side <= MAX_SIDE)
-                // A row of the second factor begins at a multiple of sixteen bytes, one of the first too.
-                && shape.n_size % 8 == 0
-                && shape.k_size % 8 == 0
+                // A matrix begins at a multiple of sixteen bytes, whichever of its sides lies along the memory.
+                && [shape.m_size, shape.n_size, shape.k_size].iter().all(|&side| side % 8 == 0)
         })
         .map(|shape| CooperativeMatrix { m: shape.m_size, n: shape.n_size, k: shape.k_size })
         .max_by_key(|shape| shape.m * shape.n * shape.k)

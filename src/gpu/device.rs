@@ -435,6 +435,8 @@ fn create_device(
     let (mut vulkan12, mut vulkan13) = required_device_features();
     let mut matrices =
         vk::PhysicalDeviceCooperativeMatrixFeaturesKHR::default().cooperative_matrix(true);
+    let mut halves =
+        vk::PhysicalDevice16BitStorageFeatures::default().storage_buffer16_bit_access(true);
     let mut info = vk::DeviceCreateInfo::default().queue_create_infos(&queues);
     if properties.cooperative_matrix.is_some() {
         extensions.push(cooperative::EXTENSION.as_ptr());
@@ -443,7 +445,7 @@ fn create_device(
             .shader_float16(true)
             .vulkan_memory_model(true)
             .vulkan_memory_model_device_scope(true);
-        info = info.push_next(&mut matrices);
+        info = info.push_next(&mut matrices).push_next(&mut halves);
     }
     let mut uniform = vk::PhysicalDeviceShaderSubgroupUniformControlFlowFeaturesKHR::default()
         .shader_subgroup_uniform_control_flow(true);

@@ -5,7 +5,7 @@ use std::path::Path;
 use glam::UVec2;
 
 use super::RGB;
-use super::conv::{Activation, Form, Precision, Product};
+use super::conv::{Activation, Form, Product};
 use super::file::TensorFile;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::{conv_strided, max_pool};
@@ -71,8 +71,7 @@ impl AlexNet {
         }
         let form = Form { activation: Activation::Relu, transposed: false, accumulate: false };
         let small = NETWORK.iter().filter(|layer| layer.window == 3);
-        let products =
-            small.map(|layer| Product::new(gpu, layer.channels[1], form, Precision::Single));
+        let products = small.map(|layer| Product::new(gpu, layer.channels[1], form));
         Ok(Self {
             values: gpu.buffer("alexnet", &values)?,
             strided: gpu.pipeline(&conv_strided::Constants::default())?,

@@ -1,27 +1,20 @@
-//! A 3x3 convolution: its kernels, forward and backward.
+//! A 3x3 convolution in single precision: its kernels, forward and backward.
 
 use glam::UVec2;
 use serde::{Deserialize, Serialize};
 
 use super::conv_shape;
 use crate::gpu::{Buffer, CooperativeMatrix, Gpu, Pipeline, Recorder, Threads};
-use crate::kernels::{
-    conv3x3, conv3x3_half, conv3x3_weight_gradient, conv3x3_weight_gradient_half, reduce_strips,
-};
+use crate::kernels::{conv3x3, conv3x3_weight_gradient, reduce_strips};
 use crate::{Error, Result};
 
 /// The most output channels that one subgroup takes.
 const OUT_BLOCK: u32 = 8;
 
-/// The most matrices of output channels, and the rows of pixels, that one subgroup takes: sixteen sums in registers.
-const HALF_BLOCKS: u32 = 4;
-const HALF_ROWS: u32 = 4;
-
 /// Rows whose pixels make one partial sum of the gradient of the weights.
 const STRIP_ROWS: u32 = 16;
-/// Of matrices a subgroup takes more channels, and fewer rows: eighteen sums in registers, and as many subgroups.
-const HALF_STRIP_ROWS: u32 = 4;
-const HALF_STRIP_BLOCKS: u32 = 2;
+/// Of matrices a subgroup takes more channels, and fewer rows: as many subgroups.
+pub(super) const HALF_STRIP_ROWS: u32 = 4;
 
 /// What follows the sum of a convolution.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -54,8 +47,13 @@ pub enum Precision {
 }
 
 impl Precision {
+    /// What the device offers of it.
+    pub(super) fn on(self, gpu: &Gpu) -> Self {
+        if self.matrix(gpu).is_some() { Self::Half } else { Self::Single }
+    }
+
     /// The matrices that factors are in; none where they have 32 bits.
-    fn matrix(self, gpu: &Gpu) -> Option<CooperativeMatrix> {
+    pub(super) fn matrix(self, gpu: &Gpu) -> Option<CooperativeMatrix> {
         gpu.properties().cooperative_matrix.filter(|_| self == Self::Half)
     }
 }
@@ -80,7 +78,7 @@ pub(super) struct Conv {
     forward: Product,
     data_gradient: Product,
     weight_gradient: WeightGradient,
-    reduce: Pipeline<reduce_strips::Kernel>,
+    reduce: Reduce,
 }
 
 /// The input of a convolution and the gradient of its output before the activation.
@@ -100,7 +98,6 @@ impl Conv {
         [inputs, outputs]: [u32; 2],
         activation: Activation,
         adds: Adds,
-        precision: Precision,
     ) -> Result<Self> {
         let none = Activation::None;
         let accumulate = adds == Adds::Output;
@@ -110,10 +107,10 @@ impl Conv {
         Ok(Self {
             inputs,
             outputs,
-            forward: Product::new(gpu, outputs, forward, precision)?,
-            data_gradient: Product::new(gpu, inputs, backward, precision)?,
-            weight_gradient: WeightGradient::new(gpu, outputs, precision)?,
-            reduce: gpu.pipeline(&reduce_strips::Constants::default())?,
+            forward: Product::new(gpu, outputs, forward)?,
+            data_gradient: Product::new(gpu, inputs, backward)?,
+            weight_gradient: WeightGradient::new(gpu, outputs)?,
+            reduce: Reduce::new(gpu)?,
         })
     }
 
@@ -155,15 +152,10 @@ impl Conv {
         partials: &mut Buffer<f32>,
         gradients: &mut Buffer<f32>,
     ) -> Result<()> {
-        let strip_count = size.y.div_ceil(self.weight_gradient.rows);
-        let parameter_count = layer_len(self.inputs, self.outputs);
-        self.weight_gradient.record(pass, size, [self.inputs, self.outputs], seen, partials)?;
-        pass.dispatch(
-            &self.reduce,
-            &reduce_strips::Params { parameter_count, strip_count, offset },
-            reduce_strips::Buffers { partials, gradients },
-            Threads::Exactly([parameter_count, 1, 1]),
-        )
+        let channels = [self.inputs, self.outputs];
+        self.weight_gradient.record(pass, size, channels, seen, partials)?;
+        let strip_count = size.y.div_ceil(STRIP_ROWS);
+        self.reduce.record(pass, channels, strip_count, offset, Strips { partials, gradients })
     }
 }
 
@@ -175,45 +167,29 @@ pub(super) struct Form {
     pub(super) accumulate: bool,
 }
 
-/// A kernel that convolves, and the pixels and channels that a subgroup takes.
+/// The kernel that convolves, and the pixels and channels that a subgroup takes.
 #[derive(Debug)]
 pub(super) struct Product {
-    kernel: ProductKernel,
+    kernel: Pipeline<conv3x3::Kernel>,
     columns: u32,
     rows: u32,
     channels: u32,
 }
 
-#[derive(Debug)]
-enum ProductKernel {
-    Single(Pipeline<conv3x3::Kernel>),
-    Half(Pipeline<conv3x3_half::Kernel>),
-}
-
 impl Product {
-    pub(super) fn new(gpu: &Gpu, outputs: u32, form: Form, precision: Precision) -> Result<Self> {
+    pub(super) fn new(gpu: &Gpu, outputs: u32, form: Form) -> Result<Self> {
         let Form { activation, transposed, accumulate } = form;
-        let matrix = precision.matrix(gpu).filter(|_| activation == Activation::None);
-        if let Some(CooperativeMatrix { m, n, k }) = matrix {
-            let (blocks, rows) = (outputs.div_ceil(m).min(HALF_BLOCKS), HALF_ROWS);
-            let constants =
-                conv3x3_half::Constants { m, n, k, blocks, rows, transposed, accumulate };
-            let kernel = ProductKernel::Half(gpu.pipeline(&constants)?);
-            return Ok(Self { kernel, columns: n, rows, channels: blocks * m });
-        }
         let [columns, rows] = conv_shape(gpu);
         let channels = outputs.min(OUT_BLOCK);
-        let activation = activation as u32;
-        let constants = conv3x3::Constants {
+        let kernel = gpu.pipeline(&conv3x3::Constants {
             columns,
             rows,
             out_block: channels,
-            activation,
+            activation: activation as u32,
             transposed,
             accumulate,
-        };
+        })?;
         let columns = columns * gpu.properties().subgroup_size;
-        let kernel = ProductKernel::Single(gpu.pipeline(&constants)?);
         Ok(Self { kernel, columns, rows, channels })
     }
 
@@ -228,55 +204,31 @@ impl Product {
         source: &Buffer<f32>,
         target: &mut Buffer<f32>,
     ) -> Result<()> {
-        let threads = Threads::Workgroups([
-            out_channels.div_ceil(self.channels),
-            size.x.div_ceil(self.columns),
-            size.y.div_ceil(self.rows),
-        ]);
-        match &self.kernel {
-            ProductKernel::Single(pipeline) => pass.dispatch(
-                pipeline,
-                &conv3x3::Params { size, in_channels, out_channels, offset },
-                conv3x3::Buffers { values, source, target },
-                threads,
-            ),
-            ProductKernel::Half(pipeline) => pass.dispatch(
-                pipeline,
-                &conv3x3_half::Params { size, in_channels, out_channels, offset },
-                conv3x3_half::Buffers { values, source, target },
-                threads,
-            ),
-        }
+        pass.dispatch(
+            &self.kernel,
+            &conv3x3::Params { size, in_channels, out_channels, offset },
+            conv3x3::Buffers { values, source, target },
+            Threads::Workgroups([
+                out_channels.div_ceil(self.channels),
+                size.x.div_ceil(self.columns),
+                size.y.div_ceil(self.rows),
+            ]),
+        )
     }
 }
 
-/// A kernel that sums the gradient of a layer's weights over strips, and the channels and rows that a subgroup takes.
+/// The kernel that sums the gradient of a layer's weights over strips, and the output channels that a subgroup takes.
 #[derive(Debug)]
 struct WeightGradient {
-    kernel: WeightGradientKernel,
-    inputs: u32,
+    kernel: Pipeline<conv3x3_weight_gradient::Kernel>,
     outputs: u32,
-    rows: u32,
-}
-
-#[derive(Debug)]
-enum WeightGradientKernel {
-    Single(Pipeline<conv3x3_weight_gradient::Kernel>),
-    Half(Pipeline<conv3x3_weight_gradient_half::Kernel>),
 }
 
 impl WeightGradient {
-    fn new(gpu: &Gpu, outputs: u32, precision: Precision) -> Result<Self> {
-        if let Some(CooperativeMatrix { m, n, k }) = precision.matrix(gpu) {
-            let (blocks, rows) = (outputs.div_ceil(m).min(HALF_STRIP_BLOCKS), HALF_STRIP_ROWS);
-            let constants = conv3x3_weight_gradient_half::Constants { m, n, k, blocks, rows };
-            let kernel = WeightGradientKernel::Half(gpu.pipeline(&constants)?);
-            return Ok(Self { kernel, inputs: n, outputs: blocks * m, rows });
-        }
-        let (out_block, rows) = (outputs.min(OUT_BLOCK), STRIP_ROWS);
-        let constants = conv3x3_weight_gradient::Constants { rows, out_block };
-        let kernel = WeightGradientKernel::Single(gpu.pipeline(&constants)?);
-        Ok(Self { kernel, inputs: 1, outputs: out_block, rows })
+    fn new(gpu: &Gpu, outputs: u32) -> Result<Self> {
+        let outputs = outputs.min(OUT_BLOCK);
+        let constants = conv3x3_weight_gradient::Constants { rows: STRIP_ROWS, out_block: outputs };
+        Ok(Self { kernel: gpu.pipeline(&constants)?, outputs })
     }
 
     fn record(
@@ -287,25 +239,51 @@ impl WeightGradient {
         Seen { source, d_target }: Seen<'_>,
         partials: &mut Buffer<f32>,
     ) -> Result<()> {
-        let threads = Threads::Workgroups([
-            in_channels.div_ceil(self.inputs),
-            out_channels.div_ceil(self.outputs),
-            size.y.div_ceil(self.rows),
-        ]);
-        match &self.kernel {
-            WeightGradientKernel::Single(pipeline) => pass.dispatch(
-                pipeline,
-                &conv3x3_weight_gradient::Params { size, in_channels, out_channels },
-                conv3x3_weight_gradient::Buffers { source, d_target, partials },
-                threads,
-            ),
-            WeightGradientKernel::Half(pipeline) => pass.dispatch(
-                pipeline,
-                &conv3x3_weight_gradient_half::Params { size, in_channels, out_channels },
-                conv3x3_weight_gradient_half::Buffers { source, d_target, partials },
-                threads,
-            ),
-        }
+        pass.dispatch(
+            &self.kernel,
+            &conv3x3_weight_gradient::Params { size, in_channels, out_channels },
+            conv3x3_weight_gradient::Buffers { source, d_target, partials },
+            Threads::Workgroups([
+                in_channels,
+                out_channels.div_ceil(self.outputs),
+                size.y.div_ceil(STRIP_ROWS),
+            ]),
+        )
+    }
+}
+
+/// The partial sums of the gradient of a layer, and where they are added.
+#[derive(Debug)]
+pub(super) struct Strips<'a> {
+    /// Holds [`partial_count`] values.
+    pub(super) partials: &'a mut Buffer<f32>,
+    pub(super) gradients: &'a mut Buffer<f32>,
+}
+
+/// The kernel that adds up the strips.
+#[derive(Debug)]
+pub(super) struct Reduce(Pipeline<reduce_strips::Kernel>);
+
+impl Reduce {
+    pub(super) fn new(gpu: &Gpu) -> Result<Self> {
+        Ok(Self(gpu.pipeline(&reduce_strips::Constants::default())?))
+    }
+
+    pub(super) fn record(
+        &self,
+        pass: &mut Recorder<'_>,
+        [inputs, outputs]: [u32; 2],
+        strip_count: u32,
+        offset: u32,
+        Strips { partials, gradients }: Strips<'_>,
+    ) -> Result<()> {
+        let parameter_count = layer_len(inputs, outputs);
+        pass.dispatch(
+            &self.0,
+            &reduce_strips::Params { parameter_count, strip_count, offset },
+            reduce_strips::Buffers { partials, gradients },
+            Threads::Exactly([parameter_count, 1, 1]),
+        )
     }
 }
 

@@ -9,17 +9,22 @@
 //! That is the paper's form. In the identity form `I_0 = R_0` and `R_{k+1} = I_k - conv_out(f)`, with the last layer zero at
 //! first: R_K begins as the render, and no gradient dies behind a sigmoid or a clamp.
 //!
-//! Activations are kept for one stage at a time: the backward pass computes those of the earlier stages again, from
-//! their inputs `R_k`.
+//! Activations are kept for one stage at a time, or for every stage where [`Denoiser::keep_activations`] finds room: without
+//! it the backward pass computes those of the earlier stages again, from their inputs `R_k`, to the same bits.
+
+mod memory;
 
 use glam::UVec2;
 use serde::{Deserialize, Serialize};
 
-use super::conv::{Activation, Adds, Conv, Precision, Seen, partial_count};
-use super::norm::{Backward, Forward, Norm, NormMemory, Use};
+use self::memory::{Activations, Earlier, Extent, Memory, Repeat};
+use super::conv::{Activation, Adds, Conv, Precision, Seen, Strips};
+use super::half::{PackedMap, Way};
+use super::inner::{Inner, Layer, Map};
+use super::norm::{Backward, Forward, Norm, Use};
 use super::parameters::{Layout, Parameters};
 use super::relu::ReluBackward;
-use super::{Form, RGB, check_binding, check_images, float_bytes, out_of_turn, pixel_count};
+use super::{Form, RGB, check_images, out_of_turn, pixel_count};
 use crate::gpu::{Buffer, Gpu, Pipeline, Properties, Recorder, Threads};
 use crate::kernels::{residual, residual_backward};
 use crate::random::Stream;
@@ -85,6 +90,11 @@ impl DenoiserSettings {
         }
     }
 
+    /// In the precision that the device offers.
+    fn held_on(self, gpu: &Gpu) -> Self {
+        Self { precision: self.precision.on(gpu), ..self }
+    }
+
     fn channels(self) -> usize {
         self.channels as usize
     }
@@ -95,18 +105,22 @@ impl DenoiserSettings {
 pub struct Denoiser {
     gpu: Gpu,
     settings: DenoiserSettings,
+    /// The same in the precision that the device offers.
+    held: DenoiserSettings,
     parameters: Parameters,
     stages: Vec<Stage>,
     kernels: Kernels,
     reserved: Extent,
     memory: Memory,
-    /// The size of the forward pass whose last stage the memory holds.
+    earlier: Earlier,
+    /// The size of the forward pass that the memory holds.
     recorded: Option<UVec2>,
 }
 
 /// Where the layers of a stage lie in the parameters.
 #[derive(Clone, Copy, Debug)]
 struct Stage {
+    number: usize,
     conv_in: u32,
     conv: u32,
     norm: u32,
@@ -116,40 +130,14 @@ struct Stage {
 #[derive(Debug)]
 struct Kernels {
     channels: u32,
+    repeats: usize,
     conv_in: Conv,
-    conv: Conv,
+    conv: Inner,
     conv_out: Conv,
     norm: Norm,
     relu_backward: ReluBackward,
     residual: Pipeline<residual::Kernel>,
     residual_backward: Pipeline<residual_backward::Kernel>,
-}
-
-/// What decides how long the buffers are.
-#[derive(Clone, Copy, Debug, Default)]
-struct Extent {
-    pixels: usize,
-    /// Partial sums of the gradient of the inner convolution.
-    partials: usize,
-}
-
-#[derive(Debug)]
-struct Memory {
-    /// f of every repeat, (repeats + 1) x (C, H, W).
-    features: Vec<Buffer<f32>>,
-    /// conv(f) of every repeat, repeats x (C, H, W).
-    convolved: Vec<Buffer<f32>>,
-    norm: NormMemory,
-    /// u, (3, H, W).
-    update: Buffer<f32>,
-    /// `R_1` to `R_K`, each (3, H, W).
-    denoised: Vec<Buffer<f32>>,
-    d_features: Buffer<f32>,
-    d_convolved: Buffer<f32>,
-    d_update: Buffer<f32>,
-    /// `dL/dR_k`, by turns, each (3, H, W).
-    d_denoised: [Buffer<f32>; 2],
-    partials: Buffer<f32>,
 }
 
 impl Denoiser {
@@ -165,6 +153,7 @@ impl Denoiser {
         let mut layout = Layout::new(Stream::new(seed, STREAM));
         let channels = settings.channels;
         let stage = |k| Stage {
+            number: k as usize,
             conv_in: layout.conv(&format!("{k}.conv_in"), RGB, channels),
             conv: layout.conv(&format!("{k}.conv"), channels, channels),
             norm: layout.norm(&format!("{k}.norm"), channels),
@@ -175,9 +164,11 @@ impl Denoiser {
         };
         let stages = (0..settings.stages).map(stage).collect();
         let reserved = Extent::default();
+        let held = settings.held_on(gpu);
         Ok(Self {
             gpu: gpu.clone(),
             settings,
+            held,
             parameters: layout.upload(
                 gpu,
                 ("denoiser", Self::LEARNING_RATE),
@@ -186,7 +177,8 @@ impl Denoiser {
             stages,
             kernels: Kernels::new(gpu, settings)?,
             reserved,
-            memory: Memory::new(gpu, settings, reserved)?,
+            memory: Memory::new(gpu, held, reserved)?,
+            earlier: Earlier::default(),
             recorded: None,
         })
     }
@@ -225,17 +217,18 @@ impl Denoiser {
 
     /// The memory that [`Denoiser::reserve`] takes for a view.
     pub fn bytes(settings: DenoiserSettings, size: UVec2) -> u64 {
-        let Extent { pixels, partials } = Extent::of(settings, size);
-        let maps = 2 * settings.repeats as usize + 3;
-        let images = settings.stages as usize + 4;
-        let norm = NormMemory::floats(pixels, settings.channels(), settings.repeats as usize);
-        let per_pixel = maps * settings.channels() + images * RGB as usize;
-        float_bytes(pixels * per_pixel + partials + norm)
+        Extent::of(settings, size).bytes(settings)
+    }
+
+    /// The memory that [`Denoiser::keep_activations`] takes for a view beside it.
+    pub fn kept_bytes(settings: DenoiserSettings, size: UVec2) -> u64 {
+        Earlier::bytes(settings, Extent::of(settings, size))
     }
 
     /// Whether the device binds every map of a view of `size`.
     pub fn fits_on(gpu: &Gpu, settings: DenoiserSettings, size: UVec2) -> bool {
-        Extent::of(settings, size).check(gpu, settings, size).is_ok()
+        let held = settings.held_on(gpu);
+        Extent::of(held, size).check(gpu, held, size).is_ok()
     }
 
     /// Takes the memory for views up to `size`, unless it is there already.
@@ -243,19 +236,42 @@ impl Denoiser {
     /// # Errors
     /// A map exceeds what the device can bind, or the device is out of memory.
     pub fn reserve(&mut self, size: UVec2) -> Result<()> {
-        let needed = Extent::of(self.settings, size);
+        let needed = Extent::of(self.held, size);
         if needed.fits(self.reserved) {
             return Ok(());
         }
         let gpu = &self.gpu;
-        needed.check(gpu, self.settings, size)?;
+        needed.check(gpu, self.held, size)?;
         // The old memory goes first: both together may not fit.
         self.recorded = None;
         let extent = needed.max(std::mem::take(&mut self.reserved));
-        self.memory = Memory::new(gpu, self.settings, Extent::default())?;
-        self.memory = Memory::new(gpu, self.settings, extent)?;
+        self.memory = Memory::new(gpu, self.held, Extent::default())?;
+        self.memory = Memory::new(gpu, self.held, extent)?;
         self.reserved = extent;
         Ok(())
+    }
+
+    /// Keeps the activations of every stage in views up to `size` from now on, where that takes no more than `most` bytes and
+    /// the device has them; says whether it does. No bit of a result follows from it.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub fn keep_activations(&mut self, size: UVec2, most: u64) -> Result<bool> {
+        let (settings, needed) = (self.held, Extent::of(self.held, size));
+        if needed.fits(self.earlier.extent()) {
+            return Ok(true);
+        }
+        let extent = needed.max(self.earlier.extent());
+        if Earlier::bytes(settings, extent) > most {
+            return Ok(false);
+        }
+        (self.recorded, self.earlier) = (None, Earlier::default());
+        match Earlier::new(&self.gpu, settings, extent) {
+            Ok(earlier) => self.earlier = earlier,
+            Err(Error::OutOfMemory { .. } | Error::BufferTooLarge { .. }) => return Ok(false),
+            Err(other) => return Err(other),
+        }
+        Ok(true)
     }
 
     /// `R_K` of the last forward pass, (3, H, W), at the beginning of a buffer that is as long as what was reserved.
@@ -275,23 +291,27 @@ impl Denoiser {
         input: &Buffer<f32>,
         render: &Buffer<f32>,
     ) -> Result<()> {
-        let pixels = pixel_count(size)?;
-        if !Extent::of(self.settings, size).fits(self.reserved) {
+        let (pixels, extent) = (pixel_count(size)?, Extent::of(self.held, size));
+        if !extent.fits(self.reserved) {
             return Err(out_of_turn("denoiser", size, "reserve memory for that size first"));
         }
         check_images(pixels, [input, render])?;
-        let (kernels, memory) = (&self.kernels, &mut self.memory);
+        let Self { kernels, parameters, earlier, .. } = self;
+        let Memory { activations: shared, denoised, .. } = &mut self.memory;
         for (k, stage) in self.stages.iter().enumerate() {
-            kernels.stage_forward(pass, size, stage, &self.parameters.values, k, input, memory)?;
-            let (before, from_here) = memory.denoised.split_at_mut(k);
+            let (before, from_here) = denoised.split_at_mut(k);
+            let stage_input = before.last().unwrap_or(input);
+            let own = earlier.of(k, extent, shared);
+            kernels.conv.prepare(pass, Way::Forward, stage.inner(&parameters.values))?;
+            kernels.stage_forward(pass, size, stage, &parameters.values, stage_input, own)?;
             let value_count = RGB * pixels as u32;
             pass.dispatch(
                 &kernels.residual,
                 &residual::Params { value_count },
                 residual::Buffers {
                     render,
-                    stage_input: before.last().unwrap_or(input),
-                    update: &memory.update,
+                    stage_input,
+                    update: &own.update,
                     denoised: &mut from_here[0],
                 },
                 Threads::Exactly([value_count, 1, 1]),
@@ -324,19 +344,26 @@ impl Denoiser {
             let remedy = "each backward pass needs a forward pass of its own before it";
             return Err(out_of_turn("denoiser", size, remedy));
         }
-        let Self { kernels, memory, parameters, stages, .. } = self;
+        let Self { kernels, memory, earlier, parameters, stages, held, .. } = self;
+        let extent = Extent::of(*held, size);
+        let are_kept = extent.fits(earlier.extent());
         pass.fill(&mut parameters.gradients, 0);
+        for stage in stages.iter() {
+            kernels.conv.prepare(pass, Way::Backward, stage.inner(&parameters.values))?;
+        }
         let last = stages.len() - 1;
         for (k, stage) in stages.iter().enumerate().rev() {
-            if k < last {
-                kernels.stage_forward(pass, size, stage, &parameters.values, k, input, memory)?;
+            let stage_input = if k == 0 { input } else { &memory.denoised[k - 1] };
+            let activations = earlier.of(k, extent, &mut memory.activations);
+            if k < last && !are_kept {
+                let values = &parameters.values;
+                kernels.stage_forward(pass, size, stage, values, stage_input, activations)?;
             }
             // The two images take turns, so that what a stage reads is never what it writes.
             let [even, odd] = &mut memory.d_denoised;
             let (own, other) = if k % 2 == 0 { (even, odd) } else { (odd, even) };
             let d_output = if k == last { d_denoised } else { &*other };
             let d_stage_input = if k == 0 { &mut *d_input } else { own };
-            let stage_input = if k == 0 { input } else { &memory.denoised[k - 1] };
             let value_count = RGB * pixels as u32;
             pass.dispatch(
                 &kernels.residual_backward,
@@ -344,7 +371,7 @@ impl Denoiser {
                 residual_backward::Buffers {
                     render,
                     stage_input,
-                    update: &memory.update,
+                    update: &activations.update,
                     d_denoised: d_output,
                     d_update: &mut memory.d_update,
                     d_stage_input: &mut *d_stage_input,
@@ -353,11 +380,10 @@ impl Denoiser {
                 Threads::Exactly([value_count, 1, 1]),
             )?;
             let maps = Maps {
-                features: &memory.features,
-                convolved: &memory.convolved,
-                norm: &mut memory.norm,
+                activations,
                 d_features: &mut memory.d_features,
                 d_convolved: &mut memory.d_convolved,
+                d_packed: &mut memory.d_packed,
                 partials: &mut memory.partials,
             };
             let ends = Ends { stage_input, d_update: &memory.d_update, d_stage_input };
@@ -369,11 +395,10 @@ impl Denoiser {
 
 /// What the backward pass of a stage reads and overwrites.
 struct Maps<'a> {
-    features: &'a [Buffer<f32>],
-    convolved: &'a [Buffer<f32>],
-    norm: &'a mut NormMemory,
+    activations: &'a mut Activations,
     d_features: &'a mut Buffer<f32>,
     d_convolved: &'a mut Buffer<f32>,
+    d_packed: &'a mut PackedMap,
     partials: &'a mut Buffer<f32>,
 }
 
@@ -392,14 +417,15 @@ impl Kernels {
         if precision == Precision::Half && cooperative_matrix.is_none() {
             tracing::warn!("{name} offers no 16-bit matrices: the denoiser is in single precision");
         }
-        let (ends, adds) = (Precision::Single, Adds::InputGradient);
+        let adds = Adds::InputGradient;
         let identity = form == Form::Identity;
         let activation = if identity { Activation::None } else { Activation::Sigmoid };
         Ok(Self {
             channels,
-            conv_in: Conv::new(gpu, [RGB, channels], Activation::Relu, adds, ends)?,
-            conv: Conv::new(gpu, [channels, channels], Activation::None, adds, precision)?,
-            conv_out: Conv::new(gpu, [channels, RGB], activation, Adds::Nothing, ends)?,
+            repeats: settings.repeats as usize,
+            conv_in: Conv::new(gpu, [RGB, channels], Activation::Relu, adds)?,
+            conv: Inner::new(gpu, channels, settings.stages, adds, precision)?,
+            conv_out: Conv::new(gpu, [channels, RGB], activation, Adds::Nothing)?,
             norm: Norm::new(gpu, channels)?,
             relu_backward: ReluBackward::new(gpu)?,
             residual: gpu.pipeline(&residual::Constants { identity })?,
@@ -407,29 +433,26 @@ impl Kernels {
         })
     }
 
-    /// The features and the update u of stage `k`.
-    #[expect(clippy::too_many_arguments, reason = "a stage, its place and its input")]
+    /// The activations of a stage.
     fn stage_forward(
         &self,
         pass: &mut Recorder<'_>,
         size: UVec2,
         stage: &Stage,
         values: &Buffer<f32>,
-        k: usize,
-        first: &Buffer<f32>,
-        memory: &mut Memory,
+        input: &Buffer<f32>,
+        activations: &mut Activations,
     ) -> Result<()> {
-        let Memory { features, convolved, norm, update, denoised, .. } = memory;
-        let input = if k == 0 { first } else { &denoised[k - 1] };
-        self.conv_in.forward(pass, size, stage.conv_in, values, input, &mut features[0])?;
-        for (repeat, convolved) in convolved.iter_mut().enumerate() {
-            let (before, after) = features.split_at_mut(repeat + 1);
-            let (shortcut, target) = (&before[repeat], &mut after[0]);
-            self.conv.forward(pass, size, stage.conv, values, shortcut, convolved)?;
+        let first = activations.first_features();
+        self.conv_in.forward(pass, size, stage.conv_in, values, input, first)?;
+        for repeat in 0..self.repeats {
+            let Repeat { shortcut, packed, convolved, norm, target } = activations.repeat(repeat);
+            let map = Map { single: shortcut, packed };
+            self.conv.forward(pass, size, stage.inner(values), map, convolved)?;
             let images = Forward { source: convolved, shortcut, target };
             self.norm.forward(pass, stage.norm_use(size, repeat), values, norm, images)?;
         }
-        let last = &features[features.len() - 1];
+        let (last, update) = activations.ends(self.repeats);
         self.conv_out.forward(pass, size, stage.conv_out, values, last, update)
     }
 
@@ -444,8 +467,8 @@ impl Kernels {
         ends: Ends<'_>,
     ) -> Result<()> {
         let Parameters { values, gradients, .. } = parameters;
-        let Maps { features, convolved, norm, d_features, d_convolved, partials } = maps;
-        let last = &features[features.len() - 1];
+        let Maps { activations, d_features, d_convolved, d_packed, partials } = maps;
+        let last = activations.features(self.repeats);
         let seen = Seen { source: last, d_target: ends.d_update };
         self.conv_out.weight_gradient(pass, size, stage.conv_out, seen, partials, gradients)?;
         self.conv_out.data_gradient(
@@ -456,17 +479,22 @@ impl Kernels {
             ends.d_update,
             d_features,
         )?;
-        for (repeat, source) in convolved.iter().enumerate().rev() {
-            let of = stage.norm_use(size, repeat);
-            let images = Backward { source, d_target: &*d_features, d_source: &mut *d_convolved };
+        for repeat in (0..self.repeats).rev() {
+            let (of, Activations { convolved, norm, .. }) =
+                (stage.norm_use(size, repeat), &mut *activations);
+            let (d_target, d_source) = (&*d_features, &mut *d_convolved);
+            let images = Backward { source: &convolved[repeat], d_target, d_source };
             self.norm.backward(pass, of, values, gradients, norm, images)?;
-            let seen = Seen { source: &features[repeat], d_target: &*d_convolved };
-            self.conv.weight_gradient(pass, size, stage.conv, seen, partials, gradients)?;
+            let source = (activations.features(repeat), &activations.packed[repeat]);
+            let d_target = Map { single: &*d_convolved, packed: &mut *d_packed };
+            let strips = Strips { partials: &mut *partials, gradients: &mut *gradients };
             // Along the shortcut the gradient stays as it is: the convolution's is added to it.
-            self.conv.data_gradient(pass, size, stage.conv, values, d_convolved, d_features)?;
+            let layer = stage.inner(values);
+            self.conv.backward(pass, size, layer, source, d_target, d_features, strips)?;
         }
         let value_count = self.channels * size.element_product();
-        self.relu_backward.record(pass, value_count, &features[0], d_features)?;
+        let first = activations.features(0);
+        self.relu_backward.record(pass, value_count, first, d_features)?;
         let seen = Seen { source: ends.stage_input, d_target: &*d_features };
         self.conv_in.weight_gradient(pass, size, stage.conv_in, seen, partials, gradients)?;
         let d_input = ends.d_stage_input;
@@ -475,59 +503,12 @@ impl Kernels {
 }
 
 impl Stage {
+    /// The layer that is repeated.
+    fn inner(self, values: &Buffer<f32>) -> Layer<'_> {
+        Layer { number: self.number, offset: self.conv, values }
+    }
+
     fn norm_use(&self, size: UVec2, repeat: usize) -> Use {
         Use { pixel_count: size.element_product(), offset: self.norm, repeat: repeat as u32 }
-    }
-}
-
-impl Extent {
-    fn of(settings: DenoiserSettings, size: UVec2) -> Self {
-        let DenoiserSettings { channels, precision, .. } = settings;
-        let ends = [[RGB, channels], [channels, RGB]];
-        let ends = ends.map(|layer| partial_count(size, layer, Precision::Single));
-        let inner = partial_count(size, [channels; 2], precision);
-        Self {
-            pixels: size.x as usize * size.y as usize,
-            partials: inner.max(ends[0]).max(ends[1]),
-        }
-    }
-
-    fn fits(self, reserved: Self) -> bool {
-        self.pixels <= reserved.pixels && self.partials <= reserved.partials
-    }
-
-    /// # Errors
-    /// The device does not bind what a view of `size` takes.
-    fn check(self, gpu: &Gpu, settings: DenoiserSettings, size: UVec2) -> Result<()> {
-        let channels = settings.channels;
-        let map = settings.channels().max(RGB as usize) * self.pixels;
-        check_binding(gpu, &format!("the denoiser's {channels} feature maps"), size, map)?;
-        let sums = format!("the sums of the gradients of the denoiser's {channels} channels");
-        check_binding(gpu, &sums, size, self.partials)
-    }
-
-    fn max(self, other: Self) -> Self {
-        Self { pixels: self.pixels.max(other.pixels), partials: self.partials.max(other.partials) }
-    }
-}
-
-impl Memory {
-    fn new(gpu: &Gpu, settings: DenoiserSettings, extent: Extent) -> Result<Self> {
-        let Extent { pixels, partials } = extent;
-        let repeats = settings.repeats as usize;
-        let map = |name| gpu.uninit(name, settings.channels() * pixels);
-        let image = |name| gpu.uninit(name, RGB as usize * pixels);
-        Ok(Self {
-            features: (0..=repeats).map(|_| map("features")).collect::<Result<_>>()?,
-            convolved: (0..repeats).map(|_| map("convolved")).collect::<Result<_>>()?,
-            norm: NormMemory::new(gpu, pixels, settings.channels(), repeats)?,
-            update: image("update")?,
-            denoised: (0..settings.stages).map(|_| image("denoised")).collect::<Result<_>>()?,
-            d_features: map("d_features")?,
-            d_convolved: map("d_convolved")?,
-            d_update: image("d_update")?,
-            d_denoised: [image("d_denoised")?, image("d_denoised")?],
-            partials: gpu.uninit("partials", partials)?,
-        })
     }
 }

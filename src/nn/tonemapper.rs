@@ -69,7 +69,7 @@ impl Tonemapper {
                 Form::Paper => layout.conv("conv3", CHANNELS, RGB),
             },
         ];
-        let (relu, none, single) = (Activation::Relu, Activation::None, Precision::Single);
+        let (relu, none) = (Activation::Relu, Activation::None);
         let [adds_input, adds_output] = match form {
             Form::Identity => [Adds::InputGradient, Adds::Output],
             Form::Paper => [Adds::Nothing; 2],
@@ -80,9 +80,9 @@ impl Tonemapper {
             parameters: layout.upload(gpu, ("tonemapper", Self::LEARNING_RATE), "{}".to_owned())?,
             offsets,
             convs: [
-                Conv::new(gpu, [RGB, CHANNELS], relu, adds_input, single)?,
-                Conv::new(gpu, [CHANNELS, CHANNELS], relu, Adds::Nothing, single)?,
-                Conv::new(gpu, [CHANNELS, RGB], none, adds_output, single)?,
+                Conv::new(gpu, [RGB, CHANNELS], relu, adds_input)?,
+                Conv::new(gpu, [CHANNELS, CHANNELS], relu, Adds::Nothing)?,
+                Conv::new(gpu, [CHANNELS, RGB], none, adds_output)?,
             ],
             product: gpu.pipeline(&product::Constants::default())?,
             product_backward: gpu.pipeline(&product_backward::Constants::default())?,

@@ -1,37 +1,64 @@
-//! The convolution of `conv3x3` without an activation, in double precision.
+//! The convolution of `conv3x3` without an activation, of packed factors, in double precision.
 
-use super::conv3x3::{sum_error, sums};
+use super::conv3x3::sums;
+use super::packed::{self, largest, scale, sum_error};
+use super::rounding::UNIT;
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::conv3x3;
 use crate::kernels::conv3x3_half::{Constants, Kernel, Params, Slices, Tolerances};
 
+/// The scaled sums that the factors make, and of the magnitudes of their terms; what the largest of both are.
+struct Scaled {
+    sums: Vec<f64>,
+    magnitudes: Vec<f64>,
+    largest: [f64; 2],
+}
+
+impl Scaled {
+    fn new(params: &Params, slices: &Slices<'_>) -> Self {
+        let Params { size, in_channels, out_channels, .. } = *params;
+        let source = packed::map(size, in_channels, slices.source);
+        let weights = packed::weights([in_channels, out_channels], slices.weights);
+        let largest = [largest(&source), largest(&weights)];
+        let layer = [weights, vec![0.0; out_channels as usize]].concat();
+        let params = conv3x3::Params { size, in_channels, out_channels, offset: 0 };
+        let of = |term: fn(f64) -> f64| sums(&params, false, &layer, &source, term);
+        Self { sums: of(|x| x), magnitudes: of(f64::abs), largest }
+    }
+}
+
+/// What the sum of two packed factors is divided by.
+fn unit(slices: &Slices<'_>) -> f64 {
+    scale(slices.largest_weight[0]) * scale(slices.largest_source[0])
+}
+
+/// What is added to a sum of channel `pixel / plane`.
+fn bias(params: &Params, constants: &Constants, values: &[f32], pixel: usize) -> f64 {
+    let channel = pixel / params.size.element_product() as usize;
+    if constants.biased { values[params.biases as usize + channel].into() } else { 0.0 }
+}
+
 impl Reference for Kernel {
-    fn run(params: &Params, constants: &Constants, Slices { values, source, target }: Slices<'_>) {
-        let Params { size, in_channels, out_channels, offset } = *params;
-        let Constants { transposed, accumulate, .. } = *constants;
-        conv3x3::Kernel::run(
-            &conv3x3::Params { size, in_channels, out_channels, offset },
-            &conv3x3::Constants { transposed, accumulate, ..Default::default() },
-            conv3x3::Slices { values, source, target },
-        );
+    fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
+        let (unit, scaled) = (unit(&slices), Scaled::new(params, &slices));
+        for (pixel, sum) in scaled.sums.into_iter().enumerate() {
+            let kept = if constants.accumulate { slices.target[pixel].into() } else { 0.0 };
+            let sum = sum / unit + bias(params, constants, slices.values, pixel);
+            slices.target[pixel] = (sum + kept) as f32;
+        }
     }
 
-    /// Both factors of a product round by 2^-10 at most, and weights below 2^-22 may vanish; the sum rounds as that of
-    /// `conv3x3`.
+    /// The sum of products, and a rounding of each of those that follow.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
-        let Slices { values, source, target } = slices;
-        let Params { size, in_channels, out_channels, offset } = *params;
-        let params = conv3x3::Params { size, in_channels, out_channels, offset };
-        let magnitudes = sums(&params, constants.transposed, values, source, f64::abs);
-        let pixels = &source[..(in_channels * size.element_product()) as usize];
-        let largest = pixels.iter().fold(0.0, |largest: f64, &x| largest.max(x.abs().into()));
-        let vanished = f64::from(9 * in_channels) * largest / 4_194_304.0;
-        let bound = |(magnitude, target): (f64, &f32)| {
-            let kept = if constants.accumulate { f64::from(target.abs()) } else { 0.0 };
-            sum_error(&params, magnitude + kept) + magnitude / 512.0 + vanished
+        let (unit, scaled) = (unit(&slices), Scaled::new(params, &slices));
+        let bound = |(pixel, &magnitude): (usize, &f64)| {
+            let kept = if constants.accumulate { slices.target[pixel].abs().into() } else { 0.0 };
+            let beside = bias(params, constants, slices.values, pixel).abs() + kept;
+            let of_sum = sum_error(9 * params.in_channels, magnitude, scaled.largest);
+            of_sum / unit + 4.0 * UNIT * (magnitude / unit + beside)
         };
         Tolerances {
-            target: Tolerance::Each(magnitudes.into_iter().zip(target.iter()).map(bound).collect()),
+            target: Tolerance::Each(scaled.magnitudes.iter().enumerate().map(bound).collect()),
         }
     }
 }

@@ -1,42 +1,74 @@
-//! The partial sums of `conv3x3_weight_gradient`, in double precision.
+//! The partial sums of `conv3x3_weight_gradient`, of packed factors, in double precision.
 
 use super::conv3x3_weight_gradient::strips;
+use super::packed::{self, largest, scale, sum_error};
 use super::rounding::UNIT;
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::conv3x3_weight_gradient;
 use crate::kernels::conv3x3_weight_gradient_half::{Constants, Kernel, Params, Slices, Tolerances};
 
-fn single(params: &Params) -> conv3x3_weight_gradient::Params {
+/// Of weights the scaled sums of packed factors, of biases those in single precision: of `term` of each factor.
+fn sums(
+    params: &Params,
+    constants: &Constants,
+    [source, d_target, d_single]: [&[f32]; 3],
+    term: fn(f64) -> f64,
+) -> Vec<f64> {
     let Params { size, in_channels, out_channels } = *params;
-    conv3x3_weight_gradient::Params { size, in_channels, out_channels }
+    let params = conv3x3_weight_gradient::Params { size, in_channels, out_channels };
+    let mut sums = strips(&params, constants.rows, source, d_target, term);
+    let single = conv3x3_weight_gradient::Params { in_channels: 0, ..params };
+    let biases = strips(&single, constants.rows, &[], d_single, term);
+    let of_strip = (out_channels * (9 * in_channels + 1)) as usize;
+    let biases = biases.chunks(out_channels as usize);
+    for (strip, own) in sums.chunks_mut(of_strip).zip(biases) {
+        strip[of_strip - own.len()..].copy_from_slice(own);
+    }
+    sums
+}
+
+/// How many of a strip's sums are those of weights, and how many there are.
+fn lengths(params: &Params) -> [usize; 2] {
+    let weights = 9 * params.in_channels * params.out_channels;
+    [weights, weights + params.out_channels].map(|n| n as usize)
+}
+
+/// What the sum of two packed factors is divided by.
+fn unit(slices: &Slices<'_>) -> f64 {
+    scale(slices.largest_source[0]) * scale(slices.largest_d_target[0])
+}
+
+/// Both factors.
+fn factors(params: &Params, slices: &Slices<'_>) -> [Vec<f32>; 2] {
+    let Params { size, in_channels, out_channels } = *params;
+    [(in_channels, slices.source), (out_channels, slices.d_target)]
+        .map(|(channels, map)| packed::map(size, channels, map))
 }
 
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
-        let Slices { source, d_target, partials } = slices;
-        let strips = strips(&single(params), constants.rows, source, d_target, |x| x);
-        partials.iter_mut().zip(strips).for_each(|(partial, sum)| *partial = sum as f32);
+        let (unit, [source, d_target]) = (unit(&slices), factors(params, &slices));
+        let maps = [&source[..], &d_target, slices.d_target_single];
+        let sums = sums(params, constants, maps, |x| x);
+        let [weights, of_strip] = lengths(params);
+        for (i, (partial, sum)) in slices.partials.iter_mut().zip(sums).enumerate() {
+            *partial = if i % of_strip < weights { sum / unit } else { sum } as f32;
+        }
     }
 
-    /// Both factors of a product round by 2^-10 at most, and what is below 2^-28 of a strip's largest may vanish. The sums
-    /// round as those of `conv3x3_weight_gradient`; those of biases no more than that.
+    /// The sums of products; those of biases round once for each pixel.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
-        let Slices { source, d_target, .. } = slices;
-        let Params { size, in_channels, out_channels } = *params;
-        let magnitudes = strips(&single(params), constants.rows, source, d_target, f64::abs);
-        let pixels_of_strip = f64::from(constants.rows * size.x);
-        let largest = |factor: &[f32], channels: u32| {
-            let own = &factor[..(channels * size.element_product()) as usize];
-            own.iter().fold(0.0, |largest: f64, &x| largest.max(x.abs().into()))
-        };
-        let both = largest(source, in_channels) * largest(d_target, out_channels);
-        let vanished = 2.0 * pixels_of_strip * both * f64::exp2(-28.0);
-        let weights = (9 * in_channels * out_channels) as usize;
-        let of_strip = weights + out_channels as usize;
+        let (unit, [source, d_target]) = (unit(&slices), factors(params, &slices));
+        let maps = [&source[..], &d_target, slices.d_target_single];
+        let magnitudes = sums(params, constants, maps, f64::abs);
+        let [weights, of_strip] = lengths(params);
+        let (pixels, largest) =
+            (constants.rows * params.size.x, [largest(&source), largest(&d_target)]);
         let bound = |(i, &magnitude): (usize, &f64)| {
-            let of_factors =
-                if i % of_strip < weights { magnitude / 512.0 + vanished } else { 0.0 };
-            (pixels_of_strip + 2.0) * UNIT * magnitude + of_factors
+            if i % of_strip < weights {
+                return sum_error(pixels, magnitude, largest) / unit;
+            }
+            (f64::from(pixels) + 2.0) * UNIT * magnitude
         };
         Tolerances { partials: Tolerance::Each(magnitudes.iter().enumerate().map(bound).collect()) }
     }

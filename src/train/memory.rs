@@ -3,6 +3,7 @@
 //! Limits are held by what follows from counts, never by what the system says at the moment: growth stops at the same
 //! number of Gaussians in every run, interrupted or not.
 
+use glam::UVec2;
 use serde::Serialize;
 
 use super::{CacheSize, Trainer};
@@ -20,6 +21,8 @@ const STATISTICS: f64 = 8.0;
 const HOST_PLANE_SETS: f64 = 3.0;
 /// A model that grows gets room for so many times as many Gaussians.
 const HEADROOM: f64 = 1.5;
+/// The fraction of the memory there may be that activations take which could be computed again.
+const ACTIVATIONS: f64 = 0.25;
 /// A view may have so many times as many intersections for each Gaussian as the last one had.
 pub(super) const MARGIN: f64 = 2.0;
 
@@ -97,6 +100,27 @@ impl Trainer {
         let each = MARGIN * met / count.max(1) as f64;
         let limit = limit.min(self.fitting_in_vram(each)).min(self.fitting_in_ram(each));
         limit.min(doubled.unwrap_or(usize::MAX)).max(count)
+    }
+
+    /// Keeps the activations that a denoiser's backward pass would compute again, within a fraction of what the run may have:
+    /// the rest is the model's.
+    pub(super) fn keep_activations(&mut self, sizes: &[UVec2]) -> Result<()> {
+        let most = (ACTIVATIONS * self.most_bytes()) as u64;
+        match &mut self.networks {
+            Some(terms) => terms.keep_activations(sizes, most),
+            None => Ok(()),
+        }
+    }
+
+    /// What there may be on the device at most, by the limits and by what it has.
+    fn most_bytes(&self) -> f64 {
+        let device = self.gpu.properties();
+        let most = |CacheSize(bytes): CacheSize| bytes.min(device.memory);
+        let vram = self.config.max_vram.map_or(device.memory, most) as f64;
+        match self.config.max_ram {
+            Some(CacheSize(ram)) if device.is_cpu => vram.min((ram as f64 - PROGRAM).max(0.0)),
+            _ => vram,
+        }
     }
 
     /// What is on the device now, less what follows the numbers of Gaussians and intersections, in bytes.

@@ -5,7 +5,6 @@ use glam::UVec2;
 use super::masks::Masking;
 use super::networks::Networks;
 use super::{ModelConfig, TrainConfig, streams};
-use crate::Result;
 use crate::gpu::{Buffer, Gpu, Recorder};
 use crate::kernels::ToneParameters;
 use crate::kernels::ssim::RADIUS;
@@ -18,6 +17,7 @@ use crate::random::Stream;
 use crate::scene::{COLOR_CHANNELS, Feature};
 use crate::tone::ToneCurve;
 use crate::window::Window;
+use crate::{Error, Result};
 
 /// What the networks of a view are held to, (3, H, W) each.
 #[derive(Clone, Copy, Debug)]
@@ -145,12 +145,31 @@ impl NetworkTerms {
         Ok(Some(terms))
     }
 
-    /// Memory for the windows of views of `size`.
-    fn reserve(&mut self, gpu: &Gpu, size: UVec2) -> Result<()> {
-        let size = match self.crop {
+    /// Keeps the activations of the denoiser's every stage in the windows of views of such sizes, where that takes no more than
+    /// `most` bytes and the device has them.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub(super) fn keep_activations(&mut self, sizes: &[UVec2], most: u64) -> Result<()> {
+        let windows: Vec<UVec2> = sizes.iter().map(|&size| self.most_of(size)).collect();
+        let Some(denoiser) = &mut self.networks.denoiser else { return Ok(()) };
+        let mut kept = windows.into_iter().map(|window| denoiser.keep_activations(window, most));
+        let are_kept = kept.try_fold(true, |all, kept| Ok::<_, Error>(all & kept?))?;
+        tracing::debug!("activations of every stage of the denoiser are kept: {are_kept}");
+        Ok(())
+    }
+
+    /// The largest window of a view of `size`.
+    fn most_of(&self, size: UVec2) -> UVec2 {
+        match self.crop {
             0 => size,
             crop => size.min(UVec2::splat(crop.saturating_add(2 * self.margin()))),
-        };
+        }
+    }
+
+    /// Memory for the windows of views of `size`.
+    fn reserve(&mut self, gpu: &Gpu, size: UVec2) -> Result<()> {
+        let size = self.most_of(size);
         self.networks.reserve(size)?;
         self.denoising.reserve(size)?;
         self.low.reserve(size)?;

@@ -1,15 +1,15 @@
 //! Every kernel against its reference, at sizes and channel counts that divide nothing.
 
 use glam::{UVec2, Vec2};
+use nightsplat::gpu::Threads;
 use nightsplat::gpu::testing::gpu;
-use nightsplat::gpu::{CooperativeMatrix, Threads};
 use nightsplat::kernels::*;
 
 use super::common::Random;
 
-const SIZES: [[u32; 2]; 5] = [[1, 1], [3, 1], [5, 7], [8, 8], [33, 17]];
+pub(crate) const SIZES: [[u32; 2]; 5] = [[1, 1], [3, 1], [5, 7], [8, 8], [33, 17]];
 
-fn values(random: &mut Random, count: u32, low: f64, high: f64) -> Vec<f32> {
+pub(crate) fn values(random: &mut Random, count: u32, low: f64, high: f64) -> Vec<f32> {
     (0..count).map(|_| random.between(low, high) as f32).collect()
 }
 
@@ -44,78 +44,6 @@ fn conv3x3_matches_its_reference_backward() {
     check_conv(conv3x3::Constants { accumulate: true, ..base }, [8, 8]);
     check_conv(conv3x3::Constants { out_block: 3, accumulate: true, ..base }, [17, 3]);
     check_conv(conv3x3::Constants { columns: 1, rows: 8, ..base }, [16, 17]);
-}
-
-fn check_half(matrix: CooperativeMatrix, transposed: bool, in_out: [u32; 2], magnitude: f64) {
-    let mut random = Random::new(1);
-    let ([in_channels, out_channels], CooperativeMatrix { m, n, k }) = (in_out, matrix);
-    let accumulate = transposed;
-    let constants = conv3x3_half::Constants { m, n, k, blocks: 2, rows: 3, transposed, accumulate };
-    for size in SIZES.map(UVec2::from_array) {
-        let pixels = size.element_product();
-        let mut image = |count, magnitude: f64| values(&mut random, count, -magnitude, magnitude);
-        let values = image(5 + 9 * in_channels * out_channels + out_channels, 0.2);
-        let [source, target] = in_out.map(|of| image(of * pixels, magnitude));
-        let params = conv3x3_half::Params { size, in_channels, out_channels, offset: 5 };
-        let blocks = out_channels.div_ceil(2 * m);
-        let threads = Threads::Workgroups([blocks, size.x.div_ceil(n), size.y.div_ceil(3)]);
-        run_kernel!(conv3x3_half, constants, params, threads, [values, source], [target]);
-    }
-}
-
-/// Runs where the device has cooperative matrices.
-#[test]
-fn conv3x3_half_matches_its_reference_at_every_magnitude() {
-    let Some(matrix) = gpu().properties().cooperative_matrix else {
-        let device = gpu();
-        let name = &device.properties().name;
-        return super::common::not_run(format_args!("{name} has no cooperative matrices"));
-    };
-    for magnitude in [1.0, 1e-9, 1e-30, 1e6] {
-        check_half(matrix, false, [8, 17], magnitude);
-        check_half(matrix, true, [17, 8], magnitude);
-    }
-    check_half(matrix, false, [64, 64], 1.0);
-    check_half(matrix, true, [3, 1], 1.0);
-}
-
-/// Runs where the device has cooperative matrices.
-#[test]
-fn conv3x3_weight_gradient_half_matches_its_reference_at_every_magnitude() {
-    let Some(CooperativeMatrix { m, n, k }) = gpu().properties().cooperative_matrix else {
-        let device = gpu();
-        let name = &device.properties().name;
-        return super::common::not_run(format_args!("{name} has no cooperative matrices"));
-    };
-    let mut random = Random::new(2);
-    for (rows, blocks, in_channels, out_channels, magnitudes) in [
-        (4, 2, 8, 17, [1.0, 1.0]),
-        (3, 1, 17, 8, [1e6, 1e-9]),
-        (4, 2, 3, 1, [1e-30, 1e30]),
-        (1, 2, 24, 24, [1e-15, 1e-15]),
-        (16, 2, 64, 40, [1e-3, 1e-3]),
-    ] {
-        for size in SIZES.map(UVec2::from_array) {
-            let pixels = size.element_product();
-            let mut image = |count, most: f64| values(&mut random, count * pixels, -most, most);
-            let source = image(in_channels, magnitudes[0]);
-            let d_target = image(out_channels, magnitudes[1]);
-            let strips = size.y.div_ceil(rows);
-            let partials = vec![f32::NAN; (strips * out_channels * (9 * in_channels + 1)) as usize];
-            run_kernel!(
-                conv3x3_weight_gradient_half,
-                conv3x3_weight_gradient_half::Constants { m, n, k, blocks, rows },
-                conv3x3_weight_gradient_half::Params { size, in_channels, out_channels },
-                Threads::Workgroups([
-                    in_channels.div_ceil(n),
-                    out_channels.div_ceil(blocks * m),
-                    strips
-                ]),
-                [source, d_target],
-                [partials]
-            );
-        }
-    }
 }
 
 #[test]

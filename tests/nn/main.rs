@@ -8,6 +8,7 @@ mod common;
 
 mod files;
 mod gradients;
+mod halves;
 mod kernels;
 mod lpips;
 mod model;

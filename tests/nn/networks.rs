@@ -2,6 +2,7 @@
 
 use glam::UVec2;
 use nightsplat::gpu::testing::gpu;
+use nightsplat::gpu::{CheckReport, DeviceChoice, Gpu};
 use nightsplat::nn::{Denoiser, DenoiserSettings, Form, Parameters, Precision, Tonemapper};
 
 use super::common::{Random, assert_close};
@@ -231,6 +232,54 @@ fn two_runs_give_the_same_bits() {
     assert!(a == b && c == d);
 }
 
+/// How often a pass convolves.
+fn convolutions(report: &CheckReport) -> usize {
+    let all = report.kernels().into_iter();
+    all.filter(|(kernel, ..)| *kernel == "conv3x3").map(|(_, count, _)| count).sum()
+}
+
+#[test]
+fn where_activations_are_kept_no_stage_is_computed_again_and_no_bit_changes() {
+    let (gpu, size) = (gpu(), UVec2::new(21, 9));
+    let [first, second, d] = images(size, 9);
+    let [stages, repeats] = [3, 2];
+    let form = Form::Paper;
+    let settings = DenoiserSettings { stages, repeats, channels: 8, form, ..Default::default() };
+    let most = Denoiser::kept_bytes(settings, size);
+    let run = |kept: UVec2, most| {
+        let mut denoiser = Denoiser::new(&gpu, settings, 1).unwrap();
+        denoiser.reserve(size).unwrap();
+        let are_kept = denoiser.keep_activations(kept, most).unwrap();
+        let images = [&first[..], &second, &d];
+        let (outcome, report) = gpu.checked(|| run_denoiser(&mut denoiser, size, images));
+        report.agree().unwrap();
+        (outcome, are_kept, convolutions(&report))
+    };
+    let ([once, a_stage], earlier) = ([2 * stages, 1].map(|n| (n * (repeats + 2)) as usize), 2);
+    let kept = run(size, most);
+    let without_room = run(size, most - 1);
+    let for_smaller_views = run(size - 1, most);
+    assert_eq!((kept.1, kept.2), (true, once));
+    assert_eq!((without_room.1, without_room.2), (false, once + earlier * a_stage));
+    assert_eq!((for_smaller_views.1, for_smaller_views.2), (true, once + earlier * a_stage));
+    assert!(kept.0 == without_room.0 && kept.0 == for_smaller_views.0);
+}
+
+#[test]
+fn activations_are_not_kept_where_the_device_has_no_room_for_them() {
+    let gpu = Gpu::new(&DeviceChoice::Best).unwrap();
+    let (settings, size) = (DenoiserSettings { stages: 3, ..Default::default() }, UVec2::splat(64));
+    let mut denoiser = Denoiser::new(&gpu, settings, 1).unwrap();
+    denoiser.reserve(size).unwrap();
+    let (before, kept) = (gpu.memory_in_use(), Denoiser::kept_bytes(settings, size));
+    gpu.limit_memory(before + kept / 2);
+    assert!(!denoiser.keep_activations(size, u64::MAX).unwrap());
+    // What did not fit is no longer there, and what is foreseen is enough.
+    gpu.limit_memory(before + kept + kept / 20);
+    assert!(denoiser.keep_activations(size, u64::MAX).unwrap());
+    assert!(gpu.memory_in_use() >= before + kept / 2);
+}
+
 /// Half precision is single precision on a device without 16-bit matrices. Gradients as small as a mean over a large
 /// view makes them lose no more than large ones.
 #[test]
@@ -267,10 +316,30 @@ fn half_precision_stays_near_single_at_every_magnitude() {
         let is_half = gpu.properties().cooperative_matrix.is_some();
         assert_eq!(far.iter().any(|&far| far > 0.0), is_half);
     }
+    assert_each_factor_is_packed_once(half, size, [&first, &second, &d]);
     let mut spoiled = first.clone();
     spoiled[100] = f32::NAN;
     let mut denoiser = Denoiser::new(&gpu, half, 1).unwrap();
     assert!(run_denoiser(&mut denoiser, size, [&spoiled, &second, &d]).output[100].is_nan());
+}
+
+/// Weights are packed once a step for each way, the map before each convolution once and its gradient once.
+fn assert_each_factor_is_packed_once(settings: DenoiserSettings, size: UVec2, images: [&[f32]; 3]) {
+    let gpu = gpu();
+    let mut denoiser = Denoiser::new(&gpu, settings, 1).unwrap();
+    denoiser.reserve(size).unwrap();
+    assert!(denoiser.keep_activations(size, u64::MAX).unwrap());
+    let (_, report) = gpu.checked(|| run_denoiser(&mut denoiser, size, images));
+    report.agree().unwrap();
+    let count = |kernel: &str| {
+        let found = report.kernels().into_iter().find(|(name, ..)| *name == kernel);
+        found.map_or(0, |(_, count, _)| count)
+    };
+    let DenoiserSettings { stages, repeats, .. } = settings;
+    let both_ways = if gpu.properties().cooperative_matrix.is_some() { 2 } else { 0 };
+    assert_eq!(count("pack_weights"), both_ways * stages as usize);
+    assert_eq!(count("pack_map"), both_ways * (stages * repeats) as usize);
+    assert_eq!(count("conv3x3_half"), both_ways * (stages * repeats) as usize);
 }
 
 #[test]

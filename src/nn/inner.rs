@@ -1,0 +1,116 @@
+//! The convolution that a stage of the denoiser repeats, in single precision or by matrices of 16 bits.
+
+use glam::UVec2;
+
+use super::conv::{Activation, Adds, Conv, Precision, Seen, Strips};
+use super::half::{HalfConv, PackedMap, PackedWeights, Way};
+use crate::Result;
+use crate::gpu::{Buffer, Gpu, Recorder};
+
+/// Its kernels, with the weights of every layer as they take them.
+#[derive(Debug)]
+pub(super) enum Inner {
+    Single(Conv),
+    Half { conv: HalfConv, layers: Vec<PackedWeights> },
+}
+
+/// A layer: which it is, and where it lies in the values.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Layer<'a> {
+    pub(super) number: usize,
+    pub(super) offset: u32,
+    pub(super) values: &'a Buffer<f32>,
+}
+
+/// A map, and where it is packed for matrices.
+#[derive(Debug)]
+pub(super) struct Map<'a> {
+    pub(super) single: &'a Buffer<f32>,
+    pub(super) packed: &'a mut PackedMap,
+}
+
+impl Inner {
+    /// # Errors
+    /// The driver refuses a kernel, or the device is out of memory.
+    pub(super) fn new(
+        gpu: &Gpu,
+        channels: u32,
+        layers: u32,
+        adds: Adds,
+        precision: Precision,
+    ) -> Result<Self> {
+        let Some(matrix) = precision.matrix(gpu) else {
+            return Ok(Self::Single(Conv::new(gpu, [channels; 2], Activation::None, adds)?));
+        };
+        let conv = HalfConv::new(gpu, channels, matrix, adds)?;
+        let layers = (0..layers).map(|_| conv.packed_weights(gpu)).collect::<Result<_>>()?;
+        Ok(Self::Half { conv, layers })
+    }
+
+    /// Packs the weights of a layer for a way, once a step: for the way back once they are for the way there.
+    pub(super) fn prepare(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        way: Way,
+        layer: Layer<'_>,
+    ) -> Result<()> {
+        let Layer { number, offset, values } = layer;
+        match self {
+            Self::Single(_) => Ok(()),
+            Self::Half { conv, layers } => {
+                conv.pack_weights(pass, way, offset, values, &mut layers[number])
+            }
+        }
+    }
+
+    /// Writes the convolution of `source` (C, H, W) to `target`, and leaves `source` packed.
+    pub(super) fn forward(
+        &self,
+        pass: &mut Recorder<'_>,
+        size: UVec2,
+        layer: Layer<'_>,
+        source: Map<'_>,
+        target: &mut Buffer<f32>,
+    ) -> Result<()> {
+        let (Layer { number, offset, values }, Map { single, packed }) = (layer, source);
+        match self {
+            Self::Single(conv) => conv.forward(pass, size, offset, values, single, target),
+            Self::Half { conv, layers } => {
+                conv.pack_map(pass, size, single, packed)?;
+                let (own, weights) = ((offset, values), &layers[number]);
+                conv.product(pass, size, Way::Forward, own, weights, packed, target)
+            }
+        }
+    }
+
+    /// Adds the gradients of weights and biases, and writes or adds that of the input, `d_source`, from that of the output,
+    /// `d_target`. The input is as the forward pass read it, in single precision, and as it left it packed, where it is.
+    #[expect(clippy::too_many_arguments, reason = "a layer, its place, two maps and two gradients")]
+    pub(super) fn backward(
+        &self,
+        pass: &mut Recorder<'_>,
+        size: UVec2,
+        layer: Layer<'_>,
+        source: (&Buffer<f32>, &PackedMap),
+        d_target: Map<'_>,
+        d_source: &mut Buffer<f32>,
+        strips: Strips<'_>,
+    ) -> Result<()> {
+        let (Layer { number, offset, values }, Map { single, packed }) = (layer, d_target);
+        match self {
+            Self::Single(conv) => {
+                let seen = Seen { source: source.0, d_target: single };
+                let Strips { partials, gradients } = strips;
+                conv.weight_gradient(pass, size, offset, seen, partials, gradients)?;
+                conv.data_gradient(pass, size, offset, values, single, d_source)
+            }
+            Self::Half { conv, layers } => {
+                conv.pack_map(pass, size, single, packed)?;
+                let factors = [source.1, &*packed];
+                conv.weight_gradient(pass, size, offset, factors, single, strips)?;
+                let (own, weights) = ((offset, values), &layers[number]);
+                conv.product(pass, size, Way::Backward, own, weights, packed, d_source)
+            }
+        }
+    }
+}

@@ -1,0 +1,114 @@
+//! Factors of 16-bit matrices as `include/packed.glsl` has them, on the host.
+
+use glam::UVec2;
+
+use crate::kernels::packed::{PACKED_CHANNELS, PACKED_COLUMNS, PACKED_ROWS};
+
+/// A map's or a layer's halves, eight in sixteen bytes.
+pub(super) type Eight = [u32; 4];
+
+pub(super) fn channels(count: u32) -> u32 {
+    count.next_multiple_of(PACKED_CHANNELS)
+}
+
+pub(super) fn extent(size: UVec2) -> UVec2 {
+    let UVec2 { x, y } = size;
+    UVec2::new(x.next_multiple_of(PACKED_COLUMNS), y.next_multiple_of(PACKED_ROWS)) + 2
+}
+
+fn exponent(largest: u32) -> i32 {
+    (largest >> 23).clamp(23, 254) as i32 - 127
+}
+
+/// What a factor is multiplied with whose largest magnitude has these bits.
+pub(super) fn scale(largest: u32) -> f64 {
+    f64::from(14 - exponent(largest)).exp2()
+}
+
+/// The half that is nearest to a number, subnormal, infinite and NaN too.
+pub(super) fn nearest(value: f64) -> u32 {
+    let sign = u32::from(value.is_sign_negative()) << 15;
+    let magnitude = value.abs();
+    let bits = if magnitude.is_nan() {
+        0x7e00
+    } else if magnitude >= 65_520.0 {
+        0x7c00
+    } else if magnitude < f64::exp2(-14.0) {
+        // The smallest that is not subnormal follows the subnormal ones.
+        (magnitude * f64::exp2(24.0)).round_ties_even() as u32
+    } else {
+        let exponent = magnitude.log2().floor();
+        let steps = (magnitude * f64::exp2(10.0 - exponent)).round_ties_even() as u32;
+        // The step above the last is the first of the next exponent.
+        steps + ((exponent as i32 + 14) as u32) * 1024
+    };
+    sign | bits
+}
+
+/// What a half stands for.
+pub(super) fn value(half: u32) -> f64 {
+    let (exponent, fraction) = ((half >> 10 & 31) as i32, f64::from(half & 0x3ff));
+    let magnitude = match exponent {
+        0 => fraction * f64::exp2(-24.0),
+        31 if fraction == 0.0 => f64::INFINITY,
+        31 => f64::NAN,
+        _ => (1024.0 + fraction) * f64::from(exponent - 25).exp2(),
+    };
+    if half & 0x8000 == 0 { magnitude } else { -magnitude }
+}
+
+/// The halves of eight numbers.
+pub(super) fn eight(number: impl Fn(u32) -> f64) -> Eight {
+    [0, 1, 2, 3].map(|word| nearest(number(2 * word)) | nearest(number(2 * word + 1)) << 16)
+}
+
+fn at(packed: &[Eight], index: u32) -> f64 {
+    let half = packed[(index / 8) as usize][(index % 8 / 2) as usize] >> (16 * (index % 2));
+    value(half & 0xffff)
+}
+
+/// What is in a packed map, as planes (C, H, W): halves, which single precision holds.
+pub(super) fn map(size: UVec2, count: u32, packed: &[Eight]) -> Vec<f32> {
+    let (columns, own) = (extent(size).x, channels(count));
+    let pixel = |i: u32| (i / size.x + 1) * columns + i % size.x + 1;
+    let plane = |c: u32| (0..size.element_product()).map(move |i| at(packed, pixel(i) * own + c));
+    (0..count).flat_map(plane).map(|value| value as f32).collect()
+}
+
+/// What is in a layer's packed weights, as (to, from, tap).
+pub(super) fn weights([from, to]: [u32; 2], packed: &[Eight]) -> Vec<f32> {
+    let [own_from, own_to] = [from, to].map(channels);
+    let taps =
+        |i: u32| (0..9).map(move |tap| at(packed, (tap * own_to + i / from) * own_from + i % from));
+    (0..to * from).flat_map(taps).map(|value| value as f32).collect()
+}
+
+/// How far the sum of so many products of packed factors may be off, of terms with such a sum of magnitudes and such largest
+/// magnitudes, all of them scaled. A matrix may cut off where an addition rounds, and flush what is subnormal.
+pub(super) fn sum_error(count: u32, magnitude: f64, largest: [f64; 2]) -> f64 {
+    let count = f64::from(count);
+    let cut = 4.0 * (count + 2.0) * super::rounding::UNIT * magnitude;
+    cut + count * f64::exp2(-14.0) * (largest[0] + largest[1])
+}
+
+/// The largest magnitude.
+pub(super) fn largest(values: &[f32]) -> f64 {
+    values.iter().fold(0.0, |largest: f64, &value| largest.max(value.abs().into()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{nearest, value};
+
+    #[test]
+    fn every_half_is_nearest_to_what_it_stands_for_and_so_is_what_is_close() {
+        for half in (0..0x1_0000).filter(|half| !value(*half).is_nan()) {
+            let own = value(half);
+            assert_eq!(nearest(own), half, "{own}");
+            assert_eq!(nearest(own * (1.0 + f64::exp2(-14.0))), half, "{own}");
+        }
+        assert_eq!(nearest(1.0 + f64::exp2(-11.0)), nearest(1.0), "of two the even one");
+        assert_eq!(nearest(-f64::exp2(-25.0)), 0x8000);
+        assert!(value(nearest(f64::NAN)).is_nan());
+    }
+}
