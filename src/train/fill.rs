@@ -25,8 +25,8 @@ use crate::scene::{Gaussians, SH_C0, width};
 const VIEWS: usize = 16;
 /// Pixels that are looked at for each Gaussian that is wanted.
 const PIXELS_EACH: usize = 4;
-/// Pixels of a view for each Gaussian that there is to be at least: more show no more of small views, and cost score later
-/// (docs/benchmarks.md).
+/// Pixels of a view for each Gaussian that there is to be, at least: with more of them small views may score lower after
+/// thousands of steps (docs/benchmarks.md).
 const LEAST_PIXELS_EACH: usize = 8;
 /// What covers less of a pixel than this says nothing of its depth.
 const LEAST_COVER: f32 = 0.5;
