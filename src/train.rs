@@ -5,6 +5,7 @@ mod checkpoint;
 mod config;
 mod ends;
 mod exposures;
+mod fill;
 mod growth;
 mod held_out;
 mod masks;
@@ -71,6 +72,7 @@ mod streams {
     pub(super) const NETWORKS: u64 = 6;
     pub(super) const CROPS: u64 = 7;
     pub(super) const BOXES: u64 = 8;
+    pub(super) const FILL: u64 = 9;
 }
 
 /// What one step did.

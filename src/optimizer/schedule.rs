@@ -150,6 +150,12 @@ impl Schedule {
             && step.is_multiple_of(self.densify_interval.max(1))
     }
 
+    /// The step behind which density control acts first, if it ever does.
+    pub fn first_round(&self) -> u64 {
+        let interval = self.densify_interval.max(1);
+        (self.densify_after / interval).saturating_add(1).saturating_mul(interval)
+    }
+
     /// How often the views of `step` are halved.
     pub fn resolution_level(&self, step: u64) -> usize {
         match self.resolution_steps {
@@ -210,7 +216,13 @@ mod tests {
         let schedule = Schedule::paper();
         let steps: Vec<u64> = (0..=6_000).filter(|&step| schedule.densifies_at(step)).collect();
         assert_eq!((steps[0], steps[1], *steps.last().unwrap()), (600, 800, 4_800));
-        assert!(!Schedule { densify_after: 600, ..schedule }.densifies_at(600));
+        assert!(!Schedule { densify_after: 600, ..schedule.clone() }.densifies_at(600));
+        for (densify_after, densify_interval) in [(500, 200), (600, 200), (50, 100), (0, 1), (7, 0)]
+        {
+            let schedule = Schedule { densify_after, densify_interval, ..schedule.clone() };
+            let first = (1..).find(|&step| schedule.densifies_at(step));
+            assert_eq!(first, Some(schedule.first_round()));
+        }
     }
 
     #[test]

@@ -174,6 +174,9 @@ pub struct DensityConfig {
     pub split_scale: f64,
     /// Fainter Gaussians are removed.
     pub min_opacity: f64,
+    /// So many Gaussians come of few, a tenth of them or fewer: random points up to that tenth, and in the first round
+    /// Gaussians at the depths of what the views show. Of the conserving control alone; 0: none are added.
+    pub fill: usize,
 }
 
 /// What a configuration need not say.
@@ -232,11 +235,20 @@ impl Default for DensityConfig {
             gradient_threshold: 4e-4,
             split_scale: 0.01,
             min_opacity: 0.005,
+            fill: 0,
         }
     }
 }
 
 impl DensityConfig {
+    /// The most first Gaussians that are few.
+    pub(super) fn few(&self) -> usize {
+        match self.control {
+            DensityControl::Conserving => self.fill / 10,
+            DensityControl::Paper => 0,
+        }
+    }
+
     /// Those of LITA-GS.
     pub fn paper() -> Self {
         Self { control: DensityControl::Paper, gradient_threshold: 2e-4, ..Self::default() }

@@ -26,7 +26,13 @@ impl Trainer {
         };
         let grown = self.growth_limit()?.max(self.model.count());
         let (room, why) = self.room(intersections);
-        let round = Round { step: self.step, rounds_left, most: room.min(grown) };
+        let most = room.min(grown);
+        if self.fills_at(self.step) {
+            self.fill(self.filled_count().min(most))?;
+            self.ends.density_due = None;
+            return self.reserve();
+        }
+        let round = Round { step: self.step, rounds_left, most };
         let report = self.model.densify(&gpu, &mut self.densifier, round)?;
         self.ends.density_due = None;
         tracing::debug!("step {}: {report:?}", self.step);

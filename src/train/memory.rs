@@ -95,7 +95,8 @@ impl Trainer {
         let rounds = (self.step / interval + 1..=self.config.steps / interval)
             .filter(|round| self.densifies_at(round * interval));
         // A Gaussian becomes two at most.
-        let doubled = (0..rounds.count()).try_fold(count, |count, _| count.checked_mul(2));
+        let filled = self.count_once_filled();
+        let doubled = (0..rounds.count()).try_fold(filled, |count, _| count.checked_mul(2));
         let limit = self.most_renderable();
         let each = MARGIN * met / count.max(1) as f64;
         let limit = limit.min(self.fitting_in_vram(each)).min(self.fitting_in_ram(each));

@@ -198,7 +198,8 @@ mod tests {
     }
 
     #[test]
-    fn paper_is_the_paper_and_balanced_is_what_the_library_defaults_to_but_for_its_end_and_bits() {
+    fn paper_is_the_paper_and_balanced_is_the_library_default_but_for_its_end_its_bits_and_what_fills()
+     {
         let paper = applied(Preset::Paper, "x", ToneCurve::Auto);
         let mut model = ModelConfig::default();
         model.follow_paper();
@@ -217,7 +218,10 @@ mod tests {
         let defaults = TrainConfig::default();
         assert_eq!((balanced.precision.rest, balanced.precision.moments), (Bits::Half, Bits::Half));
         let (tone, stop) = (defaults.tone.clone(), defaults.stop.clone());
-        let plain = TrainConfig { tone, stop, precision: defaults.precision.clone(), ..balanced };
+        assert_eq!((balanced.density.fill, defaults.density.fill), (5_000, 0));
+        let (density, precision) = (defaults.density.clone(), defaults.precision.clone());
+        assert_eq!(DensityConfig { fill: 0, ..balanced.density.clone() }, density);
+        let plain = TrainConfig { tone, stop, density, precision, ..balanced };
         assert_eq!(plain, TrainConfig { dataset: "data/x".into(), ..defaults });
         assert!(!Preset::Paper.is_planned() && Preset::Balanced.is_planned());
     }

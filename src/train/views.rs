@@ -295,8 +295,31 @@ impl Views {
         self.whole().iter().map(TrainView::size).collect()
     }
 
-    /// One Gaussian per point of the dataset, or per random point where there is none, coloured as the targets of the
-    /// training views show it.
+    /// The points of the dataset, with random ones behind them where there is none or few.
+    fn points<'a>(
+        &self,
+        dataset: &'a Dataset,
+        config: &TrainConfig,
+        frame: &Frame,
+    ) -> Cow<'a, [Point]> {
+        let own = &dataset.points;
+        let wanted = if own.is_empty() { config.random_points } else { config.density.few() };
+        let count = wanted.min(config.max_gaussians).saturating_sub(own.len());
+        if count == 0 {
+            return own.into();
+        }
+        let firsts = self.all().filter(|view| view.patch.is_first());
+        let cameras: Vec<Camera> = firsts.map(|view| view.patch.camera).collect();
+        let seed = Stream::new(config.seed, streams::POINTS).bits(0);
+        let found = if own.is_empty() { "no".to_owned() } else { own.len().to_string() };
+        tracing::info!("{found} points in the dataset: {count} random ones");
+        let point = |position| Point { position: frame.to_world(position), views: vec![] };
+        let random = init::random(&cameras, count, seed).into_iter().map(point);
+        own.iter().cloned().chain(random).collect()
+    }
+
+    /// One Gaussian per point of the dataset, and per random point where there is none or few, coloured as the targets of
+    /// the training views show it.
     pub(super) fn initial_gaussians(
         &self,
         gpu: &Gpu,
@@ -306,19 +329,7 @@ impl Views {
         exposures: Option<&[Affine]>,
     ) -> Result<Gaussians> {
         let frame = config.frame.unwrap_or_default();
-        let random;
-        let points = if dataset.points.is_empty() {
-            let firsts = self.all().filter(|view| view.patch.is_first());
-            let cameras: Vec<Camera> = firsts.map(|view| view.patch.camera).collect();
-            let count = config.random_points.min(config.max_gaussians);
-            let seed = Stream::new(config.seed, streams::POINTS).bits(0);
-            tracing::info!("no points in the dataset: {count} random ones");
-            let point = |position| Point { position: frame.to_world(position), views: vec![] };
-            random = init::random(&cameras, count, seed).into_iter().map(point).collect();
-            &random
-        } else {
-            &dataset.points
-        };
+        let points = self.points(dataset, config, &frame);
         let kept = &points[..points.len().min(config.max_gaussians)];
         let fitting = config.render_settings().most_gaussians(gpu);
         if kept.len() > fitting {
@@ -488,7 +499,7 @@ impl TrainView {
     }
 
     /// The pseudo-GT of the view, (3, H, W).
-    fn target(&self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<Arc<Buffer<f32>>> {
+    pub(super) fn target(&self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<Arc<Buffer<f32>>> {
         if self.is_baked {
             return self.input.whole(gpu);
         }

@@ -1,0 +1,271 @@
+//! More Gaussians where the dataset has few points: at the depths that the first steps have found.
+//!
+//! Few Gaussians learn within a hundred steps how far away things are, but each round of density control doubles them at
+//! most. The first round lets a pixel here and there of some training views become a Gaussian instead: of the pixel's
+//! colour, where the expected depth of what is rendered there says. All begin anew in Adam.
+
+use glam::{DVec2, DVec3, Vec3};
+
+use super::model::Model;
+use super::views::TrainView;
+use super::{Trainer, streams};
+use crate::Result;
+use crate::attributes::planes;
+use crate::camera::{Camera, Patch};
+use crate::exposure::{Affine, Exposures};
+use crate::halves::Bits;
+use crate::image::Image;
+use crate::pseudo_gt::PseudoGt;
+use crate::random::Stream;
+use crate::render::{RenderOptions, RenderSettings, Renderer};
+use crate::scene::init::{self, Start};
+use crate::scene::{Gaussians, SH_C0, width};
+
+/// Views that are looked at, at most.
+const VIEWS: usize = 16;
+/// Pixels that are looked at for each Gaussian that is wanted.
+const PIXELS_EACH: usize = 4;
+/// Pixels of a view for each Gaussian that there is to be, at least: with more of them small views may score lower after
+/// thousands of steps (docs/benchmarks.md).
+const LEAST_PIXELS_EACH: usize = 8;
+/// What covers less of a pixel than this says nothing of its depth.
+const LEAST_COVER: f32 = 0.5;
+
+/// What a pixel shows, in the frame.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Sight {
+    position: DVec3,
+    color: Vec3,
+}
+
+impl Trainer {
+    /// The round behind this step fills, if it is the first and there are few Gaussians.
+    pub(super) fn fills_at(&self, step: u64) -> bool {
+        let (few, count) = (self.config.density.few(), self.model.count());
+        let is_due = step == self.config.schedule.first_round();
+        is_due && count <= few && count < self.filled_count()
+    }
+
+    /// As many as there are to be behind that round.
+    pub(super) fn filled_count(&self) -> usize {
+        let pixels = |view: &TrainView| Patch::from(&view.patch.camera).pixel_count();
+        let most = self.views.photographs().map(pixels).max().unwrap_or_default();
+        self.config.density.fill.min(most / LEAST_PIXELS_EACH)
+    }
+
+    /// As many Gaussians as there are, or as there are to be once a later round has filled.
+    pub(super) fn count_once_filled(&self) -> usize {
+        let (count, first) = (self.model.count(), self.config.schedule.first_round());
+        let fills = self.step < first && self.fills_at(first) && self.densifies_at(first);
+        if fills { self.filled_count().max(count) } else { count }
+    }
+
+    /// Adds Gaussians until there are so many.
+    ///
+    /// # Errors
+    /// A photograph can no longer be read, or the device is out of memory or lost: the model is as it was.
+    pub(super) fn fill(&mut self, wanted: usize) -> Result<()> {
+        let more = wanted.saturating_sub(self.model.count());
+        if more == 0 {
+            return Ok(());
+        }
+        let old = self.gaussians_in_frame()?;
+        // Whoever looks at the parameters next says where they are none.
+        if !old.means().iter().all(|mean| mean.is_finite()) {
+            return Ok(());
+        }
+        let sights = self.sights(&old, more)?;
+        let draws = Stream::new(self.config.seed, streams::FILL);
+        let mut order: Vec<usize> = (0..sights.len()).collect();
+        order.sort_by_key(|&i| draws.bits(i as u64));
+        let picked: Vec<Sight> = order.into_iter().take(more).map(|i| sights[i]).collect();
+        tracing::info!(
+            "step {}: {} Gaussians at depths of the views beside {}",
+            self.step,
+            picked.len(),
+            old.count
+        );
+        let filled = joined(&old, &picked, &self.config.start)?;
+        let in_use = self.model.shape().sh_degree;
+        self.model = Model::upload(&self.gpu, &filled, in_use, &self.config.precision)?;
+        Ok(())
+    }
+
+    /// What pixels of some views show, about [`PIXELS_EACH`] times so many.
+    fn sights(&self, gaussians: &Gaussians, more: usize) -> Result<Vec<Sight>> {
+        let settings = RenderSettings {
+            shape: 0.into(),
+            raw_colors: true,
+            rest: Bits::Single,
+            ..self.config.render_settings()
+        };
+        let mut renderer = Renderer::new(&self.gpu, settings)?;
+        let pseudo_gt = PseudoGt::new(&self.gpu, &self.config.tone)?;
+        let exposures = self.exposures.as_ref().map(Exposures::affines).transpose()?;
+        let count = self.views.photographs().count();
+        let views = self.views.photographs().step_by(count.div_ceil(VIEWS).max(1));
+        let pixels = PIXELS_EACH * more / count.clamp(1, VIEWS);
+        let mut sights = vec![];
+        for view in views {
+            let camera = coarse(&view.patch.camera, pixels);
+            let depths = self.depths(&mut renderer, gaussians, &camera)?;
+            let target = self
+                .views
+                .put_together(&self.gpu, view.place, |patch| patch.target(&self.gpu, &pseudo_gt))?;
+            let exposure = exposures.as_ref().and_then(|exposures| exposures.get(view.place));
+            let neutral = exposure.map(Affine::inverse).map(|inverse| inverse.applied(&target));
+            let target = neutral.unwrap_or(target).resized(camera.width, camera.height);
+            let mask = self.mask_of(view)?.map(|mask| mask.resized(camera.width, camera.height));
+            sights.extend(seen(&camera, &depths, &target, mask.as_ref()));
+        }
+        Ok(sights)
+    }
+
+    /// In place of colours, the sum of the depths of what covers a pixel by how much it does, and the sum of how much.
+    fn depths(
+        &self,
+        renderer: &mut Renderer,
+        gaussians: &Gaussians,
+        camera: &Camera,
+    ) -> Result<Image> {
+        let mut bare = Gaussians::zeros(gaussians.count, 0);
+        bare.means_mut().copy_from_slice(gaussians.means());
+        bare.quats_mut().copy_from_slice(gaussians.quats());
+        bare.log_scales_mut().copy_from_slice(gaussians.log_scales());
+        bare.raw_opacities_mut().copy_from_slice(gaussians.raw_opacities());
+        for (dc, mean) in bare.dc_mut().iter_mut().zip(gaussians.means()) {
+            let depth = camera.view_from_world.transform_point3(mean.as_dvec3()).z;
+            *dc = Vec3::new(depth as f32, 1.0, 0.0) / SH_C0;
+        }
+        renderer.reserve(bare.count, [camera])?;
+        let options = RenderOptions { sh_degree: 0, background: [0.0; 3] };
+        renderer.render_image(&bare.upload(&self.gpu)?, camera, &options)
+    }
+
+    /// The mask of a view's photograph, as an image of three equal channels.
+    fn mask_of(&self, view: &TrainView) -> Result<Option<Image>> {
+        if self.masks.of_view(view.number).is_none() {
+            return Ok(None);
+        }
+        let mask = self.views.put_together(&self.gpu, view.place, |patch| {
+            let weights = self.masks.of_view(patch.number).map(|weights| self.gpu.read(weights));
+            let weights = weights.transpose()?.unwrap_or_default();
+            Ok(self.gpu.buffer("mask", &weights.repeat(3))?.into())
+        })?;
+        Ok(Some(mask))
+    }
+}
+
+/// The same camera with about so many pixels, if it has more.
+fn coarse(camera: &Camera, pixels: usize) -> Camera {
+    let own = f64::from(camera.width) * f64::from(camera.height);
+    let scale = (pixels as f64 / own).sqrt().min(1.0);
+    let side = |side: u32| ((f64::from(side) * scale).round() as u32).max(1);
+    camera.resized(side(camera.width), side(camera.height))
+}
+
+/// What the pixels show that something covers and no mask hides in part.
+fn seen(camera: &Camera, depths: &Image, target: &Image, mask: Option<&Image>) -> Vec<Sight> {
+    let (pixels, world_from_view) = (depths.pixel_count(), camera.view_from_world.inverse());
+    let sight = |at: usize| {
+        let cover = depths.data[pixels + at];
+        let depth = f64::from(depths.data[at] / cover);
+        let (column, row) = (at % camera.width as usize, at / camera.width as usize);
+        let pixel = DVec2::new(column as f64 + 0.5, row as f64 + 0.5);
+        let in_view = ((pixel - camera.principal_point) / camera.focal).extend(1.0) * depth;
+        let position = world_from_view.transform_point3(in_view);
+        let color = Vec3::from_array([0, 1, 2].map(|c| target.data[c * pixels + at]));
+        let counts = mask.is_none_or(|mask| mask.data[at] >= 1.0);
+        let is_sound = cover >= LEAST_COVER && position.is_finite() && color.is_finite();
+        (counts && is_sound).then_some(Sight { position, color })
+    };
+    (0..pixels).filter_map(sight).collect()
+}
+
+/// Gaussians with those of what is seen behind them, which have the features of the nearest.
+fn joined(old: &Gaussians, new: &[Sight], start: &Start) -> Result<Gaussians> {
+    let means = old.means().iter().map(|mean| mean.as_dvec3());
+    let positions: Vec<DVec3> = means.chain(new.iter().map(|sight| sight.position)).collect();
+    let colors = std::iter::repeat_n(Vec3::ZERO, old.count);
+    let colors: Vec<Vec3> = colors.chain(new.iter().map(|sight| sight.color)).collect();
+    let mut all = init::from_points(&positions, &colors, old.shape, start, 0)?;
+    let features = old.shape.features.width();
+    for (column, width) in planes(features, width(old.shape)) {
+        let (from, to) = (column * old.count, column * all.count);
+        let own = &old.parameters[from..from + width * old.count];
+        all.parameters[to..to + own.len()].copy_from_slice(own);
+    }
+    if features > 0 {
+        let nearest = |sight: &Sight| {
+            let distance = |i: &usize| positions[*i].distance_squared(sight.position);
+            (0..old.count).min_by(|a, b| distance(a).total_cmp(&distance(b)))
+        };
+        let own = all.features_mut();
+        for (i, nearest) in new.iter().map(nearest).enumerate() {
+            let Some(nearest) = nearest else { continue };
+            let from = features * nearest;
+            own.copy_within(from..from + features, features * (old.count + i));
+        }
+    }
+    Ok(all)
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::DAffine3;
+
+    use super::*;
+    use crate::scene::{Features, Shape};
+
+    fn camera(width: u32, height: u32) -> Camera {
+        let (focal, principal_point) = (DVec2::splat(2.0), DVec2::new(1.0, 0.5));
+        let view_from_world = DAffine3::from_translation(DVec3::new(0.0, 0.0, 1.0));
+        Camera { width, height, focal, principal_point, view_from_world }
+    }
+
+    #[test]
+    fn a_pixel_is_where_its_expected_depth_says_unless_little_covers_it_or_a_mask_hides_it() {
+        // The sum of depths by cover, and the cover: half a Gaussian at depth 4 is at depth 4.
+        let image = |data: &[f32]| Image { width: 2, height: 1, data: data.to_vec() };
+        let target = image(&[0.1, 0.2, 0.3, 0.4, 0.5, 0.6]);
+        let shown =
+            |data: &[f32], mask: Option<&Image>| seen(&camera(2, 1), &image(data), &target, mask);
+        let left = Sight { position: DVec3::new(-1.0, 0.0, 3.0), color: Vec3::new(0.1, 0.3, 0.5) };
+        assert_eq!(shown(&[2.0, 0.4, 0.5, 0.4, 0.0, 0.0], None), [left]);
+        let nothing: [Sight; 0] = [];
+        for depth in [f32::NAN, f32::INFINITY] {
+            assert_eq!(shown(&[depth, 0.0, 1.0, 0.0, 0.0, 0.0], None), nothing);
+        }
+        assert_eq!(shown(&[4.0, 4.0, f32::NAN, 0.0, 0.0, 0.0], None), nothing);
+        let mask = image(&[1.0, 0.9, 1.0, 0.9, 1.0, 0.9]);
+        assert_eq!(shown(&[4.0, 4.0, 1.0, 1.0, 0.0, 0.0], Some(&mask)), [left]);
+    }
+
+    #[test]
+    fn a_coarse_camera_has_about_as_many_pixels_as_asked_for_and_at_least_one() {
+        for (pixels, size) in [(0, (1, 1)), (50, (10, 5)), (200, (20, 10)), (9999, (20, 10))] {
+            let coarse = coarse(&camera(20, 10), pixels);
+            assert_eq!((coarse.width, coarse.height), size, "{pixels}");
+        }
+    }
+
+    #[test]
+    fn what_joins_leaves_the_others_as_they_are_and_takes_the_features_of_the_nearest() {
+        let features = Features { structure: true, ..Features::NONE };
+        let shape = Shape { sh_degree: 1, features };
+        let mut old = Gaussians::zeros(2, shape);
+        let numbers = old.parameters.len();
+        old.parameters = (0..numbers).map(|i| i as f32).collect();
+        let near = DVec3::new(3.0, 4.0, 5.5);
+        let new = [Sight { position: near, color: Vec3::ONE }];
+        let all = joined(&old, &new, &Start::default()).unwrap();
+        assert_eq!((all.count, all.means()[2]), (3, near.as_vec3()));
+        assert_eq!((&all.means()[..2], &all.rest()[..6]), (old.means(), old.rest()));
+        assert_eq!(all.features()[..2], *old.features());
+        assert_eq!(all.features()[2], old.features()[1]);
+        assert!(all.raw_opacities()[2] < 0.0 && all.rest()[6..].iter().all(|c| *c == Vec3::ZERO));
+        assert_eq!(joined(&old, &[], &Start::default()).unwrap(), old);
+        let none = Gaussians::zeros(0, shape);
+        assert_eq!(joined(&none, &new, &Start::default()).unwrap().count, 1);
+    }
+}
