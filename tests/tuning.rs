@@ -171,6 +171,9 @@ fn growth_has_its_axes_exponents_and_memory_and_says_what_does_not_fit() {
         }
         assert!(axis["time_exponent"].is_f64() && axis["memory_exponent"].is_f64(), "{axis}");
     }
+    // Each scene is gone before the next is measured.
+    let bytes = |axis: usize, point: usize| axes[axis]["points"][point]["bytes"].as_u64().unwrap();
+    assert!(2 * bytes(1, 0) < bytes(0, 4) && bytes(2, 0) < bytes(2, 4), "{printed:#}");
     let values = |axis: usize| -> Vec<f64> {
         axes[axis]["points"]
             .as_array()

@@ -82,8 +82,9 @@ impl Gpu {
         self.shared.collect(self.shared.reached());
     }
 
-    /// Counts the peak anew, from what is allocated now.
+    /// Counts the peak anew, from what is in use now.
     pub fn reset_peak_memory(&self) {
+        self.free_unused();
         let MemoryUsage { now, peak, .. } = &self.shared.usage;
         peak.store(now.load(Ordering::Acquire), Ordering::Release);
     }
