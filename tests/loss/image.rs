@@ -104,7 +104,7 @@ fn check_ssim(tone_curve: u32, shape: [u32; 3], size: [u32; 2], interior: Interi
 }
 
 #[test]
-fn the_ssim_matches_its_reference_at_every_size() {
+fn the_kernel_of_ssim_matches_its_reference_at_every_size() {
     for size in SIZES {
         check_ssim(CURVE_AP3, [16, 64, 1], size, Interior::whole(size.into()));
     }
