@@ -31,8 +31,8 @@ use crate::{Error, Result};
 
 #[doc(hidden)]
 pub use frame::Frame;
-use frame::RANKS_PER_PARTITION;
 pub use frame::Status;
+use frame::{RANKS_PER_PARTITION, color_vectors};
 use limits::{longest_run, splats_per_turn};
 pub use settings::RenderSettings;
 
@@ -277,7 +277,7 @@ impl Renderer {
         gradients: Gradients<'_>,
     ) -> Result<()> {
         let view = self.view(&patch.into())?;
-        let color_vectors = self.frame.color_vectors();
+        let color_vectors = color_vectors(self.settings.channels());
         let frame = &mut self.frame;
         pass.dispatch(
             &self.blend_backward,
@@ -333,7 +333,7 @@ impl Renderer {
         view: &View,
         sh_degree: u32,
     ) -> Result<()> {
-        let (frame, color_vectors) = (&self.frame, self.frame.color_vectors());
+        let (frame, color_vectors) = (&self.frame, color_vectors(self.settings.channels()));
         self.batches().iter().try_for_each(|batch| {
             pass.dispatch(
                 &self.project,

@@ -37,12 +37,12 @@ layout(push_constant) uniform Params {
     float ssim_scale;      // w / (3hw)
 };
 
-layout(binding = 0) readonly  buffer Render      { vec4 render[]; };          // (3, H, W), not clamped
-layout(binding = 1) readonly  buffer Low         { vec4 low[]; };             // (3, H, W), sRGB-encoded
-layout(binding = 2) readonly  buffer Tone        { ToneParameters tone[]; };  // (1,)
-layout(binding = 3) writeonly buffer DRender     { vec4 d_render[]; };        // (3, H, W)
-layout(binding = 4) writeonly buffer Differences { float differences[]; };    // one per workgroup: sum of |a - b|
-layout(binding = 5) writeonly buffer Indices     { float indices[]; };        // one per workgroup: sum of S
+layout(binding = 0) readonly  buffer Render       { vec4 render[]; };          // (3, H, W), not clamped
+layout(binding = 1) readonly  buffer Low          { vec4 low[]; };             // (3, H, W), sRGB-encoded
+layout(binding = 2) readonly  buffer Tone         { ToneParameters tone[]; };  // (1,)
+layout(binding = 3) writeonly buffer DRender      { vec4 d_render[]; };        // (3, H, W)
+layout(binding = 4) writeonly buffer L1Partials   { float l1_partials[]; };    // one per workgroup: sum of |a - b|
+layout(binding = 5) writeonly buffer SsimPartials { float ssim_partials[]; };  // one per workgroup: sum of S
 
 const float C1 = 0.0001;  // (0.01 L)^2, L = 1
 const float C2 = 0.0009;  // (0.03 L)^2
@@ -233,7 +233,7 @@ void main() {
     l1_sum = subgroupAdd(l1_sum);
     ssim_sum = subgroupAdd(ssim_sum);
     if (subgroupElect()) {
-        differences[WORKGROUP_INDEX] = l1_sum;
-        indices[WORKGROUP_INDEX] = ssim_sum;
+        l1_partials[WORKGROUP_INDEX] = l1_sum;
+        ssim_partials[WORKGROUP_INDEX] = ssim_sum;
     }
 }

@@ -326,7 +326,7 @@ impl Ssim {
         threads: Threads<'_>,
         LossInputs { size, interior, render, low, tone }: LossInputs<'_>,
         d_render: &mut Buffer<f32>,
-        [differences, indices]: [&mut Buffer<f32>; 2],
+        [l1_partials, ssim_partials]: [&mut Buffer<f32>; 2],
     ) -> Result<()> {
         let mean_scale = 1.0 / f64::from(interior.value_count());
         pass.dispatch(
@@ -339,7 +339,7 @@ impl Ssim {
                 l1_scale: ((1.0 - self.weight) * mean_scale) as f32,
                 ssim_scale: (self.weight * mean_scale) as f32,
             },
-            ssim::Buffers { render, low, tone, d_render, differences, indices },
+            ssim::Buffers { render, low, tone, d_render, l1_partials, ssim_partials },
             threads,
         )
     }

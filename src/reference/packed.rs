@@ -1,6 +1,7 @@
 //! Factors of 16-bit matrices as `include/packed.glsl` has them, on the host.
 
 use glam::UVec2;
+use half::f16;
 
 use crate::kernels::packed::{PACKED_CHANNELS, PACKED_COLUMNS, PACKED_ROWS};
 
@@ -25,36 +26,9 @@ pub(super) fn scale(largest: u32) -> f64 {
     f64::from(14 - exponent(largest)).exp2()
 }
 
-/// The half that is nearest to a number, subnormal, infinite and NaN too.
+/// The bits of the half that is nearest to a number in single precision, subnormal, infinite and NaN too.
 pub(super) fn nearest(value: f64) -> u32 {
-    let sign = u32::from(value.is_sign_negative()) << 15;
-    let magnitude = value.abs();
-    let bits = if magnitude.is_nan() {
-        0x7e00
-    } else if magnitude >= 65_520.0 {
-        0x7c00
-    } else if magnitude < f64::exp2(-14.0) {
-        // The smallest that is not subnormal follows the subnormal ones.
-        (magnitude * f64::exp2(24.0)).round_ties_even() as u32
-    } else {
-        let exponent = magnitude.log2().floor();
-        let steps = (magnitude * f64::exp2(10.0 - exponent)).round_ties_even() as u32;
-        // The step above the last is the first of the next exponent.
-        steps + ((exponent as i32 + 14) as u32) * 1024
-    };
-    sign | bits
-}
-
-/// What a half stands for.
-pub(super) fn value(half: u32) -> f64 {
-    let (exponent, fraction) = ((half >> 10 & 31) as i32, f64::from(half & 0x3ff));
-    let magnitude = match exponent {
-        0 => fraction * f64::exp2(-24.0),
-        31 if fraction == 0.0 => f64::INFINITY,
-        31 => f64::NAN,
-        _ => (1024.0 + fraction) * f64::from(exponent - 25).exp2(),
-    };
-    if half & 0x8000 == 0 { magnitude } else { -magnitude }
+    f16::from_f32(value as f32).to_bits().into()
 }
 
 /// The halves of eight numbers.
@@ -64,7 +38,7 @@ pub(super) fn eight(number: impl Fn(u32) -> f64) -> Eight {
 
 fn at(packed: &[Eight], index: u32) -> f64 {
     let half = packed[(index / 8) as usize][(index % 8 / 2) as usize] >> (16 * (index % 2));
-    value(half & 0xffff)
+    f16::from_bits(half as u16).to_f64()
 }
 
 /// What is in a packed map, as planes (C, H, W): halves, which single precision holds.
@@ -98,10 +72,13 @@ pub(super) fn largest(values: &[f32]) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use super::{nearest, value};
+    use half::f16;
+
+    use super::nearest;
 
     #[test]
     fn every_half_is_nearest_to_what_it_stands_for_and_so_is_what_is_close() {
+        let value = |half: u32| f16::from_bits(half as u16).to_f64();
         for half in (0..0x1_0000).filter(|half| !value(*half).is_nan()) {
             let own = value(half);
             assert_eq!(nearest(own), half, "{own}");

@@ -163,8 +163,8 @@ impl Reference for Kernel {
         slices.d_render.iter_mut().zip(gradients).for_each(|(to, d)| *to = d);
         let sum = |of: fn(&Outcome) -> f64| outcomes.iter().map(of).sum::<f64>() as f32;
         for (partials, sum) in [
-            (slices.differences, sum(|of| of.difference.value)),
-            (slices.indices, sum(|of| of.ssim.value)),
+            (slices.l1_partials, sum(|of| of.difference.value)),
+            (slices.ssim_partials, sum(|of| of.ssim.value)),
         ] {
             partials.fill(0.0);
             partials[0] = sum;
@@ -179,8 +179,8 @@ impl Reference for Kernel {
         };
         Tolerances {
             d_render: outcomes.iter().map(|of| of.gradient).collect(),
-            differences: sum(|of| of.difference),
-            indices: sum(|of| of.ssim),
+            l1_partials: sum(|of| of.difference),
+            ssim_partials: sum(|of| of.ssim),
         }
     }
 }

@@ -124,7 +124,7 @@ impl Frame {
         if self.splats.len() < count {
             let count = capacity.max(count);
             self.splats = gpu.uninit("splats", count)?;
-            self.colors = gpu.uninit("colors", self.color_vectors() * count)?;
+            self.colors = gpu.uninit("colors", color_vectors(self.channels) * count)?;
             self.depth_keys = gpu.uninit("depth_keys", count)?;
             self.ids = gpu.uninit("ids", count)?;
             self.tile_counts = gpu.uninit("tile_counts", count)?;
@@ -167,7 +167,7 @@ impl Frame {
     /// What each Gaussian takes, in bytes.
     #[cfg(feature = "io")]
     pub(super) fn bytes_per_gaussian(&self) -> usize {
-        let color = self.color_vectors() * size_of::<Vec3>();
+        let color = color_vectors(self.channels) * size_of::<Vec3>();
         let numbers = 4 * size_of::<f32>() + size_of::<UVec2>();
         size_of::<ProjectedSplat>() + color + numbers
     }
@@ -176,11 +176,6 @@ impl Frame {
     #[cfg(feature = "io")]
     pub(super) fn bytes_per_intersection(&self) -> usize {
         3 * size_of::<u32>() + self.record_vectors() * size_of::<Vec3>()
-    }
-
-    /// The vectors of a splat's values.
-    pub(super) fn color_vectors(&self) -> usize {
-        self.channels.div_ceil(3)
     }
 
     /// The vectors of a gradient record.
@@ -197,6 +192,11 @@ impl Frame {
     pub(super) fn intersection_capacity(&self) -> u32 {
         self.tiles.len() as u32
     }
+}
+
+/// The vectors of three that hold the values of a splat.
+pub(super) fn color_vectors(channels: usize) -> usize {
+    channels.div_ceil(3)
 }
 
 #[cfg(test)]

@@ -3,6 +3,7 @@
 use glam::{UVec2, Vec3};
 
 use super::RenderSettings;
+use super::frame::color_vectors;
 use crate::gpu::{Gpu, Properties};
 use crate::kernels::ProjectedSplat;
 use crate::{Error, Result};
@@ -23,8 +24,8 @@ impl RenderSettings {
     /// The most Gaussians that this device can render and train: some passes read the splat and the colour of any of them,
     /// which one binding has to hold. What else there is of them is bound in [`Batches`](crate::batches::Batches).
     pub fn most_gaussians(&self, gpu: &Gpu) -> usize {
-        let bytes =
-            size_of::<ProjectedSplat>().max(self.channels().div_ceil(3) * size_of::<Vec3>()) as u64;
+        let color = color_vectors(self.channels()) * size_of::<Vec3>();
+        let bytes = size_of::<ProjectedSplat>().max(color) as u64;
         (gpu.properties().max_storage_buffer_range / bytes).min(u32::MAX.into()) as usize
     }
 

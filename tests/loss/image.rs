@@ -83,7 +83,7 @@ fn check_ssim(tone_curve: u32, shape: [u32; 3], size: [u32; 2], interior: Interi
     let outputs = lanes * columns - 2 * halo;
     let count = 3 * width.div_ceil(outputs) * height.div_ceil(rows);
     let d_render = vec![f32::NAN; render.len()];
-    let [differences, indices] = [(); 2].map(|()| vec![f32::NAN; count as usize]);
+    let [l1_partials, ssim_partials] = [(); 2].map(|()| vec![f32::NAN; count as usize]);
     let tone = vec![TONE];
     run_kernel!(
         ssim,
@@ -98,7 +98,7 @@ fn check_ssim(tone_curve: u32, shape: [u32; 3], size: [u32; 2], interior: Interi
         },
         Threads::Workgroups([count, 1, 1]),
         [render, low, tone],
-        [d_render, differences, indices]
+        [d_render, l1_partials, ssim_partials]
     )
     .0
 }
