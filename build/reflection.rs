@@ -163,7 +163,7 @@ fn spec_constant_defaults(spirv: &[u32]) -> BTreeMap<u32, u32> {
     ids.into_iter().filter_map(|(target, id)| Some((id, *values.get(&target)?))).collect()
 }
 
-/// Whether an element is made of 32-bit floats; one of integers otherwise. A mixture could not be compared as numbers.
+/// Whether an element is made of 32-bit floats alone: such buffers are compared as numbers, all others as bits.
 fn is_float(ty: &Type) -> bool {
     match ty {
         Type::Scalar(ScalarType::Float { bits: 32 }) => true,
@@ -171,11 +171,7 @@ fn is_float(ty: &Type) -> bool {
         Type::Vector(vector) => is_float(&Type::Scalar(vector.scalar_ty.clone())),
         Type::Matrix(_) => true,
         Type::Array(array) => is_float(&array.element_ty),
-        Type::Struct(ty) => {
-            let floats = ty.members.iter().filter(|member| is_float(&member.ty)).count();
-            assert!([0, ty.members.len()].contains(&floats), "{:?} mixes numbers", ty.name);
-            floats > 0
-        }
+        Type::Struct(ty) => ty.members.iter().all(|member| is_float(&member.ty)),
         other => panic!("{other:?} is no element of a buffer"),
     }
 }

@@ -2,6 +2,7 @@
 //!
 //! Axes are those of `OpenCV` (x right, y down, z forward); pixel units, the image's corner at (0, 0), pixel centres at +0.5.
 
+mod covering;
 pub mod frame;
 mod patch;
 mod path;

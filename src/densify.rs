@@ -15,16 +15,16 @@ pub use gaussians::DeviceGaussians;
 use std::iter;
 use std::str::FromStr;
 
-use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 use crate::batches::{Batch, Batches};
+use crate::camera::{Camera, Patch};
 use crate::gpu::{Buffer, Gpu, Pipeline, Threads};
 use crate::halves::Bits;
 use crate::kernels::fate::{
     TALLY_CANDIDATES, TALLY_CLONED, TALLY_PRUNED, TALLY_SPLIT, TALLY_WORDS,
 };
-use crate::kernels::{densify_decide, densify_moments, densify_scatter, densify_score};
+use crate::kernels::{self, densify_decide, densify_moments, densify_scatter, densify_score};
 use crate::sort::{Count, RadixSort, Scan};
 use crate::{Error, Result};
 
@@ -68,6 +68,8 @@ pub struct DensifySettings {
     pub min_opacity: f64,
     /// There never come to be more; growth goes to those with the largest gradients.
     pub max_gaussians: usize,
+    /// The near plane of the cameras, world units.
+    pub near: f64,
     /// Where the drawn positions come from.
     pub seed: u64,
 }
@@ -94,6 +96,13 @@ pub struct Round {
     pub most: usize,
 }
 
+/// How often a round is tried at the most; the last trial splits nothing.
+const TRIALS: usize = 5;
+
+/// What one split may change of a camera's view, as `view_change` in densify_score.comp estimates it. It keeps a split from
+/// changing a view of 30 dB by .1 dB where the contrast is .3 (docs/benchmarks.md).
+pub const LARGEST_CHANGE: f32 = 2e-4;
+
 /// What one round did.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct DensifyReport {
@@ -114,8 +123,8 @@ pub struct DensifyReport {
 pub struct Densifier {
     gpu: Gpu,
     settings: DensifySettings,
-    /// Where they stand, three numbers each.
-    cameras: Buffer<f32>,
+    /// What conserving splits may not change. None of the paper's control.
+    cameras: Buffer<kernels::Camera>,
     score: Pipeline<densify_score::Kernel>,
     decide: Pipeline<densify_decide::Kernel>,
     scatter: Pipeline<densify_scatter::Kernel>,
@@ -154,12 +163,12 @@ impl Scratch {
 }
 
 impl Densifier {
-    /// The kernels on this device. What is wide for how near one of `cameras` is, world units, is not split; the paper's
-    /// control splits it all the same.
+    /// The kernels on this device. A Gaussian is not split where that would change what one of `cameras` sees, in world
+    /// space; the paper's control splits it all the same.
     ///
     /// # Errors
     /// A setting makes no sense, or the device refuses a pipeline.
-    pub fn new(gpu: &Gpu, settings: DensifySettings, cameras: &[DVec3]) -> Result<Self> {
+    pub fn new(gpu: &Gpu, settings: DensifySettings, cameras: &[Camera]) -> Result<Self> {
         let DensifySettings { gradient_threshold, split_scale, min_opacity, .. } = settings;
         for (name, value, upper) in [
             ("gradient threshold", gradient_threshold, f64::INFINITY),
@@ -175,8 +184,8 @@ impl Densifier {
         }
         let conserving = settings.control == DensityControl::Conserving;
         let cameras = if conserving { cameras } else { &[] };
-        let cameras: Vec<f32> =
-            cameras.iter().flat_map(|camera| camera.as_vec3().to_array()).collect();
+        let cameras: Vec<kernels::Camera> =
+            cameras.iter().map(|camera| (&Patch::from(camera)).into()).collect();
         Ok(Self {
             gpu: gpu.clone(),
             settings,
@@ -191,24 +200,45 @@ impl Densifier {
         })
     }
 
-    /// One round of density control: `gaussians` become what comes of them. The statistics are to be zeroed for the new
-    /// count; buffers that were too short for it are longer.
+    /// One round of density control: prunes and splits `gaussians`, or clones them under the paper's control. The statistics
+    /// are to be zeroed for the new count; buffers that were too short for it are longer.
+    ///
+    /// `keeps` looks at the new parameters, `(columns x count)`, before anything is final, and says which share of the splits
+    /// may stay: 1 or more for all of them. Else the round is tried again with as many fewer, those with the largest
+    /// gradients first, and at last with none.
     ///
     /// # Errors
-    /// A buffer is shorter than the Gaussians need, or the device is out of memory: the Gaussians are as they were then. Or
-    /// the device is lost.
+    /// A buffer is shorter than the Gaussians need, `keeps` fails, or the device is out of memory: the Gaussians are as
+    /// they were then. Or the device is lost.
     pub fn densify(
         &mut self,
         gaussians: &mut DeviceGaussians,
         mut inputs: DensifyInputs<'_>,
         round: Round,
+        mut keeps: impl FnMut(&Buffer<f32>, usize) -> Result<f64>,
     ) -> Result<DensifyReport> {
         check(gaussians, &inputs)?;
         let limit = self.settings.max_gaussians.min(round.most);
-        let tally = self.decide(gaussians, &inputs, limit, round)?;
-        let report = report(gaussians.count, &tally);
-        self.scatter(gaussians, &mut inputs, &report, limit, round.step)?;
-        Ok(report)
+        let mut most_added = u32::MAX;
+        for trial in 1..=TRIALS {
+            let tally = self.decide(gaussians, &inputs, limit, most_added, round)?;
+            let report = report(gaussians.count, &tally);
+            let added = report.split + report.cloned;
+            if added + report.pruned == 0 {
+                return Ok(report);
+            }
+            let mut room = self.room(gaussians, &inputs, report.count, limit)?;
+            self.scatter(gaussians, &mut inputs, &mut room, &report, round.step)?;
+            let new = room.words.as_ref().unwrap_or(inputs.gradients);
+            let share = if added == 0 { 1.0 } else { keeps(new, report.count)? };
+            if share >= 1.0 {
+                self.commit(gaussians, inputs, room, &report)?;
+                return Ok(report);
+            }
+            tracing::debug!("step {}: of {added} splits, {share:.3} may stay", round.step);
+            most_added = if trial + 1 < TRIALS { (share * added as f64) as u32 } else { 0 };
+        }
+        Err(Error::Usage("density control: the last trial of a round splits nothing".to_owned()))
     }
 
     /// What a round takes beside the Gaussians, for each, in bytes.
@@ -223,6 +253,7 @@ impl Densifier {
         gaussians: &DeviceGaussians,
         DensifyInputs { grad_norm_sums, visit_counts, .. }: &DensifyInputs<'_>,
         limit: usize,
+        most_added: u32,
         round: Round,
     ) -> Result<Vec<u32>> {
         let DeviceGaussians { count, feature_count, ref parameters, .. } = *gaussians;
@@ -230,8 +261,9 @@ impl Densifier {
         if self.scratch.keys.len() < count as usize {
             self.scratch = Scratch::new(&self.gpu, grad_norm_sums.len())?;
         }
-        let DensifySettings { gradient_threshold, split_scale, min_opacity, .. } = self.settings;
-        let camera_count = self.cameras.len() as u32 / 3;
+        let DensifySettings { gradient_threshold, split_scale, min_opacity, near, .. } =
+            self.settings;
+        let camera_count = self.cameras.len() as u32;
         let score = |batch: Batch| densify_score::Params {
             gaussian_count: batch.gaussian_count(),
             column_count: columns as u32,
@@ -240,6 +272,8 @@ impl Densifier {
             min_raw_opacity: (min_opacity / (1.0 - min_opacity)).ln() as f32,
             first_gaussian: batch.first_gaussian(),
             camera_count,
+            near: near as f32,
+            largest_change: LARGEST_CHANGE,
         };
         let decide = |batch: Batch| densify_decide::Params {
             gaussian_count: count,
@@ -248,6 +282,7 @@ impl Densifier {
             max_gaussians: limit.min(u32::MAX as usize) as u32,
             rounds_left: round.rounds_left.clamp(1, u64::from(u32::MAX)) as u32,
             split_log_scale: split_scale.ln() as f32,
+            most_added,
         };
         let batches = gaussians.batches(&self.gpu);
         let Self { scratch, sort, scan, cameras, .. } = self;
@@ -290,71 +325,78 @@ impl Densifier {
         download.map_or_else(|| Ok(vec![]), |tally| tally.wait())
     }
 
-    /// Writes the successors into the spare buffer, one plane set after the other: each leaves its own as the next one's
-    /// spare.
+    /// Writes the new parameters beside the old ones: to the words of `room`, or the gradients.
     fn scatter(
         &self,
-        gaussians: &mut DeviceGaussians,
+        gaussians: &DeviceGaussians,
         inputs: &mut DensifyInputs<'_>,
+        room: &mut Room,
         report: &DensifyReport,
-        limit: usize,
         step: u64,
     ) -> Result<()> {
-        if report.split + report.cloned + report.pruned == 0 {
-            return Ok(());
-        }
-        let DeviceGaussians { column_count, feature_count, .. } = *gaussians;
-        let parameter_columns = gaussians.parameter_columns();
+        let DeviceGaussians { feature_count, ref parameters, .. } = *gaussians;
+        let columns = gaussians.parameter_columns();
         let seed = self.settings.seed;
-        let scatter = |from: Batch, to: Batch| densify_scatter::Params {
+        let params = |from: Batch, to: Batch| densify_scatter::Params {
             gaussian_count: from.gaussian_count(),
             new_gaussian_count: to.gaussian_count(),
-            column_count: parameter_columns as u32,
+            column_count: columns as u32,
             feature_count,
             seed: (seed ^ (seed >> 32)) as u32,
             step: step as u32,
             first_gaussian: from.first_gaussian(),
             first_new_gaussian: to.first_gaussian(),
         };
-        let carry = |from: Batch, to: Batch| densify_moments::Params {
+        let target = match &mut room.words {
+            Some(words) => words,
+            None => {
+                take(&mut room.planes, inputs.gradients);
+                &mut *inputs.gradients
+            }
+        };
+        let Scratch { fates, offsets, .. } = &self.scratch;
+        let pairs = self.pairs(gaussians, report);
+        self.gpu.run("densify_scatter", |pass| {
+            for &(from, to) in &pairs {
+                let buffers = densify_scatter::Buffers {
+                    parameters: &from.of_rows(parameters, columns)?,
+                    fates: &from.of_rows(fates, 1)?,
+                    offsets: &from.of_rows(offsets, 1)?,
+                    new_parameters: &mut to.of_rows(target, columns)?,
+                };
+                let threads = Threads::Exactly([from.gaussian_count(), 1, 1]);
+                pass.dispatch(&self.scatter, &params(from, to), buffers, threads)?;
+            }
+            Ok(())
+        })
+    }
+
+    /// Makes what was scattered the parameters, and carries the moments over: each plane set leaves its own buffer as the
+    /// next one's spare.
+    fn commit(
+        &self,
+        gaussians: &mut DeviceGaussians,
+        inputs: DensifyInputs<'_>,
+        Room { mut planes, mut words, statistics }: Room,
+        report: &DensifyReport,
+    ) -> Result<()> {
+        let DeviceGaussians { column_count, feature_count, .. } = *gaussians;
+        let params = |from: Batch, to: Batch| densify_moments::Params {
             gaussian_count: from.gaussian_count(),
             new_gaussian_count: to.gaussian_count(),
             column_count,
             feature_count,
             first_new_gaussian: to.first_gaussian(),
         };
-        let Room { mut planes, mut words, statistics } =
-            self.room(gaussians, inputs, report.count, limit)?;
         let DensifyInputs { grad_norm_sums, visit_counts, gradients: spare } = inputs;
         let Scratch { fates, offsets, .. } = &self.scratch;
-        let old = gaussians.batches(&self.gpu);
-        let new = Batches::new(
-            &self.gpu,
-            report.count,
-            [column_count, feature_count].map(|n| n as usize),
-        );
-        // Every batch hands what comes of it to each of the new ones that it belongs to.
-        let pairs = || old.iter().flat_map(|from| new.iter().map(move |to| (from, to)));
+        let pairs = self.pairs(gaussians, report);
         let DeviceGaussians { parameters, moments, .. } = &mut *gaussians;
-        self.gpu.run("densify_scatter", |pass| {
-            let target = words.as_mut().unwrap_or_else(|| {
-                take(&mut planes, spare);
-                spare
-            });
-            for (from, to) in pairs() {
-                let buffers = densify_scatter::Buffers {
-                    parameters: &from.of_rows(parameters, parameter_columns)?,
-                    fates: &from.of_rows(fates, 1)?,
-                    offsets: &from.of_rows(offsets, 1)?,
-                    new_parameters: &mut to.of_rows(target, parameter_columns)?,
-                };
-                let threads = Threads::Exactly([from.gaussian_count(), 1, 1]);
-                pass.dispatch(&self.scatter, &scatter(from, to), buffers, threads)?;
-            }
-            std::mem::swap(parameters, target);
+        std::mem::swap(parameters, words.as_mut().unwrap_or(spare));
+        self.gpu.run("densify_moments", |pass| {
             for (_, moments) in moments.planes_mut() {
                 take(&mut planes, spare);
-                for (from, to) in pairs() {
+                for &(from, to) in &pairs {
                     let buffers = densify_moments::Buffers {
                         moments: &from.of_planes(moments)?.words(),
                         fates: &from.of_rows(fates, 1)?,
@@ -362,7 +404,7 @@ impl Densifier {
                         new_moments: &mut to.of_planes(spare)?.words(),
                     };
                     let threads = Threads::Exactly([from.gaussian_count(), 1, 1]);
-                    pass.dispatch(&self.moments, &carry(from, to), buffers, threads)?;
+                    pass.dispatch(&self.moments, &params(from, to), buffers, threads)?;
                 }
                 std::mem::swap(moments, spare);
             }
@@ -370,10 +412,19 @@ impl Densifier {
             Ok(())
         })?;
         if let Some((sums, counts)) = statistics {
-            (**grad_norm_sums, **visit_counts) = (sums, counts);
+            (*grad_norm_sums, *visit_counts) = (sums, counts);
         }
         gaussians.count = report.count as u32;
         Ok(())
+    }
+
+    /// Every batch with each of the new ones that its Gaussians go to.
+    fn pairs(&self, gaussians: &DeviceGaussians, report: &DensifyReport) -> Vec<(Batch, Batch)> {
+        let DeviceGaussians { column_count, feature_count, .. } = *gaussians;
+        let dimensions = [column_count, feature_count].map(|n| n as usize);
+        let (old, new) =
+            (gaussians.batches(&self.gpu), Batches::new(&self.gpu, report.count, dimensions));
+        old.iter().flat_map(|from| new.iter().map(move |to| (from, to))).collect()
     }
 
     /// What takes the place of buffers that are too short for `count` Gaussians, all of it before one of them goes.

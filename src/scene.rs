@@ -35,6 +35,13 @@ pub struct Shape {
 }
 
 /// Colour alone.
+impl Shape {
+    /// Whether Gaussians of `other` are Gaussians of this shape without its highest SH degrees.
+    pub(crate) fn holds(self, other: Self) -> bool {
+        self.features == other.features && other.sh_degree <= self.sh_degree
+    }
+}
+
 impl From<u32> for Shape {
     fn from(sh_degree: u32) -> Self {
         Self { sh_degree, features: Features::NONE }

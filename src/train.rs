@@ -1,13 +1,14 @@
 //! Training: one view a step, its pseudo-GT the target, the Gaussians what is learned.
 
+mod best;
 mod cache;
 mod checkpoint;
 mod config;
-mod ends;
+mod decisions;
+mod early_stopping;
 mod exposures;
 mod fill;
 mod growth;
-mod held_out;
 mod masks;
 mod memory;
 mod model;
@@ -20,6 +21,7 @@ mod precision;
 mod preset;
 mod rendered;
 mod submission;
+mod target_views;
 mod terms;
 mod views;
 
@@ -29,26 +31,26 @@ use std::thread::{self, ScopedJoinHandle};
 use glam::DVec3;
 
 use crate::camera::{Camera, Frame};
-use crate::dataset::{Dataset, Fingerprint};
-use crate::densify::Densifier;
+use crate::dataset::{Dataset, Fingerprint, Split};
+use crate::densify::{Densifier, DensityControl};
 use crate::exposure::Exposures;
 use crate::gpu::{Buffer, CheckReport, Gpu, PassTime, Recorder};
 use crate::loss::{LogSlot, LossLog, Losses, StepLosses, Term, TermInputs};
 use crate::nn::Form;
-use crate::optimizer::{Adam, FiniteCheck, Learnable};
+use crate::optimizer::{Adam, FiniteCheck, Learnable, LearningRates};
 use crate::pseudo_gt::PseudoGt;
 use crate::random::Stream;
 use crate::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer};
 use crate::scene::{COLOR_CHANNELS, Gaussians, Shape};
 use crate::{Error, Result};
 
+use best::Snapshot;
 pub use cache::CacheSize;
 pub use checkpoint::check_checkpoint;
 pub use config::{Background, CheckConfig, DensityConfig, TrainConfig};
-use ends::Ends;
+use decisions::Decisions;
+pub use early_stopping::{EndReason, Ended, NotFinite, StopConfig};
 pub use exposures::{ExposureConfig, Learning};
-use held_out::HeldOut;
-pub use held_out::{NotFinite, StopConfig, TestTargets};
 use masks::Masks;
 pub use memory::MemoryEstimate;
 use model::Model;
@@ -58,6 +60,8 @@ pub use precision::{PhotographBits, PrecisionConfig};
 pub use preset::Preset;
 pub use rendered::Rendered;
 use submission::{MOST_STEPS, Pace};
+use target_views::TargetViews;
+pub use target_views::TestTargets;
 use terms::{NetworkTerms, Photographs};
 pub use views::TargetExposure;
 use views::{TrainView, Views};
@@ -74,6 +78,11 @@ mod streams {
     pub(super) const BOXES: u64 = 8;
     pub(super) const FILL: u64 = 9;
 }
+
+/// Training views that tell what a round of density control costs,
+const PROBES: usize = 8;
+/// and the pixels of one: all take 100 MB of the host at the most.
+const MOST_PROBE_PIXELS: usize = 1 << 20;
 
 /// What one step did.
 #[derive(Clone, Debug)]
@@ -110,7 +119,7 @@ impl StepReport {
 /// let gpu = Gpu::new(&DeviceChoice::Best)?;
 /// let dataset = Dataset::load("photos", &config.load_options())?;
 /// let mut trainer = Trainer::new(&gpu, config.clone(), &dataset)?;
-/// while trainer.steps_done() < config.steps {
+/// while !trainer.has_ended() {
 ///     for report in trainer.advance(config.steps)? {
 ///         println!("step {}: loss {:.4}", report.step, report.loss);
 ///     }
@@ -129,8 +138,12 @@ pub struct Trainer {
     /// In units of the frame.
     extent: f64,
     target_exposure: Option<TargetExposure>,
-    held_out: HeldOut,
-    ends: Ends,
+    held_out: TargetViews,
+    /// Training views that tell what a round of density control costs; none where nothing is done about it.
+    probes: TargetViews,
+    decisions: Decisions,
+    /// The model with the best score of the held-out views; empty where there is none.
+    best: Snapshot,
     /// Steps done.
     step: u64,
     views: Views,
@@ -237,7 +250,18 @@ impl Trainer {
         if config.model.denoiser && config.model.network.form == Form::Identity {
             views.keep_targets(gpu, &pseudo_gt)?;
         }
-        let held_out = HeldOut::new(&mut pseudo_gt, dataset, &frame, &scene)?;
+        let held_out = dataset.views.iter().filter(|view| view.split == Split::HeldOut);
+        let held_out = TargetViews::new(&mut pseudo_gt, held_out, &frame, &scene)?;
+        config.say_what_cannot_end_early(held_out.is_empty(), views.photographs().count());
+        // No larger than what steps render.
+        let largest = views.sizes().iter().map(|size| size.element_product() as usize).max();
+        let pixels = largest.unwrap_or_default().min(MOST_PROBE_PIXELS);
+        let probes = match config.density.control {
+            DensityControl::Conserving => {
+                TargetViews::probes(&mut pseudo_gt, dataset, &frame, &scene, [PROBES, pixels])?
+            }
+            DensityControl::Paper => TargetViews::default(),
+        };
         if let Some(TargetExposure { scene, .. }) = &target_exposure {
             tracing::info!("{}", scene.reason());
         }
@@ -245,10 +269,14 @@ impl Trainer {
         config.model.say_what_parts_see(&sizes);
         let starts = views.exposures(&mut pseudo_gt, dataset, &scene, &config)?;
         let gaussians = match gaussians {
-            Some(gaussians) if gaussians.shape == settings.shape => match frame {
-                Frame::WORLD => gaussians.clone(),
-                _ => gaussians.from_world(&frame, DVec3::ZERO),
-            },
+            // A run that ended before its highest SH degree was in use has a model without it.
+            Some(gaussians) if settings.shape.holds(gaussians.shape) => {
+                let gaussians = gaussians.with_sh_degree(settings.shape.sh_degree);
+                match frame {
+                    Frame::WORLD => gaussians,
+                    _ => gaussians.from_world(&frame, DVec3::ZERO),
+                }
+            }
             Some(Gaussians { shape: own, .. }) => {
                 let problem = format!("Gaussians of {own:?} make no model of {:?}", settings.shape);
                 return Err(Error::Usage(problem));
@@ -277,7 +305,9 @@ impl Trainer {
             extent: dataset.extent() * frame.scale,
             target_exposure,
             held_out,
-            ends: Ends::default(),
+            probes,
+            decisions: Decisions::default(),
+            best: vec![],
             step: 0,
             views,
             model: Model::upload(gpu, &gaussians, first_sh_degree(&config), &config.precision)?,
@@ -322,7 +352,8 @@ impl Trainer {
         self.model.count()
     }
 
-    /// The Gaussians as they are now, on the host, in the dataset's world as far as f32 holds it.
+    /// The Gaussians as they are now, on the host, in the dataset's world as far as f32 holds it, with the SH degree that the
+    /// steps have reached.
     ///
     /// # Errors
     /// The device was lost.
@@ -364,14 +395,20 @@ impl Trainer {
     /// Steps that the configuration wants checked are, each on its own.
     ///
     /// # Errors
-    /// [`Error::NotFinite`] where a loss term or a gradient is NaN and [`StopConfig::not_finite`] leaves no view out,
+    /// [`Error::Usage`] where the run has ended early, [`Error::NotFinite`] where a loss term or a gradient is NaN and [`StopConfig::not_finite`] leaves no view out,
     /// [`Error::Crowded`] where the device cannot follow as many splats as lie on one tile, [`Error::Disagrees`] where a
     /// checked step is to stop at a difference and has one, or the device is out of memory or lost.
     pub fn advance(&mut self, until: u64) -> Result<Vec<StepReport>> {
+        if until > self.step && self.step < self.config.steps && self.has_ended() {
+            return Err(Error::Usage(format!(
+                "the run has ended at step {}, before step {until}, as the held-out views have converged; `Trainer::has_ended` tells",
+                self.step
+            )));
+        }
         match (self.step + 1).checked_next_multiple_of(self.config.check.every) {
             Some(checked) if checked > until => self.submit_steps(until),
             Some(checked) if checked > self.step + 1 => self.submit_steps(checked - 1),
-            Some(_) if self.step < until.min(self.config.steps) => {
+            Some(_) if self.step < until.min(self.last_step()) => {
                 let (reports, checks) = self.check_step();
                 let stops = self.config.check.stops;
                 match checks.agree() {
@@ -412,6 +449,7 @@ impl Trainer {
     fn record_step(&mut self, pass: &mut Recorder<'_>, step: u64, slot: u32) -> Result<()> {
         let schedule = &self.config.schedule;
         let view = self.views.of_step(self.config.seed, step, schedule.resolution_level(step));
+        let settling_rate = self.settling_rate(step);
         let options = RenderOptions {
             sh_degree: self.sh_degree(step),
             background: background(&self.config, step),
@@ -484,11 +522,11 @@ impl Trainer {
                 visit_counts: &mut model.visit_counts,
             },
         )?;
-        let rates = schedule.learning_rates(step, self.extent);
+        let rates = schedule.learning_rates(step, self.extent).scaled(settling_rate);
         let (degree, status) = (options.sh_degree, self.renderer.status());
         model.update((&self.gpu, pass), &self.adam, step, &rates, degree, status)?;
         learnables(&mut self.networks, &mut self.exposures).try_for_each(|learnable| {
-            self.adam.update(pass, step, learnable, self.renderer.status())
+            self.adam.update(pass, step, settling_rate, learnable, self.renderer.status())
         })?;
         match &mut self.exposures {
             Some(exposures) => exposures.center(pass, self.renderer.status()),
@@ -501,13 +539,19 @@ impl Trainer {
         self.networks.as_mut().map(|terms| &mut terms.networks)
     }
 
+    /// The learning rates of a step, before the settling phase or in it.
+    pub fn learning_rates(&self, step: u64) -> LearningRates {
+        let rates = self.config.schedule.learning_rates(step, self.extent);
+        rates.scaled(self.settling_rate(step))
+    }
+
     /// Renders what `camera` sees, with every SH degree trained so far, before a black background.
     ///
     /// # Errors
     /// The device is out of memory or lost.
     pub fn render(&mut self, camera: &Camera) -> Result<Rendered> {
         let camera = self.frame.camera(camera);
-        self.render_of_degree(&camera, self.sh_degree(self.step))
+        self.render_of_degree(&camera, self.sh_degree_in_use())
     }
 
     /// As [`Trainer::render`], of a camera in the frame.

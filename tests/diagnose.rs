@@ -334,22 +334,35 @@ fn a_run_without_a_length_ends_when_held_out_views_have_converged() {
     let (root, out) = (set.path().display(), set.path().join("run"));
     // Whatever is learned is too little.
     let options = "--preset draft --set stop.views=1 --set stop.every=5 --set stop.gain=90 \
-                   --set schedule.resolution_steps=[0,0] --set checkpoint_every=10";
+                   --set schedule.resolution_steps=[0,0] --set schedule.settle_steps=5 --set checkpoint_every=10";
     let train = format!("train {root} --out {} {options}", out.display());
     succeed(&train);
     let scores = fs::read_to_string(out.join("held_out.csv")).unwrap();
     let steps = |text: &str| -> Vec<String> {
         text.lines().skip(1).map(|line| line.split(',').next().unwrap().to_owned()).collect()
     };
-    assert_eq!(steps(&scores), ["5", "10", "15"]);
+    // It has converged at step 15, and settles.
+    assert_eq!(steps(&scores), ["5", "10", "15", "20"]);
     let log = fs::read_to_string(out.join("train.csv")).unwrap();
-    assert_eq!(log.lines().count(), 16);
+    assert_eq!(log.lines().count(), 21);
     // The one that is held out is never trained on.
     let views: BTreeSet<&str> =
         log.lines().skip(1).map(|line| line.split(',').nth(1).unwrap()).collect();
     assert_eq!(views.len(), 9);
-    let metrics = fs::read_to_string(out.join("metrics.json")).unwrap();
-    assert!(metrics.contains("\"steps\": 15"), "{metrics}");
+    let json = |file: &str| -> serde_json::Value {
+        serde_json::from_str(&fs::read_to_string(out.join(file)).unwrap()).unwrap()
+    };
+    let (metrics, done) = (json("metrics.json"), json("done.json"));
+    assert_eq!((&metrics["steps"], &done["steps"]), (&20.into(), &20.into()));
+    let ended = &metrics["ended"];
+    assert_eq!((&ended["reason"], &ended["step"]), (&"converged".into(), &20.into()));
+    assert_eq!(ended, &done["ended"]);
+    let psnr = |line: &str| line.split(',').nth(1).unwrap().parse::<f64>().unwrap();
+    let scored: Vec<f64> = scores.lines().skip(1).map(psnr).collect();
+    let [low, high] = [f64::min, f64::max].map(|pick| scored.iter().copied().reduce(pick).unwrap());
+    let spread = metrics["held_out"]["spread"].as_f64().unwrap();
+    assert!((spread - (high - low)).abs() < 1e-9, "{spread}");
+    assert_eq!(metrics["held_out"]["scores"], 4);
     // What goes on from the checkpoint at 10 comes to the same end.
     let model = fs::read(out.join("model.ply")).unwrap();
     fs::remove_file(out.join("metrics.json")).unwrap();

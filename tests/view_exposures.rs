@@ -228,7 +228,7 @@ fn adam_finds_the_exposures_of_views_that_differ_by_nothing_else() {
         let mut d_render = gpu.buffer("d_render", &d).unwrap();
         gpu.run("learn", |pass| {
             exposures.backward(pass, view, size, &render_on_device, &mut d_render)?;
-            adam.update(pass, step, &mut exposures, &status)?;
+            adam.update(pass, step, 1.0, &mut exposures, &status)?;
             exposures.center(pass, &status)
         })
         .unwrap();

@@ -19,6 +19,7 @@ layout(push_constant) uniform Params {
     uint  max_gaussians;
     uint  rounds_left;      // this one included; at least 1
     float split_log_scale;  // ln of the largest standard deviation of a clone
+    uint  most_added;       // of all batches
 };
 
 layout(constant_id = 0) const bool CONSERVING = false;  // every candidate is split
@@ -34,7 +35,7 @@ layout(binding = 5) writeonly buffer Offspring  { uint offspring_counts[]; }; //
 uint room() {
     uint kept = gaussian_count - tally[TALLY_PRUNED];
     uint free = max(max_gaussians, kept) - kept;
-    return free / rounds_left + (free % rounds_left > 0 ? 1 : 0);
+    return min(most_added, free / rounds_left + (free % rounds_left > 0 ? 1 : 0));
 }
 
 bool is_small(uint i) {

@@ -59,16 +59,15 @@ Shape drawn(uint i, Shape parent, mat3 axes, bool is_split, uint copy_index) {
     return child;
 }
 
-// One half of a Gaussian along its longest axis, the first of those that are equally long.
+// One half of a Gaussian along its longest axis.
 Shape half_of(Shape parent, mat3 axes, uint copy_index) {
     vec3 log_scales = parent.log_scales;
-    float longest = max(log_scales.x, max(log_scales.y, log_scales.z));
-    uint axis = log_scales.x == longest ? 0 : log_scales.y == longest ? 1 : 2;
+    uint axis = longest_axis(log_scales);
     float opacity = sigmoid(parent.raw_opacity);
     float along = log(SPLIT_ALONG + SPLIT_ALONG_SLOPE * opacity);
     float across = log(SPLIT_ACROSS + SPLIT_ACROSS_SLOPE * opacity);
     float new_opacity = opacity * (SPLIT_OPACITY + SPLIT_OPACITY_SLOPE * opacity);
-    float offset = (copy_index == 0 ? SPLIT_OFFSET : -SPLIT_OFFSET) * exp(longest);
+    float offset = (copy_index == 0 ? SPLIT_OFFSET : -SPLIT_OFFSET) * exp(log_scales[axis]);
     Shape child;
     child.mean = parent.mean + offset * axes[axis];
     for (uint k = 0; k < 3; ++k) child.log_scales[k] = log_scales[k] + (k == axis ? along : across);

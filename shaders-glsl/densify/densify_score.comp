@@ -2,14 +2,16 @@
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
 #include "gaussian.glsl"
+#include "camera.glsl"
+#include "splat.glsl"
 #include "fate.glsl"
 
 //! Densify score: one thread per Gaussian makes the key that orders it by how much it asks to multiply.
 //!
-//! To go: fainter than the minimum or with a parameter that is not finite. Of the rest, those whose screen-space
+//! Pruned: fainter than the minimum or with a parameter that is not finite. Of the rest, those whose screen-space
 //! gradient, averaged over the steps that saw them, exceeds the threshold are candidates (Kerbl et al. 2023, section
-//! 5.2), unless a camera is near for how wide they are: its view of such a Gaussian is not that of two halves.
-//! Reference: `src/reference/densify_score.rs`.
+//! 5.2), unless splitting them would change what a camera sees by more than a bound. Reference:
+//! `src/reference/densify_score.rs`.
 
 layout(local_size_x = 64) in;
 
@@ -20,7 +22,9 @@ layout(push_constant) uniform Params {
     float gradient_threshold;  // mean norm in normalised device units; exceeded, not met
     float min_raw_opacity;     // before the sigmoid
     uint  first_gaussian;      // how many lie before those of this dispatch
-    uint  camera_count;        // 0: a Gaussian of any width may multiply
+    uint  camera_count;
+    float near;                // world units
+    float largest_change;      // of a camera's view by one split; exceeded, not met
 };
 
 layout(binding = 0) readonly  buffer Parameters   { float parameters[]; };      // planes
@@ -29,7 +33,7 @@ layout(binding = 2) readonly  buffer VisitCounts  { uint visit_counts[]; };     
 layout(binding = 3) writeonly buffer Keys         { uint keys[]; };             // (gaussian_count), KEY_*
 layout(binding = 4) writeonly buffer Ids          { uint ids[]; };              // (gaussian_count)
 layout(binding = 5) buffer Tally { uint tally[]; };                             // TALLY_*, zero before
-layout(binding = 6) readonly  buffer Cameras      { float cameras[]; };         // (camera_count, 3), where they stand
+layout(binding = 6) readonly  buffer Cameras      { Camera cameras[]; };        // (camera_count)
 
 // Positive phrasing: a NaN fails the test.
 bool is_sound(uint i) {
@@ -43,27 +47,52 @@ bool is_sound(uint i) {
     return true;
 }
 
-// Whether two halves would look as it does from everywhere that views are seen from.
-bool is_far_enough(uint i) {
+// An estimate of the mean squared change of a view where two halves take the place of a Gaussian, in units of the squared
+// contrast of what it covers: the share of the view that it covers, times the square of its opacity and of the relative
+// change of depth. Halves that move across the view show what the Gaussian showed; those that move along the ray are
+// magnified, and may pass what stands before the Gaussian.
+float view_change(vec3 mean, mat3 axes, float opacity, uint axis, Camera camera) {
+    vec3 mean_in_view = camera.view_from_world * vec4(mean, 1.0);
+    mat3 view_axes = mat3(camera.view_from_world) * axes;
+    float shift = SPLIT_OFFSET * abs(view_axes[axis].z);
+    // No half is beyond the near plane.
+    if (mean_in_view.z + shift <= near) return 0.0;
+    // Where the nearer half is, the footprint is the largest.
+    mean_in_view.z = max(mean_in_view.z - shift, max(near, NEAREST));
+    vec2 slope = clamped_slope(mean_in_view, camera);
+    mat3 rows = transpose(view_axes);
+    vec3 u0 = camera.focal.x / mean_in_view.z * (rows * vec3(1.0, 0.0, -slope.x));
+    vec3 u1 = camera.focal.y / mean_in_view.z * (rows * vec3(0.0, 1.0, -slope.y));
+    vec2 variance = vec2(dot(u0, u0), dot(u1, u1)) + DILATION;
+    vec2 half_extent = sqrt(max(splat_level(opacity), 0.0) * variance);
+    vec2 mean2d = camera.focal * mean_in_view.xy / mean_in_view.z + camera.principal_point;
+    vec2 size = vec2(camera.size);
+    vec2 covered = clamp(mean2d + half_extent, vec2(0.0), size) - clamp(mean2d - half_extent, vec2(0.0), size);
+    float change = opacity * shift / mean_in_view.z;
+    return covered.x / size.x * (covered.y / size.y) * change * change;
+}
+
+// Whether a split of the Gaussian changes no camera's view by more than the bound.
+bool is_safe_to_split(uint i) {
     vec3 mean = LOAD_VEC3(parameters, MEANS_COLUMN, gaussian_count, i);
     vec3 log_scales = LOAD_VEC3(parameters, LOG_SCALES_COLUMN, gaussian_count, i);
-    float width = exp(max(log_scales.x, max(log_scales.y, log_scales.z)));
-    float least = width / WIDEST_SPLIT;
-    bool is_far = true;
-    for (uint k = 0; k < camera_count; ++k) {
-        vec3 away = mean - vec3(cameras[3 * k], cameras[3 * k + 1], cameras[3 * k + 2]);
-        is_far = is_far && dot(away, away) >= least * least;
-    }
-    return is_far;
+    mat3 axes = rotation(unit_quat(LOAD_VEC4(parameters, QUATS_COLUMN, gaussian_count, i)));
+    for (uint k = 0; k < 3; k++) axes[k] *= exp(log_scales[k]);
+    float opacity = sigmoid(parameters[RAW_OPACITIES_COLUMN * gaussian_count + i]);
+    uint axis = longest_axis(log_scales);
+    // Positive phrasing: a NaN fails the test.
+    for (uint k = 0; k < camera_count; ++k)
+        if (!(view_change(mean, axes, opacity, axis, cameras[k]) <= largest_change)) return false;
+    return true;
 }
 
 void main() {
     uint i = THREAD_INDEX;
     if (i >= gaussian_count) return;
     float mean_gradient = visit_counts[i] > 0 ? grad_norm_sums[i] / float(visit_counts[i]) : 0.0;
-    bool is_candidate = mean_gradient > gradient_threshold && is_far_enough(i);
+    bool is_candidate = mean_gradient > gradient_threshold;
     uint key = KEY_PRUNE;
-    if (is_sound(i)) key = is_candidate ? KEY_TOP - floatBitsToUint(mean_gradient) : KEY_KEEP;
+    if (is_sound(i)) key = is_candidate && is_safe_to_split(i) ? KEY_TOP - floatBitsToUint(mean_gradient) : KEY_KEEP;
     keys[i] = key;
     ids[i] = first_gaussian + i;
     uint candidates = subgroupAdd(key < KEY_KEEP ? 1u : 0u);

@@ -10,6 +10,9 @@ struct Camera {
     vec2  most_slope;       // and at the most: beyond, the affine approximation of a splat explodes
 };
 
+// A renderer without a near plane counts from here, in world units.
+const float NEAREST = 1e-4;
+
 // x / z and y / z, no farther than the Jacobian is taken.
 vec2 clamped_slope(vec3 mean_in_view, Camera camera) {
     return clamp(mean_in_view.xy / mean_in_view.z, camera.least_slope, camera.most_slope);

@@ -36,6 +36,9 @@ const float SPLIT_ACROSS        = 0.993;
 const float SPLIT_ACROSS_SLOPE  = -0.063;
 const float SPLIT_OPACITY       = 0.565;
 const float SPLIT_OPACITY_SLOPE = 0.2;
-// A Gaussian whose largest standard deviation exceeds this share of the way to the nearest camera is not split: the halves
-// stand so much nearer and farther than it that their projections do not add up to its own (docs/benchmarks.md).
-const float WIDEST_SPLIT = 0.8;
+
+// The axis that a conserving split is along: the first of those that are equally long.
+uint longest_axis(vec3 log_scales) {
+    float longest = max(log_scales.x, max(log_scales.y, log_scales.z));
+    return log_scales.x == longest ? 0 : log_scales.y == longest ? 1 : 2;
+}

@@ -37,8 +37,6 @@ layout(binding = 5) writeonly buffer TileCounts { uint tile_counts[]; };
 // A depth key is how many sixteenfold roundings the depth is beyond `near`: 2e-6 of the depth each, over 32 octaves.
 const uint DEPTH_BITS = 24;
 const uint CULLED = (1u << DEPTH_BITS) - 1;  // the depth key of what is not seen: it sorts last
-// A renderer without a near plane counts from here, in world units.
-const float NEAREST = 1e-4;
 const uint FEATURE_COUNT = CHANNELS - 3;
 
 #include "rest.glsl"

@@ -26,7 +26,7 @@ impl Run {
     /// # Errors
     /// The device is out of memory or lost.
     pub(super) fn new(title: String, trained: Trained, dataset: &Dataset) -> Result<Self> {
-        let Trained { mut trainer, scored, losses, spent } = trained;
+        let Trained { mut trainer, scored, losses, spent, .. } = trained;
         let mut renders = BTreeMap::new();
         for view in pictured(dataset) {
             let render = trainer.render(&view.camera)?;

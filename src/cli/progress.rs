@@ -91,9 +91,11 @@ pub(crate) struct Reporter {
     /// What JSON says of a run at its start.
     facts: Value,
     bar: ProgressBar,
-    /// The last step.
+    /// The last step, as far as that is known.
     steps: u64,
-    /// When the run began, and behind which step.
+    /// The run may end before it.
+    may_end_early: bool,
+    /// When the run began, and after which step.
     begin: (Instant, u64),
     spoke: Instant,
 }
@@ -106,6 +108,7 @@ impl Reporter {
             facts: json!({}),
             bar: ProgressBar::hidden(),
             steps: 0,
+            may_end_early: false,
             begin: (now, 0),
             spoke: now,
         }
@@ -118,6 +121,15 @@ impl Reporter {
 
     /// Says it.
     pub(crate) fn observe(&mut self, event: Event<'_>) {
+        match event {
+            Event::Started { step, steps, may_end_early, .. } => {
+                let now = Instant::now();
+                (self.steps, self.may_end_early) = (steps, may_end_early);
+                (self.begin, self.spoke) = ((now, step), now);
+            }
+            Event::LastStep { last, .. } => (self.steps, self.may_end_early) = (last, false),
+            _ => {}
+        }
         match self.form {
             ProgressForm::Bar => self.draw(event),
             ProgressForm::Plain => self.write(event),
@@ -128,10 +140,14 @@ impl Reporter {
 
     fn draw(&mut self, event: Event<'_>) {
         match event {
-            Event::Started { step, steps, memory } => {
-                self.start(step, steps);
+            Event::Started { step, memory, .. } => {
                 say(&foreseen(memory));
-                self.bar = bar(steps).with_position(step);
+                self.bar = ProgressBar::new(self.steps).with_position(step);
+                self.bar.set_style(style(self.may_end_early));
+            }
+            Event::LastStep { last, .. } => {
+                self.bar.set_length(last);
+                self.bar.set_style(style(self.may_end_early));
             }
             Event::Step(report) => {
                 self.bar.set_position(report.step);
@@ -150,10 +166,7 @@ impl Reporter {
 
     fn write(&mut self, event: Event<'_>) {
         match event {
-            Event::Started { step, steps, memory } => {
-                self.start(step, steps);
-                say(&foreseen(memory));
-            }
+            Event::Started { memory, .. } => say(&foreseen(memory)),
             Event::Step(report) if self.is_due() => say(&self.line(report)),
             Event::HeldOut { step, psnr } => {
                 say(&format!("step {step}: held-out views {psnr:.2} dB against their targets"));
@@ -169,10 +182,10 @@ impl Reporter {
 
     fn print(&mut self, event: Event<'_>) {
         let line = match event {
-            Event::Started { step, steps, memory } => {
-                self.start(step, steps);
+            Event::Started { step, steps, may_end_early, memory } => {
                 let mut started = json!({
-                    "event": "started", "step": step, "steps": steps, "memory": memory,
+                    "event": "started", "step": step, "steps": steps, "may_end_early": may_end_early,
+                    "memory": memory,
                 });
                 let facts = self.facts.as_object().into_iter().flatten();
                 facts.for_each(|(name, value)| started[name] = value.clone());
@@ -190,6 +203,10 @@ impl Reporter {
             Event::HeldOut { step, psnr } => {
                 json!({ "event": "held_out", "step": step, "psnr": psnr })
             }
+            Event::LastStep { step, last } => {
+                json!({ "event": "last_step", "step": step, "last": last })
+            }
+            Event::Ended(ended) => json!({ "event": "ended", "ended": ended }),
             Event::Evaluated { step, scored } => {
                 json!({ "event": "evaluated", "step": step, "mean": scores(scored) })
             }
@@ -206,11 +223,6 @@ impl Reporter {
         let _ = writeln!(std::io::stdout(), "{line}");
     }
 
-    fn start(&mut self, step: u64, steps: u64) {
-        let now = Instant::now();
-        (self.steps, self.begin, self.spoke) = (steps, (now, step), now);
-    }
-
     fn is_due(&mut self) -> bool {
         let is_due = self.spoke.elapsed() >= SILENCE;
         if is_due {
@@ -222,8 +234,9 @@ impl Reporter {
     fn line(&self, StepReport { step, loss, gaussians, .. }: &StepReport) -> String {
         let (each, left) = self.pace(*step);
         let (steps, left) = (self.steps, duration(left));
+        let most = at_most(self.may_end_early);
         format!(
-            "step {step} of {steps}: loss {loss:.4}, {gaussians} Gaussians, {each:.0} ms a step, {left} left"
+            "step {step} of {most}{steps}: loss {loss:.4}, {gaussians} Gaussians, {each:.0} ms a step, {most}{left} left"
         )
     }
 
@@ -231,7 +244,7 @@ impl Reporter {
     fn pace(&self, step: u64) -> (f64, f64) {
         let (begin, before) = self.begin;
         let each = begin.elapsed().as_secs_f64() / (step - before).max(1) as f64;
-        (1e3 * each, each * (self.steps - step) as f64)
+        (1e3 * each, each * self.steps.saturating_sub(step) as f64)
     }
 }
 
@@ -282,10 +295,15 @@ fn say(line: &str) {
 }
 
 /// Step, loss, Gaussians, steps per second and time left.
-fn bar(steps: u64) -> ProgressBar {
-    let template = "{bar:32} {pos}/{len}  {msg}  {per_sec}  {eta} left";
-    let style = ProgressStyle::with_template(template);
-    ProgressBar::new(steps).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
+fn style(may_end_early: bool) -> ProgressStyle {
+    let most = at_most(may_end_early);
+    let template = format!("{{bar:32}} {{pos}}/{{len}}  {{msg}}  {{per_sec}}  {most}{{eta}} left");
+    ProgressStyle::with_template(&template).unwrap_or_else(|_| ProgressStyle::default_bar())
+}
+
+/// What a number of steps, or the time they take, is said with while the run may end early.
+fn at_most(may_end_early: bool) -> &'static str {
+    if may_end_early { "at most " } else { "" }
 }
 
 #[cfg(test)]
@@ -295,8 +313,7 @@ mod tests {
     #[test]
     fn a_line_says_how_far_a_run_is_and_how_long_it_will_take() {
         let mut progress = Reporter::new(ProgressForm::Plain);
-        progress.start(100, 400);
-        progress.begin.0 -= Duration::from_secs(50);
+        (progress.steps, progress.begin) = (400, (Instant::now() - Duration::from_secs(50), 100));
         let report = StepReport {
             step: 200,
             view: "a".to_owned(),
@@ -306,6 +323,9 @@ mod tests {
             milliseconds: 480.0,
         };
         let said = "step 200 of 400: loss 0.0432, 2400 Gaussians, 500 ms a step, 1 min 40 s left";
+        assert_eq!(progress.line(&report), said);
+        progress.may_end_early = true;
+        let said = "step 200 of at most 400: loss 0.0432, 2400 Gaussians, 500 ms a step, at most 1 min 40 s left";
         assert_eq!(progress.line(&report), said);
         assert!(!progress.is_due());
         progress.spoke -= SILENCE;

@@ -20,9 +20,7 @@ use crate::nn::Precision;
 use crate::output::printable;
 use crate::run::{self, HeldRun, RunDirectory, Session, Trained};
 use crate::tone::{CurveChoice, GainChoice, Profile, ToneCurve, ToneSettings};
-use crate::train::{
-    Background, CacheSize, Learning, ModelName, Part, Preset, StopConfig, TrainConfig,
-};
+use crate::train::{Background, CacheSize, Learning, ModelName, Part, Preset, TrainConfig};
 
 /// Train a 3D Gaussian Splatting model from dark photographs.
 ///
@@ -442,7 +440,7 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     let held = if args.resume { HeldRun::Resume } else { held_unless(args.overwrite) };
     let mut progress = Reporter::new(form).with_facts(serde_json::json!(facts));
     let session = Session { plan: plan.as_ref(), held, requests: signals::requests()? };
-    let Trained { trainer, scored, spent, .. } =
+    let Trained { trainer, ended, scored, spent, .. } =
         run::train_in(&gpu, &config, &dataset, &args.out, &session, |event| {
             progress.observe(event);
         })?;
@@ -450,6 +448,7 @@ pub fn run(args: &TrainArgs) -> Result<()> {
         return Ok(());
     }
     let gaussians = trainer.gaussian_count();
+    writeln!(out, "{ended}")?;
     if let Some(line) = summary(&scored) {
         writeln!(out, "{line}")?;
     }
@@ -507,14 +506,12 @@ fn planned(args: &TrainArgs, config: TrainConfig, gpu: &Gpu) -> crate::Result<Pl
     Ok(Planned { config, plan: Some(plan), dataset })
 }
 
-/// A run that is made longer keeps the views that it began with: those held out stay so, and end it no more.
-fn as_begun(args: &TrainArgs, config: TrainConfig) -> crate::Result<TrainConfig> {
-    let begun = run::load_config(&args.out)?.stop;
-    if args.options.steps.is_none() || config.stop.views == begun.views {
-        return Ok(config);
+/// A run that is resumed with a number of steps keeps the views that it began with: those held out stay so.
+fn as_begun(args: &TrainArgs, mut config: TrainConfig) -> crate::Result<TrainConfig> {
+    if args.options.steps.is_some() {
+        config.stop.views = run::load_config(&args.out)?.stop.views;
     }
-    let stop = StopConfig { views: begun.views, every: config.steps, ..config.stop };
-    Ok(TrainConfig { stop, ..config })
+    Ok(config)
 }
 
 /// What `--max-resolution` says.

@@ -1,6 +1,7 @@
 //! Which views take part: some are left out by name, some kept from training.
 
 use super::{Dataset, Split, View};
+use crate::camera::Camera;
 
 impl Dataset {
     /// The training views.
@@ -27,13 +28,13 @@ impl Dataset {
     }
 }
 
-/// Keeps so many training views from training, an eighth of them at most, spread evenly.
+/// Holds out `count` of the training views, an eighth of them at most: views that cover where the cameras stand and look.
 pub(super) fn with_held_out(mut views: Vec<View>, count: usize) -> Vec<View> {
     const MOST: usize = 8;
     let mut training: Vec<&mut View> = views.iter_mut().filter(|view| view.is_train()).collect();
-    let (of, count) = (training.len(), count.min(training.len() / MOST));
-    for place in 0..count {
-        training[(2 * place + 1) * of / (2 * count)].split = Split::HeldOut;
+    let cameras: Vec<Camera> = training.iter().map(|view| view.camera).collect();
+    for place in Camera::covering(&cameras, count.min(training.len() / MOST)) {
+        training[place].split = Split::HeldOut;
     }
     views
 }

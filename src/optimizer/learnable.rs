@@ -17,7 +17,8 @@ pub trait Learnable {
 }
 
 impl Adam {
-    /// Records step number `step`, from 1, of all that is learned; nothing changes while `status` is set.
+    /// Records step number `step`, from 1, of all that is learned, at `rate` times its own rate; nothing changes while
+    /// `status` is set.
     ///
     /// # Errors
     /// As [`Adam::record`].
@@ -25,10 +26,11 @@ impl Adam {
         &self,
         pass: &mut Recorder<'_>,
         step: u64,
+        rate: f64,
         learnable: &mut dyn Learnable,
         status: &Buffer<u32>,
     ) -> Result<()> {
-        let rates = LearningRates::uniform(learnable.learning_rate(step));
+        let rates = LearningRates::uniform(rate * learnable.learning_rate(step));
         let buffers = learnable.buffers();
         // One column of planes.
         let shape = [buffers.parameters.len() as u32, 1, 0];

@@ -17,6 +17,11 @@ impl LearningRates {
     pub const fn uniform(rate: f64) -> Self {
         Self([rate; ATTRIBUTES.len()])
     }
+
+    /// Every rate times `factor`.
+    pub fn scaled(self, factor: f64) -> Self {
+        Self(self.0.map(|rate| factor * rate))
+    }
 }
 
 /// Those of the table.
@@ -83,6 +88,11 @@ pub struct Schedule {
     pub densify_before: u64,
     /// and every so many steps.
     pub densify_interval: u64,
+    /// The last steps of a run, a third of it at most: the model settles. There is no density control, and all learning
+    /// rates decay
+    pub settle_steps: u64,
+    /// exponentially, to this part of themselves.
+    pub settle_rate: f64,
     /// Views are a quarter of their width and height before the first of these steps, half before the second.
     pub resolution_steps: [u64; 2],
     /// The weight of the near-camera damping is 1 before the first of these steps, 1/2 before the second, then 0.
@@ -101,6 +111,8 @@ impl Default for Schedule {
             densify_after: 50,
             densify_before: 3_000,
             densify_interval: 100,
+            settle_steps: 0,
+            settle_rate: 0.05,
             resolution_steps: [0, 200],
             damping_steps: [4_000, 7_000],
         }
@@ -156,6 +168,11 @@ impl Schedule {
         (self.densify_after / interval).saturating_add(1).saturating_mul(interval)
     }
 
+    /// What learning rates are multiplied by after this share of the settling phase.
+    pub fn settling_rate(&self, done: f64) -> f64 {
+        self.settle_rate.powf(done.clamp(0.0, 1.0))
+    }
+
     /// How often the views of `step` are halved.
     pub fn resolution_level(&self, step: u64) -> usize {
         match self.resolution_steps {
@@ -170,10 +187,11 @@ impl Schedule {
         1 + self.resolution_level(1)
     }
 
-    /// How many rounds of density control there are from the end of `step` on, one there included.
-    pub fn rounds_left(&self, step: u64) -> u64 {
+    /// The number of rounds of density control from the end of `step` on, one there included, where none comes after
+    /// step `last`.
+    pub fn rounds_left(&self, step: u64, last: u64) -> u64 {
         let interval = self.densify_interval.max(1);
-        self.densify_before.saturating_sub(1).saturating_sub(step) / interval + 1
+        self.densify_before.saturating_sub(1).min(last).saturating_sub(step) / interval + 1
     }
 
     /// The weight w of the near-camera damping of the screen gradients that density control reads: they are
@@ -228,7 +246,11 @@ mod tests {
     #[test]
     fn the_rounds_left_fall_to_one() {
         let schedule = Schedule::paper();
-        assert_eq!([600, 800, 4_600, 4_800].map(|step| schedule.rounds_left(step)), [22, 21, 2, 1]);
+        assert_eq!(
+            [600, 800, 4_600, 4_800].map(|step| schedule.rounds_left(step, 9_000)),
+            [22, 21, 2, 1]
+        );
+        assert_eq!([600, 800].map(|step| schedule.rounds_left(step, 1_100)), [3, 2]);
     }
 
     #[test]
@@ -270,6 +292,6 @@ mod tests {
         assert!(schedule.learning_rates(1, 1.0)[Attribute::Means].is_finite());
         assert_eq!(schedule.sh_degree(2, 3), 2);
         assert!(schedule.densifies_at(501));
-        assert!(schedule.rounds_left(1) > 0);
+        assert!(schedule.rounds_left(1, 1) > 0);
     }
 }

@@ -12,7 +12,11 @@ impl Reference for Kernel {
         let (first, of_batch) = (params.first_gaussian as usize, params.batch_count as usize);
         let log_scales = Attribute::LogScales.column(0) * of_batch;
         let kept = params.gaussian_count - slices.tally[TALLY_PRUNED as usize];
-        let room = params.max_gaussians.saturating_sub(kept).div_ceil(params.rounds_left);
+        let room = params
+            .max_gaussians
+            .saturating_sub(kept)
+            .div_ceil(params.rounds_left)
+            .min(params.most_added);
         let end = if slices.tally[TALLY_CANDIDATES as usize] > room {
             slices.sorted_keys[room as usize]
         } else {

@@ -1,10 +1,18 @@
+//! How much each Gaussian asks to multiply, and what a split of it would change in the views of cameras.
+
+use glam::{DMat3, DVec2, DVec3, DVec4};
+
+use super::camera::{Camera, rotation, unit_quat};
+use super::gaussian::{Gaussian, sigmoid};
 use super::rounding::UNIT;
 use crate::attributes::{Attribute, planes};
 use crate::gpu::{Reference, Tolerance};
+use crate::kernels::camera::NEAREST;
 use crate::kernels::densify_score::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::fate::{
-    KEY_KEEP, KEY_PRUNE, KEY_TOP, TALLY_CANDIDATES, TALLY_PRUNED, WIDEST_SPLIT,
+    KEY_KEEP, KEY_PRUNE, KEY_TOP, SPLIT_OFFSET, TALLY_CANDIDATES, TALLY_PRUNED,
 };
+use crate::kernels::splat::DILATION;
 
 fn mean_gradient(slices: &Slices<'_>, i: usize) -> f32 {
     match slices.visit_counts[i] {
@@ -13,23 +21,55 @@ fn mean_gradient(slices: &Slices<'_>, i: usize) -> f32 {
     }
 }
 
-/// The squared distance of the nearest camera, in units of what the width of a Gaussian asks for, and the logarithm of
-/// that width.
-fn nearness(params: &Params, slices: &Slices<'_>, i: usize) -> [f64; 2] {
+/// An estimate of the mean squared change of a view where two halves take the place of a Gaussian, in units of the squared
+/// contrast of what it covers: the share of the view that it covers, times the square of its opacity and of the relative
+/// change of depth.
+pub(super) fn view_change(near: f64, camera: &Camera, gaussian: &Gaussian) -> f64 {
+    let opacity = sigmoid(gaussian.raw_opacity);
+    let scale = DMat3::from_diagonal(gaussian.log_scale.exp());
+    let view_axes = camera.rotation * rotation(unit_quat(gaussian.quat)) * scale;
+    let mean = camera.view(gaussian.mean);
+    let shift = SPLIT_OFFSET * view_axes.col(gaussian.log_scale.max_position()).z.abs();
+    if mean.z + shift <= near {
+        return 0.0;
+    }
+    let mean = mean.truncate().extend((mean.z - shift).max(near.max(NEAREST)));
+    let (slope, rows) = (camera.clamped_slope(mean), view_axes.transpose());
+    let u0 = camera.focal.x / mean.z * (rows * DVec3::new(1.0, 0.0, -slope.x));
+    let u1 = camera.focal.y / mean.z * (rows * DVec3::new(0.0, 1.0, -slope.y));
+    let variance = DVec2::new(u0.dot(u0), u1.dot(u1)) + DILATION;
+    let level = 2.002 * (255.0 * opacity).ln() + 1e-3;
+    let half_extent = (level.max(0.0) * variance).map(f64::sqrt);
+    let mean2d = camera.focal * mean.truncate() / mean.z + camera.principal_point;
+    let clamped = |corner: DVec2| corner.clamp(DVec2::ZERO, camera.size);
+    let covered = (clamped(mean2d + half_extent) - clamped(mean2d - half_extent)) / camera.size;
+    covered.element_product() * (opacity * shift / mean.z).powi(2)
+}
+
+/// The most that a split of Gaussian `i` changes in a camera's view; NaN where one is.
+fn largest_change(params: &Params, slices: &Slices<'_>, i: usize) -> f64 {
     let n = params.gaussian_count as usize;
-    let of = |attribute: Attribute| -> [f64; 3] {
-        let first = attribute.column(0) * n + 3 * i;
+    fn of<const WIDTH: usize>(
+        slices: &Slices<'_>,
+        n: usize,
+        i: usize,
+        own: Attribute,
+    ) -> [f64; WIDTH] {
+        let first = own.column(0) * n + WIDTH * i;
         std::array::from_fn(|k| f64::from(slices.parameters[first + k]))
+    }
+    let gaussian = Gaussian {
+        mean: DVec3::from_array(of(slices, n, i, Attribute::Means)),
+        quat: DVec4::from_array(of(slices, n, i, Attribute::Quats)),
+        log_scale: DVec3::from_array(of(slices, n, i, Attribute::LogScales)),
+        raw_opacity: of::<1>(slices, n, i, Attribute::RawOpacities)[0],
+        features: vec![],
+        sh: vec![],
     };
-    let [mean, log_scales] = [Attribute::Means, Attribute::LogScales].map(of);
-    let width = log_scales.into_iter().fold(f64::NEG_INFINITY, f64::max);
-    let cameras = slices.cameras.chunks_exact(3).take(params.camera_count as usize);
-    let squared = cameras.map(|camera| {
-        let away = mean.iter().zip(camera).map(|(mean, camera)| mean - f64::from(*camera));
-        away.map(|away| away * away).sum::<f64>()
-    });
-    let least = width.exp() / WIDEST_SPLIT;
-    [squared.fold(f64::INFINITY, f64::min) / (least * least), width]
+    let cameras = slices.cameras.iter().take(params.camera_count as usize);
+    let change = |camera| view_change(params.near.into(), &Camera::from(camera), &gaussian);
+    let most = |most: f64, one: f64| if most >= one { most } else { one };
+    cameras.map(change).fold(0.0, |a, b| if f64::is_nan(a) { a } else { most(a, b) })
 }
 
 impl Reference for Kernel {
@@ -46,7 +86,7 @@ impl Reference for Kernel {
             let key = if !is_finite || !is_visible {
                 KEY_PRUNE
             } else if mean_gradient > params.gradient_threshold
-                && nearness(params, &slices, i)[0] >= 1.0
+                && largest_change(params, &slices, i) <= f64::from(params.largest_change)
             {
                 KEY_TOP - mean_gradient.to_bits()
             } else {
@@ -60,16 +100,19 @@ impl Reference for Kernel {
     }
 
     /// A division is good to five roundings, and the reference's to one: as many units of a key, which is made of bits,
-    /// and a unit is up to two roundings. At the threshold, whether there is a candidate hangs on it, and as near as a camera
-    /// may be on an exponential, good to 3 + 2 |x| units (Vulkan 1.3, appendix on precision).
+    /// and a unit is up to two roundings. At the threshold, whether there is a candidate hangs on it. So it does where a
+    /// view would change by about the bound: by a thousandth of it, as exponentials, differences of depths and the edges
+    /// of what is covered are good to that wherever a parameter is below about 1 000.
     fn tolerances(params: &Params, _: &Constants, slices: Slices<'_>) -> Tolerances {
         const ROUNDINGS: f64 = 6.0;
-        let threshold = f64::from(params.gradient_threshold);
+        let (threshold, bound) =
+            (f64::from(params.gradient_threshold), f64::from(params.largest_change));
         let is_close = |i: usize| {
-            let distance = (f64::from(mean_gradient(&slices, i)) - threshold).abs();
-            let [nearness, width] = nearness(params, &slices, i);
-            let of_nearness = (2.0 * (3.0 + 2.0 * width.abs()) + 4.0 * ROUNDINGS) * UNIT;
-            distance <= ROUNDINGS * UNIT * threshold || (nearness - 1.0).abs() <= of_nearness
+            let gradient = f64::from(mean_gradient(&slices, i));
+            let is_near = |value: f64, limit: f64, part: f64| (value - limit).abs() <= part * limit;
+            is_near(gradient, threshold, ROUNDINGS * UNIT)
+                || (gradient > threshold
+                    && is_near(largest_change(params, &slices, i), bound, 1e-3))
         };
         let n = params.gaussian_count as usize;
         let keys = (0..n).map(|i| if is_close(i) { f64::from(u32::MAX) } else { ROUNDINGS });

@@ -9,7 +9,8 @@ use super::sh::sh_basis;
 use super::splat::{Splat, extent_error, splat_level, splat_tile_rows, splat_tiles, stored_color};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::ProjectedSplat;
-use crate::kernels::project::{CULLED, Constants, Kernel, NEAREST, Params, Slices, Tolerances};
+use crate::kernels::camera::NEAREST;
+use crate::kernels::project::{CULLED, Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::splat::{ALPHA_MIN, DILATION};
 
 /// What one Gaussian is on the image plane.

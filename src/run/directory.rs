@@ -107,6 +107,12 @@ pub(crate) const TARGET_EXPOSURE: &str = "target_exposure";
 /// Where `metrics.json` holds what the steps took beside seconds.
 pub(crate) const SPENT: &str = "spent";
 
+/// How the run ended, in `metrics.json`.
+pub(crate) const ENDED: &str = "ended";
+
+/// The last scores of the held-out views and their spread, in `metrics.json`.
+pub(crate) const HELD_OUT_COURSE: &str = "held_out";
+
 /// Gain and bias of the training views.
 pub(super) const EXPOSURES: &str = "exposures.csv";
 
@@ -247,17 +253,6 @@ impl RunDirectory {
         let (raw_colors, is_new) = (config.model.raw_colors, log.is_empty());
         let path = path.to_owned();
         Ok(Self { path, log: file, terms, seconds_before, raw_colors, is_new, aside, _lock: lock })
-    }
-
-    /// The scores of the held-out views up to a step, in order: step, PSNR in dB.
-    pub fn held_out_scores(&self, step: u64) -> Vec<(u64, f64)> {
-        let path = self.path.join(HELD_OUT);
-        let text = std::fs::read_to_string(&path).unwrap_or_default();
-        let entry = |line: &str| -> Option<(u64, f64)> {
-            let (step, score) = line.split_once(',')?;
-            Some((step.parse().ok()?, score.parse().ok()?))
-        };
-        text.lines().filter_map(entry).filter(|one| one.0 <= step).collect()
     }
 
     /// Writes the scores of the held-out views: step, PSNR in dB.

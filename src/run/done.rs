@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::directory::DONE;
 use crate::dataset::{Dataset, Fingerprint};
 use crate::output::write_whole;
-use crate::train::TrainConfig;
+use crate::train::{Ended, TrainConfig};
 use crate::{Error, Result};
 
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
@@ -17,18 +17,26 @@ struct Done {
     configuration: String,
     /// Checksum of what was trained on.
     dataset: String,
-    /// The step that ended it.
+    /// The last step.
     steps: u64,
+    /// How it ended; older files do not say.
+    #[serde(default)]
+    ended: Option<Ended>,
 }
 
-/// Writes the sign, behind everything else.
+/// Writes the sign, after everything else.
 pub(super) fn save(
     run: &Path,
     config: &TrainConfig,
     dataset: &Fingerprint,
-    steps: u64,
+    ended: &Ended,
 ) -> Result<()> {
-    let done = Done { configuration: config.checksum()?, dataset: dataset.checksum(), steps };
+    let done = Done {
+        configuration: config.checksum()?,
+        dataset: dataset.checksum(),
+        steps: ended.step,
+        ended: Some(*ended),
+    };
     let text =
         serde_json::to_string_pretty(&done).map_err(|error| Error::Usage(error.to_string()))?;
     write_whole(&run.join(DONE), (text + "\n").as_bytes())

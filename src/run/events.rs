@@ -2,7 +2,7 @@
 
 use super::Trained;
 use crate::eval::ViewScore;
-use crate::train::{MemoryEstimate, StepReport};
+use crate::train::{Ended, MemoryEstimate, StepReport};
 
 /// A moment of a run, in the order in which they come.
 #[derive(Clone, Copy, Debug)]
@@ -14,6 +14,8 @@ pub enum Event<'a> {
         step: u64,
         /// The step that ends the run.
         steps: u64,
+        /// The run may end before it, once the held-out views have converged.
+        may_end_early: bool,
         /// What it is going to take.
         memory: &'a MemoryEstimate,
     },
@@ -24,13 +26,22 @@ pub enum Event<'a> {
         /// Steps done.
         step: u64,
     },
-    /// The views that are kept from training were scored against their targets.
+    /// The held-out views were scored against their targets.
     HeldOut {
         /// Steps done.
         step: u64,
-        /// Their mean, dB.
+        /// Their mean PSNR, dB.
         psnr: f64,
     },
+    /// The run no longer ends early, or it has converged: what its last step is, is certain.
+    LastStep {
+        /// Steps done.
+        step: u64,
+        /// The last step.
+        last: u64,
+    },
+    /// The last step is done, and the model of the best step is in place.
+    Ended(&'a Ended),
     /// The test views were scored, on the way or behind the last step.
     Evaluated {
         /// Steps done.

@@ -74,6 +74,21 @@ impl EventFile {
         self.write(step, &Message::default().message(5, &Message::default().message(1, &value)))
     }
 
+    /// A line of text at a step.
+    ///
+    /// # Errors
+    /// The disk is full or gone.
+    pub(super) fn text(&mut self, step: u64, tag: &str, text: &str) -> Result<()> {
+        const DT_STRING: u64 = 7;
+        let one = Message::default().message(2, &Message::default().varint(1, 1));
+        let tensor = Message::default().varint(1, DT_STRING).message(2, &one);
+        let tensor = tensor.bytes(8, text.as_bytes());
+        let plugin = Message::default().message(1, &Message::default().bytes(1, b"text"));
+        let value = Message::default().bytes(1, tag.as_bytes());
+        let value = value.message(8, &tensor).message(9, &plugin);
+        self.write(step, &Message::default().message(5, &Message::default().message(1, &value)))
+    }
+
     /// What was written is in the file, for whoever watches.
     ///
     /// # Errors

@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use super::directory::{Progress, SPENT, TARGET_EXPOSURE};
+use super::directory::{ENDED, HELD_OUT_COURSE, Progress, SPENT, TARGET_EXPOSURE};
 use super::meter::{Meter, Spent};
 use super::tensorboard::EventFile;
 use super::{Event, Requests, RunDirectory, done, generations, load};
@@ -12,7 +12,7 @@ use crate::dataset::{Dataset, View};
 use crate::diagnose::Plan;
 use crate::eval::{self, Compared, ViewScore, Yardstick};
 use crate::gpu::Gpu;
-use crate::train::{Learning, MemoryEstimate, StepReport, TrainConfig, Trainer};
+use crate::train::{Ended, Learning, MemoryEstimate, StepReport, TrainConfig, Trainer};
 use crate::{Error, Result, Stop};
 
 /// What becomes of a run that the directory already holds.
@@ -43,6 +43,8 @@ pub struct Session<'a> {
 pub struct Trained {
     /// The model and its networks, on the device.
     pub trainer: Trainer,
+    /// How it ended.
+    pub ended: Ended,
     /// The test views that have a reference image.
     pub scored: Vec<ViewScore>,
     /// The loss of every step of this call.
@@ -109,13 +111,18 @@ pub fn train_in(
     directory.save_views(dataset)?;
     let memory = trainer.memory_estimate()?;
     say_what_is_short(gpu, &memory);
-    observe(Event::Started { step: trainer.steps_done(), steps: config.steps, memory: &memory });
+    observe(Event::Started {
+        step: trainer.steps_done(),
+        steps: trainer.last_step(),
+        may_end_early: trainer.may_end_early(),
+        memory: &memory,
+    });
     let mut course = Course::new(gpu, config, dataset, &directory, &trainer);
     let requests = &session.requests;
     let losses = course.train_to_the_end(&mut trainer, &mut directory, requests, &mut observe);
     let losses = losses.inspect_err(|error| course.rescue(error, &mut trainer, &mut directory))?;
     let finished = course.finish(&mut trainer, &mut directory, &mut observe);
-    let (scored, spent) =
+    let (ended, scored, spent) =
         finished.inspect_err(|error| course.rescue(error, &mut trainer, &mut directory))?;
     let (gaussians, steps) = (trainer.gaussian_count(), trainer.steps_done());
     let mut metrics = eval::metrics(&scored, spent.seconds, gaussians, steps);
@@ -127,9 +134,13 @@ pub fn train_in(
     if config.exposure.learn == Learning::On {
         eval::add_exposure(&mut metrics, &scored);
     }
+    metrics[ENDED] = serde_json::json!(ended);
+    if let Some(course) = held_out_course(&trainer) {
+        metrics[HELD_OUT_COURSE] = course;
+    }
     directory.save_metrics(&metrics)?;
-    done::save(out, config, trainer.fingerprint(), steps)?;
-    let trained = Trained { trainer, scored, losses, spent };
+    done::save(out, config, trainer.fingerprint(), &ended)?;
+    let trained = Trained { trainer, ended, scored, losses, spent };
     observe(Event::Finished(&trained));
     Ok(trained)
 }
@@ -229,6 +240,10 @@ struct Course<'a> {
     yardstick: Option<Yardstick>,
     /// For `TensorBoard`, once there is something to tell.
     events: Option<EventFile>,
+    /// Scores of the held-out views that are told.
+    told: usize,
+    /// Whether the run may end early, as far as that is told.
+    may_end_early: bool,
 }
 
 impl<'a> Course<'a> {
@@ -251,6 +266,8 @@ impl<'a> Course<'a> {
             progress,
             yardstick: None,
             events: None,
+            told: trainer.held_out_scores().count(),
+            may_end_early: trainer.may_end_early(),
         }
     }
 
@@ -267,12 +284,9 @@ impl<'a> Course<'a> {
         let is_over = |since: Instant, minutes: f64| {
             minutes > 0.0 && since.elapsed() >= Duration::from_secs_f64(60.0 * minutes)
         };
-        let score_every = if config.stop.views > 0 { config.stop.every } else { 0 };
-        let mut held_out = directory.held_out_scores(trainer.steps_done());
-        while trainer.steps_done() < config.steps {
+        while !trainer.has_ended() {
             let next = |every| (trainer.steps_done() + 1).checked_next_multiple_of(every);
-            let until =
-                [config.eval_every, config.checkpoint_every, score_every, config.hash_every];
+            let until = [config.eval_every, config.checkpoint_every, config.hash_every];
             let until = until.into_iter().filter_map(next).min().unwrap_or(config.steps);
             let reports = self.meter.of(|| trainer.advance(until))?;
             for report in &reports {
@@ -285,26 +299,20 @@ impl<'a> Course<'a> {
                 directory.settle()?;
             }
             if config.tensorboard {
-                self.tell_events(directory, &reports)?;
+                self.tell_events(trainer, directory, &reports)?;
             }
+            self.tell_scores(trainer, directory, observe)?;
             let Some(step) = reports.last().map(|report| report.step) else { continue };
             let falls_on = |every: u64| every > 0 && step.is_multiple_of(every);
-            // Before the checkpoint: what goes on from there knows the score.
-            if falls_on(score_every)
-                && let Some(psnr) = trainer.held_out_psnr()?
-            {
-                held_out.push((step, psnr));
-                directory.save_held_out(&held_out)?;
-                observe(Event::HeldOut { step, psnr });
-            }
             if falls_on(config.hash_every) {
                 directory.log_hashes(step, &trainer.gaussians_in_frame()?)?;
             }
             let stop =
                 requests.stops().or(is_over(begin, config.max_minutes).then_some(Stop::TimeUp));
-            let stop = stop.filter(|_| step < config.steps);
+            let stop = stop.filter(|_| !trainer.has_ended());
+            let is_last = trainer.has_ended() && config.checkpoint_every > 0;
             let saves = requests.takes_save() || is_over(saved, config.checkpoint_minutes);
-            if falls_on(config.checkpoint_every) || saves || stop.is_some() {
+            if falls_on(config.checkpoint_every) || is_last || saves || stop.is_some() {
                 directory.save_checkpoint(trainer)?;
                 (self.saved, saved) = (step, Instant::now());
                 observe(Event::Checkpointed { step });
@@ -312,29 +320,30 @@ impl<'a> Course<'a> {
             if let Some(cause) = stop {
                 return Err(Error::Stopped { run: directory.path().to_owned(), step, cause });
             }
-            if falls_on(score_every) && has_converged(config, &held_out) && step < config.steps {
-                tracing::info!("step {step}: the held-out views have converged");
-                break;
-            }
-            if falls_on(config.eval_every) && step < config.steps {
+            if falls_on(config.eval_every) && !trainer.has_ended() {
                 self.evaluate(trainer, directory, observe)?;
             }
         }
         Ok(losses)
     }
 
-    /// Scores the test views and writes the model.
+    /// Restores the best model where the last is worse, scores the test views and writes the model.
     fn finish(
         &mut self,
         trainer: &mut Trainer,
         directory: &mut RunDirectory,
         observe: &mut impl FnMut(Event<'_>),
-    ) -> Result<(Vec<ViewScore>, Spent)> {
+    ) -> Result<(Ended, Vec<ViewScore>, Spent)> {
+        let ended = trainer.end()?;
+        if let Some(events) = &mut self.events {
+            events.text(ended.step, "run/ended", &ended.to_string())?;
+        }
+        observe(Event::Ended(&ended));
         trainer.leave_out_what_gains_nothing()?;
         let spent = self.meter.spent(self.gpu.peak_memory());
         let scored = self.evaluate(trainer, directory, observe)?;
         directory.save_trained(trainer)?;
-        Ok((scored, spent))
+        Ok((ended, scored, spent))
     }
 
     /// Saves what was trained before an error that leaves it as it was: nothing but memory, a file or the like was missing.
@@ -397,7 +406,12 @@ impl<'a> Course<'a> {
 
 impl Course<'_> {
     /// Writes what `TensorBoard` draws over the steps, of every tenth.
-    fn tell_events(&mut self, directory: &RunDirectory, reports: &[StepReport]) -> Result<()> {
+    fn tell_events(
+        &mut self,
+        trainer: &Trainer,
+        directory: &RunDirectory,
+        reports: &[StepReport],
+    ) -> Result<()> {
         const EVERY: u64 = 10;
         let events = match &mut self.events {
             Some(events) => events,
@@ -405,14 +419,14 @@ impl Course<'_> {
         };
         let named = |group: &str, name: &str, value| (format!("{group}/{name}"), value);
         for StepReport { step, loss, terms, gaussians, milliseconds, .. } in reports {
-            if !step.is_multiple_of(EVERY) && *step < self.config.steps {
+            if !step.is_multiple_of(EVERY) && *step < trainer.last_step() {
                 continue;
             }
             let mut values = vec![("loss/all".to_owned(), *loss)];
             values.extend(terms.iter().map(|(term, value)| named("loss", term.column, *value)));
             values.push(("model/Gaussians".to_owned(), *gaussians as f64));
             values.push(("model/milliseconds a step".to_owned(), *milliseconds));
-            let rates = self.config.schedule.learning_rates(*step, self.dataset.extent());
+            let rates = trainer.learning_rates(*step);
             let rate = |own: &AttributeSpec| named("rates", own.name, rates[own.attribute]);
             values.extend(ATTRIBUTES.iter().map(rate));
             events.scalars(*step, &values)?;
@@ -420,7 +434,32 @@ impl Course<'_> {
         events.flush()
     }
 
-    /// Writes how the model shows a test view, and what it should be.
+    /// Writes and tells every score of the held-out views since the last call, and the last step once that is certain.
+    fn tell_scores(
+        &mut self,
+        trainer: &Trainer,
+        directory: &RunDirectory,
+        observe: &mut impl FnMut(Event<'_>),
+    ) -> Result<()> {
+        let scores: Vec<(u64, f64)> = trainer.held_out_scores().collect();
+        if scores.len() > self.told {
+            directory.save_held_out(&scores)?;
+        }
+        for &(step, psnr) in scores.get(self.told..).unwrap_or_default() {
+            observe(Event::HeldOut { step, psnr });
+            if let Some(events) = &mut self.events {
+                events
+                    .scalars(step, &[("held-out views against targets/PSNR".to_owned(), psnr)])?;
+            }
+        }
+        if self.may_end_early && !trainer.may_end_early() {
+            observe(Event::LastStep { step: trainer.steps_done(), last: trainer.last_step() });
+        }
+        (self.told, self.may_end_early) = (scores.len(), trainer.may_end_early());
+        Ok(())
+    }
+
+    /// Writes how a test view looks, and what it should be.
     fn tell_events_pictures(
         &mut self,
         step: u64,
@@ -452,10 +491,16 @@ impl Course<'_> {
     }
 }
 
-/// By the scores since the views have had their size.
-fn has_converged(config: &TrainConfig, held_out: &[(u64, f64)]) -> bool {
-    let [_, whole] = config.schedule.resolution_steps;
+/// How the held-out views' scores came to their end, for `metrics.json`: the last, and how far the last ten lie apart.
+fn held_out_course(trainer: &Trainer) -> Option<serde_json::Value> {
+    const LAST: usize = 10;
     let scores: Vec<f64> =
-        held_out.iter().filter(|(step, _)| *step >= whole).map(|&(_, psnr)| psnr).collect();
-    config.stop.has_converged(&scores)
+        trainer.held_out_scores().rev().take(LAST).map(|(_, psnr)| psnr).collect();
+    let (lowest, highest) =
+        (scores.iter().copied().reduce(f64::min)?, scores.iter().copied().reduce(f64::max)?);
+    Some(serde_json::json!({
+        "psnr": scores.first(),
+        "scores": scores.len(),
+        "spread": highest - lowest,
+    }))
 }

@@ -11,7 +11,8 @@ use rayon::prelude::*;
 use safetensors::tensor::{Dtype, TensorView};
 use serde::{Deserialize, Serialize};
 
-use super::ends::Ends;
+use super::best::Snapshot;
+use super::decisions::Decisions;
 use super::model::Model;
 use super::{TrainConfig, Trainer, learnables};
 use crate::batches::Batches;
@@ -31,6 +32,9 @@ const HEADER: &str = "checkpoint";
 
 const FORMAT: &str = "nightsplat checkpoint 1";
 
+/// What the names of the tensors of the best model so far begin with.
+const BEST: &str = "best.";
+
 const VISIT_COUNTS: &str = "density.visit_counts";
 
 /// What a checkpoint says of itself.
@@ -42,8 +46,8 @@ struct Header {
     /// The settings of the run, as TOML.
     config: String,
     /// What the held-out views have ended.
-    #[serde(default)]
-    ends: Ends,
+    #[serde(default, rename = "ends")]
+    decisions: Decisions,
     /// The views that it trains on no more.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     left_out: Vec<String>,
@@ -58,12 +62,13 @@ struct Header {
 impl Header {
     /// The checksum of a file with this header and these tensors, in the order of their names.
     fn checksum_with(&self, mut tensors: Vec<(String, &[u8])>) -> String {
-        let Self { format, step, config, ends, left_out, dataset, .. } = self;
+        let Self { format, step, config, decisions, left_out, dataset, .. } = self;
         let mut hasher = Hasher::default();
         // Older files have none.
         left_out.iter().for_each(|name| hasher.write(name.as_bytes()));
-        hasher
-            .write(serde_json::json!([format, step, config, ends, dataset]).to_string().as_bytes());
+        hasher.write(
+            serde_json::json!([format, step, config, decisions, dataset]).to_string().as_bytes(),
+        );
         tensors.sort_unstable();
         for (name, bytes) in tensors {
             hasher.write(name.as_bytes());
@@ -96,16 +101,16 @@ pub fn check_checkpoint(path: &Path) -> Result<()> {
 }
 
 /// A tensor of the state.
-struct State<'a> {
-    name: String,
-    shape: Vec<usize>,
+pub(super) struct State<'a> {
+    pub(super) name: String,
+    pub(super) shape: Vec<usize>,
     buffer: &'a mut Buffer<f32>,
     /// How it lies in the buffer, where that is not as in the file.
     batches: Option<Batches>,
 }
 
 impl State<'_> {
-    fn read(&self, gpu: &Gpu) -> Result<Vec<f32>> {
+    pub(super) fn read(&self, gpu: &Gpu) -> Result<Vec<f32>> {
         if let Some(batches) = self.batches {
             return batches.read(gpu, self.buffer);
         }
@@ -114,7 +119,7 @@ impl State<'_> {
         Ok(values)
     }
 
-    fn write(self, gpu: &Gpu, values: &[f32]) -> Result<()> {
+    pub(super) fn write(self, gpu: &Gpu, values: &[f32]) -> Result<()> {
         match self.batches {
             Some(batches) => batches.write(gpu, self.buffer, values),
             None => gpu.write(self.buffer, values),
@@ -133,7 +138,7 @@ impl Trainer {
             format: FORMAT.to_owned(),
             step: self.step,
             config: self.config.to_toml()?,
-            ends: self.ends.clone(),
+            decisions: self.decisions.clone(),
             left_out: self.views.left_out(),
             dataset: Some(self.fingerprint.clone()),
             checksum: None,
@@ -146,6 +151,12 @@ impl Trainer {
         for (name, _, values) in &downloads {
             self.refuse_values(name, values)?;
         }
+        let best = self.best.iter();
+        downloads.extend(
+            best.map(|(name, shape, values)| {
+                (format!("{BEST}{name}"), shape.clone(), values.clone())
+            }),
+        );
         let mut visits = gpu.read(&self.model.visit_counts)?;
         visits.truncate(self.model.count());
         let tensors =
@@ -179,8 +190,9 @@ impl Trainer {
     }
 
     /// Takes over the state that [`Trainer::save_checkpoint`] wrote: further steps give the bits that the run would have
-    /// had without the interruption. A run that is longer than it was going to be may differ in one thing: density control
-    /// would have acted once more near the old end.
+    /// had without the interruption. A run that is resumed with another number of steps takes them all; it may differ from
+    /// one that was to have them from its start, near the old end: there was no density control, and the model may have
+    /// settled.
     ///
     /// # Errors
     /// The file is missing, damaged or beyond the end of this run, or it was made with other settings; the trainer is
@@ -190,18 +202,23 @@ impl Trainer {
         let damaged =
             |problem: String| Error::input(path, format!("is no whole checkpoint ({problem})"));
         let file = TensorFile::of(&bytes).map_err(|error| damaged(error.to_string()))?;
-        let header = self.header_of(path, &file)?;
+        let (header, begun) = self.header_of(path, &file)?;
         let visits: Vec<u32> = values(&file, VISIT_COUNTS, Dtype::U32, None).map_err(damaged)?;
         let gpu = self.gpu.clone();
         let mut restored = self.model.zeros_like(&gpu, visits.len(), self.sh_degree_of(&file))?;
         gpu.write(&mut restored.visit_counts, &visits)?;
+        let best = best_of(&file).map_err(damaged)?;
         let fresh = std::mem::replace(&mut self.model, restored);
         if let Err(error) = self.read_state(&gpu, &file, &header, &damaged) {
             self.model = fresh;
             return Err(error);
         }
         self.views.set_left_out(&header.left_out);
-        (self.step, self.ends) = (header.step, header.ends);
+        (self.step, self.decisions, self.best) = (header.step, header.decisions, best);
+        self.decisions.goes_on |= begun.steps != self.config.steps;
+        if let Some(change) = begun.stop.change(&self.config.stop) {
+            tracing::warn!("{change}: it decides from step {} on", self.step);
+        }
         self.renderer.set_sh_degree(self.model.shape().sh_degree)?;
         self.reserve()
     }
@@ -217,8 +234,8 @@ impl Trainer {
         (0..=whole.sh_degree).find(fits).unwrap_or(self.model.shape().sh_degree)
     }
 
-    /// The header of a checkpoint that this run can go on from.
-    fn header_of(&self, path: &Path, file: &TensorFile<'_>) -> Result<Header> {
+    /// The header of a checkpoint that this run can go on from, and the settings in it.
+    fn header_of(&self, path: &Path, file: &TensorFile<'_>) -> Result<(Header, TrainConfig)> {
         let refused = |problem: String| Error::input(path, problem);
         let anew = "begin anew with `HeldRun::Replace`";
         let header = file.note(HEADER).and_then(|header| serde_json::from_str(header).ok());
@@ -251,7 +268,7 @@ impl Trainer {
                 "is at step {step}, this run ends at {steps}; raise `TrainConfig::steps`"
             )));
         }
-        Ok(header)
+        Ok((header, config))
     }
 
     /// Refuses Gaussians that hold NaN or infinity.
@@ -317,7 +334,7 @@ impl Trainer {
     }
 
     /// Everything that the next step depends on but the visit counts, which are integers.
-    fn state(&mut self) -> Vec<State<'_>> {
+    pub(super) fn state(&mut self) -> Vec<State<'_>> {
         let Model { gaussians, grad_norm_sums, .. } = &mut self.model;
         let batches = gaussians.batches(&self.gpu);
         let [of_parameters, of_moments] =
@@ -351,6 +368,17 @@ impl Trainer {
 
 fn first_not_finite(values: &[f32]) -> Option<usize> {
     values.par_iter().position_first(|value| !value.is_finite())
+}
+
+/// The best model that a checkpoint has.
+fn best_of(file: &TensorFile<'_>) -> std::result::Result<Snapshot, String> {
+    let of_best = |(name, _): &(String, &[u8])| name.starts_with(BEST);
+    let tensors = file.tensors().into_iter().filter(of_best).map(|(name, _)| {
+        let shape = file.tensor(&name).map_or(vec![], |(info, _)| info.shape.clone());
+        let values = values(file, &name, Dtype::F32, None)?;
+        Ok((name[BEST.len()..].to_owned(), shape, values))
+    });
+    tensors.collect()
 }
 
 /// What Adam works on, by the names of the tensors: the parameters, and then their moments.

@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::cache::CacheSize;
+use super::early_stopping::StopConfig;
 use super::exposures::{ExposureConfig, Learning};
-use super::held_out::StopConfig;
 use super::parts::ModelConfig;
 use super::precision::PrecisionConfig;
 use super::streams;
@@ -445,6 +445,12 @@ impl TrainConfig {
                 self.schedule.boost,
                 (1e-3..=1e3).contains(&self.schedule.boost),
                 "0.001 to 1000",
+            ),
+            (
+                "schedule.settle_rate",
+                self.schedule.settle_rate,
+                self.schedule.settle_rate > 0.0 && self.schedule.settle_rate <= 1.0,
+                "above 0 and at most 1",
             ),
         ];
         for (spec, rate) in ATTRIBUTES.iter().zip(schedule.initial_rates.0) {

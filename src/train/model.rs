@@ -17,7 +17,7 @@ impl Trainer {
     pub fn gradients(&self) -> Result<Gaussians> {
         let Model { gaussians, gradients, .. } = &self.model;
         let planes = gaussians.batches(&self.gpu).read(&self.gpu, gradients)?;
-        Ok(self.model.whole(planes))
+        Ok(self.model.host(planes))
     }
 }
 
@@ -67,6 +67,21 @@ impl Model {
         })
     }
 
+    /// The name of their parameters' tensor in a checkpoint.
+    pub(super) const PARAMETERS: &str = "gaussians.parameters";
+
+    /// The SH degree of Gaussians whose parameters take this number of words each.
+    pub(super) fn sh_degree_of_words(&self, words: usize) -> u32 {
+        let whole = self.whole_shape();
+        let of = |sh_degree| {
+            let columns = width(Shape { sh_degree, ..whole });
+            self.gaussians.rest.columns([columns, whole.features.width()])
+        };
+        (0..=whole.sh_degree)
+            .find(|&sh_degree| of(sh_degree) == words)
+            .unwrap_or(self.shape.sh_degree)
+    }
+
     /// As many others of the same make, to be overwritten.
     ///
     /// # Errors
@@ -83,14 +98,9 @@ impl Model {
         Shape { sh_degree: self.sh_degree, ..self.shape }
     }
 
-    /// Gaussians of that shape, of planes as they are on the device.
-    fn whole(&self, parameters: Vec<f32>) -> Gaussians {
-        let own = Gaussians { count: self.count(), shape: self.shape, parameters };
-        if self.shape.sh_degree == self.sh_degree {
-            own
-        } else {
-            own.with_sh_degree(self.sh_degree)
-        }
+    /// Gaussians of planes as they are on the device: with the SH degree that was in use so far.
+    fn host(&self, parameters: Vec<f32>) -> Gaussians {
+        Gaussians { count: self.count(), shape: self.shape, parameters }
     }
 
     /// Makes room for another SH degree; coefficients beyond it go, with what Adam keeps of them.
@@ -175,22 +185,24 @@ impl Model {
         })
     }
 
-    /// One round of density control; the statistics begin anew.
+    /// One round of density control, whose new parameters `keeps` agrees to ([`Densifier::densify`]); the statistics
+    /// begin anew.
     ///
     /// # Errors
-    /// The device is out of memory or lost.
+    /// Those of `keeps`, or the device is out of memory or lost.
     pub(super) fn densify(
         &mut self,
         gpu: &Gpu,
         densifier: &mut Densifier,
         round: Round,
+        keeps: impl FnMut(&Buffer<f32>, usize) -> Result<f64>,
     ) -> Result<DensifyReport> {
         let inputs = DensifyInputs {
             grad_norm_sums: &mut self.grad_norm_sums,
             visit_counts: &mut self.visit_counts,
             gradients: &mut self.gradients,
         };
-        let report = densifier.densify(&mut self.gaussians, inputs, round)?;
+        let report = densifier.densify(&mut self.gaussians, inputs, round, keeps)?;
         gpu.run("clear_statistics", |pass| {
             pass.fill(&mut self.grad_norm_sums, 0);
             pass.fill(&mut self.visit_counts, 0);
@@ -237,7 +249,7 @@ impl Model {
     /// # Errors
     /// The device was lost.
     pub(super) fn download(&self, gpu: &Gpu) -> Result<Gaussians> {
-        Ok(self.whole(self.gaussians.read(gpu)?))
+        Ok(self.host(self.gaussians.read(gpu)?))
     }
 }
 

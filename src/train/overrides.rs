@@ -66,7 +66,7 @@ impl TrainConfig {
     /// is scored and saved, on which device and by which tiles. A lower limit of the Gaussians is no difference either: a
     /// run that outgrows its machine goes on with what it has.
     pub fn difference(&self, other: &Self) -> Option<String> {
-        const ALSO: [&str; 4] = ["steps", "reference", "stop.every", "stop.gain"];
+        const ALSO: [&str; 5] = ["steps", "reference", "stop.every", "stop.gain", "stop.margin"];
         let tables = [self, other].map(Table::try_from);
         let [own, others] = match &tables {
             [Ok(own), Ok(others)] => [own, others].map(|table| settings("", table)),

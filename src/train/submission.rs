@@ -94,13 +94,23 @@ impl Trainer {
     fn train_stretch(&mut self, until: u64, reports: &mut Vec<StepReport>) -> Result<()> {
         // A run that goes on from where memory was out has that before it.
         self.control()?;
+        self.train_steps(until, reports)?;
+        self.control()
+    }
+
+    /// Trains up to `until`, to the next step after which something is due, or for about half a second.
+    pub(super) fn train_steps(&mut self, until: u64, reports: &mut Vec<StepReport>) -> Result<()> {
         self.make_room_for_degree()?;
         let (begin, mut next) = (Instant::now(), self.step + 1);
-        let until = until.min(self.config.steps);
+        let until = until.min(self.last_step());
         // Density control may change the number of Gaussians, and another SH degree their memory.
         let rises = |step| self.sh_degree(step + 1) > self.sh_degree(step);
-        let changes =
-            |&step: &u64| self.densifies_at(step) || rises(step) || self.decides_degree_at(step);
+        let changes = |&step: &u64| {
+            self.densifies_at(step)
+                || rises(step)
+                || self.decides_degree_at(step)
+                || self.scores_at(step)
+        };
         let last = (next..until).find(changes).unwrap_or(until);
         let (mut in_flight, mut sent) = (VecDeque::new(), Ok(()));
         loop {
@@ -122,24 +132,30 @@ impl Trainer {
                 break;
             }
         }
-        self.ends.degree_due = !reports.is_empty() && self.decides_degree_at(self.step);
+        self.decisions.score_due = !reports.is_empty() && self.scores_at(self.step);
+        self.decisions.degree_due = !reports.is_empty() && self.decides_degree_at(self.step);
         if !reports.is_empty() && self.densifies_at(self.step) {
             // Due whether or not there is memory to ask.
-            self.ends.density_due = Some(0);
-            self.ends.density_due = Some(self.renderer.intersections()?);
+            self.decisions.density_due = Some(0);
+            self.decisions.density_due = Some(self.renderer.intersections()?);
         }
-        sent?;
-        self.control()
+        sent
     }
 
     /// Does what is due behind the last step: each is done, or the model is as it was and it stays due.
-    fn control(&mut self) -> Result<()> {
-        if let Some(intersections) = self.ends.density_due {
+    pub(super) fn control(&mut self) -> Result<()> {
+        if self.decisions.score_due {
+            self.score_held_out()?;
+            self.decisions.score_due = false;
+            // A run that has just converged grows no more.
+            self.decisions.density_due.take_if(|_| self.decisions.converged == Some(self.step));
+        }
+        if let Some(intersections) = self.decisions.density_due {
             self.control_density(intersections)?;
         }
-        if self.ends.degree_due {
+        if self.decisions.degree_due {
             self.decide_degree()?;
-            self.ends.degree_due = false;
+            self.decisions.degree_due = false;
         }
         Ok(())
     }

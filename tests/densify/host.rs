@@ -1,14 +1,15 @@
 //! Gaussians in host memory, and what density control makes of them on the device and by its references.
 
-use glam::{DVec3, Vec3};
+use glam::{DAffine3, DVec2, DVec3, Vec3};
+use nightsplat::camera::{Camera, Patch};
 use nightsplat::densify::{
     Densifier, DensifyInputs, DensifyReport, DensifySettings, DensityControl, DeviceGaussians,
-    Round,
+    LARGEST_CHANGE, Round,
 };
-use nightsplat::gpu::{Gpu, Reference};
+use nightsplat::gpu::{Buffer, Gpu, Reference};
 use nightsplat::halves::Bits;
 use nightsplat::kernels::fate::{KEY_KEEP, KEY_PRUNE};
-use nightsplat::kernels::{densify_decide, densify_moments, densify_scatter, densify_score};
+use nightsplat::kernels::{self, densify_decide, densify_moments, densify_scatter, densify_score};
 use nightsplat::optimizer::Moments;
 
 /// Four features and SH of degree 1.
@@ -21,6 +22,7 @@ pub(super) const SETTINGS: DensifySettings = DensifySettings {
     split_scale: 0.05,
     min_opacity: 0.005,
     max_gaussians: usize::MAX,
+    near: 0.01,
     seed: 10,
 };
 pub(super) const CONSERVING: DensifySettings =
@@ -30,6 +32,17 @@ pub(super) const LAST: Round = Round { step: STEP, rounds_left: 1, most: usize::
 
 pub(super) fn room_for(gpu: &Gpu, count: usize) -> DeviceGaussians {
     DeviceGaussians::new(gpu, count, [COLUMNS, FEATURES], [Bits::Single; 2]).unwrap()
+}
+
+/// Of 64 x 48 pixels, at a position, looking along +z.
+pub(super) fn camera_at(position: DVec3) -> Camera {
+    Camera {
+        width: 64,
+        height: 48,
+        focal: DVec2::splat(60.0),
+        principal_point: DVec2::new(32.0, 24.0),
+        view_from_world: DAffine3::from_translation(-position),
+    }
 }
 
 /// Gaussians, their moments and their statistics in host memory.
@@ -116,10 +129,22 @@ impl Host {
 
     pub(super) fn densify_seen_from(
         &self,
-        cameras: &[DVec3],
+        cameras: &[Camera],
         gpu: &Gpu,
         settings: DensifySettings,
         round: Round,
+    ) -> (Self, DensifyReport) {
+        self.densify_as_kept(cameras, gpu, settings, round, |_| 1.0)
+    }
+
+    /// The same where `keeps` says of a number of Gaussians which share of the splits stays.
+    pub(super) fn densify_as_kept(
+        &self,
+        cameras: &[Camera],
+        gpu: &Gpu,
+        settings: DensifySettings,
+        round: Round,
+        mut keeps: impl FnMut(usize) -> f64,
     ) -> (Self, DensifyReport) {
         let planes = |data: &[f32]| gpu.buffer("planes", data).unwrap();
         let mut gaussians = room_for(gpu, self.count);
@@ -132,7 +157,11 @@ impl Host {
             gradients: &mut planes(&vec![f32::NAN; self.count * COLUMNS]),
         };
         let mut densifier = Densifier::new(gpu, settings, cameras).unwrap();
-        let report = densifier.densify(&mut gaussians, inputs, round).unwrap();
+        let keeps = |new: &Buffer<f32>, count: usize| {
+            assert!(new.len() >= count * COLUMNS);
+            Ok(keeps(count))
+        };
+        let report = densifier.densify(&mut gaussians, inputs, round, keeps).unwrap();
         assert_eq!(report.count, gaussians.count as usize);
         let Moments::Single { first, second } = &gaussians.moments else { panic!() };
         let read = |buffer| {
@@ -155,14 +184,14 @@ impl Host {
     /// The same by the references, with sort and prefix sums on the host.
     pub(super) fn reference(
         &self,
-        cameras: &[DVec3],
+        cameras: &[Camera],
         settings: DensifySettings,
         round: Round,
     ) -> Self {
         let conserving = settings.control == DensityControl::Conserving;
         let cameras = if conserving { cameras } else { &[] };
-        let cameras: Vec<f32> =
-            cameras.iter().flat_map(|camera| camera.as_vec3().to_array()).collect();
+        let cameras: Vec<kernels::Camera> =
+            cameras.iter().map(|camera| (&Patch::from(camera)).into()).collect();
         let n = self.count;
         let (gaussian_count, column_count, feature_count) =
             (n as u32, COLUMNS as u32, FEATURES as u32);
@@ -174,7 +203,9 @@ impl Host {
             gradient_threshold: settings.gradient_threshold as f32,
             min_raw_opacity: (settings.min_opacity / (1.0 - settings.min_opacity)).ln() as f32,
             first_gaussian: 0,
-            camera_count: cameras.len() as u32 / 3,
+            camera_count: cameras.len() as u32,
+            near: settings.near as f32,
+            largest_change: LARGEST_CHANGE,
         };
         let slices = densify_score::Slices {
             parameters: &self.parameters,
@@ -198,6 +229,7 @@ impl Host {
             max_gaussians: settings.max_gaussians.min(u32::MAX as usize) as u32,
             rounds_left: round.rounds_left as u32,
             split_log_scale: settings.split_scale.ln() as f32,
+            most_added: u32::MAX,
         };
         let slices = densify_decide::Slices {
             parameters: &self.parameters,

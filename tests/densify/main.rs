@@ -4,7 +4,7 @@
 
 mod host;
 
-use glam::{DAffine3, DVec2, DVec3, Quat, Vec3};
+use glam::{DVec3, Quat, Vec3};
 use nightsplat::camera::Camera;
 use nightsplat::densify::{
     Densifier, DensifyInputs, DensifyReport, DensifySettings, DensityControl, DeviceGaussians,
@@ -16,7 +16,7 @@ use nightsplat::optimizer::Moments;
 use nightsplat::render::{RenderOptions, RenderSettings, Renderer};
 use nightsplat::scene::{Features, Shape};
 
-use host::{COLUMNS, CONSERVING, FEATURES, Host, LAST, SETTINGS, room_for};
+use host::{COLUMNS, CONSERVING, FEATURES, Host, LAST, SETTINGS, camera_at, room_for};
 
 #[test]
 fn density_control_matches_its_references() {
@@ -26,7 +26,7 @@ fn density_control_matches_its_references() {
     let opaque = DensifySettings { min_opacity: 0.4, ..CONSERVING };
     let cases = [SETTINGS, CONSERVING, limited, opaque];
     let cases = cases.into_iter().flat_map(|s| sizes.map(|n| (s, n)));
-    let cameras = [DVec3::new(0.3, -0.2, 0.6), DVec3::new(-0.9, 0.4, -0.3)];
+    let cameras = [DVec3::new(0.3, -0.2, 0.6), DVec3::new(-0.9, 0.4, -0.3)].map(camera_at);
     for (settings, count) in cases {
         let before = Host::mixed(count);
         let round = Round { rounds_left: 3, ..LAST };
@@ -307,7 +307,10 @@ fn a_buffer_that_is_too_short_is_refused() {
             visit_counts: &mut gpu.zeros("visit_counts", len(4, 2)).unwrap(),
             gradients: &mut planes(6),
         };
-        let refused = densifier.densify(&mut gaussians, inputs, LAST).unwrap_err().to_string();
+        let refused = densifier
+            .densify(&mut gaussians, inputs, LAST, |_, _| Ok(1.0))
+            .unwrap_err()
+            .to_string();
         assert!(refused.contains(&why), "{short}: {refused}");
     }
 }
@@ -389,7 +392,7 @@ fn buffers_that_suffice_are_kept_and_others_grow_with_headroom() {
             visit_counts: &mut visit_counts,
             gradients: &mut gradients,
         };
-        let report = densifier.densify(&mut gaussians, inputs, LAST).unwrap();
+        let report = densifier.densify(&mut gaussians, inputs, LAST, |_, _| Ok(1.0)).unwrap();
         assert_eq!(report.count, count);
         let DeviceGaussians { parameters, moments, .. } = &gaussians;
         let Moments::Single { first, second } = moments else { panic!("{moments:?}") };
@@ -399,41 +402,76 @@ fn buffers_that_suffice_are_kept_and_others_grow_with_headroom() {
     }
 }
 
-/// A Gaussian before a camera at the origin, wide in depth.
-fn in_depth(width: f32) -> Host {
+#[test]
+fn a_round_that_is_refused_is_tried_again_with_fewer_splits_and_at_last_with_none() {
+    let gpu = gpu();
+    let mut before = Host::calm(100);
+    for (i, sum) in before.grad_norm_sums.iter_mut().enumerate() {
+        *sum = 0.1 + i as f32;
+    }
+    before.parameters[10 * 100] = -9.0;
+    let round = |keeps: &mut dyn FnMut(usize) -> f64| {
+        before.densify_as_kept(&[], &gpu, CONSERVING, LAST, keeps)
+    };
+    let mut tried = vec![];
+    let (after, report) = round(&mut |count| {
+        tried.push(count);
+        if count > 120 { 0.3 } else { 1.0 }
+    });
+    // 99 splits, three tenths of them, three tenths of these.
+    assert_eq!(tried, [198, 99 + 29, 99 + 8]);
+    assert_eq!((report.split, report.pruned, report.count), (8, 1, 107));
+    // What stays are the largest gradients, and what a refused trial wrote is gone.
+    let limited = DensifySettings { max_gaussians: 107, ..CONSERVING };
+    assert_eq!(after, before.densify(&gpu, limited, LAST).0);
+    let mut tried = 0;
+    let (_, report) = round(&mut |_| {
+        tried += 1;
+        0.9
+    });
+    assert_eq!((tried, report.split, report.pruned, report.count), (4, 0, 1, 99));
+}
+
+/// A Gaussian before a camera at the origin.
+fn in_depth(opacity: f32, scales: [f32; 3]) -> Host {
     let mut host = Host::calm(1);
     host.pull_at(0);
     host.parameters[..3].copy_from_slice(&[0.0, 0.0, 3.0]);
     host.quat_mut(0).copy_from_slice(&[1.0, 0.0, 0.0, 0.0]);
-    host.log_scales_mut(0).copy_from_slice(&[0.3f32.ln(), 0.3f32.ln(), width.ln()]);
+    host.log_scales_mut(0).copy_from_slice(&scales.map(f32::ln));
+    host.parameters[10] = (opacity / (1.0 - opacity)).ln();
     host
 }
 
 #[test]
-fn what_is_wide_for_how_near_a_camera_is_stays_whole() {
+fn a_gaussian_whose_halves_a_camera_would_see_otherwise_stays_whole() {
     let gpu = gpu();
-    for (width, split) in [(0.1, 1), (2.399, 1), (2.401, 0), (400.0, 0)] {
-        let before = in_depth(width);
-        let round = |settings, cameras: &[DVec3]| {
+    let cameras = [DVec3::new(90.0, 0.0, 0.0), DVec3::ZERO].map(camera_at);
+    for (opacity, scales, split) in [
+        // Wide in depth: by what it covers and how opaque it is.
+        (0.9, [0.3, 0.3, 1.0], 0),
+        (0.9, [0.01, 0.01, 1.0], 1),
+        (0.01, [0.3, 0.3, 1.0], 1),
+        (0.9, [0.3, 0.3, 400.0], 0),
+        // As wide across the view: its halves show what it showed.
+        (0.9, [1.0, 0.3, 0.3], 1),
+    ] {
+        let before = in_depth(opacity, scales);
+        let round = |settings, cameras: &[Camera]| {
             before.densify_seen_from(cameras, &gpu, settings, LAST).1.split
         };
-        let cameras = [DVec3::new(90.0, 0.0, 0.0), DVec3::ZERO];
-        assert_eq!(round(CONSERVING, &cameras), split, "{width}");
-        assert_eq!((round(CONSERVING, &[]), round(SETTINGS, &cameras)), (1, 1), "{width}");
+        assert_eq!(round(CONSERVING, &cameras), split, "{opacity} {scales:?}");
+        // The first camera has it far out of sight, unless it reaches everywhere.
+        assert_eq!(round(CONSERVING, &cameras[..1]), u32::from(scales[2] < 400.0) as usize);
+        assert_eq!((round(CONSERVING, &[]), round(SETTINGS, &cameras)), (1, 1));
     }
 }
 
-/// How far a round may be from conserving what a camera sees, and what it would be beyond that.
+/// What splits change at the most where the bound lets them pass, and what they would change beyond it.
 #[test]
-fn halves_that_stand_too_near_a_camera_would_change_its_view() {
+fn a_split_within_the_bound_changes_no_view_by_much() {
     let gpu = gpu();
-    let camera = Camera {
-        width: 64,
-        height: 48,
-        focal: DVec2::splat(60.0),
-        principal_point: DVec2::new(32.0, 24.0),
-        view_from_world: DAffine3::IDENTITY,
-    };
+    let camera = camera_at(DVec3::ZERO);
     let features = Features { depth: true, noise: true, ..Features::NONE };
     assert_eq!(features.width(), FEATURES);
     let shape = Shape { sh_degree: 1, features };
@@ -445,20 +483,30 @@ fn halves_that_stand_too_near_a_camera_would_change_its_view() {
         renderer.reserve(host.count, [&camera]).unwrap();
         renderer.render_image(&planes, &camera, &options).unwrap().data
     };
-    let mut lost = |width: f32, cameras: &[DVec3]| {
-        let before = in_depth(width);
-        let (after, _) = before.densify_seen_from(cameras, &gpu, CONSERVING, LAST);
-        let (before, after) = (image(&before), image(&after));
+    let mut mean_square = |before: &Host, cameras: &[Camera]| {
+        let (after, report) = before.densify_seen_from(cameras, &gpu, CONSERVING, LAST);
+        let (before, after) = (image(before), image(&after));
         let squares = before.iter().zip(&after).map(|(a, b)| f64::from(a - b).powi(2));
-        let power: f64 = before.iter().map(|value| f64::from(*value).powi(2)).sum();
-        (squares.sum::<f64>() / power).sqrt()
+        (report.split, squares.sum::<f64>() / before.len() as f64)
     };
-    // The difference in parts of the view: of halves by themselves, of the widest that are made, and what that keeps out.
-    for (width, least, most) in
-        [(0.3, 0.0, 0.1), (2.39, 0.4, 0.6), (3.0, 0.7, 1.0), (5.0, 2.0, 4.0)]
-    {
-        let lost = [lost(width, &[]), lost(width, &[DVec3::ZERO])];
-        assert!((least..most).contains(&lost[0]), "{width}: {}", lost[0]);
-        assert_eq!(lost[1], if width > 2.4 { 0.0 } else { lost[0] });
+    let (mut most_passed, mut most_refused) = (0.0_f64, 0.0_f64);
+    for opacity in [0.05, 0.3, 0.9] {
+        for across in [0.02_f32, 0.1, 0.5, 2.0] {
+            for depth in [0.5_f32, 1.0, 2.0, 4.0] {
+                let before =
+                    in_depth(opacity, [across.min(0.9 * depth), 0.7 * across.min(depth), depth]);
+                let (split, passed) = mean_square(&before, &[camera]);
+                let (_, unguarded) = mean_square(&before, &[]);
+                assert_eq!(passed, if split == 1 { unguarded } else { 0.0 });
+                if split == 1 {
+                    most_passed = most_passed.max(passed);
+                } else {
+                    most_refused = most_refused.max(unguarded);
+                }
+            }
+        }
     }
+    // 30 dB have a mean square of 1e-3; a tenth of a decibel is 2e-5 of it.
+    assert!(most_passed < 2e-4, "{most_passed}");
+    assert!(most_refused > 1e-2, "{most_refused}");
 }

@@ -1,7 +1,7 @@
-//! What ends by the scores of the held-out views: growth, and the rise of the SH degree.
+//! What the held-out views decide: when growth ends, how far the SH degree rises, and when the run has converged.
 //!
-//! Both are decided where the model changes anyway, at a round of density control and where the degree would rise, from what
-//! the model shows then: the same run decides the same, and a checkpoint holds what was decided and from what.
+//! Each is decided at a step that is known beforehand, from what the model shows then: the same run decides the same, and
+//! a checkpoint holds what was decided and from what.
 
 use serde::{Deserialize, Serialize};
 
@@ -15,29 +15,49 @@ const PATIENCE: usize = 4;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 struct Round {
     step: u64,
-    /// The score of the held-out views, in thousandths of a dB: whole numbers survive every file.
+    /// Of the held-out views, in thousandths of a dB: whole numbers survive every file.
     score: i64,
     gaussians: usize,
+}
+
+/// The score of the held-out views after a step.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) struct Score {
+    pub(super) step: u64,
+    /// Their mean PSNR in thousandths of a dB.
+    pub(super) score: i64,
 }
 
 /// What was decided, and from what.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default)]
-pub(super) struct Ends {
+pub(super) struct Decisions {
     rounds: Vec<Round>,
-    /// As many Gaussians there were when growth ended.
+    /// The number of Gaussians when growth ended.
     gaussians: Option<usize>,
     /// The highest degree that paid.
     pub(super) sh_degree: Option<u32>,
-    /// The intersections of the last step, where density control is due behind it and could not be done.
+    /// Every score of the held-out views so far.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub(super) scores: Vec<Score>,
+    /// The step at which the run had converged: it settles from there, and ends.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) converged: Option<u64>,
+    /// The run was resumed with another number of steps: it takes them all.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub(super) goes_on: bool,
+    /// The held-out views are due to be scored, which could not be done yet.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub(super) score_due: bool,
+    /// The intersections of the last step, where a round of density control is due that could not be done yet.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) density_due: Option<u32>,
-    /// Where it is due to decide if the SH degree in use has paid, and could not be done.
+    /// Where it is due to decide if the SH degree in use has paid, and could not be done yet.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub(super) degree_due: bool,
 }
 
-impl Ends {
+impl Decisions {
     /// Whether growth has ended at the last round, where each doubling of the Gaussians has to gain so many dB.
     fn gains_too_little(&self, growth_gain: f64) -> bool {
         let Some(before) = self.rounds.len().checked_sub(PATIENCE) else { return false };
@@ -55,8 +75,13 @@ impl Ends {
 impl Trainer {
     /// The SH degree that a step trains.
     pub(super) fn sh_degree(&self, step: u64) -> u32 {
-        let highest = self.ends.sh_degree.unwrap_or(self.config.sh_degree);
+        let highest = self.decisions.sh_degree.unwrap_or(self.config.sh_degree);
         self.config.schedule.sh_degree(step, highest)
+    }
+
+    /// The SH degree of what the model shows.
+    pub(super) fn sh_degree_in_use(&self) -> u32 {
+        self.sh_degree(self.step).min(self.model.shape().sh_degree)
     }
 
     /// Makes room for the SH degree of the next step.
@@ -85,19 +110,19 @@ impl Trainer {
         let growth_gain = self.config.stop.growth_gain;
         let [_, whole] = self.config.schedule.resolution_steps;
         // What was scored before the memory was out is not scored twice.
-        let is_scored = self.ends.rounds.last().is_some_and(|round| round.step == self.step);
-        if growth_gain > 0.0 && self.ends.gaussians.is_none() && self.step >= whole {
+        let is_scored = self.decisions.rounds.last().is_some_and(|round| round.step == self.step);
+        if growth_gain > 0.0 && self.decisions.gaussians.is_none() && self.step >= whole {
             let psnr = if is_scored { None } else { self.held_out_psnr()? };
             if let Some(psnr) = psnr {
                 let (step, gaussians) = (self.step, self.model.count());
-                self.ends.rounds.push(Round {
+                self.decisions.rounds.push(Round {
                     step,
                     score: (1e3 * psnr).round() as i64,
                     gaussians,
                 });
             }
-            if self.ends.gains_too_little(growth_gain) {
-                self.ends.gaussians = Some(self.model.count());
+            if self.decisions.gains_too_little(growth_gain) {
+                self.decisions.gaussians = Some(self.model.count());
                 tracing::info!(
                     "step {}: growth ends at {} Gaussians: {PATIENCE} rounds gained less on the held-out views than \
                      {growth_gain} dB for each doubling",
@@ -106,7 +131,7 @@ impl Trainer {
                 );
             }
         }
-        Ok(self.ends.gaussians.unwrap_or(usize::MAX))
+        Ok(self.decisions.gaussians.unwrap_or(usize::MAX))
     }
 
     /// Whether it is decided after this step if the SH degree in use has paid: the next step would raise it, or would if
@@ -114,7 +139,7 @@ impl Trainer {
     pub(super) fn decides_degree_at(&self, step: u64) -> bool {
         let interval = self.config.schedule.sh_degree_interval.max(1);
         self.config.stop.degree_gain > 0.0
-            && self.ends.sh_degree.is_none()
+            && self.decisions.sh_degree.is_none()
             && (step + 1).is_multiple_of(interval)
             && step < self.config.steps
             && self.config.schedule.sh_degree(step, self.config.sh_degree) > 0
@@ -141,7 +166,7 @@ impl Trainer {
             degree - 1
         );
         self.set_sh_degree(degree - 1)?;
-        self.ends.sh_degree = Some(degree - 1);
+        self.decisions.sh_degree = Some(degree - 1);
         Ok(())
     }
 }
@@ -150,25 +175,25 @@ impl Trainer {
 mod tests {
     use super::*;
 
-    fn ends(rounds: &[(i64, usize)]) -> Ends {
+    fn decisions(rounds: &[(i64, usize)]) -> Decisions {
         let round = |(i, &(score, gaussians)): (usize, &(i64, usize))| Round {
             step: 100 * i as u64,
             score,
             gaussians,
         };
-        Ends { rounds: rounds.iter().enumerate().map(round).collect(), ..Ends::default() }
+        Decisions { rounds: rounds.iter().enumerate().map(round).collect(), ..Decisions::default() }
     }
 
     #[test]
     fn growth_ends_once_four_rounds_gain_too_little_for_what_they_add() {
         let grown = [(20_000, 100), (20_100, 150), (20_150, 200), (20_180, 300), (20_190, 400)];
         // .19 dB for two doublings.
-        assert!(ends(&grown).gains_too_little(0.1));
-        assert!(!ends(&grown).gains_too_little(0.09));
-        assert!(!ends(&grown[..4]).gains_too_little(0.1));
+        assert!(decisions(&grown).gains_too_little(0.1));
+        assert!(!decisions(&grown).gains_too_little(0.09));
+        assert!(!decisions(&grown[..4]).gains_too_little(0.1));
         let fallen = [(20_000, 100), (20_900, 120), (19_000, 140), (19_000, 150), (19_500, 160)];
-        assert!(!ends(&fallen).gains_too_little(0.5), "the best round counts");
+        assert!(!decisions(&fallen).gains_too_little(0.5), "the best round counts");
         let full = [(20_000, 100); 5];
-        assert!(!ends(&full).gains_too_little(0.5), "what does not grow need not gain");
+        assert!(!decisions(&full).gains_too_little(0.5), "what does not grow need not gain");
     }
 }

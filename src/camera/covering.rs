@@ -1,0 +1,118 @@
+//! A choice of views that covers where the cameras of a scene stand and look.
+
+use super::Camera;
+
+/// Where a camera stands, and where it looks.
+type Place = [f64; 6];
+
+impl Camera {
+    /// The indices of `count` cameras, or of all if there are fewer, in ascending order, that cover where they stand and look.
+    ///
+    /// The cameras are divided into that many groups of about one size: again and again in two, across the direction in
+    /// which a group differs most. Of each group the camera nearest to its mean is picked. Positions count in units of their
+    /// standard deviation, directions as unit vectors.
+    pub fn covering(cameras: &[Self], count: usize) -> Vec<usize> {
+        let places = places(cameras);
+        let mut picked = vec![];
+        pick(&places, (0..cameras.len()).collect(), count.min(cameras.len()), &mut picked);
+        picked.sort_unstable();
+        picked
+    }
+}
+
+fn places(cameras: &[Camera]) -> Vec<Place> {
+    let centers: Vec<_> = cameras.iter().map(Camera::center).collect();
+    let middle = centers.iter().sum::<glam::DVec3>() / centers.len().max(1) as f64;
+    let squares: f64 = centers.iter().map(|center| center.distance_squared(middle)).sum();
+    let deviation = (squares / centers.len().max(1) as f64).sqrt();
+    let scale = if deviation > 0.0 { 1.0 / deviation } else { 0.0 };
+    let place = |(camera, center): (&Camera, &glam::DVec3)| {
+        let [x, y, z] = (scale * (*center - middle)).to_array();
+        let [u, v, w] = camera.view_from_world.matrix3.row(2).to_array();
+        [x, y, z, u, v, w]
+    };
+    cameras.iter().zip(&centers).map(place).collect()
+}
+
+/// Picks `count` of a group.
+fn pick(places: &[Place], mut group: Vec<usize>, count: usize, picked: &mut Vec<usize>) {
+    match count {
+        0 => {}
+        1 => picked.extend(nearest_to_mean(places, &group)),
+        _ => {
+            let axis = widest_axis(places, &group);
+            group.sort_by(|&a, &b| places[a][axis].total_cmp(&places[b][axis]).then(a.cmp(&b)));
+            let first = count / 2;
+            let rest = group.split_off(group.len() * first / count);
+            pick(places, group, first, picked);
+            pick(places, rest, count - first, picked);
+        }
+    }
+}
+
+fn mean(places: &[Place], group: &[usize], axis: usize) -> f64 {
+    group.iter().map(|&i| places[i][axis]).sum::<f64>() / group.len().max(1) as f64
+}
+
+fn widest_axis(places: &[Place], group: &[usize]) -> usize {
+    let variance = |axis: usize| {
+        let mean = mean(places, group, axis);
+        group.iter().map(|&i| (places[i][axis] - mean).powi(2)).sum::<f64>()
+    };
+    let axes = (0..6).map(|axis| (axis, variance(axis)));
+    axes.reduce(|best, next| if next.1 > best.1 { next } else { best }).map_or(0, |(axis, _)| axis)
+}
+
+fn nearest_to_mean(places: &[Place], group: &[usize]) -> Option<usize> {
+    let means: Place = std::array::from_fn(|axis| mean(places, group, axis));
+    let distance = |i: usize| -> f64 {
+        places[i].iter().zip(means).map(|(own, mean)| (own - mean).powi(2)).sum()
+    };
+    group.iter().copied().min_by(|&a, &b| distance(a).total_cmp(&distance(b)).then(a.cmp(&b)))
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::{DAffine3, DMat3, DVec2, DVec3};
+
+    use super::*;
+
+    fn camera(position: DVec3, turn: f64) -> Camera {
+        let rotation = DMat3::from_rotation_y(turn);
+        let view_from_world = DAffine3::from_mat3_translation(rotation, -(rotation * position));
+        let (focal, principal_point) = (DVec2::splat(10.0), DVec2::splat(5.0));
+        Camera { width: 10, height: 10, focal, principal_point, view_from_world }
+    }
+
+    #[test]
+    fn a_path_is_covered_from_one_end_to_the_other_whatever_the_order_of_its_views() {
+        let steps: Vec<usize> = (0..32).map(|i| i * 13 % 32).collect();
+        let cameras: Vec<Camera> =
+            steps.iter().map(|&step| camera(DVec3::X * step as f64, 0.0)).collect();
+        let mut picked: Vec<usize> =
+            Camera::covering(&cameras, 4).into_iter().map(|i| steps[i]).collect();
+        picked.sort_unstable();
+        for (picked, middle) in picked.iter().zip([3.5, 11.5, 19.5, 27.5]) {
+            assert!((*picked as f64 - middle).abs() < 1.0, "{picked} for {middle}");
+        }
+    }
+
+    #[test]
+    fn cameras_in_one_place_are_told_apart_by_where_they_look() {
+        let cameras: Vec<Camera> =
+            (0..16).map(|i| camera(DVec3::ZERO, 0.1 * f64::from(i))).collect();
+        let picked = Camera::covering(&cameras, 2);
+        assert!(picked[0] < 8 && picked[1] >= 8, "{picked:?}");
+    }
+
+    #[test]
+    fn no_camera_is_picked_twice_and_none_beyond_those_there_are() {
+        let cameras = vec![camera(DVec3::ONE, 0.0); 5];
+        for (count, picked) in [(0, 0), (1, 1), (3, 3), (5, 5), (9, 5)] {
+            let mut own = Camera::covering(&cameras, count);
+            own.dedup();
+            assert_eq!(own.len(), picked, "{count}");
+        }
+        assert!(Camera::covering(&[], 3).is_empty());
+    }
+}

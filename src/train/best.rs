@@ -1,0 +1,52 @@
+//! The best model of a run so far, kept on the host: a run that ends worse goes back to it.
+
+use super::Trainer;
+use super::model::Model;
+use crate::Result;
+
+/// A tensor of a checkpoint: its name, its shape and its values.
+pub(super) type Tensor = (String, Vec<usize>, Vec<f32>);
+
+/// What a model shows, without what training needs to go on: the parameters of the Gaussians and of what else is learned, as
+/// a checkpoint has them.
+pub(super) type Snapshot = Vec<Tensor>;
+
+/// Whether a tensor of a checkpoint is one of those.
+fn is_parameters(name: &str) -> bool {
+    name.ends_with(".parameters")
+}
+
+impl Trainer {
+    /// The model as it is now.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub(super) fn snapshot(&mut self) -> Result<Snapshot> {
+        let gpu = self.gpu.clone();
+        let state = self.state().into_iter().filter(|state| is_parameters(&state.name));
+        let tensors = state.map(|state| {
+            let values = state.read(&gpu)?;
+            Ok((state.name, state.shape, values))
+        });
+        tensors.collect()
+    }
+
+    /// Makes the model what it was; moments and statistics are gone.
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub(super) fn restore_snapshot(&mut self, snapshot: &Snapshot) -> Result<()> {
+        let gpu = self.gpu.clone();
+        let shape = |(name, shape, _): &Tensor| (name == Model::PARAMETERS).then(|| shape.clone());
+        if let Some([words, count]) = snapshot.iter().find_map(shape).as_deref() {
+            let sh_degree = self.model.sh_degree_of_words(*words);
+            self.model = self.model.zeros_like(&gpu, *count, sh_degree)?;
+            self.renderer.set_sh_degree(self.model.shape().sh_degree)?;
+        }
+        for state in self.state() {
+            let kept = snapshot.iter().find(|(name, _, _)| *name == state.name);
+            kept.map_or(Ok(()), |(_, _, values)| state.write(&gpu, values))?;
+        }
+        self.reserve()
+    }
+}

@@ -1,0 +1,318 @@
+//! Early stopping: a run whose held-out views gain nothing any more settles and ends, and keeps its best model.
+//!
+//! ```text
+//! growth -> converged, or the last steps begin -> settling: no density control, learning rates decay -> end
+//! ```
+//!
+//! The scores go up and down with the views seen last, and with every round of density control. So they are never taken
+//! right after a round, and a run never ends where it converged: its last steps are for the parameters to settle.
+
+use serde::{Deserialize, Serialize};
+
+use super::decisions::Score;
+use super::{TrainConfig, Trainer};
+use crate::{Error, Result};
+
+/// Steps after a round of density control in which the held-out views are not scored: the model has settled by then.
+const SETTLING_DISTANCE: u64 = 50;
+
+/// When a run, or a part of it, ends before its last step. Scores are against targets, never against references.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct StopConfig {
+    /// The number of training views that are held out, an eighth of them at most; 0: none, and no run ends early.
+    pub views: usize,
+    /// The steps from one score of theirs to the next. A score that falls within 50 steps after a round of density control
+    /// is taken at the end of these.
+    pub every: u64,
+    /// dB. Once two scores in a row do not exceed the best before by this much, the run has converged: it settles
+    /// ([`crate::optimizer::Schedule::settle_steps`]) and ends.
+    pub gain: f64,
+    /// dB. A run that ends worse than its best score by more than this keeps the model of that score.
+    pub margin: f64,
+    /// dB. Growth ends once four rounds of density control gain less than this for each doubling of the Gaussians; 0: it
+    /// goes on to its last step.
+    pub growth_gain: f64,
+    /// What is done about a view whose loss or gradient is not finite.
+    #[serde(skip_serializing_if = "NotFinite::is_stop")]
+    pub not_finite: NotFinite,
+    /// dB. The SH degree rises no further, and falls back, once the one in use gains less than this; 0: it always rises.
+    pub degree_gain: f64,
+}
+
+/// What is done about a view whose loss or gradient is NaN or infinite. The step that finds it changes nothing, either way.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum NotFinite {
+    /// The run ends with an error that names step, view and term.
+    #[default]
+    Stop,
+    /// The view is trained on no more.
+    SkipView,
+}
+
+impl NotFinite {
+    #[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes a reference")]
+    fn is_stop(&self) -> bool {
+        *self == Self::Stop
+    }
+}
+
+impl Default for StopConfig {
+    fn default() -> Self {
+        Self {
+            views: 0,
+            every: 250,
+            gain: 0.05,
+            margin: 0.1,
+            growth_gain: 0.0,
+            not_finite: NotFinite::Stop,
+            degree_gain: 0.0,
+        }
+    }
+}
+
+impl StopConfig {
+    /// Whether a run with these scores, in order, has converged.
+    pub fn has_converged(&self, scores: &[f64]) -> bool {
+        const PATIENCE: usize = 2;
+        let Some(before) = scores.len().checked_sub(PATIENCE).filter(|&before| before > 0) else {
+            return false;
+        };
+        let best = |of: &[f64]| of.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        best(&scores[before..]) < best(&scores[..before]) + self.gain
+    }
+
+    /// What is decided by otherwise with `other`, of the settings that a resumed run may have changed.
+    pub(super) fn change(&self, other: &Self) -> Option<String> {
+        let settings = [
+            ("every", self.every as f64, other.every as f64),
+            ("gain", self.gain, other.gain),
+            ("margin", self.margin, other.margin),
+        ];
+        let changed = settings.into_iter().find(|(_, before, now)| before != now);
+        changed.map(|(name, before, now)| format!("stop.{name} was {before} and is {now}"))
+    }
+
+    /// # Errors
+    /// [`Error::Usage`] names a value that makes no sense.
+    pub(super) fn check(&self) -> Result<()> {
+        let gain = |name, gain: f64| (name, gain, gain.is_finite() && gain >= 0.0, "0 or more");
+        let rules = [
+            ("stop.every", self.every as f64, self.every >= 1, "at least 1"),
+            gain("stop.gain", self.gain),
+            gain("stop.margin", self.margin),
+            gain("stop.growth_gain", self.growth_gain),
+            gain("stop.degree_gain", self.degree_gain),
+        ];
+        match rules.into_iter().find(|(_, _, holds, _)| !holds) {
+            Some((name, value, _, rule)) => {
+                Err(Error::Usage(format!("{name} is {value}; it must be {rule}")))
+            }
+            None => Ok(()),
+        }
+    }
+}
+
+/// Why a run has ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum EndReason {
+    /// The held-out views gained nothing any more.
+    Converged,
+    /// Its steps are done.
+    Steps,
+}
+
+/// How a run has ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Ended {
+    /// Why.
+    pub reason: EndReason,
+    /// Its last step.
+    pub step: u64,
+    /// The step whose model is kept: the last, unless the held-out views scored higher before.
+    pub best_step: u64,
+}
+
+impl std::fmt::Display for Ended {
+    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { reason, step, best_step } = self;
+        let why = match reason {
+            EndReason::Converged => "the held-out views have converged",
+            EndReason::Steps => "all steps are done",
+        };
+        write!(out, "ended at step {step}: {why}")?;
+        if best_step == step {
+            Ok(())
+        } else {
+            write!(out, "; the model of step {best_step} is kept")
+        }
+    }
+}
+
+impl TrainConfig {
+    /// The length of the settling phase: that of the schedule, or a third of a run that is short for it.
+    pub fn settling_steps(&self) -> u64 {
+        self.schedule.settle_steps.min(self.steps / 3)
+    }
+
+    /// Warns of an early end that was asked for and cannot come, and of a settling phase that is cut short.
+    pub(super) fn say_what_cannot_end_early(&self, scores_nothing: bool, views: usize) {
+        let (asked, settling, steps) = (self.stop.views, self.schedule.settle_steps, self.steps);
+        if asked > 0 && scores_nothing {
+            tracing::warn!(
+                "no view is held out of {views} training views, one for each 8 that show something: the run takes all its {steps} steps"
+            );
+        }
+        let own = self.settling_steps();
+        if own < settling {
+            tracing::warn!(
+                "the model settles in the last {own} of {steps} steps: schedule.settle_steps = {settling} is more than a third of them"
+            );
+        }
+    }
+}
+
+impl Trainer {
+    /// The step that ends the run, as far as that is known now: fewer than its steps once it has converged.
+    pub fn last_step(&self) -> u64 {
+        let early = self.converged().map(|converged| converged + self.config.settling_steps());
+        early.map_or(self.config.steps, |early| early.min(self.config.steps))
+    }
+
+    /// The step at which the run has converged, if it ends for that.
+    fn converged(&self) -> Option<u64> {
+        self.decisions.converged.filter(|_| !self.decisions.goes_on)
+    }
+
+    /// Whether the last step is done.
+    pub fn has_ended(&self) -> bool {
+        self.step >= self.last_step()
+    }
+
+    /// Whether the run may end before its last step.
+    pub fn may_end_early(&self) -> bool {
+        let is_open = self.converged().is_none() && !self.decisions.goes_on;
+        is_open && self.step < self.settles_after() && !self.held_out.is_empty()
+    }
+
+    /// The step after which the model settles: there is no density control any more, and learning rates decay.
+    pub fn settles_after(&self) -> u64 {
+        let planned = self.config.steps - self.config.settling_steps();
+        self.converged().map_or(planned, |converged| converged.min(planned))
+    }
+
+    /// What all learning rates of a step are multiplied by.
+    pub(super) fn settling_rate(&self, step: u64) -> f64 {
+        let (length, since) =
+            (self.config.settling_steps(), step.saturating_sub(self.settles_after()));
+        if length == 0 {
+            1.0
+        } else {
+            self.config.schedule.settling_rate(since as f64 / length as f64)
+        }
+    }
+
+    /// The scores of the held-out views so far: step, PSNR in dB.
+    pub fn held_out_scores(&self) -> impl DoubleEndedIterator<Item = (u64, f64)> {
+        self.decisions.scores.iter().map(|score| (score.step, score.score as f64 / 1e3))
+    }
+
+    /// Whether the held-out views are scored after this step: at the end, and every few steps but not right after a round
+    /// of density control.
+    pub(super) fn scores_at(&self, step: u64) -> bool {
+        if self.held_out.is_empty() {
+            return false;
+        }
+        let due = step - step % self.config.stop.every;
+        let is_first = due > 0 && (due..step).all(|earlier| self.is_unsettled(earlier));
+        step == self.last_step() || is_first && !self.is_unsettled(step)
+    }
+
+    /// Whether a round of density control was so near before this step that a score would show that.
+    fn is_unsettled(&self, step: u64) -> bool {
+        let interval = self.config.schedule.densify_interval.max(1);
+        let round = (step - 1) / interval * interval;
+        step > 1 && self.densifies_at(round) && step - round < SETTLING_DISTANCE.min(interval)
+    }
+
+    /// Scores the held-out views, keeps the model if it is the best so far, and decides whether the run has converged.
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub(super) fn score_held_out(&mut self) -> Result<()> {
+        let Some(psnr) = self.held_out_psnr()? else { return Ok(()) };
+        let [_, whole] = self.config.schedule.resolution_steps;
+        let score = Score { step: self.step, score: (1e3 * psnr).round() as i64 };
+        let is_best = self.best_score().is_none_or(|best| score.score > best.score);
+        if is_best && self.step >= whole {
+            self.best = self.snapshot()?;
+        }
+        self.decisions.scores.push(score);
+        let scores: Vec<f64> = self
+            .held_out_scores()
+            .filter(|(step, _)| *step >= whole)
+            .map(|(_, psnr)| psnr)
+            .collect();
+        if self.may_end_early() && self.config.stop.has_converged(&scores) {
+            self.decisions.converged = Some(self.step);
+            tracing::info!(
+                "step {}: the held-out views have converged; the run ends at step {}",
+                self.step,
+                self.last_step()
+            );
+        }
+        Ok(())
+    }
+
+    /// The best score since views have their full size, the first of equals: that of [`Trainer::best`].
+    fn best_score(&self) -> Option<Score> {
+        let [_, whole] = self.config.schedule.resolution_steps;
+        let scores = self.decisions.scores.iter().filter(|score| score.step >= whole);
+        scores.copied().reduce(|best, next| if next.score > best.score { next } else { best })
+    }
+
+    /// How the run has ended, with the best of its models: where the held-out views score lower at the end than before by
+    /// more than [`StopConfig::margin`], the model of the best score is restored. No steps follow: a run that is to go on
+    /// from its end goes on from a checkpoint that was saved before.
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub fn end(&mut self) -> Result<Ended> {
+        if std::mem::take(&mut self.decisions.score_due) {
+            self.score_held_out()?;
+        }
+        let step = self.step;
+        let reason = self.converged().map_or(EndReason::Steps, |_| EndReason::Converged);
+        let last = self.decisions.scores.last().filter(|last| last.step == step);
+        let lost = |best: &Score| last.map_or(0.0, |last| (best.score - last.score) as f64 / 1e3);
+        let better = self.best_score().filter(|best| lost(best) > self.config.stop.margin);
+        let best = std::mem::take(&mut self.best);
+        if better.is_some() {
+            self.restore_snapshot(&best)?;
+        }
+        Ok(Ended { reason, step, best_step: better.map_or(step, |better| better.step) })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_run_ends_once_two_scores_in_a_row_gain_too_little() {
+        let stop = StopConfig { gain: 0.05, ..StopConfig::default() };
+        for (scores, ends) in [
+            (&[][..], false),
+            (&[20.0, 20.0], false),
+            (&[20.0, 20.02, 20.04], true),
+            (&[20.0, 19.0, 20.06], false),
+            (&[20.0, 20.5, 20.5, 20.5], true),
+            (&[20.0, 21.0, 20.0, 20.9], true),
+            (&[20.0, 20.1, 20.2, 20.3, 20.4], false),
+        ] {
+            assert_eq!(stop.has_converged(scores), ends, "{scores:?}");
+        }
+    }
+}

@@ -1,0 +1,257 @@
+//! Views that the model is scored on against their targets: those held out from training, and probes among those trained on.
+
+use glam::DVec2;
+
+use super::Trainer;
+use super::terms::NetworkTerms;
+use super::views::{lifted_from, measured};
+use crate::Result;
+use crate::camera::{Camera, Frame};
+use crate::dataset::{Dataset, View};
+use crate::exposure::{Affine, Exposures};
+use crate::gpu::Gpu;
+use crate::image::{Image, Mask};
+use crate::metrics::psnr_of_counted;
+use crate::pseudo_gt::PseudoGt;
+use crate::tone::{Scene, ToneSettings};
+
+use super::rendered::Rendered;
+
+/// Views with their targets.
+#[derive(Debug, Default)]
+pub(super) struct TargetViews(Vec<TargetView>);
+
+/// A view in the frame, and what it is to show where no mask hides it.
+#[derive(Debug)]
+struct TargetView {
+    camera: Camera,
+    target: Image,
+    mask: Option<Mask>,
+    /// Of the training photograph whose learned exposure the target has; `None` for the neutral exposure.
+    place: Option<usize>,
+}
+
+impl TargetViews {
+    /// The views that show something, with their targets, made as those of training views are. A view that is black or
+    /// masked entirely says nothing of a model: it is left out, with a warning.
+    ///
+    /// # Errors
+    /// A photograph can no longer be read, or the device is out of memory or lost.
+    pub(super) fn new<'a>(
+        pseudo_gt: &mut PseudoGt,
+        views: impl IntoIterator<Item = &'a View>,
+        frame: &Frame,
+        scene: &Scene,
+    ) -> Result<Self> {
+        let mut shown = vec![];
+        for view in views {
+            let Some(target) = target(pseudo_gt, view, scene)? else { continue };
+            if shows_nothing(&target, view.mask.as_ref()) {
+                let name = &view.name;
+                tracing::warn!(
+                    "view {name} is black or masked entirely: the model is not scored on it"
+                );
+                continue;
+            }
+            let (camera, mask) = (frame.camera(&view.camera), view.mask.clone());
+            shown.push(TargetView { camera, target, mask, place: None });
+        }
+        Ok(Self(shown))
+    }
+
+    /// `count` training views that cover the cameras, for a look at what a change costs. Views with more than `pixels` are
+    /// resized to about that.
+    ///
+    /// # Errors
+    /// As [`TargetViews::new`].
+    pub(super) fn probes(
+        pseudo_gt: &mut PseudoGt,
+        dataset: &Dataset,
+        frame: &Frame,
+        scene: &Scene,
+        [count, pixels]: [usize; 2],
+    ) -> Result<Self> {
+        let views: Vec<&View> =
+            dataset.train_views().filter(|view| view.has_photograph()).collect();
+        let cameras: Vec<Camera> = views.iter().map(|view| view.camera).collect();
+        let mut probes = vec![];
+        for place in Camera::covering(&cameras, count) {
+            let Self(of_view) = Self::new(pseudo_gt, [views[place]], frame, scene)?;
+            probes.extend(
+                of_view
+                    .into_iter()
+                    .map(|view| TargetView { place: Some(place), ..view.shrunk(pixels) }),
+            );
+        }
+        Ok(Self(probes))
+    }
+
+    /// The mean PSNR, dB, of the colours and of the output of what `render` shows of each camera; `None` if there is no
+    /// view. `affines` are the exposures of the training photographs.
+    ///
+    /// # Errors
+    /// Those of `render`.
+    pub(super) fn mean_psnr(
+        &self,
+        affines: &[Affine],
+        mut render: impl FnMut(&Camera) -> Result<Rendered>,
+    ) -> Result<Option<[f64; 2]>> {
+        let mut sums = [0.0; 2];
+        for TargetView { camera, target, mask, place } in &self.0 {
+            let exposure = place.and_then(|place| affines.get(place));
+            let neutral = exposure.map(|own| own.inverse().applied(target));
+            let target = neutral.as_ref().unwrap_or(target);
+            let rendered = render(camera)?;
+            for (sum, image) in sums.iter_mut().zip([&rendered.colors, rendered.output()]) {
+                *sum += psnr_of_counted(&clamped(image), target, mask.as_ref())?;
+            }
+        }
+        Ok((!self.0.is_empty()).then(|| sums.map(|sum| sum / self.0.len() as f64)))
+    }
+
+    pub(super) fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+}
+
+impl TargetView {
+    /// The same with about so many pixels, if it has more.
+    fn shrunk(self, pixels: usize) -> Self {
+        let size = DVec2::new(self.camera.width.into(), self.camera.height.into());
+        let scale = (pixels as f64 / size.element_product()).sqrt().min(1.0);
+        let [width, height] =
+            (scale * size).round().max(DVec2::ONE).to_array().map(|side| side as u32);
+        let (camera, target) =
+            (self.camera.resized(width, height), self.target.resized(width, height));
+        Self { camera, target, ..self }
+    }
+}
+
+/// Whether no pixel that counts reaches half a code value of 8 bits.
+fn shows_nothing(target: &Image, mask: Option<&Mask>) -> bool {
+    let is_dark = |value: &f32| !(*value > 0.5 / 255.0);
+    match mask {
+        Some(mask) => mask.counted(target).iter().all(is_dark),
+        None => target.data.iter().all(is_dark),
+    }
+}
+
+fn clamped(image: &Image) -> Image {
+    let data = image.data.iter().map(|value| value.clamp(0.0, 1.0)).collect();
+    Image { data, ..*image }
+}
+
+/// The target of a view, made as those of the training views are; none without a photograph.
+fn target(pseudo_gt: &mut PseudoGt, view: &View, scene: &Scene) -> Result<Option<Image>> {
+    let settings = pseudo_gt.settings().clone();
+    let Some(photograph) = lifted_from(view, settings.lift_first)? else { return Ok(None) };
+    let lift = settings.lift(scene, &pseudo_gt.measure(&view.counted(&photograph))?);
+    let target = pseudo_gt.lifted(&photograph, &lift)?;
+    Ok(Some(target.resized(view.camera.width, view.camera.height)))
+}
+
+/// The targets that the test views would have were they trained on: what `tone` makes of their photographs in the scene of
+/// the training photographs.
+#[derive(Debug)]
+pub struct TestTargets {
+    pseudo_gt: PseudoGt,
+    scene: Scene,
+}
+
+impl TestTargets {
+    /// Measures the training photographs.
+    ///
+    /// # Errors
+    /// Every training photograph is as good as black where their exposure is asked for; a photograph can no longer be read;
+    /// the device is out of memory or lost.
+    pub fn new(gpu: &Gpu, tone: &ToneSettings, dataset: &Dataset) -> Result<Self> {
+        let mut pseudo_gt = PseudoGt::new(gpu, tone)?;
+        let (scene, _) = measured(&mut pseudo_gt, dataset)?;
+        Ok(Self { pseudo_gt, scene })
+    }
+
+    /// That of a view, of its camera's size; none where it has no photograph.
+    ///
+    /// # Errors
+    /// The photograph can no longer be read, or the device is out of memory or lost.
+    pub fn of(&mut self, view: &View) -> Result<Option<Image>> {
+        target(&mut self.pseudo_gt, view, &self.scene)
+    }
+}
+
+impl Trainer {
+    /// The mean PSNR, dB, of what the Gaussians show of the held-out views against their targets; none where there are none.
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub fn held_out_psnr(&mut self) -> Result<Option<f64>> {
+        self.held_out_psnr_of_degree(self.sh_degree(self.step))
+    }
+
+    /// As [`Trainer::held_out_psnr`], with the colours of an SH degree.
+    pub(super) fn held_out_psnr_of_degree(&mut self, sh_degree: u32) -> Result<Option<f64>> {
+        Ok(self.psnr_of_held_out(sh_degree)?.map(|[colors, _]| colors))
+    }
+
+    /// The mean PSNR, dB, of R_0 and of the output, R_K where the model has a denoiser; `None` if no view is held out.
+    fn psnr_of_held_out(&mut self, sh_degree: u32) -> Result<Option<[f64; 2]>> {
+        let views = std::mem::take(&mut self.held_out);
+        let scores = views.mean_psnr(&[], |camera| self.render_of_degree(camera, sh_degree));
+        self.held_out = views;
+        scores
+    }
+
+    /// Leaves out what the denoiser has learned where it shows the held-out views, or without any some of the training views,
+    /// hardly better than R_0 does: it is the identity again. For the end of a run, not on its way; the paper's stays.
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub fn leave_out_what_gains_nothing(&mut self) -> Result<()> {
+        /// Less on few views, dB, is chance.
+        const LEAST_GAIN: f64 = 0.05;
+        if !self.networks.as_ref().is_some_and(NetworkTerms::follow_target) {
+            return Ok(());
+        }
+        let sh_degree = self.sh_degree(self.step);
+        let scores = match self.psnr_of_held_out(sh_degree)? {
+            None => {
+                let views = self.some_training_views()?;
+                views.mean_psnr(&self.affines()?, |camera| {
+                    self.render_of_degree(camera, sh_degree)
+                })?
+            }
+            scores => scores,
+        };
+        let Some([colors, denoised]) = scores else { return Ok(()) };
+        let gain = denoised - colors;
+        if gain >= LEAST_GAIN {
+            tracing::info!("the denoiser gains {gain:.2} dB on targets");
+            return Ok(());
+        }
+        tracing::info!("the denoiser gains nothing on targets ({gain:.2} dB): it is left out");
+        match self.networks.as_mut().and_then(|terms| terms.networks.denoiser.as_mut()) {
+            Some(denoiser) => denoiser.become_identity(),
+            None => Ok(()),
+        }
+    }
+
+    /// Training views, evenly spread, with their targets.
+    fn some_training_views(&self) -> Result<TargetViews> {
+        const MOST: usize = 8;
+        let views = self.views.whole();
+        let some = views.iter().step_by(views.len().div_ceil(MOST).max(1)).map(|view| {
+            let target = view.image(&self.gpu, &*view.kept_target(&self.gpu)?)?;
+            let (camera, place) = (view.patch.pinhole(), Some(view.place));
+            Ok(TargetView { camera, target, mask: None, place })
+        });
+        Ok(TargetViews(some.collect::<Result<_>>()?))
+    }
+
+    /// The exposure of every training photograph, where exposures are learned.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub(super) fn affines(&self) -> Result<Vec<Affine>> {
+        self.exposures.as_ref().map_or_else(|| Ok(vec![]), Exposures::affines)
+    }
+}
