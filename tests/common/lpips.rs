@@ -51,7 +51,8 @@ fn tensors(network: Network) -> Vec<(String, Vec<usize>)> {
             (format!("net.{place}.bias"), vec![outputs]),
         ]
     });
-    let linear = |(index, channels)| (format!("lin{index}.model.1.weight"), vec![1, channels, 1, 1]);
+    let linear =
+        |(index, channels)| (format!("lin{index}.model.1.weight"), vec![1, channels, 1, 1]);
     convolutions.chain(compared.into_iter().enumerate().map(linear)).collect()
 }
 

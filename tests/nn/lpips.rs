@@ -55,15 +55,13 @@ fn the_distance_of_alexnet_is_pytorch_s() {
         (97, 70, 1.059226e-02, 1.753948e-04),
     ];
     assert_distances(Network::Alex, Range::Signed, &expected);
-    let expected =
-        [(31, 31, 1.295715e-03, 2.349210e-05), (97, 70, 8.203130e-03, 1.189130e-04)];
+    let expected = [(31, 31, 1.295715e-03, 2.349210e-05), (97, 70, 8.203130e-03, 1.189130e-04)];
     assert_distances(Network::Alex, Range::Unit, &expected);
 }
 
 #[test]
 fn the_distance_of_vgg_is_pytorch_s() {
-    let expected =
-        [(16, 16, 3.423346e-03, 6.976494e-05), (37, 22, 6.713986e-03, 1.908189e-04)];
+    let expected = [(16, 16, 3.423346e-03, 6.976494e-05), (37, 22, 6.713986e-03, 1.908189e-04)];
     assert_distances(Network::Vgg, Range::Signed, &expected);
     let expected = [(16, 16, 1.460342e-03, 3.301097e-05), (37, 22, 3.067561e-03, 4.611988e-05)];
     assert_distances(Network::Vgg, Range::Unit, &expected);
@@ -129,7 +127,11 @@ fn weights_of_another_network_are_named() {
     // SqueezeNet begins as VGG-16 does.
     let first = vec![0.0; 64 * 27];
     safetensors::write(&path, &[("net.slice1.0.weight", &[64, 3, 3, 3], &first)]);
-    refused(&["neither `net.slice5.10.weight` of AlexNet", "`net.slice5.28.weight` of VGG-16", remedy]);
+    refused(&[
+        "neither `net.slice5.10.weight` of AlexNet",
+        "`net.slice5.28.weight` of VGG-16",
+        remedy,
+    ]);
 }
 
 #[test]

@@ -480,3 +480,16 @@ fn column(score: &str) -> Column {
     };
     Column { name: name.to_owned(), digits, best }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn of_every_lpips_the_least_is_best() {
+        for measure in Measure::all() {
+            let Column { name, best, .. } = column(&measure.key());
+            assert!(matches!(best, Best::Least) && name == measure.title(), "{name}");
+        }
+    }
+}
