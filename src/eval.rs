@@ -13,7 +13,7 @@ use crate::dataset::{Dataset, View};
 use crate::exposure::Affine;
 use crate::gpu::{Buffer, Gpu};
 use crate::image::Image;
-use crate::lpips::Lpips;
+use crate::lpips::{Lpips, Measure};
 use crate::metrics::{self, Scores};
 use crate::render::{RenderOptions, RenderSettings, Renderer};
 use crate::scene::{Feature, Features, Gaussians};
@@ -147,7 +147,7 @@ impl Compared<'_> {
     /// LPIPS over the pixels that count.
     ///
     /// # Errors
-    /// The view is too small for it, or the device is out of memory or lost.
+    /// Those of [`Lpips::distance`].
     pub fn lpips(&self, gpu: &Gpu, lpips: &Lpips) -> Result<f64> {
         let Self { view, render, target } = self;
         let mask = view.mask.as_ref().map(|mask| mask.resized(render.width, render.height));
@@ -383,7 +383,7 @@ pub fn score_by(
     Ok(scored)
 }
 
-/// `metrics.json`: means and views, and what the run took; null where that, or a mean, is not known.
+/// `metrics.json`: means and views, and what the run took; null where that, or a mean, is not known. [`add_lpips`] adds LPIPS.
 pub fn metrics(
     scored: &[ViewScore],
     seconds: impl Into<Option<f64>>,
@@ -434,6 +434,22 @@ pub fn add_reference(metrics: &mut Value, tone: &ToneSettings) {
     }
 }
 
+/// Adds LPIPS to the mean and the views of `metrics.json` under the key of its measure, and says which measure that is.
+pub fn add_lpips(metrics: &mut Value, scored: &[ViewScore], measure: Measure) {
+    let key = measure.key();
+    let Measure { network, range } = measure;
+    metrics["lpips"] = json!({ "network": network.name(), "range": range.name(), "key": key });
+    let (mean, _) = means(scored);
+    if let Some(lpips) = mean.and_then(|mean| mean.lpips) {
+        metrics["mean"][&key] = json!(lpips);
+    }
+    for ViewScore { name, scores, .. } in scored {
+        if let Some(lpips) = scores.lpips {
+            metrics["views"][name][&key] = json!(lpips);
+        }
+    }
+}
+
 /// Says in `metrics.json` of a model with learned exposures at which one the test views were scored, as no photograph of
 /// theirs was trained on: at the neutral one, the mean of the training views. Beside it stand the scores behind the affine
 /// of each channel that brings each render nearest to its reference image, which is what others report; they know the
@@ -465,9 +481,6 @@ fn entry(scores: &Scores, r0: Option<&Scores>) -> Value {
         "psnr_channel_mean": scores.psnr_channel_mean,
         "ssim": scores.ssim,
     });
-    if let Some(lpips) = scores.lpips {
-        entry["lpips"] = json!(lpips);
-    }
     if let Some(r0) = r0 {
         entry["r0"] = self::entry(r0, None);
     }

@@ -1,4 +1,4 @@
-//! LPIPS (Zhang et al. 2018, version 0.1): how far two pictures are apart to AlexNet. Lower is more alike.
+//! LPIPS (Zhang et al. 2018, version 0.1): how far two pictures are apart to a network's eye. Lower is more alike.
 
 use std::path::Path;
 
@@ -7,66 +7,139 @@ use glam::UVec2;
 use crate::gpu::Gpu;
 use crate::image::Image;
 use crate::input;
-use crate::nn::{AlexNet, LAYERS, TensorFile, published};
+pub use crate::nn::Network;
+use crate::nn::{TensorFile, Trunk, published};
 use crate::{Error, Result};
 
-/// What makes a picture of [-1, 1] the network's input: minus `SHIFT`, over `SCALE`, for each channel.
+/// What makes a picture the network's input: minus `SHIFT`, over `SCALE`, for each channel. It is meant for [-1, 1].
 const SHIFT: [f32; 3] = [-0.030, -0.088, -0.188];
 const SCALE: [f32; 3] = [0.458, 0.448, 0.450];
+
+/// The values that black and white have when they are given to the measure.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Range {
+    /// [-1, 1], as the measure's authors made it.
+    #[default]
+    Signed,
+    /// [0, 1], as the code of 3DGS gives it pictures.
+    Unit,
+}
+
+impl Range {
+    /// Each of them.
+    pub const ALL: [Self; 2] = [Self::Signed, Self::Unit];
+
+    /// The name on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Signed => "signed",
+            Self::Unit => "unit",
+        }
+    }
+
+    fn of_unit(self, value: f32) -> f32 {
+        match self {
+            Self::Signed => 2.0 * value - 1.0,
+            Self::Unit => value,
+        }
+    }
+}
+
+/// Which LPIPS a number is: those of two measures do not compare.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Measure {
+    /// Whose activations are compared.
+    pub network: Network,
+    /// What the network is given.
+    pub range: Range,
+}
+
+impl Measure {
+    /// Each of them.
+    pub fn all() -> impl Iterator<Item = Self> {
+        let of = |network| Range::ALL.map(|range| Self { network, range });
+        Network::ALL.into_iter().flat_map(of)
+    }
+
+    /// The name of its numbers in JSON: `lpips` for the default, else network and range behind it, as `lpips_vgg_unit`.
+    pub fn key(self) -> String {
+        if self == Self::default() {
+            return "lpips".to_owned();
+        }
+        format!("lpips_{}_{}", self.network.name(), self.range.name())
+    }
+
+    /// The head of a column of its numbers.
+    pub fn title(self) -> String {
+        if self == Self::default() {
+            return "LPIPS".to_owned();
+        }
+        format!("LPIPS {} {}", self.network.name(), self.range.name())
+    }
+}
 
 /// The measure, on the device.
 #[derive(Debug)]
 pub struct Lpips {
-    network: AlexNet,
-    /// How much each channel of each layer counts.
-    weights: [Vec<f32>; LAYERS],
+    trunk: Trunk,
+    range: Range,
+    /// How much each channel counts of each layer that is compared.
+    weights: Vec<Vec<f32>>,
 }
 
 impl Lpips {
-    /// The measure with the weights of a safetensors file: the tensors of `lpips.LPIPS(net='alex')` under its names.
+    /// The measure with the weights of a safetensors file: the tensors of `lpips.LPIPS(net='alex')` or `(net='vgg')` under
+    /// its names. They tell which network it is.
     ///
     /// # Errors
-    /// [`Error::Input`] names what is missing, of another shape or not finite; the device is out of memory.
-    pub fn load(gpu: &Gpu, path: impl AsRef<Path>) -> Result<Self> {
+    /// [`Error::Input`]: the file is no network's, or names what is missing, of another shape or not finite; the device is out
+    /// of memory.
+    pub fn load(gpu: &Gpu, path: impl AsRef<Path>, range: Range) -> Result<Self> {
         let path = path.as_ref();
         let bytes = input::bytes(path)?;
         let file = TensorFile::of(&bytes).map_err(|error| {
             Error::input(path, format!("is no whole safetensors file ({error})"))
         })?;
-        let network = AlexNet::new(gpu, path, &file)?;
-        let mut weights = std::array::from_fn(|_| vec![]);
-        for (index, weights) in weights.iter_mut().enumerate() {
-            let (name, channels) = (format!("lin{index}.model.1.weight"), AlexNet::channels(index));
-            *weights = published(path, &file, &name, &[1, channels, 1, 1])?;
-        }
-        Ok(Self { network, weights })
+        let network = Network::of(path, &file)?;
+        let trunk = Trunk::new(gpu, path, &file, network)?;
+        let weights = network.compared_channels().enumerate().map(|(index, channels)| {
+            published(path, &file, &format!("lin{index}.model.1.weight"), &[1, channels, 1, 1])
+        });
+        Ok(Self { trunk, range, weights: weights.collect::<Result<_>>()? })
+    }
+
+    /// Which LPIPS its distances are.
+    pub fn measure(&self) -> Measure {
+        Measure { network: self.trunk.network, range: self.range }
     }
 
     /// The distance of two pictures of one size, sRGB in [0, 1]; 0 for equal ones.
     ///
     /// # Errors
-    /// [`Error::Usage`] where the sizes differ or are too small; the device is out of memory or lost.
+    /// [`Error::Usage`] where the sizes differ, are too small, or are too large for a binding of the device; the device is out
+    /// of memory or lost.
     pub fn distance(&self, gpu: &Gpu, render: &Image, reference: &Image) -> Result<f64> {
         let size = |image: &Image| UVec2::new(image.width, image.height);
         if size(render) != size(reference) {
             let problem = "two pictures of different sizes cannot be compared";
             return Err(Error::Usage(problem.to_owned()));
         }
+        self.trunk.check(gpu, size(render))?;
         let seen =
-            |image: &Image| self.network.activations(gpu, size(image), &network_input(image));
+            |image: &Image| self.trunk.activations(gpu, size(image), &self.network_input(image));
         let (a, b) = (seen(render)?, seen(reference)?);
         let layers = a.iter().zip(&b).zip(&self.weights);
         Ok(layers.map(|((a, b), weights)| layer_distance(a, b, weights)).sum())
     }
-}
 
-fn network_input(image: &Image) -> Vec<f32> {
-    let pixels = image.pixel_count();
-    let value = |(at, value): (usize, &f32)| {
-        let channel = at / pixels;
-        (2.0 * value - 1.0 - SHIFT[channel]) / SCALE[channel]
-    };
-    image.data.iter().enumerate().map(value).collect()
+    fn network_input(&self, image: &Image) -> Vec<f32> {
+        let pixels = image.pixel_count();
+        let value = |(at, &value): (usize, &f32)| {
+            let channel = at / pixels;
+            (self.range.of_unit(value) - SHIFT[channel]) / SCALE[channel]
+        };
+        image.data.iter().enumerate().map(value).collect()
+    }
 }
 
 /// The mean over the pixels of the weighted squared differences of the unit vectors across the channels.

@@ -1,4 +1,5 @@
-//! The networks: the denoiser that takes the noise from a render, and the tonemapper that darkens it again.
+//! The networks: the denoiser that takes the noise from a render, and the tonemapper that darkens it again; and those that
+//! LPIPS looks through.
 //!
 //! Images are planes, (C, H, W), row by row. A network owns its parameters, with their gradients beside them, and the
 //! memory of one view: [`Denoiser::reserve`] takes it, `forward` fills it, `backward` uses it up. Sums over pixels are
@@ -6,8 +7,6 @@
 //!
 //! Norms use the statistics of the image itself, in training and afterwards: there are no running averages.
 
-#[cfg(feature = "io")]
-mod alexnet;
 mod conv;
 mod denoiser;
 #[cfg(feature = "io")]
@@ -18,6 +17,8 @@ mod norm;
 mod parameters;
 mod relu;
 mod tonemapper;
+#[cfg(feature = "io")]
+mod trunk;
 
 use glam::UVec2;
 use serde::{Deserialize, Serialize};
@@ -25,8 +26,6 @@ use serde::{Deserialize, Serialize};
 use crate::gpu::{Buffer, Gpu};
 use crate::{Error, Result};
 
-#[cfg(feature = "io")]
-pub(crate) use alexnet::{AlexNet, LAYERS, published};
 pub use conv::Precision;
 pub use denoiser::{Denoiser, DenoiserSettings};
 #[cfg(feature = "io")]
@@ -35,6 +34,10 @@ pub(crate) use file::TensorFile;
 pub use file::{load, save};
 pub use parameters::{Parameters, Tensor};
 pub use tonemapper::Tonemapper;
+#[cfg(feature = "io")]
+pub use trunk::Network;
+#[cfg(feature = "io")]
+pub(crate) use trunk::{Trunk, published};
 
 /// How a network begins and ends.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]

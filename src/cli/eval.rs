@@ -10,7 +10,7 @@ use super::{progress_bar, table};
 use crate::dataset::View;
 use crate::eval::{self, ViewScore, Yardstick};
 use crate::gpu::DeviceChoice;
-use crate::lpips::Lpips;
+use crate::lpips::{Lpips, Measure, Range};
 use crate::metrics::Scores;
 use crate::output::printable;
 use crate::run;
@@ -33,15 +33,39 @@ pub struct EvalArgs {
     /// Where the dataset is now, or another copy of it; what differs from the run's views is said [default: where the run found it]
     #[arg(long, value_name = "DIR")]
     pub dataset: Option<PathBuf>,
-    /// Score LPIPS too, with the weights of its network in safetensors; the guide has the command that converts the published ones
+    /// Score LPIPS too, the distance of two pictures to the eye of AlexNet or VGG-16: lower is more alike. The safetensors
+    /// file of weights tells which network it is; scripts/lpips-weights.py writes those that are published
     #[arg(long, value_name = "WEIGHTS")]
     pub lpips: Option<PathBuf>,
+    /// What LPIPS gives its network of a picture in [0, 1]; numbers of different ranges or networks do not compare, so take
+    /// what the table you compare with took
+    #[arg(long, value_name = "RANGE", value_enum, default_value_t, requires = "lpips")]
+    pub lpips_range: LpipsRange,
     /// Write what was scored to RUN/eval/renders, and what it was compared with to RUN/eval/references or RUN/eval/targets
     #[arg(long)]
     pub save_images: bool,
     /// The device: uuid:, pci: or index of `nightsplat doctor`, a part of its name, or cpu [default: that of the run]
     #[arg(long, value_name = "DEVICE")]
     pub device: Option<DeviceChoice>,
+}
+
+/// [`Range`] on the command line.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum LpipsRange {
+    /// Stretched to [-1, 1], for which the measure was made: `normalize=True` in lpips and torchmetrics, gsplat's AlexNet
+    #[default]
+    Signed,
+    /// As it is, an oversight that became a custom: the code of 3DGS, gsplat's VGG-16, and papers that follow them
+    Unit,
+}
+
+impl From<LpipsRange> for Range {
+    fn from(range: LpipsRange) -> Self {
+        match range {
+            LpipsRange::Signed => Self::Signed,
+            LpipsRange::Unit => Self::Unit,
+        }
+    }
 }
 
 /// Scores the run and prints the scores.
@@ -51,7 +75,9 @@ pub struct EvalArgs {
 pub fn run(args: &EvalArgs) -> Result<()> {
     let FinishedRun { gpu, config, dataset, gaussian_count, mut player } =
         FinishedRun::open(&args.run, args.dataset.as_deref(), args.device.as_ref())?;
-    let lpips = args.lpips.as_ref().map(|weights| Lpips::load(&gpu, weights)).transpose()?;
+    let load = |weights| Lpips::load(&gpu, weights, args.lpips_range.into());
+    let lpips = args.lpips.as_ref().map(load).transpose()?;
+    let measure = lpips.as_ref().map(Lpips::measure);
     let mut yardstick = Yardstick::of(&gpu, &config.tone, &dataset)?;
     let bar = progress_bar(yardstick.view_count(&dataset));
     let render = |view: &View| {
@@ -84,6 +110,9 @@ pub fn run(args: &EvalArgs) -> Result<()> {
         let steps = recorded["steps"].as_u64().or_else(|| run::stopped_at(&args.run));
         let steps = steps.unwrap_or(config.steps);
         let mut metrics = eval::metrics(&scored, seconds, gaussian_count, steps);
+        if let Some(measure) = measure {
+            eval::add_lpips(&mut metrics, &scored, measure);
+        }
         eval::add_reference(&mut metrics, &config.tone);
         for what in [run::SPENT, run::TARGET_EXPOSURE] {
             if let Some(known) = recorded.get(what) {
@@ -95,7 +124,7 @@ pub fn run(args: &EvalArgs) -> Result<()> {
         }
         writeln!(out, "{metrics:#}")?;
     } else {
-        write!(out, "{}", score_table(&scored))?;
+        write!(out, "{}", score_table(&scored, measure))?;
         if let Some(known) = config.tone.knows_references() {
             writeln!(out, "{}", eval::with_reference(&known))?;
         }
@@ -106,12 +135,12 @@ pub fn run(args: &EvalArgs) -> Result<()> {
     Ok(())
 }
 
-fn score_table(scored: &[ViewScore]) -> String {
+fn score_table(scored: &[ViewScore], measure: Option<Measure>) -> String {
     let (mean, mean_r0) = eval::means(scored);
-    let mut header = vec!["view", "PSNR", "channel mean", "SSIM"];
-    header.extend(mean.and_then(|mean| mean.lpips).map(|_| "LPIPS"));
+    let mut header = ["view", "PSNR", "channel mean", "SSIM"].map(str::to_owned).to_vec();
+    header.extend(measure.map(Measure::title));
     // Before the denoiser.
-    header.extend(mean_r0.iter().flat_map(|_| ["PSNR of R_0", "SSIM of R_0"]));
+    header.extend(mean_r0.iter().flat_map(|_| ["PSNR of R_0", "SSIM of R_0"]).map(str::to_owned));
     let row = |name: &str, scores: &Scores, r0: Option<&Scores>| {
         let Scores { psnr, psnr_channel_mean, ssim, lpips } = scores;
         let mut row = vec![
@@ -126,7 +155,7 @@ fn score_table(scored: &[ViewScore]) -> String {
         );
         row
     };
-    let mut rows = vec![header.into_iter().map(str::to_owned).collect()];
+    let mut rows = vec![header];
     rows.extend(scored.iter().map(|view| row(&view.name, &view.scores, view.r0.as_ref())));
     rows.extend(mean.map(|mean| row("mean", &mean, mean_r0.as_ref())));
     table::aligned(&rows)

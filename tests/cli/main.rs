@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
 use nightsplat::image::Image;
+use nightsplat::lpips::Network;
 use nightsplat::metrics::Scores;
 use serde_json::Value;
 
@@ -182,16 +183,35 @@ fn eval_agrees_with_train_and_saves_what_it_scored() {
 fn eval_scores_lpips_where_it_is_given_the_weights() {
     let fixture = fixture();
     let weights = fixture.path("weights.safetensors");
-    common::lpips::write(&weights, |_, _, _| {});
     let eval = format!("eval {} --lpips {}", fixture.run(), weights.display());
-    let scores: Value = serde_json::from_str(&succeed(&format!("{eval} --json"))).unwrap();
-    let of = |name: &str| scores["views"][name]["lpips"].as_f64().unwrap();
-    let mean = scores["mean"]["lpips"].as_f64().unwrap();
-    assert!((mean - (of("000") + of("008")) / 2.0).abs() < 1e-12 && mean > 0.0, "{scores}");
-    let table = succeed(&eval);
-    assert!(table.contains("LPIPS") && table.contains(&format!("{mean:.4}")), "{table}");
+    for (network, range, key, title) in [
+        (Network::Alex, "signed", "lpips", "LPIPS "),
+        (Network::Alex, "unit", "lpips_alex_unit", "LPIPS alex unit"),
+        (Network::Vgg, "signed", "lpips_vgg_signed", "LPIPS vgg signed"),
+        (Network::Vgg, "unit", "lpips_vgg_unit", "LPIPS vgg unit"),
+    ] {
+        common::lpips::write(network, &weights, |_, _, _| {});
+        let eval = match range {
+            "signed" => eval.clone(),
+            _ => format!("{eval} --lpips-range {range}"),
+        };
+        let scores: Value = serde_json::from_str(&succeed(&format!("{eval} --json"))).unwrap();
+        let of = |name: &str| scores["views"][name][key].as_f64().unwrap();
+        let mean = scores["mean"][key].as_f64().unwrap();
+        assert!((mean - (of("000") + of("008")) / 2.0).abs() < 1e-12 && mean > 0.0, "{scores}");
+        let said = serde_json::json!({ "network": network.name(), "range": range, "key": key });
+        assert_eq!(scores["lpips"], said);
+        let keys = keys(&scores["mean"]);
+        assert_eq!(keys.iter().filter(|key| key.starts_with("lpips")).count(), 1, "{keys:?}");
+        let table = succeed(&eval);
+        let header = format!("{} ", table.lines().next().unwrap());
+        assert!(header.contains(title) && table.contains(&format!("{mean:.4}")), "{table}");
+    }
     fs::write(&weights, "of nothing").unwrap();
     refused(&eval, 3, &["weights.safetensors", "safetensors"]);
+    let without = format!("eval {} --lpips-range unit", fixture.run());
+    refused(&without, 2, &["--lpips <WEIGHTS>"]);
+    assert!(json(fixture.path("run/metrics.json")).get("lpips").is_none(), "train scores no LPIPS");
 }
 
 #[test]

@@ -2,6 +2,8 @@
 
 use std::path::Path;
 
+use nightsplat::lpips::Network;
+
 use super::safetensors;
 
 /// Numbers of [-0.5, 0.5) by a multiplicative hash (Knuth).
@@ -10,31 +12,57 @@ pub(crate) fn noise(index: usize, salt: u64) -> f64 {
     hash as f64 / 2.0_f64.powi(32) - 0.5
 }
 
-/// The tensors of `lpips.LPIPS(net='alex')` in its order.
-fn tensors() -> Vec<(String, Vec<usize>)> {
-    let layers = [
-        (1, 0, 64, 3, 11),
-        (2, 3, 192, 64, 5),
-        (3, 6, 384, 192, 3),
-        (4, 8, 256, 384, 3),
-        (5, 10, 256, 256, 3),
-    ];
-    let convolutions = layers.into_iter().flat_map(|(slice, at, outputs, inputs, window)| {
-        let name = format!("net.slice{slice}.{at}");
+/// Where a convolution stands, its output and input channels, its window.
+type Layer = (&'static str, usize, usize, usize);
+
+const ALEXNET: &[Layer] = &[
+    ("slice1.0", 64, 3, 11),
+    ("slice2.3", 192, 64, 5),
+    ("slice3.6", 384, 192, 3),
+    ("slice4.8", 256, 384, 3),
+    ("slice5.10", 256, 256, 3),
+];
+
+const VGG16: &[Layer] = &[
+    ("slice1.0", 64, 3, 3),
+    ("slice1.2", 64, 64, 3),
+    ("slice2.5", 128, 64, 3),
+    ("slice2.7", 128, 128, 3),
+    ("slice3.10", 256, 128, 3),
+    ("slice3.12", 256, 256, 3),
+    ("slice3.14", 256, 256, 3),
+    ("slice4.17", 512, 256, 3),
+    ("slice4.19", 512, 512, 3),
+    ("slice4.21", 512, 512, 3),
+    ("slice5.24", 512, 512, 3),
+    ("slice5.26", 512, 512, 3),
+    ("slice5.28", 512, 512, 3),
+];
+
+/// The tensors of `lpips.LPIPS(net=...)` in its order.
+fn tensors(network: Network) -> Vec<(String, Vec<usize>)> {
+    let (layers, compared) = match network {
+        Network::Alex => (ALEXNET, [64, 192, 384, 256, 256]),
+        Network::Vgg => (VGG16, [64, 128, 256, 512, 512]),
+    };
+    let convolutions = layers.iter().flat_map(|&(place, outputs, inputs, window)| {
         [
-            (format!("{name}.weight"), vec![outputs, inputs, window, window]),
-            (format!("{name}.bias"), vec![outputs]),
+            (format!("net.{place}.weight"), vec![outputs, inputs, window, window]),
+            (format!("net.{place}.bias"), vec![outputs]),
         ]
     });
-    let linear = |(index, layer): (usize, (i32, i32, usize, usize, usize))| {
-        (format!("lin{index}.model.1.weight"), vec![1, layer.2, 1, 1])
-    };
-    convolutions.chain(layers.into_iter().enumerate().map(linear)).collect()
+    let linear =
+        |(index, channels)| (format!("lin{index}.model.1.weight"), vec![1, channels, 1, 1]);
+    convolutions.chain(compared.into_iter().enumerate().map(linear)).collect()
 }
 
-/// Writes weights of AlexNet, each made by a formula from its place, `change`d.
-pub(crate) fn write(path: &Path, change: impl Fn(&str, &mut Vec<usize>, &mut Vec<f32>)) {
-    let made = tensors().into_iter().enumerate().map(|(salt, (name, mut shape))| {
+/// Writes weights of a network, each made by a formula from its place, `change`d.
+pub(crate) fn write(
+    network: Network,
+    path: &Path,
+    change: impl Fn(&str, &mut Vec<usize>, &mut Vec<f32>),
+) {
+    let made = tensors(network).into_iter().enumerate().map(|(salt, (name, mut shape))| {
         let fan_in: usize = shape[1..].iter().product();
         let value = |at| {
             let noise = noise(at, salt as u64);

@@ -14,6 +14,7 @@ use crate::dataset::Dataset;
 use crate::eval::{AGAINST, WITH_REFERENCE};
 use crate::gpu::Gpu;
 use crate::image::Image;
+use crate::lpips::Measure;
 use crate::output::{csv_field, write_whole};
 use crate::report::{
     Bar, Best, Column, Comparison, Mark, Picture, Report, Series, Table, bars, plot_points,
@@ -468,12 +469,27 @@ fn differing(runs: &[Run]) -> Vec<String> {
 
 /// How a score of `metrics.json` is shown.
 fn column(score: &str) -> Column {
+    if let Some(measure) = Measure::all().find(|measure| measure.key() == score) {
+        return Column { name: measure.title(), digits: 3, best: Best::Least };
+    }
     let (name, digits, best) = match score {
         "psnr" => ("PSNR, dB", 2, Best::Greatest),
         "psnr_channel_mean" => ("channel-mean PSNR, dB", 2, Best::Greatest),
         "ssim" => ("SSIM", 3, Best::Greatest),
-        "lpips" => ("LPIPS", 3, Best::Least),
         other => (other, 4, Best::Unmarked),
     };
     Column { name: name.to_owned(), digits, best }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn of_every_lpips_the_least_is_best() {
+        for measure in Measure::all() {
+            let Column { name, best, .. } = column(&measure.key());
+            assert!(matches!(best, Best::Least) && name == measure.title(), "{name}");
+        }
+    }
 }
