@@ -129,6 +129,7 @@ pub fn train_in(
     }
     directory.save_metrics(&metrics)?;
     done::save(out, config, trainer.fingerprint(), steps)?;
+    eval::warn_of_holes(&scored, config.background);
     let trained = Trained { trainer, scored, losses, spent };
     observe(Event::Finished(&trained));
     Ok(trained)
