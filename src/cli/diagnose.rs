@@ -130,7 +130,11 @@ fn holes(run: &Path, args: &DiagnoseArgs) -> Result<(String, BTreeMap<String, Le
     let views = leftovers.iter().map(|(name, leftover)| (name.as_str(), *leftover));
     let healthy = || {
         let mean = Leftover::mean(leftovers.values().copied()).map_or(0.0, |own| own.mean);
-        format!("{}: {:.1} % of the background shows through the model", run.display(), 100.0 * mean)
+        format!(
+            "{}: {:.1} % of the background shows through the model",
+            run.display(),
+            100.0 * mean
+        )
     };
     let remark = hole_warning(views, config.background).unwrap_or_else(healthy);
     Ok((remark, leftovers))

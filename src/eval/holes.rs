@@ -96,7 +96,8 @@ mod tests {
         assert_eq!(leftover, Leftover { mean: 99.5 / 256.0, q99: 197.0 / 256.0 });
         assert_eq!(Leftover::of_pixels(&mut [0.25]), Some(Leftover { mean: 0.25, q99: 0.25 }));
         assert_eq!(Leftover::of_pixels(&mut []), None);
-        let both = Leftover::mean([leftover, Leftover { mean: 0.0, q99: 1.0 }].into_iter()).unwrap();
+        let both =
+            Leftover::mean([leftover, Leftover { mean: 0.0, q99: 1.0 }].into_iter()).unwrap();
         assert_eq!(both, Leftover { mean: 99.5 / 512.0, q99: 453.0 / 512.0 });
         assert_eq!(Leftover::mean([].into_iter()), None);
     }
