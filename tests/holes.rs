@@ -158,6 +158,11 @@ fn holes_are_said_by_train_eval_and_diagnose() {
         assert!(table.contains(part), "no {part} in {table}");
     }
 
+    // Where no view is held out, training views are looked at.
+    let all = format!("train {set} --out {set}/all --test-every 0 {short}");
+    let (_, warned) = command::run(&all, 0);
+    assert!(warning(&warned) == 1 && warned.contains("of 6 views"), "{warned}");
+
     let (said, _) = command::run(&format!("diagnose {set} --run {run}"), 0);
     assert!(said.contains("note: view ") && warning(&said) == 1, "{said}");
     let json: Value =

@@ -74,7 +74,7 @@ pub fn run(args: &EvalArgs) -> Result<()> {
         Ok(())
     })?;
     bar.finish_and_clear();
-    eval::warn_of_holes(&scored, config.background);
+    eval::warn_of_holes(&scored, &dataset, config.background, |view| player.render(view))?;
     if scored.is_empty() {
         let root = dataset.root.display();
         tracing::warn!(

@@ -129,7 +129,6 @@ pub fn train_in(
     }
     directory.save_metrics(&metrics)?;
     done::save(out, config, trainer.fingerprint(), steps)?;
-    eval::warn_of_holes(&scored, config.background);
     let trained = Trained { trainer, scored, losses, spent };
     observe(Event::Finished(&trained));
     Ok(trained)
@@ -334,6 +333,8 @@ impl<'a> Course<'a> {
         trainer.leave_out_what_gains_nothing()?;
         let spent = self.meter.spent(self.gpu.peak_memory());
         let scored = self.evaluate(trainer, directory, observe)?;
+        let render = |view: &View| trainer.render(&view.camera);
+        eval::warn_of_holes(&scored, self.dataset, self.config.background, render)?;
         directory.save_trained(trainer)?;
         Ok((scored, spent))
     }
