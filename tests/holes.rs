@@ -9,11 +9,11 @@ use std::path::Path;
 use glam::DVec3;
 use nightsplat::dataset::synthetic::{self, Capture, SyntheticOptions};
 use nightsplat::dataset::{Dataset, View};
-use nightsplat::eval::{self, Leftover, MOST_LEFTOVER};
+use nightsplat::eval::{self, Leftover, MOST_LEFTOVER, Player};
 use nightsplat::gpu::testing::gpu;
 use nightsplat::image::{Image, Mask};
 use nightsplat::tone::{ToneCurve, ToneSettings};
-use nightsplat::train::{Background, TrainConfig, Trainer};
+use nightsplat::train::{Background, Part, TrainConfig, Trainer};
 
 use serde_json::Value;
 
@@ -130,6 +130,24 @@ fn what_a_mask_hides_is_no_hole() {
     assert_eq!(masked(&[empty, covered].concat()), None);
     // A picture that no Gaussian made has none.
     assert_eq!(Leftover::of(&rendered.colors.clone().into(), view), None);
+}
+
+#[test]
+fn a_denoiser_and_patches_leave_the_transmittances_as_they_are() {
+    let dataset = common::train::dataset(8, [64, 48]);
+    let mut config = TrainConfig { patch_pixels: Some(1000), ..TrainConfig::default() };
+    config.model.set_parts(&[Part::Denoiser]);
+    let mut trainer = Trainer::new(&gpu(), config, &dataset).unwrap();
+    let view = dataset.test_views().next().unwrap();
+    let rendered = trainer.render(&view.camera).unwrap();
+    assert!(rendered.denoised.is_some());
+    let (gaussians, plain) = (trainer.gaussians().unwrap(), TrainConfig::default());
+    let mut player = Player::new(&gpu(), &gaussians, &plain, None).unwrap();
+    let whole = player.render(view).unwrap();
+    let [in_parts, whole] = [rendered, whole].map(|own| own.transmittances.unwrap());
+    assert_eq!(in_parts.len(), 64 * 48);
+    let far = in_parts.iter().zip(&whole).filter(|(own, whole)| (*own - *whole).abs() > 1e-3);
+    assert!(far.count() < 10 && whole.iter().any(|&open| open < 0.5));
 }
 
 #[test]
