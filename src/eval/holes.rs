@@ -64,7 +64,9 @@ pub fn hole_warning<'a>(
     let open = views.iter().filter(|(_, leftover)| leftover.mean > MOST_LEFTOVER);
     let (name, worst) = open.clone().max_by(|(_, a), (_, b)| a.mean.total_cmp(&b.mean))?;
     let cause = match background {
-        Background::Black => "what is dark stayed empty; train with `--background random`",
+        Background::Black => {
+            "what is dark can stay empty before black; train with `--background random`"
+        }
         Background::Random => "no photograph shows what is there; take some that do",
     };
     Some(format!(
