@@ -4,7 +4,8 @@
     scripts/test-page.py [NIGHTSPLAT]      (default: target/release/nightsplat, or debug)
 
 Trains a small synthetic set, opens the page from disk at the size of its views and at twice that, and wants 30 dB or more
-of every view. Then opens it in a browser without WebGL, which must say so. Needs nothing but Python and Chromium, to
+of every view. Turns the background grey by its key and black again by its control: grey must show where nothing is, and
+leave what is opaque. Then opens it in a browser without WebGL, which must say so. Needs nothing but Python and Chromium, to
 which it speaks the DevTools protocol through a pipe; where there is no Chromium it says `not run`.
 """
 
@@ -40,6 +41,30 @@ COMPARE = """(async (png) => {
   const square = a.reduce((sum, value, k) => sum + (value - b[k]) ** 2, 0) / a.length;
   return 10 * Math.log10(255 ** 2 / Math.max(square, 1e-9));
 })('PNG')"""
+
+# The key G from far away: before, behind, and once the control has been clicked. Red of every pixel; the alpha is left out.
+GREY = """(async () => {
+  const canvas = document.getElementById('canvas'), gl = canvas.getContext('webgl2');
+  const press = (key) => canvas.dispatchEvent(new KeyboardEvent('keydown', { key, bubbles: true }));
+  const red = async () => {
+    await new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)));
+    const pixels = new Uint8Array(4 * canvas.width * canvas.height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.readPixels(0, 0, canvas.width, canvas.height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
+    return [...pixels.filter((_, k) => k % 4 === 0)];
+  };
+  for (let step = 0; step < 100; step++) press('s');
+  const before = await red();
+  press('g');
+  const grey = await red(), isShown = document.getElementById('grey').checked;
+  document.getElementById('grey').click();
+  const after = await red(), added = grey.map((value, k) => value - before[k]);
+  return {
+    isShown, empty: grey[0], least: Math.min(...added), most: Math.max(...added),
+    opaque: added.filter((value) => value <= 4).length,
+    changed: after.filter((value, k) => value !== before[k]).length,
+  };
+})()"""
 
 
 class Browser:
@@ -168,6 +193,12 @@ def main():
                     failed += psnr < ENOUGH
                 if not pictures:
                     raise RuntimeError(f"no renders in {renders}")
+            seen = browser.evaluate(GREY)
+            # Rounding of half floats is one level.
+            is_grey = seen["isShown"] and seen["empty"] in (127, 128) and seen["least"] >= -1 and seen["most"] <= 129
+            is_grey = is_grey and seen["opaque"] > 0 and seen["changed"] == 0
+            print(f"{'ok' if is_grey else 'BAD':3} before grey: {seen}")
+            failed += not is_grey
         with Browser(program, NO_GL, folder / "profile-without") as browser:
             ready = browser.open(page)
             message = browser.evaluate("document.getElementById('message').textContent")

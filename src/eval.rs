@@ -21,6 +21,10 @@ use crate::tone::{ToneCurve, ToneSettings};
 use crate::train::{Networks, Rendered, TestTargets, TrainConfig};
 use crate::{Error, Result};
 
+mod holes;
+
+pub use holes::{Leftover, MOST_LEFTOVER, hole_warning, warn_of_holes};
+
 /// What test views are scored against.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Against {
@@ -128,6 +132,8 @@ pub struct ViewScore {
     pub r0: Option<Scores>,
     /// Those of [`Compared::aligned`], where it was asked.
     pub aligned: Option<Scores>,
+    /// How much of the background shows; none of what is no render.
+    pub leftover: Option<Leftover>,
     /// What it was scored against.
     pub against: Against,
 }
@@ -375,6 +381,7 @@ pub fn score_by(
             scores: of(&compared.render)?,
             r0: has_denoiser.then(|| of(&quantized(&rendered.colors))).transpose()?,
             aligned: None,
+            leftover: Leftover::of(&rendered, view),
             against,
         };
         look(&mut score, &compared)?;
@@ -405,6 +412,11 @@ pub fn metrics(
     });
     if let Some(label) = label(scored) {
         metrics[AGAINST] = json!(label);
+    }
+    let leftovers = || scored.iter().filter_map(|view| Some((&view.name, view.leftover?)));
+    if let Some(mean) = Leftover::mean(leftovers().map(|(_, leftover)| leftover)) {
+        let views: BTreeMap<_, _> = leftovers().collect();
+        metrics["leftover_transmittance"] = json!({ "mean": mean, "views": views });
     }
     metrics
 }

@@ -40,14 +40,15 @@ fn renderer(setup: &Setup) -> Renderer {
 #[test]
 fn patches_show_what_the_whole_view_shows() {
     let whole = setup(None);
-    let expected = whole.render().render;
+    let rendered = whole.render();
+    let expected = [&rendered.render[..], &rendered.transmittances].concat();
     let gaussians = gpu().buffer("parameters", &whole.parameters).unwrap();
     for (patch_pixels, count) in [(2500, 2), (1000, 6), (300, 20)] {
         let setup = setup(Some(patch_pixels));
         let mut renderer = renderer(&setup);
         assert_eq!(renderer.patches(&setup.camera).len(), count);
-        let shown = renderer.render_channels(&gaussians, &setup.camera, &setup.options).unwrap();
-        assert_eq!(shown.len(), setup.channels() * setup.pixels());
+        let shown = renderer.render_planes(&gaussians, &setup.camera, &setup.options).unwrap();
+        assert_eq!(shown.len(), (setup.channels() + 1) * setup.pixels());
         let errors = shown.iter().zip(&expected).map(|(shown, whole)| (shown - whole).abs());
         // A splat may be just above the least alpha in one, and just below in the other.
         let far = errors.clone().filter(|&error| error > 1e-4).count();

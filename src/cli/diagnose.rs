@@ -2,16 +2,19 @@
 
 mod page;
 
+use std::collections::BTreeMap;
 use std::io::Write;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::Result;
 use serde::Serialize;
 
+use super::finished_run::FinishedRun;
 use super::table;
 use crate::Error;
 use crate::dataset::{Dataset, LoadOptions};
 use crate::diagnose::{Diagnosis, Noise, Plan, SceneDiagnosis, ViewDiagnosis};
+use crate::eval::{Leftover, hole_warning};
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::output::write_whole;
 use crate::train::{Preset, TrainConfig};
@@ -25,6 +28,7 @@ use crate::train::{Preset, TrainConfig};
 ///   nightsplat diagnose photos --report photos.html
 ///   nightsplat diagnose photos --plan plan.toml         edit plan.toml, then
 ///   nightsplat train photos --out run --plan plan.toml
+///   nightsplat diagnose photos --run run                where the model has holes
 ///
 /// In the table, p10, p90, mean and cubic mean are of the luminance of encoded values, r is
 /// p10 / p90; EV are stops more light than the other views show of the same points; noise is
@@ -45,6 +49,9 @@ pub struct DiagnoseArgs {
     /// Write the plan, for `nightsplat train --plan`
     #[arg(long, value_name = "FILE.toml")]
     pub plan: Option<PathBuf>,
+    /// Look at the model of this run as well: how much of the background it shows in each view
+    #[arg(long, value_name = "RUN")]
+    pub run: Option<PathBuf>,
     /// Plan for photographs shrunk by this factor; they are measured as stored [default: {downscale}]
     #[arg(long, value_name = "F")]
     pub downscale: Option<f64>,
@@ -69,6 +76,9 @@ struct Output<'a> {
     #[serde(flatten)]
     diagnosis: &'a Diagnosis,
     plan: &'a Plan,
+    /// Of the model of a run, by view.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    leftover_transmittance: Option<&'a BTreeMap<String, Leftover>>,
 }
 
 /// Measures, plans and prints.
@@ -84,7 +94,10 @@ pub fn run(args: &DiagnoseArgs) -> Result<()> {
     let gpu = Gpu::new(&args.device.clone().unwrap_or_default())?;
     let options = load_options(&config);
     let dataset = Dataset::load(&config.dataset, &options)?;
-    let diagnosis = Diagnosis::of(&dataset, &options)?;
+    let mut diagnosis = Diagnosis::of(&dataset, &options)?;
+    let run = args.run.as_deref().map(|run| holes(run, args)).transpose()?;
+    diagnosis.remarks.extend(run.iter().map(|(remark, _)| remark.clone()));
+    let diagnosis = diagnosis;
     let plan = Plan::new(&diagnosis, &config, gpu.properties().memory);
     if let Some(path) = &args.plan {
         write_whole(path, plan.to_toml()?.as_bytes())?;
@@ -94,7 +107,8 @@ pub fn run(args: &DiagnoseArgs) -> Result<()> {
     }
     let device = gpu.properties().name.as_str();
     let text = if args.json {
-        let output = Output { device, diagnosis: &diagnosis, plan: &plan };
+        let leftover_transmittance = run.as_ref().map(|(_, leftovers)| leftovers);
+        let output = Output { device, diagnosis: &diagnosis, plan: &plan, leftover_transmittance };
         let json = serde_json::to_string_pretty(&output);
         json.map_err(|error| Error::output("standard output", error.to_string()))? + "\n"
     } else {
@@ -102,6 +116,28 @@ pub fn run(args: &DiagnoseArgs) -> Result<()> {
     };
     write!(std::io::stdout().lock(), "{text}")?;
     Ok(())
+}
+
+/// How much of the background the model of a run shows in every view of the dataset, and what to say of it.
+fn holes(run: &Path, args: &DiagnoseArgs) -> Result<(String, BTreeMap<String, Leftover>)> {
+    let FinishedRun { config, dataset, mut player, .. } =
+        FinishedRun::open(run, Some(&args.dataset), args.device.as_ref())?;
+    let mut leftovers = BTreeMap::new();
+    for view in &dataset.views {
+        let leftover = Leftover::of(&player.render(view)?, view);
+        leftovers.extend(leftover.map(|leftover| (view.name.clone(), leftover)));
+    }
+    let views = leftovers.iter().map(|(name, leftover)| (name.as_str(), *leftover));
+    let healthy = || {
+        let mean = Leftover::mean(leftovers.values().copied()).map_or(0.0, |own| own.mean);
+        format!(
+            "{}: {:.1} % of the background shows through the model",
+            run.display(),
+            100.0 * mean
+        )
+    };
+    let remark = hole_warning(views, config.background).unwrap_or_else(healthy);
+    Ok((remark, leftovers))
 }
 
 /// As the configuration's, with depth maps wherever there are some: whether there are is part of the diagnosis.

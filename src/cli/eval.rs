@@ -8,7 +8,7 @@ use anyhow::Result;
 use super::finished_run::FinishedRun;
 use super::{progress_bar, table};
 use crate::dataset::View;
-use crate::eval::{self, ViewScore, Yardstick};
+use crate::eval::{self, Leftover, ViewScore, Yardstick};
 use crate::gpu::DeviceChoice;
 use crate::lpips::{Lpips, Measure, Range};
 use crate::metrics::Scores;
@@ -23,6 +23,9 @@ use crate::train::Learning;
 /// each is compared with its own pseudo-GT, what the run's curve makes of its photograph, and that is said: it tells how
 /// well the model shows its targets, not how right these are. A run that was stopped is scored as it was at its last
 /// checkpoint.
+///
+/// Beside the scores stands the leftover transmittance, how much of the background each view shows: its mean, and what 99 %
+/// of the pixels stay below. No score tells a hole before black from a dark surface; from a mean of 0.1 on it is said.
 #[derive(Clone, Debug, clap::Args)]
 pub struct EvalArgs {
     /// The run directory that `nightsplat train` wrote
@@ -97,6 +100,7 @@ pub fn run(args: &EvalArgs) -> Result<()> {
         Ok(())
     })?;
     bar.finish_and_clear();
+    eval::warn_of_holes(&scored, &dataset, config.background, |view| player.render(view))?;
     if scored.is_empty() {
         let root = dataset.root.display();
         tracing::warn!(
@@ -141,7 +145,9 @@ fn score_table(scored: &[ViewScore], measure: Option<Measure>) -> String {
     header.extend(measure.map(Measure::title));
     // Before the denoiser.
     header.extend(mean_r0.iter().flat_map(|_| ["PSNR of R_0", "SSIM of R_0"]).map(str::to_owned));
-    let row = |name: &str, scores: &Scores, r0: Option<&Scores>| {
+    let mean_leftover = Leftover::mean(scored.iter().filter_map(|view| view.leftover));
+    header.extend(mean_leftover.iter().flat_map(|_| ["leftover", "99 %"]).map(str::to_owned));
+    let row = |name: &str, scores: &Scores, r0: Option<&Scores>, leftover: Option<Leftover>| {
         let Scores { psnr, psnr_channel_mean, ssim, lpips } = scores;
         let mut row = vec![
             name.to_owned(),
@@ -153,10 +159,13 @@ fn score_table(scored: &[ViewScore], measure: Option<Measure>) -> String {
         row.extend(
             r0.into_iter().flat_map(|r0| [format!("{:.2}", r0.psnr), format!("{:.4}", r0.ssim)]),
         );
+        let leftover = leftover.into_iter().flat_map(|own| [own.mean, own.q99]);
+        row.extend(leftover.map(|value| format!("{value:.4}")));
         row
     };
     let mut rows = vec![header];
-    rows.extend(scored.iter().map(|view| row(&view.name, &view.scores, view.r0.as_ref())));
-    rows.extend(mean.map(|mean| row("mean", &mean, mean_r0.as_ref())));
+    let of_view = |view: &ViewScore| row(&view.name, &view.scores, view.r0.as_ref(), view.leftover);
+    rows.extend(scored.iter().map(of_view));
+    rows.extend(mean.map(|mean| row("mean", &mean, mean_r0.as_ref(), mean_leftover)));
     table::aligned(&rows)
 }

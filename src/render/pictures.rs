@@ -40,7 +40,7 @@ impl Renderer {
         camera: &Camera,
         options: &RenderOptions,
     ) -> Result<Image> {
-        let mut data = self.render_channels(gaussians, camera, options)?;
+        let mut data = self.render_planes(gaussians, camera, options)?;
         let Camera { width, height, .. } = *camera;
         data.truncate(3 * width as usize * height as usize);
         Ok(Image { width, height, data })
@@ -52,6 +52,21 @@ impl Renderer {
     /// # Errors
     /// As [`Renderer::render_image`].
     pub fn render_channels(
+        &mut self,
+        gaussians: &Buffer<f32>,
+        camera: &Camera,
+        options: &RenderOptions,
+    ) -> Result<Vec<f32>> {
+        let mut planes = self.render_planes(gaussians, camera, options)?;
+        planes.truncate(self.settings.channels() * Patch::from(camera).pixel_count());
+        Ok(planes)
+    }
+
+    /// As [`Renderer::render_channels`], and behind the channels how much of the background shows, (channels + 1, H, W).
+    ///
+    /// # Errors
+    /// As [`Renderer::render_image`].
+    pub fn render_planes(
         &mut self,
         gaussians: &Buffer<f32>,
         camera: &Camera,
@@ -71,7 +86,7 @@ impl Renderer {
         parts: &[Patch],
         options: &RenderOptions,
     ) -> Result<Vec<f32>> {
-        let mut data = vec![0.0; self.settings.channels() * whole.pixel_count()];
+        let mut data = vec![0.0; (self.settings.channels() + 1) * whole.pixel_count()];
         for part in parts {
             let own = self.render_patch(gaussians, part, options)?;
             part.paste((part, &own), (whole, &mut data));
@@ -111,7 +126,8 @@ impl Renderer {
         Ok(Status::from_words(&words))
     }
 
-    /// Every channel of one patch, (channels, h, w); where the device cannot follow all intersections of it, half by half.
+    /// Every channel of one patch, and behind them its [`Renderer::transmittances`], (channels + 1, h, w); where the device
+    /// cannot follow all intersections of it, half by half.
     ///
     /// # Errors
     /// As [`Renderer::render_image`].
@@ -136,8 +152,10 @@ impl Renderer {
             }
             self.grow(status.intersections)?;
         }
-        let mut data = self.gpu.read(&self.frame.render)?;
-        data.truncate(self.settings.channels() * patch.pixel_count());
-        Ok(data)
+        let mut planes = self.gpu.read(&self.frame.render)?;
+        planes.truncate(self.settings.channels() * patch.pixel_count());
+        let transmittances = self.gpu.read(&self.frame.transmittances)?;
+        planes.extend_from_slice(&transmittances[..patch.pixel_count()]);
+        Ok(planes)
     }
 }

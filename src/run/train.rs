@@ -342,6 +342,8 @@ impl<'a> Course<'a> {
         trainer.leave_out_what_gains_nothing()?;
         let spent = self.meter.spent(self.gpu.peak_memory());
         let scored = self.evaluate(trainer, directory, observe)?;
+        let render = |view: &View| trainer.render(&view.camera);
+        eval::warn_of_holes(&scored, self.dataset, self.config.background, render)?;
         directory.save_trained(trainer)?;
         Ok((ended, scored, spent))
     }

@@ -14,6 +14,8 @@ pub struct Rendered {
     pub colors: Image,
     /// R_K, where the model has a denoiser.
     pub denoised: Option<Image>,
+    /// How much of the background shows at each pixel, 0 to 1, (H, W); none of a picture that is no render.
+    pub transmittances: Option<Vec<f32>>,
 }
 
 impl Rendered {
@@ -31,21 +33,33 @@ impl Rendered {
     ) -> Result<Self> {
         let Some(networks) = networks.filter(|networks| networks.has_denoiser()) else {
             renderer.reserve(count, [camera])?;
-            return Ok(renderer.render_image(gaussians, camera, options)?.into());
+            let planes = renderer.render_planes(gaussians, camera, options)?;
+            return Ok(Self::of_planes(camera, planes));
         };
         let (whole, margin) = (Patch::from(camera), networks.margin());
         let patches = renderer.patches_with_margin(camera, margin, |size| networks.fits(size));
-        let mut colors = Image::filled(camera.width, camera.height, [0.0; 3]);
-        let mut denoised = colors.clone();
+        let mut denoised = Image::filled(camera.width, camera.height, [0.0; 3]);
+        let mut planes = vec![];
         for patch in patches {
             let around = patch.with_margin(margin);
             renderer.reserve_with_headroom([count; 2], [around.size])?;
-            let channels = renderer.render_patch(gaussians, &around, options)?;
-            patch.paste((&around, &channels), (&whole, &mut colors.data));
-            let own = networks.denoised_image(&channels, around.size)?;
+            let own = renderer.render_patch(gaussians, &around, options)?;
+            planes.resize(own.len() / around.pixel_count() * whole.pixel_count(), 0.0);
+            patch.paste((&around, &own), (&whole, &mut planes));
+            let channels = &own[..own.len() - around.pixel_count()];
+            let own = networks.denoised_image(channels, around.size)?;
             patch.paste((&around, &own.data), (&whole, &mut denoised.data));
         }
-        Ok(Self { colors, denoised: Some(denoised) })
+        Ok(Self { denoised: Some(denoised), ..Self::of_planes(camera, planes) })
+    }
+
+    /// What [`Renderer::render_planes`] shows of a camera, without a denoiser.
+    fn of_planes(&Camera { width, height, .. }: &Camera, mut planes: Vec<f32>) -> Self {
+        let pixels = width as usize * height as usize;
+        let transmittances = planes.split_off(planes.len() - pixels);
+        planes.truncate(3 * pixels);
+        let colors = Image { width, height, data: planes };
+        Self { colors, denoised: None, transmittances: Some(transmittances) }
     }
 
     /// What the model is scored on: R_K, or R_0 where there is no denoiser.
@@ -54,9 +68,9 @@ impl Rendered {
     }
 }
 
-/// A picture that no denoiser has seen.
+/// A picture that is no render, a photograph say.
 impl From<Image> for Rendered {
     fn from(colors: Image) -> Self {
-        Self { colors, denoised: None }
+        Self { colors, denoised: None, transmittances: None }
     }
 }

@@ -89,7 +89,11 @@ fn a_run_directory_has_its_four_files_and_metrics_their_shape() {
     }
     assert!(file_names(&run).iter().all(|name| !name.ends_with(".partial")));
     let metrics = json(run.join("metrics.json"));
-    assert_eq!(keys(&metrics), ["mean", "views", "seconds", "gaussians", "steps", "spent"]);
+    let leftover = "leftover_transmittance";
+    let known = ["mean", "views", "seconds", "gaussians", "steps", leftover, "spent"];
+    assert_eq!(keys(&metrics), known);
+    assert_eq!(keys(&metrics[leftover]), ["mean", "views"]);
+    assert_eq!(keys(&metrics[leftover]["views"]["008"]), ["mean", "q99"]);
     assert_eq!(keys(&metrics["mean"]), ["psnr", "psnr_channel_mean", "ssim"]);
     assert_eq!(keys(&metrics["views"]), ["000", "008"]);
     assert_eq!(keys(&metrics["views"]["008"]), ["psnr", "psnr_channel_mean", "ssim"]);

@@ -129,7 +129,6 @@
     const ids = attribute('id', new Uint32Array(count), 1, true);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-    gl.clearColor(0, 0, 0, 1);
 
     // Sums in half floats where the device blends them: eight bits would round at every splat.
     const fine = gl.getExtension('EXT_color_buffer_float') || gl.getExtension('EXT_color_buffer_half_float');
@@ -148,7 +147,7 @@
       gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, image, 0);
     };
 
-    return (camera, width, height) => {
+    return (camera, width, height, grey) => {
       resize(width, height);
       const m = camera.viewFromWorld, fit = placed(camera, width, height);
       gl.useProgram(built);
@@ -166,6 +165,7 @@
       gl.uniform2f(uniform('scale'), 2 / width, -2 / height);
       gl.bindFramebuffer(gl.FRAMEBUFFER, fine ? sums : null);
       gl.viewport(0, 0, width, height);
+      gl.clearColor(grey, grey, grey, 1);
       gl.clear(gl.COLOR_BUFFER_BIT);
       gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, count);
       if (fine) shown();
@@ -268,7 +268,8 @@
       pending = false;
       const ratio = window.devicePixelRatio || 1;
       const [width, height] = [canvas.clientWidth, canvas.clientHeight].map((v) => Math.max(1, Math.round(v * ratio)));
-      draw(camera(), width, height);
+      // Before grey, what black hides is seen: holes.
+      draw(camera(), width, height, element('grey').checked ? 0.5 : 0);
       compare(ratio);
     };
     const refresh = () => { if (!pending) { pending = true; requestAnimationFrame(paint); } };
@@ -370,13 +371,14 @@
       const step = keys[event.key.toLowerCase()], turns = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
       if (step) move(...step.map((v) => 0.03 * reach() * v));
       else if (turns) look(turns[0] * 0.04, turns[1] * 0.04);
+      else if (event.key.toLowerCase() === 'g') element('grey').click();
       else return;
       event.preventDefault();
     });
 
     element('views').append(new Option('free', ''), ...views.map(({ name }, k) => new Option(name, String(k))));
     element('views').addEventListener('change', ({ target: { value } }) => choose(value === '' ? null : Number(value)));
-    element('compare').addEventListener('change', refresh);
+    for (const id of ['compare', 'grey']) element(id).addEventListener('change', refresh);
     element('slider').addEventListener('input', () => compare());
     element('provenance').append(...[...scene.provenance, `${scene.count} Gaussians`].map((line) => {
       const item = document.createElement('li');
