@@ -252,7 +252,9 @@ impl Trainer {
         }
         let held_out = dataset.views.iter().filter(|view| view.split == Split::HeldOut);
         let held_out = TargetViews::new(&mut pseudo_gt, held_out, &frame, &scene)?;
-        config.say_what_cannot_end_early(held_out.is_empty(), views.photographs().count());
+        if config.stop.views > 0 && held_out.is_empty() {
+            tracing::info!("no held-out view shows anything: the run takes all its steps");
+        }
         // No larger than what steps render.
         let largest = views.sizes().iter().map(|size| size.element_product() as usize).max();
         let pixels = largest.unwrap_or_default().min(MOST_PROBE_PIXELS);

@@ -372,6 +372,34 @@ fn a_run_without_a_length_ends_when_held_out_views_have_converged() {
 }
 
 #[test]
+fn a_run_that_has_ended_early_goes_on_from_its_end() {
+    let set = written(&Capture::default());
+    let (root, out) = (set.path().display(), set.path().join("run"));
+    let options = "--preset draft --set stop.views=1 --set stop.every=5 --set stop.gain=90 \
+                   --set schedule.resolution_steps=[0,0] --set schedule.settle_steps=6";
+    let train = |more: &str| {
+        succeed(&format!("train {root} --out {} {options} --progress json {more}", out.display()))
+    };
+    let said = train("");
+    for event in [
+        r#""event":"last_step","last":21,"step":15"#,
+        r#""ended":{"best_step":21,"reason":"converged","step":21}"#,
+    ] {
+        assert!(said.contains(event), "no {event} in {said}");
+    }
+    assert!(said.contains(r#""may_end_early":true"#));
+    // Done is done, whatever would have been the most steps.
+    assert!(train("--resume").contains("is done: 21 steps"));
+    let said = train("--resume --steps 27");
+    let steps =
+        |event: &&str| event.contains(r#""event":"started""#) && event.contains(r#""step":21"#);
+    assert!(said.lines().any(|line| steps(&line)), "{said}");
+    assert!(said.contains(r#""ended":{"best_step":27,"reason":"steps","step":27}"#), "{said}");
+    let log = fs::read_to_string(out.join("train.csv")).unwrap();
+    assert_eq!(log.lines().count(), 28);
+}
+
+#[test]
 fn sets_of_any_kind_have_a_plan_or_one_clear_error() {
     // Black views are left out and named; only black ones are refused.
     let set = written(&Capture::default());

@@ -8,11 +8,13 @@ use std::process::Stdio;
 use std::time::Duration;
 
 use glam::Vec3;
-use nightsplat::dataset::Dataset;
 use nightsplat::dataset::synthetic::{self, SyntheticOptions};
+use nightsplat::dataset::{Dataset, Split, View};
 use nightsplat::gpu::testing::gpu;
+use nightsplat::image::Image;
 use nightsplat::run::{self, Event, HeldRun};
-use nightsplat::train::{Background, Part, StepReport, TrainConfig, Trainer};
+use nightsplat::scene::Attribute;
+use nightsplat::train::{Background, EndReason, Part, StepReport, TrainConfig, Trainer};
 use safetensors::SafeTensors;
 
 mod common;
@@ -114,6 +116,85 @@ fn growth_and_the_sh_degree_end_where_held_out_views_gain_too_little_and_a_resum
         restored.restore(&checkpoint).unwrap();
         assert!(finished(&mut restored, folder.path()).0 == expected, "from step {step}");
     }
+}
+
+/// A set of which one view is held out, and a run on it that converges as soon as it can: what is gained is never enough.
+fn early(folder: &Path) -> (Dataset, TrainConfig) {
+    let options = SyntheticOptions { views: 12, width: 40, height: 30, seed: 2 };
+    synthetic::write(folder, &options).unwrap();
+    let mut config = config(&[]);
+    config.steps = 60;
+    config.schedule.resolution_steps = [0, 0];
+    (config.stop.views, config.stop.every, config.stop.gain) = (1, 7, 90.0);
+    config.schedule.settle_steps = 9;
+    (Dataset::load(folder, &config.load_options()).unwrap(), config)
+}
+
+fn ended(trainer: &mut Trainer, folder: &Path) -> Vec<u8> {
+    while !trainer.has_ended() {
+        trainer.advance(u64::MAX).unwrap();
+    }
+    let path = folder.join("end.safetensors");
+    trainer.save_checkpoint(&path).unwrap();
+    fs::read(path).unwrap()
+}
+
+#[test]
+fn a_run_that_converges_settles_and_ends_and_so_does_one_that_was_killed() {
+    let folder = tempfile::tempdir().unwrap();
+    let (dataset, config) = early(folder.path());
+    let new = || Trainer::new(&gpu(), config.clone(), &dataset).unwrap();
+    let mut whole = new();
+    assert!(whole.may_end_early());
+    let expected = ended(&mut whole, folder.path());
+    // Rounds follow steps 10 and 20. Scores that fall in the ten steps after one wait for the end of these.
+    let steps: Vec<u64> = whole.held_out_scores().map(|(step, _)| step).collect();
+    assert_eq!(steps, [7, 20, 30, 39]);
+    assert_eq!((whole.settles_after(), whole.steps_done(), whole.may_end_early()), (30, 39, false));
+    let rate = |step| whole.learning_rates(step)[Attribute::Quats];
+    assert!(rate(30) > 0.99 * rate(29) && rate(39) < 0.06 * rate(30));
+    let refused = whole.advance(60).unwrap_err().to_string();
+    assert!(refused.contains("has ended at step 39, before step 60"), "{refused}");
+    let end = whole.end().unwrap();
+    assert_eq!((end.reason, end.step), (EndReason::Converged, 39));
+    // In growth, after a score, at the step that converges, and while it settles.
+    for step in [5, 20, 25, 30, 34] {
+        let checkpoint = folder.path().join("checkpoint.safetensors");
+        let mut interrupted = new();
+        advance(&mut interrupted, step);
+        interrupted.save_checkpoint(&checkpoint).unwrap();
+        let mut restored = new();
+        restored.restore(&checkpoint).unwrap();
+        assert!(ended(&mut restored, folder.path()) == expected, "from step {step}");
+        assert_eq!(restored.end().unwrap(), end);
+    }
+}
+
+#[test]
+fn a_run_that_is_resumed_with_other_steps_takes_them_all() {
+    let folder = tempfile::tempdir().unwrap();
+    let (dataset, config) = early(folder.path());
+    let checkpoint = folder.path().join("end.safetensors");
+    ended(&mut Trainer::new(&gpu(), config.clone(), &dataset).unwrap(), folder.path());
+    let longer = TrainConfig { steps: 48, ..config };
+    let mut restored = Trainer::new(&gpu(), longer, &dataset).unwrap();
+    restored.restore(&checkpoint).unwrap();
+    assert_eq!((restored.last_step(), restored.may_end_early()), (48, false));
+    ended(&mut restored, folder.path());
+    let end = restored.end().unwrap();
+    assert_eq!((end.reason, end.step), (EndReason::Steps, 48));
+}
+
+#[test]
+fn held_out_views_that_show_nothing_are_not_scored() {
+    let folder = tempfile::tempdir().unwrap();
+    let (mut dataset, config) = early(folder.path());
+    let held_out = |view: &&mut View| view.split == Split::HeldOut;
+    let view = dataset.views.iter_mut().find(held_out).unwrap();
+    (view.image, view.original) = (Some(Image::filled(40, 30, [0.0; 3])), None);
+    let mut trainer = Trainer::new(&gpu(), config, &dataset).unwrap();
+    assert!(!trainer.may_end_early());
+    assert_eq!((trainer.last_step(), trainer.held_out_psnr().unwrap()), (60, None));
 }
 
 #[test]

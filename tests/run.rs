@@ -110,6 +110,16 @@ fn a_run_says_at_its_start_what_it_trains_and_why() {
     ] {
         assert!(said.contains(part), "no `{part}` in: {said}");
     }
+    // Nothing is held out of eight views but one, and nothing of seven.
+    let said = start("d", "--progress none --preset draft --set steps=30");
+    assert!(
+        said.contains("30 steps at most: the run settles for 10 and ends once 1 held-out"),
+        "{said}"
+    );
+    assert!(said.contains("30 steps are too few to settle for 100 (a third of them at most)"));
+    assert!(said.contains("ended at step 30: all steps are done"), "{said}");
+    let said = start("e", "--progress none --preset balanced --set steps=3 --test-every 3");
+    assert!(said.contains("no early end: 6 training views are too few to hold one out"), "{said}");
     let said = start("b", "--steps 1 --progress none --plan none --curve AP3 --test-every 5");
     assert!(said.contains("curve ap3: as asked for"), "{said}");
     assert!(said.contains("2 test views (every 5th by name, as asked for)"), "{said}");
@@ -189,7 +199,7 @@ fn a_planned_run_is_made_longer_on_the_views_that_it_began_with() {
     succeed(&format!("synth {set} --views 20 --width 32 --height 24"));
     let short = "--set steps=6 --checkpoint-every 3 --progress none";
     let said = succeed(&train(folder.path(), "run", short));
-    assert!(said.contains("kept from training to tell when it has converged"), "{said}");
+    assert!(said.contains("held-out view"), "{said}");
     let said = succeed(&train(folder.path(), "run", "--steps 9 --resume --progress none"));
     assert!(said.contains("9 steps"), "{said}");
 }

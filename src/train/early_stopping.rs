@@ -64,7 +64,7 @@ impl Default for StopConfig {
             views: 0,
             every: 250,
             gain: 0.05,
-            margin: 0.1,
+            margin: 0.25,
             growth_gain: 0.0,
             not_finite: NotFinite::Stop,
             degree_gain: 0.0,
@@ -155,22 +155,6 @@ impl TrainConfig {
     /// The length of the settling phase: that of the schedule, or a third of a run that is short for it.
     pub fn settling_steps(&self) -> u64 {
         self.schedule.settle_steps.min(self.steps / 3)
-    }
-
-    /// Warns of an early end that was asked for and cannot come, and of a settling phase that is cut short.
-    pub(super) fn say_what_cannot_end_early(&self, scores_nothing: bool, views: usize) {
-        let (asked, settling, steps) = (self.stop.views, self.schedule.settle_steps, self.steps);
-        if asked > 0 && scores_nothing {
-            tracing::warn!(
-                "no view is held out of {views} training views, one for each 8 that show something: the run takes all its {steps} steps"
-            );
-        }
-        let own = self.settling_steps();
-        if own < settling {
-            tracing::warn!(
-                "the model settles in the last {own} of {steps} steps: schedule.settle_steps = {settling} is more than a third of them"
-            );
-        }
     }
 }
 
@@ -299,6 +283,9 @@ impl Trainer {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::dataset::Dataset;
+    use crate::dataset::synthetic::{self, SyntheticOptions};
+    use crate::gpu::testing::gpu;
 
     #[test]
     fn a_run_ends_once_two_scores_in_a_row_gain_too_little() {
@@ -314,5 +301,55 @@ mod tests {
         ] {
             assert_eq!(stop.has_converged(scores), ends, "{scores:?}");
         }
+    }
+
+    /// A trainer on a small set with a held-out view, after some steps and a score.
+    fn scored(margin: f64) -> Trainer {
+        let folder = tempfile::tempdir().unwrap();
+        let options = SyntheticOptions { views: 10, width: 32, height: 24, seed: 3 };
+        synthetic::write(folder.path(), &options).unwrap();
+        let mut config = TrainConfig { steps: 20, ..TrainConfig::default() };
+        (config.stop.views, config.stop.margin) = (1, margin);
+        config.schedule.resolution_steps = [0, 0];
+        let dataset = Dataset::load(folder.path(), &config.load_options()).unwrap();
+        let mut trainer = Trainer::new(&gpu(), config, &dataset).unwrap();
+        trainer.train_steps(12, &mut vec![]).unwrap();
+        trainer.score_held_out().unwrap();
+        trainer
+    }
+
+    #[test]
+    fn a_run_that_ends_worse_than_it_was_goes_back_and_one_within_the_margin_does_not() {
+        for (margin, best_step) in [(0.25, 12), (90.0, 20)] {
+            let mut trainer = scored(margin);
+            let best = trainer.gaussians().unwrap();
+            trainer.train_steps(20, &mut vec![]).unwrap();
+            // Damage: nothing is seen any more.
+            let gpu = trainer.gpu.clone();
+            let parameters = &mut trainer.model.gaussians.parameters;
+            let faint = vec![-20.0; parameters.len()];
+            gpu.write(parameters, &faint).unwrap();
+            trainer.score_held_out().unwrap();
+            let ended = trainer.end().unwrap();
+            assert_eq!(ended, Ended { reason: EndReason::Steps, step: 20, best_step });
+            assert_eq!(trainer.gaussians().unwrap() == best, best_step == 12);
+            assert_eq!(ended.to_string().contains("the model of step 12 is kept"), best_step == 12);
+        }
+    }
+
+    #[test]
+    fn the_best_model_survives_a_kill() {
+        let mut trainer = scored(0.25);
+        let file = tempfile::NamedTempFile::new().unwrap();
+        let best = trainer.gaussians().unwrap();
+        trainer.train_steps(16, &mut vec![]).unwrap();
+        trainer.save_checkpoint(file.path()).unwrap();
+        let mut restored = scored(0.25);
+        restored.best.clear();
+        restored.restore(file.path()).unwrap();
+        assert_eq!((restored.step, restored.best.len()), (16, trainer.best.len()));
+        let kept = restored.best.clone();
+        restored.restore_snapshot(&kept).unwrap();
+        assert!(restored.gaussians().unwrap() == best);
     }
 }

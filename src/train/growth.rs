@@ -205,7 +205,7 @@ mod tests {
         }
     }
 
-    /// The scenes in the folder that NIGHTSPLAT_SCENES names, each at whole, half and quarter size, with three seeds.
+    /// The scenes in the folder that `NIGHTSPLAT_SCENES` names, each at whole, half and quarter size, with three seeds.
     #[test]
     #[ignore = "takes hours: `scripts/stress.py growth`"]
     fn no_round_of_a_real_scene_costs_the_training_views_much() {

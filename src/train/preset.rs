@@ -169,7 +169,7 @@ mod tests {
     use crate::loss::Weights;
     use crate::nn::Form;
     use crate::tone::ToneSettings;
-    use crate::train::ModelConfig;
+    use crate::train::{Background, ModelConfig};
 
     fn applied(preset: Preset, scene: &str, curve: ToneCurve) -> TrainConfig {
         let tone = ToneSettings::new(curve);
@@ -198,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn paper_is_the_paper_and_balanced_is_the_library_default_but_for_its_end_its_bits_and_what_fills()
+    fn paper_is_the_paper_and_balanced_is_the_library_default_but_for_its_end_its_background_its_bits_and_what_fills()
      {
         let paper = applied(Preset::Paper, "x", ToneCurve::Auto);
         let mut model = ModelConfig::default();
@@ -213,15 +213,22 @@ mod tests {
             ..Default::default()
         };
         assert_eq!(paper, expected);
-        let balanced = applied(Preset::Balanced, "x", ToneCurve::Ase);
-        assert_eq!((balanced.tone.curve, balanced.stop.views), (ToneCurve::Ase, 2));
-        let defaults = TrainConfig::default();
+        let (balanced, defaults) =
+            (applied(Preset::Balanced, "x", ToneCurve::Ase), TrainConfig::default());
+        assert_eq!((balanced.tone.curve, balanced.stop.views), (ToneCurve::Ase, 8));
+        assert_eq!(
+            (balanced.background, defaults.background),
+            (Background::Random, Background::Black)
+        );
+        assert_eq!((balanced.schedule.settle_steps, defaults.schedule.settle_steps), (250, 0));
         assert_eq!((balanced.precision.rest, balanced.precision.moments), (Bits::Half, Bits::Half));
         let (tone, stop) = (defaults.tone.clone(), defaults.stop.clone());
         assert_eq!((balanced.density.fill, defaults.density.fill), (5_000, 0));
         let (density, precision) = (defaults.density.clone(), defaults.precision.clone());
         assert_eq!(DensityConfig { fill: 0, ..balanced.density.clone() }, density);
-        let plain = TrainConfig { tone, stop, density, precision, ..balanced };
+        let (schedule, background) = (defaults.schedule.clone(), defaults.background);
+        let plain =
+            TrainConfig { tone, stop, density, precision, schedule, background, ..balanced };
         assert_eq!(plain, TrainConfig { dataset: "data/x".into(), ..defaults });
         assert!(!Preset::Paper.is_planned() && Preset::Balanced.is_planned());
     }

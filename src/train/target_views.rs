@@ -129,7 +129,7 @@ impl TargetView {
 
 /// Whether no pixel that counts reaches half a code value of 8 bits.
 fn shows_nothing(target: &Image, mask: Option<&Mask>) -> bool {
-    let is_dark = |value: &f32| !(*value > 0.5 / 255.0);
+    let is_dark = |value: &f32| value.is_nan() || *value <= 0.5 / 255.0;
     match mask {
         Some(mask) => mask.counted(target).iter().all(is_dark),
         None => target.data.iter().all(is_dark),

@@ -18,8 +18,15 @@ pub(super) struct Facts {
     size: [u32; 2],
     train_views: usize,
     test_views: usize,
-    /// Views that are kept from training to tell when it has converged.
+    /// Views that are held out to tell when the run has converged.
     held_out_views: usize,
+    /// The most steps that the run takes.
+    steps: u64,
+    /// The last steps, in which the model settles.
+    settling_steps: u64,
+    /// What a run that was to end early, or to settle for longer, does instead.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    notes: Vec<String>,
     /// What says which views are test views.
     split: String,
     points: usize,
@@ -52,6 +59,9 @@ impl Facts {
             train_views: of(Split::Train),
             test_views: of(Split::Test),
             held_out_views: of(Split::HeldOut),
+            steps: config.steps,
+            settling_steps: config.settling_steps(),
+            notes: notes(config, dataset),
             split: Dataset::split_rule(&config.dataset, &config.load_options()),
             points: dataset.points.len(),
             curve: config.tone.curve.name().to_owned(),
@@ -65,18 +75,39 @@ impl Facts {
 
     pub(super) fn text(&self) -> String {
         let Self { dataset, device, size: [width, height], train_views, points, .. } = self;
-        let held_out = match self.held_out_views {
-            0 => String::new(),
-            count => format!(", {count} kept from training to tell when it has converged"),
+        let length = match (self.held_out_views, self.settling_steps) {
+            (0, 0) => format!("{} steps", self.steps),
+            (0, settling) => format!("{} steps, of which the last {settling} settle", self.steps),
+            (views, settling) => format!(
+                "{} steps at most: the run settles for {settling} and ends once {views} held-out views have converged",
+                self.steps
+            ),
         };
+        let notes: String = self.notes.iter().map(|note| format!("{note}\n")).collect();
         let tests = match self.test_views {
             0 => "no test view".to_owned(),
             count => format!("{count} test views ({}) scored against {}", self.split, self.against),
         };
         format!(
-            "{dataset}: {train_views} views of {width}x{height} to train on{held_out}; {tests}; {points} points; on {device}\n\
-             curve {}: {}\n",
+            "{dataset}: {train_views} views of {width}x{height} to train on; {tests}; {points} points; on {device}\n\
+             {length}\n{notes}curve {}: {}\n",
             self.curve, self.why
         )
     }
+}
+
+/// A line for each thing that was asked of the length of a run and cannot be.
+fn notes(config: &TrainConfig, dataset: &Dataset) -> Vec<String> {
+    let (steps, asked) = (config.steps, config.schedule.settle_steps);
+    let views = dataset.views.iter().filter(|view| view.is_for_training()).count();
+    let is_held_out = dataset.views.iter().any(|view| view.split == Split::HeldOut);
+    let none = (config.stop.views > 0 && !is_held_out).then(|| {
+        format!(
+            "no early end: {views} training views are too few to hold one out (one of eight is)"
+        )
+    });
+    let short = (config.settling_steps() < asked).then(|| {
+        format!("{steps} steps are too few to settle for {asked} (a third of them at most)")
+    });
+    none.into_iter().chain(short).collect()
 }
