@@ -1,10 +1,11 @@
 #!/usr/bin/env python3
 """The campaigns that take longer than tests may: each prints what it found, and the first that fails ends the script.
 
-    scripts/stress.py [table] [conditioning] [cameras] [long] [kills] [fuzz] [guards]
+    scripts/stress.py [table] [conditioning] [cameras] [long] [kills] [fuzz] [guards] [growth]
 
 Without a name all of them run. NIGHTSPLAT names the command (default: target/release/nightsplat, built first), STEPS and
-KILLS how many steps and kills (100000 and 200), FUZZ_SECONDS what each fuzz target gets (600).
+KILLS how many steps and kills (100000 and 200), FUZZ_SECONDS what each fuzz target gets (600), NIGHTSPLAT_SCENES the scenes
+of growth, parted by commas (NIGHTSPLAT_DOWNSCALES 4,2,1 and NIGHTSPLAT_SEEDS 1,2,3).
 """
 
 import os
@@ -129,7 +130,15 @@ def guards(_):
     run(sys.executable, ROOT / "scripts" / "plant-defects.py", "guard:")
 
 
-CAMPAIGNS = {campaign.__name__: campaign for campaign in (table, conditioning, cameras, long, kills, fuzz, guards)}
+def growth(_):
+    """No round of density control costs the training views of a scene more than .3 dB."""
+    if not os.environ.get("NIGHTSPLAT_SCENES"):
+        print("not run: NIGHTSPLAT_SCENES names no scene")
+        return
+    run("cargo", "test", "--release", "--lib", "--", "--ignored", "--nocapture", "no_round_of_a_real_scene")
+
+
+CAMPAIGNS = {campaign.__name__: campaign for campaign in (table, conditioning, cameras, long, kills, fuzz, guards, growth)}
 
 
 def main():

@@ -2,16 +2,17 @@
 //!
 //! Axes are those of `OpenCV` (x right, y down, z forward); pixel units, the image's corner at (0, 0), pixel centres at +0.5.
 
-mod covering;
 pub mod frame;
 mod patch;
 mod path;
+mod places;
 
 use glam::{DAffine3, DVec2, DVec3};
 
 pub use frame::Frame;
 pub use patch::Patch;
 pub use path::CameraPath;
+pub(crate) use places::Places;
 
 /// An undistorted pinhole camera with its pose.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -174,6 +174,8 @@ impl Diagnosis {
                            expose longer";
             return Err(Error::input(&dataset.root, problem));
         };
+        let cameras = views.iter().map(|(_, view)| view.camera);
+        let exposure = exposure.seen_by(photographs.iter().map(|one| &one.histogram).zip(cameras));
         let of_view = |(place, photograph): (usize, &Photograph)| {
             photograph.diagnosis(&views[place].1.name, &shared, place)
         };

@@ -14,9 +14,9 @@ mod requests;
 mod tensorboard;
 mod train;
 
-pub use directory::{Progress, RunDirectory, load_progress};
 #[cfg(feature = "cli")]
-pub(crate) use directory::{SPENT, TARGET_EXPOSURE};
+pub(crate) use directory::{ENDED, HELD_OUT_COURSE, SPENT, TARGET_EXPOSURE};
+pub use directory::{Progress, RunDirectory, load_progress};
 pub use done::done_steps;
 pub use events::Event;
 pub use load::{

@@ -15,6 +15,7 @@ mod model;
 mod networks;
 mod overrides;
 mod parts;
+mod passes;
 mod patches;
 mod paths;
 mod precision;
@@ -37,11 +38,10 @@ use crate::exposure::Exposures;
 use crate::gpu::{Buffer, CheckReport, Gpu, PassTime, Recorder};
 use crate::loss::{LogSlot, LossLog, Losses, StepLosses, Term, TermInputs};
 use crate::nn::Form;
-use crate::optimizer::{Adam, FiniteCheck, Learnable, LearningRates};
+use crate::optimizer::{Adam, FiniteCheck, LearningRates};
 use crate::pseudo_gt::PseudoGt;
-use crate::random::Stream;
-use crate::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer};
-use crate::scene::{COLOR_CHANNELS, Gaussians, Shape};
+use crate::render::{Damping, Gradients, RenderOptions, Renderer};
+use crate::scene::{COLOR_CHANNELS, Gaussians};
 use crate::{Error, Result};
 
 use best::Snapshot;
@@ -56,6 +56,7 @@ pub use memory::MemoryEstimate;
 use model::Model;
 pub use networks::Networks;
 pub use parts::{ModelConfig, ModelName, NetworkRates, Part};
+use passes::{Kernels, background, first_sh_degree, learnables};
 pub use precision::{PhotographBits, PrecisionConfig};
 pub use preset::Preset;
 pub use rendered::Rendered;
@@ -584,55 +585,6 @@ impl Trainer {
             terms: config.terms().into_iter().map(value).collect(),
             gaussians: self.model.count(),
             milliseconds,
-        }
-    }
-}
-
-/// What needs nothing but the device and settings.
-struct Kernels {
-    renderer: Renderer,
-    losses: Losses,
-    adam: Adam,
-    finite: FiniteCheck,
-    densifier: Densifier,
-}
-
-impl Kernels {
-    fn new(gpu: &Gpu, config: &TrainConfig, dataset: &Dataset) -> Result<Self> {
-        let (rest, own) = (config.precision.rest, config.render_settings());
-        let shape = Shape { sh_degree: first_sh_degree(config), ..own.shape };
-        Ok(Self {
-            renderer: Renderer::new(gpu, RenderSettings { rest, shape, ..own })?,
-            losses: Losses::new(gpu, &config.loss())?,
-            adam: Adam::new(gpu)?,
-            finite: FiniteCheck::new(gpu)?,
-            densifier: growth::densifier(gpu, config, dataset)?,
-        })
-    }
-}
-
-/// The SH degree of the first step.
-fn first_sh_degree(config: &TrainConfig) -> u32 {
-    config.schedule.sh_degree(1, config.sh_degree)
-}
-
-/// Everything that is learned beside the Gaussians: Adam trains it, and checkpoints keep it.
-fn learnables<'a>(
-    networks: &'a mut Option<NetworkTerms>,
-    exposures: &'a mut Option<Exposures>,
-) -> impl Iterator<Item = &'a mut dyn Learnable> {
-    let networks = networks.iter_mut().flat_map(|terms| terms.networks.parameters_mut());
-    let networks = networks.map(|parameters| parameters as &mut dyn Learnable);
-    networks.chain(exposures.iter_mut().map(|exposures| exposures as &mut dyn Learnable))
-}
-
-/// The background of a step.
-fn background(config: &TrainConfig, step: u64) -> [f32; 3] {
-    match config.background {
-        Background::Black => [0.0; 3],
-        Background::Random => {
-            let stream = Stream::new(config.seed, streams::BACKGROUND);
-            std::array::from_fn(|c| stream.uniform(3 * step + c as u64) as f32)
         }
     }
 }

@@ -155,8 +155,10 @@ fn photographs_are_lifted_before_they_are_shrunk() {
         .train_views()
         .map(|view| (view.name.clone(), view.photograph().unwrap().unwrap().into_owned()));
     let photographs: Vec<(String, Image)> = photographs.collect();
-    let measured: Vec<_> =
-        photographs.iter().map(|(_, image)| pseudo_gt.measure(&image.data).unwrap()).collect();
+    let seen = photographs.iter().zip(shrunk.train_views());
+    let measured: Vec<_> = seen
+        .map(|((_, image), view)| pseudo_gt.measure(&image.data).unwrap().seen_by(&view.camera))
+        .collect();
     let scene = settings.scene(&measured).unwrap();
     for ((name, photograph), measured) in photographs.iter().zip(&measured) {
         let lifted = pseudo_gt.lifted(photograph, &settings.lift(&scene, measured)).unwrap();

@@ -382,8 +382,8 @@ fn a_run_that_has_ended_early_goes_on_from_its_end() {
     };
     let said = train("");
     for event in [
-        r#""event":"last_step","last":21,"step":15"#,
-        r#""ended":{"best_step":21,"reason":"converged","step":21}"#,
+        r#""event":"last_step","step":15,"last":21"#,
+        r#""ended":{"reason":"converged","step":21,"best_step":21}"#,
     ] {
         assert!(said.contains(event), "no {event} in {said}");
     }
@@ -394,7 +394,7 @@ fn a_run_that_has_ended_early_goes_on_from_its_end() {
     let steps =
         |event: &&str| event.contains(r#""event":"started""#) && event.contains(r#""step":21"#);
     assert!(said.lines().any(|line| steps(&line)), "{said}");
-    assert!(said.contains(r#""ended":{"best_step":27,"reason":"steps","step":27}"#), "{said}");
+    assert!(said.contains(r#""ended":{"reason":"steps","step":27,"best_step":27}"#), "{said}");
     let log = fs::read_to_string(out.join("train.csv")).unwrap();
     assert_eq!(log.lines().count(), 28);
 }

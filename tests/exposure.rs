@@ -1,5 +1,7 @@
 //! How bright the automatic target is: the rule against a slow one over pixels, and what comes of odd sets.
 
+use glam::{DAffine3, DVec2, DVec3};
+use nightsplat::camera::Camera;
 use nightsplat::tone::{Exposure, LuminanceHistogram, Statistics, exposed_anew, soft};
 
 /// A reproducible photograph whose luminance crowds near black, planar; `contrast` is the power that crowds it.
@@ -94,7 +96,7 @@ fn darker_views_have_a_higher_gain_and_equal_ones_the_scene_s() {
     let histogram = LuminanceHistogram::of(&view);
     let equal = exposure(&vec![view.clone(); 3]).unwrap();
     assert_eq!(equal.spread, 0.0);
-    assert!((equal.gain_of(&histogram) / equal.gain - 1.0).abs() < 1e-9);
+    assert!((equal.gain_of(&histogram, None) / equal.gain - 1.0).abs() < 1e-9);
     let single = exposure(std::slice::from_ref(&view)).unwrap();
     assert!((single.gain / equal.gain - 1.0).abs() < 1e-12);
 
@@ -106,12 +108,68 @@ fn darker_views_have_a_higher_gain_and_equal_ones_the_scene_s() {
     // Nearly all of the difference is taken back: the targets are as bright as one another.
     let means = views.each_ref().map(|view| {
         let histogram = LuminanceHistogram::of(view);
-        histogram.mean_of(|y| soft(y, varied.gain_of(&histogram)))
+        histogram.mean_of(|y| soft(y, varied.gain_of(&histogram, None)))
     });
     let [low, high] = [f64::min, f64::max].map(|of| means.into_iter().reduce(of).unwrap());
     assert!(high - low < 0.03, "{means:?}");
     let shared = varied.clone().shared();
-    assert_eq!(shared.gain_of(&histogram), varied.gain);
+    assert_eq!(shared.gain_of(&histogram, None), varied.gain);
+}
+
+/// Cameras along a path, a step apart each, that look ahead.
+fn camera(step: usize) -> Camera {
+    Camera {
+        width: 8,
+        height: 8,
+        focal: DVec2::splat(8.0),
+        principal_point: DVec2::splat(4.0),
+        view_from_world: DAffine3::from_translation(-(step as f64) * DVec3::X),
+    }
+}
+
+/// The gains of views along a path that are scaled by factors, and how much of their differences they keep.
+fn gains_along(factors: &[f32]) -> (Vec<f64>, f64) {
+    let view = photograph(20_000, 0.1, 2, 7);
+    let views: Vec<_> =
+        factors.iter().map(|&factor| LuminanceHistogram::of(&scaled(&view, factor))).collect();
+    let seen = views.iter().enumerate().map(|(i, view)| (view, camera(i)));
+    let exposure = Exposure::of(&views, None).unwrap().seen_by(seen);
+    let gain = |(i, view)| exposure.gain_of(view, Some(&camera(i)));
+    (views.iter().enumerate().map(gain).collect(), exposure.share)
+}
+
+#[test]
+fn views_that_are_near_each_other_have_about_one_gain_unless_their_exposures_differ() {
+    let spread = |gains: &[f64]| {
+        let [low, high] = [f64::min, f64::max].map(|of| gains.iter().copied().reduce(of).unwrap());
+        (high / low).log2()
+    };
+    // What differs by little from view to view is taken for what they show: the targets agree.
+    let flicker: Vec<f32> = (0..40).map(|i| if i % 2 == 0 { 1.0 } else { 1.1 }).collect();
+    let (gains, share) = gains_along(&flicker);
+    assert!(spread(&gains[5..35]) < 0.3 * 1.1_f64.log2(), "{}", spread(&gains[5..35]));
+    assert!(share < 0.3, "{share}");
+    // What changes along the path is followed.
+    let drift: Vec<f32> = (0..40).map(|i| 1.02_f32.powi(i)).collect();
+    let (gains, share) = gains_along(&drift);
+    assert!(share > 0.8 && spread(&gains) > 0.8 * 39.0 * 1.02_f64.log2(), "{share}");
+    // Photographs a stop apart are exposed anew, each by itself.
+    let stops: Vec<f32> = (0..40).map(|i| if i % 2 == 0 { 1.0 } else { 0.5 }).collect();
+    let (gains, share) = gains_along(&stops);
+    assert!(share > 0.9 && spread(&gains) > 0.9, "{share}");
+}
+
+#[test]
+fn a_view_beyond_all_others_has_the_gain_of_the_nearest() {
+    let views: Vec<_> = [1.0, 0.8]
+        .map(|factor| LuminanceHistogram::of(&scaled(&photograph(20_000, 0.1, 2, 7), factor)))
+        .into();
+    let seen = views.iter().enumerate().map(|(i, view)| (view, camera(100 * i)));
+    let exposure = Exposure::of(&views, None).unwrap().seen_by(seen);
+    let [near, far] = [0, 1].map(|i| exposure.gain_of(&views[i], Some(&camera(100 * i))));
+    let beyond = exposure.gain_of(&views[1], Some(&camera(100_000)));
+    assert!(far > near && (beyond / far - 1.0).abs() < 1e-9, "{beyond}, not {far}");
+    assert_eq!(exposure.clone().shared().gain_of(&views[1], Some(&camera(0))), exposure.gain);
 }
 
 #[test]
@@ -150,7 +208,7 @@ fn black_views_are_left_out_and_a_black_set_has_no_exposure() {
     let with = exposure(&[good.clone(), black.clone(), vec![0.0; 3000]]).unwrap();
     let without = exposure(&[good]).unwrap();
     assert_eq!((with.gain, with.black), (without.gain, 2));
-    assert_eq!(with.gain_of(&LuminanceHistogram::of(&black)), with.gain);
+    assert_eq!(with.gain_of(&LuminanceHistogram::of(&black), None), with.gain);
     assert!(with.reason().contains("2 as good as black"), "{}", with.reason());
     assert_eq!(exposure(&[black, vec![0.0; 3000]]), None);
     assert_eq!(exposure(&[]), None);

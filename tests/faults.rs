@@ -122,7 +122,7 @@ fn a_device_that_is_lost_anywhere_leaves_the_last_checkpoint_to_go_on_from() {
     assert!(train(&gpu(), &config, &dataset, &straight, HeldRun::Refuse).0.is_none());
     let expected = std::fs::read(straight.join("model.ply")).unwrap();
     let mut resumed = 0;
-    for number in [1, 40, 65, 75, 85, 95] {
+    for number in [1, 40, 80, 95, 105, 115, 125] {
         let out = folder.path().join(format!("run{number}"));
         let lost = gpu();
         lose_at_submission(&lost, number);

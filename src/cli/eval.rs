@@ -118,7 +118,7 @@ pub fn run(args: &EvalArgs) -> Result<()> {
             eval::add_lpips(&mut metrics, &scored, measure);
         }
         eval::add_reference(&mut metrics, &config.tone);
-        for what in [run::SPENT, run::TARGET_EXPOSURE] {
+        for what in [run::SPENT, run::TARGET_EXPOSURE, run::ENDED, run::HELD_OUT_COURSE] {
             if let Some(known) = recorded.get(what) {
                 metrics[what] = known.clone();
             }

@@ -102,7 +102,7 @@ impl ColourScene {
                 tracing::warn!("left out: {} is as good as black", pair.path.display());
                 continue;
             }
-            let gain = exposure.gain_of(&luminance) as f32;
+            let gain = exposure.gain_of(&luminance, None) as f32;
             pair.colours.iter_mut().for_each(|[dark, _]| *dark = dark.map(|x| gain * x));
             pairs.push(pair);
         }

@@ -16,7 +16,8 @@ impl PseudoGt {
         let tiles: Vec<&Buffer<f32>> = tiles.iter().collect();
         let gpu = self.gpu.clone();
         gpu.run("tone statistics", |pass| self.statistics_of_tiles(pass, &tiles))?;
-        Ok(Measured { statistics: self.measured()?, luminance: self.luminance_histogram()? })
+        let (statistics, luminance) = (self.measured()?, self.luminance_histogram()?);
+        Ok(Measured { statistics, luminance, camera: None })
     }
 
     /// The target that a photograph becomes, of its own size.

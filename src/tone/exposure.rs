@@ -4,13 +4,17 @@
 //! soft(x; k) = delta + (1 - delta) (1 - exp(-k x))                       delta = 0.075
 //! gain(H)    k = 0.90 / (mean W^3)^(1/3), W = min(Y, 99.9 % quantile of Y)
 //!            within the gains at which the mean of soft(Y; k) is 0.44 and 0.54, at most 128
-//! ln k_v     = s ln gain(view) + (1 - s) ln gain(scene)
-//! s          = max(0.75, sigma^2 / (sigma^2 + 0.1^2))
+//! ln k_v     = s ln gain(view) + (1 - s) around(view)
+//! around(v)  = sum_w a_vw ln gain(w) / sum_w a_vw            a_vw = exp(-|p_v - p_w|^2 / (2 h^2)), h = 0.15
+//! s          = tau^2 / (tau^2 + 0.1^2)
 //! lift       = mean soft(Y; k) / mean Y, over the scene
 //! ```
 //!
-//! H is the histogram of the encoded luminance Y of one photograph, or of all training photographs together, sigma the
-//! standard deviation of ln gain over the views. A cubic mean lies between mean exposure (power 1) and exposure for the
+//! H is the histogram of the encoded luminance Y of one photograph, or of all training photographs together. p is where a
+//! camera stands, in units of the standard deviation of the positions, and the direction in which it looks; tau is the root
+//! mean square of ln gain(v) - around(v) over the views. So views that show the same have targets that agree, unless their
+//! exposures differ. Where cameras are not known, ln gain(scene) takes the place of around(v), and s is max(0.75, sigma^2 /
+//! (sigma^2 + 0.1^2)), sigma the standard deviation of ln gain over the views. A cubic mean lies between mean exposure (power 1) and exposure for the
 //! highlights (infinity): a scene rich in contrast is exposed lower, as a photographer does. Lamps and windows leave it
 //! unbounded, so the mean, of which 0.46 is the encoded 18 % grey, is the guard. Power and constants come from pairs of low-
 //! and normal-light photographs (LOL, LOM, `RealX3D`).
@@ -19,6 +23,7 @@ use serde::Serialize;
 
 use super::histogram::LuminanceHistogram;
 use super::real::Real;
+use crate::camera::{Camera, Places};
 
 /// The black level of [`soft`].
 pub(super) const BLACK_LEVEL: f64 = 0.075;
@@ -32,11 +37,14 @@ const MEANS: [f64; 2] = [0.44, 0.54];
 /// The gains that may come out.
 const GAINS: [f64; 2] = [1e-3, 128.0];
 
-/// The least weight of a view's own gain.
+/// The least weight of a view's own gain where cameras are not known.
 const LEAST_SHARE: f64 = 0.75;
 
-/// The spread of ln gain between views at which their own gains have half the weight.
+/// The spread of ln gain between views, or between those near each other, at which their own gains have half the weight.
 const NOISE: f64 = 0.1;
+
+/// h: how far apart cameras are whose views have about one gain.
+const REACH: f64 = 0.15;
 
 /// Lifts up to the first leave the photograph as it is; from the second on the curve has its whole weight.
 const WELL_LIT: [f64; 2] = [1.5, 2.0];
@@ -61,12 +69,36 @@ pub struct Exposure {
     pub mean: f64,
     /// sigma: the standard deviation of ln gain over the views.
     pub spread: f64,
-    /// s: the weight of a view's own gain.
+    /// How much of the differences between the views' own gains is in the gains of their targets: the slope of ln k.
     pub share: f64,
     /// How many photographs are as good as black.
     pub black: usize,
     /// The mean luminance that was asked for in place of the rule's.
     brightness: Option<f64>,
+    /// The views' own gains by their cameras, where these are known.
+    around: Option<Around>,
+}
+
+/// Gains by where they were found.
+#[derive(Clone, Debug, PartialEq)]
+struct Around {
+    places: Places,
+    /// ln gain of each place.
+    gains: Vec<f64>,
+    /// s: the weight of a view's own gain.
+    own: f64,
+}
+
+impl Around {
+    /// around(v): the mean of ln gain over the places near a camera, the nearest of which always counts.
+    fn ln_gain(&self, camera: &Camera) -> f64 {
+        let squares: Vec<f64> = self.places.squared_distances(camera).collect();
+        let nearest = squares.iter().copied().fold(f64::INFINITY, f64::min);
+        let weight = |square: &f64| (-(square - nearest) / (2.0 * REACH * REACH)).exp();
+        let weights: Vec<f64> = squares.iter().map(weight).collect();
+        let sum: f64 = weights.iter().zip(&self.gains).map(|(weight, gain)| weight * gain).sum();
+        sum / weights.iter().sum::<f64>()
+    }
 }
 
 impl Exposure {
@@ -97,25 +129,62 @@ impl Exposure {
             target: mean_of_soft(&pool, gain),
             mean: pool.mean(),
             spread: variance.sqrt(),
-            share: LEAST_SHARE.max(variance / (variance + NOISE * NOISE)),
+            share: share_without_cameras(variance),
             black,
             brightness,
+            around: None,
         })
+    }
+
+    /// The same where the cameras of the training photographs are known.
+    #[must_use]
+    pub fn seen_by<'a>(
+        self,
+        views: impl IntoIterator<Item = (&'a LuminanceHistogram, Camera)>,
+    ) -> Self {
+        let lit = views.into_iter().filter(|(view, _)| !is_black(view));
+        let (gains, cameras): (Vec<f64>, Vec<Camera>) =
+            lit.map(|(view, camera)| (gain_of(view, self.brightness).ln(), camera)).unzip();
+        if gains.is_empty() {
+            return self;
+        }
+        let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
+        let mut around = Around { places: Places::new(&cameras), gains, own: 0.0 };
+        let smooth: Vec<f64> = cameras.iter().map(|camera| around.ln_gain(camera)).collect();
+        let squares = around.gains.iter().zip(&smooth).map(|(own, smooth)| (own - smooth).powi(2));
+        let variance = mean(&squares.collect::<Vec<_>>());
+        around.own = variance / (variance + NOISE * NOISE);
+        // The slope of ln k over ln gain.
+        let middle = mean(&around.gains);
+        let (mut products, mut squares) = (0.0, 0.0);
+        for (own, smooth) in around.gains.iter().zip(&smooth) {
+            let used = around.own * own + (1.0 - around.own) * smooth;
+            products += (used - middle) * (own - middle);
+            squares += (own - middle).powi(2);
+        }
+        let share = if squares > 0.0 { products / squares } else { self.share };
+        Self { share: share.clamp(0.0, 1.0), around: Some(around), ..self }
     }
 
     /// The same with one gain for every photograph.
     #[must_use]
     pub fn shared(self) -> Self {
-        Self { share: 0.0, ..self }
+        Self { share: 0.0, around: None, ..self }
     }
 
-    /// k of a photograph of the scene, of training or not; one as good as black has the scene's.
-    pub fn gain_of(&self, view: &LuminanceHistogram) -> f64 {
+    /// k of a photograph of the scene, of training or not, and of its camera where that is known; one as good as black has
+    /// the scene's.
+    pub fn gain_of(&self, view: &LuminanceHistogram, camera: Option<&Camera>) -> f64 {
         if is_black(view) {
             return self.gain;
         }
-        let own = gain_of(view, self.brightness);
-        (self.share * own.ln() + (1.0 - self.share) * self.gain.ln()).exp()
+        let own = gain_of(view, self.brightness).ln();
+        let (share, other) = match (&self.around, camera) {
+            (Some(around), Some(camera)) => (around.own, around.ln_gain(camera)),
+            (Some(_), None) => (share_without_cameras(self.spread.powi(2)), self.gain.ln()),
+            (None, _) => (self.share, self.gain.ln()),
+        };
+        (share * own + (1.0 - share) * other).exp()
     }
 
     /// How many times brighter the targets are than the photographs, on the mean.
@@ -197,6 +266,11 @@ pub(crate) fn all_black(path: &std::path::Path) -> crate::Error {
     let problem = "every photograph is as good as black (99 % of its pixels are below 2 of 255); expose longer, or name \
                    a curve with --curve";
     crate::Error::input(path, problem)
+}
+
+/// The weight of a view's own gain beside the scene's, by the variance of ln gain over the views.
+fn share_without_cameras(variance: f64) -> f64 {
+    LEAST_SHARE.max(variance / (variance + NOISE * NOISE))
 }
 
 /// Whether a photograph shows next to nothing.

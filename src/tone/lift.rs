@@ -4,6 +4,7 @@ use super::exposure::{Exposure, solved};
 use super::histogram::LuminanceHistogram;
 use super::law::{clamped, curve_at};
 use super::{Statistics, ToneCurve, ToneParameters, ToneSettings};
+use crate::camera::Camera;
 
 /// The strengths that a curve may be solved for.
 const STRENGTHS: [f64; 2] = [1e-3, 1e4];
@@ -15,6 +16,16 @@ pub struct Measured {
     pub statistics: Statistics,
     /// The whole distribution of its luminance.
     pub luminance: LuminanceHistogram,
+    /// The camera that took it, where that is known.
+    pub camera: Option<Camera>,
+}
+
+impl Measured {
+    /// The same of a photograph that `camera` took.
+    #[must_use]
+    pub fn seen_by(self, camera: &Camera) -> Self {
+        Self { camera: Some(*camera), ..self }
+    }
 }
 
 /// What the curves of a scene's photographs have in common.
@@ -43,6 +54,11 @@ impl ToneSettings {
     pub fn scene(&self, training: &[Measured]) -> Option<Scene> {
         let exposure = if self.takes_exposure() {
             let found = Exposure::of(training.iter().map(|one| &one.luminance), self.brightness)?;
+            let seen = training.iter().map(|one| Some((&one.luminance, one.camera?)));
+            let found = match seen.collect::<Option<Vec<_>>>() {
+                Some(seen) => found.seen_by(seen),
+                None => found,
+            };
             Some(if self.scene_statistics { found.shared() } else { found })
         } else {
             None
@@ -59,7 +75,7 @@ impl ToneSettings {
         let Some(exposure) = &scene.exposure else {
             return Lift { parameters, weight: 1.0, gain: None };
         };
-        let gain = exposure.gain_of(&photograph.luminance);
+        let gain = exposure.gain_of(&photograph.luminance, photograph.camera.as_ref());
         let strength = match self.curve {
             ToneCurve::Auto | ToneCurve::Profile => gain,
             _ => self.strength(&parameters, &photograph.luminance, gain),

@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::views::Views;
 use super::{TrainConfig, Trainer};
+use crate::camera::Camera;
 use crate::dataset::{Dataset, LoadOptions, Photograph, View};
 use crate::exposure::{Affine, ExposureRates, table};
 use crate::image::{Image, exposure_value, linear_from_srgb, srgb_from_linear};
@@ -192,8 +193,8 @@ struct Targets<'a> {
 }
 
 impl Targets<'_> {
-    fn target(&mut self, photograph: &Image) -> Result<Image> {
-        let measured = self.pseudo_gt.measure(&photograph.data)?;
+    fn target(&mut self, photograph: &Image, camera: &Camera) -> Result<Image> {
+        let measured = self.pseudo_gt.measure(&photograph.data)?.seen_by(camera);
         let lift = self.pseudo_gt.settings().lift(self.scene, &measured);
         self.pseudo_gt.lifted(photograph, &lift)
     }
@@ -202,15 +203,16 @@ impl Targets<'_> {
     /// photograph without them nearest to the target of the photograph as it is. A curve that follows from each photograph
     /// takes much of the difference away before.
     fn affine_of_stops(&mut self, name: &str, stops: f64) -> Result<Affine> {
-        let mut views = self.dataset.train_views().filter(|view| view.name == name);
-        let Some(photograph) = views.next().map(View::loaded).transpose()?.flatten() else {
-            return Ok(Affine::IDENTITY);
-        };
+        let view = self.dataset.train_views().find(|view| view.name == name);
+        let photograph = view.map(View::loaded).transpose()?.flatten();
+        let Some((view, photograph)) = view.zip(photograph) else { return Ok(Affine::IDENTITY) };
         let scale = (-stops).exp2() as f32;
         let without = |&x: &f32| srgb_from_linear(scale * linear_from_srgb(x));
         let neutral =
             Image { data: photograph.data.iter().map(without).collect(), ..*photograph.as_ref() };
-        let affine = Affine::least_squares(&self.target(&neutral)?, &self.target(&photograph)?)?;
+        let [neutral, own] =
+            [&neutral, &*photograph].map(|photograph| self.target(photograph, &view.camera));
+        let affine = Affine::least_squares(&neutral?, &own?)?;
         // Of a photograph of one colour there is no more to say than that.
         let is_exposure = affine.gain.iter().all(|&gain| gain > 0.0);
         Ok(if is_exposure { affine } else { Affine::IDENTITY })

@@ -133,7 +133,6 @@ mod tests {
 
     use super::*;
     use crate::dataset::synthetic::{self, SyntheticOptions};
-    use crate::diagnose::{Diagnosis, Plan};
     use crate::gpu::testing::gpu;
     use crate::pseudo_gt::PseudoGt;
     use crate::train::Preset;
@@ -183,15 +182,6 @@ mod tests {
         config
     }
 
-    /// As a diagnosis of the photographs decides.
-    fn planned(mut config: TrainConfig) -> TrainConfig {
-        let options = config.load_options();
-        let dataset = Dataset::load(&config.dataset, &options).unwrap();
-        let diagnosis = Diagnosis::of(&dataset, &options).unwrap();
-        Plan::new(&diagnosis, &config, gpu().properties().memory).apply(&mut config);
-        config
-    }
-
     #[test]
     fn no_round_costs_the_training_views_much() {
         for seed in 1..=3 {
@@ -216,8 +206,7 @@ mod tests {
         for scene in scenes.split(',').map(PathBuf::from) {
             for downscale in sizes.split(',').map(|size| size.parse().unwrap()) {
                 for seed in seeds.split(',').map(|seed| seed.parse().unwrap()) {
-                    let own = TrainConfig { downscale, ..of(Preset::Balanced, &scene, seed) };
-                    let config = planned(own);
+                    let config = TrainConfig { downscale, ..of(Preset::Balanced, &scene, seed) };
                     let (step, lost) = worst(&config);
                     let line = format!(
                         "{} / {downscale}, seed {seed}: {lost:.3} dB at step {step}",

@@ -145,7 +145,8 @@ fn clamped(image: &Image) -> Image {
 fn target(pseudo_gt: &mut PseudoGt, view: &View, scene: &Scene) -> Result<Option<Image>> {
     let settings = pseudo_gt.settings().clone();
     let Some(photograph) = lifted_from(view, settings.lift_first)? else { return Ok(None) };
-    let lift = settings.lift(scene, &pseudo_gt.measure(&view.counted(&photograph))?);
+    let measured = pseudo_gt.measure(&view.counted(&photograph))?.seen_by(&view.camera);
+    let lift = settings.lift(scene, &measured);
     let target = pseudo_gt.lifted(&photograph, &lift)?;
     Ok(Some(target.resized(view.camera.width, view.camera.height)))
 }

@@ -453,7 +453,7 @@ pub(super) fn measured(
     let mut measured = vec![];
     for (_, view) in photographs(dataset) {
         let Some(photograph) = lifted_from(view, lift_first)? else { continue };
-        measured.push(pseudo_gt.measure(&view.counted(&photograph))?);
+        measured.push(pseudo_gt.measure(&view.counted(&photograph))?.seen_by(&view.camera));
     }
     let scene = pseudo_gt.settings().scene(&measured).ok_or_else(|| all_black(&dataset.root))?;
     Ok((scene, measured))

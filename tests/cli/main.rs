@@ -90,7 +90,7 @@ fn a_run_directory_has_its_four_files_and_metrics_their_shape() {
     assert!(file_names(&run).iter().all(|name| !name.ends_with(".partial")));
     let metrics = json(run.join("metrics.json"));
     let leftover = "leftover_transmittance";
-    let known = ["mean", "views", "seconds", "gaussians", "steps", leftover, "spent"];
+    let known = ["mean", "views", "seconds", "gaussians", "steps", leftover, "spent", "ended"];
     assert_eq!(keys(&metrics), known);
     assert_eq!(keys(&metrics[leftover]), ["mean", "views"]);
     assert_eq!(keys(&metrics[leftover]["views"]["008"]), ["mean", "q99"]);

@@ -65,7 +65,7 @@ fn exposure(views: &[&View]) -> Option<Exposure> {
 
 /// About what `--curve auto` makes of a photograph.
 fn lift(image: &Image, exposure: &Exposure) -> Image {
-    let gain = exposure.gain_of(&LuminanceHistogram::of(&image.data));
+    let gain = exposure.gain_of(&LuminanceHistogram::of(&image.data), None);
     let weight = exposure.weight();
     let value = |&x: &f32| {
         let x = f64::from(x);

@@ -1,37 +1,63 @@
-//! A choice of views that covers where the cameras of a scene stand and look.
+//! Where the cameras of a scene stand and look: how near one is to another, and a choice that covers them all.
+
+use glam::DVec3;
 
 use super::Camera;
 
-/// Where a camera stands, and where it looks.
+/// Position and direction. Positions count from the middle in units of their standard deviation, directions as unit vectors.
 type Place = [f64; 6];
+
+/// The places of a scene's cameras.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Places {
+    middle: DVec3,
+    /// One over the standard deviation of the positions; 0 where all are one.
+    scale: f64,
+    places: Vec<Place>,
+}
+
+impl Places {
+    /// Those of cameras.
+    pub(crate) fn new(cameras: &[Camera]) -> Self {
+        let count = cameras.len().max(1) as f64;
+        let middle = cameras.iter().map(Camera::center).sum::<DVec3>() / count;
+        let squares = cameras.iter().map(|camera| camera.center().distance_squared(middle));
+        let deviation = (squares.sum::<f64>() / count).sqrt();
+        let scale = if deviation > 0.0 { 1.0 / deviation } else { 0.0 };
+        let mut own = Self { middle, scale, places: vec![] };
+        own.places = cameras.iter().map(|camera| own.place(camera)).collect();
+        own
+    }
+
+    /// The squared distance of each place from that of a camera.
+    pub(crate) fn squared_distances(&self, camera: &Camera) -> impl Iterator<Item = f64> {
+        let from = self.place(camera);
+        self.places.iter().map(move |place| squared_distance(place, &from))
+    }
+
+    fn place(&self, camera: &Camera) -> Place {
+        let [x, y, z] = (self.scale * (camera.center() - self.middle)).to_array();
+        let [u, v, w] = camera.view_from_world.matrix3.row(2).to_array();
+        [x, y, z, u, v, w]
+    }
+}
+
+fn squared_distance(a: &Place, b: &Place) -> f64 {
+    a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum()
+}
 
 impl Camera {
     /// The indices of `count` cameras, or of all if there are fewer, in ascending order, that cover where they stand and look.
     ///
     /// The cameras are divided into that many groups of about one size: again and again in two, across the direction in
-    /// which a group differs most. Of each group the camera nearest to its mean is picked. Positions count in units of their
-    /// standard deviation, directions as unit vectors.
+    /// which a group differs most. Of each group the camera nearest to its mean is picked.
     pub fn covering(cameras: &[Self], count: usize) -> Vec<usize> {
-        let places = places(cameras);
+        let Places { places, .. } = Places::new(cameras);
         let mut picked = vec![];
         pick(&places, (0..cameras.len()).collect(), count.min(cameras.len()), &mut picked);
         picked.sort_unstable();
         picked
     }
-}
-
-fn places(cameras: &[Camera]) -> Vec<Place> {
-    let centers: Vec<_> = cameras.iter().map(Camera::center).collect();
-    let middle = centers.iter().sum::<glam::DVec3>() / centers.len().max(1) as f64;
-    let squares: f64 = centers.iter().map(|center| center.distance_squared(middle)).sum();
-    let deviation = (squares / centers.len().max(1) as f64).sqrt();
-    let scale = if deviation > 0.0 { 1.0 / deviation } else { 0.0 };
-    let place = |(camera, center): (&Camera, &glam::DVec3)| {
-        let [x, y, z] = (scale * (*center - middle)).to_array();
-        let [u, v, w] = camera.view_from_world.matrix3.row(2).to_array();
-        [x, y, z, u, v, w]
-    };
-    cameras.iter().zip(&centers).map(place).collect()
 }
 
 /// Picks `count` of a group.
@@ -65,9 +91,7 @@ fn widest_axis(places: &[Place], group: &[usize]) -> usize {
 
 fn nearest_to_mean(places: &[Place], group: &[usize]) -> Option<usize> {
     let means: Place = std::array::from_fn(|axis| mean(places, group, axis));
-    let distance = |i: usize| -> f64 {
-        places[i].iter().zip(means).map(|(own, mean)| (own - mean).powi(2)).sum()
-    };
+    let distance = |i: usize| squared_distance(&places[i], &means);
     group.iter().copied().min_by(|&a, &b| distance(a).total_cmp(&distance(b)).then(a.cmp(&b)))
 }
 

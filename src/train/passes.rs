@@ -1,0 +1,63 @@
+//! The passes of a step, and what they work on beside the Gaussians.
+
+use super::terms::NetworkTerms;
+use super::{Background, TrainConfig, growth, streams};
+use crate::Result;
+use crate::dataset::Dataset;
+use crate::densify::Densifier;
+use crate::exposure::Exposures;
+use crate::gpu::Gpu;
+use crate::loss::Losses;
+use crate::optimizer::{Adam, FiniteCheck, Learnable};
+use crate::random::Stream;
+use crate::render::{RenderSettings, Renderer};
+use crate::scene::Shape;
+
+/// What needs nothing but the device and settings.
+pub(super) struct Kernels {
+    pub(super) renderer: Renderer,
+    pub(super) losses: Losses,
+    pub(super) adam: Adam,
+    pub(super) finite: FiniteCheck,
+    pub(super) densifier: Densifier,
+}
+
+impl Kernels {
+    pub(super) fn new(gpu: &Gpu, config: &TrainConfig, dataset: &Dataset) -> Result<Self> {
+        let (rest, own) = (config.precision.rest, config.render_settings());
+        let shape = Shape { sh_degree: first_sh_degree(config), ..own.shape };
+        Ok(Self {
+            renderer: Renderer::new(gpu, RenderSettings { rest, shape, ..own })?,
+            losses: Losses::new(gpu, &config.loss())?,
+            adam: Adam::new(gpu)?,
+            finite: FiniteCheck::new(gpu)?,
+            densifier: growth::densifier(gpu, config, dataset)?,
+        })
+    }
+}
+
+/// The SH degree of the first step.
+pub(super) fn first_sh_degree(config: &TrainConfig) -> u32 {
+    config.schedule.sh_degree(1, config.sh_degree)
+}
+
+/// Everything that is learned beside the Gaussians: Adam trains it, and checkpoints keep it.
+pub(super) fn learnables<'a>(
+    networks: &'a mut Option<NetworkTerms>,
+    exposures: &'a mut Option<Exposures>,
+) -> impl Iterator<Item = &'a mut dyn Learnable> {
+    let networks = networks.iter_mut().flat_map(|terms| terms.networks.parameters_mut());
+    let networks = networks.map(|parameters| parameters as &mut dyn Learnable);
+    networks.chain(exposures.iter_mut().map(|exposures| exposures as &mut dyn Learnable))
+}
+
+/// The background of a step.
+pub(super) fn background(config: &TrainConfig, step: u64) -> [f32; 3] {
+    match config.background {
+        Background::Black => [0.0; 3],
+        Background::Random => {
+            let stream = Stream::new(config.seed, streams::BACKGROUND);
+            std::array::from_fn(|c| stream.uniform(3 * step + c as u64) as f32)
+        }
+    }
+}
