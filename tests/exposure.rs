@@ -1,5 +1,7 @@
 //! How bright the automatic target is: the rule against a slow one over pixels, and what comes of odd sets.
 
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
 use glam::{DAffine3, DVec2, DVec3};
 use nightsplat::camera::Camera;
 use nightsplat::tone::{Exposure, LuminanceHistogram, Statistics, exposed_anew, soft};

@@ -155,7 +155,7 @@ fn holes_are_said_by_train_eval_and_diagnose() {
     let folder = dark_room();
     let set = folder.path().display();
     let run = format!("{set}/run");
-    let short = "--curve none --steps 60 --progress none";
+    let short = "--curve none --steps 60 --background black --progress none";
     let (_, warned) = command::run(&format!("train {set} --out {run} {short}"), 0);
     let warning =
         |text: &str| text.lines().filter(|line| line.contains("of the background")).count();

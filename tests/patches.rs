@@ -205,7 +205,8 @@ fn a_denoiser_sees_around_each_patch() {
     config.model.rates.denoiser = 1e-2;
     let mut trainer = Trainer::new(&gpu(), config.clone(), &dataset).unwrap();
     advance(&mut trainer, config.steps);
-    let gaussians = trainer.gaussians_in_frame().unwrap();
+    let sh_degree = config.render_settings().shape.sh_degree;
+    let gaussians = trainer.gaussians_in_frame().unwrap().with_sh_degree(sh_degree);
     let camera = trainer.frame().camera(&dataset.views[0].camera);
     let parameters = gpu().buffer("parameters", &gaussians.parameters).unwrap();
     let options = RenderOptions { sh_degree: 0, background: [0.0; 3] };

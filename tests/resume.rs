@@ -261,6 +261,7 @@ fn a_run_tells_its_observer_everything_in_order() {
                 Event::Step(report) => format!("step {}", report.step),
                 Event::Checkpointed { step } => format!("checkpointed {step}"),
                 Event::Evaluated { step, scored } => format!("evaluated {step}: {}", scored.len()),
+                Event::Ended(ended) => format!("ended {}", ended.step),
                 Event::Finished(trained) => format!("finished {}", trained.scored.len()),
                 _ => String::new(),
             });
@@ -273,14 +274,15 @@ fn a_run_tells_its_observer_everything_in_order() {
         expected.extend((step == 20).then(|| "checkpointed 20".to_owned()));
         expected.extend((step % 12 == 0).then(|| format!("evaluated {step}: 2")));
     }
-    expected.extend(["evaluated 30: 2", "finished 2"].map(str::to_owned));
+    let end = ["checkpointed 30", "ended 30", "evaluated 30: 2", "finished 2"];
+    expected.extend(end.map(str::to_owned));
     let (steps, told) = train(&config, HeldRun::Refuse);
     assert_eq!((steps.unwrap(), told), (30, expected));
 
     let (refused, told) = train(&config, HeldRun::Refuse);
     assert!(refused.unwrap_err().to_string().contains("already holds a run") && told.is_empty());
     let (steps, told) = train(&TrainConfig { steps: 33, ..config }, HeldRun::Resume);
-    assert_eq!((steps.unwrap(), told[0].as_str()), (13, "started 20 of 33"));
+    assert_eq!((steps.unwrap(), told[0].as_str()), (3, "started 30 of 33"));
 }
 
 /// The log without the column of times.
@@ -323,7 +325,7 @@ fn a_killed_run_is_resumed_to_the_same_model() {
 
     refused(&train(&killed, "--steps 203 --resume --overwrite"), 2, &["--overwrite"]);
     refused(&train(&killed, "--steps 300 --resume --seed 4"), 3, &["seed = 10, not 4"]);
-    refused(&train(&killed, "--steps 199 --resume"), 3, &["at step 200", "--steps"]);
+    refused(&train(&killed, "--steps 199 --resume"), 3, &["at step 203", "--steps"]);
     fs::write(killed.join("train.csv"), "step,view\n1,000,1\n").unwrap();
     refused(&train(&killed, "--steps 300 --resume"), 3, &["train.csv", "step 200"]);
     fs::remove_file(&checkpoint).unwrap();

@@ -168,7 +168,9 @@ fn a_run_that_was_stopped_is_rendered_scored_and_made_longer_with_a_lower_cap() 
     for file in ["metrics.json", "done.json"] {
         fs::remove_file(path("run").join(file)).unwrap();
     }
-    fs::copy(path("ten/model.ply"), path("run/model.ply")).unwrap();
+    for file in ["model.ply", "checkpoint.safetensors"] {
+        fs::copy(path("ten").join(file), path("run").join(file)).unwrap();
+    }
     assert_eq!(stopped_at(&path("run")), Some(10));
     let run_folder = path("run").display().to_string();
     let (printed, said) = run(&format!("eval {run_folder} --json"), 0);

@@ -13,7 +13,7 @@ use crate::gpu::Gpu;
 use crate::image::{Image, Mask};
 use crate::metrics::psnr_of_counted;
 use crate::pseudo_gt::PseudoGt;
-use crate::tone::{Scene, ToneSettings};
+use crate::tone::{LuminanceHistogram, Scene, ToneSettings, is_black};
 
 use super::rendered::Rendered;
 
@@ -43,16 +43,18 @@ impl TargetViews {
         frame: &Frame,
         scene: &Scene,
     ) -> Result<Self> {
-        let mut shown = vec![];
+        let (mut shown, lift_first) = (vec![], pseudo_gt.settings().lift_first);
         for view in views {
-            let Some(target) = target(pseudo_gt, view, scene)? else { continue };
-            if shows_nothing(&target, view.mask.as_ref()) {
+            let Some(photograph) = lifted_from(view, lift_first)? else { continue };
+            let counted = view.counted(&photograph);
+            if counted.is_empty() || is_black(&LuminanceHistogram::of(&counted)) {
                 let name = &view.name;
                 tracing::warn!(
                     "view {name} is black or masked entirely: the model is not scored on it"
                 );
                 continue;
             }
+            let target = target_of(pseudo_gt, view, &photograph, scene)?;
             let (camera, mask) = (frame.camera(&view.camera), view.mask.clone());
             shown.push(TargetView { camera, target, mask, place: None });
         }
@@ -127,28 +129,22 @@ impl TargetView {
     }
 }
 
-/// Whether no pixel that counts reaches half a code value of 8 bits.
-fn shows_nothing(target: &Image, mask: Option<&Mask>) -> bool {
-    let is_dark = |value: &f32| value.is_nan() || *value <= 0.5 / 255.0;
-    match mask {
-        Some(mask) => mask.counted(target).iter().all(is_dark),
-        None => target.data.iter().all(is_dark),
-    }
-}
-
 fn clamped(image: &Image) -> Image {
     let data = image.data.iter().map(|value| value.clamp(0.0, 1.0)).collect();
     Image { data, ..*image }
 }
 
-/// The target of a view, made as those of the training views are; none without a photograph.
-fn target(pseudo_gt: &mut PseudoGt, view: &View, scene: &Scene) -> Result<Option<Image>> {
-    let settings = pseudo_gt.settings().clone();
-    let Some(photograph) = lifted_from(view, settings.lift_first)? else { return Ok(None) };
-    let measured = pseudo_gt.measure(&view.counted(&photograph))?.seen_by(&view.camera);
-    let lift = settings.lift(scene, &measured);
-    let target = pseudo_gt.lifted(&photograph, &lift)?;
-    Ok(Some(target.resized(view.camera.width, view.camera.height)))
+/// The target that a view's photograph becomes, made as those of the training views are.
+fn target_of(
+    pseudo_gt: &mut PseudoGt,
+    view: &View,
+    photograph: &Image,
+    scene: &Scene,
+) -> Result<Image> {
+    let measured = pseudo_gt.measure(&view.counted(photograph))?.seen_by(&view.camera);
+    let lift = pseudo_gt.settings().lift(scene, &measured);
+    let target = pseudo_gt.lifted(photograph, &lift)?;
+    Ok(target.resized(view.camera.width, view.camera.height))
 }
 
 /// The targets that the test views would have were they trained on: what `tone` makes of their photographs in the scene of
@@ -176,7 +172,9 @@ impl TestTargets {
     /// # Errors
     /// The photograph can no longer be read, or the device is out of memory or lost.
     pub fn of(&mut self, view: &View) -> Result<Option<Image>> {
-        target(&mut self.pseudo_gt, view, &self.scene)
+        let photograph = lifted_from(view, self.pseudo_gt.settings().lift_first)?;
+        let target = |photograph| target_of(&mut self.pseudo_gt, view, photograph, &self.scene);
+        photograph.as_deref().map(target).transpose()
     }
 }
 

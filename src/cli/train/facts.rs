@@ -79,8 +79,9 @@ impl Facts {
             (0, 0) => format!("{} steps", self.steps),
             (0, settling) => format!("{} steps, of which the last {settling} settle", self.steps),
             (views, settling) => format!(
-                "{} steps at most: the run settles for {settling} and ends once {views} held-out views have converged",
-                self.steps
+                "{} steps at most: the run settles for {settling} and ends once {views} held-out view{} converged",
+                self.steps,
+                if views == 1 { " has" } else { "s have" }
             ),
         };
         let notes: String = self.notes.iter().map(|note| format!("{note}\n")).collect();
