@@ -111,12 +111,13 @@ fn a_run_says_at_its_start_what_it_trains_and_why() {
         assert!(said.contains(part), "no `{part}` in: {said}");
     }
     // Nothing is held out of eight views but one, and nothing of seven.
-    let said = start("d", "--progress none --preset draft --set steps=30");
-    assert!(
-        said.contains("30 steps at most: the run settles for 10 and ends once 1 held-out"),
-        "{said}"
-    );
-    assert!(said.contains("30 steps are too few to settle for 100 (a third of them at most)"));
+    let said = start("d", "--progress none --preset balanced --set steps=30");
+    for part in [
+        "30 steps at most: the run settles for 10 and ends once 1 held-out view has converged",
+        "30 steps are too few to settle for 250 (a third of them at most)",
+    ] {
+        assert!(said.contains(part), "no `{part}` in: {said}");
+    }
     assert!(said.contains("ended at step 30: all steps are done"), "{said}");
     let said = start("e", "--progress none --preset balanced --set steps=3 --test-every 3");
     assert!(said.contains("no early end: 6 training views are too few to hold one out"), "{said}");
@@ -168,9 +169,9 @@ fn a_run_that_was_stopped_is_rendered_scored_and_made_longer_with_a_lower_cap() 
     for file in ["metrics.json", "done.json"] {
         fs::remove_file(path("run").join(file)).unwrap();
     }
-    for file in ["model.ply", "checkpoint.safetensors"] {
-        fs::copy(path("ten").join(file), path("run").join(file)).unwrap();
-    }
+    fs::copy(path("ten/model.ply"), path("run/model.ply")).unwrap();
+    let checkpoint = path("run/checkpoint.safetensors");
+    fs::copy(path("run/checkpoint.before.safetensors"), checkpoint).unwrap();
     assert_eq!(stopped_at(&path("run")), Some(10));
     let run_folder = path("run").display().to_string();
     let (printed, said) = run(&format!("eval {run_folder} --json"), 0);

@@ -25,7 +25,7 @@ impl Trainer {
         schedule.densifies_at(step) && is_in_time && step <= self.settles_after()
     }
 
-    /// Density control behind the last step, whose view had so many intersections.
+    /// Density control after the last step, whose view had this many intersections.
     pub(super) fn control_density(&mut self, intersections: u32) -> Result<()> {
         let rounds_left = match self.config.density.control {
             DensityControl::Conserving => {

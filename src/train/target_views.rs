@@ -117,7 +117,7 @@ impl TargetViews {
 }
 
 impl TargetView {
-    /// The same with about so many pixels, if it has more.
+    /// The same, shrunk to about this number of pixels if it has more.
     fn shrunk(self, pixels: usize) -> Self {
         let size = DVec2::new(self.camera.width.into(), self.camera.height.into());
         let scale = (pixels as f64 / size.element_product()).sqrt().min(1.0);
