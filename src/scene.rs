@@ -37,7 +37,7 @@ pub struct Shape {
 /// Colour alone.
 impl Shape {
     /// Whether Gaussians of `other` are Gaussians of this shape without its highest SH degrees.
-    pub(crate) fn holds(self, other: Self) -> bool {
+    pub fn holds(self, other: Self) -> bool {
         self.features == other.features && other.sh_degree <= self.sh_degree
     }
 }

@@ -390,6 +390,11 @@ fn a_run_that_has_ended_early_goes_on_from_its_end() {
     assert!(said.contains(r#""may_end_early":true"#));
     // Done is done, whatever would have been the most steps.
     assert!(train("--resume").contains("is done: 21 steps"));
+    // What decides may be changed, and is said; what is trained on may not.
+    let again = format!("train {root} --out {} {options} --resume --set", out.display());
+    let (_, said) = run(&format!("{again} stop.gain=80"), 0);
+    assert!(said.contains("stop.gain was 90 and is 80: it decides from step 21 on"), "{said}");
+    refused(&format!("{again} stop.views=0"), 3, &["was made with stop.views = 1, not 0"]);
     let said = train("--resume --steps 27");
     let steps =
         |event: &&str| event.contains(r#""event":"started""#) && event.contains(r#""step":21"#);
