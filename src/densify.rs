@@ -99,7 +99,8 @@ pub struct Round {
 /// How often a round is tried at the most; the last trial splits nothing.
 const TRIALS: usize = 5;
 
-/// What one split may change of a camera's view, as `view_change` in `densify_score.comp` estimates it. It keeps a split from
+/// The largest mean squared change of a camera's view by one split, in units of the squared contrast of what the Gaussian
+/// covers, as `view_change` in `densify_score.comp` estimates it. It keeps a split from
 /// changing a view of 30 dB by .1 dB where the contrast is .3 (docs/benchmarks.md).
 pub const LARGEST_CHANGE: f32 = 2e-4;
 

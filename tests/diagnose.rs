@@ -390,7 +390,7 @@ fn a_run_that_has_ended_early_goes_on_from_its_end() {
     assert!(said.contains(r#""may_end_early":true"#));
     // Done is done, whatever would have been the most steps.
     assert!(train("--resume").contains("is done: 21 steps"));
-    // What decides may be changed, and is said; what is trained on may not.
+    // A resumed run may change the stopping rule, with a warning, but not which views are held out.
     let again = format!("train {root} --out {} {options} --resume --set", out.display());
     let (_, said) = run(&format!("{again} stop.gain=80"), 0);
     assert!(said.contains("stop.gain was 90 and is 80: it decides from step 21 on"), "{said}");

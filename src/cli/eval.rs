@@ -25,7 +25,7 @@ use crate::train::Learning;
 /// checkpoint.
 ///
 /// Beside the scores stands the leftover transmittance, how much of the background each view shows: its mean, and what 99 %
-/// of the pixels stay below. No score tells a hole before black from a dark surface; from a mean of 0.1 on it is said.
+/// of the pixels stay below. No score tells a hole before black from a dark surface; a mean above 0.1 is a warning.
 #[derive(Clone, Debug, clap::Args)]
 pub struct EvalArgs {
     /// The run directory that `nightsplat train` wrote

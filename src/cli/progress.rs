@@ -301,7 +301,7 @@ fn style(may_end_early: bool) -> ProgressStyle {
     ProgressStyle::with_template(&template).unwrap_or_else(|_| ProgressStyle::default_bar())
 }
 
-/// What a number of steps, or the time they take, is said with while the run may end early.
+/// The prefix of a number of steps, or of a time, while the run may end early.
 fn at_most(may_end_early: bool) -> &'static str {
     if may_end_early { "at most " } else { "" }
 }

@@ -19,7 +19,7 @@ pub const MOST_LEFTOVER: f64 = 0.1;
 pub struct Leftover {
     /// Over the pixels that count.
     pub mean: f64,
-    /// 99 % of them have at most so much.
+    /// The 99 % quantile over these pixels.
     pub q99: f64,
 }
 
@@ -90,7 +90,7 @@ pub fn warn_of_holes(
     background: Background,
     mut render: impl FnMut(&View) -> Result<Rendered>,
 ) -> Result<()> {
-    /// So many training views, evenly spread.
+    /// The number of training views that are looked at, evenly spread.
     const MOST: usize = 8;
     let own = |view: &ViewScore| Some((view.name.clone(), view.leftover?));
     let mut leftovers: Vec<(String, Leftover)> = scored.iter().filter_map(own).collect();

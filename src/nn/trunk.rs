@@ -31,7 +31,7 @@ struct Layer {
     window: u32,
     stride: u32,
     padding: u32,
-    /// The largest of each so many pixels to a side, every second one, goes in.
+    /// Max pooling before the layer: the side of its window in pixels; its stride is 2.
     pool: Option<u32>,
     /// LPIPS looks at its activations.
     is_compared: bool,

@@ -22,13 +22,7 @@ impl Trainer {
     /// # Errors
     /// The device was lost.
     pub(super) fn snapshot(&mut self) -> Result<Snapshot> {
-        let gpu = self.gpu.clone();
-        let state = self.state().into_iter().filter(|state| is_parameters(&state.name));
-        let tensors = state.map(|state| {
-            let values = state.read(&gpu)?;
-            Ok((state.name, state.shape, values))
-        });
-        tensors.collect()
+        self.tensors(is_parameters)
     }
 
     /// Makes the model what it was; moments and statistics are gone.

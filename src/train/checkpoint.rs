@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use safetensors::tensor::{Dtype, TensorView};
 use serde::{Deserialize, Serialize};
 
-use super::best::Snapshot;
+use super::best::{Snapshot, Tensor};
 use super::decisions::Decisions;
 use super::model::Model;
 use super::{TrainConfig, Trainer, learnables};
@@ -110,7 +110,7 @@ pub(super) struct State<'a> {
 }
 
 impl State<'_> {
-    pub(super) fn read(&self, gpu: &Gpu) -> Result<Vec<f32>> {
+    fn read(&self, gpu: &Gpu) -> Result<Vec<f32>> {
         if let Some(batches) = self.batches {
             return batches.read(gpu, self.buffer);
         }
@@ -143,24 +143,17 @@ impl Trainer {
             dataset: Some(self.fingerprint.clone()),
             checksum: None,
         };
-        let mut downloads = vec![];
-        for state in self.state() {
-            let values = state.read(&gpu)?;
-            downloads.push((state.name, state.shape, values));
-        }
+        let downloads = self.tensors(|_| true)?;
         for (name, _, values) in &downloads {
             self.refuse_values(name, values)?;
         }
-        let best = self.best.iter();
-        downloads.extend(
-            best.map(|(name, shape, values)| {
-                (format!("{BEST}{name}"), shape.clone(), values.clone())
-            }),
-        );
+        let own = downloads.iter().map(|tensor| (tensor.0.clone(), tensor));
+        let best = self.best.iter().map(|tensor| (format!("{BEST}{}", tensor.0), tensor));
+        let named: Vec<(String, &Tensor)> = own.chain(best).collect();
         let mut visits = gpu.read(&self.model.visit_counts)?;
         visits.truncate(self.model.count());
         let tensors =
-            downloads.iter().map(|(name, _, values)| (name.clone(), bytemuck::cast_slice(values)));
+            named.iter().map(|(name, (_, _, values))| (name.clone(), bytemuck::cast_slice(values)));
         let visit_counts = (VISIT_COUNTS.to_owned(), bytemuck::cast_slice(&visits));
         header.checksum = Some(header.checksum_with(tensors.chain([visit_counts]).collect()));
         let header = serde_json::json!(header).to_string();
@@ -176,7 +169,7 @@ impl Trainer {
                 Dtype::U32,
                 bytemuck::cast_slice(&visits),
             )?];
-            for (name, shape, values) in &downloads {
+            for (name, (_, shape, values)) in &named {
                 views.push(view(name, shape, Dtype::F32, bytemuck::cast_slice(values))?);
             }
             // It is read by whoever may read the run: safetensors gives what it writes to its owner alone.
@@ -187,6 +180,20 @@ impl Trainer {
             // A checkpoint is for the day the power fails.
             std::fs::File::open(path)?.sync_all()
         })
+    }
+
+    /// The tensors of the state whose names are wanted, read back.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub(super) fn tensors(&mut self, wants: impl Fn(&str) -> bool) -> Result<Vec<Tensor>> {
+        let gpu = self.gpu.clone();
+        let state = self.state().into_iter().filter(|state| wants(&state.name));
+        let tensors = state.map(|state| {
+            let values = state.read(&gpu)?;
+            Ok((state.name, state.shape, values))
+        });
+        tensors.collect()
     }
 
     /// Takes over the state that [`Trainer::save_checkpoint`] wrote: further steps give the bits that the run would have

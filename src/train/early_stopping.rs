@@ -83,7 +83,7 @@ impl StopConfig {
         best(&scores[before..]) < best(&scores[..before]) + self.gain
     }
 
-    /// What is decided by otherwise with `other`, of the settings that a resumed run may have changed.
+    /// The first of the settings that a resumed run may change in which `other` differs, with both values.
     pub(super) fn change(&self, other: &Self) -> Option<String> {
         let settings = [
             ("every", self.every as f64, other.every as f64),
