@@ -11,11 +11,13 @@ mod masks;
 mod members;
 mod names;
 mod options;
+mod packed;
 mod pixels;
 mod place;
 mod points;
 mod similarity;
 mod split;
+mod stamp;
 pub mod synthetic;
 mod transforms;
 mod undistort;
@@ -34,7 +36,8 @@ use crate::{Error, Result};
 pub use fingerprint::Fingerprint;
 use listing::{ListedView, Listing, list, warn};
 use members::with_held_out;
-pub use options::{DepthOptions, LoadOptions};
+pub use options::{DepthOptions, LoadOptions, MeasuredSize};
+pub(crate) use pixels::Look;
 pub use pixels::Original;
 use pixels::Source;
 use points::points;
@@ -234,7 +237,18 @@ impl Dataset {
     /// # Ok::<(), nightsplat::Error>(())
     /// ```
     pub fn load(root: impl AsRef<Path>, options: &LoadOptions) -> Result<Self> {
-        let root = root.as_ref();
+        Self::load_and_look(root.as_ref(), options, None)
+    }
+
+    /// The same; `look` sees every training photograph as it is stored while it is in memory.
+    ///
+    /// # Errors
+    /// As [`Dataset::load`].
+    pub(crate) fn load_and_look(
+        root: &Path,
+        options: &LoadOptions,
+        look: Option<Look<'_>>,
+    ) -> Result<Self> {
         options.check()?;
         let files = Files::default();
         let Listing { mut frames, mut skipped, remarks } = list(root, &files)?;
@@ -242,7 +256,7 @@ impl Dataset {
         split(root, &mut frames, options.test_every, &files)?;
 
         let sources = sources(root, &frames, options, &files, &mut skipped);
-        let views = pixels::load(sources, options, &mut skipped)?;
+        let views = pixels::load(sources, options, look, &mut skipped)?;
         if !views.iter().any(|view| view.split == Split::Train) {
             let first = skipped.first().map(|line| format!(" ({line})")).unwrap_or_default();
             let problem = format!(

@@ -23,6 +23,10 @@ mod orientation;
 mod raw;
 
 #[cfg(feature = "io")]
+pub(crate) use codec::PictureFile;
+#[cfg(all(feature = "io", test))]
+pub(crate) use codec::openings;
+#[cfg(feature = "io")]
 pub use exif::exposure_value;
 #[cfg(feature = "io")]
 pub use jpeg::exif_segment;

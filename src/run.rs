@@ -17,7 +17,7 @@ mod train;
 #[cfg(feature = "cli")]
 pub(crate) use directory::{ENDED, HELD_OUT_COURSE, SPENT, TARGET_EXPOSURE};
 pub use directory::{Progress, RunDirectory, load_progress};
-pub use done::done_steps;
+pub use done::{done_steps, done_steps_by_stamp};
 pub use events::Event;
 pub use load::{
     is_finished, load_config, load_exposures, load_metrics, load_model, load_networks, other_views,

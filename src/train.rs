@@ -6,6 +6,7 @@ mod checkpoint;
 mod config;
 mod decisions;
 mod early_stopping;
+mod epochs;
 mod exposures;
 mod fill;
 mod growth;
@@ -32,7 +33,7 @@ use std::thread::{self, ScopedJoinHandle};
 use glam::DVec3;
 
 use crate::camera::{Camera, Frame};
-use crate::dataset::{Dataset, Fingerprint, Split};
+use crate::dataset::{Dataset, Fingerprint, Original, Split};
 use crate::densify::{Densifier, DensityControl};
 use crate::exposure::Exposures;
 use crate::gpu::{Buffer, CheckReport, Gpu, PassTime, Recorder};
@@ -42,6 +43,7 @@ use crate::optimizer::{Adam, FiniteCheck, LearningRates};
 use crate::pseudo_gt::PseudoGt;
 use crate::render::{Damping, Gradients, RenderOptions, Renderer};
 use crate::scene::{COLOR_CHANNELS, Gaussians};
+use crate::tone::Scene;
 use crate::{Error, Result};
 
 use best::Snapshot;
@@ -138,6 +140,8 @@ pub struct Trainer {
     frame: Frame,
     /// In units of the frame.
     extent: f64,
+    /// What the curves of the photographs have in common.
+    scene: Scene,
     target_exposure: Option<TargetExposure>,
     held_out: TargetViews,
     /// Training views that tell what a round of density control costs; none where nothing is done about it.
@@ -297,6 +301,7 @@ impl Trainer {
         if let Some(exposures) = &mut exposures {
             sizes.iter().try_for_each(|&size| exposures.reserve(size))?;
         }
+        dataset.views.iter().filter_map(|view| view.original.as_ref()).for_each(Original::release);
         let (Kernels { renderer, mut losses, adam, finite, densifier }, fingerprint) =
             beside.join().unwrap_or_else(|panic| resume_unwind(panic))?;
         losses.prepare(&views.sources(gpu, &pseudo_gt, dataset))?;
@@ -306,6 +311,7 @@ impl Trainer {
             fingerprint,
             frame,
             extent: dataset.extent() * frame.scale,
+            scene,
             target_exposure,
             held_out,
             probes,
@@ -343,6 +349,11 @@ impl Trainer {
     /// Steps done so far.
     pub fn steps_done(&self) -> u64 {
         self.step
+    }
+
+    /// What the curves of the training photographs have in common, for [`TestTargets::in_scene`].
+    pub fn scene(&self) -> &Scene {
+        &self.scene
     }
 
     /// How bright the targets are; none where the curve's constants say that.
@@ -464,7 +475,7 @@ impl Trainer {
         self.renderer.forward(pass, &model.gaussians.parameters, view.patch, &options)?;
         let (render, status) = self.renderer.render_and_status();
         let (d_render, size) = (&mut self.d_render, view.size());
-        let input = view.input.decoded(pass, decoded)?;
+        let input = self.views.input(view).decoded(pass, decoded)?;
         let log = &mut LogSlot { log: &mut self.log, slot, status };
         let channels = COLOR_CHANNELS + model.shape().features.width();
         let masks = &mut self.masks;
@@ -495,7 +506,7 @@ impl Trainer {
             }
         }
         if let Some(networks) = &mut self.networks {
-            let low = match &view.photograph {
+            let low = match self.views.photograph(view) {
                 Some(photograph) => photograph.decoded(pass, decoded_photograph)?,
                 None => input,
             };

@@ -29,6 +29,11 @@ impl Places {
         own
     }
 
+    /// Every `step`th of the places, in the same units.
+    pub(crate) fn every(self, step: usize) -> Self {
+        Self { places: self.places.into_iter().step_by(step).collect(), ..self }
+    }
+
     /// The squared distance of each place from that of a camera.
     pub(crate) fn squared_distances(&self, camera: &Camera) -> impl Iterator<Item = f64> {
         let from = self.place(camera);

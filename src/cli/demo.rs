@@ -17,7 +17,7 @@ use crate::output::write_whole;
 use crate::pseudo_gt::PseudoGt;
 use crate::report::{Distribution, Report, distributions};
 use crate::run::HeldRun;
-use crate::tone::{Scene, ToneCurve, ToneSettings};
+use crate::tone::{Measured, Scene, ToneCurve, ToneSettings};
 use crate::train::TrainConfig;
 
 /// Make a small dark multi-view set, train on it with three tone curves, and show the results side by side.
@@ -143,10 +143,10 @@ fn luminances(gpu: &Gpu, dataset: &Dataset) -> crate::Result<String> {
     let mut drawn = vec![photographs];
     for curve in CURVES {
         let settings = ToneSettings::new(curve);
-        let mut pseudo_gt = PseudoGt::new(gpu, &settings)?;
+        let pseudo_gt = PseudoGt::new(gpu, &settings)?;
         let mut targets = Distribution::new(title(curve));
         for (photograph, _) in &pairs {
-            let measured = pseudo_gt.measure(&photograph.data)?;
+            let measured = Measured::of(&photograph.data);
             let lift = settings.lift(&Scene::default(), &measured);
             targets.add(&pseudo_gt.lifted(photograph, &lift)?.data);
         }

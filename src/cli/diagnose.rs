@@ -93,8 +93,7 @@ pub fn run(args: &DiagnoseArgs) -> Result<()> {
     config.max_resolution = args.max_resolution.unwrap_or(config.max_resolution);
     let gpu = Gpu::new(&args.device.clone().unwrap_or_default())?;
     let options = load_options(&config);
-    let dataset = Dataset::load(&config.dataset, &options)?;
-    let mut diagnosis = Diagnosis::of(&dataset, &options)?;
+    let (dataset, mut diagnosis) = Diagnosis::load(&config.dataset, &options)?;
     let run = args.run.as_deref().map(|run| holes(run, args)).transpose()?;
     diagnosis.remarks.extend(run.iter().map(|(remark, _)| remark.clone()));
     let diagnosis = diagnosis;

@@ -415,6 +415,9 @@ pub fn run(args: &TrainArgs) -> Result<()> {
         true => RunDirectory::check_resumed(&args.out)?,
         false => RunDirectory::check(&args.out, args.overwrite)?,
     }
+    if let Some(steps) = done_by_stamp(args, &config)? {
+        return say_done(args, steps);
+    }
     let gpu = Gpu::new(&config.device.parse::<DeviceChoice>()?)?;
     let Planned { config, plan, dataset } = planned(args, config, &gpu)?;
     for line in args.options.idle(&config) {
@@ -422,8 +425,7 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     }
     let finished = if args.resume { run::done_steps(&args.out, &config, &dataset)? } else { None };
     if let Some(steps) = finished {
-        let done = format!("{} is done: {steps} steps", args.out.display());
-        return Ok(writeln!(std::io::stdout(), "{}", printable(&done))?);
+        return say_done(args, steps);
     }
     let form = args.progress.unwrap_or_else(ProgressForm::of_terminal);
     let is_text = form != ProgressForm::Json;
@@ -468,6 +470,28 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     Ok(())
 }
 
+fn say_done(args: &TrainArgs, steps: u64) -> Result<()> {
+    let done = format!("{} is done: {steps} steps", args.out.display());
+    Ok(writeln!(std::io::stdout(), "{}", printable(&done))?)
+}
+
+/// The steps of the run that is to go on, if it is done and the files of its dataset are as they were: nothing is decoded for
+/// that.
+fn done_by_stamp(args: &TrainArgs, config: &TrainConfig) -> crate::Result<Option<u64>> {
+    if !args.resume || !args.out.join("config.toml").is_file() {
+        return Ok(None);
+    }
+    let given = args.plan.clone().filter(|path| path != Path::new("none"));
+    let config = match given.or_else(|| run::plan_of(&args.out)) {
+        Some(file) => {
+            let plan = Plan::read(&file)?;
+            as_begun(args, args.options.planned_config(config.dataset.clone(), Some(&plan))?)?
+        }
+        None => config.clone(),
+    };
+    run::done_steps_by_stamp(&args.out, &config)
+}
+
 /// What a run begins with.
 struct Planned {
     config: TrainConfig,
@@ -489,15 +513,18 @@ fn planned(args: &TrainArgs, config: TrainConfig, gpu: &Gpu) -> crate::Result<Pl
     let config = args.options.planned_config(config.dataset, None)?;
     let config = if is_resumed { as_begun(args, config)? } else { config };
     let options = diagnose::load_options(&config);
-    let mut dataset = Dataset::load(&config.dataset, &options)?;
-    let plan = match file {
-        Some(file) => Plan::load(&file, &dataset)?,
+    let (mut dataset, plan) = match file {
+        Some(file) => {
+            let dataset = Dataset::load(&config.dataset, &options)?;
+            let plan = Plan::load(&file, &dataset)?;
+            (dataset, plan)
+        }
         None => {
-            let diagnosis = Diagnosis::of(&dataset, &options)?;
+            let (dataset, diagnosis) = Diagnosis::load(&config.dataset, &options)?;
             for remark in &diagnosis.remarks {
                 tracing::warn!("{remark}");
             }
-            Plan::new(&diagnosis, &config, gpu.properties().memory)
+            (dataset, Plan::new(&diagnosis, &config, gpu.properties().memory))
         }
     };
     dataset.leave_out(&plan.left_out);

@@ -25,8 +25,22 @@ pub struct LoadOptions {
     pub hold_out: usize,
     /// Masks hide what is white, not what is black.
     pub invert_masks: bool,
+    /// At which size training photographs are measured while they are decoded, if they are not kept at that size.
+    pub measured: MeasuredSize,
     /// What is looked for as the training views' depth.
     pub depth: DepthOptions,
+}
+
+/// At which size a curve is applied to photographs, and what it follows from is measured.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum MeasuredSize {
+    /// They are not measured.
+    #[default]
+    None,
+    /// Their own.
+    Own,
+    /// That of the view's camera.
+    Loaded,
 }
 
 /// Where depth maps come from: `STEM.*` or `depth_STEM.*` in a folder.
@@ -51,6 +65,7 @@ impl Default for LoadOptions {
             load_low_test: true,
             hold_out: 0,
             invert_masks: false,
+            measured: MeasuredSize::default(),
             depth: DepthOptions::default(),
         }
     }

@@ -190,16 +190,7 @@ impl Plan {
     /// # Errors
     /// [`Error::Input`]: the file cannot be read, holds no plan, or that of another dataset.
     pub fn load(path: &Path, dataset: &Dataset) -> Result<Self> {
-        let text = input::text(path)?;
-        let plan: Self = toml::from_str(&text).map_err(|error| {
-            let line = error.span().map(|span| text[..span.start].matches('\n').count() + 1);
-            let place = line.map(|line| format!(" (line {line})")).unwrap_or_default();
-            let message = error.message().lines().next().unwrap_or_default();
-            Error::input(
-                path,
-                format!("is no plan: {message}{place}; make one with `nightsplat diagnose`"),
-            )
-        })?;
+        let plan = Self::read(path)?;
         let own = PlannedViews::of(dataset);
         if plan.dataset != own {
             let (of, is) = (plan.dataset.described(), own.described());
@@ -210,6 +201,23 @@ impl Plan {
             return Err(Error::input(path, problem));
         }
         Ok(plan)
+    }
+
+    /// Reads a plan, of whichever dataset.
+    ///
+    /// # Errors
+    /// [`Error::Input`]: the file cannot be read or holds no plan.
+    pub fn read(path: &Path) -> Result<Self> {
+        let text = input::text(path)?;
+        toml::from_str(&text).map_err(|error| {
+            let line = error.span().map(|span| text[..span.start].matches('\n').count() + 1);
+            let place = line.map(|line| format!(" (line {line})")).unwrap_or_default();
+            let message = error.message().lines().next().unwrap_or_default();
+            Error::input(
+                path,
+                format!("is no plan: {message}{place}; make one with `nightsplat diagnose`"),
+            )
+        })
     }
 }
 

@@ -104,6 +104,7 @@ pub fn train_in(
     mut observe: impl FnMut(Event<'_>),
 ) -> Result<Trained> {
     gpu.reset_peak_memory();
+    let stamp = Dataset::stamp(&dataset.root, &config.load_options()).ok();
     let (mut directory, mut trainer) = begin(gpu, config, dataset, out, session.held)?;
     if let Some(plan) = session.plan {
         directory.save_plan(plan)?;
@@ -139,7 +140,7 @@ pub fn train_in(
         metrics[HELD_OUT_COURSE] = course;
     }
     directory.save_metrics(&metrics)?;
-    done::save(out, config, trainer.fingerprint(), &ended)?;
+    done::save(out, config, (trainer.fingerprint(), stamp), &ended)?;
     let trained = Trained { trainer, ended, scored, losses, spent };
     observe(Event::Finished(&trained));
     Ok(trained)
@@ -379,7 +380,9 @@ impl<'a> Course<'a> {
     ) -> Result<Vec<ViewScore>> {
         let mut yardstick = match self.yardstick.take() {
             Some(known) => known,
-            None => Yardstick::of(self.gpu, &self.config.tone, self.dataset)?,
+            None => {
+                Yardstick::in_scene(self.gpu, &self.config.tone, self.dataset, trainer.scene())?
+            }
         };
         let (step, mut is_first) = (trainer.steps_done(), true);
         let render = |view: &View| trainer.render(&view.camera);

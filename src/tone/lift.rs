@@ -21,6 +21,12 @@ pub struct Measured {
 }
 
 impl Measured {
+    /// Of the planes (3, pixels) of a photograph.
+    pub fn of(planes: &[f32]) -> Self {
+        let (statistics, luminance) = (Statistics::of(planes), LuminanceHistogram::of(planes));
+        Self { statistics, luminance, camera: None }
+    }
+
     /// The same of a photograph that `camera` took.
     #[must_use]
     pub fn seen_by(self, camera: &Camera) -> Self {

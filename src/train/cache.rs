@@ -3,6 +3,7 @@
 //! The file holds them as the device had them, so that the cache changes no bit. It has no name where the system allows
 //! that, and goes with the run.
 
+use std::collections::BTreeSet;
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
@@ -97,6 +98,9 @@ fn host_memory() -> Option<u64> {
 #[derive(Debug)]
 pub(super) struct Cache {
     gpu: Gpu,
+    kept: Vec<Kept>,
+    /// Those on the device, by when they were asked for last.
+    on_device: BTreeSet<(u64, usize)>,
     budget: u64,
     /// Bytes that are on the device.
     taken: u64,
@@ -107,12 +111,15 @@ pub(super) struct Cache {
     spool: Option<Arc<Spool>>,
 }
 
+/// The place of a photograph in the cache.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Slot(usize);
+
 /// A photograph on the device, in the file, or both.
 #[derive(Debug)]
 pub(super) struct Kept {
     on_device: Option<Photograph>,
     in_file: Option<InFile>,
-    value_count: usize,
     decoded_len: usize,
     bytes: u64,
     /// When it was asked for last.
@@ -120,29 +127,37 @@ pub(super) struct Kept {
 }
 
 impl Cache {
-    /// One of so many bytes on the device; what does not fit lies in `folder`, or where the system has temporary files.
+    /// One of `budget` bytes on the device; what does not fit lies in `folder`, or where the system has temporary files.
     pub(super) fn new(gpu: &Gpu, budget: u64, folder: Option<PathBuf>) -> Self {
-        Self { gpu: gpu.clone(), budget, taken: 0, clock: 0, folder, spool: None }
+        let (kept, on_device) = (vec![], BTreeSet::new());
+        Self { gpu: gpu.clone(), kept, on_device, budget, taken: 0, clock: 0, folder, spool: None }
     }
 
     /// Takes in a photograph, which stays on the device where there is room.
     ///
     /// # Errors
     /// The file cannot be written, or the device was lost.
-    pub(super) fn keep(&mut self, photograph: Photograph) -> Result<Kept> {
-        let mut kept = Kept {
+    pub(super) fn keep(&mut self, photograph: Photograph) -> Result<Slot> {
+        let place = self.kept.len();
+        let bytes = photograph.bytes();
+        self.kept.push(Kept {
             in_file: None,
-            value_count: photograph.len(),
             decoded_len: photograph.decoded_len(),
-            bytes: photograph.bytes(),
+            bytes,
             asked: 0,
             on_device: Some(photograph),
-        };
-        self.taken += kept.bytes;
+        });
+        self.on_device.insert((0, place));
+        self.taken += bytes;
         if self.taken > self.budget {
-            self.put_away(&mut kept)?;
+            self.put_away(place)?;
         }
-        Ok(kept)
+        Ok(Slot(place))
+    }
+
+    /// A photograph that was taken in.
+    pub(super) fn get(&self, Slot(place): Slot) -> &Kept {
+        &self.kept[place]
     }
 
     /// Whether everything taken in so far is on the device, and always will be.
@@ -155,38 +170,44 @@ impl Cache {
         self.budget
     }
 
-    /// Brings `wanted` of `all` to the device, in place of those that were not asked for the longest; they stay there until
-    /// the next call.
+    /// Brings `wanted` to the device, in place of those that were not asked for the longest; they stay there until the next
+    /// call.
     ///
     /// # Errors
     /// The file cannot be read or written, or the device is out of memory or lost.
-    pub(super) fn bring(&mut self, all: &mut [&mut Kept], wanted: &[usize]) -> Result<()> {
+    pub(super) fn bring(&mut self, wanted: &[Slot]) -> Result<()> {
         self.clock += 1;
-        for &place in wanted {
-            all[place].asked = self.clock;
+        for &Slot(place) in wanted {
+            let kept = &mut self.kept[place];
+            if self.on_device.remove(&(kept.asked, place)) {
+                self.on_device.insert((self.clock, place));
+            }
+            kept.asked = self.clock;
         }
-        for &place in wanted {
-            if all[place].on_device.is_some() {
-                continue;
+        for &Slot(place) in wanted {
+            let Kept { on_device: None, bytes, .. } = self.kept[place] else { continue };
+            while self.taken + bytes > self.budget {
+                let oldest = self.on_device.first().copied();
+                let Some((_, idle)) = oldest.filter(|(asked, _)| *asked < self.clock) else {
+                    break;
+                };
+                self.put_away(idle)?;
             }
-            while self.taken + all[place].bytes > self.budget {
-                let idle = all.iter_mut().filter(|kept| kept.on_device.is_some());
-                let idle = idle.filter(|kept| kept.asked < self.clock);
-                let Some(oldest) = idle.min_by_key(|kept| kept.asked) else { break };
-                self.put_away(oldest)?;
-            }
-            let kept = &mut all[place];
+            let kept = &mut self.kept[place];
             if let Some(in_file) = &kept.in_file {
                 kept.on_device = Some(in_file.load(&self.gpu)?);
-                self.taken += kept.bytes;
+                self.on_device.insert((self.clock, place));
+                self.taken += bytes;
             }
         }
         Ok(())
     }
 
-    /// Takes a photograph off the device, behind writing it to the file the first time.
-    fn put_away(&mut self, kept: &mut Kept) -> Result<()> {
+    /// Takes a photograph off the device, after it has been written to the file the first time.
+    fn put_away(&mut self, place: usize) -> Result<()> {
+        let kept = &mut self.kept[place];
         let Some(photograph) = kept.on_device.take() else { return Ok(()) };
+        self.on_device.remove(&(kept.asked, place));
         if kept.in_file.is_none() {
             let spool = match &self.spool {
                 Some(spool) => Arc::clone(spool),
@@ -209,11 +230,6 @@ impl Cache {
 }
 
 impl Kept {
-    /// How many values it has.
-    pub(super) fn len(&self) -> usize {
-        self.value_count
-    }
-
     /// How many floats have to be there to decode it to.
     pub(super) fn decoded_len(&self) -> usize {
         self.decoded_len
@@ -386,16 +402,16 @@ mod tests {
             let mut cache = Cache::new(&gpu, budget, None);
             let mut darkroom = Darkroom::new(&gpu, PhotographBits::Exact);
             let kept = (0..7).map(|i| cache.keep(darkroom.upload("low", &values(i)).unwrap()));
-            let mut kept = kept.collect::<Result<Vec<_>>>().unwrap();
+            let slots = kept.collect::<Result<Vec<_>>>().unwrap();
             assert_eq!(cache.holds_all(), budget == 1 << 30);
             for wanted in [&[0, 1][..], &[6], &[5, 2], &[3], &[0, 4], &[2]] {
-                let mut all: Vec<&mut Kept> = kept.iter_mut().collect();
-                cache.bring(&mut all, wanted).unwrap();
+                let of_wanted: Vec<Slot> = wanted.iter().map(|&place| slots[place]).collect();
+                cache.bring(&of_wanted).unwrap();
                 for &place in wanted {
                     let mut scratch = gpu.uninit("decoded", 9000).unwrap();
                     let mut plain = None;
                     gpu.run("decode", |pass| {
-                        let decoded = kept[place].decoded(pass, &mut scratch)?;
+                        let decoded = cache.get(slots[place]).decoded(pass, &mut scratch)?;
                         plain = Some(pass.download(decoded)?);
                         Ok(())
                     })
@@ -403,13 +419,14 @@ mod tests {
                     let decoded = plain.unwrap().wait().unwrap();
                     assert!(decoded[..9000] == values(place), "{budget}: {place}");
                 }
+                let kept = &cache.kept;
                 let on_device: u64 =
                     kept.iter().filter(|one| one.on_device.is_some()).map(Kept::bytes).sum();
                 assert_eq!(on_device, cache.taken);
                 let asked: u64 = wanted.iter().map(|&place| kept[place].bytes()).sum();
                 assert!(cache.taken <= budget.max(asked), "{} of {budget}", cache.taken);
             }
-            for (place, kept) in kept.iter().enumerate() {
+            for (place, kept) in cache.kept.iter().enumerate() {
                 assert!(gpu.read(&*kept.whole(&gpu).unwrap()).unwrap() == values(place));
             }
         }

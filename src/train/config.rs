@@ -11,7 +11,7 @@ use super::parts::ModelConfig;
 use super::precision::PrecisionConfig;
 use super::streams;
 use crate::camera::frame::{FRAME_EXTENT, Frame};
-use crate::dataset::{Dataset, DepthOptions, LoadOptions};
+use crate::dataset::{Dataset, DepthOptions, LoadOptions, MeasuredSize};
 use crate::densify::DensityControl;
 use crate::gpu::Tile;
 use crate::input;
@@ -296,6 +296,7 @@ impl TrainConfig {
             keep: CacheSize::on_host(self.cache, self.max_ram),
             reference: self.reference.clone(),
             invert_masks: self.invert_masks,
+            measured: if self.tone.lift_first { MeasuredSize::Own } else { MeasuredSize::Loaded },
             hold_out: self.stop.views,
             depth: DepthOptions {
                 load: self.model.depth,

@@ -13,7 +13,7 @@ use crate::dataset::{Dataset, LoadOptions, Photograph, View};
 use crate::exposure::{Affine, ExposureRates, table};
 use crate::image::{Image, exposure_value, linear_from_srgb, srgb_from_linear};
 use crate::pseudo_gt::PseudoGt;
-use crate::tone::Scene;
+use crate::tone::{Measured, Scene};
 use crate::{Error, Result};
 
 /// Whether something is learned.
@@ -194,7 +194,7 @@ struct Targets<'a> {
 
 impl Targets<'_> {
     fn target(&mut self, photograph: &Image, camera: &Camera) -> Result<Image> {
-        let measured = self.pseudo_gt.measure(&photograph.data)?.seen_by(camera);
+        let measured = Measured::of(&photograph.data).seen_by(camera);
         let lift = self.pseudo_gt.settings().lift(self.scene, &measured);
         self.pseudo_gt.lifted(photograph, &lift)
     }
@@ -203,7 +203,9 @@ impl Targets<'_> {
     /// photograph without them nearest to the target of the photograph as it is. A curve that follows from each photograph
     /// takes much of the difference away before.
     fn affine_of_stops(&mut self, name: &str, stops: f64) -> Result<Affine> {
-        let view = self.dataset.train_views().find(|view| view.name == name);
+        let views = &self.dataset.views;
+        let place = views.binary_search_by(|view| view.name.as_str().cmp(name));
+        let view = place.ok().map(|place| &views[place]);
         let photograph = view.map(View::loaded).transpose()?.flatten();
         let Some((view, photograph)) = view.zip(photograph) else { return Ok(Affine::IDENTITY) };
         let scale = (-stops).exp2() as f32;

@@ -109,9 +109,9 @@ impl Trainer {
         for view in views {
             let camera = coarse(&view.patch.camera, pixels);
             let depths = self.depths(&mut renderer, gaussians, &camera)?;
-            let target = self
-                .views
-                .put_together(&self.gpu, view.place, |patch| patch.target(&self.gpu, &pseudo_gt))?;
+            let target = self.views.put_together(&self.gpu, view.place, |patch| {
+                self.views.target(&self.gpu, &pseudo_gt, patch)
+            })?;
             let exposure = exposures.as_ref().and_then(|exposures| exposures.get(view.place));
             let neutral = exposure.map(Affine::inverse).map(|inverse| inverse.applied(&target));
             let target = neutral.unwrap_or(target).resized(camera.width, camera.height);

@@ -148,7 +148,7 @@ mod tests {
         let dataset = Dataset::load(&config.dataset, &config.load_options()).unwrap();
         let frame = dataset.frame();
         let mut pseudo_gt = PseudoGt::new(&gpu, &config.tone).unwrap();
-        let (scene, _) = measured(&mut pseudo_gt, &dataset).unwrap();
+        let (scene, _) = measured(pseudo_gt.settings(), &dataset).unwrap();
         let all = [usize::MAX; 2];
         let views = TargetViews::probes(&mut pseudo_gt, &dataset, &frame, &scene, all).unwrap();
         let mut trainer = Trainer::new(&gpu, config.clone(), &dataset).unwrap();

@@ -34,8 +34,7 @@ impl Masks {
         let (mut weights, mut largest) = (vec![], 0);
         for view in views.all() {
             let (size, Camera { width, height, .. }) = (view.size(), view.patch.camera);
-            let own = dataset.views.iter().find(|own| own.name == view.name);
-            let mask = own.and_then(|own| own.mask.as_ref());
+            let mask = dataset.views[view.index].mask.as_ref();
             let mask = mask.map(|mask| mask.resized(width, height));
             let mask = mask.map(|mask| gpu.buffer("mask", &view.patch.cut(&mask.weights)));
             largest = largest.max(if mask.is_some() { value_count(size) } else { 0 });

@@ -80,7 +80,9 @@ impl Views {
         of: impl Fn(&TrainView) -> Result<Arc<Buffer<f32>>>,
     ) -> Result<Image> {
         let mut image = Image { width: 0, height: 0, data: vec![] };
-        for view in self.whole().iter().filter(|view| view.place == place) {
+        let views = self.whole();
+        let first = views.partition_point(|view| view.place < place);
+        for view in views[first..].iter().take_while(|view| view.place == place) {
             let (patch, data) = (&view.patch, gpu.read(&*of(view)?)?);
             let Camera { width, height, .. } = patch.camera;
             if patch.is_whole() {

@@ -13,7 +13,7 @@ use crate::gpu::Gpu;
 use crate::image::{Image, Mask};
 use crate::metrics::psnr_of_counted;
 use crate::pseudo_gt::PseudoGt;
-use crate::tone::{LuminanceHistogram, Scene, ToneSettings, is_black};
+use crate::tone::{LuminanceHistogram, Measured, Scene, ToneSettings, is_black};
 
 use super::rendered::Rendered;
 
@@ -141,7 +141,7 @@ fn target_of(
     photograph: &Image,
     scene: &Scene,
 ) -> Result<Image> {
-    let measured = pseudo_gt.measure(&view.counted(photograph))?.seen_by(&view.camera);
+    let measured = Measured::of(&view.counted(photograph)).seen_by(&view.camera);
     let lift = pseudo_gt.settings().lift(scene, &measured);
     let target = pseudo_gt.lifted(photograph, &lift)?;
     Ok(target.resized(view.camera.width, view.camera.height))
@@ -162,9 +162,16 @@ impl TestTargets {
     /// Every training photograph is as good as black where their exposure is asked for; a photograph can no longer be read;
     /// the device is out of memory or lost.
     pub fn new(gpu: &Gpu, tone: &ToneSettings, dataset: &Dataset) -> Result<Self> {
-        let mut pseudo_gt = PseudoGt::new(gpu, tone)?;
-        let (scene, _) = measured(&mut pseudo_gt, dataset)?;
-        Ok(Self { pseudo_gt, scene })
+        let (scene, _) = measured(tone, dataset)?;
+        Self::in_scene(gpu, tone, &scene)
+    }
+
+    /// The same where the training photographs are measured already.
+    ///
+    /// # Errors
+    /// The device is out of memory.
+    pub fn in_scene(gpu: &Gpu, tone: &ToneSettings, scene: &Scene) -> Result<Self> {
+        Ok(Self { pseudo_gt: PseudoGt::new(gpu, tone)?, scene: scene.clone() })
     }
 
     /// That of a view, of its camera's size; none where it has no photograph.
@@ -239,7 +246,7 @@ impl Trainer {
         const MOST: usize = 8;
         let views = self.views.whole();
         let some = views.iter().step_by(views.len().div_ceil(MOST).max(1)).map(|view| {
-            let target = view.image(&self.gpu, &*view.kept_target(&self.gpu)?)?;
+            let target = view.image(&self.gpu, &*self.views.kept_target(&self.gpu, view)?)?;
             let (camera, place) = (view.patch.pinhole(), Some(view.place));
             Ok(TargetView { camera, target, mask: None, place })
         });

@@ -6,14 +6,16 @@ use std::ops::RangeInclusive;
 use std::sync::Arc;
 
 use glam::{DVec3, UVec2, Vec3};
+use rayon::prelude::*;
 use serde::Serialize;
 
-use super::cache::{Cache, CacheSize, Kept};
+use super::cache::{Cache, CacheSize, Kept, Slot};
+use super::epochs::Epochs;
 use super::precision::Darkroom;
 use super::{TrainConfig, streams};
 use crate::Result;
 use crate::camera::{Camera, Frame, Patch};
-use crate::dataset::{Dataset, Point, View};
+use crate::dataset::{Dataset, MeasuredSize, Point, View};
 use crate::exposure::Affine;
 use crate::gpu::{Buffer, Gpu};
 use crate::image::Image;
@@ -34,15 +36,15 @@ pub(super) struct TrainView {
     /// Its photograph's place among those that are trained on.
     pub(super) place: usize,
     /// Index into the dataset's views.
-    index: usize,
+    pub(super) index: usize,
     /// What it is of its photograph, in the frame.
     pub(super) patch: Patch,
     /// Depth from elsewhere, (H, W), where the dataset's is of another size.
     depth: Option<Vec<f32>>,
     /// What the loss applies `tone` to, planar (3, H, W), sRGB-encoded: the dark photograph, or the target itself.
-    pub(super) input: Kept,
+    input: Slot,
     /// The dark photograph, where that is not the input and a network sees it.
-    pub(super) photograph: Option<Kept>,
+    photograph: Option<Slot>,
     /// The curve that the photograph gets; one element. Where the input is the target already, none.
     pub(super) tone: Buffer<ToneParameters>,
     /// Whether the input is the target.
@@ -79,6 +81,7 @@ pub(super) struct Views {
     /// The places of those that are trained on no more.
     left_out: BTreeSet<usize>,
     cache: Cache,
+    epochs: Epochs,
 }
 
 /// A view whose shorter side would fall below this is not shrunk any more, in pixels.
@@ -100,7 +103,7 @@ impl Views {
     ) -> Result<(Self, Scene, Option<TargetExposure>)> {
         let settings = pseudo_gt.settings().clone();
         let keeps_photographs = config.model.denoiser || config.model.tonemapper;
-        let (scene, measured) = measured(pseudo_gt, dataset)?;
+        let (scene, measured) = measured(&settings, dataset)?;
         let mut darkroom = Darkroom::new(gpu, config.precision.photographs);
         let budget = CacheSize::on_device(config.cache, config.max_vram, gpu);
         let mut cache = Cache::new(gpu, budget, config.spool.clone());
@@ -141,7 +144,8 @@ impl Views {
             }
         }
         views.iter_mut().flatten().enumerate().for_each(|(number, view)| view.number = number);
-        let views = Self { levels: views, left_out: BTreeSet::new(), cache };
+        let views =
+            Self { levels: views, left_out: BTreeSet::new(), cache, epochs: Epochs::default() };
         // The targets of a profile are as bright as its references.
         let exposure = scene.exposure.clone().filter(|_| settings.profile.is_none());
         let exposure = exposure.map(|scene| TargetExposure::new(scene, gains));
@@ -161,28 +165,24 @@ impl Views {
         if self.cache.holds_all() {
             return Ok(*steps.end());
         }
-        let (mut wanted, mut bytes, mut last) = (BTreeSet::new(), 0, *steps.start());
+        let (mut numbers, mut wanted) = (BTreeSet::new(), vec![]);
+        let (mut bytes, mut last) = (0, *steps.start());
         for step in steps {
             let level = config.schedule.resolution_level(step);
             let view = self.of_step(config.seed, step, level);
-            let own = view.input.bytes() + view.photograph.as_ref().map_or(0, Kept::bytes);
-            let is_new = !wanted.contains(&view.number);
-            if !wanted.is_empty() && is_new && bytes + own > self.cache.budget() {
+            let slots = [Some(view.input), view.photograph].into_iter().flatten();
+            let own: u64 = slots.clone().map(|slot| self.cache.get(slot).bytes()).sum();
+            let is_new = !numbers.contains(&view.number);
+            if !numbers.is_empty() && is_new && bytes + own > self.cache.budget() {
                 break;
             }
-            bytes += if is_new { own } else { 0 };
-            wanted.insert(view.number);
+            if numbers.insert(view.number) {
+                bytes += own;
+                wanted.extend(slots);
+            }
             last = step;
         }
-        let (mut all, mut places) = (vec![], vec![]);
-        for view in self.levels.iter_mut().flatten() {
-            let is_wanted = wanted.contains(&view.number);
-            for kept in std::iter::once(&mut view.input).chain(view.photograph.as_mut()) {
-                places.extend(is_wanted.then_some(all.len()));
-                all.push(kept);
-            }
-        }
-        self.cache.bring(&mut all, &places)?;
+        self.cache.bring(&wanted)?;
         Ok(last)
     }
 
@@ -191,9 +191,11 @@ impl Views {
     /// # Errors
     /// The device is out of memory or lost.
     pub(super) fn keep_targets(&mut self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<()> {
-        for view in self.levels.iter_mut().flatten().filter(|view| !view.is_baked) {
-            view.target = Some(view.target(gpu, pseudo_gt)?);
+        let mut levels = std::mem::take(&mut self.levels);
+        for view in levels.iter_mut().flatten().filter(|view| !view.is_baked) {
+            view.target = Some(self.target(gpu, pseudo_gt, view)?);
         }
+        self.levels = levels;
         Ok(())
     }
 
@@ -207,27 +209,47 @@ impl Views {
         let source = |view: &'a TrainView| ViewSource {
             size: view.size(),
             depth: view.depth.as_deref().or(dataset.views[view.index].depth.as_deref()),
-            target: Box::new(|| view.target(gpu, pseudo_gt)),
+            target: Box::new(|| self.target(gpu, pseudo_gt, view)),
         };
         self.levels.iter().flatten().map(source).collect()
+    }
+
+    /// The dark photograph of a view, planar (3, H, W); only there where it is the input, or was kept.
+    fn whole_photograph(&self, gpu: &Gpu, view: &TrainView) -> Result<Arc<Buffer<f32>>> {
+        self.photograph(view).unwrap_or_else(|| self.input(view)).whole(gpu)
+    }
+
+    /// The pseudo-GT of a view, (3, H, W), where the input is that, or it was kept.
+    pub(super) fn kept_target(&self, gpu: &Gpu, view: &TrainView) -> Result<Arc<Buffer<f32>>> {
+        view.target
+            .as_ref()
+            .map_or_else(|| self.input(view).whole(gpu), |target| Ok(Arc::clone(target)))
+    }
+
+    /// The pseudo-GT of a view, (3, H, W).
+    pub(super) fn target(
+        &self,
+        gpu: &Gpu,
+        pseudo_gt: &PseudoGt,
+        view: &TrainView,
+    ) -> Result<Arc<Buffer<f32>>> {
+        let input = self.input(view).whole(gpu)?;
+        if view.is_baked {
+            return Ok(input);
+        }
+        let mut target = gpu.uninit("target", input.len())?;
+        gpu.run("target", |pass| pseudo_gt.map(pass, &input, &view.tone, 0, &mut target))?;
+        Ok(Arc::new(target))
     }
 
     /// The view that a step trains on, at one of the levels: every epoch takes each view once, in an order of its own, and
     /// for one that is left out the next again.
     pub(super) fn of_step(&self, seed: u64, step: u64, level: usize) -> &TrainView {
         let views = &self.levels[level];
-        let count = views.len() as u64;
-        let (epoch, place) = ((step - 1) / count, (step - 1) % count);
-        let stream = Stream::new(seed, streams::VIEWS);
-        // Fisher-Yates from the end; the picks of an epoch only depend on its number.
-        let mut order: Vec<usize> = (0..views.len()).collect();
-        for left in (1..count).rev() {
-            let draw = stream.bits(epoch * count + left) % (left + 1);
-            order.swap(left as usize, draw as usize);
-        }
-        let from_place = order.iter().cycle().skip(place as usize).take(views.len());
+        let (order, place) = self.epochs.of_step(seed, step, views.len());
+        let from_place = order.iter().cycle().skip(place).take(views.len());
         let own = from_place.copied().find(|at| !self.left_out.contains(&views[*at].place));
-        &views[own.unwrap_or(order[place as usize])]
+        &views[own.unwrap_or(order[place])]
     }
 
     /// Trains on a view no more; false where there is no other.
@@ -261,10 +283,20 @@ impl Views {
     /// How many floats the largest input, and the largest photograph beside one, have to be decoded to.
     pub(super) fn decoded_lens(&self) -> [usize; 2] {
         let views = || self.levels.iter().flatten();
-        let inputs = views().map(|view| view.input.decoded_len()).max();
-        let photographs = views().filter_map(|view| view.photograph.as_ref());
-        let photographs = photographs.map(Kept::decoded_len).max();
+        let len = |slot| self.cache.get(slot).decoded_len();
+        let inputs = views().map(|view| len(view.input)).max();
+        let photographs = views().filter_map(|view| view.photograph).map(len).max();
         [inputs, photographs].map(Option::unwrap_or_default)
+    }
+
+    /// What the loss applies the curve of a view to.
+    pub(super) fn input(&self, view: &TrainView) -> &Kept {
+        self.cache.get(view.input)
+    }
+
+    /// The dark photograph of a view, where that is not the input and a network sees it.
+    pub(super) fn photograph(&self, view: &TrainView) -> Option<&Kept> {
+        view.photograph.map(|slot| self.cache.get(slot))
     }
 
     /// One view of every photograph, unshrunk.
@@ -337,13 +369,14 @@ impl Views {
             tracing::warn!("{fitting} of {of} points begin as Gaussians: {device} binds no more");
         }
         let kept = &kept[..kept.len().min(fitting)];
+        // Of the views of the dataset, the place of each among those that are trained on.
+        let mut places = vec![None; dataset.views.len()];
+        self.photographs().for_each(|view| places[view.index] = Some(view.place));
         let colors = init::colors_from_views(kept, &dataset.views, |index| {
-            let Some(view) = self.photographs().find(|view| view.index == index) else {
-                return Ok(None);
-            };
-            let target = self.put_together(gpu, view.place, |view| view.target(gpu, pseudo_gt))?;
-            let exposure = exposures.and_then(|exposures| exposures.get(view.place));
-            Ok(Some(exposure.map_or(target.clone(), |own| own.inverse().applied(&target))))
+            let Some(place) = places[index] else { return Ok(None) };
+            let target = self.put_together(gpu, place, |view| self.target(gpu, pseudo_gt, view))?;
+            let exposure = exposures.and_then(|exposures| exposures.get(place));
+            Ok(Some(exposure.map_or_else(|| target.clone(), |own| own.inverse().applied(&target))))
         })?;
         let positions: Vec<DVec3> =
             kept.iter().map(|point| frame.from_world(point.position)).collect();
@@ -353,9 +386,8 @@ impl Views {
         if config.model.network.form == Form::Identity {
             let low = if shape.features.illumination {
                 init::colors_from_views(kept, &dataset.views, |index| {
-                    let view = self.photographs().find(|view| view.index == index);
-                    let low = |view: &TrainView| view.whole_photograph(gpu);
-                    view.map(|view| self.put_together(gpu, view.place, low)).transpose()
+                    let low = |view: &TrainView| self.whole_photograph(gpu, view);
+                    places[index].map(|place| self.put_together(gpu, place, low)).transpose()
                 })?
             } else {
                 vec![]
@@ -443,20 +475,38 @@ fn photographs(dataset: &Dataset) -> impl Iterator<Item = (usize, &View)> {
 /// What is measured of all training photographs together, and of each.
 ///
 /// # Errors
-/// Every photograph is as good as black where their exposure is asked for; a photograph can no longer be read; the
-/// device is out of memory or lost.
+/// Every photograph is as good as black where their exposure is asked for, or a photograph can no longer be read.
 pub(super) fn measured(
-    pseudo_gt: &mut PseudoGt,
+    settings: &ToneSettings,
     dataset: &Dataset,
 ) -> Result<(Scene, Vec<Measured>)> {
-    let lift_first = pseudo_gt.settings().lift_first;
+    let views: Vec<&View> = photographs(dataset).map(|(_, view)| view).collect();
+    let pixels = |view: &&View| u64::from(view.camera.width) * u64::from(view.camera.height);
+    let largest = views.iter().map(pixels).max().unwrap_or_default();
     let mut measured = vec![];
-    for (_, view) in photographs(dataset) {
-        let Some(photograph) = lifted_from(view, lift_first)? else { continue };
-        measured.push(pseudo_gt.measure(&view.counted(&photograph))?.seen_by(&view.camera));
+    for views in views.chunks(Image::decoded_at_once(largest)) {
+        let of_views = views.par_iter().map(|view| measured_of(view, settings.lift_first));
+        measured.extend(of_views.collect::<Result<Vec<_>>>()?.into_iter().flatten());
     }
-    let scene = pseudo_gt.settings().scene(&measured).ok_or_else(|| all_black(&dataset.root))?;
+    let scene = settings.scene(&measured).ok_or_else(|| all_black(&dataset.root))?;
     Ok((scene, measured))
+}
+
+/// What is measured of a view; known where its photograph was measured while it was decoded.
+///
+/// # Errors
+/// As [`lifted_from`].
+pub(super) fn measured_of(view: &View, lift_first: bool) -> Result<Option<Measured>> {
+    let size = if lift_first { MeasuredSize::Own } else { MeasuredSize::Loaded };
+    let read_anew = view.original.as_ref().filter(|_| lift_first || view.image.is_none());
+    let measured = match read_anew.and_then(|original| original.measured(size)) {
+        Some(measured) => Some(measured.clone()),
+        None => {
+            let photograph = lifted_from(view, lift_first)?;
+            photograph.map(|photograph| Measured::of(&view.counted(&photograph)))
+        }
+    };
+    Ok(measured.map(|measured| measured.seen_by(&view.camera)))
 }
 
 /// What is measured of a view and becomes its target: the photograph as its camera took it where it is lifted before it is
@@ -486,27 +536,6 @@ impl TrainView {
     /// Width and height in pixels.
     pub(super) fn size(&self) -> UVec2 {
         self.patch.size
-    }
-
-    /// The dark photograph, planar (3, H, W); only there where it is the input, or was kept.
-    fn whole_photograph(&self, gpu: &Gpu) -> Result<Arc<Buffer<f32>>> {
-        self.photograph.as_ref().unwrap_or(&self.input).whole(gpu)
-    }
-
-    /// The pseudo-GT of the view, (3, H, W), where the input is that, or it was kept.
-    pub(super) fn kept_target(&self, gpu: &Gpu) -> Result<Arc<Buffer<f32>>> {
-        self.target.as_ref().map_or_else(|| self.input.whole(gpu), |target| Ok(Arc::clone(target)))
-    }
-
-    /// The pseudo-GT of the view, (3, H, W).
-    pub(super) fn target(&self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<Arc<Buffer<f32>>> {
-        if self.is_baked {
-            return self.input.whole(gpu);
-        }
-        let input = self.input.whole(gpu)?;
-        let mut target = gpu.uninit("target", self.input.len())?;
-        gpu.run("target", |pass| pseudo_gt.map(pass, &input, &self.tone, 0, &mut target))?;
-        Ok(Arc::new(target))
     }
 
     /// Pixels of the view on the host.
