@@ -27,7 +27,7 @@ use std::borrow::Cow;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use glam::DVec3;
+use glam::{DVec3, UVec2};
 
 use crate::camera::Camera;
 use crate::image::files::Files;
@@ -162,6 +162,12 @@ impl View {
             (None, Some(file)) => file.load_at(size).map(Cow::Owned).map(Some),
             (None, None) => Ok(None),
         }
+    }
+
+    /// Width and height of what [`View::photograph`] gives; none where the view has no photograph.
+    pub fn own_size(&self) -> Option<UVec2> {
+        let kept = self.image.as_ref().map(|image| UVec2::new(image.width, image.height));
+        self.original.as_ref().map(Original::size).or(kept)
     }
 
     /// The photograph as its camera took it, undistorted and not shrunk; none where the view has none.

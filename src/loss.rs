@@ -8,6 +8,7 @@ mod denoising;
 mod depth;
 mod image;
 mod log;
+mod parameters;
 mod structure;
 
 use std::sync::Arc;
@@ -16,7 +17,6 @@ use glam::UVec2;
 use serde::{Deserialize, Serialize};
 
 use crate::gpu::{Buffer, Gpu, Recorder};
-use crate::kernels::ToneParameters;
 use crate::random::Stream;
 use crate::scene::{Feature, Features};
 use crate::{Error, Result};
@@ -25,11 +25,12 @@ pub use denoising::{DenoisingGradients, DenoisingInputs, DenoisingLoss, Denoisin
 pub use depth::{DepthBoxes, DepthInputs, DepthLoss, DepthSettings};
 pub use image::{Loss, LossInputs, LossSettings};
 pub use log::{LogSlot, LossLog, LossLogDownload, StepLosses};
+pub use parameters::{ParameterInputs, ParameterTerms, ParameterWeights};
 pub use structure::{StructureInputs, StructureLoss};
 
 /// Every term, in the order of the columns.
-pub const TERMS: [LossSpec; 5] =
-    [image::TARGET, image::DARK, structure::SPEC, depth::SPEC, denoising::SPEC];
+pub const TERMS: [LossSpec; 6] =
+    [image::TARGET, image::DARK, structure::SPEC, depth::SPEC, denoising::SPEC, parameters::SPEC];
 
 /// What the terms weigh beside (1 - w) L1 + w (1 - SSIM). The defaults are those of LITA-GS's code but for the total variation,
 /// which blurs what holds no noise.
@@ -61,19 +62,36 @@ impl Weights {
     }
 }
 
-/// All that is to know about a term.
+/// All that is to know about a term; it is on where something that it logs has a weight above 0.
 #[derive(Debug)]
 pub struct LossSpec {
-    /// What the Gaussians carry for it; none: every model has the term.
-    pub feature: Option<Feature>,
     /// What it logs.
     pub terms: &'static [Term],
-    /// Builds it where it is one of the render; those of the networks' outputs are built and recorded with the networks.
-    pub on_render: Option<BuildTerm>,
+    /// What it looks at, and what builds it.
+    pub on: TermOn,
 }
 
-/// Builds a term of the render.
-pub type BuildTerm = fn(&Gpu, &LossConfig) -> Result<Box<dyn LossTerm>>;
+/// What a term looks at, with what builds it.
+#[derive(Clone, Copy, Debug)]
+pub enum TermOn {
+    /// The colours of the render. The first such term writes their gradient, every other adds to it.
+    Colors(fn(&Gpu, &LossConfig, Gradient) -> Result<Box<dyn LossTerm>>),
+    /// The channels of the render that show a feature, whose gradient it writes.
+    Feature(Feature, fn(&Gpu, &LossConfig) -> Result<Box<dyn LossTerm>>),
+    /// Outputs of the networks, with which it is built and recorded.
+    Networks,
+    /// The parameters of the Gaussians, to whose gradient it adds; recorded by [`ParameterTerms`].
+    Parameters,
+}
+
+/// What a term of the colours does with the gradient that is there.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Gradient {
+    /// It overwrites it.
+    Written,
+    /// It adds to it.
+    Added,
+}
 
 /// A value that a loss term logs, and how it enters the loss.
 #[derive(Clone, Copy)]
@@ -118,12 +136,14 @@ impl std::fmt::Debug for Term {
 /// What the terms of a model are built from.
 #[derive(Clone, Copy, Debug)]
 pub struct LossConfig {
-    /// A `CURVE_*` of include/tone.glsl.
-    pub tone_curve: u32,
     /// w of (1 - w) L1 + w (1 - SSIM), in [0, 1].
     pub ssim_weight: f64,
-    /// What the other terms weigh.
+    /// What the other terms weigh; 0 of a part that the model lacks.
     pub weights: Weights,
+    /// What the reconstruction of the dark photograph weighs: 1, or 0 where the model has no tonemapper.
+    pub low: f64,
+    /// What the parameters of the Gaussians weigh.
+    pub parameters: ParameterWeights,
     /// The side of the boxes of the local depth term, in pixels.
     pub depth_box: u32,
     /// The random numbers that place these boxes.
@@ -157,9 +177,9 @@ impl LossConfig {
         Ok(())
     }
 
-    fn specs(&self) -> impl Iterator<Item = &'static LossSpec> {
-        let features = self.features;
-        TERMS.iter().filter(move |spec| spec.feature.is_none_or(|feature| features.has(feature)))
+    fn specs(&self) -> impl Iterator<Item = &'static LossSpec> + '_ {
+        let is_on = |spec: &&LossSpec| spec.terms.iter().any(|term| (term.weight)(self) > 0.0);
+        TERMS.iter().filter(is_on)
     }
 }
 
@@ -190,10 +210,8 @@ pub struct TermInputs<'a> {
     /// What is held to the target, (3, H, W) or longer, not clamped: the colours of the render, or what the view's exposure
     /// makes of them.
     pub colors: &'a Buffer<f32>,
-    /// (3, H, W), sRGB-encoded; its tone curve is the pseudo-GT.
-    pub low: &'a Buffer<f32>,
-    /// The curve of this view, one element.
-    pub tone: &'a Buffer<ToneParameters>,
+    /// The pseudo-GT, (3, H, W).
+    pub target: &'a Buffer<f32>,
 }
 
 impl TermInputs<'_> {
@@ -211,7 +229,7 @@ pub trait LossTerm: std::fmt::Debug + Send {
     /// The device is out of memory or lost.
     fn prepare(&mut self, views: &[ViewSource<'_>]) -> Result<()>;
 
-    /// Records the term of a step: writes its channels of `d_render`, (channels, H, W), and its values to the log.
+    /// Records the term of a step: its part of `d_render`, (channels, H, W), and its values in the log.
     ///
     /// # Errors
     /// A buffer is shorter than the view, or the view is larger than those prepared for.
@@ -234,8 +252,20 @@ impl Losses {
     /// # Errors
     /// A weight makes no sense, or the device refuses a pipeline.
     pub fn new(gpu: &Gpu, config: &LossConfig) -> Result<Self> {
-        let build = config.specs().filter_map(|spec| spec.on_render);
-        Ok(Self(build.map(|build| build(gpu, config)).collect::<Result<_>>()?))
+        let (mut terms, mut gradient) = (vec![], Gradient::Written);
+        for spec in config.specs() {
+            match spec.on {
+                TermOn::Colors(build) => {
+                    terms.push(build(gpu, config, gradient)?);
+                    gradient = Gradient::Added;
+                }
+                TermOn::Feature(feature, build) if config.features.has(feature) => {
+                    terms.push(build(gpu, config)?);
+                }
+                TermOn::Feature(..) | TermOn::Networks | TermOn::Parameters => {}
+            }
+        }
+        Ok(Self(terms))
     }
 
     /// Computes what stays the same of these views, and makes room for them.
@@ -346,7 +376,7 @@ mod tests {
     #[test]
     fn a_term_reads_the_first_channel_of_its_feature() {
         let gpu = gpu();
-        let (image, tone) = (gpu.zeros("image", 1).unwrap(), gpu.uninit("tone", 1).unwrap());
+        let image = gpu.zeros("image", 1).unwrap();
         let features = Features { depth: true, structure: true, noise: true, illumination: true };
         let inputs = TermInputs {
             step: 1,
@@ -355,8 +385,7 @@ mod tests {
             features,
             render: &image,
             colors: &image,
-            low: &image,
-            tone: &tone,
+            target: &image,
         };
         let all = [Feature::Depth, Feature::Structure, Feature::Noise, Feature::Illumination];
         assert_eq!(all.map(|feature| inputs.plane(feature)), [3, 4, 5, 8]);

@@ -37,8 +37,7 @@ use crate::dataset::{Dataset, Fingerprint, Original, Split};
 use crate::densify::{Densifier, DensityControl};
 use crate::exposure::Exposures;
 use crate::gpu::{Buffer, CheckReport, Gpu, PassTime, Recorder};
-use crate::loss::{LogSlot, LossLog, Losses, StepLosses, Term, TermInputs};
-use crate::nn::Form;
+use crate::loss::{LogSlot, LossLog, Losses, ParameterTerms, StepLosses, Term, TermInputs};
 use crate::optimizer::{Adam, FiniteCheck, LearningRates};
 use crate::pseudo_gt::PseudoGt;
 use crate::render::{Damping, Gradients, RenderOptions, Renderer};
@@ -169,8 +168,13 @@ pub struct Trainer {
     failed: Option<Error>,
     /// On the device, beside what follows the number of Gaussians and intersections, in bytes.
     fixed_bytes: f64,
-    /// Of a step's view, what is kept in fewer bits: the loss's input, and the photograph where a network sees it besides.
-    decoded: [Buffer<f32>; 2],
+    /// What makes the target of a step's view,
+    pseudo_gt: PseudoGt,
+    /// the target, (3, H, W),
+    target: Buffer<f32>,
+    /// and the dark photograph, where a network sees it.
+    photograph: Buffer<f32>,
+    parameter_terms: Option<ParameterTerms>,
     d_render: Buffer<f32>,
     log: LossLog,
     pace: Pace,
@@ -250,11 +254,8 @@ impl Trainer {
         let settings = config.render_settings();
         let mut pseudo_gt = PseudoGt::new(gpu, &config.tone)?;
         let frame = config.frame.unwrap_or_default();
-        let (mut views, scene, target_exposure) =
+        let (views, scene, target_exposure) =
             Views::upload(gpu, &mut pseudo_gt, dataset, &frame, &config)?;
-        if config.model.denoiser && config.model.network.form == Form::Identity {
-            views.keep_targets(gpu, &pseudo_gt)?;
-        }
         let held_out = dataset.views.iter().filter(|view| view.split == Split::HeldOut);
         let held_out = TargetViews::new(&mut pseudo_gt, held_out, &frame, &scene)?;
         if config.stop.views > 0 && held_out.is_empty() {
@@ -295,7 +296,7 @@ impl Trainer {
         views.say_what_shows_nothing(&gaussians);
         let pixels = sizes.iter().map(|size| size.x as usize * size.y as usize).max();
         let values = settings.channels() * pixels.unwrap_or_default();
-        let masks = Masks::new(gpu, dataset, &views, config.loss().tone_curve)?;
+        let masks = Masks::new(gpu, dataset, &views)?;
         let exposures = starts.map(|starts| Exposures::new(gpu, config.exposure.rates, &starts));
         let mut exposures = exposures.transpose()?;
         if let Some(exposures) = &mut exposures {
@@ -305,7 +306,10 @@ impl Trainer {
         let (Kernels { renderer, mut losses, adam, finite, densifier }, fingerprint) =
             beside.join().unwrap_or_else(|panic| resume_unwind(panic))?;
         losses.prepare(&views.sources(gpu, &pseudo_gt, dataset))?;
-        let [inputs, photographs] = views.decoded_lens();
+        let networks = NetworkTerms::new(gpu, &config, &sizes, !masks.is_empty())?;
+        let pictures = views.most_values();
+        // Beside the target only networks look at the photograph.
+        let photographs = if networks.is_some() { pictures } else { 0 };
         let mut trainer = Self {
             gpu: gpu.clone(),
             fingerprint,
@@ -322,7 +326,9 @@ impl Trainer {
             model: Model::upload(gpu, &gaussians, first_sh_degree(&config), &config.precision)?,
             renderer,
             losses,
-            networks: NetworkTerms::new(gpu, &config, &sizes, !masks.is_empty())?,
+            networks,
+            pseudo_gt,
+            parameter_terms: ParameterTerms::new(gpu, config.loss)?,
             masks,
             exposures,
             adam,
@@ -332,7 +338,8 @@ impl Trainer {
             has_said_room: false,
             failed: None,
             fixed_bytes: 0.0,
-            decoded: [gpu.uninit("decoded", inputs)?, gpu.uninit("decoded low", photographs)?],
+            target: gpu.uninit("target", pictures)?,
+            photograph: gpu.uninit("low", photographs)?,
             d_render: gpu.uninit("d_render", values)?,
             log: LossLog::new(gpu, MOST_STEPS as usize)?,
             pace: Pace::default(),
@@ -470,12 +477,11 @@ impl Trainer {
         };
         let damping = Damping { weight: schedule.damping_weight(step), depth: self.extent as f32 };
         let model = &mut self.model;
-        let [decoded, decoded_photograph] = &mut self.decoded;
 
         self.renderer.forward(pass, &model.gaussians.parameters, view.patch, &options)?;
         let (render, status) = self.renderer.render_and_status();
         let (d_render, size) = (&mut self.d_render, view.size());
-        let input = self.views.input(view).decoded(pass, decoded)?;
+        let target = self.views.record_target(pass, &self.pseudo_gt, view, &mut self.target)?;
         let log = &mut LogSlot { log: &mut self.log, slot, status };
         let channels = COLOR_CHANNELS + model.shape().features.width();
         let masks = &mut self.masks;
@@ -486,32 +492,28 @@ impl Trainer {
             features: model.shape().features,
             render,
             colors: render,
-            low: input,
-            tone: &view.tone,
+            target,
         };
         match &mut self.exposures {
             Some(exposures) => {
                 exposures.expose(pass, view.place, size, render)?;
                 let exposed = exposures.exposed();
-                let colors = masks.shown(pass, view.number, size, exposed, (input, &view.tone))?;
+                let colors = masks.shown(pass, view.number, size, exposed, target)?;
                 let inputs = &TermInputs { colors, ..*inputs };
                 self.losses.record(pass, inputs, d_render, log)?;
                 masks.hide(pass, view.number, (size, channels), d_render)?;
                 exposures.backward(pass, view.place, size, render, d_render)?;
             }
             None => {
-                let colors = masks.shown(pass, view.number, size, render, (input, &view.tone))?;
+                let colors = masks.shown(pass, view.number, size, render, target)?;
                 self.losses.record(pass, &TermInputs { colors, ..*inputs }, d_render, log)?;
                 masks.hide(pass, view.number, (size, channels), d_render)?;
             }
         }
         if let Some(networks) = &mut self.networks {
-            let low = match self.views.photograph(view) {
-                Some(photograph) => photograph.decoded(pass, decoded_photograph)?,
-                None => input,
-            };
+            let (pseudo_gt, scratch) = (&self.pseudo_gt, &mut self.photograph);
+            let low = self.views.record_photograph(pass, pseudo_gt, view, scratch)?;
             // Networks see the model at the neutral exposure.
-            let target = view.target.as_deref().unwrap_or(input);
             let target = match &mut self.exposures {
                 Some(exposures) if networks.follow_target() => {
                     exposures.neutralize(pass, view.place, size, target)?;
@@ -536,6 +538,11 @@ impl Trainer {
                 visit_counts: &mut model.visit_counts,
             },
         )?;
+        if let Some(terms) = &mut self.parameter_terms {
+            let (_, status) = self.renderer.render_and_status();
+            let log = &mut LogSlot { log: &mut self.log, slot, status };
+            model.record_terms((&self.gpu, pass), terms, log)?;
+        }
         let rates = schedule.learning_rates(step, self.extent).scaled(settling_rate);
         let (degree, status) = (options.sh_degree, self.renderer.status());
         model.update((&self.gpu, pass), &self.adam, step, &rates, degree, status)?;

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicI64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use glam::DAffine3;
+use glam::{DAffine3, UVec2};
 use rayon::prelude::*;
 
 use super::packed::Packed;
@@ -201,6 +201,11 @@ pub struct Original {
 impl Original {
     fn of(path: PathBuf, lens: Lens) -> Self {
         Self { path, lens, measured: None, checksum: None, stored: Arc::default() }
+    }
+
+    /// Width and height, undistorted.
+    pub(super) fn size(&self) -> UVec2 {
+        UVec2::new(self.lens.width, self.lens.height)
     }
 
     /// Undistorted, at its own size: as it was kept, or read anew.

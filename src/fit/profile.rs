@@ -20,7 +20,7 @@ use serde::Serialize;
 
 use super::pairs::{files_of, name_of};
 use crate::image::Image;
-use crate::kernels::tone_profile::SEGMENTS;
+use crate::kernels::pseudo_gt::SEGMENTS;
 use crate::tone::{Exposure, LuminanceHistogram, Profile, measurable, soft};
 use crate::{Error, Result};
 

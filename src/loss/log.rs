@@ -146,16 +146,17 @@ impl LogSlot<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::loss::{LossConfig, Weights};
+    use crate::loss::{LossConfig, ParameterWeights, Weights};
     use crate::random::Stream;
     use crate::scene::Features;
 
     #[test]
     fn the_total_is_one_of_distances_and_of_what_likenesses_lack() {
         let config = LossConfig {
-            tone_curve: 0,
             ssim_weight: 0.25,
-            weights: Weights::default(),
+            weights: Weights { denoising: 0.0, structure: 0.0, depth: 0.0, ..Weights::default() },
+            low: 0.0,
+            parameters: ParameterWeights::default(),
             depth_box: 1,
             boxes: Stream::new(0, 0),
             features: Features::NONE,

@@ -267,12 +267,18 @@ impl ToneSettings {
     /// is another ([`Self::lift`]).
     pub fn parameters(&self, statistics: &Statistics) -> ToneParameters {
         if self.curve == ToneCurve::Profile {
-            return ToneParameters { white: 1.0, offset: 0.0, gain: 1.0, constants: [0.0; _] };
+            return ToneParameters {
+                white: 1.0,
+                gain: 1.0,
+                weight: 1.0,
+                ..ToneParameters::default()
+            };
         }
         if self.curve == ToneCurve::Auto {
             let mut constants = [0.0; _];
             constants[0] = self.colour as f32;
-            return ToneParameters { white: 1.0, offset: self.alpha as f32, gain: 1.0, constants };
+            let offset = self.alpha as f32;
+            return ToneParameters { white: 1.0, offset, gain: 1.0, weight: 1.0, constants };
         }
         let numbers = Numbers::<f64>::from(self);
         let curve = law(self.curve.family(), self.white(), &numbers, statistics);
@@ -280,6 +286,7 @@ impl ToneSettings {
             white: curve.white as f32,
             offset: curve.offset as f32,
             gain: curve.gain as f32,
+            weight: 1.0,
             constants: curve.constants.map(|constant| constant as f32),
         }
     }
@@ -298,7 +305,7 @@ impl ToneSettings {
     /// `lum_preserve` and `per_channel` are shown as they map grey.
     pub fn value(&self, t: f64, statistics: &Statistics) -> f64 {
         let grey = Statistics { channel_means: [statistics.mean; 3], ..*statistics };
-        let ToneParameters { mut white, offset, gain, constants } = self.parameters(&grey);
+        let ToneParameters { mut white, offset, gain, constants, .. } = self.parameters(&grey);
         if self.white() == White::ChannelMeans {
             white = constants[0];
         }
@@ -319,17 +326,6 @@ impl ToneSettings {
         let theta = self.theta as f32;
         let means = Statistics { mean: theta, channel_means: [theta; 3], ..Statistics::default() };
         Statistics { p10: 1.0, p80: theta, p90: 1.0, ..means }
-    }
-
-    /// Whether the target is made once, at upload, instead of in the loss kernels: tables, curves whose channels depend on
-    /// each other, and what is lifted before it is shrunk or lifted in part.
-    pub fn needs_baking(&self) -> bool {
-        !self.curve.is_formula() || self.lift_first || self.takes_exposure()
-    }
-
-    /// The curve that the loss kernels evaluate, as a `CURVE_*`: none on a target that is baked.
-    pub fn loss_curve(&self) -> u32 {
-        if self.needs_baking() { ToneCurve::None.constant() } else { self.curve.constant() }
     }
 }
 

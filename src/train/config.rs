@@ -15,13 +15,13 @@ use crate::dataset::{Dataset, DepthOptions, LoadOptions, MeasuredSize};
 use crate::densify::DensityControl;
 use crate::gpu::Tile;
 use crate::input;
-use crate::loss::LossConfig;
+use crate::loss::{LossConfig, ParameterWeights};
 use crate::nn::Form;
 use crate::optimizer::Schedule;
 use crate::random::Stream;
 use crate::render::RenderSettings;
 use crate::scene::init::Start;
-use crate::scene::{ATTRIBUTES, Attribute, Features, MAX_SH_DEGREE, Shape};
+use crate::scene::{ATTRIBUTES, Attribute, MAX_SH_DEGREE, Shape};
 use crate::tone::ToneSettings;
 use crate::{Error, Result};
 
@@ -101,6 +101,8 @@ pub struct TrainConfig {
     pub sh_degree: u32,
     /// Weight w of 1 - SSIM beside (1 - w) L1.
     pub ssim_weight: f64,
+    /// What the parameters of the Gaussians weigh in the loss.
+    pub loss: ParameterWeights,
     /// Density control stops growing here.
     pub max_gaussians: usize,
     /// What is seen where no splat is, during training; scores and renders use black.
@@ -202,6 +204,7 @@ impl Default for TrainConfig {
             seed: 10,
             sh_degree: MAX_SH_DEGREE,
             ssim_weight: 0.2,
+            loss: ParameterWeights::default(),
             max_gaussians: 1_000_000,
             background: Background::Black,
             eval_every: 0,
@@ -353,13 +356,13 @@ impl TrainConfig {
     /// What the loss terms of the model are built from.
     pub fn loss(&self) -> LossConfig {
         LossConfig {
-            tone_curve: self.tone.loss_curve(),
             ssim_weight: self.ssim_weight,
-            weights: self.model.weights,
+            weights: self.model.effective_weights(),
+            low: f64::from(u8::from(self.model.tonemapper)),
+            parameters: self.loss,
             depth_box: self.model.depth_box,
             boxes: Stream::new(self.seed, streams::BOXES),
-            // The denoiser's terms are there without a noise map, too.
-            features: Features { noise: self.model.denoiser, ..self.model.features() },
+            features: self.model.features(),
         }
     }
 
@@ -372,7 +375,9 @@ impl TrainConfig {
         self.start.check()?;
         self.model.check()?;
         self.stop.check()?;
-        self.loss().check()?;
+        // Of parts that the model lacks, too.
+        let weights = self.model.weights;
+        LossConfig { weights, low: 1.0, ..self.loss() }.check()?;
         self.exposure.check()?;
         if self.exposure.learn == Learning::On && self.model.tonemapper {
             let problem = "`ExposureConfig::learn` is on, and the tonemapper holds the model to the dark photographs, whose \

@@ -7,6 +7,7 @@
 use glam::{DVec2, DVec3, Vec3};
 
 use super::model::Model;
+use super::patches::put_together;
 use super::views::TrainView;
 use super::{Trainer, streams};
 use crate::Result;
@@ -15,7 +16,6 @@ use crate::camera::{Camera, Patch};
 use crate::exposure::{Affine, Exposures};
 use crate::halves::Bits;
 use crate::image::Image;
-use crate::pseudo_gt::PseudoGt;
 use crate::random::Stream;
 use crate::render::{RenderOptions, RenderSettings, Renderer};
 use crate::scene::init::{self, Start};
@@ -100,7 +100,6 @@ impl Trainer {
             ..self.config.render_settings()
         };
         let mut renderer = Renderer::new(&self.gpu, settings)?;
-        let pseudo_gt = PseudoGt::new(&self.gpu, &self.config.tone)?;
         let exposures = self.exposures.as_ref().map(Exposures::affines).transpose()?;
         let count = self.views.photographs().count();
         let views = self.views.photographs().step_by(count.div_ceil(VIEWS).max(1));
@@ -109,9 +108,7 @@ impl Trainer {
         for view in views {
             let camera = coarse(&view.patch.camera, pixels);
             let depths = self.depths(&mut renderer, gaussians, &camera)?;
-            let target = self.views.put_together(&self.gpu, view.place, |patch| {
-                self.views.target(&self.gpu, &pseudo_gt, patch)
-            })?;
+            let target = self.views.picture(&self.gpu, &self.pseudo_gt, view.place)?;
             let exposure = exposures.as_ref().and_then(|exposures| exposures.get(view.place));
             let neutral = exposure.map(Affine::inverse).map(|inverse| inverse.applied(&target));
             let target = neutral.unwrap_or(target).resized(camera.width, camera.height);
@@ -147,12 +144,13 @@ impl Trainer {
         if self.masks.of_view(view.number).is_none() {
             return Ok(None);
         }
-        let mask = self.views.put_together(&self.gpu, view.place, |patch| {
-            let weights = self.masks.of_view(patch.number).map(|weights| self.gpu.read(weights));
-            let weights = weights.transpose()?.unwrap_or_default();
-            Ok(self.gpu.buffer("mask", &weights.repeat(3))?.into())
-        })?;
-        Ok(Some(mask))
+        let views = self.views.of_places(view.place..view.place + 1);
+        let weights = |view: &TrainView| {
+            let weights = self.masks.of_view(view.number).map(|weights| self.gpu.read(weights));
+            Ok(weights.transpose()?.unwrap_or_default().repeat(3))
+        };
+        let parts = views.iter().map(weights).collect::<Result<_>>()?;
+        Ok(put_together(views, parts).pop())
     }
 }
 

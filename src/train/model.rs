@@ -3,9 +3,11 @@
 use super::{PrecisionConfig, Trainer};
 use crate::Result;
 use crate::attributes::planes;
+use crate::batches::Batch;
 use crate::densify::{Densifier, DensifyInputs, DensifyReport, DeviceGaussians, Round};
 use crate::gpu::{Buffer, Gpu, Recorder};
 use crate::halves::Bits;
+use crate::loss::{LogSlot, ParameterInputs, ParameterTerms};
 use crate::optimizer::{Adam, AdamBuffers, FiniteCheck, LearningRates};
 use crate::scene::{ATTRIBUTES, Attribute, Gaussians, Shape, width};
 
@@ -183,6 +185,30 @@ impl Model {
             let halves = [count, first, column_count - first];
             adam.record_halves(pass, step, rate, halves, buffers, status)
         })
+    }
+
+    /// Records the terms on parameters: adds to the gradients.
+    ///
+    /// # Errors
+    /// As [`ParameterTerms::record`].
+    pub(super) fn record_terms(
+        &self,
+        (gpu, pass): (&Gpu, &mut Recorder<'_>),
+        terms: &mut ParameterTerms,
+        log: &mut LogSlot<'_>,
+    ) -> Result<()> {
+        let gaussians = &self.gaussians;
+        let words = gaussians.parameter_columns();
+        let batch = |batch: Batch| {
+            let parameters = batch.of_rows(&gaussians.parameters, words)?;
+            Ok((batch.gaussian_count(), parameters, batch.of_planes(&self.gradients)?))
+        };
+        let mut batches = gaussians.batches(gpu).iter().map(batch).collect::<Result<Vec<_>>>()?;
+        let inputs = batches.iter_mut().map(|(gaussian_count, parameters, gradients)| {
+            let (gaussian_count, all_count) = (*gaussian_count, gaussians.count);
+            (ParameterInputs { gaussian_count, all_count, parameters: &*parameters }, gradients)
+        });
+        terms.record(pass, &mut inputs.collect::<Vec<_>>(), log)
     }
 
     /// One round of density control, whose new parameters `keeps` agrees to ([`Densifier::densify`]); the statistics

@@ -146,6 +146,19 @@ impl NetworkRates {
 }
 
 impl ModelConfig {
+    /// What the terms weigh: 0 those of a part that the model lacks.
+    pub(super) fn effective_weights(&self) -> Weights {
+        let of = |has: bool, weight: f64| if has { weight } else { 0.0 };
+        let Weights { denoising, total_variation, low_ssim, structure, depth } = self.weights;
+        Weights {
+            denoising: of(self.denoiser, denoising),
+            total_variation: of(self.denoiser, total_variation),
+            low_ssim,
+            structure: of(self.structure, structure),
+            depth: of(self.depth, depth),
+        }
+    }
+
     /// Says where the parts of a model see less than they are set to.
     pub(super) fn say_what_parts_see(&self, sizes: &[UVec2]) {
         let shortest = sizes.iter().map(|size| size.min_element()).min().unwrap_or_default();

@@ -1,10 +1,10 @@
 //! Views that the model is scored on against their targets: those held out from training, and probes among those trained on.
 
-use glam::DVec2;
+use glam::{DVec2, UVec2};
 
 use super::Trainer;
 use super::terms::NetworkTerms;
-use super::views::{lifted_from, measured};
+use super::views::{Shown, lifted_from, measured};
 use crate::Result;
 use crate::camera::{Camera, Frame};
 use crate::dataset::{Dataset, View};
@@ -246,7 +246,10 @@ impl Trainer {
         const MOST: usize = 8;
         let views = self.views.whole();
         let some = views.iter().step_by(views.len().div_ceil(MOST).max(1)).map(|view| {
-            let target = view.image(&self.gpu, &*self.views.kept_target(&self.gpu, view)?)?;
+            let views = std::slice::from_ref(view);
+            let target = self.views.read(&self.gpu, &self.pseudo_gt, views, Shown::Targets)?;
+            let UVec2 { x: width, y: height } = view.size();
+            let target = Image { width, height, data: target.concat() };
             let (camera, place) = (view.patch.pinhole(), Some(view.place));
             Ok(TargetView { camera, target, mask: None, place })
         });

@@ -9,15 +9,14 @@ use glam::{DVec3, UVec2, Vec3};
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::cache::{Cache, CacheSize, Kept, Slot};
+use super::cache::{Cache, CacheSize, Slot};
 use super::epochs::Epochs;
-use super::precision::Darkroom;
+use super::precision::Encoder;
 use super::{TrainConfig, streams};
-use crate::Result;
 use crate::camera::{Camera, Frame, Patch};
 use crate::dataset::{Dataset, MeasuredSize, Point, View};
 use crate::exposure::Affine;
-use crate::gpu::{Buffer, Gpu};
+use crate::gpu::{Buffer, Download, Gpu, Recorder};
 use crate::image::Image;
 use crate::kernels::ToneParameters;
 use crate::loss::ViewSource;
@@ -25,7 +24,8 @@ use crate::nn::Form;
 use crate::pseudo_gt::PseudoGt;
 use crate::random::Stream;
 use crate::scene::{COLOR_CHANNELS, Feature, Gaussians, Shape, init};
-use crate::tone::{Exposure, Measured, Scene, Statistics, ToneCurve, ToneSettings, all_black};
+use crate::tone::{Exposure, Measured, Scene, ToneSettings, all_black};
+use crate::{Error, Result};
 
 /// One training view: a photograph, or a patch of one that is too large to be trained on at once.
 #[derive(Debug)]
@@ -41,16 +41,13 @@ pub(super) struct TrainView {
     pub(super) patch: Patch,
     /// Depth from elsewhere, (H, W), where the dataset's is of another size.
     depth: Option<Vec<f32>>,
-    /// What the loss applies `tone` to, planar (3, H, W), sRGB-encoded: the dark photograph, or the target itself.
-    input: Slot,
-    /// The dark photograph, where that is not the input and a network sees it.
+    /// What its target is made of in every step, planar (3, H, W), sRGB-encoded.
+    stored: Slot,
+    /// Whether that is the dark photograph, and gets the curve of its place; else it is the target, whose curve was applied to
+    /// the photograph at its own size.
+    gets_curve: bool,
+    /// The dark photograph, where that is not what is stored and a network sees it.
     photograph: Option<Slot>,
-    /// The curve that the photograph gets; one element. Where the input is the target already, none.
-    pub(super) tone: Buffer<ToneParameters>,
-    /// Whether the input is the target.
-    is_baked: bool,
-    /// The target, where that is not the input and a network is held to it.
-    pub(super) target: Option<Arc<Buffer<f32>>>,
 }
 
 /// How bright the targets are, and what a model makes of them.
@@ -82,6 +79,8 @@ pub(super) struct Views {
     left_out: BTreeSet<usize>,
     cache: Cache,
     epochs: Epochs,
+    /// The curve of every photograph, by place.
+    curves: Buffer<ToneParameters>,
 }
 
 /// A view whose shorter side would fall below this is not shrunk any more, in pixels.
@@ -104,48 +103,54 @@ impl Views {
         let settings = pseudo_gt.settings().clone();
         let keeps_photographs = config.model.denoiser || config.model.tonemapper;
         let (scene, measured) = measured(&settings, dataset)?;
-        let mut darkroom = Darkroom::new(gpu, config.precision.photographs);
+        let mut encoder = Encoder::new(gpu, config.precision.photographs);
         let budget = CacheSize::on_device(config.cache, config.max_vram, gpu);
         let mut cache = Cache::new(gpu, budget, config.spool.clone());
         let mut views = vec![];
         views.resize_with(config.schedule.resolution_levels(), Vec::<TrainView>::new);
-        let mut gains = BTreeMap::new();
+        let (mut gains, mut curves) = (BTreeMap::new(), vec![]);
         for (place, ((index, view), measured)) in photographs(dataset).zip(&measured).enumerate() {
             let lift = settings.lift(&scene, measured);
             gains.extend(lift.gain.map(|gain| (view.name.clone(), gain)));
-            let original = if settings.lift_first { view.photograph()? } else { None };
-            let target = original.map(|original| pseudo_gt.lifted(&original, &lift)).transpose()?;
+            curves.push(lift.parameters);
             let Some(image) = view.loaded()? else { continue };
-            for (level, views) in views.iter_mut().enumerate() {
-                let size = shrunk(UVec2::new(image.width, image.height), level as u32);
-                let photograph = view.blacked_out(image.resized(size.x, size.y));
-                let target = match &target {
-                    Some(target) => Some(view.blacked_out(target.resized(size.x, size.y))),
-                    None if settings.needs_baking() => Some(pseudo_gt.lifted(&photograph, &lift)?),
-                    None => None,
-                };
+            let own = UVec2::new(image.width, image.height);
+            let sizes = (0..views.len()).map(|level| shrunk(own, level as u32));
+            let sizes: Vec<UVec2> = sizes.collect();
+            // What is trained on at its own size gets its curve in every step.
+            let own = view.own_size().filter(|_| settings.lift_first);
+            let is_larger = own.filter(|own| sizes.iter().any(|size| size != own));
+            let whole = if is_larger.is_some() { view.photograph()? } else { None };
+            let whole = whole.map(|whole| pseudo_gt.lifted(&whole, &lift)).transpose()?;
+            for (views, size) in views.iter_mut().zip(sizes) {
+                let resized = |whole: &Image| view.blacked_out(whole.resized(size.x, size.y));
                 let camera = frame.camera(&view.camera).resized(size.x, size.y);
                 let patches = config.patches(gpu, &camera);
-                let is_as_loaded = level == 0 && patches.len() == 1;
+                let is_as_loaded =
+                    size == UVec2::new(image.width, image.height) && patches.len() == 1;
                 let depth = view.depth.as_ref().filter(|_| !is_as_loaded);
                 let print = Print {
                     name: &view.name,
                     place,
                     index,
-                    keeps_photograph: target.is_some() && keeps_photographs,
-                    photograph,
-                    target,
+                    keeps_photograph: keeps_photographs,
+                    photograph: resized(&image),
+                    target: whole.as_ref().filter(|_| own != Some(size)).map(resized),
                     depth: depth.map(|depth| resized_plane(depth, &image, size)),
-                    tone: lift.parameters,
                 };
                 for patch in patches {
-                    views.push(print.view(gpu, patch, &mut darkroom, &mut cache)?);
+                    views.push(print.view(patch, &mut encoder, &mut cache)?);
                 }
             }
         }
         views.iter_mut().flatten().enumerate().for_each(|(number, view)| view.number = number);
-        let views =
-            Self { levels: views, left_out: BTreeSet::new(), cache, epochs: Epochs::default() };
+        let views = Self {
+            levels: views,
+            left_out: BTreeSet::new(),
+            cache,
+            epochs: Epochs::default(),
+            curves: gpu.buffer("curves", &curves)?,
+        };
         // The targets of a profile are as bright as its references.
         let exposure = scene.exposure.clone().filter(|_| settings.profile.is_none());
         let exposure = exposure.map(|scene| TargetExposure::new(scene, gains));
@@ -170,8 +175,8 @@ impl Views {
         for step in steps {
             let level = config.schedule.resolution_level(step);
             let view = self.of_step(config.seed, step, level);
-            let slots = [Some(view.input), view.photograph].into_iter().flatten();
-            let own: u64 = slots.clone().map(|slot| self.cache.get(slot).bytes()).sum();
+            let slots = [Some(view.stored), view.photograph].into_iter().flatten();
+            let own: u64 = slots.clone().map(|slot| self.cache.bytes(slot)).sum();
             let is_new = !numbers.contains(&view.number);
             if !numbers.is_empty() && is_new && bytes + own > self.cache.budget() {
                 break;
@@ -184,19 +189,6 @@ impl Views {
         }
         self.cache.bring(&wanted)?;
         Ok(last)
-    }
-
-    /// Keeps the target of every view beside what the loss makes it of, for [`TrainView::kept_target`].
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
-    pub(super) fn keep_targets(&mut self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<()> {
-        let mut levels = std::mem::take(&mut self.levels);
-        for view in levels.iter_mut().flatten().filter(|view| !view.is_baked) {
-            view.target = Some(self.target(gpu, pseudo_gt, view)?);
-        }
-        self.levels = levels;
-        Ok(())
     }
 
     /// What the loss terms may compare the views with.
@@ -214,31 +206,83 @@ impl Views {
         self.levels.iter().flatten().map(source).collect()
     }
 
-    /// The dark photograph of a view, planar (3, H, W); only there where it is the input, or was kept.
-    fn whole_photograph(&self, gpu: &Gpu, view: &TrainView) -> Result<Arc<Buffer<f32>>> {
-        self.photograph(view).unwrap_or_else(|| self.input(view)).whole(gpu)
+    /// Records the target of a view that is on the device, (3, H, W); it may be `scratch` or what is stored.
+    ///
+    /// # Errors
+    /// The photograph is not on the device, or `scratch` is shorter.
+    pub(super) fn record_target<'a>(
+        &'a self,
+        pass: &mut Recorder<'_>,
+        pseudo_gt: &PseudoGt,
+        view: &TrainView,
+        scratch: &'a mut Buffer<f32>,
+    ) -> Result<&'a Buffer<f32>> {
+        pseudo_gt.record(pass, self.cache.on_device(view.stored)?, self.curve(view), scratch)
     }
 
-    /// The pseudo-GT of a view, (3, H, W), where the input is that, or it was kept.
-    pub(super) fn kept_target(&self, gpu: &Gpu, view: &TrainView) -> Result<Arc<Buffer<f32>>> {
-        view.target
-            .as_ref()
-            .map_or_else(|| self.input(view).whole(gpu), |target| Ok(Arc::clone(target)))
+    /// The same for the dark photograph of a view, where that is kept.
+    ///
+    /// # Errors
+    /// As there.
+    pub(super) fn record_photograph<'a>(
+        &'a self,
+        pass: &mut Recorder<'_>,
+        pseudo_gt: &PseudoGt,
+        view: &TrainView,
+        scratch: &'a mut Buffer<f32>,
+    ) -> Result<&'a Buffer<f32>> {
+        let photograph = self.cache.on_device(view.photograph.unwrap_or(view.stored))?;
+        pseudo_gt.record(pass, photograph, None, scratch)
     }
 
-    /// The pseudo-GT of a view, (3, H, W).
-    pub(super) fn target(
+    /// The curve that makes the target of what is stored of a view.
+    fn curve(&self, view: &TrainView) -> Option<(&Buffer<ToneParameters>, u32)> {
+        view.gets_curve.then_some((&self.curves, view.place as u32))
+    }
+
+    /// Targets or dark photographs, (3, H, W), of views wherever they are stored, in one submission.
+    pub(super) fn read(
+        &self,
+        gpu: &Gpu,
+        pseudo_gt: &PseudoGt,
+        views: &[TrainView],
+        shown: Shown,
+    ) -> Result<Vec<Vec<f32>>> {
+        let (mut stored, mut scratch) = (vec![], vec![]);
+        for view in views {
+            let slot = view.photograph.filter(|_| shown == Shown::Photographs);
+            let photograph = self.cache.load(slot.unwrap_or(view.stored))?;
+            let curve = self.curve(view).filter(|_| shown == Shown::Targets);
+            scratch.push(gpu.uninit("target", photograph.value_count)?);
+            stored.push((photograph, curve));
+        }
+        let mut downloads = vec![];
+        gpu.run("pseudo-GT", |pass| {
+            for ((photograph, curve), scratch) in stored.iter().zip(&mut scratch) {
+                let target = pseudo_gt.record(pass, photograph, *curve, scratch)?;
+                downloads.push(pass.download(target)?);
+            }
+            Ok(())
+        })?;
+        downloads.into_iter().map(Download::wait).collect()
+    }
+
+    /// The target of a view, (3, H, W), in a buffer of its own or in the one that it is stored in.
+    fn target(
         &self,
         gpu: &Gpu,
         pseudo_gt: &PseudoGt,
         view: &TrainView,
     ) -> Result<Arc<Buffer<f32>>> {
-        let input = self.input(view).whole(gpu)?;
-        if view.is_baked {
-            return Ok(input);
+        let stored = self.cache.load(view.stored)?;
+        let curve = self.curve(view);
+        if stored.code_bits == 32 && curve.is_none() {
+            return Ok(Arc::clone(&stored.values));
         }
-        let mut target = gpu.uninit("target", input.len())?;
-        gpu.run("target", |pass| pseudo_gt.map(pass, &input, &view.tone, 0, &mut target))?;
+        let mut target = gpu.uninit("target", stored.value_count)?;
+        gpu.run("pseudo-GT", |pass| {
+            pseudo_gt.record(pass, &stored, curve, &mut target).map(|_| ())
+        })?;
         Ok(Arc::new(target))
     }
 
@@ -280,23 +324,10 @@ impl Views {
         self.levels.first().map_or(&[], Vec::as_slice)
     }
 
-    /// How many floats the largest input, and the largest photograph beside one, have to be decoded to.
-    pub(super) fn decoded_lens(&self) -> [usize; 2] {
-        let views = || self.levels.iter().flatten();
-        let len = |slot| self.cache.get(slot).decoded_len();
-        let inputs = views().map(|view| len(view.input)).max();
-        let photographs = views().filter_map(|view| view.photograph).map(len).max();
-        [inputs, photographs].map(Option::unwrap_or_default)
-    }
-
-    /// What the loss applies the curve of a view to.
-    pub(super) fn input(&self, view: &TrainView) -> &Kept {
-        self.cache.get(view.input)
-    }
-
-    /// The dark photograph of a view, where that is not the input and a network sees it.
-    pub(super) fn photograph(&self, view: &TrainView) -> Option<&Kept> {
-        view.photograph.map(|slot| self.cache.get(slot))
+    /// How many floats the largest view has.
+    pub(super) fn most_values(&self) -> usize {
+        let values = |view: &TrainView| COLOR_CHANNELS * view.size().element_product() as usize;
+        self.all().map(values).max().unwrap_or_default()
     }
 
     /// One view of every photograph, unshrunk.
@@ -372,9 +403,10 @@ impl Views {
         // Of the views of the dataset, the place of each among those that are trained on.
         let mut places = vec![None; dataset.views.len()];
         self.photographs().for_each(|view| places[view.index] = Some(view.place));
+        let mut targets = Pictures::new(self, gpu, pseudo_gt, Shown::Targets);
         let colors = init::colors_from_views(kept, &dataset.views, |index| {
             let Some(place) = places[index] else { return Ok(None) };
-            let target = self.put_together(gpu, place, |view| self.target(gpu, pseudo_gt, view))?;
+            let target = targets.next(place)?;
             let exposure = exposures.and_then(|exposures| exposures.get(place));
             Ok(Some(exposure.map_or_else(|| target.clone(), |own| own.inverse().applied(&target))))
         })?;
@@ -385,9 +417,9 @@ impl Views {
         let mut gaussians = init::from_points(&positions, &colors, shape, &config.start, seed)?;
         if config.model.network.form == Form::Identity {
             let low = if shape.features.illumination {
+                let mut photographs = Pictures::new(self, gpu, pseudo_gt, Shown::Photographs);
                 init::colors_from_views(kept, &dataset.views, |index| {
-                    let low = |view: &TrainView| self.whole_photograph(gpu, view);
-                    places[index].map(|place| self.put_together(gpu, place, low)).transpose()
+                    places[index].map(|place| photographs.next(place)).transpose()
                 })?
             } else {
                 vec![]
@@ -398,38 +430,77 @@ impl Views {
     }
 }
 
+/// What is looked at of a view.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Shown {
+    /// What it is held to.
+    Targets,
+    /// What it was made of; only where that is kept.
+    Photographs,
+}
+
+/// Pictures of the photographs one after the other, made several at a time.
+struct Pictures<'a> {
+    views: &'a Views,
+    gpu: &'a Gpu,
+    pseudo_gt: &'a PseudoGt,
+    shown: Shown,
+    /// By place.
+    made: BTreeMap<usize, Image>,
+}
+
+impl<'a> Pictures<'a> {
+    fn new(views: &'a Views, gpu: &'a Gpu, pseudo_gt: &'a PseudoGt, shown: Shown) -> Self {
+        Self { views, gpu, pseudo_gt, shown, made: BTreeMap::new() }
+    }
+
+    /// That of a place; those before are gone.
+    fn next(&mut self, place: usize) -> Result<Image> {
+        /// Of those that are made at a time.
+        const MOST_PIXELS: usize = 1 << 20;
+        let Self { views, gpu, pseudo_gt, shown, ref mut made } = *self;
+        if !made.contains_key(&place) {
+            let mut pixels = 0;
+            let after = views.photographs().filter(|view| view.place >= place);
+            let now = after.take_while(|view| {
+                let is_first = pixels == 0;
+                pixels += Patch::from(&view.patch.camera).pixel_count();
+                is_first || pixels <= MOST_PIXELS
+            });
+            let last = now.last().map_or(place, |view| view.place);
+            let images = views.pictures(gpu, pseudo_gt, place..last + 1, shown)?;
+            *made = (place..).zip(images).collect();
+        }
+        let gone = || Error::Usage(format!("there is no photograph {place} to train on"));
+        made.remove(&place).ok_or_else(gone)
+    }
+}
+
 /// A photograph at the size of a level.
 struct Print<'a> {
     name: &'a str,
     place: usize,
     index: usize,
     photograph: Image,
-    /// None where the loss makes it.
+    /// Where its curve was applied at another size.
     target: Option<Image>,
     /// Whether the photograph stays beside the target.
     keeps_photograph: bool,
     /// Where it is not the dataset's.
     depth: Option<Vec<f32>>,
-    tone: ToneParameters,
 }
 
 impl Print<'_> {
-    fn view(
-        &self,
-        gpu: &Gpu,
-        patch: Patch,
-        darkroom: &mut Darkroom,
-        cache: &mut Cache,
-    ) -> Result<TrainView> {
+    fn view(&self, patch: Patch, encoder: &mut Encoder, cache: &mut Cache) -> Result<TrainView> {
         let mut upload =
-            |name, image: &Image| cache.keep(darkroom.upload(name, &patch.cut(&image.data))?);
-        let photograph = self.keeps_photograph.then(|| upload("low", &self.photograph));
-        let (input, tone) = match &self.target {
+            |name, image: &Image| cache.keep(encoder.upload(name, &patch.cut(&image.data))?);
+        let (stored, photograph) = match &self.target {
             Some(target) => {
-                let none = ToneSettings::new(ToneCurve::None).parameters(&Statistics::default());
-                (upload("target", target)?, none)
+                let photograph = self.keeps_photograph.then(|| upload("low", &self.photograph));
+                let photograph = photograph.transpose()?;
+                (upload("target", target)?, photograph)
             }
-            None => (upload("low", &self.photograph)?, self.tone),
+            None => (upload("low", &self.photograph)?, None),
         };
         Ok(TrainView {
             name: self.name.to_owned(),
@@ -438,11 +509,9 @@ impl Print<'_> {
             index: self.index,
             patch,
             depth: self.depth.as_ref().map(|depth| patch.cut(depth).into_owned()),
-            input,
-            photograph: photograph.transpose()?,
-            tone: gpu.buffer("tone", &[tone])?,
-            is_baked: self.target.is_some(),
-            target: None,
+            stored,
+            gets_curve: self.target.is_none(),
+            photograph,
         })
     }
 }
@@ -536,12 +605,5 @@ impl TrainView {
     /// Width and height in pixels.
     pub(super) fn size(&self) -> UVec2 {
         self.patch.size
-    }
-
-    /// Pixels of the view on the host.
-    pub(super) fn image(&self, gpu: &Gpu, pixels: &Buffer<f32>) -> Result<Image> {
-        let data = gpu.read(pixels)?;
-        let UVec2 { x: width, y: height } = self.size();
-        Ok(Image { width, height, data })
     }
 }
