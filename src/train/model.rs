@@ -2,12 +2,12 @@
 
 use super::{PrecisionConfig, Trainer};
 use crate::Result;
-use crate::attributes::planes;
-use crate::densify::{Densifier, DensifyInputs, DensifyReport, DeviceGaussians, Round};
 use crate::gpu::{Buffer, Gpu, Recorder};
-use crate::halves::Bits;
-use crate::optimizer::{Adam, AdamBuffers, FiniteCheck, LearningRates};
-use crate::scene::{ATTRIBUTES, Attribute, Gaussians, Shape, width};
+use crate::splats::attributes::planes;
+use crate::splats::densify::{Densifier, DensifyInputs, DensifyReport, DeviceGaussians, Round};
+use crate::splats::halves::Bits;
+use crate::splats::optimizer::{Adam, AdamBuffers, FiniteCheck, LearningRates};
+use crate::splats::scene::{ATTRIBUTES, Attribute, Gaussians, Shape, width};
 
 impl Trainer {
     /// The gradient of every parameter that the last step left, in the frame.
@@ -267,7 +267,7 @@ fn lengthen(gpu: &Gpu, buffer: &mut Buffer<f32>, len: usize) -> Result<()> {
 mod tests {
     use super::*;
     use crate::gpu::testing::gpu;
-    use crate::scene::Features;
+    use crate::splats::scene::Features;
 
     /// Else the next round of density control would have to make that room again.
     #[test]
