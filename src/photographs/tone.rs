@@ -17,7 +17,6 @@
 //! follows from the luminance of all photographs, see [`Exposure`]; so may that of every other curve. [`FAMILIES`] is the table of all curves; a [`Table`]
 //! of values from a file is a curve too, and so is a camera's [`Profile`].
 
-mod catalogue;
 mod exposure;
 mod families;
 #[cfg(feature = "io")]
@@ -34,11 +33,10 @@ mod table;
 use std::fmt;
 use std::str::FromStr;
 
-pub use self::catalogue::{FAMILIES, ToneCurve};
 #[cfg(feature = "io")]
 pub(crate) use self::exposure::all_black;
 pub use self::exposure::{Exposure, exposed_anew, is_black, soft};
-pub use self::families::{Constant, Family, Law, White};
+pub use self::families::{Constant, FAMILIES, Family, Law, ToneCurve, White};
 #[cfg(feature = "io")]
 pub use self::file::CurveChoice;
 pub use self::histogram::LuminanceHistogram;

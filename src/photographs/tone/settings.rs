@@ -6,8 +6,9 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 
 use super::exposure::BLACK_LEVEL;
-use super::families::White;
+use super::families::{White, padded};
 use super::law::{Numbers, black_level, law};
+use super::real::Real;
 use super::{Profile, Statistics, Table, ToneCurve, ToneParameters};
 use crate::{Error, Result};
 
@@ -54,6 +55,19 @@ pub struct ToneSettings {
     pub table: Option<Table>,
     /// What [`ToneCurve::Profile`] is made of.
     pub profile: Option<Profile>,
+}
+
+impl<T: Real> From<&ToneSettings> for Numbers<T> {
+    fn from(settings: &ToneSettings) -> Self {
+        Self {
+            theta: T::of(settings.theta),
+            alpha: T::of(settings.alpha),
+            beta: settings.beta,
+            gain_c: T::of(settings.gain_c),
+            base_gain: T::of(settings.base_gain),
+            constants: padded(&settings.constants).map(T::of),
+        }
+    }
 }
 
 impl ToneSettings {
