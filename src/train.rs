@@ -5,12 +5,14 @@ mod cache;
 mod checkpoint;
 mod config;
 mod decisions;
+pub mod diagnose;
 mod early_stopping;
 mod epochs;
 mod exposures;
 mod fill;
 mod growth;
 mod masks;
+mod measuring;
 mod memory;
 mod model;
 mod networks;
@@ -33,16 +35,16 @@ use std::thread::{self, ScopedJoinHandle};
 use glam::DVec3;
 
 use crate::camera::{Camera, Frame};
-use crate::dataset::{Dataset, Fingerprint, Original, Split};
-use crate::densify::{Densifier, DensityControl};
-use crate::exposure::Exposures;
 use crate::gpu::{Buffer, CheckReport, Gpu, PassTime, Recorder};
+use crate::loss::exposure::Exposures;
 use crate::loss::{LogSlot, LossLog, Losses, ParameterTerms, StepLosses, Term, TermInputs};
-use crate::optimizer::{Adam, FiniteCheck, LearningRates};
-use crate::pseudo_gt::PseudoGt;
-use crate::render::{Damping, Gradients, RenderOptions, Renderer};
-use crate::scene::{COLOR_CHANNELS, Gaussians};
-use crate::tone::Scene;
+use crate::photographs::dataset::{Dataset, Fingerprint, Original, Split};
+use crate::photographs::pseudo_gt::PseudoGt;
+use crate::photographs::tone::Scene;
+use crate::splats::densify::{Densifier, DensityControl};
+use crate::splats::optimizer::{Adam, FiniteCheck, LearningRates};
+use crate::splats::render::{Damping, Gradients, RenderOptions, Renderer};
+use crate::splats::scene::{COLOR_CHANNELS, Gaussians};
 use crate::{Error, Result};
 
 use best::Snapshot;
@@ -53,6 +55,7 @@ use decisions::Decisions;
 pub use early_stopping::{EndReason, Ended, NotFinite, StopConfig};
 pub use exposures::{ExposureConfig, Learning};
 use masks::Masks;
+pub use measuring::TargetExposure;
 pub use memory::MemoryEstimate;
 use model::Model;
 pub use networks::Networks;
@@ -65,7 +68,6 @@ use submission::{MOST_STEPS, Pace};
 use target_views::TargetViews;
 pub use target_views::TestTargets;
 use terms::{NetworkTerms, Photographs};
-pub use views::TargetExposure;
 use views::{TrainView, Views};
 
 /// The streams of random numbers that training draws from, one per purpose.
@@ -110,10 +112,10 @@ impl StepReport {
     }
 }
 
-/// A model in training, and all that its steps need; [`crate::run::train`] drives one into a run directory.
+/// A model in training, and all that its steps need; [`crate::results::run::train`] drives one into a run directory.
 ///
 /// ```no_run
-/// use nightsplat::dataset::Dataset;
+/// use nightsplat::photographs::dataset::Dataset;
 /// use nightsplat::gpu::{DeviceChoice, Gpu};
 /// use nightsplat::train::{TrainConfig, Trainer};
 ///
@@ -126,7 +128,7 @@ impl StepReport {
 ///         println!("step {}: loss {:.4}", report.step, report.loss);
 ///     }
 /// }
-/// nightsplat::scene::ply::save(&trainer.gaussians()?, "model.ply")?;
+/// nightsplat::splats::scene::ply::save(&trainer.gaussians()?, "model.ply")?;
 /// # Ok::<(), nightsplat::Error>(())
 /// ```
 #[derive(Debug)]
@@ -356,16 +358,6 @@ impl Trainer {
     /// Steps done so far.
     pub fn steps_done(&self) -> u64 {
         self.step
-    }
-
-    /// What the curves of the training photographs have in common, for [`TestTargets::in_scene`].
-    pub fn scene(&self) -> &Scene {
-        &self.scene
-    }
-
-    /// How bright the targets are; none where the curve's constants say that.
-    pub fn target_exposure(&self) -> Option<&TargetExposure> {
-        self.target_exposure.as_ref()
     }
 
     /// The number of Gaussians.

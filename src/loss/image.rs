@@ -247,7 +247,12 @@ impl Loss {
                         interior_begin: inputs.interior.origin,
                         interior_end: inputs.interior.end(),
                     },
-                    l1::Buffers { render, target, d_render, partials: l1_partials },
+                    l1::Buffers {
+                        render: render.slice(),
+                        target: target.slice(),
+                        d_render: d_render.slice_mut(),
+                        partials: l1_partials.slice_mut(),
+                    },
                     threads,
                 )?;
             }
@@ -327,7 +332,13 @@ impl Ssim {
                 l1_scale: ((1.0 - self.weight) * mean_scale) as f32,
                 ssim_scale: (self.weight * mean_scale) as f32,
             },
-            ssim::Buffers { render, target, d_render, l1_partials, ssim_partials },
+            ssim::Buffers {
+                render: render.slice(),
+                target: target.slice(),
+                d_render: d_render.slice_mut(),
+                l1_partials: l1_partials.slice_mut(),
+                ssim_partials: ssim_partials.slice_mut(),
+            },
             threads,
         )
     }

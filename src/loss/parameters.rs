@@ -1,17 +1,17 @@
 //! Terms on the parameters of the Gaussians: the mean opacity and the mean standard deviation, each pressed down by its weight.
 //!
-//! L = w_o mean sigmoid(o) + w_s mean exp(s), o the raw opacities, s the logarithms of the three standard deviations: the
-//! regularisers of 3DGS-MCMC (Kheradmand et al. 2024). They look at no view, so they are recorded after the render's gradient
+//! L = a mean sigmoid(o) + b mean exp(s), a and b the weights, o the raw opacities, s the logarithms of the three standard
+//! deviations: the regularisers of 3DGS-MCMC (Kheradmand et al. 2024). They look at no view, so they are recorded after the render's gradient
 //! has become that of the parameters, and add to it.
 
 use serde::{Deserialize, Serialize};
 
 use super::log::{LogSlot, PartialSums};
 use super::{LossSpec, Term, TermOn};
-use crate::attributes::Attribute;
+use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::parameter_terms;
-use crate::{Error, Result};
+use crate::splats::batches::{Batch, Batches};
 
 pub(super) const SPEC: LossSpec =
     LossSpec { terms: &[Term::OPACITY, Term::SCALE], on: TermOn::Parameters };
@@ -51,19 +51,19 @@ impl ParameterWeights {
     }
 }
 
-/// What the terms read of one batch of Gaussians.
+/// What the terms read of a step.
 #[derive(Clone, Copy, Debug)]
 pub struct ParameterInputs<'a> {
-    /// How many Gaussians the batch has.
-    pub gaussian_count: u32,
-    /// How many all batches have: the means are over these.
-    pub all_count: u32,
-    /// Their planes; the columns of opacities and scales are those of include/gaussian.glsl.
+    /// How the planes of the Gaussians lie.
+    pub batches: &'a Batches,
+    /// Words that a Gaussian has in `parameters`.
+    pub words: usize,
+    /// The planes; the columns of opacities and scales are those of include/gaussian.glsl.
     pub parameters: &'a Buffer<f32>,
 }
 
-/// A window begins at a multiple of this many floats, where every device lets a binding begin.
-const WINDOW: u32 = 64;
+/// A part begins at a multiple of this many floats, where every device lets a binding begin.
+const PART: usize = 64;
 
 /// Records the terms on parameters that have a weight.
 #[derive(Debug)]
@@ -98,62 +98,54 @@ impl ParameterTerms {
         weights.is_on().then(new).transpose()
     }
 
-    /// Records the terms of a step: adds to the gradients of every batch, planes as the parameters', and writes the means to the
-    /// log.
+    /// Records the terms of a step: adds to the gradients, planes of floats in the same batches, and writes the means to the log.
     ///
     /// # Errors
-    /// A buffer is shorter than its batch, the log has no such slot, or the device is out of memory.
+    /// A buffer is shorter than its batches, the log has no such slot, or the device is out of memory.
     pub fn record(
         &mut self,
         pass: &mut Recorder<'_>,
-        batches: &mut [(ParameterInputs<'_>, &mut Buffer<f32>)],
+        ParameterInputs { batches, words, parameters }: ParameterInputs<'_>,
+        gradients: &mut Buffer<f32>,
         log: &mut LogSlot<'_>,
     ) -> Result<()> {
         log.check()?;
         let each = self.gaussians_per_workgroup;
-        // Batches bind windows of the partial sums; what lies between these counts as 0.
-        let room = |count: u32| count.div_ceil(each).next_multiple_of(WINDOW);
-        let total: u32 = batches.iter().map(|(inputs, _)| room(inputs.gaussian_count)).sum();
-        if self.opacity_partials.len() < total as usize {
-            self.opacity_partials = self.gpu.uninit("opacity_partials", total as usize)?;
-            self.scale_partials = self.gpu.uninit("scale_partials", total as usize)?;
+        let workgroups = |batch: &Batch| batch.gaussian_count().div_ceil(each);
+        // Batches bind parts of the partial sums; what lies between these counts as 0.
+        let room = |batch: &Batch| (workgroups(batch) as usize).next_multiple_of(PART);
+        let total: usize = batches.iter().map(|batch| room(&batch)).sum();
+        let all: u32 = batches.iter().map(|batch| batch.gaussian_count()).sum();
+        if self.opacity_partials.len() < total {
+            self.opacity_partials = self.gpu.uninit("opacity_partials", total)?;
+            self.scale_partials = self.gpu.uninit("scale_partials", total)?;
         }
         pass.fill(&mut self.opacity_partials, 0);
         pass.fill(&mut self.scale_partials, 0);
-        let (mut first, mut all) = (0, 1);
-        for (inputs, gradients) in batches {
-            let &mut ParameterInputs { gaussian_count, all_count, parameters } = inputs;
-            let needed = gaussian_count as usize * (Attribute::RawOpacities.column(0) + 1);
-            for buffer in [parameters, &**gradients] {
-                if buffer.len() < needed {
-                    let (name, len) = (buffer.name(), buffer.len());
-                    let problem = format!("buffer `{name}` holds {len} floats, not {needed}");
-                    return Err(Error::Usage(problem));
-                }
-            }
-            all = all_count.max(1);
-            let own = room(gaussian_count) as usize;
-            let scale =
-                |weight: f64, each: u32| (weight / (f64::from(each) * f64::from(all))) as f32;
+        let scale = |weight: f64, each: f64| (weight / (each * f64::from(all.max(1)))) as f32;
+        let mut first = 0;
+        for batch in batches.iter() {
+            let part = first..first + room(&batch);
+            first = part.end;
             pass.dispatch(
                 &self.pipeline,
                 &parameter_terms::Params {
-                    gaussian_count,
-                    opacity_scale: scale(self.weights.opacity_weight, 1),
-                    log_scale_scale: scale(self.weights.scale_weight, 3),
+                    gaussian_count: batch.gaussian_count(),
+                    opacity_scale: scale(self.weights.opacity_weight, 1.0),
+                    log_scale_scale: scale(self.weights.scale_weight, 3.0),
                 },
                 parameter_terms::Buffers {
-                    parameters,
-                    gradients,
-                    opacity_partials: &mut self.opacity_partials.window(first, own)?,
-                    scale_partials: &mut self.scale_partials.window(first, own)?,
+                    parameters: batch.rows(parameters, words)?,
+                    gradients: batch.planes_mut(&mut *gradients)?,
+                    opacity_partials: self.opacity_partials.slice_mut().range(part.clone())?,
+                    scale_partials: self.scale_partials.slice_mut().range(part)?,
                 },
-                Threads::Workgroups([gaussian_count.div_ceil(each), 1, 1]),
+                Threads::Workgroups([workgroups(&batch), 1, 1]),
             )?;
-            first += own;
         }
-        let mean = |each: f32| 1.0 / (each * all as f32);
-        let sums = |term, partials, scale| PartialSums { term, partials, count: total, scale };
+        let mean = |each: f32| 1.0 / (each * all.max(1) as f32);
+        let sums =
+            |term, partials, scale| PartialSums { term, partials, count: total as u32, scale };
         log.record(
             pass,
             [

@@ -1,10 +1,10 @@
 //! Mean opacity and mean standard deviation of the Gaussians, with their gradients.
 
 use super::rounding::{Rounded, chain};
-use crate::attributes::Attribute;
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::parameter_terms::{Constants, Kernel, Params, Slices, Tolerances};
-use crate::tone::Real;
+use crate::photographs::tone::Real;
+use crate::splats::attributes::Attribute;
 
 /// A value that a term sums up, and its derivative with respect to the parameter, in any number.
 fn opacity<T: Real>(raw: T) -> [T; 2] {
@@ -92,7 +92,7 @@ impl Reference for Kernel {
         }
         let chain = chain(0) + f64::from(3 * constants.gaussians_per_thread);
         let [opacity_partials, scale_partials] =
-            outcomes.map(|of| Tolerance::Sum(Rounded::sum(chain, of.values.into_iter()).bound()));
+            outcomes.map(|of| Tolerance::Sum(Rounded::sum(chain, of.values).bound()));
         Tolerances { gradients: Tolerance::Each(bounds), opacity_partials, scale_partials }
     }
 }

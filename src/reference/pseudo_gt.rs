@@ -5,7 +5,7 @@ use crate::kernels::curves::{
     CURVE_AUTO, CURVE_LUM_PRESERVE, CURVE_PER_CHANNEL, CURVE_PROFILE, CURVE_TABLE,
 };
 use crate::kernels::pseudo_gt::{Constants, Kernel, Params, Slices, Tolerances};
-use crate::tone::{Real, interpolate, measurable, profiled};
+use crate::photographs::tone::{Real, interpolate, measurable, profiled};
 
 /// What is stored of a value.
 fn stored(code_bits: u32, slices: &Slices<'_>, i: usize) -> f32 {

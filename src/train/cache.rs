@@ -12,7 +12,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use serde::{Deserialize, Serialize};
 
 use crate::gpu::Gpu;
-use crate::pseudo_gt::Encoded;
+use crate::photographs::pseudo_gt::Encoded;
 use crate::{Error, Result};
 
 /// The fraction of the device's memory, and of the machine's, that photographs take where nothing else is asked for.
@@ -337,8 +337,8 @@ mod tests {
     use super::super::precision::Encoder;
     use super::*;
     use crate::gpu::testing::gpu;
-    use crate::pseudo_gt::PseudoGt;
-    use crate::tone::ToneSettings;
+    use crate::photographs::pseudo_gt::PseudoGt;
+    use crate::photographs::tone::ToneSettings;
     use crate::train::PhotographBits;
 
     #[test]

@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use super::streams;
-use crate::random::Stream;
+use crate::base::random::Stream;
 
 /// The orders of the epochs that steps are in, each drawn once.
 #[derive(Debug, Default)]

@@ -13,9 +13,9 @@ use super::views::{Shown, TrainView, Views};
 use super::{TrainConfig, Trainer};
 use crate::camera::{Camera, Patch};
 use crate::gpu::Gpu;
-use crate::image::Image;
-use crate::nn::{Denoiser, Tonemapper};
-use crate::pseudo_gt::PseudoGt;
+use crate::networks::{Denoiser, Tonemapper};
+use crate::photographs::image::Image;
+use crate::photographs::pseudo_gt::PseudoGt;
 use crate::{Error, Result};
 
 impl TrainConfig {

@@ -9,8 +9,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::Result;
 use crate::gpu::{Buffer, Gpu};
-use crate::halves::Bits;
-use crate::pseudo_gt::Encoded;
+use crate::photographs::pseudo_gt::Encoded;
+use crate::splats::halves::Bits;
 
 /// In how many bits a run keeps what it could keep in fewer.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -153,10 +153,10 @@ fn different(values: &[f32], most: usize) -> Option<Vec<u32>> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::base::random::Stream;
     use crate::gpu::testing::gpu;
-    use crate::pseudo_gt::PseudoGt;
-    use crate::random::Stream;
-    use crate::tone::ToneSettings;
+    use crate::photographs::pseudo_gt::PseudoGt;
+    use crate::photographs::tone::ToneSettings;
 
     /// What comes back of values, and in how many bits they were kept.
     fn kept(bits: PhotographBits, values: &[f32]) -> (Vec<f32>, u32) {

@@ -3,17 +3,18 @@
 use glam::{DVec2, UVec2};
 
 use super::Trainer;
+use super::measuring::{TargetExposure, lifted_from, measured};
 use super::terms::NetworkTerms;
-use super::views::{Shown, lifted_from, measured};
+use super::views::Shown;
 use crate::Result;
 use crate::camera::{Camera, Frame};
-use crate::dataset::{Dataset, View};
-use crate::exposure::{Affine, Exposures};
 use crate::gpu::Gpu;
-use crate::image::{Image, Mask};
-use crate::metrics::psnr_of_counted;
-use crate::pseudo_gt::PseudoGt;
-use crate::tone::{LuminanceHistogram, Measured, Scene, ToneSettings, is_black};
+use crate::loss::exposure::{Affine, Exposures};
+use crate::photographs::dataset::{Dataset, View};
+use crate::photographs::image::{Image, Mask};
+use crate::photographs::metrics::psnr_of_counted;
+use crate::photographs::pseudo_gt::PseudoGt;
+use crate::photographs::tone::{LuminanceHistogram, Measured, Scene, ToneSettings, is_black};
 
 use super::rendered::Rendered;
 
@@ -186,6 +187,16 @@ impl TestTargets {
 }
 
 impl Trainer {
+    /// What the curves of the training photographs have in common, for [`TestTargets::in_scene`].
+    pub fn scene(&self) -> &Scene {
+        &self.scene
+    }
+
+    /// How bright the targets are; none where the curve's constants say that.
+    pub fn target_exposure(&self) -> Option<&TargetExposure> {
+        self.target_exposure.as_ref()
+    }
+
     /// The mean PSNR, dB, of what the Gaussians show of the held-out views against their targets; none where there are none.
     ///
     /// # Errors

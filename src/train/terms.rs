@@ -5,16 +5,16 @@ use glam::UVec2;
 use super::masks::Masking;
 use super::networks::Networks;
 use super::{ModelConfig, TrainConfig, streams};
+use crate::base::random::Stream;
 use crate::gpu::{Buffer, Gpu, Recorder};
 use crate::kernels::ssim::RADIUS;
 use crate::loss::{
     DenoisingGradients, DenoisingInputs, DenoisingLoss, DenoisingWeights, Gradient, Interior,
     LogSlot, Loss, LossInputs, LossSettings, Term, TermInputs,
 };
-use crate::nn::{Denoiser, Form};
-use crate::random::Stream;
-use crate::scene::{COLOR_CHANNELS, Feature};
-use crate::window::Window;
+use crate::networks::window::Window;
+use crate::networks::{Denoiser, Form};
+use crate::splats::scene::{COLOR_CHANNELS, Feature};
 use crate::{Error, Result};
 
 /// What the networks of a view are held to, (3, H, W) each.

@@ -6,25 +6,24 @@ use std::ops::RangeInclusive;
 use std::sync::Arc;
 
 use glam::{DVec3, UVec2, Vec3};
-use rayon::prelude::*;
-use serde::Serialize;
 
 use super::cache::{Cache, CacheSize, Slot};
 use super::epochs::Epochs;
+use super::measuring::{TargetExposure, measured, photographs};
 use super::precision::Encoder;
 use super::{TrainConfig, streams};
+use crate::base::random::Stream;
 use crate::camera::{Camera, Frame, Patch};
-use crate::dataset::{Dataset, MeasuredSize, Point, View};
-use crate::exposure::Affine;
 use crate::gpu::{Buffer, Download, Gpu, Recorder};
-use crate::image::Image;
 use crate::kernels::ToneParameters;
 use crate::loss::ViewSource;
-use crate::nn::Form;
-use crate::pseudo_gt::PseudoGt;
-use crate::random::Stream;
-use crate::scene::{COLOR_CHANNELS, Feature, Gaussians, Shape, init};
-use crate::tone::{Exposure, Measured, Scene, ToneSettings, all_black};
+use crate::loss::exposure::Affine;
+use crate::networks::Form;
+use crate::photographs::dataset::{Dataset, Point};
+use crate::photographs::image::Image;
+use crate::photographs::pseudo_gt::PseudoGt;
+use crate::photographs::tone::Scene;
+use crate::splats::scene::{COLOR_CHANNELS, Feature, Gaussians, Shape, init};
 use crate::{Error, Result};
 
 /// One training view: a photograph, or a patch of one that is too large to be trained on at once.
@@ -48,26 +47,6 @@ pub(super) struct TrainView {
     gets_curve: bool,
     /// The dark photograph, where that is not what is stored and a network sees it.
     photograph: Option<Slot>,
-}
-
-/// How bright the targets are, and what a model makes of them.
-#[derive(Clone, Debug, Serialize)]
-pub struct TargetExposure {
-    /// The gain that a model of views with differing gains agrees on, their geometric mean: the exposure at which it
-    /// renders and is scored.
-    pub model_gain: f64,
-    /// What was found for the training photographs together.
-    pub scene: Exposure,
-    /// The gain of every training view, by name.
-    pub gains: BTreeMap<String, f64>,
-}
-
-impl TargetExposure {
-    fn new(scene: Exposure, gains: BTreeMap<String, f64>) -> Self {
-        let logarithms: f64 = gains.values().map(|gain| gain.ln()).sum();
-        let model_gain = (logarithms / gains.len().max(1) as f64).exp();
-        Self { model_gain, scene, gains }
-    }
 }
 
 /// All training views in the dataset's order, as they are and then by level of the resolution schedule, each half the
@@ -339,7 +318,7 @@ impl Views {
     pub(super) fn say_what_shows_nothing(&self, gaussians: &Gaussians) {
         let means: Vec<DVec3> = gaussians.means().iter().map(|mean| mean.as_dvec3()).collect();
         for TrainView { name, patch, .. } in self.photographs() {
-            if !means.iter().any(|&mean| patch.camera.sees(mean).is_some()) {
+            if !scattered(means.len()).any(|at| patch.camera.sees(means[at]).is_some()) {
                 tracing::warn!(
                     "view {name} shows nothing: none of the {} first Gaussians lies in it; check its pose",
                     means.len()
@@ -461,7 +440,9 @@ impl<'a> Pictures<'a> {
         let Self { views, gpu, pseudo_gt, shown, ref mut made } = *self;
         if !made.contains_key(&place) {
             let mut pixels = 0;
-            let after = views.photographs().filter(|view| view.place >= place);
+            let whole = views.whole();
+            let after = &whole[whole.partition_point(|view| view.place < place)..];
+            let after = after.iter().filter(|view| view.patch.is_first());
             let now = after.take_while(|view| {
                 let is_first = pixels == 0;
                 pixels += Patch::from(&view.patch.camera).pixel_count();
@@ -535,56 +516,26 @@ fn begin_as_identity(gaussians: &mut Gaussians, colors: &[Vec3], low: &[Vec3]) {
     }
 }
 
-/// The training views that have a photograph, and their places in the dataset.
-fn photographs(dataset: &Dataset) -> impl Iterator<Item = (usize, &View)> {
-    let views = dataset.views.iter().enumerate();
-    views.filter(|(_, view)| view.is_train() && view.has_photograph())
-}
-
-/// What is measured of all training photographs together, and of each.
-///
-/// # Errors
-/// Every photograph is as good as black where their exposure is asked for, or a photograph can no longer be read.
-pub(super) fn measured(
-    settings: &ToneSettings,
-    dataset: &Dataset,
-) -> Result<(Scene, Vec<Measured>)> {
-    let views: Vec<&View> = photographs(dataset).map(|(_, view)| view).collect();
-    let pixels = |view: &&View| u64::from(view.camera.width) * u64::from(view.camera.height);
-    let largest = views.iter().map(pixels).max().unwrap_or_default();
-    let mut measured = vec![];
-    for views in views.chunks(Image::decoded_at_once(largest)) {
-        let of_views = views.par_iter().map(|view| measured_of(view, settings.lift_first));
-        measured.extend(of_views.collect::<Result<Vec<_>>>()?.into_iter().flatten());
-    }
-    let scene = settings.scene(&measured).ok_or_else(|| all_black(&dataset.root))?;
-    Ok((scene, measured))
-}
-
-/// What is measured of a view; known where its photograph was measured while it was decoded.
-///
-/// # Errors
-/// As [`lifted_from`].
-pub(super) fn measured_of(view: &View, lift_first: bool) -> Result<Option<Measured>> {
-    let size = if lift_first { MeasuredSize::Own } else { MeasuredSize::Loaded };
-    let read_anew = view.original.as_ref().filter(|_| lift_first || view.image.is_none());
-    let measured = match read_anew.and_then(|original| original.measured(size)) {
-        Some(measured) => Some(measured.clone()),
-        None => {
-            let photograph = lifted_from(view, lift_first)?;
-            photograph.map(|photograph| Measured::of(&view.counted(&photograph)))
+/// The numbers below `count`, each once, with neighbours far apart: what is found at some place in a list is found after few
+/// steps, however the list is sorted.
+fn scattered(count: usize) -> impl Iterator<Item = usize> {
+    const GOLDEN: f64 = 0.618_033_988_75;
+    let divides_both = |step: usize| {
+        let (mut a, mut b) = (step, count);
+        while b > 0 {
+            (a, b) = (b, a % b);
         }
+        a > 1
     };
-    Ok(measured.map(|measured| measured.seen_by(&view.camera)))
-}
-
-/// What is measured of a view and becomes its target: the photograph as its camera took it where it is lifted before it is
-/// shrunk, else as it was loaded; none where the view has none.
-///
-/// # Errors
-/// As [`View::photograph`].
-pub(super) fn lifted_from(view: &View, lift_first: bool) -> Result<Option<Cow<'_, Image>>> {
-    if lift_first { view.photograph() } else { view.loaded() }
+    let mut step = ((GOLDEN * count as f64) as usize).max(1);
+    while divides_both(step) {
+        step += 1;
+    }
+    (0..count).scan(0, move |at, _| {
+        let here = *at;
+        *at = (here + step) % count;
+        Some(here)
+    })
 }
 
 /// A size halved as often as its level says and its shorter side allows.
@@ -605,5 +556,22 @@ impl TrainView {
     /// Width and height in pixels.
     pub(super) fn size(&self) -> UVec2 {
         self.patch.size
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::scattered;
+
+    #[test]
+    fn scattered_numbers_are_all_there_and_neighbours_far_apart() {
+        for count in [0, 1, 2, 3, 4, 6, 10, 97, 1000] {
+            let numbers: Vec<usize> = scattered(count).collect();
+            let near = numbers.windows(2).filter(|two| two[0].abs_diff(two[1]) < count / 4).count();
+            assert!(near <= 1 || count < 4, "{count}: {near}");
+            let mut sorted = numbers;
+            sorted.sort_unstable();
+            assert!(sorted.into_iter().eq(0..count));
+        }
     }
 }

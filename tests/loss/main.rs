@@ -13,6 +13,9 @@ mod log;
 mod parameters;
 mod structure;
 
+mod masks;
+mod view_exposures;
+
 use std::collections::BTreeMap;
 
 use common::{largest, widen};

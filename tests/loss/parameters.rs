@@ -1,12 +1,13 @@
 //! The terms on parameters.
 
-use nightsplat::attributes::{Attribute, column_count};
+use nightsplat::base::random::Stream;
 use nightsplat::gpu::Threads;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::parameter_terms;
 use nightsplat::loss::{ParameterInputs, ParameterTerms, ParameterWeights, Term};
-use nightsplat::random::Stream;
 use nightsplat::reference::parameter_terms::parameter_terms;
+use nightsplat::splats::attributes::{Attribute, column_count};
+use nightsplat::splats::batches::Batches;
 
 use super::{assert_close, central_differences, log_step};
 
@@ -66,38 +67,29 @@ fn the_gradient_is_that_of_finite_differences() {
 }
 
 #[test]
-fn two_batches_log_the_means_of_all_gaussians() {
-    let gpu = gpu();
+fn the_means_over_the_gaussians_reach_the_log_and_their_gradients_the_planes() {
+    let (gpu, count) = (gpu(), 741);
     let weights = ParameterWeights { opacity_weight: 0.3, scale_weight: 0.7 };
     let mut terms = ParameterTerms::new(&gpu, weights).unwrap().unwrap();
-    let (counts, all_count) = ([700_usize, 41], 741);
-    let parts = counts.map(planes);
-    let buffers = parts.each_ref().map(|part| gpu.buffer("parameters", part).unwrap());
-    let mut gradients = parts.each_ref().map(|part| gpu.zeros("gradients", part.len()).unwrap());
+    let (planes, words) = (planes(count), column_count(0, 0));
+    let batches = Batches::new(&gpu, count, [words, 0]);
+    let parameters = batches.upload(&gpu, "parameters", &planes).unwrap();
+    let mut gradients = batches.zeros(&gpu, "gradients").unwrap();
     let logged = log_step(&gpu, |pass, log| {
-        let batches = counts.into_iter().zip(&buffers).zip(&mut gradients);
-        let batches = batches.map(|((count, parameters), gradients)| {
-            let gaussian_count = count as u32;
-            (ParameterInputs { gaussian_count, all_count, parameters }, gradients)
-        });
-        terms.record(pass, &mut batches.collect::<Vec<_>>(), log)
+        let inputs = ParameterInputs { batches: &batches, words, parameters: &parameters };
+        terms.record(pass, inputs, &mut gradients, log)
     })
     .unwrap();
-    let [mut opacity, mut scale] = [0.0; 2];
-    for ((count, part), gradients) in counts.into_iter().zip(&parts).zip(&gradients) {
-        let part: Vec<f64> = part.iter().copied().map(f64::from).collect();
-        let share = count as f64 / f64::from(all_count);
-        opacity += share * parameter_terms(&part, count, [1.0, 0.0]).0;
-        scale += share * parameter_terms(&part, count, [0.0, 1.0]).0;
-        let weights = [weights.opacity_weight, weights.scale_weight].map(|weight| weight * share);
-        let (_, expected) = parameter_terms(&part, count, weights);
-        let expected: Vec<f32> = expected.into_iter().map(|value| value as f32).collect();
-        assert_close("gradients", &gpu.read(gradients).unwrap(), &expected, 1e-8);
-    }
+    let planes: Vec<f64> = planes.into_iter().map(f64::from).collect();
+    let [opacity, scale] = [[1.0, 0.0], [0.0, 1.0]].map(|of| parameter_terms(&planes, count, of).0);
     for (term, expected) in [(Term::OPACITY, opacity), (Term::SCALE, scale)] {
         let found = f64::from(logged.losses.get(term));
         assert!((found / expected - 1.0).abs() < 1e-5, "{term:?}: {found}, not {expected}");
     }
+    let of_both = [weights.opacity_weight, weights.scale_weight];
+    let (_, expected) = parameter_terms(&planes, count, of_both);
+    let expected: Vec<f32> = expected.into_iter().map(|value| value as f32).collect();
+    assert_close("gradients", &batches.read(&gpu, &gradients).unwrap(), &expected, 1e-8);
 }
 
 #[test]

@@ -13,13 +13,13 @@ use super::scene::{self, Scene};
 use super::tune::Pass;
 use super::{Bench, table, total};
 use crate::Error;
-use crate::dataset::synthetic::{self, SyntheticOptions};
-use crate::dataset::{Dataset, Point};
-use crate::diagnose::Diagnosis;
-use crate::random::Stream;
-use crate::render::{RenderSettings, Renderer};
-use crate::scene::{Features, MAX_SH_DEGREE, Shape};
-use crate::tone::ToneCurve;
+use crate::base::random::Stream;
+use crate::photographs::dataset::synthetic::{self, SyntheticOptions};
+use crate::photographs::dataset::{self, Dataset};
+use crate::photographs::tone::ToneCurve;
+use crate::splats::render::{RenderSettings, Renderer};
+use crate::splats::scene::{Features, MAX_SH_DEGREE, Shape};
+use crate::train::diagnose::Diagnosis;
 use crate::train::{TrainConfig, Trainer};
 
 /// Gaussians, in those that are asked for: 10 000 to 500 000 at the default.
@@ -132,10 +132,10 @@ fn points(bench: &Bench) -> crate::Result<Axis> {
         let near = |at: usize| {
             let draws = Stream::new(7, at as u64);
             let beside = DVec3::new(draws.normal(0), draws.normal(1), draws.normal(2));
-            let Point { position, views } = &dataset.points[at % dataset.points.len()];
-            Point { position: *position + 0.01 * beside, views: views.clone() }
+            let dataset::Point { position, views } = &dataset.points[at % dataset.points.len()];
+            dataset::Point { position: *position + 0.01 * beside, views: views.clone() }
         };
-        let points: Vec<Point> = (0..times * dataset.points.len()).map(near).collect();
+        let points: Vec<dataset::Point> = (0..times * dataset.points.len()).map(near).collect();
         let count = points.len() as f64;
         let dataset = Dataset { points, ..dataset.clone() };
         bench.gpu.reset_peak_memory();

@@ -1,0 +1,65 @@
+//! Photographs from the host, one at a time, in tiles where one exceeds what the device binds.
+
+use super::PseudoGt;
+use crate::Result;
+use crate::gpu::{Buffer, Download};
+use crate::photographs::image::Image;
+use crate::photographs::tone::{Lift, Measured};
+
+impl PseudoGt {
+    /// Measures the planes (3, pixels) of a photograph.
+    ///
+    /// # Errors
+    /// There are no pixels, or the device is out of memory or lost.
+    pub fn measure(&mut self, planes: &[f32]) -> Result<Measured> {
+        let tiles = self.tiles(planes)?;
+        let tiles: Vec<&Buffer<f32>> = tiles.iter().collect();
+        let gpu = self.gpu.clone();
+        gpu.run("tone statistics", |pass| self.statistics_of_tiles(pass, &tiles))?;
+        let (statistics, luminance) = (self.measured()?, self.luminance_histogram()?);
+        Ok(Measured { statistics, luminance, camera: None })
+    }
+
+    /// The target that a photograph becomes, of its own size.
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub fn lifted(&self, photograph: &Image, lift: &Lift) -> Result<Image> {
+        let parameters = self.gpu.buffer("tone parameters", &[lift.parameters])?;
+        let Image { width, height, .. } = *photograph;
+        let pixels = photograph.pixel_count();
+        let (mut data, mut first) = (vec![0.0; photograph.data.len()], 0);
+        for tile in self.tiles(&photograph.data)? {
+            let mut mapped = self.gpu.uninit("pseudo-GT", tile.len())?;
+            let mut download = None;
+            self.gpu.run("pseudo-GT", |pass| {
+                self.map(pass, &tile, &parameters, 0, &mut mapped)?;
+                download = Some(pass.download(&mapped)?);
+                Ok(())
+            })?;
+            let mapped = download.map_or_else(|| Ok(vec![]), Download::wait)?;
+            let count = tile.len() / 3;
+            for (plane, values) in mapped.chunks_exact(count.max(1)).enumerate() {
+                data[plane * pixels + first..][..count].copy_from_slice(values);
+            }
+            first += count;
+        }
+        Ok(Image { width, height, data })
+    }
+
+    /// Runs of pixels, each planar (3, count), that the device can bind.
+    fn tiles(&self, planes: &[f32]) -> Result<Vec<Buffer<f32>>> {
+        let pixels = planes.len() / 3;
+        let bytes_per_pixel = 3 * size_of::<f32>() as u64;
+        let most = (self.gpu.properties().max_storage_buffer_range / bytes_per_pixel) as usize;
+        if pixels <= most {
+            return Ok(vec![self.gpu.buffer("photograph", planes)?]);
+        }
+        let tile = |first: usize| {
+            let count = most.min(pixels - first);
+            let plane = |plane: usize| &planes[plane * pixels + first..][..count];
+            self.gpu.buffer("photograph", &[plane(0), plane(1), plane(2)].concat())
+        };
+        (0..pixels).step_by(most).map(tile).collect()
+    }
+}
