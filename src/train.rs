@@ -29,8 +29,6 @@ mod views;
 use std::panic::resume_unwind;
 use std::thread::{self, ScopedJoinHandle};
 
-use glam::DVec3;
-
 use crate::camera::{Camera, Frame};
 use crate::dataset::{Dataset, Fingerprint, Split};
 use crate::densify::{Densifier, DensityControl};
@@ -274,11 +272,7 @@ impl Trainer {
         let gaussians = match gaussians {
             // A run that ended before its highest SH degree was in use has a model without it.
             Some(gaussians) if settings.shape.holds(gaussians.shape) => {
-                let gaussians = gaussians.with_sh_degree(settings.shape.sh_degree);
-                match frame {
-                    Frame::WORLD => gaussians,
-                    _ => gaussians.from_world(&frame, DVec3::ZERO),
-                }
+                gaussians.with_sh_degree(settings.shape.sh_degree).from_world(&frame)
             }
             Some(Gaussians { shape: own, .. }) => {
                 let problem = format!("Gaussians of {own:?} make no model of {:?}", settings.shape);
@@ -361,11 +355,7 @@ impl Trainer {
     /// # Errors
     /// The device was lost.
     pub fn gaussians(&self) -> Result<Gaussians> {
-        let gaussians = self.gaussians_in_frame()?;
-        Ok(match self.frame {
-            Frame::WORLD => gaussians,
-            frame => gaussians.to_world(&frame, DVec3::ZERO),
-        })
+        Ok(self.gaussians_in_frame()?.to_world(&self.frame))
     }
 
     /// The same in [`Trainer::frame`], to the bit as they are trained.
@@ -461,7 +451,7 @@ impl Trainer {
         let model = &mut self.model;
         let [decoded, decoded_photograph] = &mut self.decoded;
 
-        self.renderer.forward(pass, &model.gaussians.parameters, view.patch, &options)?;
+        self.renderer.forward(pass, &model.gaussians, view.patch, &options)?;
         let (render, status) = self.renderer.render_and_status();
         let (d_render, size) = (&mut self.d_render, view.size());
         let input = view.input.decoded(pass, decoded)?;
@@ -514,7 +504,7 @@ impl Trainer {
         }
         self.renderer.backward(
             pass,
-            &model.gaussians.parameters,
+            &model.gaussians,
             view.patch,
             &options,
             damping,
@@ -560,7 +550,7 @@ impl Trainer {
     /// As [`Trainer::render`], of a camera in the frame.
     fn render_of_degree(&mut self, camera: &Camera, sh_degree: u32) -> Result<Rendered> {
         let options = RenderOptions { sh_degree, background: [0.0; 3] };
-        let gaussians = (&self.model.gaussians.parameters, self.model.count());
+        let gaussians = &self.model.gaussians;
         let networks = self.networks.as_mut().map(|terms| &mut terms.networks);
         Rendered::new(&mut self.renderer, gaussians, camera, &options, networks)
     }
@@ -572,7 +562,7 @@ impl Trainer {
     fn reserve(&mut self) -> Result<()> {
         let Self { model, views, renderer, .. } = self;
         let sizes = views.all().map(TrainView::size);
-        renderer.reserve_with_headroom([model.count(), model.capacity()], sizes)
+        renderer.reserve_sizes(model.count(), model.capacity(), sizes)
     }
 
     fn report(&self, step: u64, losses: &StepLosses, milliseconds: f64) -> StepReport {

@@ -6,6 +6,7 @@
 use std::ops::Range;
 
 use glam::{DVec2, DVec3, Vec3};
+use nightsplat::attributes::PlaneCounts;
 use nightsplat::attributes::planes;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::adam::{LOG_SCALE_MAX, LOG_SCALE_MIN};
@@ -173,8 +174,8 @@ fn adam_on_device(steps: u64, start: &[f32]) -> Vec<f32> {
                     gradients: gradients[(step % TURNS) as usize].slice(),
                     moments: moments.slice_mut(),
                 };
-                let counts = [GAUSSIANS as u32, COLUMNS as u32, 0];
-                adam.record(pass, step, &RATES, counts, buffers, &status)?;
+                let planes = PlaneCounts { gaussians: GAUSSIANS, columns: COLUMNS, features: 0 };
+                adam.record(pass, step, &RATES, planes, buffers, &status)?;
             }
             Ok(())
         })

@@ -10,7 +10,7 @@ use nightsplat::eval::{self, Player};
 
 use nightsplat::gpu::testing::{gpu, recorded};
 use nightsplat::gpu::{DeviceChoice, Gpu};
-use nightsplat::halves::Bits;
+use nightsplat::halves::StorageFormat;
 use nightsplat::image::Image;
 use nightsplat::metrics::Scores;
 use nightsplat::scene::{Gaussians, Shape};
@@ -177,7 +177,7 @@ fn a_plain_step_is_at_most_24_dispatches_and_20_barriers() {
         config.precision.rest = rest;
         config
     };
-    for bits in [Bits::Single, Bits::Half] {
+    for bits in [StorageFormat::Single, StorageFormat::Half] {
         let [dispatches, barriers] = recorded_for_a_step(with_all_coefficients(bits));
         let counted = format!("{bits:?}: {dispatches} dispatches, {barriers} barriers");
         println!("{counted}");

@@ -13,7 +13,7 @@ use crate::Result;
 use crate::attributes::planes;
 use crate::camera::{Camera, Patch};
 use crate::exposure::{Affine, Exposures};
-use crate::halves::Bits;
+use crate::halves::StorageFormat;
 use crate::image::Image;
 use crate::pseudo_gt::PseudoGt;
 use crate::random::Stream;
@@ -96,7 +96,7 @@ impl Trainer {
         let settings = RenderSettings {
             shape: 0.into(),
             raw_colors: true,
-            rest: Bits::Single,
+            rest: StorageFormat::Single,
             ..self.config.render_settings()
         };
         let mut renderer = Renderer::new(&self.gpu, settings)?;
