@@ -33,7 +33,7 @@ fn main() {
     println!("cargo:rerun-if-changed={SHADERS}");
     println!("cargo:rerun-if-changed=build.rs");
     println!("cargo:rerun-if-changed=build");
-    println!("cargo:rerun-if-changed=src/attributes.rs");
+    println!("cargo:rerun-if-changed=src/splats/attributes.rs");
     let out_dir = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets OUT_DIR"));
 
     let mut structs = Structs::default();

@@ -7,7 +7,7 @@ use super::{Interior, LossSpec, Term, check_weight, holds, no_scratch, value_cou
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::denoising;
-use crate::scene::Feature;
+use crate::splats::scene::Feature;
 
 pub(super) const SPEC: LossSpec = LossSpec {
     feature: Some(Feature::Noise),

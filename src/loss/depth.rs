@@ -9,12 +9,12 @@ use super::log::{LogSlot, PartialSums};
 use super::{
     LossSpec, LossTerm, Term, TermInputs, ViewSource, check_weight, holds, no_scratch, pixel_count,
 };
+use crate::base::random::Stream;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::{
     DepthGradient, DepthMoments, depth_boxes, depth_correlation, depth_gradient, depth_moments,
 };
-use crate::random::Stream;
-use crate::scene::Feature;
+use crate::splats::scene::Feature;
 use crate::{Error, Result};
 
 pub(super) const SPEC: LossSpec = LossSpec {

@@ -12,7 +12,7 @@ use super::{
 };
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::{ToneParameters, l1, ssim};
-use crate::scene::Feature;
+use crate::splats::scene::Feature;
 use crate::{Error, Result};
 
 /// R_0 and the pseudo-GT.

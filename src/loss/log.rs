@@ -146,9 +146,9 @@ impl LogSlot<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::base::random::Stream;
     use crate::loss::{LossConfig, Weights};
-    use crate::random::Stream;
-    use crate::scene::Features;
+    use crate::splats::scene::Features;
 
     #[test]
     fn the_total_is_one_of_distances_and_of_what_likenesses_lack() {

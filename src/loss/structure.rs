@@ -9,8 +9,8 @@ use super::{
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::structure_l1;
-use crate::scene::Feature;
-use crate::structure::StructureTarget;
+use crate::photographs::structure::StructureTarget;
+use crate::splats::scene::Feature;
 
 pub(super) const SPEC: LossSpec = LossSpec {
     feature: Some(Feature::Structure),
@@ -79,7 +79,7 @@ pub struct StructureInputs<'a> {
     pub render: &'a Buffer<f32>,
     /// The channel that holds the structure.
     pub plane: u32,
-    /// (H, W), from [`crate::structure::StructureTarget`].
+    /// (H, W), from [`crate::photographs::structure::StructureTarget`].
     pub structure: &'a Buffer<f32>,
 }
 

@@ -5,7 +5,6 @@ use glam::{DMat3, DVec2, DVec3, DVec4};
 use super::camera::{Camera, rotation, unit_quat};
 use super::gaussian::{Gaussian, sigmoid};
 use super::rounding::UNIT;
-use crate::attributes::{Attribute, planes};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::camera::NEAREST;
 use crate::kernels::densify_score::{Constants, Kernel, Params, Slices, Tolerances};
@@ -13,6 +12,7 @@ use crate::kernels::fate::{
     KEY_KEEP, KEY_PRUNE, KEY_TOP, SPLIT_OFFSET, TALLY_CANDIDATES, TALLY_PRUNED,
 };
 use crate::kernels::splat::DILATION;
+use crate::splats::attributes::{Attribute, planes};
 
 fn mean_gradient(slices: &Slices<'_>, i: usize) -> f32 {
     match slices.visit_counts[i] {

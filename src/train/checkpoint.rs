@@ -15,15 +15,15 @@ use super::best::{Snapshot, Tensor};
 use super::decisions::Decisions;
 use super::model::Model;
 use super::{TrainConfig, Trainer, learnables};
-use crate::batches::Batches;
-use crate::dataset::Fingerprint;
+use crate::base::hash::{self, Hasher};
+use crate::base::input;
+use crate::base::output::write_whole_with;
 use crate::gpu::{Gpu, SliceMut};
-use crate::hash::{self, Hasher};
-use crate::input;
-use crate::nn::TensorFile;
-use crate::optimizer::{AdamBuffers, Moments};
-use crate::output::write_whole_with;
-use crate::scene::{Gaussians, Shape, width};
+use crate::networks::TensorFile;
+use crate::photographs::dataset::Fingerprint;
+use crate::splats::batches::Batches;
+use crate::splats::optimizer::{AdamBuffers, Moments};
+use crate::splats::scene::{Gaussians, Shape, width};
 use crate::{Error, Result};
 
 /// The key of the metadata that holds a [`Header`] as JSON: several keys would come in another order every time.

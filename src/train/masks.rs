@@ -6,10 +6,10 @@ use glam::UVec2;
 use super::views::Views;
 use crate::Result;
 use crate::camera::Camera;
-use crate::dataset::Dataset;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::{ToneParameters, mask_gradient, mask_render};
-use crate::scene::COLOR_CHANNELS;
+use crate::photographs::dataset::Dataset;
+use crate::splats::scene::COLOR_CHANNELS;
 
 /// The masks of the views that have one, and what applies them; a view without one costs nothing.
 #[derive(Debug)]

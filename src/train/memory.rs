@@ -9,8 +9,8 @@ use serde::Serialize;
 use super::{CacheSize, Trainer};
 use crate::Result;
 use crate::camera::Patch;
-use crate::render::RenderOptions;
-use crate::scene::{Layout, Shape};
+use crate::splats::render::RenderOptions;
+use crate::splats::scene::{Layout, Shape};
 
 /// What the program, the driver and its compiled kernels take on the host, about.
 const PROGRAM: f64 = 256.0 * 1024.0 * 1024.0;

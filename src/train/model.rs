@@ -2,12 +2,12 @@
 
 use super::{PrecisionConfig, Trainer};
 use crate::Result;
-use crate::attributes::{PlaneCounts, planes};
-use crate::densify::{Densifier, DensifyInputs, DensifyReport, Round};
 use crate::gpu::{Buffer, Gpu, Recorder};
-use crate::halves::StorageFormat;
-use crate::optimizer::{Adam, AdamBuffers, FiniteCheck, LearningRates, Moments};
-use crate::scene::{
+use crate::splats::attributes::{PlaneCounts, planes};
+use crate::splats::densify::{Densifier, DensifyInputs, DensifyReport, Round};
+use crate::splats::halves::StorageFormat;
+use crate::splats::optimizer::{Adam, AdamBuffers, FiniteCheck, LearningRates, Moments};
+use crate::splats::scene::{
     ATTRIBUTES, Attribute, DeviceGaussians, GaussianSlice, Gaussians, Layout, Shape,
 };
 
@@ -265,7 +265,7 @@ fn lengthen(gpu: &Gpu, buffer: &mut Buffer<f32>, len: usize) -> Result<()> {
 mod tests {
     use super::*;
     use crate::gpu::testing::gpu;
-    use crate::scene::Features;
+    use crate::splats::scene::Features;
 
     /// Else the next round of density control would have to make that room again.
     #[test]

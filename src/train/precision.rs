@@ -9,8 +9,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
-use crate::halves::StorageFormat;
 use crate::kernels::decode;
+use crate::splats::halves::StorageFormat;
 
 /// In how many bits a run keeps what it could keep in fewer.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -259,8 +259,8 @@ impl Photograph {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::base::random::Stream;
     use crate::gpu::testing::gpu;
-    use crate::random::Stream;
 
     /// What comes back of values, and in how many bits they were kept.
     fn kept(bits: PhotographBits, values: &[f32]) -> (Vec<f32>, u32) {

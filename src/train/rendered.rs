@@ -3,9 +3,9 @@
 use super::Networks;
 use crate::Result;
 use crate::camera::{Camera, Patch};
-use crate::image::Image;
-use crate::render::{RenderOptions, Renderer};
-use crate::scene::{GaussianSlice, Layout};
+use crate::photographs::image::Image;
+use crate::splats::render::{RenderOptions, Renderer};
+use crate::splats::scene::{GaussianSlice, Layout};
 
 /// What a model shows of a view.
 #[derive(Clone, Debug)]

@@ -17,7 +17,7 @@ use std::io::Write;
 use std::panic::Location;
 use std::path::PathBuf;
 
-use nightsplat::random::Stream;
+use nightsplat::base::random::Stream;
 
 /// Runs a kernel on the device over host vectors named like its buffers, checks what it leaves against its reference, and
 /// gives back what it writes.

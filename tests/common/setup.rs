@@ -4,12 +4,12 @@ use glam::{DAffine3, DMat3, DVec2, DVec3, UVec2, Vec2};
 use nightsplat::camera;
 use nightsplat::gpu::Tile;
 use nightsplat::gpu::testing::gpu;
+use nightsplat::photographs::tone::Profile;
 use nightsplat::reference::camera::Camera;
 use nightsplat::reference::gaussian::{Gaussian, Planes};
 use nightsplat::reference::sh::sh_count;
-use nightsplat::render::{self, Damping, RenderOptions, RenderSettings, Renderer, Status};
-use nightsplat::scene::{DeviceGaussians, Features, Gaussians, Shape};
-use nightsplat::tone::Profile;
+use nightsplat::splats::render::{self, Damping, RenderOptions, RenderSettings, Renderer, Status};
+use nightsplat::splats::scene::{DeviceGaussians, Features, Gaussians, Shape};
 
 use super::Random;
 

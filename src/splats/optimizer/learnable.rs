@@ -1,0 +1,40 @@
+//! What is learned beside the Gaussians.
+
+use super::{Adam, AdamBuffers, LearningRates};
+use crate::Result;
+use crate::gpu::{Buffer, Recorder};
+use crate::splats::attributes::PlaneCounts;
+
+/// Numbers that Adam trains at one rate and that a checkpoint keeps, such as the parameters of a network.
+pub trait Learnable {
+    /// What its tensors are called in a checkpoint: `NAME.parameters`, `NAME.first_moments`, `NAME.second_moments`.
+    fn name(&self) -> &'static str;
+
+    /// Adam's learning rate at a step, counted from 1.
+    fn learning_rate(&self, step: u64) -> f64;
+
+    /// What is learned, with the gradients of the step and what Adam keeps.
+    fn buffers(&mut self) -> AdamBuffers<'_>;
+}
+
+impl Adam {
+    /// Records step number `step`, from 1, of all that is learned, at `rate` times its own rate; nothing changes while
+    /// `status` is set.
+    ///
+    /// # Errors
+    /// As [`Adam::record`].
+    pub fn update(
+        &self,
+        pass: &mut Recorder<'_>,
+        step: u64,
+        rate: f64,
+        learnable: &mut dyn Learnable,
+        status: &Buffer<u32>,
+    ) -> Result<()> {
+        let rates = LearningRates::uniform(rate * learnable.learning_rate(step));
+        let buffers = learnable.buffers();
+        // One column of planes.
+        let planes = PlaneCounts { gaussians: buffers.parameters.len(), columns: 1, features: 0 };
+        self.record(pass, step, &rates, planes, buffers, status)
+    }
+}

@@ -1,0 +1,491 @@
+//! The differentiable rasteriser: Gaussians and a camera in, a render out; its gradient in, theirs out.
+//!
+//! ```text
+//! project -> sort by depth -> order_counts -> emit -> sort by tile -> blend_forward
+//!     -> [loss] -> blend_backward -> project_backward
+//! ```
+//!
+//! Counts stay on the device. Where the intersections of a view exceed the memory reserved for them, a status flag is
+//! raised, nothing is rendered or updated, and the host grows the buffers and redoes the step ([`Renderer::grow`]).
+
+mod frame;
+mod limits;
+mod pictures;
+mod room;
+mod settings;
+
+use glam::{UVec2, Vec2};
+
+use crate::camera::Patch;
+use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Statistic, Threads, Tile};
+use crate::kernels::project::DEPTH_BITS;
+use crate::kernels::splat::MAX_CHANNELS;
+use crate::kernels::{
+    self, blend_backward, blend_forward, emit, order_counts, project, project_backward,
+};
+use crate::splats::halves::StorageFormat;
+use crate::splats::scene::{GaussianSlice, Layout, Shape};
+use crate::splats::sort::{Count, RadixSort};
+use crate::{Error, Result};
+
+#[doc(hidden)]
+pub use frame::Frame;
+pub use frame::Status;
+use frame::{RANKS_PER_PARTITION, color_vectors};
+use limits::{longest_run, splats_per_turn};
+pub use settings::RenderSettings;
+
+/// What changes from render to render.
+#[derive(Clone, Copy, Debug)]
+pub struct RenderOptions {
+    /// Degree of the spherical harmonics used, at most the one stored.
+    pub sh_degree: u32,
+    /// What is seen where no splat is, RGB; features are zero there.
+    pub background: [f32; 3],
+}
+
+/// How the screen-space gradient enters the statistics of density control.
+#[derive(Clone, Copy, Debug)]
+pub struct Damping {
+    /// 0 to 1: the fraction that is damped.
+    pub weight: f32,
+    /// Depth from which nothing is damped, in world units.
+    pub depth: f32,
+}
+
+/// Where the backward pass leaves its results, each for all Gaussians.
+#[derive(Debug)]
+pub struct Gradients<'a> {
+    /// (columns x Gaussians): gradient of every parameter.
+    pub parameters: &'a mut Buffer<f32>,
+    /// (Gaussians): sums of the norms of the screen-space gradients in normalised device units.
+    pub grad_norm_sums: &'a mut Buffer<f32>,
+    /// (Gaussians): in how many steps each was seen.
+    pub visit_counts: &'a mut Buffer<u32>,
+}
+
+/// Renders Gaussians, forward and backward. Holds the memory of one view.
+///
+/// ```no_run
+/// use nightsplat::photographs::dataset::{Dataset, LoadOptions};
+/// use nightsplat::gpu::{DeviceChoice, Gpu};
+/// use nightsplat::splats::render::{RenderOptions, RenderSettings, Renderer};
+/// use nightsplat::splats::scene::ply;
+///
+/// let gpu = Gpu::new(&DeviceChoice::Best)?;
+/// let camera = Dataset::load("photos", &LoadOptions::default())?.views[0].camera;
+/// let gaussians = ply::load("run/model.ply")?;
+/// let settings = RenderSettings { shape: gaussians.shape, ..RenderSettings::default() };
+/// let mut renderer = Renderer::new(&gpu, settings)?;
+/// let on_device = gaussians.upload(&gpu)?;
+/// renderer.reserve(gaussians.count, [&camera])?;
+/// let options = RenderOptions { sh_degree: gaussians.shape.sh_degree, background: [0.0; 3] };
+/// renderer.render_image(&on_device, &camera, &options)?.save_png8("view.png")?;
+/// # Ok::<(), nightsplat::Error>(())
+/// ```
+#[derive(Debug)]
+pub struct Renderer {
+    gpu: Gpu,
+    settings: RenderSettings,
+    tile: Tile,
+    /// The most splats of one tile that the blending kernels follow.
+    longest_run: u32,
+    project: Pipeline<project::Kernel>,
+    order_counts: Pipeline<order_counts::Kernel>,
+    emit: Pipeline<emit::Kernel>,
+    blend_forward: Pipeline<blend_forward::Kernel>,
+    blend_backward: Pipeline<blend_backward::Kernel>,
+    project_backward: Pipeline<project_backward::Kernel>,
+    depth_sort: RadixSort,
+    tile_sort: RadixSort,
+    frame: Frame,
+}
+
+impl Renderer {
+    /// Builds the kernels; memory comes with [`Renderer::reserve`].
+    ///
+    /// # Errors
+    /// The driver refuses a kernel, or the tile does not suit the device.
+    pub fn new(gpu: &Gpu, settings: RenderSettings) -> Result<Self> {
+        let tile = settings.tile_on(gpu)?;
+        let Tile { size: [tile_width, tile_height], subgroups: subgroups_per_tile } = tile;
+        let channels = settings.channels() as u32;
+        let (alpha_max, partition_size) = (settings.max_alpha, RANKS_PER_PARTITION);
+        let (project, project_backward) = projections(gpu, &settings, tile.size)?;
+        let shaping_channels = settings.shaping_channels();
+        let (skips_groups, splats_per_turn) = (!gpu.properties().is_cpu, splats_per_turn(gpu));
+        // What every kernel that includes `splat.glsl` is specialised with, and what some are beside it.
+        macro_rules! constants {
+            ($kernel:ident $(, $own:ident)*) => {
+                $kernel::Constants { alpha_max, channels, tile_width, tile_height, $($own,)* }
+            };
+        }
+        Ok(Self {
+            gpu: gpu.clone(),
+            settings,
+            tile,
+            longest_run: longest_run(gpu),
+            project,
+            order_counts: gpu.pipeline(&order_counts::Constants { partition_size })?,
+            emit: gpu.pipeline(&constants!(emit, partition_size))?,
+            blend_forward: gpu.pipeline(&constants!(
+                blend_forward,
+                skips_groups,
+                splats_per_turn,
+                subgroups_per_tile
+            ))?,
+            blend_backward: gpu.pipeline(&constants!(
+                blend_backward,
+                shaping_channels,
+                skips_groups,
+                splats_per_turn,
+                subgroups_per_tile
+            ))?,
+            project_backward,
+            depth_sort: RadixSort::new(gpu, 0)?,
+            tile_sort: RadixSort::new(gpu, 0)?,
+            frame: Frame::new(gpu, settings.channels())?,
+        })
+    }
+
+    /// Renders Gaussians of another SH degree from now on.
+    ///
+    /// # Errors
+    /// The driver refuses a kernel; the renderer is as it was.
+    pub fn set_sh_degree(&mut self, sh_degree: u32) -> Result<()> {
+        if sh_degree == self.settings.shape.sh_degree {
+            return Ok(());
+        }
+        let shape = Shape { sh_degree, ..self.settings.shape };
+        let settings = RenderSettings { shape, ..self.settings };
+        (self.project, self.project_backward) = projections(&self.gpu, &settings, self.tile.size)?;
+        self.settings = settings;
+        Ok(())
+    }
+
+    /// How many intersections the last render had; waits for it.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub fn intersections(&self) -> Result<u32> {
+        Ok(self.gpu.read(&self.frame.counts)?[0])
+    }
+
+    /// The last render, planar (channels, H, W): RGB, then the features.
+    pub fn render(&self) -> &Buffer<f32> {
+        &self.frame.render
+    }
+
+    /// How much of the background the last render lets through, (H, W): 1 where no splat is.
+    pub fn transmittances(&self) -> &Buffer<f32> {
+        &self.frame.transmittances
+    }
+
+    /// What the driver tells of the blend kernels, forward and backward; none where it tells nothing.
+    ///
+    /// # Errors
+    /// The driver refuses a kernel.
+    pub fn blend_statistics(&self) -> Result<Option<[Vec<Statistic>; 2]>> {
+        let forward = self.blend_forward.statistics()?;
+        Ok(forward.zip(self.blend_backward.statistics()?).map(<[_; 2]>::from))
+    }
+
+    /// Everything that the passes of the last render handed each other.
+    #[doc(hidden)]
+    pub fn frame(&self) -> &Frame {
+        &self.frame
+    }
+
+    /// The status words: see [`Status`]. Kernels that change parameters look at the first and do nothing unless it is 0.
+    pub fn status(&self) -> &Buffer<u32> {
+        &self.frame.status
+    }
+
+    /// The last render and the status words, for a loss that reads the one and raises flags in the other.
+    pub fn render_and_status(&mut self) -> (&Buffer<f32>, &mut Buffer<u32>) {
+        (&self.frame.render, &mut self.frame.status)
+    }
+
+    /// What to say of a view whose [`Status::crowd`] is too large for this device.
+    pub fn too_crowded(&self, view: String, splats: u32) -> Error {
+        let [width, height] = self.tile.size;
+        let (tile, device) = (format!("{width}x{height}"), self.gpu.properties().name.clone());
+        Error::Crowded { view, splats, tile, device, limit: self.longest_run }
+    }
+
+    /// Lowers every flag of the status.
+    pub fn clear_status(&mut self, pass: &mut Recorder<'_>) {
+        pass.fill(&mut self.frame.status, 0);
+    }
+
+    /// Records the render of `gaussians` as a camera sees them, or a patch of what it sees.
+    ///
+    /// # Errors
+    /// The Gaussians are not made of what the settings say; they or the image exceed what was reserved; or a pass exceeds what
+    /// the device launches.
+    pub fn forward<'a>(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        gaussians: impl Into<GaussianSlice<'a>>,
+        patch: impl Into<Patch>,
+        options: &RenderOptions,
+    ) -> Result<()> {
+        let (gaussians, view) = (gaussians.into(), self.view(&patch.into())?);
+        self.check(&gaussians.layout)?;
+        let gaussian_count = gaussians.layout.count as u32;
+        pass.fill(&mut self.frame.gaussian_counts, gaussian_count);
+        self.record_project(pass, gaussians, &view, options.sh_degree)?;
+        self.record_bins(pass, gaussian_count, &view)?;
+        let mut background = [0.0; MAX_CHANNELS as usize];
+        background[..3].copy_from_slice(&options.background);
+        let frame = &mut self.frame;
+        pass.dispatch(
+            &self.blend_forward,
+            &blend_forward::Params {
+                size: view.camera.size,
+                tile_columns: view.tiles.x,
+                longest_run: self.longest_run,
+                background,
+            },
+            blend_forward::Buffers {
+                counts: frame.counts.slice(),
+                sorted_slots: frame.slots.slice(),
+                owners: frame.owners.slice(),
+                splats: frame.splats.slice(),
+                colors: frame.colors.slice(),
+                render: frame.render.slice_mut(),
+                transmittances: frame.transmittances.slice_mut(),
+                sorted_tiles: frame.tiles.slice(),
+                tile_ranges: frame.tile_ranges.slice_mut(),
+                status: frame.status.slice_mut(),
+            },
+            Threads::Workgroups([view.tile_count(), 1, 1]),
+        )
+    }
+
+    /// Records the gradients of the Gaussians, given `d_render`, that of the render recorded last (channels, H, W).
+    ///
+    /// # Errors
+    /// The Gaussians are not made of what the settings say, or a pass exceeds what the device launches.
+    #[expect(clippy::too_many_arguments, reason = "what the forward pass takes, and its gradient")]
+    pub fn backward<'a>(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        gaussians: impl Into<GaussianSlice<'a>>,
+        patch: impl Into<Patch>,
+        options: &RenderOptions,
+        damping: Damping,
+        d_render: &Buffer<f32>,
+        gradients: Gradients<'_>,
+    ) -> Result<()> {
+        let (gaussians, view) = (gaussians.into(), self.view(&patch.into())?);
+        self.check(&gaussians.layout)?;
+        let color_vectors = color_vectors(self.settings.channels());
+        let frame = &mut self.frame;
+        pass.dispatch(
+            &self.blend_backward,
+            &blend_backward::Params { size: view.camera.size, tile_columns: view.tiles.x },
+            blend_backward::Buffers {
+                tile_ranges: frame.tile_ranges.slice(),
+                sorted_slots: frame.slots.slice(),
+                owners: frame.owners.slice(),
+                splats: frame.splats.slice(),
+                colors: frame.colors.slice(),
+                render: frame.render.slice(),
+                d_render: d_render.slice(),
+                records: frame.records.slice_mut(),
+            },
+            Threads::Workgroups([view.tile_count(), 1, 1]),
+        )?;
+        let GaussianSlice { layout, parameters } = gaussians;
+        for batch in layout.batches(&self.gpu).iter() {
+            let gaussian_count = batch.gaussian_count();
+            pass.dispatch(
+                &self.project_backward,
+                &project_backward::Params {
+                    camera: view.camera,
+                    half_view: view.half_view,
+                    gaussian_count,
+                    sh_degree: options.sh_degree,
+                    damping_weight: damping.weight,
+                    damping_depth: damping.depth,
+                },
+                project_backward::Buffers {
+                    parameters: batch.rows(parameters, layout.words())?,
+                    splats: batch.rows(&frame.splats, 1)?,
+                    colors: batch.rows(&frame.colors, color_vectors)?,
+                    tile_counts: batch.rows(&frame.tile_counts, 1)?,
+                    emitted: batch.rows(&frame.emitted, 1)?,
+                    records: frame.records.slice(),
+                    status: frame.status.slice_mut(),
+                    gradients: batch.planes_mut(&mut *gradients.parameters)?,
+                    grad_norm_sums: batch.rows_mut(&mut *gradients.grad_norm_sums, 1)?,
+                    visit_counts: batch.rows_mut(&mut *gradients.visit_counts, 1)?,
+                },
+                Threads::Exactly([gaussian_count, 1, 1]),
+            )?;
+        }
+        Ok(())
+    }
+
+    fn record_project(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        GaussianSlice { layout, parameters }: GaussianSlice<'_>,
+        view: &View,
+        sh_degree: u32,
+    ) -> Result<()> {
+        let color_vectors = color_vectors(self.settings.channels());
+        let frame = &mut self.frame;
+        layout.batches(&self.gpu).iter().try_for_each(|batch| {
+            pass.dispatch(
+                &self.project,
+                &project::Params {
+                    camera: view.camera,
+                    near: self.settings.near,
+                    gaussian_count: batch.gaussian_count(),
+                    sh_degree,
+                    first_gaussian: batch.first_gaussian(),
+                },
+                project::Buffers {
+                    parameters: batch.rows(parameters, layout.words())?,
+                    splats: batch.rows_mut(&mut frame.splats, 1)?,
+                    colors: batch.rows_mut(&mut frame.colors, color_vectors)?,
+                    depth_keys: batch.rows_mut(&mut frame.depth_keys, 1)?,
+                    ids: batch.rows_mut(&mut frame.ids, 1)?,
+                    tile_counts: batch.rows_mut(&mut frame.tile_counts, 1)?,
+                },
+                Threads::Exactly([batch.gaussian_count(), 1, 1]),
+            )
+        })
+    }
+
+    /// Refuses Gaussians that the kernels would read as others, or that there is no memory for.
+    fn check(&self, layout: &Layout) -> Result<()> {
+        let RenderSettings { shape, rest, .. } = self.settings;
+        let reserved = self.frame.splats.len();
+        let problem = if layout.shape != shape {
+            let [own, made_for] = [layout.shape, shape];
+            format!("Gaussians of {own} cannot be rendered by a renderer made for {made_for}")
+        } else if layout.sh_rest != rest {
+            let [own, made_for] = [layout.sh_rest, rest];
+            format!(
+                "Gaussians with SH coefficients as {own:?} cannot be rendered by a renderer made for {made_for:?}"
+            )
+        } else if layout.count > reserved {
+            let count = layout.count;
+            format!("{count} Gaussians exceed the {reserved} that the renderer reserved")
+        } else {
+            return Ok(());
+        };
+        Err(Error::Usage(problem))
+    }
+
+    /// From projected splats to each tile's list of them, front to back.
+    fn record_bins(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        gaussian_count: u32,
+        view: &View,
+    ) -> Result<()> {
+        let frame = &mut self.frame;
+        let all = Count { counts: &frame.gaussian_counts, index: 0 };
+        self.depth_sort.record(pass, all, &mut frame.depth_keys, &mut frame.ids, DEPTH_BITS)?;
+        pass.dispatch(
+            &self.order_counts,
+            &order_counts::Params { gaussian_count, capacity: frame.intersection_capacity() },
+            order_counts::Buffers {
+                sorted_ids: frame.ids.slice(),
+                tile_counts: frame.tile_counts.slice(),
+                slots_before: frame.slots_before.slice_mut(),
+                sums: frame.sums.slice_mut(),
+                counts: frame.counts.slice_mut(),
+                status: frame.status.slice_mut(),
+                arrivals: frame.arrivals.slice_mut(),
+            },
+            Threads::Workgroups([gaussian_count.div_ceil(RANKS_PER_PARTITION).max(1), 1, 1]),
+        )?;
+        pass.dispatch(
+            &self.emit,
+            &emit::Params { size: view.camera.size, gaussian_count, tile_columns: view.tiles.x },
+            emit::Buffers {
+                counts: frame.counts.slice(),
+                sorted_ids: frame.ids.slice(),
+                tile_counts: frame.tile_counts.slice(),
+                slots_before: frame.slots_before.slice(),
+                sums: frame.sums.slice(),
+                splats: frame.splats.slice(),
+                tiles: frame.tiles.slice_mut(),
+                slots: frame.slots.slice_mut(),
+                owners: frame.owners.slice_mut(),
+                emitted: frame.emitted.slice_mut(),
+            },
+            Threads::Exactly([gaussian_count, 1, 1]),
+        )?;
+        let emitted = Count { counts: &frame.counts, index: 0 };
+        // One value more than there are tiles: padding sorts behind them all.
+        let bits = u32::BITS - view.tile_count().leading_zeros();
+        self.tile_sort.record(pass, emitted, &mut frame.tiles, &mut frame.slots, bits)
+    }
+
+    /// Columns and rows of tiles.
+    fn tiles(&self, size: UVec2) -> UVec2 {
+        let tile = UVec2::from(self.tile.size);
+        (size + tile - 1) / tile
+    }
+
+    fn view(&self, patch: &Patch) -> Result<View> {
+        let tiles = self.tiles(patch.size);
+        if self.settings.channels() * patch.pixel_count() > self.frame.render.len()
+            || (tiles.x * tiles.y) as usize > self.frame.tile_ranges.len()
+        {
+            let UVec2 { x: width, y: height } = patch.size;
+            let what = format!("a {width}x{height} image exceeds what the renderer reserved");
+            return Err(Error::Usage(what));
+        }
+        Ok(View { camera: patch.into(), half_view: patch.half_view(), tiles })
+    }
+}
+
+/// The kernels that read the Gaussians: of all kernels these alone know their SH degree.
+fn projections(
+    gpu: &Gpu,
+    settings: &RenderSettings,
+    [tile_width, tile_height]: [u32; 2],
+) -> Result<(Pipeline<project::Kernel>, Pipeline<project_backward::Kernel>)> {
+    let (channels, alpha_max) = (settings.channels() as u32, settings.max_alpha);
+    let (sh_degree, raw_colors) = (settings.shape.sh_degree, settings.raw_colors);
+    let half_rest = settings.rest == StorageFormat::Half;
+    let project = project::Constants {
+        channels,
+        alpha_max,
+        tile_width,
+        tile_height,
+        sh_degree,
+        raw_colors,
+        half_rest,
+    };
+    let project_backward = project_backward::Constants {
+        channels,
+        alpha_max,
+        tile_width,
+        tile_height,
+        sh_degree,
+        raw_colors,
+        half_rest,
+    };
+    Ok((gpu.pipeline(&project)?, gpu.pipeline(&project_backward)?))
+}
+
+/// A patch as the kernels take it, and the columns and rows of tiles of its image.
+struct View {
+    camera: kernels::Camera,
+    half_view: Vec2,
+    tiles: UVec2,
+}
+
+impl View {
+    fn tile_count(&self) -> u32 {
+        self.tiles.x * self.tiles.y
+    }
+}
