@@ -22,6 +22,7 @@ mod paths;
 mod precision;
 mod preset;
 mod rendered;
+mod start;
 mod submission;
 mod target_views;
 mod terms;
@@ -172,11 +173,20 @@ pub struct Trainer {
 }
 
 impl Trainer {
-    /// Uploads the training views, takes their statistics and places the first Gaussians.
+    /// Uploads the training views, takes their statistics and places the first Gaussians, or those of [`TrainConfig::init`].
     ///
     /// # Errors
-    /// The configuration makes no sense, or the device is out of memory or lost.
+    /// The configuration makes no sense, the model to begin with does not suit it, or the device is out of memory or lost.
     pub fn new(gpu: &Gpu, config: TrainConfig, dataset: &Dataset) -> Result<Self> {
+        let initial = config.initial_model()?;
+        Self::on_patches(gpu, config, dataset, initial.as_ref())
+    }
+
+    /// A trainer whose state a checkpoint is to replace: the model that its run began with need not be there any more.
+    ///
+    /// # Errors
+    /// As [`Trainer::new`].
+    pub(crate) fn to_restore(gpu: &Gpu, config: TrainConfig, dataset: &Dataset) -> Result<Self> {
         Self::on_patches(gpu, config, dataset, None)
     }
 

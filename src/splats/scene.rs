@@ -127,6 +127,28 @@ impl Gaussians {
         other
     }
 
+    /// The same with these features: those that come are zero, others go.
+    pub fn with_features(&self, features: Features) -> Self {
+        let mut other = Self::zeros(self.count, Shape { features, ..self.shape });
+        other.origin = self.origin;
+        let kept = |attribute: &Attribute| *attribute != Attribute::Features;
+        for attribute in ATTRIBUTES.iter().map(|spec| spec.attribute).filter(kept) {
+            let plane = other.plane(attribute);
+            other.parameters[plane].copy_from_slice(&self.parameters[self.plane(attribute)]);
+        }
+        let [own, new] = [self.shape.features, features].map(Features::width);
+        for feature in FEATURES.iter().map(|spec| spec.feature) {
+            let channels = [self.shape.features, features].map(|all| all.channels_of(feature));
+            let [Some(from), Some(to)] = channels else { continue };
+            let [from, to] = [from, to].map(|c| c.start - COLOR_CHANNELS..c.end - COLOR_CHANNELS);
+            let rows = other.features_mut().chunks_exact_mut(new);
+            rows.zip(self.features().chunks_exact(own)).for_each(|(new, own)| {
+                new[to.clone()].copy_from_slice(&own[from.clone()]);
+            });
+        }
+        other
+    }
+
     /// The least SH degree that there has to be room for.
     #[cfg(feature = "io")]
     pub(crate) fn sh_degree_in_use(&self) -> u32 {
