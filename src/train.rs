@@ -22,6 +22,7 @@ mod paths;
 mod precision;
 mod preset;
 mod rendered;
+mod start;
 mod submission;
 mod target_views;
 mod terms;
@@ -29,8 +30,6 @@ mod views;
 
 use std::panic::resume_unwind;
 use std::thread::{self, ScopedJoinHandle};
-
-use glam::DVec3;
 
 use crate::camera::{Camera, Frame};
 #[cfg(feature = "check")]
@@ -176,11 +175,20 @@ pub struct Trainer {
 }
 
 impl Trainer {
-    /// Uploads the training views, takes their statistics and places the first Gaussians.
+    /// Uploads the training views, takes their statistics and places the first Gaussians, or those of [`TrainConfig::init`].
     ///
     /// # Errors
-    /// The configuration makes no sense, or the device is out of memory or lost.
+    /// The configuration makes no sense, the model to begin with does not suit it, or the device is out of memory or lost.
     pub fn new(gpu: &Gpu, config: TrainConfig, dataset: &Dataset) -> Result<Self> {
+        let initial = config.initial_model()?;
+        Self::on_patches(gpu, config, dataset, initial.as_ref())
+    }
+
+    /// A trainer whose state a checkpoint is to replace: the model that its run began with need not be there any more.
+    ///
+    /// # Errors
+    /// As [`Trainer::new`].
+    pub(crate) fn to_restore(gpu: &Gpu, config: TrainConfig, dataset: &Dataset) -> Result<Self> {
         Self::on_patches(gpu, config, dataset, None)
     }
 
@@ -277,11 +285,7 @@ impl Trainer {
         let gaussians = match gaussians {
             // A run that ended before its highest SH degree was in use has a model without it.
             Some(gaussians) if settings.shape.holds(gaussians.shape) => {
-                let gaussians = gaussians.with_sh_degree(settings.shape.sh_degree);
-                match frame {
-                    Frame::WORLD => gaussians,
-                    _ => gaussians.from_world(&frame, DVec3::ZERO),
-                }
+                gaussians.with_sh_degree(settings.shape.sh_degree).from_world(&frame)
             }
             Some(Gaussians { shape: own, .. }) => {
                 let problem = format!("Gaussians of {own:?} make no model of {:?}", settings.shape);
@@ -364,11 +368,7 @@ impl Trainer {
     /// # Errors
     /// The device was lost.
     pub fn gaussians(&self) -> Result<Gaussians> {
-        let gaussians = self.gaussians_in_frame()?;
-        Ok(match self.frame {
-            Frame::WORLD => gaussians,
-            frame => gaussians.to_world(&frame, DVec3::ZERO),
-        })
+        Ok(self.gaussians_in_frame()?.to_world(&self.frame))
     }
 
     /// The same in [`Trainer::frame`], to the bit as they are trained.
@@ -474,7 +474,7 @@ impl Trainer {
         let model = &mut self.model;
         let [decoded, decoded_photograph] = &mut self.decoded;
 
-        self.renderer.forward(pass, &model.gaussians.parameters, view.patch, &options)?;
+        self.renderer.forward(pass, &model.gaussians, view.patch, &options)?;
         let (render, status) = self.renderer.render_and_status();
         let (d_render, size) = (&mut self.d_render, view.size());
         let input = view.input.decoded(pass, decoded)?;
@@ -527,7 +527,7 @@ impl Trainer {
         }
         self.renderer.backward(
             pass,
-            &model.gaussians.parameters,
+            &model.gaussians,
             view.patch,
             &options,
             damping,
@@ -573,7 +573,7 @@ impl Trainer {
     /// As [`Trainer::render`], of a camera in the frame.
     fn render_of_degree(&mut self, camera: &Camera, sh_degree: u32) -> Result<Rendered> {
         let options = RenderOptions { sh_degree, background: [0.0; 3] };
-        let gaussians = (&self.model.gaussians.parameters, self.model.count());
+        let gaussians = &self.model.gaussians;
         let networks = self.networks.as_mut().map(|terms| &mut terms.networks);
         Rendered::new(&mut self.renderer, gaussians, camera, &options, networks)
     }
@@ -585,7 +585,7 @@ impl Trainer {
     fn reserve(&mut self) -> Result<()> {
         let Self { model, views, renderer, .. } = self;
         let sizes = views.all().map(TrainView::size);
-        renderer.reserve_with_headroom([model.count(), model.capacity()], sizes)
+        renderer.reserve_sizes(model.count(), model.capacity(), sizes)
     }
 
     fn report(&self, step: u64, losses: &StepLosses, milliseconds: f64) -> StepReport {

@@ -124,6 +124,9 @@ pub(crate) struct TrainOptions {
     /// Learn exposures from where this table has them: name,ev or name,gain_r,gain_g,gain_b,bias_r,bias_g,bias_b [default: exposures.csv of the dataset]
     #[arg(long, value_name = "FILE")]
     exposures: Option<PathBuf>,
+    /// Begin with the Gaussians of a PLY, of a run or of another program, in the dataset's world, in place of the dataset's points
+    #[arg(long, value_name = "MODEL.ply")]
+    init: Option<PathBuf>,
     /// A folder of reference images by name, for scores only
     #[arg(long, value_name = "DIR")]
     reference: Option<PathBuf>,
@@ -396,6 +399,9 @@ impl TrainOptions {
             (config.exposure.learn, config.exposure.start) = (Learning::On, self.exposures.clone());
         }
         set(&mut config.exposure.learn, &self.exposure);
+        if self.init.is_some() {
+            config.init.clone_from(&self.init);
+        }
         if self.reference.is_some() {
             config.reference.clone_from(&self.reference);
         }

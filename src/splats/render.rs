@@ -23,9 +23,8 @@ use crate::kernels::splat::MAX_CHANNELS;
 use crate::kernels::{
     self, blend_backward, blend_forward, emit, order_counts, project, project_backward,
 };
-use crate::splats::batches::Batches;
-use crate::splats::halves::Bits;
-use crate::splats::scene::{Shape, width};
+use crate::splats::halves::StorageFormat;
+use crate::splats::scene::{GaussianSlice, Layout, Shape};
 use crate::splats::sort::{Count, RadixSort};
 use crate::{Error, Result};
 
@@ -78,10 +77,10 @@ pub struct Gradients<'a> {
 /// let gaussians = ply::load("run/model.ply")?;
 /// let settings = RenderSettings { shape: gaussians.shape, ..RenderSettings::default() };
 /// let mut renderer = Renderer::new(&gpu, settings)?;
-/// let parameters = gaussians.upload(&gpu)?;
+/// let on_device = gaussians.upload(&gpu)?;
 /// renderer.reserve(gaussians.count, [&camera])?;
 /// let options = RenderOptions { sh_degree: gaussians.shape.sh_degree, background: [0.0; 3] };
-/// renderer.render_image(&parameters, &camera, &options)?.save_png8("view.png")?;
+/// renderer.render_image(&on_device, &camera, &options)?.save_png8("view.png")?;
 /// # Ok::<(), nightsplat::Error>(())
 /// ```
 #[derive(Debug)]
@@ -219,21 +218,24 @@ impl Renderer {
         pass.fill(&mut self.frame.status, 0);
     }
 
-    /// Records the render of `gaussians` (planes of all attributes, in [`Batches`]) as a camera sees them, or a patch of what it
-    /// sees.
+    /// Records the render of `gaussians` as a camera sees them, or a patch of what it sees.
     ///
     /// # Errors
-    /// The image exceeds what was reserved, or a pass exceeds what the device launches.
-    pub fn forward(
+    /// The Gaussians are not made of what the settings say; they or the image exceed what was reserved; or a pass exceeds what
+    /// the device launches.
+    pub fn forward<'a>(
         &mut self,
         pass: &mut Recorder<'_>,
-        gaussians: &Buffer<f32>,
+        gaussians: impl Into<GaussianSlice<'a>>,
         patch: impl Into<Patch>,
         options: &RenderOptions,
     ) -> Result<()> {
-        let view = self.view(&patch.into())?;
+        let (gaussians, view) = (gaussians.into(), self.view(&patch.into())?);
+        self.check(&gaussians.layout)?;
+        let gaussian_count = gaussians.layout.count as u32;
+        pass.fill(&mut self.frame.gaussian_counts, gaussian_count);
         self.record_project(pass, gaussians, &view, options.sh_degree)?;
-        self.record_bins(pass, &view)?;
+        self.record_bins(pass, gaussian_count, &view)?;
         let mut background = [0.0; MAX_CHANNELS as usize];
         background[..3].copy_from_slice(&options.background);
         let frame = &mut self.frame;
@@ -264,19 +266,20 @@ impl Renderer {
     /// Records the gradients of the Gaussians, given `d_render`, that of the render recorded last (channels, H, W).
     ///
     /// # Errors
-    /// A pass exceeds what the device launches.
+    /// The Gaussians are not made of what the settings say, or a pass exceeds what the device launches.
     #[expect(clippy::too_many_arguments, reason = "what the forward pass takes, and its gradient")]
-    pub fn backward(
+    pub fn backward<'a>(
         &mut self,
         pass: &mut Recorder<'_>,
-        gaussians: &Buffer<f32>,
+        gaussians: impl Into<GaussianSlice<'a>>,
         patch: impl Into<Patch>,
         options: &RenderOptions,
         damping: Damping,
         d_render: &Buffer<f32>,
         gradients: Gradients<'_>,
     ) -> Result<()> {
-        let view = self.view(&patch.into())?;
+        let (gaussians, view) = (gaussians.into(), self.view(&patch.into())?);
+        self.check(&gaussians.layout)?;
         let color_vectors = color_vectors(self.settings.channels());
         let frame = &mut self.frame;
         pass.dispatch(
@@ -294,10 +297,9 @@ impl Renderer {
             },
             Threads::Workgroups([view.tile_count(), 1, 1]),
         )?;
-        let parameter_columns = self.parameter_columns();
-        for batch in self.batches().iter() {
+        let GaussianSlice { layout, parameters } = gaussians;
+        for batch in layout.batches(&self.gpu).iter() {
             let gaussian_count = batch.gaussian_count();
-            let frame = &mut self.frame;
             pass.dispatch(
                 &self.project_backward,
                 &project_backward::Params {
@@ -309,7 +311,7 @@ impl Renderer {
                     damping_depth: damping.depth,
                 },
                 project_backward::Buffers {
-                    parameters: batch.rows(gaussians, parameter_columns)?,
+                    parameters: batch.rows(parameters, layout.words())?,
                     splats: batch.rows(&frame.splats, 1)?,
                     colors: batch.rows(&frame.colors, color_vectors)?,
                     tile_counts: batch.rows(&frame.tile_counts, 1)?,
@@ -329,14 +331,13 @@ impl Renderer {
     fn record_project(
         &mut self,
         pass: &mut Recorder<'_>,
-        gaussians: &Buffer<f32>,
+        GaussianSlice { layout, parameters }: GaussianSlice<'_>,
         view: &View,
         sh_degree: u32,
     ) -> Result<()> {
         let color_vectors = color_vectors(self.settings.channels());
-        let parameter_columns = self.parameter_columns();
-        let (batches, frame) = (self.batches(), &mut self.frame);
-        batches.iter().try_for_each(|batch| {
+        let frame = &mut self.frame;
+        layout.batches(&self.gpu).iter().try_for_each(|batch| {
             pass.dispatch(
                 &self.project,
                 &project::Params {
@@ -347,7 +348,7 @@ impl Renderer {
                     first_gaussian: batch.first_gaussian(),
                 },
                 project::Buffers {
-                    parameters: batch.rows(gaussians, parameter_columns)?,
+                    parameters: batch.rows(parameters, layout.words())?,
                     splats: batch.rows_mut(&mut frame.splats, 1)?,
                     colors: batch.rows_mut(&mut frame.colors, color_vectors)?,
                     depth_keys: batch.rows_mut(&mut frame.depth_keys, 1)?,
@@ -359,22 +360,35 @@ impl Renderer {
         })
     }
 
-    /// How those that render lie in the buffers of their planes.
-    /// Words per Gaussian of what is rendered.
-    fn parameter_columns(&self) -> usize {
+    /// Refuses Gaussians that the kernels would read as others, or that there is no memory for.
+    fn check(&self, layout: &Layout) -> Result<()> {
         let RenderSettings { shape, rest, .. } = self.settings;
-        rest.columns([width(shape), shape.features.width()])
-    }
-
-    fn batches(&self) -> Batches {
-        let (count, shape) = (self.frame.gaussian_count as usize, self.settings.shape);
-        Batches::new(&self.gpu, count, [width(shape), shape.features.width()])
+        let reserved = self.frame.splats.len();
+        let problem = if layout.shape != shape {
+            let [own, made_for] = [layout.shape, shape];
+            format!("Gaussians of {own} cannot be rendered by a renderer made for {made_for}")
+        } else if layout.sh_rest != rest {
+            let [own, made_for] = [layout.sh_rest, rest];
+            format!(
+                "Gaussians with SH coefficients as {own:?} cannot be rendered by a renderer made for {made_for:?}"
+            )
+        } else if layout.count > reserved {
+            let count = layout.count;
+            format!("{count} Gaussians exceed the {reserved} that the renderer reserved")
+        } else {
+            return Ok(());
+        };
+        Err(Error::Usage(problem))
     }
 
     /// From projected splats to each tile's list of them, front to back.
-    fn record_bins(&mut self, pass: &mut Recorder<'_>, view: &View) -> Result<()> {
+    fn record_bins(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        gaussian_count: u32,
+        view: &View,
+    ) -> Result<()> {
         let frame = &mut self.frame;
-        let gaussian_count = frame.gaussian_count;
         let all = Count { counts: &frame.gaussian_counts, index: 0 };
         self.depth_sort.record(pass, all, &mut frame.depth_keys, &mut frame.ids, DEPTH_BITS)?;
         pass.dispatch(
@@ -441,7 +455,7 @@ fn projections(
 ) -> Result<(Pipeline<project::Kernel>, Pipeline<project_backward::Kernel>)> {
     let (channels, alpha_max) = (settings.channels() as u32, settings.max_alpha);
     let (sh_degree, raw_colors) = (settings.shape.sh_degree, settings.raw_colors);
-    let half_rest = settings.rest == Bits::Half;
+    let half_rest = settings.rest == StorageFormat::Half;
     let project = project::Constants {
         channels,
         alpha_max,

@@ -64,6 +64,10 @@ pub struct TrainConfig {
     /// A folder of reference images by name, in place of what lies beside the input.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub reference: Option<PathBuf>,
+    /// A PLY whose Gaussians the training begins with, in place of first ones at the points; every SH degree is in use from the
+    /// first step.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub init: Option<PathBuf>,
     /// Masks hide what is white, not what is black.
     #[serde(skip_serializing_if = "is_off")]
     pub invert_masks: bool,
@@ -189,6 +193,7 @@ impl Default for TrainConfig {
         Self {
             dataset: PathBuf::new(),
             reference: None,
+            init: None,
             invert_masks: false,
             steps: 5000,
             downscale: 1.0,

@@ -44,7 +44,7 @@ impl Trainer {
         let Some((largest, _)) = largest else { return Ok(None) };
         let patches: Vec<Patch> =
             patches().filter(|&(place, _)| place == largest).map(|(_, patch)| patch).collect();
-        let gaussians = &self.model.gaussians.parameters;
+        let gaussians = self.model.gaussians.slice();
         let mut met = 0;
         for patch in &patches {
             met = met.max(self.renderer.count_intersections(gaussians, patch)?);

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::decode;
-use crate::splats::halves::Bits;
+use crate::splats::halves::StorageFormat;
 
 /// In how many bits a run keeps what it could keep in fewer.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -19,9 +19,9 @@ pub struct PrecisionConfig {
     /// The training photographs, or the targets that are made of them once.
     pub photographs: PhotographBits,
     /// SH coefficients above degree 0.
-    pub rest: Bits,
+    pub rest: StorageFormat,
     /// What Adam keeps of the gradients of every Gaussian.
-    pub moments: Bits,
+    pub moments: StorageFormat,
 }
 
 /// In how many bits a photograph, or a target, is kept on the device.

@@ -168,7 +168,7 @@ mod tests {
     use crate::networks::Form;
     use crate::photographs::tone::ToneSettings;
     use crate::splats::densify::DensityControl;
-    use crate::splats::halves::Bits;
+    use crate::splats::halves::StorageFormat;
     use crate::train::{Background, ModelConfig};
 
     fn applied(preset: Preset, scene: &str, curve: ToneCurve) -> TrainConfig {
@@ -221,7 +221,10 @@ mod tests {
             (Background::Random, Background::Black)
         );
         assert_eq!((balanced.schedule.settle_steps, defaults.schedule.settle_steps), (250, 0));
-        assert_eq!((balanced.precision.rest, balanced.precision.moments), (Bits::Half, Bits::Half));
+        assert_eq!(
+            (balanced.precision.rest, balanced.precision.moments),
+            (StorageFormat::Half, StorageFormat::Half)
+        );
         let (tone, stop) = (defaults.tone.clone(), defaults.stop.clone());
         assert_eq!((balanced.density.fill, defaults.density.fill), (5_000, 0));
         let (density, precision) = (defaults.density.clone(), defaults.precision.clone());

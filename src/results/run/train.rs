@@ -169,7 +169,10 @@ fn begin(
     // A disk that has room for the run has it for photographs.
     config.spool.get_or_insert_with(|| out.to_owned());
     let config = &config;
-    let mut trainer = Trainer::new(gpu, config.clone(), dataset)?;
+    let mut trainer = match checkpoint {
+        Some(_) => Trainer::to_restore(gpu, config.clone(), dataset)?,
+        None => Trainer::new(gpu, config.clone(), dataset)?,
+    };
     if let Some(checkpoint) = checkpoint {
         trainer.restore(&checkpoint)?;
         let step = trainer.steps_done();
