@@ -8,16 +8,19 @@
 //! Counts stay on the device. Where the intersections of a view exceed the memory reserved for them, a status flag is
 //! raised, nothing is rendered or updated, and the host grows the buffers and redoes the step ([`Renderer::grow`]).
 
+mod cameras;
 mod frame;
 mod limits;
 mod pictures;
 mod room;
 mod settings;
 
+use std::collections::BTreeMap;
+
 use glam::{UVec2, Vec2};
 
 use crate::batches::Batches;
-use crate::camera::Patch;
+use crate::camera::CameraModel;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Statistic, Threads, Tile};
 use crate::halves::Bits;
 use crate::kernels::project::DEPTH_BITS;
@@ -29,6 +32,7 @@ use crate::scene::{Shape, width};
 use crate::sort::{Count, RadixSort};
 use crate::{Error, Result};
 
+pub use cameras::{Viewpoint, Viewpoints};
 #[doc(hidden)]
 pub use frame::Frame;
 pub use frame::Status;
@@ -91,12 +95,12 @@ pub struct Renderer {
     tile: Tile,
     /// The most splats of one tile that the blending kernels follow.
     longest_run: u32,
-    project: Pipeline<project::Kernel>,
+    /// By camera model; those of a model come with the first view of it, a pinhole's at once.
+    projections: BTreeMap<u32, Projections>,
     order_counts: Pipeline<order_counts::Kernel>,
     emit: Pipeline<emit::Kernel>,
     blend_forward: Pipeline<blend_forward::Kernel>,
     blend_backward: Pipeline<blend_backward::Kernel>,
-    project_backward: Pipeline<project_backward::Kernel>,
     depth_sort: RadixSort,
     tile_sort: RadixSort,
     frame: Frame,
@@ -112,7 +116,8 @@ impl Renderer {
         let Tile { size: [tile_width, tile_height], subgroups: subgroups_per_tile } = tile;
         let channels = settings.channels() as u32;
         let (alpha_max, partition_size) = (settings.max_alpha, RANKS_PER_PARTITION);
-        let (project, project_backward) = projections(gpu, &settings, tile.size)?;
+        let pinhole = CameraModel::Pinhole.number();
+        let projections = Projections::new(gpu, &settings, tile.size, pinhole)?;
         let shaping_channels = settings.shaping_channels();
         let (skips_groups, splats_per_turn) = (!gpu.properties().is_cpu, splats_per_turn(gpu));
         // What every kernel that includes `splat.glsl` is specialised with, and what some are beside it.
@@ -126,7 +131,7 @@ impl Renderer {
             settings,
             tile,
             longest_run: longest_run(gpu),
-            project,
+            projections: BTreeMap::from([(pinhole, projections)]),
             order_counts: gpu.pipeline(&order_counts::Constants { partition_size })?,
             emit: gpu.pipeline(&constants!(emit, partition_size))?,
             blend_forward: gpu.pipeline(&constants!(
@@ -142,7 +147,6 @@ impl Renderer {
                 splats_per_turn,
                 subgroups_per_tile
             ))?,
-            project_backward,
             depth_sort: RadixSort::new(gpu, 0)?,
             tile_sort: RadixSort::new(gpu, 0)?,
             frame: Frame::new(gpu, settings.channels())?,
@@ -159,7 +163,10 @@ impl Renderer {
         }
         let shape = Shape { sh_degree, ..self.settings.shape };
         let settings = RenderSettings { shape, ..self.settings };
-        (self.project, self.project_backward) = projections(&self.gpu, &settings, self.tile.size)?;
+        let own = |&model: &u32| {
+            Ok((model, Projections::new(&self.gpu, &settings, self.tile.size, model)?))
+        };
+        self.projections = self.projections.keys().map(own).collect::<Result<_>>()?;
         self.settings = settings;
         Ok(())
     }
@@ -220,18 +227,22 @@ impl Renderer {
     }
 
     /// Records the render of `gaussians` (planes of all attributes, in [`Batches`]) as a camera sees them, or a patch of what it
-    /// sees.
+    /// sees. The first view of a camera model builds the kernels for it.
     ///
     /// # Errors
-    /// The image exceeds what was reserved, or a pass exceeds what the device launches.
-    pub fn forward(
+    /// The image exceeds what was reserved, a pass exceeds what the device launches, or the driver refuses a kernel.
+    pub fn forward<'a>(
         &mut self,
         pass: &mut Recorder<'_>,
         gaussians: &Buffer<f32>,
-        patch: impl Into<Patch>,
+        viewpoint: impl Into<Viewpoint<'a>>,
         options: &RenderOptions,
     ) -> Result<()> {
-        let view = self.view(&patch.into())?;
+        let viewpoint = viewpoint.into();
+        let view = self.view(&viewpoint)?;
+        if viewpoint.on_device.is_none() {
+            pass.update(&mut self.frame.camera, &[(&viewpoint.patch).into()])?;
+        }
         self.record_project(pass, gaussians, &view, options.sh_degree)?;
         self.record_bins(pass, &view)?;
         let mut background = [0.0; MAX_CHANNELS as usize];
@@ -240,7 +251,7 @@ impl Renderer {
         pass.dispatch(
             &self.blend_forward,
             &blend_forward::Params {
-                size: view.camera.size,
+                size: view.size,
                 tile_columns: view.tiles.x,
                 longest_run: self.longest_run,
                 background,
@@ -261,27 +272,28 @@ impl Renderer {
         )
     }
 
-    /// Records the gradients of the Gaussians, given `d_render`, that of the render recorded last (channels, H, W).
+    /// Records the gradients of the Gaussians, given `d_render`, that of the render recorded last (channels, H, W), which was
+    /// of the same viewpoint.
     ///
     /// # Errors
     /// A pass exceeds what the device launches.
     #[expect(clippy::too_many_arguments, reason = "what the forward pass takes, and its gradient")]
-    pub fn backward(
+    pub fn backward<'a>(
         &mut self,
         pass: &mut Recorder<'_>,
         gaussians: &Buffer<f32>,
-        patch: impl Into<Patch>,
+        viewpoint: impl Into<Viewpoint<'a>>,
         options: &RenderOptions,
         damping: Damping,
         d_render: &Buffer<f32>,
         gradients: Gradients<'_>,
     ) -> Result<()> {
-        let view = self.view(&patch.into())?;
+        let view = self.view(&viewpoint.into())?;
         let color_vectors = color_vectors(self.settings.channels());
         let frame = &mut self.frame;
         pass.dispatch(
             &self.blend_backward,
-            &blend_backward::Params { size: view.camera.size, tile_columns: view.tiles.x },
+            &blend_backward::Params { size: view.size, tile_columns: view.tiles.x },
             blend_backward::Buffers {
                 tile_ranges: &frame.tile_ranges,
                 sorted_slots: &frame.slots,
@@ -295,13 +307,14 @@ impl Renderer {
             Threads::Workgroups([view.tile_count(), 1, 1]),
         )?;
         let parameter_columns = self.parameter_columns();
+        let project_backward = &self.projections[&view.model].backward;
         for batch in self.batches().iter() {
             let gaussian_count = batch.gaussian_count();
             let frame = &mut self.frame;
             pass.dispatch(
-                &self.project_backward,
+                project_backward,
                 &project_backward::Params {
-                    camera: view.camera,
+                    camera_index: view.camera_index,
                     half_view: view.half_view,
                     gaussian_count,
                     sh_degree: options.sh_degree,
@@ -319,6 +332,7 @@ impl Renderer {
                     gradients: &mut batch.of_planes(gradients.parameters)?,
                     grad_norm_sums: &mut batch.of_rows(gradients.grad_norm_sums, 1)?,
                     visit_counts: &mut batch.of_rows(gradients.visit_counts, 1)?,
+                    cameras: view.cameras.unwrap_or(&frame.camera),
                 },
                 Threads::Exactly([gaussian_count, 1, 1]),
             )?;
@@ -330,15 +344,16 @@ impl Renderer {
         &mut self,
         pass: &mut Recorder<'_>,
         gaussians: &Buffer<f32>,
-        view: &View,
+        view: &View<'_>,
         sh_degree: u32,
     ) -> Result<()> {
         let (frame, color_vectors) = (&self.frame, color_vectors(self.settings.channels()));
+        let project = &self.projections[&view.model].forward;
         self.batches().iter().try_for_each(|batch| {
             pass.dispatch(
-                &self.project,
+                project,
                 &project::Params {
-                    camera: view.camera,
+                    camera_index: view.camera_index,
                     near: self.settings.near,
                     gaussian_count: batch.gaussian_count(),
                     sh_degree,
@@ -351,6 +366,7 @@ impl Renderer {
                     depth_keys: &mut batch.of_rows(&frame.depth_keys, 1)?,
                     ids: &mut batch.of_rows(&frame.ids, 1)?,
                     tile_counts: &mut batch.of_rows(&frame.tile_counts, 1)?,
+                    cameras: view.cameras.unwrap_or(&frame.camera),
                 },
                 Threads::Exactly([batch.gaussian_count(), 1, 1]),
             )
@@ -370,7 +386,7 @@ impl Renderer {
     }
 
     /// From projected splats to each tile's list of them, front to back.
-    fn record_bins(&mut self, pass: &mut Recorder<'_>, view: &View) -> Result<()> {
+    fn record_bins(&mut self, pass: &mut Recorder<'_>, view: &View<'_>) -> Result<()> {
         let frame = &mut self.frame;
         let gaussian_count = frame.gaussian_count;
         let all = Count { counts: &frame.gaussian_counts, index: 0 };
@@ -391,7 +407,7 @@ impl Renderer {
         )?;
         pass.dispatch(
             &self.emit,
-            &emit::Params { size: view.camera.size, gaussian_count, tile_columns: view.tiles.x },
+            &emit::Params { size: view.size, gaussian_count, tile_columns: view.tiles.x },
             emit::Buffers {
                 counts: &frame.counts,
                 sorted_ids: &frame.ids,
@@ -418,7 +434,8 @@ impl Renderer {
         (size + tile - 1) / tile
     }
 
-    fn view(&self, patch: &Patch) -> Result<View> {
+    fn view<'a>(&mut self, viewpoint: &Viewpoint<'a>) -> Result<View<'a>> {
+        let Viewpoint { patch, on_device } = viewpoint;
         let tiles = self.tiles(patch.size);
         if self.settings.channels() * patch.pixel_count() > self.frame.render.len()
             || (tiles.x * tiles.y) as usize > self.frame.tile_ranges.len()
@@ -427,48 +444,65 @@ impl Renderer {
             let what = format!("a {width}x{height} image exceeds what the renderer reserved");
             return Err(Error::Usage(what));
         }
-        Ok(View { camera: patch.into(), half_view: patch.half_view(), tiles })
+        let model = patch.camera.model.number();
+        if !self.projections.contains_key(&model) {
+            let own = Projections::new(&self.gpu, &self.settings, self.tile.size, model)?;
+            self.projections.insert(model, own);
+        }
+        let (cameras, camera_index) = on_device.unzip();
+        let camera_index = camera_index.unwrap_or_default();
+        let (size, half_view) = (patch.size, patch.half_view());
+        Ok(View { model, cameras, camera_index, size, half_view, tiles })
     }
 }
 
-/// The kernels that read the Gaussians: of all kernels these alone know their SH degree.
-fn projections(
-    gpu: &Gpu,
-    settings: &RenderSettings,
-    [tile_width, tile_height]: [u32; 2],
-) -> Result<(Pipeline<project::Kernel>, Pipeline<project_backward::Kernel>)> {
-    let (channels, alpha_max) = (settings.channels() as u32, settings.max_alpha);
-    let (sh_degree, raw_colors) = (settings.shape.sh_degree, settings.raw_colors);
-    let half_rest = settings.rest == Bits::Half;
-    let project = project::Constants {
-        channels,
-        alpha_max,
-        tile_width,
-        tile_height,
-        sh_degree,
-        raw_colors,
-        half_rest,
-    };
-    let project_backward = project_backward::Constants {
-        channels,
-        alpha_max,
-        tile_width,
-        tile_height,
-        sh_degree,
-        raw_colors,
-        half_rest,
-    };
-    Ok((gpu.pipeline(&project)?, gpu.pipeline(&project_backward)?))
+/// The kernels that read Gaussians and camera: of all kernels these alone know the SH degree and the camera model.
+#[derive(Debug)]
+struct Projections {
+    forward: Pipeline<project::Kernel>,
+    backward: Pipeline<project_backward::Kernel>,
 }
 
-/// A patch as the kernels take it, and the columns and rows of tiles of its image.
-struct View {
-    camera: kernels::Camera,
+impl Projections {
+    fn new(
+        gpu: &Gpu,
+        settings: &RenderSettings,
+        [tile_width, tile_height]: [u32; 2],
+        camera_model: u32,
+    ) -> Result<Self> {
+        let (channels, alpha_max) = (settings.channels() as u32, settings.max_alpha);
+        let (sh_degree, raw_colors) = (settings.shape.sh_degree, settings.raw_colors);
+        let half_rest = settings.rest == Bits::Half;
+        macro_rules! pipeline {
+            ($kernel:ident) => {
+                gpu.pipeline(&$kernel::Constants {
+                    channels,
+                    alpha_max,
+                    tile_width,
+                    tile_height,
+                    sh_degree,
+                    raw_colors,
+                    half_rest,
+                    camera_model,
+                })?
+            };
+        }
+        Ok(Self { forward: pipeline!(project), backward: pipeline!(project_backward) })
+    }
+}
+
+/// A viewpoint as the kernels take it, and the columns and rows of tiles of its image.
+struct View<'a> {
+    model: u32,
+    /// None: those of the renderer.
+    cameras: Option<&'a Buffer<kernels::Camera>>,
+    camera_index: u32,
+    size: UVec2,
     half_view: Vec2,
     tiles: UVec2,
 }
 
-impl View {
+impl View<'_> {
     fn tile_count(&self) -> u32 {
         self.tiles.x * self.tiles.y
     }

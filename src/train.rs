@@ -461,7 +461,8 @@ impl Trainer {
         let model = &mut self.model;
         let [decoded, decoded_photograph] = &mut self.decoded;
 
-        self.renderer.forward(pass, &model.gaussians.parameters, view.patch, &options)?;
+        let viewpoint = self.views.viewpoint(view);
+        self.renderer.forward(pass, &model.gaussians.parameters, viewpoint, &options)?;
         let (render, status) = self.renderer.render_and_status();
         let (d_render, size) = (&mut self.d_render, view.size());
         let input = view.input.decoded(pass, decoded)?;
@@ -515,7 +516,7 @@ impl Trainer {
         self.renderer.backward(
             pass,
             &model.gaussians.parameters,
-            view.patch,
+            viewpoint,
             &options,
             damping,
             &self.d_render,

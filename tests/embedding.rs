@@ -9,7 +9,7 @@ use std::sync::Mutex;
 use ash::vk::Handle as _;
 use ash::{ext, khr, vk};
 use glam::{DAffine3, DVec2};
-use nightsplat::camera::Camera;
+use nightsplat::camera::{Camera, CameraModel};
 use nightsplat::gpu::testing::gpu;
 use nightsplat::gpu::{Gpu, HostDevice, required_device_features};
 use nightsplat::image::Image;
@@ -84,6 +84,7 @@ fn camera() -> Camera {
         height: 40,
         focal: DVec2::splat(40.0),
         principal_point: DVec2::new(24.0, 20.0),
+        model: CameraModel::Pinhole,
         view_from_world: DAffine3::IDENTITY,
     }
 }

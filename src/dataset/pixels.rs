@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use super::undistort::{Undistortion, WIDEST};
 use super::{LoadOptions, Split, View, masks};
-use crate::camera::{Camera, Lens};
+use crate::camera::{Camera, CameraModel, Lens};
 use crate::image::{Image, Mask, Orientation};
 use crate::{Error, Result};
 
@@ -262,7 +262,7 @@ fn load_group(
 
 /// What makes a pinhole of the lens; none where it is one.
 fn undistortion(lens: &Lens, name: &str) -> Result<Option<Undistortion>> {
-    let undistortion = (!lens.is_pinhole()).then(|| {
+    let undistortion = (lens.model() != Some(CameraModel::Pinhole)).then(|| {
         Undistortion::new(lens).ok_or_else(|| {
             let problem = "its distortion coefficients describe no lens; calibrate again or undistort with COLMAP";
             Error::input(name, problem)
@@ -323,6 +323,7 @@ fn load_view(
         height: lens.height,
         focal: undistortion.map_or(lens.focal, |undistortion| undistortion.focal),
         principal_point: lens.principal_point,
+        model: CameraModel::Pinhole,
         view_from_world,
     };
     let camera = camera.resized(size.0, size.1);

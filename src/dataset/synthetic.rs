@@ -13,7 +13,7 @@ use rayon::prelude::*;
 use serde_json::{Value, json};
 
 use self::room::{FOCUS, Room};
-use crate::camera::Camera;
+use crate::camera::{Camera, CameraModel};
 use crate::image::{Image, srgb_from_linear};
 use crate::random::Stream;
 use crate::{Error, Result};
@@ -201,6 +201,7 @@ fn camera(view: usize, options: &SyntheticOptions) -> Camera {
         height: options.height,
         focal: DVec2::new(focal, 1.01 * focal),
         principal_point: size * DVec2::new(0.525, 0.485),
+        model: CameraModel::Pinhole,
         view_from_world: DAffine3::from_mat3_translation(world_from_view, FOCUS + distance * back)
             .inverse(),
     }

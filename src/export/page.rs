@@ -81,7 +81,7 @@ impl Page<'_> {
 
 fn view(bookmark: &Bookmark) -> serde_json::Value {
     let Bookmark { name, camera, pictures } = bookmark;
-    let Camera { width, height, focal, principal_point, view_from_world } = camera;
+    let Camera { width, height, focal, principal_point, view_from_world, .. } = camera;
     let pictures =
         pictures.iter().map(|(label, image)| json!({ "label": label, "image": jpeg(image) }));
     json!({
@@ -115,6 +115,7 @@ fn model(gaussians: &Gaussians) -> Vec<u8> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::camera::CameraModel;
     use crate::export::tests::drawn;
 
     #[test]
@@ -125,6 +126,7 @@ mod tests {
             height: 30,
             focal: glam::DVec2::splat(35.0),
             principal_point: glam::DVec2::new(20.0, 15.0),
+            model: CameraModel::Pinhole,
             view_from_world: glam::DAffine3::IDENTITY,
         };
         let evil = "</script><b>@MODEL@";

@@ -1,10 +1,12 @@
 //! Gaussians and a view of them, through the renderer that ships.
 
 use glam::{DAffine3, DMat3, DVec2, DVec3, UVec2, Vec2};
-use nightsplat::camera;
+use nightsplat::camera::{self, CameraModel};
 use nightsplat::gpu::testing::gpu;
 use nightsplat::gpu::{Buffer, Tile};
-use nightsplat::reference::camera::Camera;
+use nightsplat::reference::camera::{Camera, Model};
+use nightsplat::reference::camera_fisheye::Fisheye;
+use nightsplat::reference::camera_pinhole::Pinhole;
 use nightsplat::reference::gaussian::{Gaussian, Planes};
 use nightsplat::reference::sh::sh_count;
 use nightsplat::render::{self, Damping, RenderOptions, RenderSettings, Renderer, Status};
@@ -37,8 +39,19 @@ pub(crate) struct Setup {
 }
 
 impl Setup {
-    /// `count` Gaussians inside the view of a turned camera with an off-centre principal point.
+    /// `count` Gaussians inside the view of a turned pinhole with an off-centre principal point.
     pub(crate) fn new(count: usize, size: [u32; 2], shape: impl Into<Shape>, seed: u64) -> Self {
+        Self::seen_by(CameraModel::Pinhole, count, size, shape, seed)
+    }
+
+    /// The same of another camera model, whose numbers are of f32.
+    pub(crate) fn seen_by(
+        model: CameraModel,
+        count: usize,
+        size: [u32; 2],
+        shape: impl Into<Shape>,
+        seed: u64,
+    ) -> Self {
         let shape = shape.into();
         let (sin, cos) = 0.3f32.sin_cos();
         // Every number is one of f32, which is what the kernels are given.
@@ -50,6 +63,7 @@ impl Setup {
             height,
             focal: (Vec2::new(0.9, 0.8) * width as f32).as_dvec2(),
             principal_point: (Vec2::new(0.42, 0.57) * UVec2::from(size).as_vec2()).as_dvec2(),
+            model,
             view_from_world: DAffine3 {
                 matrix3: DMat3::from_cols(x, y, z),
                 translation: wide([0.2, -0.1, 0.4]),
@@ -85,10 +99,10 @@ impl Setup {
         }
     }
 
-    /// The point of the world that is seen at `pixel`, so deep in the view.
+    /// The point of the world that is seen at `pixel`, so deep in the view; behind the camera where a fisheye shows nothing.
     pub(crate) fn at_pixel(&self, pixel: DVec2, depth: f64) -> DVec3 {
+        let in_view = self.camera.in_view(pixel, depth).unwrap_or(DVec3::NEG_Z * depth);
         let camera = self.camera();
-        let in_view = ((pixel - camera.principal_point) / camera.focal * depth).extend(depth);
         camera.rotation.transpose() * (in_view - camera.translation)
     }
 
@@ -99,14 +113,23 @@ impl Setup {
 
     /// The camera as the references know it.
     pub(crate) fn camera(&self) -> Camera {
-        let camera::Camera { width, height, focal, principal_point, view_from_world } = self.camera;
+        let camera::Camera { width, height, focal, principal_point, model, view_from_world } =
+            self.camera;
         let size = UVec2::new(width, height).as_dvec2();
         let DAffine3 { matrix3: rotation, translation } = view_from_world;
         // As far outside the view as a fraction of its size.
         let margin = 0.15 * size;
-        let least_slope = -(principal_point + margin) / focal;
-        let most_slope = (size - principal_point + margin) / focal;
-        Camera { rotation, translation, focal, principal_point, size, least_slope, most_slope }
+        let model = match model {
+            CameraModel::Pinhole => Model::Pinhole(Pinhole {
+                least_slope: -(principal_point + margin) / focal,
+                most_slope: (size - principal_point + margin) / focal,
+            }),
+            CameraModel::Fisheye(lens) => Model::Fisheye(Fisheye {
+                distortion: lens.coefficients,
+                largest_angle: lens.largest_angle(),
+            }),
+        };
+        Camera { rotation, translation, focal, principal_point, size, model }
     }
 
     pub(crate) fn get(&self, i: usize) -> Gaussian {
