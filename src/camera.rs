@@ -64,6 +64,30 @@ impl Camera {
             .filter(|pixel| pixel.cmpge(DVec2::ZERO).all() && pixel.cmplt(size).all())
     }
 
+    /// The pixels of which a part shows nothing, as indices into a plane, ascending: outside the circle of a fisheye.
+    pub fn unseen(&self) -> Vec<usize> {
+        let CameraModel::Fisheye(lens) = self.model else { return vec![] };
+        let reach = lens.radius(lens.largest_angle());
+        let size = DVec2::new(self.width.into(), self.height.into());
+        // A rectangle lies within an ellipse where its corners do.
+        let is_within = |corner: DVec2, size: DVec2| {
+            let corners = [DVec2::ZERO, DVec2::X, DVec2::Y, DVec2::ONE];
+            let mut corners = corners.into_iter().map(|at| corner + at * size);
+            corners.all(|at| ((at - self.principal_point) / self.focal).length() < reach)
+        };
+        if is_within(DVec2::ZERO, size) {
+            return vec![];
+        }
+        let corner = |pixel: u64| {
+            let [column, row] = [pixel % u64::from(self.width), pixel / u64::from(self.width)];
+            DVec2::new(column as f64, row as f64)
+        };
+        let all = 0..u64::from(self.width) * u64::from(self.height);
+        all.filter(|&pixel| !is_within(corner(pixel), DVec2::ONE))
+            .map(|pixel| pixel as usize)
+            .collect()
+    }
+
     /// The same camera over an image of another size.
     pub fn resized(&self, width: u32, height: u32) -> Self {
         let scale = DVec2::new(f64::from(width), f64::from(height))

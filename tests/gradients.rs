@@ -8,7 +8,7 @@ use nightsplat::scene::Shape;
 
 mod common;
 use common::chain::Chain;
-use common::setup::{Gradients, Rendered, Setup, features, tile_of, variants};
+use common::setup::{Gradients, Rendered, Setup, features, fisheye, tile_of, variants};
 
 const SIZE: [u32; 2] = [26, 19];
 
@@ -61,6 +61,14 @@ fn check(setup: &Setup, name: &str) {
 fn the_chain_s_gradients_are_its_central_differences() {
     for degree in 0..=3 {
         check(&Setup::new(7, SIZE, degree, 21 + u64::from(degree)), &format!("degree {degree}"));
+    }
+}
+
+#[test]
+fn the_chain_s_gradients_are_its_central_differences_through_a_fisheye_too() {
+    for degree in [0, 2] {
+        let setup = Setup::seen_by(fisheye(), 7, SIZE, degree, 21 + u64::from(degree));
+        check(&setup, &format!("fisheye, degree {degree}"));
     }
 }
 

@@ -29,10 +29,24 @@ impl FinishedRun {
         dataset: Option<&Path>,
         device: Option<&DeviceChoice>,
     ) -> Result<Self> {
+        Self::open_with(folder, dataset, device, |_| {})
+    }
+
+    /// The same with something in the configuration changed.
+    ///
+    /// # Errors
+    /// As there.
+    pub(super) fn open_with(
+        folder: &Path,
+        dataset: Option<&Path>,
+        device: Option<&DeviceChoice>,
+        change: impl FnOnce(&mut TrainConfig),
+    ) -> Result<Self> {
         let mut config = run::load_config(folder)?;
         if let Some(dataset) = dataset {
             config.move_dataset(dataset);
         }
+        change(&mut config);
         let raw_colors = config.model.raw_colors;
         let gaussians = run::load_model(folder, raw_colors)?;
         if !config.dataset.is_dir() {

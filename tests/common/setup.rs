@@ -1,7 +1,7 @@
 //! Gaussians and a view of them, through the renderer that ships.
 
 use glam::{DAffine3, DMat3, DVec2, DVec3, UVec2, Vec2};
-use nightsplat::camera::{self, CameraModel};
+use nightsplat::camera::{self, CameraModel, KannalaBrandt};
 use nightsplat::gpu::testing::gpu;
 use nightsplat::gpu::{Buffer, Tile};
 use nightsplat::reference::camera::{Camera, Model};
@@ -261,11 +261,17 @@ pub(crate) fn tile_of((size, subgroups): ([u32; 2], u32)) -> Tile {
     Tile { size, subgroups }
 }
 
+/// A fisheye as they are sold, in numbers of f32.
+pub(crate) fn fisheye() -> CameraModel {
+    let coefficients = [0.05f32, -0.02, 0.006, -0.001].map(f64::from);
+    CameraModel::Fisheye(KannalaBrandt { coefficients })
+}
+
 /// Every size, channel count, tile and SH degree (stored, in use) that a kernel may trip over; colours are raw in those
 /// with many channels.
 pub(crate) fn variants() -> Vec<Setup> {
     type Row = (usize, [u32; 2], [u32; 2], usize, ([u32; 2], u32));
-    let rows: [Row; 9] = [
+    let rows: [Row; 11] = [
         (0, [33, 17], [0, 0], 3, ([16, 8], 1)),
         (1, [16, 16], [0, 0], 3, ([16, 16], 1)),
         (63, [50, 37], [1, 1], 4, ([16, 8], 1)),
@@ -275,10 +281,15 @@ pub(crate) fn variants() -> Vec<Setup> {
         (300, [131, 77], [3, 3], 3, ([16, 8], 1)),
         (300, [70, 53], [1, 1], 3, ([16, 16], 4)),
         (120, [51, 37], [2, 2], 11, ([16, 16], 2)),
+        (64, [50, 37], [1, 1], 3, ([16, 8], 1)),
+        (200, [66, 52], [2, 1], 4, ([16, 16], 1)),
     ];
-    let build = |(count, size, [stored, used], channels, tile): Row| {
+    /// Those from here on are seen by a fisheye.
+    const PINHOLES: usize = 9;
+    let build = |(i, (count, size, [stored, used], channels, tile)): (usize, Row)| {
         let shape = Shape { sh_degree: stored, features: features(channels) };
-        let mut setup = Setup::new(count, size, shape, count as u64);
+        let model = if i < PINHOLES { CameraModel::Pinhole } else { fisheye() };
+        let mut setup = Setup::seen_by(model, count, size, shape, count as u64);
         setup.options.sh_degree = used;
         setup.settings.raw_colors = channels > 4;
         // Tiles that do not suit its subgroups a device replaces by its own.
@@ -286,5 +297,5 @@ pub(crate) fn variants() -> Vec<Setup> {
             Some(tile_of(tile)).filter(|&tile| gpu().properties().suits_tile(tile));
         setup
     };
-    rows.map(build).to_vec()
+    rows.into_iter().enumerate().map(build).collect()
 }
