@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use table::{ATTRIBUTES, Width};
 
-#[path = "../src/attributes.rs"]
+#[path = "../src/splats/attributes.rs"]
 #[allow(dead_code, unreachable_pub, reason = "the crate sees more of the table than the shaders")]
 mod table;
 
@@ -15,7 +15,7 @@ pub(crate) const INCLUDE: &str = "attributes.glsl";
 pub(crate) fn glsl() -> String {
     let (rest, fixed) = ATTRIBUTES.split_last().expect("there are attributes");
     assert!(rest.width == Width::Rest && fixed.last().is_some_and(|s| s.width == Width::Features));
-    let mut out = "// Made by build.rs from src/attributes.rs.\n\n".to_owned();
+    let mut out = "// Made by build.rs from src/splats/attributes.rs.\n\n".to_owned();
     for spec in fixed {
         let (name, column) = (spec.name.to_uppercase(), spec.attribute.column(0));
         writeln!(out, "const uint {name}_COLUMN = {column};  // {}", spec.content)

@@ -14,9 +14,9 @@ use ash::{khr, vk};
 use glam::{DAffine3, DVec2, DVec3, Vec3};
 use nightsplat::camera::{Camera, CameraModel};
 use nightsplat::gpu::{Gpu, HostDevice, HostRecording, required_device_features};
-use nightsplat::image::Image;
-use nightsplat::render::{RenderOptions, RenderSettings, Renderer, Status};
-use nightsplat::scene::{Gaussians, init};
+use nightsplat::photographs::image::Image;
+use nightsplat::splats::render::{RenderOptions, RenderSettings, Renderer, Status};
+use nightsplat::splats::scene::{Gaussians, init};
 
 const OPTIONS: RenderOptions = RenderOptions { sh_degree: 0, background: [0.05, 0.05, 0.1] };
 

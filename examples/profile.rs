@@ -4,8 +4,8 @@
 
 use std::io::Write;
 
-use nightsplat::dataset::Dataset;
 use nightsplat::gpu::{DeviceChoice, Gpu, PassTime};
+use nightsplat::photographs::dataset::Dataset;
 use nightsplat::train::{TrainConfig, Trainer};
 
 /// Steps that are measured.

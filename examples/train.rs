@@ -6,12 +6,12 @@
 
 use std::path::PathBuf;
 
-use nightsplat::dataset::Dataset;
-use nightsplat::dataset::synthetic::{self, SyntheticOptions};
-use nightsplat::eval;
 use nightsplat::gpu::{DeviceChoice, Gpu};
-use nightsplat::run::{self, Event, HeldRun};
-use nightsplat::tone::{ToneCurve, ToneSettings};
+use nightsplat::photographs::dataset::Dataset;
+use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
+use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
+use nightsplat::results::eval;
+use nightsplat::results::run::{self, Event, HeldRun};
 use nightsplat::train::TrainConfig;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {

@@ -1,4 +1,4 @@
-//! Every parser of files from elsewhere as a function of bytes: what fuzzing and `tests/hostile_bytes.rs` feed.
+//! Every parser of files from elsewhere as a function of bytes: what fuzzing and `tests/photographs/hostile_bytes.rs` feed.
 //!
 //! A parser may refuse whatever it is given, in one line. It never panics, and what it lets through keeps its promises.
 
@@ -6,10 +6,10 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use nightsplat::Result;
-use nightsplat::dataset::{Dataset, LoadOptions};
-use nightsplat::image::Image;
-use nightsplat::scene::ply;
-use nightsplat::tone::{Profile, ToneSettings};
+use nightsplat::photographs::dataset::{Dataset, LoadOptions};
+use nightsplat::photographs::image::Image;
+use nightsplat::photographs::tone::{Profile, ToneSettings};
+use nightsplat::splats::scene::ply;
 use nightsplat::train::{TrainConfig, check_checkpoint};
 
 /// A parser, by the name of its fuzz target and of its folder of seeds.

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Prints what PyTorch's LPIPS says of the pictures of tests/nn/lpips.rs, on the weights that the test makes.
+"""Prints what PyTorch's LPIPS says of the pictures of tests/networks/lpips.rs, on the weights that the test makes.
 
     pip install torch torchvision lpips
     scripts/lpips-reference.py

@@ -35,9 +35,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 WORK = ROOT / "target" / "mutants"
 TREE = WORK / "tree"
-MODULES = ["optimizer", "densify", "loss", "render", "tone"]
-TESTS = ("batches curve_files curves densify embedding exposure faults fit gradients halves limits loss masks not_finite optimizer "
-         "parts patches precision pseudo_gt render tone tone_command training view_exposures window")
+MODULES = ["splats/optimizer", "splats/densify", "loss", "splats/render", "photographs/tone"]
+TESTS = "cli gpu loss networks photographs splats train"
 # Of the tests that reach a mutant, those that take together so many seconds are run, the quickest first.
 MOST_SECONDS = 120
 # Tests of a program run together as long as that takes no more than this beside what was spent before: a mutant that quick
@@ -291,7 +290,7 @@ def main():
     counts = defaultdict(Counter)
     numbers = {mutant["number"] for mutant in mutants}
     for mutant in everything:
-        module = re.match(r"src/(\w+)", mutant["file"])[1]
+        module = re.match(rf"src/({'|'.join(options.modules)})", mutant["file"])[1]
         what = verdicts.get(mutant["name"], ("not run",))[0] if mutant["number"] in numbers else \
             "unplanted" if mutant in unplanted else "unviable"
         counts[module][what] += 1

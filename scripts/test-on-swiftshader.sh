@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Runs the tests on SwiftShader, the software device that comes with Debian's chromium: subgroups of four, and no push
 # descriptors. Arguments go to `cargo test`:
-#     scripts/test-on-swiftshader.sh --test sort --test render
+#     scripts/test-on-swiftshader.sh --test splats
 # What fails there is named in scripts/known-failures/swiftshader.txt.
 set -euo pipefail
 cd "$(dirname "$0")/.."

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Runs the tests, of which exactly those must fail that a file names, with the reason behind `#`. What follows goes to
 # `cargo test`:
-#     scripts/test-with-known-failures.sh scripts/known-failures/swiftshader.txt --test sort --test render
+#     scripts/test-with-known-failures.sh scripts/known-failures/swiftshader.txt --test splats
 # A failure that is not named, a named one that passes and a process that died are failures of this script.
 set -uo pipefail
 cd "$(dirname "$0")/.."

@@ -6,7 +6,7 @@ use anyhow::Result;
 use clap::{CommandFactory, Parser, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
 
-use crate::image::Image;
+use crate::photographs::image::Image;
 
 pub mod ablate;
 mod batch;

@@ -6,6 +6,7 @@
 
 mod denoising;
 mod depth;
+pub mod exposure;
 mod image;
 mod log;
 mod structure;
@@ -15,10 +16,10 @@ use std::sync::Arc;
 use glam::UVec2;
 use serde::{Deserialize, Serialize};
 
+use crate::base::random::Stream;
 use crate::gpu::{Buffer, Gpu, Recorder};
 use crate::kernels::ToneParameters;
-use crate::random::Stream;
-use crate::scene::{Feature, Features};
+use crate::splats::scene::{Feature, Features};
 use crate::{Error, Result};
 
 pub use denoising::{DenoisingGradients, DenoisingInputs, DenoisingLoss, DenoisingWeights};

@@ -5,8 +5,8 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use nightsplat::Error;
+use nightsplat::base::output::printable;
 use nightsplat::cli::{Cli, in_options};
-use nightsplat::output::printable;
 use tracing_subscriber::filter::LevelFilter;
 
 fn main() -> ExitCode {

@@ -5,6 +5,7 @@ mod cache;
 mod checkpoint;
 mod config;
 mod decisions;
+pub mod diagnose;
 mod early_stopping;
 mod exposures;
 mod fill;
@@ -32,16 +33,16 @@ use std::thread::{self, ScopedJoinHandle};
 use glam::DVec3;
 
 use crate::camera::{Camera, Frame};
-use crate::dataset::{Dataset, Fingerprint, Split};
-use crate::densify::{Densifier, DensityControl};
-use crate::exposure::Exposures;
 use crate::gpu::{Buffer, CheckReport, Gpu, PassTime, Recorder};
+use crate::loss::exposure::Exposures;
 use crate::loss::{LogSlot, LossLog, Losses, StepLosses, Term, TermInputs};
-use crate::nn::Form;
-use crate::optimizer::{Adam, FiniteCheck, LearningRates};
-use crate::pseudo_gt::PseudoGt;
-use crate::render::{Damping, Gradients, RenderOptions, Renderer};
-use crate::scene::{COLOR_CHANNELS, Gaussians};
+use crate::networks::Form;
+use crate::photographs::dataset::{Dataset, Fingerprint, Split};
+use crate::photographs::pseudo_gt::PseudoGt;
+use crate::splats::densify::{Densifier, DensityControl};
+use crate::splats::optimizer::{Adam, FiniteCheck, LearningRates};
+use crate::splats::render::{Damping, Gradients, RenderOptions, Renderer};
+use crate::splats::scene::{COLOR_CHANNELS, Gaussians};
 use crate::{Error, Result};
 
 use best::Snapshot;
@@ -109,10 +110,10 @@ impl StepReport {
     }
 }
 
-/// A model in training, and all that its steps need; [`crate::run::train`] drives one into a run directory.
+/// A model in training, and all that its steps need; [`crate::results::run::train`] drives one into a run directory.
 ///
 /// ```no_run
-/// use nightsplat::dataset::Dataset;
+/// use nightsplat::photographs::dataset::Dataset;
 /// use nightsplat::gpu::{DeviceChoice, Gpu};
 /// use nightsplat::train::{TrainConfig, Trainer};
 ///
@@ -125,7 +126,7 @@ impl StepReport {
 ///         println!("step {}: loss {:.4}", report.step, report.loss);
 ///     }
 /// }
-/// nightsplat::scene::ply::save(&trainer.gaussians()?, "model.ply")?;
+/// nightsplat::splats::scene::ply::save(&trainer.gaussians()?, "model.ply")?;
 /// # Ok::<(), nightsplat::Error>(())
 /// ```
 #[derive(Debug)]

@@ -1,5 +1,5 @@
 // One Gaussian's attributes, stored as planes in one float array: all means, then all quats, and so on.
-// Plane k begins at (the widths before it) * gaussian_count. `src/attributes.rs` is the table.
+// Plane k begins at (the widths before it) * gaussian_count. `src/splats/attributes.rs` is the table.
 
 #include "attributes.glsl"
 

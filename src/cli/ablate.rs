@@ -12,13 +12,13 @@ use super::signals;
 use super::table;
 use super::train::{TrainOptions, held_unless};
 use crate::Error;
-use crate::dataset::Dataset;
-use crate::eval::{self, Yardstick};
+use crate::base::output::write_whole;
 use crate::gpu::{DeviceChoice, Gpu};
-use crate::image::Image;
-use crate::output::write_whole;
-use crate::report::{Report, plot};
-use crate::run::{HeldRun, Session};
+use crate::photographs::dataset::Dataset;
+use crate::photographs::image::Image;
+use crate::results::eval::{self, Yardstick};
+use crate::results::report::{Report, plot};
+use crate::results::run::{HeldRun, Session};
 use crate::train::{Part, TrainConfig};
 
 /// Train colour alone, each part of LITA-GS alone beside it, and all of them: same seed, same steps.

@@ -7,15 +7,15 @@ use clap::{Args, FromArgMatches};
 
 use self::point::Point;
 use super::train::TrainArgs;
-use crate::dataset::View;
-use crate::diagnose::Plan;
-use crate::eval::Player;
+use crate::base::input;
+use crate::base::output::write_whole;
 use crate::gpu::Gpu;
-use crate::image::Image;
-use crate::input;
-use crate::output::write_whole;
-use crate::run;
+use crate::photographs::dataset::View;
+use crate::photographs::image::Image;
+use crate::results::eval::Player;
+use crate::results::run;
 use crate::train::TrainConfig;
+use crate::train::diagnose::Plan;
 use crate::{Error, Result};
 
 pub(super) mod csv;

@@ -8,8 +8,8 @@ use serde_json::{Value, json};
 
 use super::table;
 use super::train::TrainOptions;
-use crate::dataset::Dataset;
 use crate::gpu::{CheckReport, CheckedPass, DeviceChoice, Gpu};
+use crate::photographs::dataset::Dataset;
 use crate::train::Trainer;
 
 /// Compare every pass of some training steps with its CPU reference, and name the first number that differs.

@@ -3,12 +3,12 @@
 use std::collections::BTreeMap;
 
 use crate::Result;
-use crate::dataset::{Dataset, View};
-use crate::eval::{self, ViewScore};
-use crate::image::Image;
-use crate::metrics::Scores;
-use crate::report::{Best, Column, Comparison, Picture, Series, Table};
-use crate::run::{Spent, Trained};
+use crate::photographs::dataset::{Dataset, View};
+use crate::photographs::image::Image;
+use crate::photographs::metrics::Scores;
+use crate::results::eval::{self, ViewScore};
+use crate::results::report::{Best, Column, Comparison, Picture, Series, Table};
+use crate::results::run::{Spent, Trained};
 
 /// A run and what it made of the test views.
 pub(super) struct Run {

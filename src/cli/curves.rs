@@ -4,11 +4,13 @@ use std::io::Write;
 use std::path::PathBuf;
 
 use super::table;
-use crate::dataset::{Dataset, LoadOptions, Split};
-use crate::image::Image;
-use crate::output::write_whole;
-use crate::report::{Series, VerticalLine, plot_in_groups, svg_file};
-use crate::tone::{CurveChoice, FAMILIES, Family, Statistics, ToneCurve, ToneSettings};
+use crate::base::output::write_whole;
+use crate::photographs::dataset::{Dataset, LoadOptions, Split};
+use crate::photographs::image::Image;
+use crate::photographs::tone::{
+    CurveChoice, FAMILIES, Family, Statistics, ToneCurve, ToneSettings,
+};
+use crate::results::report::{Series, VerticalLine, plot_in_groups, svg_file};
 use crate::{Error, Result};
 
 /// List the tone curves, print their values or plot them.

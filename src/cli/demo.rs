@@ -8,16 +8,16 @@ use anyhow::Result;
 use super::comparison::{self, Run};
 use super::{progress, table};
 use crate::Error;
-use crate::dataset::Dataset;
-use crate::dataset::synthetic::{self, SyntheticOptions};
-use crate::eval::{self, ViewScore};
+use crate::base::output::write_whole;
 use crate::gpu::{DeviceChoice, Gpu};
-use crate::optimizer::Schedule;
-use crate::output::write_whole;
-use crate::pseudo_gt::PseudoGt;
-use crate::report::{Distribution, Report, distributions};
-use crate::run::HeldRun;
-use crate::tone::{Scene, ToneCurve, ToneSettings};
+use crate::photographs::dataset::Dataset;
+use crate::photographs::dataset::synthetic::{self, SyntheticOptions};
+use crate::photographs::pseudo_gt::PseudoGt;
+use crate::photographs::tone::{Scene, ToneCurve, ToneSettings};
+use crate::results::eval::{self, ViewScore};
+use crate::results::report::{Distribution, Report, distributions};
+use crate::results::run::HeldRun;
+use crate::splats::optimizer::Schedule;
 use crate::train::TrainConfig;
 
 /// Make a small dark multi-view set, train on it with three tone curves, and show the results side by side.

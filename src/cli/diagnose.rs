@@ -12,11 +12,11 @@ use serde::Serialize;
 use super::finished_run::FinishedRun;
 use super::table;
 use crate::Error;
-use crate::dataset::{Dataset, LoadOptions};
-use crate::diagnose::{Diagnosis, Noise, Plan, SceneDiagnosis, ViewDiagnosis};
-use crate::eval::{Leftover, hole_warning};
+use crate::base::output::write_whole;
 use crate::gpu::{DeviceChoice, Gpu};
-use crate::output::write_whole;
+use crate::photographs::dataset::{Dataset, LoadOptions};
+use crate::results::eval::{Leftover, hole_warning};
+use crate::train::diagnose::{Diagnosis, Noise, Plan, SceneDiagnosis, ViewDiagnosis};
 use crate::train::{Preset, TrainConfig};
 
 /// Look at dark photographs before training: what they are, and what a model of them needs.

@@ -7,13 +7,13 @@ use anyhow::Result;
 
 use super::finished_run::FinishedRun;
 use super::{progress_bar, table};
-use crate::dataset::View;
-use crate::eval::{self, Leftover, ViewScore, Yardstick};
+use crate::base::output::printable;
 use crate::gpu::DeviceChoice;
-use crate::lpips::{Lpips, Measure, Range};
-use crate::metrics::Scores;
-use crate::output::printable;
-use crate::run;
+use crate::networks::lpips::{Lpips, Measure, Range};
+use crate::photographs::dataset::View;
+use crate::photographs::metrics::Scores;
+use crate::results::eval::{self, Leftover, ViewScore, Yardstick};
+use crate::results::run;
 use crate::train::Learning;
 
 /// Score a run on the test views of its dataset.

@@ -7,17 +7,17 @@ use anyhow::Result;
 use glam::DAffine3;
 
 use super::finished_run::FinishedRun;
+use crate::base::output::{printable, write_whole};
 use crate::camera::Camera;
-use crate::dataset::{Dataset, View};
-use crate::export::page::{Bookmark, Page};
-use crate::export::{Provenance, glb, sog, spz};
 use crate::gpu::DeviceChoice;
-use crate::image::Image;
-use crate::output::{printable, write_whole};
-use crate::render::RenderSettings;
-use crate::scene::{Gaussians, ply};
+use crate::photographs::dataset::{Dataset, View};
+use crate::photographs::image::Image;
+use crate::results::export::page::{Bookmark, Page};
+use crate::results::export::{Provenance, glb, sog, spz};
+use crate::splats::render::RenderSettings;
+use crate::splats::scene::{Gaussians, ply};
 use crate::train::TrainConfig;
-use crate::{Error, run};
+use crate::{Error, results::run};
 
 /// Write a run's model in the format of a viewer, as bright as it was trained to be.
 #[derive(Clone, Debug, clap::Args)]

@@ -2,10 +2,10 @@
 
 use std::path::Path;
 
-use crate::dataset::Dataset;
-use crate::eval::Player;
 use crate::gpu::{DeviceChoice, Gpu};
-use crate::run;
+use crate::photographs::dataset::Dataset;
+use crate::results::eval::Player;
+use crate::results::run;
 use crate::train::TrainConfig;
 use crate::{Error, Result};
 

@@ -7,12 +7,12 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use super::table::aligned;
-use crate::fit::{
+use crate::base::output::write_whole;
+use crate::photographs::fit::{
     Channels, Estimate, Fit, FitOptions, HeldOut, Pair, Scene, Scores, Weighting, cross_validate,
     fit,
 };
-use crate::output::write_whole;
-use crate::tone::{FAMILIES, Family, ToneCurve};
+use crate::photographs::tone::{FAMILIES, Family, ToneCurve};
 use crate::{Error, Result};
 
 mod plot;

@@ -7,7 +7,7 @@ use clap::CommandFactory;
 use clap_mangen::Man;
 
 use super::Cli;
-use crate::output::write_whole;
+use crate::base::output::write_whole;
 use crate::{Error, Result};
 
 /// Write the man pages into a folder: nightsplat.1, and one for each subcommand

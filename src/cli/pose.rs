@@ -16,9 +16,9 @@ use anyhow::Result;
 use self::reconstruction::{Mapper, Matcher, Reconstruction};
 use self::tool::Tool;
 use crate::Error;
-use crate::dataset::Dataset;
 use crate::gpu::{DeviceChoice, Gpu};
-use crate::image::files::{photographs_in, stem, unread_in};
+use crate::photographs::dataset::Dataset;
+use crate::photographs::image::files::{photographs_in, stem, unread_in};
 
 /// Find the cameras of dark photographs with COLMAP, and write a dataset that `train` takes.
 ///

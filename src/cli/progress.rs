@@ -7,10 +7,10 @@ use std::time::{Duration, Instant};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::{Value, json};
 
-use crate::dataset::Dataset;
-use crate::eval::{self, Against, ViewScore};
 use crate::gpu::Gpu;
-use crate::run::{self, Event, HeldRun, Session, Trained};
+use crate::photographs::dataset::Dataset;
+use crate::results::eval::{self, Against, ViewScore};
+use crate::results::run::{self, Event, HeldRun, Session, Trained};
 use crate::train::{MemoryEstimate, StepReport, TrainConfig};
 
 /// How a run says what it does.

@@ -9,15 +9,15 @@ use anyhow::Result;
 
 use super::finished_run::FinishedRun;
 use super::{ImageFormat, progress_bar};
+use crate::base::output::printable;
 use crate::camera::{Camera, CameraPath};
-use crate::dataset::{Dataset, Split, View};
-use crate::eval::Layer;
-use crate::exposure::Affine;
 use crate::gpu::DeviceChoice;
-use crate::image::Image;
-use crate::output::printable;
-use crate::tone::exposed_anew;
-use crate::{Error, run};
+use crate::loss::exposure::Affine;
+use crate::photographs::dataset::{Dataset, Split, View};
+use crate::photographs::image::Image;
+use crate::photographs::tone::exposed_anew;
+use crate::results::eval::Layer;
+use crate::{Error, results::run};
 
 /// Render a run from the cameras of its dataset, whether they took an image or not, or along a path through them.
 ///

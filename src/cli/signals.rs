@@ -6,7 +6,7 @@ use std::sync::atomic::AtomicBool;
 use signal_hook::consts::{SIGINT, SIGTERM};
 use signal_hook::flag;
 
-use crate::run::Requests;
+use crate::results::run::Requests;
 use crate::{Error, Result, Stop};
 
 /// What signals ask of the runs of this process, from now on.

@@ -27,9 +27,9 @@ use super::batch::point::{ADAPTIVE, Axis, OFFSET};
 use super::batch::{self, Common, Run, absolute, runner};
 use super::progress_bar;
 use crate::Error;
-use crate::dataset::Dataset;
 use crate::gpu::{DeviceChoice, Gpu};
-use crate::tone::Statistics;
+use crate::photographs::dataset::Dataset;
+use crate::photographs::tone::Statistics;
 use crate::train::TrainConfig;
 
 /// Train over a grid of settings, each point in its own run directory, and rank the results.

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use crate::dataset::synthetic::{self, SyntheticOptions};
+use crate::photographs::dataset::synthetic::{self, SyntheticOptions};
 use crate::{Error, Result};
 
 /// Write a small dark multi-view set, made from an analytic scene, in the layout of the LOM benchmark.

@@ -1,7 +1,7 @@
 //! Tables for the terminal.
 
-use crate::output::printable;
-use crate::report::{Column, Table};
+use crate::base::output::printable;
+use crate::results::report::{Column, Table};
 
 /// A table of the report, as the terminal shows it.
 pub(super) fn of(table: &Table) -> String {

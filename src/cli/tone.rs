@@ -12,18 +12,18 @@ use serde::Serialize;
 use self::page::Page;
 use self::photographs::{Listed, listed};
 use super::{ImageFormat, progress_bar, table};
-use crate::dataset::{Dataset, Split};
-use crate::eval;
+use crate::base::output::printable;
 use crate::gpu::{DeviceChoice, Gpu};
-use crate::image::{Image, Mask};
-use crate::metrics::Scores;
-use crate::output::printable;
-use crate::pseudo_gt::PseudoGt;
-use crate::report::Distribution;
-use crate::tone::{
+use crate::photographs::dataset::{Dataset, Split};
+use crate::photographs::image::{Image, Mask};
+use crate::photographs::metrics::Scores;
+use crate::photographs::pseudo_gt::PseudoGt;
+use crate::photographs::tone::{
     CurveChoice, Exposure, GainChoice, Profile, Scene, Statistics, ToneCurve, ToneSettings,
     all_black,
 };
+use crate::results::eval;
+use crate::results::report::Distribution;
 use crate::{Error, Result};
 
 /// Apply a tone curve to a photograph, a folder of them or a dataset, and tell what that does.

@@ -34,11 +34,11 @@ use super::batch::runner::Failure;
 use super::batch::{self, Common, Run, absolute, runner, train_args};
 use super::{diagnose, progress_bar, table};
 use crate::Error;
-use crate::dataset::Dataset;
-use crate::diagnose::{Diagnosis, Plan};
+use crate::base::output::write_whole;
 use crate::gpu::{DeviceChoice, Gpu};
-use crate::output::write_whole;
-use crate::run::energy_counters;
+use crate::photographs::dataset::Dataset;
+use crate::results::run::energy_counters;
+use crate::train::diagnose::{Diagnosis, Plan};
 use crate::train::{Preset, TrainConfig, Trainer};
 
 /// Train the presets, and every single change of balanced, and draw what time and memory buy.

@@ -11,15 +11,15 @@ use self::facts::Facts;
 use super::diagnose;
 use super::progress::{ProgressForm, Reporter, summary};
 use super::signals;
-use crate::dataset::Dataset;
-use crate::densify::DensityControl;
-use crate::diagnose::{Diagnosis, Plan};
-use crate::eval;
+use crate::base::output::printable;
 use crate::gpu::{DeviceChoice, Gpu};
-use crate::nn::Precision;
-use crate::output::printable;
-use crate::run::{self, HeldRun, RunDirectory, Session, Trained};
-use crate::tone::{CurveChoice, GainChoice, Profile, ToneCurve, ToneSettings};
+use crate::networks::Precision;
+use crate::photographs::dataset::Dataset;
+use crate::photographs::tone::{CurveChoice, GainChoice, Profile, ToneCurve, ToneSettings};
+use crate::results::eval;
+use crate::results::run::{self, HeldRun, RunDirectory, Session, Trained};
+use crate::splats::densify::DensityControl;
+use crate::train::diagnose::{Diagnosis, Plan};
 use crate::train::{Background, CacheSize, Learning, ModelName, Part, Preset, TrainConfig};
 
 /// Train a 3D Gaussian Splatting model from dark photographs.

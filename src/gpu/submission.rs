@@ -69,7 +69,7 @@ impl Gpu {
     /// Records passes and submits them; does not wait.
     ///
     /// The queue is held while `record` runs: other threads that submit wait. What submits by itself, such as
-    /// [`Gpu::write`], [`Gpu::zeros`] or [`crate::render::Renderer::reserve`], belongs before or behind the recording.
+    /// [`Gpu::write`], [`Gpu::zeros`] or [`crate::splats::render::Renderer::reserve`], belongs before or behind the recording.
     ///
     /// # Errors
     /// What `record` returns (nothing is submitted then), this thread is recording already, or the device was lost.

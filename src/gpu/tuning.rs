@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::subgroups::WORKGROUP;
 use super::{Gpu, Properties};
-use crate::output::write_whole;
+use crate::base::output::write_whole;
 use crate::{Error, Result};
 
 /// Names a file in place of the one in the user's cache folder, or is `off`: no file.

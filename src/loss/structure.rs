@@ -9,8 +9,8 @@ use super::{
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::structure_l1;
-use crate::scene::Feature;
-use crate::structure::StructureTarget;
+use crate::photographs::structure::StructureTarget;
+use crate::splats::scene::Feature;
 
 pub(super) const SPEC: LossSpec = LossSpec {
     feature: Some(Feature::Structure),
@@ -79,7 +79,7 @@ pub struct StructureInputs<'a> {
     pub render: &'a Buffer<f32>,
     /// The channel that holds the structure.
     pub plane: u32,
-    /// (H, W), from [`crate::structure::StructureTarget`].
+    /// (H, W), from [`crate::photographs::structure::StructureTarget`].
     pub structure: &'a Buffer<f32>,
 }
 
@@ -150,7 +150,12 @@ impl StructureLoss {
                 first: plane * pixels,
                 scale: (self.weight / f64::from(pixels)) as f32,
             },
-            structure_l1::Buffers { render, structure, d_render, partials: &mut self.partials },
+            structure_l1::Buffers {
+                render: render.slice(),
+                structure: structure.slice(),
+                d_render: d_render.slice_mut(),
+                partials: self.partials.slice_mut(),
+            },
             Threads::Workgroups([workgroups, 1, 1]),
         )?;
         let sums = |count| PartialSums {

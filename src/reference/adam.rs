@@ -1,12 +1,12 @@
 use super::random::random_bits;
 use super::rounding::Rounded;
-use crate::attributes::{Attribute, planes};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::adam::{
     Constants, Kernel, LOG_SCALE_MAX, LOG_SCALE_MIN, Params, Slices, Tolerances,
 };
 use crate::kernels::adam_step::{BETA1, BETA2, EPSILON, GRADIENT_BOUND};
-use crate::tone::Real;
+use crate::photographs::tone::Real;
+use crate::splats::attributes::{Attribute, planes};
 
 /// The parameter and both moments after a step at `rate`. A compiler folds 1 - beta in double precision.
 pub(super) fn stepped<T: Real>(

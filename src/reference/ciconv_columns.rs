@@ -6,7 +6,7 @@ use super::ciconv_rows::taps;
 use super::rounding::{Rounded, chain};
 use crate::gpu::Reference;
 use crate::kernels::ciconv_columns::{Constants, EPSILON, Kernel, Params, Slices, Tolerances};
-use crate::tone::Real;
+use crate::photographs::tone::Real;
 
 /// ln(W + 1e-5) of every pixel.
 fn log_invariants(params: &Params, smooth_rows: &[Vec3], slope_rows: &[Vec3]) -> Vec<Rounded> {

@@ -3,7 +3,7 @@ use glam::Vec2;
 use super::rounding::{Rounded, chain};
 use crate::gpu::Reference;
 use crate::kernels::ciconv_moments::{Constants, EPSILON, Kernel, Params, Slices, Tolerances};
-use crate::tone::Real;
+use crate::photographs::tone::Real;
 
 /// Mean and 1 / standard deviation, from the moments of the workgroups.
 fn norm(params: &Params, moments: &[Vec2]) -> [Rounded; 2] {

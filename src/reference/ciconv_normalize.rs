@@ -1,7 +1,7 @@
 use super::rounding::Rounded;
 use crate::gpu::Reference;
 use crate::kernels::ciconv_normalize::{Constants, Kernel, Params, Slices, Tolerances};
-use crate::tone::Real;
+use crate::photographs::tone::Real;
 
 /// The structure at every pixel.
 fn structure(params: &Params, slices: &Slices<'_>) -> impl Iterator<Item = Rounded> {

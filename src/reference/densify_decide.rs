@@ -1,10 +1,10 @@
-use crate::attributes::Attribute;
 use crate::gpu::Reference;
 use crate::kernels::densify_decide::{Constants, Kernel, Params, Slices};
 use crate::kernels::fate::{
     FATE_CLONE, FATE_KEEP, FATE_PRUNE, FATE_SPLIT, KEY_KEEP, KEY_PRUNE, TALLY_CANDIDATES,
     TALLY_CLONED, TALLY_PRUNED, TALLY_SPLIT,
 };
+use crate::splats::attributes::Attribute;
 
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {

@@ -1,7 +1,7 @@
 use super::densify_scatter::copies;
-use crate::attributes::planes;
 use crate::gpu::Reference;
 use crate::kernels::densify_moments::{Constants, Kernel, Params, Slices};
+use crate::splats::attributes::planes;
 
 impl Reference for Kernel {
     fn run(params: &Params, _: &Constants, slices: Slices<'_>) {

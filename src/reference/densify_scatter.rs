@@ -7,13 +7,13 @@ use glam::{Quat, Vec3};
 use super::gaussian::sigmoid;
 use super::random::random_bits;
 use super::rounding::{TRIGONOMETRIC, UNIT};
-use crate::attributes::{Attribute, planes};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::densify_scatter::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::fate::{
     FATE_CLONE, FATE_KEEP, FATE_SPLIT, PAPER_LOG_SPLIT_FACTOR, SPLIT_ACROSS, SPLIT_ACROSS_SLOPE,
     SPLIT_ALONG, SPLIT_ALONG_SLOPE, SPLIT_OFFSET, SPLIT_OPACITY, SPLIT_OPACITY_SLOPE,
 };
+use crate::splats::attributes::{Attribute, planes};
 
 fn random_uniform(key: u32) -> f32 {
     ((random_bits(key) >> 8) + 1) as f32 / 16_777_216.0

@@ -6,7 +6,6 @@ use super::camera::Camera;
 use super::gaussian::{Gaussian, sigmoid};
 use super::rotation::{rotation, unit_quat};
 use super::rounding::UNIT;
-use crate::attributes::{Attribute, planes};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::camera::NEAREST;
 use crate::kernels::densify_score::{Constants, Kernel, Params, Slices, Tolerances};
@@ -14,6 +13,7 @@ use crate::kernels::fate::{
     KEY_KEEP, KEY_PRUNE, KEY_TOP, SPLIT_OFFSET, TALLY_CANDIDATES, TALLY_PRUNED,
 };
 use crate::kernels::splat::DILATION;
+use crate::splats::attributes::{Attribute, planes};
 
 fn mean_gradient(slices: &Slices<'_>, i: usize) -> f32 {
     match slices.visit_counts[i] {

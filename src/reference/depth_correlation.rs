@@ -6,7 +6,7 @@ use super::rounding::{Rounded, chain};
 use crate::gpu::Reference;
 use crate::kernels::DepthGradient;
 use crate::kernels::depth_correlation::{Constants, EPSILON, Kernel, Params, Slices, Tolerances};
-use crate::tone::Real;
+use crate::photographs::tone::Real;
 
 /// P, and what multiplies a - mean a and b - mean b in its gradient with respect to a.
 #[derive(Clone, Copy, Debug)]

@@ -4,7 +4,7 @@ use super::rounding::{Rounded, chain};
 use crate::gpu::Reference;
 use crate::kernels::DepthMoments;
 use crate::kernels::depth_moments::{Constants, Kernel, Params, Slices, Tolerances};
-use crate::tone::Real;
+use crate::photographs::tone::Real;
 
 /// Means of a and b, then the sums of aa, ab and bb about them, of every chunk.
 fn moments(params: &Params, slices: &Slices<'_>) -> impl Iterator<Item = [Rounded; 5]> {

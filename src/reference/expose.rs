@@ -4,7 +4,7 @@ use super::rounding::{Rounded, values};
 use crate::gpu::Reference;
 use crate::kernels::expose::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::exposure::{BIAS_SCALE, EXPOSURE_WIDTH};
-use crate::tone::Real;
+use crate::photographs::tone::Real;
 
 /// Gain and bias of a channel of a view, in any number.
 pub fn gain_and_bias<T: Real>(exposures: &[T], view: usize, channel: usize) -> [T; 2] {

@@ -2,7 +2,7 @@ use super::rounding::{Rounded, chain, values};
 use crate::gpu::Reference;
 use crate::kernels::exposure::{BIAS_SCALE, EXPOSURE_WIDTH};
 use crate::kernels::exposure_gradient::{Constants, Kernel, Params, Slices, Tolerances};
-use crate::tone::Real;
+use crate::photographs::tone::Real;
 
 /// The gradient of every number of every view.
 fn gradients(params: &Params, slices: &Slices<'_>) -> Vec<Rounded> {

@@ -1,12 +1,12 @@
-//! One Gaussian's attributes in the planes of [`attributes`](crate::attributes).
+//! One Gaussian's attributes in the planes of [`attributes`](crate::splats::attributes).
 
 use std::borrow::Cow;
 use std::ops::Range;
 
 use glam::{DVec3, DVec4};
 
-use crate::attributes::{column_count, planes};
-use crate::halves::Halves;
+use crate::splats::attributes::{column_count, planes};
+use crate::splats::halves::Halves;
 
 /// A Gaussian, or the gradient of one, in f64.
 #[derive(Clone, Debug, PartialEq)]

@@ -5,7 +5,7 @@ use crate::gpu::Reference;
 use crate::kernels::RankSearch;
 use crate::kernels::luminance::{Constants, Kernel, Params, Slices};
 use crate::kernels::rank_search::{FIRST_SHIFT, WORKGROUP};
-use crate::tone::{luminance, measurable};
+use crate::photographs::tone::{luminance, measurable};
 
 impl Reference for Kernel {
     fn run(params: &Params, _: &Constants, slices: Slices<'_>) {

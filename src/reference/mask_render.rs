@@ -1,7 +1,7 @@
 use super::rounding::{Rounded, rounded_tone_curve, values};
 use crate::gpu::Reference;
 use crate::kernels::mask_render::{Constants, Kernel, Params, Slices, Tolerances};
-use crate::tone::Real;
+use crate::photographs::tone::Real;
 
 /// Every value written.
 fn shown<'a>(

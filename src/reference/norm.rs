@@ -3,7 +3,7 @@
 use super::rounding::{Gated, Rounded};
 use crate::kernels::ChannelStatistics;
 use crate::kernels::norm_merge::EPSILON;
-use crate::tone::Real;
+use crate::photographs::tone::Real;
 
 /// Mean and 1 / standard deviation.
 #[derive(Clone, Copy, Debug)]

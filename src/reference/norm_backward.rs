@@ -2,7 +2,7 @@ use super::norm::{affine, backward, plane};
 use super::rounding::{Rounded, values};
 use crate::gpu::Reference;
 use crate::kernels::norm_backward::{Constants, Kernel, Params, Slices, Tolerances};
-use crate::tone::Real;
+use crate::photographs::tone::Real;
 
 /// The gradient of every value of every channel.
 fn d_source(params: &Params, slices: &Slices<'_>) -> Vec<Rounded> {

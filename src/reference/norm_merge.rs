@@ -3,7 +3,7 @@ use super::rounding::{Rounded, chain};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::ChannelStatistics;
 use crate::kernels::norm_merge::{Constants, Kernel, Params, Slices, Tolerances};
-use crate::tone::Real;
+use crate::photographs::tone::Real;
 
 /// The statistics of every channel.
 fn merged(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Vec<Statistics<Rounded>> {

@@ -6,7 +6,7 @@ use std::ops::{Add, Div, Mul, Neg, Sub};
 
 use crate::gpu::Tolerance;
 use crate::kernels::ToneParameters;
-use crate::tone::{Real, curve_at};
+use crate::photographs::tone::{Real, curve_at};
 
 /// The relative error of one rounding; half a unit in the last place (ulp).
 pub const UNIT: f64 = f32::EPSILON as f64 / 2.0;
@@ -276,8 +276,8 @@ impl Real for Rounded {
 #[cfg(test)]
 mod tests {
     use super::{Rounded, UNIT};
-    use crate::random::Stream;
-    use crate::tone::Real;
+    use crate::base::random::Stream;
+    use crate::photographs::tone::Real;
 
     /// A formula with every operation, in any number.
     fn formula<T: Real>(x: T, y: T) -> T {

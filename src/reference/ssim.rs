@@ -6,7 +6,7 @@ use super::inside;
 use super::rounding::{Rounded, UNIT, chain, rounded_tone_curve, values};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::ssim::{C1, C2, Constants, Kernel, Params, Slices, Tolerances};
-use crate::tone::Real;
+use crate::photographs::tone::Real;
 
 /// SSIM at one pixel of one channel and its derivatives with respect to the blurred moments.
 #[derive(Clone, Copy, Debug, Default)]

@@ -3,7 +3,7 @@ use crate::gpu::Reference;
 use crate::kernels::ToneParameters;
 use crate::kernels::curves::{CURVE_AUTO, CURVE_LUM_PRESERVE};
 use crate::kernels::tone_mix::{Constants, Kernel, Params, Slices, Tolerances};
-use crate::tone::{Real, measurable};
+use crate::photographs::tone::{Real, measurable};
 
 /// The pixel's channels under the curve.
 fn mixed(curve: u32, rgb: [f32; 3], tone: &ToneParameters) -> [Rounded; 3] {

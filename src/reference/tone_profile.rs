@@ -1,7 +1,7 @@
 use super::rounding::{Rounded, values};
 use crate::gpu::Reference;
 use crate::kernels::tone_profile::{Constants, Kernel, Params, Slices, Tolerances};
-use crate::tone::{measurable, profiled};
+use crate::photographs::tone::{measurable, profiled};
 
 /// Planar, as the target.
 fn mapped(params: &Params, slices: &Slices<'_>) -> Vec<Rounded> {

@@ -1,7 +1,7 @@
 use super::rounding::{Rounded, values};
 use crate::gpu::Reference;
 use crate::kernels::tone_table::{Constants, Kernel, Params, Slices, Tolerances};
-use crate::tone::{Real, interpolate};
+use crate::photographs::tone::{Real, interpolate};
 
 /// Every value on its channel's curve.
 fn mapped(params: &Params, slices: &Slices<'_>) -> Vec<Rounded> {

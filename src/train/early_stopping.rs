@@ -26,7 +26,7 @@ pub struct StopConfig {
     /// is taken at the end of these.
     pub every: u64,
     /// dB. Once two scores in a row do not exceed the best before by this much, the run has converged: it settles
-    /// ([`crate::optimizer::Schedule::settle_steps`]) and ends.
+    /// ([`crate::splats::optimizer::Schedule::settle_steps`]) and ends.
     pub gain: f64,
     /// dB. A run that ends worse than its best score by more than this keeps the model of that score.
     pub margin: f64,
@@ -283,9 +283,9 @@ impl Trainer {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::dataset::Dataset;
-    use crate::dataset::synthetic::{self, SyntheticOptions};
     use crate::gpu::testing::gpu;
+    use crate::photographs::dataset::Dataset;
+    use crate::photographs::dataset::synthetic::{self, SyntheticOptions};
 
     #[test]
     fn a_run_ends_once_two_scores_in_a_row_gain_too_little() {

@@ -9,11 +9,11 @@ use serde::{Deserialize, Serialize};
 use super::views::Views;
 use super::{TrainConfig, Trainer};
 use crate::camera::Camera;
-use crate::dataset::{Dataset, LoadOptions, Photograph, View};
-use crate::exposure::{Affine, ExposureRates, table};
-use crate::image::{Image, exposure_value, linear_from_srgb, srgb_from_linear};
-use crate::pseudo_gt::PseudoGt;
-use crate::tone::Scene;
+use crate::loss::exposure::{Affine, ExposureRates, table};
+use crate::photographs::dataset::{Dataset, LoadOptions, Photograph, View};
+use crate::photographs::image::{Image, exposure_value, linear_from_srgb, srgb_from_linear};
+use crate::photographs::pseudo_gt::PseudoGt;
+use crate::photographs::tone::Scene;
 use crate::{Error, Result};
 
 /// Whether something is learned.
@@ -39,7 +39,7 @@ impl FromStr for Learning {
     }
 }
 
-/// Gain and bias of each channel of each training view, [`crate::exposure`].
+/// Gain and bias of each channel of each training view, [`crate::loss::exposure`].
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ExposureConfig {

@@ -10,16 +10,16 @@ use super::model::Model;
 use super::views::TrainView;
 use super::{Trainer, streams};
 use crate::Result;
-use crate::attributes::planes;
+use crate::base::random::Stream;
 use crate::camera::{Camera, Patch};
-use crate::exposure::{Affine, Exposures};
-use crate::halves::Bits;
-use crate::image::Image;
-use crate::pseudo_gt::PseudoGt;
-use crate::random::Stream;
-use crate::render::{RenderOptions, RenderSettings, Renderer};
-use crate::scene::init::{self, Start};
-use crate::scene::{Gaussians, SH_C0, width};
+use crate::loss::exposure::{Affine, Exposures};
+use crate::photographs::image::Image;
+use crate::photographs::pseudo_gt::PseudoGt;
+use crate::splats::attributes::planes;
+use crate::splats::halves::Bits;
+use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
+use crate::splats::scene::init::{self, Start};
+use crate::splats::scene::{Gaussians, SH_C0, width};
 
 /// Views that are looked at, at most.
 const VIEWS: usize = 16;
@@ -215,7 +215,7 @@ mod tests {
 
     use super::*;
     use crate::camera::CameraModel;
-    use crate::scene::{Features, Shape};
+    use crate::splats::scene::{Features, Shape};
 
     fn camera(width: u32, height: u32) -> Camera {
         let (focal, principal_point) = (DVec2::splat(2.0), DVec2::new(1.0, 0.5));

@@ -6,12 +6,12 @@ use super::memory::MARGIN;
 use super::rendered::Rendered;
 use super::{TrainConfig, Trainer, streams};
 use crate::Result;
+use crate::base::random::Stream;
 use crate::camera::Camera;
-use crate::dataset::Dataset;
-use crate::densify::{Densifier, DensifyReport, DensifySettings, DensityControl, Round};
 use crate::gpu::{Buffer, Gpu};
-use crate::random::Stream;
-use crate::render::RenderOptions;
+use crate::photographs::dataset::Dataset;
+use crate::splats::densify::{Densifier, DensifyReport, DensifySettings, DensityControl, Round};
+use crate::splats::render::RenderOptions;
 
 /// dB. A round that costs the probes more is tried again with fewer splits. All training views may lose somewhat more.
 const MOST_LOST: f64 = 0.2;
@@ -132,9 +132,9 @@ mod tests {
     use std::path::{Path, PathBuf};
 
     use super::*;
-    use crate::dataset::synthetic::{self, SyntheticOptions};
     use crate::gpu::testing::gpu;
-    use crate::pseudo_gt::PseudoGt;
+    use crate::photographs::dataset::synthetic::{self, SyntheticOptions};
+    use crate::photographs::pseudo_gt::PseudoGt;
     use crate::train::Preset;
     use crate::train::target_views::TargetViews;
     use crate::train::views::measured;

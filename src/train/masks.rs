@@ -6,10 +6,10 @@ use glam::UVec2;
 use super::views::Views;
 use crate::Result;
 use crate::camera::Camera;
-use crate::dataset::Dataset;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::{ToneParameters, mask_gradient, mask_render};
-use crate::scene::COLOR_CHANNELS;
+use crate::photographs::dataset::Dataset;
+use crate::splats::scene::COLOR_CHANNELS;
 
 /// The masks of the views that have one, and what applies them; a view without one costs nothing.
 #[derive(Debug)]
@@ -130,7 +130,13 @@ impl Masking {
         pass.dispatch(
             &self.render,
             &mask_render::Params { value_count, pixel_count: size.x * size.y },
-            mask_render::Buffers { weights, render, low, tone, shown: &mut self.shown },
+            mask_render::Buffers {
+                weights: weights.slice(),
+                render: render.slice(),
+                low: low.slice(),
+                tone: tone.slice(),
+                shown: self.shown.slice_mut(),
+            },
             Threads::Exactly([value_count, 1, 1]),
         )?;
         Ok(&self.shown)
@@ -152,7 +158,7 @@ impl Masking {
         pass.dispatch(
             &self.gradient,
             &mask_gradient::Params { value_count, pixel_count },
-            mask_gradient::Buffers { weights, d_render },
+            mask_gradient::Buffers { weights: weights.slice(), d_render: d_render.slice_mut() },
             Threads::Exactly([value_count, 1, 1]),
         )
     }

@@ -9,9 +9,9 @@ use serde::Serialize;
 use super::{CacheSize, Trainer};
 use crate::Result;
 use crate::camera::Patch;
-use crate::densify::DeviceGaussians;
-use crate::render::RenderOptions;
-use crate::scene::{Shape, width};
+use crate::splats::densify::DeviceGaussians;
+use crate::splats::render::RenderOptions;
+use crate::splats::scene::{Shape, width};
 
 /// What the program, the driver and its compiled kernels take on the host, about.
 const PROGRAM: f64 = 256.0 * 1024.0 * 1024.0;

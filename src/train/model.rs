@@ -2,12 +2,12 @@
 
 use super::{PrecisionConfig, Trainer};
 use crate::Result;
-use crate::attributes::planes;
-use crate::densify::{Densifier, DensifyInputs, DensifyReport, DeviceGaussians, Round};
 use crate::gpu::{Buffer, Gpu, Recorder};
-use crate::halves::Bits;
-use crate::optimizer::{Adam, AdamBuffers, FiniteCheck, LearningRates};
-use crate::scene::{ATTRIBUTES, Attribute, Gaussians, Shape, width};
+use crate::splats::attributes::planes;
+use crate::splats::densify::{Densifier, DensifyInputs, DensifyReport, DeviceGaussians, Round};
+use crate::splats::halves::Bits;
+use crate::splats::optimizer::{Adam, AdamBuffers, FiniteCheck, LearningRates};
+use crate::splats::scene::{ATTRIBUTES, Attribute, Gaussians, Shape, width};
 
 impl Trainer {
     /// The gradient of every parameter that the last step left, in the frame.
@@ -117,7 +117,7 @@ impl Model {
         self.planes_mut().try_for_each(|plane| lengthen(gpu, plane, room * columns))?;
         let parameters = self.gaussians.read(gpu)?;
         let batches = self.gaussians.batches(gpu);
-        let planes = self.planes_mut().map(|plane| batches.read(gpu, plane));
+        let planes = self.planes_mut().map(|plane| batches.read(gpu, &*plane));
         let planes = planes.collect::<Result<Vec<_>>>()?;
 
         (self.shape, self.gaussians.column_count) = (new, columns as u32);
@@ -163,22 +163,23 @@ impl Model {
         sh_degree: u32,
         status: &Buffer<u32>,
     ) -> Result<()> {
-        let gaussians = &self.gaussians;
+        let gaussians = &mut self.gaussians;
         let DeviceGaussians { column_count, feature_count, rest, .. } = *gaussians;
         let first = width(0) as u32 + feature_count;
         let of_floats = if sh_degree == 0 || rest == Bits::Half { first } else { column_count };
         gaussians.batches(gpu).iter().try_for_each(|batch| {
             let words = gaussians.parameter_columns();
-            let parameters = &mut batch.of_rows(&gaussians.parameters, words)?;
-            let gradients = &batch.of_planes(&self.gradients)?;
-            let moments = &mut gaussians.moments.of_batch(&batch)?;
+            let mut buffers = AdamBuffers {
+                parameters: batch.rows_mut(&mut gaussians.parameters, words)?,
+                gradients: batch.planes(&self.gradients)?,
+                moments: gaussians.moments.of_batch(&batch)?,
+            };
             let count = batch.gaussian_count();
-            let buffers = AdamBuffers { parameters, gradients, moments };
-            adam.record(pass, step, rates, [count, of_floats, feature_count], buffers, status)?;
+            let floats = [count, of_floats, feature_count];
+            adam.record(pass, step, rates, floats, buffers.reborrow(), status)?;
             if sh_degree == 0 || rest == Bits::Single {
                 return Ok(());
             }
-            let buffers = AdamBuffers { parameters, gradients, moments };
             let rate = rates[Attribute::Rest];
             let halves = [count, first, column_count - first];
             adam.record_halves(pass, step, rate, halves, buffers, status)
@@ -224,8 +225,8 @@ impl Model {
             (self.gaussians.parameter_batches(gpu), self.gaussians.parameter_columns());
         let mut before = 0;
         for batch in batches.iter() {
-            let planes = batch.of_rows(&self.gaussians.parameters, words)?;
-            if let Some(at) = finite.first(gpu, &planes, planes.len())? {
+            let planes = batch.rows(&self.gaussians.parameters, words)?;
+            if let Some(at) = finite.first(gpu, planes, planes.len())? {
                 return Ok(Some(batches.place_of(before + at)));
             }
             before += planes.len();
@@ -257,7 +258,7 @@ impl Model {
 fn lengthen(gpu: &Gpu, buffer: &mut Buffer<f32>, len: usize) -> Result<()> {
     if buffer.len() < len {
         let mut longer = gpu.uninit_in_windows(buffer.name(), len)?;
-        gpu.write(&mut longer, &gpu.read(buffer)?)?;
+        gpu.write(&mut longer, &gpu.read(&*buffer)?)?;
         *buffer = longer;
     }
     Ok(())
@@ -267,7 +268,7 @@ fn lengthen(gpu: &Gpu, buffer: &mut Buffer<f32>, len: usize) -> Result<()> {
 mod tests {
     use super::*;
     use crate::gpu::testing::gpu;
-    use crate::scene::Features;
+    use crate::splats::scene::Features;
 
     /// Else the next round of density control would have to make that room again.
     #[test]

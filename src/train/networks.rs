@@ -6,10 +6,10 @@ use glam::UVec2;
 
 use super::ModelConfig;
 use crate::gpu::{Buffer, Gpu, Recorder};
-use crate::image::Image;
-use crate::nn::{self, Denoiser, Parameters, Tonemapper};
-use crate::scene::{COLOR_CHANNELS, Feature, Features};
-use crate::window::{Window, Windows};
+use crate::networks::window::{Window, Windows};
+use crate::networks::{self, Denoiser, Parameters, Tonemapper};
+use crate::photographs::image::Image;
+use crate::splats::scene::{COLOR_CHANNELS, Feature, Features};
 use crate::{Error, Result};
 
 /// The networks that a model has, with the windows of the render that they take.
@@ -143,8 +143,8 @@ impl Networks {
     pub fn save(&self, path: &Path) -> Result<()> {
         let denoiser = self.denoiser.as_ref().map(Denoiser::parameters);
         let tonemapper = self.tonemapper.as_ref().map(Tonemapper::parameters);
-        let networks: Vec<&Parameters> = denoiser.into_iter().chain(tonemapper).collect();
-        nn::save(path, &networks, &self.gpu)
+        let parameters: Vec<&Parameters> = denoiser.into_iter().chain(tonemapper).collect();
+        networks::save(path, &parameters, &self.gpu)
     }
 
     /// Reads the weights of every network.
@@ -153,8 +153,8 @@ impl Networks {
     /// The file is missing or damaged, or holds networks of another configuration.
     pub fn load(&mut self, path: &Path) -> Result<()> {
         let gpu = self.gpu.clone();
-        let mut networks: Vec<&mut Parameters> = self.parameters_mut().collect();
-        nn::load(path, &mut networks, &gpu)
+        let mut parameters: Vec<&mut Parameters> = self.parameters_mut().collect();
+        networks::load(path, &mut parameters, &gpu)
     }
 
     /// The parameters of every network.

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use toml::{Table, Value};
 
 use super::TrainConfig;
-use crate::hash::{self, Hasher};
+use crate::base::hash::{self, Hasher};
 use crate::{Error, Result};
 
 /// The settings that no result depends on beyond its rounding: where the dataset lies, what is kept and logged and when,

@@ -7,8 +7,8 @@ use glam::UVec2;
 use serde::{Deserialize, Serialize};
 
 use crate::loss::{DepthBoxes, Weights};
-use crate::nn::{Denoiser, DenoiserSettings, Form, Tonemapper};
-use crate::scene::Features;
+use crate::networks::{Denoiser, DenoiserSettings, Form, Tonemapper};
+use crate::splats::scene::Features;
 use crate::{Error, Result};
 
 /// The models that have a name.

@@ -3,15 +3,15 @@
 use super::terms::NetworkTerms;
 use super::{Background, TrainConfig, growth, streams};
 use crate::Result;
-use crate::dataset::Dataset;
-use crate::densify::Densifier;
-use crate::exposure::Exposures;
+use crate::base::random::Stream;
 use crate::gpu::Gpu;
 use crate::loss::Losses;
-use crate::optimizer::{Adam, FiniteCheck, Learnable};
-use crate::random::Stream;
-use crate::render::{RenderSettings, Renderer};
-use crate::scene::Shape;
+use crate::loss::exposure::Exposures;
+use crate::photographs::dataset::Dataset;
+use crate::splats::densify::Densifier;
+use crate::splats::optimizer::{Adam, FiniteCheck, Learnable};
+use crate::splats::render::{RenderSettings, Renderer};
+use crate::splats::scene::Shape;
 
 /// What needs nothing but the device and settings.
 pub(super) struct Kernels {

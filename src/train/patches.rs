@@ -14,9 +14,9 @@ use super::{TrainConfig, Trainer};
 use crate::Result;
 use crate::camera::{Camera, Patch};
 use crate::gpu::{Buffer, Gpu};
-use crate::image::Image;
-use crate::nn::{Denoiser, Tonemapper};
-use crate::scene::COLOR_CHANNELS;
+use crate::networks::{Denoiser, Tonemapper};
+use crate::photographs::image::Image;
+use crate::splats::scene::COLOR_CHANNELS;
 
 impl TrainConfig {
     /// What a view is trained on in: all of it where the device and [`TrainConfig::patch_pixels`] allow it.

@@ -9,8 +9,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
-use crate::halves::Bits;
 use crate::kernels::decode;
+use crate::splats::halves::Bits;
 
 /// In how many bits a run keeps what it could keep in fewer.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -232,7 +232,11 @@ impl Photograph {
         pass.dispatch(
             &coded.decoder,
             &decode::Params { value_count: coded.value_count as u32 },
-            decode::Buffers { codes: &coded.codes, values: &coded.values, decoded: scratch },
+            decode::Buffers {
+                codes: coded.codes.slice(),
+                values: coded.values.slice(),
+                decoded: scratch.slice_mut(),
+            },
             Threads::Exactly([coded.codes.len() as u32, 1, 1]),
         )?;
         Ok(scratch)
@@ -255,8 +259,8 @@ impl Photograph {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::base::random::Stream;
     use crate::gpu::testing::gpu;
-    use crate::random::Stream;
 
     /// What comes back of values, and in how many bits they were kept.
     fn kept(bits: PhotographBits, values: &[f32]) -> (Vec<f32>, u32) {

@@ -5,10 +5,10 @@
 use std::str::FromStr;
 
 use super::{DensityConfig, TrainConfig};
-use crate::attributes::Attribute;
-use crate::optimizer::Schedule;
-use crate::scene::init::Start;
-use crate::tone::ToneCurve;
+use crate::photographs::tone::ToneCurve;
+use crate::splats::attributes::Attribute;
+use crate::splats::optimizer::Schedule;
+use crate::splats::scene::init::Start;
 use crate::{Error, Result};
 
 /// A trade of time for quality, or a benchmark that the paper reports.
@@ -164,11 +164,11 @@ mod tests {
     use std::path::Path;
 
     use super::*;
-    use crate::densify::DensityControl;
-    use crate::halves::Bits;
     use crate::loss::Weights;
-    use crate::nn::Form;
-    use crate::tone::ToneSettings;
+    use crate::networks::Form;
+    use crate::photographs::tone::ToneSettings;
+    use crate::splats::densify::DensityControl;
+    use crate::splats::halves::Bits;
     use crate::train::{Background, ModelConfig};
 
     fn applied(preset: Preset, scene: &str, curve: ToneCurve) -> TrainConfig {

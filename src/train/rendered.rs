@@ -4,8 +4,8 @@ use super::Networks;
 use crate::Result;
 use crate::camera::{Camera, Patch};
 use crate::gpu::Buffer;
-use crate::image::Image;
-use crate::render::{RenderOptions, Renderer};
+use crate::photographs::image::Image;
+use crate::splats::render::{RenderOptions, Renderer};
 
 /// What a model shows of a view.
 #[derive(Clone, Debug)]

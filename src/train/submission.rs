@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use super::{NotFinite, StepReport, Trainer};
 use crate::gpu::Download;
 use crate::loss::{LossLogDownload, StepLosses};
-use crate::render::Status;
+use crate::splats::render::Status;
 use crate::{Error, Result};
 
 /// Steps that one submission holds at most.

@@ -7,13 +7,13 @@ use super::terms::NetworkTerms;
 use super::views::{lifted_from, measured};
 use crate::Result;
 use crate::camera::{Camera, Frame};
-use crate::dataset::{Dataset, View};
-use crate::exposure::{Affine, Exposures};
 use crate::gpu::Gpu;
-use crate::image::{Image, Mask};
-use crate::metrics::psnr_of_counted;
-use crate::pseudo_gt::PseudoGt;
-use crate::tone::{LuminanceHistogram, Scene, ToneSettings, is_black};
+use crate::loss::exposure::{Affine, Exposures};
+use crate::photographs::dataset::{Dataset, View};
+use crate::photographs::image::{Image, Mask};
+use crate::photographs::metrics::psnr_of_counted;
+use crate::photographs::pseudo_gt::PseudoGt;
+use crate::photographs::tone::{LuminanceHistogram, Scene, ToneSettings, is_black};
 
 use super::rendered::Rendered;
 

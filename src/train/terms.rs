@@ -5,6 +5,7 @@ use glam::UVec2;
 use super::masks::Masking;
 use super::networks::Networks;
 use super::{ModelConfig, TrainConfig, streams};
+use crate::base::random::Stream;
 use crate::gpu::{Buffer, Gpu, Recorder};
 use crate::kernels::ToneParameters;
 use crate::kernels::ssim::RADIUS;
@@ -12,11 +13,10 @@ use crate::loss::{
     DenoisingGradients, DenoisingInputs, DenoisingLoss, DenoisingWeights, Interior, LogSlot, Loss,
     LossInputs, LossSettings, Term, TermInputs,
 };
-use crate::nn::{Denoiser, Form};
-use crate::random::Stream;
-use crate::scene::{COLOR_CHANNELS, Feature};
-use crate::tone::ToneCurve;
-use crate::window::Window;
+use crate::networks::window::Window;
+use crate::networks::{Denoiser, Form};
+use crate::photographs::tone::ToneCurve;
+use crate::splats::scene::{COLOR_CHANNELS, Feature};
 use crate::{Error, Result};
 
 /// What the networks of a view are held to, (3, H, W) each.

@@ -12,19 +12,21 @@ use super::cache::{Cache, CacheSize, Kept};
 use super::precision::Darkroom;
 use super::{TrainConfig, streams};
 use crate::Result;
+use crate::base::random::Stream;
 use crate::camera::{Camera, Frame, Patch};
-use crate::dataset::{Dataset, Point, View};
-use crate::exposure::Affine;
 use crate::gpu::{Buffer, Gpu};
-use crate::image::Image;
 use crate::kernels::ToneParameters;
 use crate::loss::ViewSource;
-use crate::nn::Form;
-use crate::pseudo_gt::PseudoGt;
-use crate::random::Stream;
-use crate::render::{Viewpoint, Viewpoints};
-use crate::scene::{COLOR_CHANNELS, Feature, Gaussians, Shape, init};
-use crate::tone::{Exposure, Measured, Scene, Statistics, ToneCurve, ToneSettings, all_black};
+use crate::loss::exposure::Affine;
+use crate::networks::Form;
+use crate::photographs::dataset::{Dataset, Point, View};
+use crate::photographs::image::Image;
+use crate::photographs::pseudo_gt::PseudoGt;
+use crate::photographs::tone::{
+    Exposure, Measured, Scene, Statistics, ToneCurve, ToneSettings, all_black,
+};
+use crate::splats::render::{Viewpoint, Viewpoints};
+use crate::splats::scene::{COLOR_CHANNELS, Feature, Gaussians, Shape, init};
 
 /// One training view: a photograph, or a patch of one that is too large to be trained on at once.
 #[derive(Debug)]

@@ -6,14 +6,22 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
-use nightsplat::image::Image;
-use nightsplat::lpips::Network;
-use nightsplat::metrics::Scores;
+use nightsplat::networks::lpips::Network;
+use nightsplat::photographs::image::Image;
+use nightsplat::photographs::metrics::Scores;
 use serde_json::Value;
 
 #[path = "../common/mod.rs"]
 mod common;
+mod curves_command;
+mod doctor;
+mod progress;
 mod refusals;
+mod stress;
+mod sweep;
+mod tone_command;
+mod tradeoff;
+mod tuning;
 use common::command::{refused, succeed};
 
 /// Work that the tests share, done once: a small set and a short run on it.

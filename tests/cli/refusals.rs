@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use crate::common::command::{command, refused, refused_with, run};
-use crate::{common, copied_set, fixture};
+use crate::{copied_set, fixture};
 
 /// Training on `root` must fail in one line and leave no run that looks complete.
 fn refuses_to_train(root: &Path, options: &str, code: i32, parts: &[&str]) {
@@ -193,11 +193,11 @@ fn no_device_and_an_unknown_one_are_said_with_the_remedy() {
 #[test]
 fn what_validation_says_fails_the_command() {
     if !cfg!(debug_assertions) {
-        return common::not_run("commands are validated in debug builds alone");
+        return crate::common::not_run("commands are validated in debug builds alone");
     }
     // Advice on best practices, to which nothing here is held, finds something in every run.
     let advice = "VK_VALIDATION_FEATURE_ENABLE_BEST_PRACTICES_EXT";
-    let photograph = common::fixture("lom/low/000.png");
+    let photograph = crate::common::fixture("lom/low/000.png");
     let out = tempfile::tempdir().unwrap();
     let arguments = format!("tone {} --out {}", photograph.display(), out.path().display());
     let output = command(&arguments).env("VK_LAYER_ENABLES", advice).output().unwrap();

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use nightsplat::lpips::Network;
+use nightsplat::networks::lpips::Network;
 
 use super::safetensors;
 

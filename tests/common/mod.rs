@@ -17,7 +17,7 @@ use std::io::Write;
 use std::panic::Location;
 use std::path::PathBuf;
 
-use nightsplat::random::Stream;
+use nightsplat::base::random::Stream;
 
 /// Runs a kernel on the device over host vectors named like its buffers, checks what it leaves against its reference, and
 /// gives back what it writes.
@@ -31,7 +31,10 @@ macro_rules! run_kernel {
         $(let mut $output = gpu.buffer(stringify!($output), &$output).unwrap();)+
         let (done, report) = gpu.checked(|| {
             gpu.run(stringify!($kernel), |pass| {
-                let buffers = $kernel::Buffers { $($input: &$input,)* $($output: &mut $output,)+ };
+                let buffers = $kernel::Buffers {
+                    $($input: $input.slice(),)*
+                    $($output: $output.slice_mut(),)+
+                };
                 pass.dispatch(&pipeline, params, buffers, threads)
             })
         });

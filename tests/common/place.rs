@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::PathBuf;
 
-use nightsplat::dataset::synthetic::{self, SyntheticOptions};
+use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
 
 /// A folder with a set of nine small views in `set`, and runs beside it.
 pub(crate) struct Place(pub(crate) tempfile::TempDir);

@@ -4,14 +4,14 @@ use glam::{DAffine3, DMat3, DVec2, DVec3, UVec2, Vec2};
 use nightsplat::camera::{self, CameraModel, KannalaBrandt};
 use nightsplat::gpu::testing::gpu;
 use nightsplat::gpu::{Buffer, Tile};
+use nightsplat::photographs::tone::Profile;
 use nightsplat::reference::camera::{Camera, Model};
 use nightsplat::reference::camera_fisheye::Fisheye;
 use nightsplat::reference::camera_pinhole::Pinhole;
 use nightsplat::reference::gaussian::{Gaussian, Planes};
 use nightsplat::reference::sh::sh_count;
-use nightsplat::render::{self, Damping, RenderOptions, RenderSettings, Renderer, Status};
-use nightsplat::scene::{Features, Shape};
-use nightsplat::tone::Profile;
+use nightsplat::splats::render::{self, Damping, RenderOptions, RenderSettings, Renderer, Status};
+use nightsplat::splats::scene::{Features, Shape};
 
 use super::Random;
 

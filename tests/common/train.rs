@@ -1,9 +1,9 @@
 //! Small sets, and training on them.
 
-use nightsplat::dataset::Dataset;
-use nightsplat::dataset::synthetic::{self, SyntheticOptions};
 use nightsplat::gpu::testing::gpu;
-use nightsplat::scene::Gaussians;
+use nightsplat::photographs::dataset::Dataset;
+use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
+use nightsplat::splats::scene::Gaussians;
 use nightsplat::train::{StepReport, TrainConfig, Trainer};
 
 /// So many synthetic views of a size, loaded as by default.

@@ -1,13 +1,13 @@
 //! The depth term.
 
 use glam::{UVec2, Vec2};
+use nightsplat::base::random::Stream;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::gpu::{Gpu, Threads};
 use nightsplat::kernels::{
     DepthGradient, DepthMoments, depth_boxes, depth_correlation, depth_gradient, depth_moments,
 };
 use nightsplat::loss::{DepthBoxes, DepthInputs, DepthLoss, DepthSettings, Term};
-use nightsplat::random::Stream;
 
 use super::{
     Logged, NOT_FINITE, Torch, assert_close, assert_gradient, bits, central_differences, largest,

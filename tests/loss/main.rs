@@ -12,6 +12,9 @@ mod image;
 mod log;
 mod structure;
 
+mod masks;
+mod view_exposures;
+
 use std::collections::BTreeMap;
 
 use common::{largest, widen};

@@ -5,7 +5,7 @@ use nightsplat::gpu::Gpu;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::structure_l1;
 use nightsplat::loss::{StructureInputs, StructureLoss, Term};
-use nightsplat::structure::StructureTarget;
+use nightsplat::photographs::structure::StructureTarget;
 
 use super::{
     Logged, NOT_FINITE, Torch, assert_close, assert_gradient, bits, central_differences, largest,

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use super::options::pair;
-use crate::tone::ToneCurve;
+use crate::photographs::tone::ToneCurve;
 use crate::{Error, Result};
 
 /// The axis of presets, over which the other settings win.

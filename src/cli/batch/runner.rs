@@ -17,7 +17,7 @@ use indicatif::ProgressBar;
 
 use super::Run;
 use crate::cli::signals;
-use crate::run::Requests;
+use crate::results::run::Requests;
 use crate::{Error, Result, Stop};
 
 /// A point that did not finish, and why.

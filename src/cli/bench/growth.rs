@@ -9,9 +9,9 @@ use super::scene::{self, Scene};
 use super::tune::Pass;
 use super::{Bench, table, total};
 use crate::Error;
-use crate::render::{RenderSettings, Renderer};
-use crate::scene::{Features, MAX_SH_DEGREE, Shape};
-use crate::tone::ToneCurve;
+use crate::photographs::tone::ToneCurve;
+use crate::splats::render::{RenderSettings, Renderer};
+use crate::splats::scene::{Features, MAX_SH_DEGREE, Shape};
 
 /// Gaussians, in those that are asked for: 10 000 to 500 000 at the default.
 const GAUSSIANS: [f64; 5] = [0.5, 1.5, 5.0, 12.5, 25.0];

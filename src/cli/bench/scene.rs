@@ -5,14 +5,14 @@ use std::path::PathBuf;
 use glam::{DAffine3, DVec2, Vec3};
 
 use crate::Result;
+use crate::base::random::Stream;
 use crate::camera::{Camera, CameraModel};
-use crate::dataset::{Dataset, Point, Split, View};
 use crate::gpu::{CheckReport, Gpu};
-use crate::image::Image;
-use crate::random::Stream;
-use crate::render::{RenderOptions, RenderSettings, Renderer, Status};
-use crate::scene::{Gaussians, SH_C0, Shape};
-use crate::tone::{ToneCurve, ToneSettings};
+use crate::photographs::dataset::{Dataset, Point, Split, View};
+use crate::photographs::image::Image;
+use crate::photographs::tone::{ToneCurve, ToneSettings};
+use crate::splats::render::{RenderOptions, RenderSettings, Renderer, Status};
+use crate::splats::scene::{Gaussians, SH_C0, Shape};
 use crate::train::{Part, TrainConfig, Trainer};
 
 /// Gaussians before a camera that looks along z from the origin.

@@ -6,11 +6,11 @@ use std::time::Instant;
 use super::scene::{self, Scene, Trainers};
 use super::{Bench, Timing, median, total};
 use crate::Result;
+use crate::base::random::Stream;
 use crate::gpu::{Buffer, CheckReport, Gpu, PassTime};
-use crate::pseudo_gt::PseudoGt;
-use crate::random::Stream;
-use crate::sort::{Count, RadixSort};
-use crate::tone::{ToneCurve, ToneParameters, ToneSettings};
+use crate::photographs::pseudo_gt::PseudoGt;
+use crate::photographs::tone::{ToneCurve, ToneParameters, ToneSettings};
+use crate::splats::sort::{Count, RadixSort};
 
 /// What the stages took.
 pub(super) struct Stages {

@@ -21,7 +21,7 @@ use crate::kernels;
 use crate::reference::blend_forward::blend_pixel;
 use crate::reference::gaussian::Planes;
 use crate::reference::project::project_gaussian;
-use crate::scene::{ATTRIBUTES, Gaussians};
+use crate::splats::scene::{ATTRIBUTES, Gaussians};
 use crate::train::{TrainConfig, Trainer};
 use crate::{Error, reference};
 

@@ -8,8 +8,8 @@ use serde_json::{Map, Value, json};
 use super::{Bench, median, scene, stages, table, total};
 use crate::camera::Camera;
 use crate::gpu::{Buffer, Statistic, TUNE_VARIABLE, Tile, TunedTile};
-use crate::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer, Status};
-use crate::scene::{Features, MAX_SH_DEGREE, Shape};
+use crate::splats::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer, Status};
+use crate::splats::scene::{Features, MAX_SH_DEGREE, Shape};
 
 /// From the few pixels of a narrow subgroup to 32 rows of a wide one.
 const SIZES: [[u32; 2]; 7] = [[8, 4], [8, 8], [16, 4], [16, 8], [16, 16], [32, 8], [32, 16]];

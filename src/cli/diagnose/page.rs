@@ -1,13 +1,13 @@
 //! The page of `diagnose`: photographs dark and lifted with their histograms, the plan, every figure.
 
 use super::{COLUMNS, DIGITS, scene_facts, sizes, values};
-use crate::dataset::{Dataset, View};
-use crate::diagnose::{Diagnosis, Plan};
-use crate::image::Image;
-use crate::report::{
+use crate::photographs::dataset::{Dataset, View};
+use crate::photographs::image::Image;
+use crate::photographs::tone::{Exposure, LuminanceHistogram, luminance, soft};
+use crate::results::report::{
     Best, Column, Comparison, Distribution, Facts, Picture, Report, Table, distributions,
 };
-use crate::tone::{Exposure, LuminanceHistogram, luminance, soft};
+use crate::train::diagnose::{Diagnosis, Plan};
 
 /// The width of a picture, pixels.
 const PICTURE_WIDTH: u32 = 240;

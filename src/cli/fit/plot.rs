@@ -1,9 +1,9 @@
 //! The pairs and the curves as an SVG file that stands alone.
 
 use super::Fitted;
-use crate::fit::{Channels, FitOptions, Histogram, Pair};
-use crate::report::{Series, plot};
-use crate::tone::{Statistics, ToneCurve, ToneSettings};
+use crate::photographs::fit::{Channels, FitOptions, Histogram, Pair};
+use crate::photographs::tone::{Statistics, ToneCurve, ToneSettings};
+use crate::results::report::{Series, plot};
 
 /// The t up to which curves are drawn holds this share of all pixels.
 const SHARE: f64 = 0.995;
@@ -48,7 +48,7 @@ pub(super) fn svg(fitted: &Fitted, pairs: &[&Pair], options: &FitOptions) -> Str
         let columns = pooled.columns.iter();
         let columns =
             columns.filter(|column| column.count > LEAST_COLUMN * count && column.x <= end);
-        let point = |column: &crate::fit::Column| {
+        let point = |column: &crate::photographs::fit::Column| {
             let mean = column.sum_y / column.count;
             let deviation = (column.sum_y2 / column.count - mean * mean).max(0.0).sqrt();
             (column.x, mean + deviations * deviation)

@@ -4,13 +4,13 @@ use serde::Serialize;
 
 use super::FitArgs;
 use crate::Result;
+use crate::base::output::write_whole;
 use crate::cli::table::aligned;
-use crate::fit::{
+use crate::photographs::fit::{
     ColourPair, ColourScene, ProfileFold, ProfileScores, cross_validate_profile, fit_profile,
     profile_scores,
 };
-use crate::output::write_whole;
-use crate::tone::Profile;
+use crate::photographs::tone::Profile;
 
 /// A fitted profile.
 #[derive(Clone, Debug, Serialize)]

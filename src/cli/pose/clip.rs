@@ -7,8 +7,8 @@ use rayon::prelude::*;
 
 use super::create;
 use super::tool::Tool;
-use crate::image::Image;
-use crate::image::files::photographs_in;
+use crate::photographs::image::Image;
+use crate::photographs::image::files::photographs_in;
 use crate::{Error, Result};
 
 /// Frames of a window, of which one stays.

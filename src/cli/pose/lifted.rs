@@ -5,11 +5,11 @@ use std::path::{Path, PathBuf};
 use super::create;
 use crate::cli::progress_bar;
 use crate::gpu::Gpu;
-use crate::image::files::{photographs_in, stem};
-use crate::image::{Image, exif_segment};
-use crate::pseudo_gt::PseudoGt;
-use crate::tone::{ToneSettings, all_black};
-use crate::{Result, input};
+use crate::photographs::image::files::{photographs_in, stem};
+use crate::photographs::image::{Image, exif_segment};
+use crate::photographs::pseudo_gt::PseudoGt;
+use crate::photographs::tone::{ToneSettings, all_black};
+use crate::{Result, base::input};
 
 /// Lifts the photographs into `folder`, as stored, and returns the gain of the scene. A JPEG stays one and keeps its Exif,
 /// so that COLMAP finds the focal length; everything else becomes PNG.

@@ -7,8 +7,8 @@ use anyhow::Result;
 
 use super::tool::Tool;
 use super::{PoseArgs, create, lifted};
-use crate::dataset::Dataset;
-use crate::image::files::photographs_in;
+use crate::photographs::dataset::Dataset;
+use crate::photographs::image::files::photographs_in;
 
 /// Which photographs COLMAP compares.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]

@@ -4,9 +4,9 @@ use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
+use crate::base::output::write_whole;
 use crate::cli::ImageFormat;
-use crate::image::Image;
-use crate::output::write_whole;
+use crate::photographs::image::Image;
 use crate::{Error, Result};
 
 /// Refuses, before anything is rendered, a video that could not be made.

@@ -122,7 +122,7 @@ fn product(axes: &[Axis]) -> Vec<Vec<(String, String)>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::tone::ToneCurve;
+    use crate::photographs::tone::ToneCurve;
 
     fn names(given: &[(&str, &str)], table: Option<PaperTable>) -> Vec<String> {
         let axes: Vec<Axis> =

@@ -5,18 +5,18 @@ use std::path::Path;
 use serde_json::Value;
 
 use crate::Result;
+use crate::base::output::{csv_field, write_whole};
 use crate::cli::batch::Run;
 use crate::cli::batch::csv::number;
 use crate::cli::batch::point::{ADAPTIVE, OFFSET, Point, SEED};
 use crate::cli::batch::runner::Failure;
 use crate::cli::batch::sample::{deviation, mean};
-use crate::dataset::Dataset;
-use crate::eval::{AGAINST, WITH_REFERENCE};
 use crate::gpu::Gpu;
-use crate::image::Image;
-use crate::lpips::Measure;
-use crate::output::{csv_field, write_whole};
-use crate::report::{
+use crate::networks::lpips::Measure;
+use crate::photographs::dataset::Dataset;
+use crate::photographs::image::Image;
+use crate::results::eval::{AGAINST, WITH_REFERENCE};
+use crate::results::report::{
     Bar, Best, Column, Comparison, Mark, Picture, Report, Series, Table, bars, plot_points,
 };
 

@@ -5,12 +5,12 @@ use std::path::Path;
 use super::photographs::Listed;
 use super::{CurveOnSet, Mapped, Measures, ToneArgs, ToneOutput, settings, without};
 use crate::Result;
-use crate::eval;
+use crate::base::output::write_whole;
 use crate::gpu::Gpu;
-use crate::image::Image;
-use crate::metrics::Scores;
-use crate::output::write_whole;
-use crate::report::{
+use crate::photographs::image::Image;
+use crate::photographs::metrics::Scores;
+use crate::results::eval;
+use crate::results::report::{
     Best, Column, Comparison, Distribution, Picture, Report, Table, distributions,
 };
 

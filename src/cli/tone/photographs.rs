@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 
 use super::{ToneArgs, is_same_file};
 use crate::cli::ImageFormat;
-use crate::dataset::{Dataset, LoadOptions, Photograph, Split};
-use crate::image::files::{photographs_in, unread_in};
-use crate::image::{Image, Mask, Orientation};
+use crate::photographs::dataset::{Dataset, LoadOptions, Photograph, Split};
+use crate::photographs::image::files::{photographs_in, unread_in};
+use crate::photographs::image::{Image, Mask, Orientation};
 use crate::{Error, Result};
 
 /// A photograph to map.

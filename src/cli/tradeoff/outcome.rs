@@ -3,13 +3,13 @@
 use serde_json::{Map, Value, json};
 
 use super::knobs::BASE;
+use crate::base::output::csv_field;
 use crate::cli::batch::Run;
 use crate::cli::batch::csv::number;
 use crate::cli::batch::point::{PRESET, Point, SEED};
 use crate::cli::batch::sample::{deviation, mean};
-use crate::output::csv_field;
-use crate::report::{Best, Column, Table};
-use crate::run::{Progress, load_progress};
+use crate::results::report::{Best, Column, Table};
+use crate::results::run::{Progress, load_progress};
 
 /// A figure of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -7,11 +7,11 @@ use crate::Result;
 use crate::cli::batch::Run;
 use crate::cli::batch::point::SEED;
 use crate::cli::batch::runner::Failure;
-use crate::dataset::Dataset;
 use crate::gpu::Gpu;
-use crate::image::Image;
-use crate::report::{Comparison, Picture, Report, Trace, traces};
-use crate::run::{Progress, energy_counters};
+use crate::photographs::dataset::Dataset;
+use crate::photographs::image::Image;
+use crate::results::report::{Comparison, Picture, Report, Trace, traces};
+use crate::results::run::{Progress, energy_counters};
 
 /// Points on the way this much worse than the best are left out: they would flatten all others.
 const SHOWN_DECIBELS: f64 = 3.0;

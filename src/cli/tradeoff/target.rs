@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use crate::cli::tone::{self, ToneArgs};
-use crate::dataset::{Dataset, View};
-use crate::tone::ToneSettings;
+use crate::photographs::dataset::{Dataset, View};
+use crate::photographs::tone::ToneSettings;
 use crate::{Error, Result};
 
 /// What test views are scored against.

@@ -2,12 +2,12 @@
 
 use serde::Serialize;
 
-use crate::dataset::{Dataset, Split};
-use crate::diagnose::Plan;
-use crate::eval::Yardstick;
 use crate::gpu::Gpu;
-use crate::tone::ToneCurve;
+use crate::photographs::dataset::{Dataset, Split};
+use crate::photographs::tone::ToneCurve;
+use crate::results::eval::Yardstick;
 use crate::train::TrainConfig;
+use crate::train::diagnose::Plan;
 
 /// Device, views, split, points and curve.
 #[derive(Clone, Debug, Serialize)]

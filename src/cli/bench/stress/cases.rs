@@ -4,11 +4,11 @@ use glam::Vec3;
 
 use super::hostile::{Hostile, camera_of_focal};
 use crate::Result;
+use crate::base::random::Stream;
 use crate::gpu::Gpu;
-use crate::random::Stream;
-use crate::render::RenderSettings;
-use crate::scene::Gaussians;
-use crate::tone::{ToneCurve, ToneSettings};
+use crate::photographs::tone::{ToneCurve, ToneSettings};
+use crate::splats::render::RenderSettings;
+use crate::splats::scene::Gaussians;
 
 /// An input, and what is to come of it.
 #[derive(Debug)]

@@ -5,15 +5,15 @@ use std::path::PathBuf;
 
 use glam::{DVec2, DVec3, Vec3};
 
+use crate::base::random::Stream;
 use crate::camera::{Camera, Frame};
 use crate::cli::bench::scene;
-use crate::dataset::synthetic::{self, SyntheticOptions};
-use crate::dataset::{Dataset, Point, Split, View};
-use crate::exposure::{Affine, table};
-use crate::image::{Image, linear_from_srgb};
-use crate::random::Stream;
-use crate::scene::Gaussians;
-use crate::tone::{ToneCurve, ToneSettings};
+use crate::loss::exposure::{Affine, table};
+use crate::photographs::dataset::synthetic::{self, SyntheticOptions};
+use crate::photographs::dataset::{Dataset, Point, Split, View};
+use crate::photographs::image::{Image, linear_from_srgb};
+use crate::photographs::tone::{ToneCurve, ToneSettings};
+use crate::splats::scene::Gaussians;
 use crate::train::{Learning, TrainConfig};
 use crate::{Error, Result};
 

@@ -1,0 +1,11 @@
+//! What every other module stands on and none of it knows splatting: files read and written whole, hashes, random numbers.
+//!
+//! - [`input`]: files that users name, read whole
+//! - [`output`]: files that are never seen half-written
+//! - [`hash`]: checksums of numbers and bytes
+//! - [`random`]: counter-based random numbers
+
+pub mod hash;
+pub mod input;
+pub mod output;
+pub mod random;

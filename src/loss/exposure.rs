@@ -1,0 +1,311 @@
+//! Per-view exposure and colour, learned: photographs of one scene that are not equally bright show one model.
+//!
+//! What a training view is compared with is not the render c but e = gain c + bias, an affine of the encoded values for each
+//! channel of each view. The model has one brightness: whatever is learned, the mean of gains over the training views is 1 and
+//! that of biases 0, exactly ([`Exposures::center`]), so that a view shows the model as it is where its exposure is the mean.
+
+mod affine;
+#[cfg(feature = "io")]
+pub mod table;
+
+use glam::{UVec2, Vec2};
+use serde::{Deserialize, Serialize};
+
+pub use affine::Affine;
+
+use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
+use crate::kernels::exposure::{BIAS_SCALE, EXPOSURE_WIDTH};
+use crate::kernels::{expose, expose_backward, exposure_center, exposure_gradient};
+use crate::splats::optimizer::{AdamBuffers, Learnable, Moments};
+use crate::splats::scene::COLOR_CHANNELS;
+use crate::{Error, Result};
+
+/// How fast exposures are learned: Adam's rate, of gains.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ExposureRates {
+    /// At the start.
+    pub initial: f64,
+    /// At the end of its exponential decay and from there on.
+    pub last: f64,
+    /// The steps of the decay.
+    pub steps: u64,
+}
+
+impl Default for ExposureRates {
+    fn default() -> Self {
+        Self { initial: 0.01, last: 0.001, steps: 600 }
+    }
+}
+
+impl ExposureRates {
+    /// The rate of a step, counted from 1.
+    pub fn at(&self, step: u64) -> f64 {
+        let done = (step as f64 / self.steps.max(1) as f64).min(1.0);
+        self.initial * (self.last / self.initial).powf(done)
+    }
+}
+
+/// The exposures of all training views on the device, with the kernels that apply and learn them.
+#[derive(Debug)]
+pub struct Exposures {
+    gpu: Gpu,
+    rates: ExposureRates,
+    view_count: u32,
+    chunk: u32,
+    expose: Pipeline<expose::Kernel>,
+    neutralize: Pipeline<expose::Kernel>,
+    backward: Pipeline<expose_backward::Kernel>,
+    gradient: Pipeline<exposure_gradient::Kernel>,
+    center: Pipeline<exposure_center::Kernel>,
+    /// (views, `EXPOSURE_WIDTH`), as include/exposure.glsl has them.
+    parameters: Buffer<f32>,
+    gradients: Buffer<f32>,
+    moments: Moments,
+    /// (3, H, W) of the largest view.
+    exposed: Buffer<f32>,
+    /// (3, chunks) of the largest view.
+    partials: Buffer<Vec2>,
+}
+
+impl Exposures {
+    /// Exposures that begin as these, centred; without memory for views: see [`Exposures::reserve`].
+    ///
+    /// # Errors
+    /// There is no view, a gain is not above 0, or the device is out of memory.
+    pub fn new(gpu: &Gpu, rates: ExposureRates, start: &[Affine]) -> Result<Self> {
+        let mut parameters = vec![];
+        for affine in Affine::about_their_mean(start) {
+            parameters.extend(affine.parameters()?);
+        }
+        if parameters.is_empty() {
+            return Err(Error::Usage(
+                "there is no view whose exposure could be learned".to_owned(),
+            ));
+        }
+        let constants = expose_backward::Constants::default();
+        let mut exposures = Self {
+            gpu: gpu.clone(),
+            rates,
+            view_count: start.len() as u32,
+            chunk: constants.chunk,
+            expose: gpu.pipeline(&expose::Constants { inverse: false })?,
+            neutralize: gpu.pipeline(&expose::Constants { inverse: true })?,
+            backward: gpu.pipeline(&constants)?,
+            gradient: gpu.pipeline(&exposure_gradient::Constants::default())?,
+            center: gpu.pipeline(&exposure_center::Constants::default())?,
+            gradients: gpu.zeros("exposure_gradients", parameters.len())?,
+            moments: Moments::zeros(gpu, parameters.len())?,
+            parameters: gpu.buffer("exposures", &parameters)?,
+            exposed: gpu.uninit("exposed", 0)?,
+            partials: gpu.uninit("exposure_partials", 0)?,
+        };
+        let no_step_failed = gpu.zeros("status", 1)?;
+        gpu.run("center", |pass| exposures.center(pass, &no_step_failed))?;
+        Ok(exposures)
+    }
+
+    /// Memory for views of `size`, and for those reserved for before.
+    ///
+    /// # Errors
+    /// The device is out of memory.
+    pub fn reserve(&mut self, size: UVec2) -> Result<()> {
+        let values = COLOR_CHANNELS * pixels(size) as usize;
+        if values > self.exposed.len() {
+            self.exposed = self.gpu.uninit("exposed", values)?;
+        }
+        let partials = COLOR_CHANNELS * self.chunks(size) as usize;
+        if partials > self.partials.len() {
+            self.partials = self.gpu.uninit("exposure_partials", partials)?;
+        }
+        Ok(())
+    }
+
+    /// Records what `view` shows of a render, (3 or more, H, W); [`Exposures::exposed`] has it.
+    ///
+    /// # Errors
+    /// There is no such view, it is larger than those reserved for, or the render is smaller.
+    pub fn expose(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        view: usize,
+        size: UVec2,
+        render: &Buffer<f32>,
+    ) -> Result<()> {
+        self.dispatch(pass, false, view, size, render)
+    }
+
+    /// Records the target of `view`, (3, H, W), as it would be at the neutral exposure; [`Exposures::exposed`] has it.
+    ///
+    /// # Errors
+    /// As [`Exposures::expose`].
+    pub fn neutralize(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        view: usize,
+        size: UVec2,
+        target: &Buffer<f32>,
+    ) -> Result<()> {
+        self.dispatch(pass, true, view, size, target)
+    }
+
+    fn dispatch(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        inverse: bool,
+        view: usize,
+        size: UVec2,
+        render: &Buffer<f32>,
+    ) -> Result<()> {
+        self.check(view, size, render)?;
+        pass.dispatch(
+            if inverse { &self.neutralize } else { &self.expose },
+            &expose::Params { pixel_count: pixels(size), view: view as u32 },
+            expose::Buffers {
+                exposures: self.parameters.slice(),
+                render: render.slice(),
+                exposed: self.exposed.slice_mut(),
+            },
+            Threads::Exactly([COLOR_CHANNELS as u32 * pixels(size), 1, 1]),
+        )
+    }
+
+    /// What was exposed or neutralised last, (3, H, W).
+    pub fn exposed(&self) -> &Buffer<f32> {
+        &self.exposed
+    }
+
+    /// Records the gradient of the exposures, and replaces dL/d exposed in the colours of `d_render` by dL/d render.
+    ///
+    /// # Errors
+    /// As [`Exposures::expose`].
+    pub fn backward(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        view: usize,
+        size: UVec2,
+        render: &Buffer<f32>,
+        d_render: &mut Buffer<f32>,
+    ) -> Result<()> {
+        self.check(view, size, render)?;
+        self.check(view, size, d_render)?;
+        let (pixel_count, view, chunk_count) = (pixels(size), view as u32, self.chunks(size));
+        pass.dispatch(
+            &self.backward,
+            &expose_backward::Params { pixel_count, view },
+            expose_backward::Buffers {
+                exposures: self.parameters.slice(),
+                render: render.slice(),
+                d_render: d_render.slice_mut(),
+                partials: self.partials.slice_mut(),
+            },
+            Threads::Workgroups([chunk_count, COLOR_CHANNELS as u32, 1]),
+        )?;
+        pass.dispatch(
+            &self.gradient,
+            &exposure_gradient::Params { chunk_count, view, view_count: self.view_count },
+            exposure_gradient::Buffers {
+                partials: self.partials.slice(),
+                gradients: self.gradients.slice_mut(),
+            },
+            Threads::Workgroups([1, 1, 1]),
+        )
+    }
+
+    /// Records what follows Adam's step: afterwards the mean over the views is the identity again.
+    ///
+    /// # Errors
+    /// There is no status word.
+    pub fn center(&mut self, pass: &mut Recorder<'_>, status: &Buffer<u32>) -> Result<()> {
+        if status.is_empty() {
+            return Err(Error::Usage("exposures need a status word".to_owned()));
+        }
+        pass.dispatch(
+            &self.center,
+            &exposure_center::Params { view_count: self.view_count },
+            exposure_center::Buffers {
+                exposures: self.parameters.slice_mut(),
+                status: status.slice(),
+            },
+            Threads::Workgroups([EXPOSURE_WIDTH, 1, 1]),
+        )
+    }
+
+    /// The exposure of every view as it is now.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub fn affines(&self) -> Result<Vec<Affine>> {
+        let parameters = self.gpu.read(&self.parameters)?;
+        Ok(parameters.chunks_exact(EXPOSURE_WIDTH as usize).map(Affine::of_parameters).collect())
+    }
+
+    fn chunks(&self, size: UVec2) -> u32 {
+        pixels(size).div_ceil(self.chunk)
+    }
+
+    /// A kernel that runs beyond a buffer corrupts its neighbours: refuse before anything is recorded.
+    fn check(&self, view: usize, size: UVec2, planes: &Buffer<f32>) -> Result<()> {
+        let values = COLOR_CHANNELS * pixels(size) as usize;
+        if view >= self.view_count as usize {
+            let count = self.view_count;
+            return Err(Error::Usage(format!("there is no exposure {view} of {count}")));
+        }
+        let fits = (1..=self.exposed.len()).contains(&values)
+            && COLOR_CHANNELS * self.chunks(size) as usize <= self.partials.len();
+        if !fits {
+            let UVec2 { x, y } = size;
+            let problem = format!("exposures have no scratch memory for a view of {x} x {y}");
+            return Err(Error::Usage(problem));
+        }
+        if planes.len() < values {
+            let (name, len) = (planes.name(), planes.len());
+            let problem = format!("buffer `{name}` holds {len} values, the view has {values}");
+            return Err(Error::Usage(problem));
+        }
+        Ok(())
+    }
+}
+
+impl Learnable for Exposures {
+    fn name(&self) -> &'static str {
+        "exposures"
+    }
+
+    fn learning_rate(&self, step: u64) -> f64 {
+        self.rates.at(step)
+    }
+
+    fn buffers(&mut self) -> AdamBuffers<'_> {
+        let Self { parameters, gradients, moments, .. } = self;
+        AdamBuffers {
+            parameters: parameters.slice_mut(),
+            gradients: gradients.slice(),
+            moments: moments.slice_mut(),
+        }
+    }
+}
+
+fn pixels(size: UVec2) -> u32 {
+    size.x.saturating_mul(size.y)
+}
+
+impl Affine {
+    /// What is learned of it.
+    fn parameters(&self) -> Result<[f32; EXPOSURE_WIDTH as usize]> {
+        let [gains, biases] = [self.gain.map(|gain| gain - 1.0), self.bias.map(|b| b / BIAS_SCALE)];
+        let mut parameters = [0.0; EXPOSURE_WIDTH as usize];
+        for (to, value) in parameters.iter_mut().zip(gains.into_iter().chain(biases)) {
+            *to = value as f32;
+        }
+        if self.gain.iter().all(|&gain| gain > 0.0) && parameters.iter().all(|p| p.is_finite()) {
+            return Ok(parameters);
+        }
+        Err(Error::Usage(format!("{self} is no exposure: gains must be above 0 and all be finite")))
+    }
+
+    fn of_parameters(parameters: &[f32]) -> Self {
+        let at = |c: usize| f64::from(parameters[c]);
+        Self { gain: [0, 1, 2].map(|c| 1.0 + at(c)), bias: [3, 4, 5].map(|c| BIAS_SCALE * at(c)) }
+    }
+}

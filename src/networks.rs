@@ -1,0 +1,123 @@
+//! The networks: the denoiser that takes the noise from a render, and the tonemapper that darkens it again; and those that
+//! LPIPS looks through.
+//!
+//! Images are planes, (C, H, W), row by row. A network owns its parameters, with their gradients beside them, and the
+//! memory of one view: [`Denoiser::reserve`] takes it, `forward` fills it, `backward` uses it up. Sums over pixels are
+//! partial sums in a fixed order, so the same step gives the same bits.
+//!
+//! Norms use the statistics of the image itself, in training and afterwards: there are no running averages.
+
+mod conv;
+mod denoiser;
+#[cfg(feature = "io")]
+mod file;
+mod half;
+mod inner;
+#[cfg(feature = "io")]
+pub mod lpips;
+mod norm;
+mod parameters;
+mod relu;
+mod tonemapper;
+#[cfg(feature = "io")]
+mod trunk;
+pub mod window;
+
+use glam::UVec2;
+use serde::{Deserialize, Serialize};
+
+use crate::gpu::{Buffer, Gpu};
+use crate::{Error, Result};
+
+pub use conv::Precision;
+pub use denoiser::{Denoiser, DenoiserSettings};
+#[cfg(feature = "io")]
+pub(crate) use file::TensorFile;
+#[cfg(feature = "io")]
+pub use file::{load, save};
+pub use parameters::{Parameters, Tensor};
+pub use tonemapper::Tonemapper;
+#[cfg(feature = "io")]
+pub use trunk::Network;
+#[cfg(feature = "io")]
+pub(crate) use trunk::{Trunk, published};
+
+/// How a network begins and ends.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Form {
+    /// What goes in comes out until something better is learned: the network's last layer begins at zero, has nothing behind
+    /// it, and what it says is a difference.
+    #[default]
+    Identity,
+    /// LITA-GS's: the denoiser's last layer begins at random behind a sigmoid, about one half; the tonemapper says its whole
+    /// image.
+    Paper,
+}
+
+/// Red, green, blue.
+const RGB: u32 = 3;
+
+/// The columns and rows of pixels that one lane of `conv3x3` owns.
+///
+/// On a processor a load costs the most, and a lane's neighbouring columns share theirs; on a GPU neighbouring lanes
+/// read neighbouring pixels, and registers are what a block may fill.
+const CPU_SHAPE: [u32; 2] = [4, 4];
+const GPU_SHAPE: [u32; 2] = [1, 8];
+
+/// The columns and rows of pixels that suit the device.
+pub(crate) fn conv_shape(gpu: &Gpu) -> [u32; 2] {
+    if gpu.properties().is_cpu { CPU_SHAPE } else { GPU_SHAPE }
+}
+
+/// Pixels of a view.
+///
+/// # Errors
+/// The view is empty.
+fn pixel_count(size: UVec2) -> Result<usize> {
+    let UVec2 { x: width, y: height } = size;
+    match width as usize * height as usize {
+        0 => Err(Error::Usage(format!(
+            "a network has nothing to do for a view of {width} x {height}"
+        ))),
+        pixels => Ok(pixels),
+    }
+}
+
+/// A kernel that runs beyond a buffer corrupts its neighbours: refuse before anything is recorded.
+fn check_images<const N: usize>(pixels: usize, images: [&Buffer<f32>; N]) -> Result<()> {
+    let needed = RGB as usize * pixels;
+    match images.into_iter().find(|image| image.len() < needed) {
+        None => Ok(()),
+        Some(short) => {
+            let (name, len) = (short.name(), short.len());
+            let problem = format!("buffer `{name}` holds {len} values, the view has {needed}");
+            Err(Error::Usage(problem))
+        }
+    }
+}
+
+/// # Errors
+/// One binding cannot span `len` floats of `what`.
+fn check_binding(gpu: &Gpu, what: &str, size: UVec2, len: usize) -> Result<()> {
+    let properties = gpu.properties();
+    let (bytes, limit) = (float_bytes(len), properties.max_storage_buffer_range);
+    if bytes <= limit {
+        return Ok(());
+    }
+    let (UVec2 { x: width, y: height }, device) = (size, &properties.name);
+    Err(Error::Usage(format!(
+        "{what} at {width} x {height} take {bytes} bytes, {device} binds {limit} at most; use a smaller crop or fewer \
+         channels"
+    )))
+}
+
+/// The forward or backward pass does not match what came before it.
+fn out_of_turn(network: &str, size: UVec2, remedy: &str) -> Error {
+    let UVec2 { x: width, y: height } = size;
+    Error::Usage(format!("the {network} is not ready for a view of {width} x {height}; {remedy}"))
+}
+
+fn float_bytes(len: usize) -> u64 {
+    (len as u64).saturating_mul(size_of::<f32>() as u64)
+}

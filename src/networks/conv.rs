@@ -1,0 +1,315 @@
+//! A 3x3 convolution in single precision: its kernels, forward and backward.
+
+use glam::UVec2;
+use serde::{Deserialize, Serialize};
+
+use super::conv_shape;
+use crate::gpu::{Buffer, CooperativeMatrix, Gpu, Pipeline, Recorder, Threads};
+use crate::kernels::{conv3x3, conv3x3_weight_gradient, reduce_strips};
+use crate::{Error, Result};
+
+/// The most output channels that one subgroup takes.
+const OUT_BLOCK: u32 = 8;
+
+/// Rows whose pixels make one partial sum of the gradient of the weights.
+const STRIP_ROWS: u32 = 16;
+/// Of matrices a subgroup takes more channels, and fewer rows: as many subgroups.
+pub(super) const HALF_STRIP_ROWS: u32 = 4;
+
+/// What follows the sum of a convolution.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u32)]
+pub(super) enum Activation {
+    None = 0,
+    Relu = conv3x3::RELU,
+    Sigmoid = conv3x3::SIGMOID,
+}
+
+/// What a convolution adds to, in place of overwriting it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Adds {
+    Nothing,
+    /// Its output.
+    Output,
+    /// The gradient of its input.
+    InputGradient,
+}
+
+/// How precise the factors of a convolution are; its sums are in single precision.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Precision {
+    /// 32 bits.
+    #[default]
+    Single,
+    /// 16 bits, by cooperative matrices, where the device offers them, else as `Single`.
+    Half,
+}
+
+impl Precision {
+    /// What the device offers of it.
+    pub(super) fn on(self, gpu: &Gpu) -> Self {
+        if self.matrix(gpu).is_some() { Self::Half } else { Self::Single }
+    }
+
+    /// The matrices that factors are in; none where they have 32 bits.
+    pub(super) fn matrix(self, gpu: &Gpu) -> Option<CooperativeMatrix> {
+        gpu.properties().cooperative_matrix.filter(|_| self == Self::Half)
+    }
+}
+
+impl std::str::FromStr for Precision {
+    type Err = Error;
+
+    fn from_str(name: &str) -> Result<Self> {
+        match name {
+            "single" => Ok(Self::Single),
+            "half" => Ok(Self::Half),
+            _ => Err(Error::Usage(format!("unknown precision `{name}`; single or half"))),
+        }
+    }
+}
+
+/// A convolution's kernels; its weights lie at an offset of the network's parameters.
+#[derive(Debug)]
+pub(super) struct Conv {
+    inputs: u32,
+    outputs: u32,
+    forward: Product,
+    data_gradient: Product,
+    weight_gradient: WeightGradient,
+    reduce: Reduce,
+}
+
+/// The input of a convolution and the gradient of its output before the activation.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Seen<'a> {
+    pub(super) source: &'a Buffer<f32>,
+    pub(super) d_target: &'a Buffer<f32>,
+}
+
+impl Conv {
+    /// Where a buffer is said to be added to, what it holds stays in the sum.
+    ///
+    /// # Errors
+    /// The driver refuses a kernel.
+    pub(super) fn new(
+        gpu: &Gpu,
+        [inputs, outputs]: [u32; 2],
+        activation: Activation,
+        adds: Adds,
+    ) -> Result<Self> {
+        let none = Activation::None;
+        let accumulate = adds == Adds::Output;
+        let forward = Form { activation, transposed: false, accumulate };
+        let accumulate = adds == Adds::InputGradient;
+        let backward = Form { activation: none, transposed: true, accumulate };
+        Ok(Self {
+            inputs,
+            outputs,
+            forward: Product::new(gpu, outputs, forward)?,
+            data_gradient: Product::new(gpu, inputs, backward)?,
+            weight_gradient: WeightGradient::new(gpu, outputs)?,
+            reduce: Reduce::new(gpu)?,
+        })
+    }
+
+    /// Writes the activated convolution of `source` (in, H, W) to `target` (out, H, W), or adds it.
+    pub(super) fn forward(
+        &self,
+        pass: &mut Recorder<'_>,
+        size: UVec2,
+        offset: u32,
+        values: &Buffer<f32>,
+        source: &Buffer<f32>,
+        target: &mut Buffer<f32>,
+    ) -> Result<()> {
+        let channels = [self.inputs, self.outputs];
+        self.forward.record(pass, size, channels, offset, values, source, target)
+    }
+
+    /// Writes or adds the gradient of the input, given that of the output before the activation.
+    pub(super) fn data_gradient(
+        &self,
+        pass: &mut Recorder<'_>,
+        size: UVec2,
+        offset: u32,
+        values: &Buffer<f32>,
+        d_target: &Buffer<f32>,
+        d_source: &mut Buffer<f32>,
+    ) -> Result<()> {
+        let channels = [self.outputs, self.inputs];
+        self.data_gradient.record(pass, size, channels, offset, values, d_target, d_source)
+    }
+
+    /// Adds the gradients of weights and biases; `partials` holds [`partial_count`] values.
+    pub(super) fn weight_gradient(
+        &self,
+        pass: &mut Recorder<'_>,
+        size: UVec2,
+        offset: u32,
+        seen: Seen<'_>,
+        partials: &mut Buffer<f32>,
+        gradients: &mut Buffer<f32>,
+    ) -> Result<()> {
+        let channels = [self.inputs, self.outputs];
+        self.weight_gradient.record(pass, size, channels, seen, partials)?;
+        let strip_count = size.y.div_ceil(STRIP_ROWS);
+        self.reduce.record(pass, channels, strip_count, offset, Strips { partials, gradients })
+    }
+}
+
+/// What a product is for.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Form {
+    pub(super) activation: Activation,
+    pub(super) transposed: bool,
+    pub(super) accumulate: bool,
+}
+
+/// The kernel that convolves, and the pixels and channels that a subgroup takes.
+#[derive(Debug)]
+pub(super) struct Product {
+    kernel: Pipeline<conv3x3::Kernel>,
+    columns: u32,
+    rows: u32,
+    channels: u32,
+}
+
+impl Product {
+    pub(super) fn new(gpu: &Gpu, outputs: u32, form: Form) -> Result<Self> {
+        let Form { activation, transposed, accumulate } = form;
+        let [columns, rows] = conv_shape(gpu);
+        let channels = outputs.min(OUT_BLOCK);
+        let kernel = gpu.pipeline(&conv3x3::Constants {
+            columns,
+            rows,
+            out_block: channels,
+            activation: activation as u32,
+            transposed,
+            accumulate,
+        })?;
+        let columns = columns * gpu.properties().subgroup_size;
+        Ok(Self { kernel, columns, rows, channels })
+    }
+
+    #[expect(clippy::too_many_arguments, reason = "a layer, its place and its images")]
+    pub(super) fn record(
+        &self,
+        pass: &mut Recorder<'_>,
+        size: UVec2,
+        [in_channels, out_channels]: [u32; 2],
+        offset: u32,
+        values: &Buffer<f32>,
+        source: &Buffer<f32>,
+        target: &mut Buffer<f32>,
+    ) -> Result<()> {
+        pass.dispatch(
+            &self.kernel,
+            &conv3x3::Params { size, in_channels, out_channels, offset },
+            conv3x3::Buffers {
+                values: values.slice(),
+                source: source.slice(),
+                target: target.slice_mut(),
+            },
+            Threads::Workgroups([
+                out_channels.div_ceil(self.channels),
+                size.x.div_ceil(self.columns),
+                size.y.div_ceil(self.rows),
+            ]),
+        )
+    }
+}
+
+/// The kernel that sums the gradient of a layer's weights over strips, and the output channels that a subgroup takes.
+#[derive(Debug)]
+struct WeightGradient {
+    kernel: Pipeline<conv3x3_weight_gradient::Kernel>,
+    outputs: u32,
+}
+
+impl WeightGradient {
+    fn new(gpu: &Gpu, outputs: u32) -> Result<Self> {
+        let outputs = outputs.min(OUT_BLOCK);
+        let constants = conv3x3_weight_gradient::Constants { rows: STRIP_ROWS, out_block: outputs };
+        Ok(Self { kernel: gpu.pipeline(&constants)?, outputs })
+    }
+
+    fn record(
+        &self,
+        pass: &mut Recorder<'_>,
+        size: UVec2,
+        [in_channels, out_channels]: [u32; 2],
+        Seen { source, d_target }: Seen<'_>,
+        partials: &mut Buffer<f32>,
+    ) -> Result<()> {
+        pass.dispatch(
+            &self.kernel,
+            &conv3x3_weight_gradient::Params { size, in_channels, out_channels },
+            conv3x3_weight_gradient::Buffers {
+                source: source.slice(),
+                d_target: d_target.slice(),
+                partials: partials.slice_mut(),
+            },
+            Threads::Workgroups([
+                in_channels,
+                out_channels.div_ceil(self.outputs),
+                size.y.div_ceil(STRIP_ROWS),
+            ]),
+        )
+    }
+}
+
+/// The partial sums of the gradient of a layer, and where they are added.
+#[derive(Debug)]
+pub(super) struct Strips<'a> {
+    /// Holds [`partial_count`] values.
+    pub(super) partials: &'a mut Buffer<f32>,
+    pub(super) gradients: &'a mut Buffer<f32>,
+}
+
+/// The kernel that adds up the strips.
+#[derive(Debug)]
+pub(super) struct Reduce(Pipeline<reduce_strips::Kernel>);
+
+impl Reduce {
+    pub(super) fn new(gpu: &Gpu) -> Result<Self> {
+        Ok(Self(gpu.pipeline(&reduce_strips::Constants::default())?))
+    }
+
+    pub(super) fn record(
+        &self,
+        pass: &mut Recorder<'_>,
+        [inputs, outputs]: [u32; 2],
+        strip_count: u32,
+        offset: u32,
+        Strips { partials, gradients }: Strips<'_>,
+    ) -> Result<()> {
+        let parameter_count = layer_len(inputs, outputs);
+        pass.dispatch(
+            &self.0,
+            &reduce_strips::Params { parameter_count, strip_count, offset },
+            reduce_strips::Buffers { partials: partials.slice(), gradients: gradients.slice_mut() },
+            Threads::Exactly([parameter_count, 1, 1]),
+        )
+    }
+}
+
+/// Weights and biases of a layer.
+fn layer_len(inputs: u32, outputs: u32) -> u32 {
+    outputs * (9 * inputs + 1)
+}
+
+/// Floats that the partial sums of a layer's gradient take at most.
+pub(super) fn partial_count(
+    size: UVec2,
+    [inputs, outputs]: [u32; 2],
+    precision: Precision,
+) -> usize {
+    let rows = match precision {
+        Precision::Single => STRIP_ROWS,
+        Precision::Half => HALF_STRIP_ROWS,
+    };
+    let strips = size.y.div_ceil(rows);
+    strips as usize * outputs as usize * (9 * inputs as usize + 1)
+}

@@ -1,0 +1,514 @@
+//! The denoiser: stages that each estimate the noise that is left and take it from the render.
+//!
+//! ```text
+//! I_0 = noise map, I_k = R_k for k >= 1; R_0 = render
+//! f = relu(conv_in(I_k)); `repeats` times: f = f + relu(norm(conv(f)))     one conv and one norm for all repeats
+//! R_{k+1} = clamp(R_0 - (I_k + sigmoid(conv_out(f))), 0, 1)
+//! ```
+//!
+//! That is the paper's form. In the identity form `I_0 = R_0` and `R_{k+1} = I_k - conv_out(f)`, with the last layer zero at
+//! first: R_K begins as the render, and no gradient dies behind a sigmoid or a clamp.
+//!
+//! Activations are kept for one stage at a time, or for every stage where [`Denoiser::keep_activations`] finds room: without
+//! it the backward pass computes those of the earlier stages again, from their inputs `R_k`, to the same bits.
+
+mod memory;
+
+use glam::UVec2;
+use serde::{Deserialize, Serialize};
+
+use self::memory::{Activations, Earlier, Extent, Memory, Repeat};
+use super::conv::{Activation, Adds, Conv, Precision, Seen, Strips};
+use super::half::{PackedMap, Way};
+use super::inner::{Inner, Layer, Map};
+use super::norm::{Backward, Forward, Norm, Use};
+use super::parameters::{Layout, Parameters};
+use super::relu::ReluBackward;
+use super::{Form, RGB, check_images, out_of_turn, pixel_count};
+use crate::base::random::Stream;
+use crate::gpu::{Buffer, Gpu, Pipeline, Properties, Recorder, Threads};
+use crate::kernels::{residual, residual_backward};
+use crate::{Error, Result};
+
+/// The stream of random numbers that the weights are drawn from.
+const STREAM: u64 = 5;
+
+/// How large a denoiser is, and what it begins as. By default it is as small as pays on noisy photographs
+/// (docs/benchmarks.md).
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct DenoiserSettings {
+    /// Estimates of the noise, each with its own weights.
+    pub stages: u32,
+    /// How often a stage applies its inner convolution and norm.
+    pub repeats: u32,
+    /// Feature maps.
+    pub channels: u32,
+    /// Of the inner convolution.
+    pub precision: Precision,
+    /// How the networks begin and end, the tonemapper too.
+    pub form: Form,
+}
+
+impl Default for DenoiserSettings {
+    fn default() -> Self {
+        Self {
+            stages: 1,
+            repeats: 2,
+            channels: 8,
+            precision: Precision::Single,
+            form: Form::default(),
+        }
+    }
+}
+
+impl DenoiserSettings {
+    /// LITA-GS's.
+    pub fn paper() -> Self {
+        Self {
+            stages: 3,
+            repeats: 6,
+            channels: 64,
+            precision: Precision::Single,
+            form: Form::Paper,
+        }
+    }
+
+    /// # Errors
+    /// A number is out of its range.
+    pub fn check(&self) -> Result<()> {
+        let ranges = [
+            ("stages", self.stages, 16),
+            ("repeats", self.repeats, 64),
+            ("channels", self.channels, 512),
+        ];
+        match ranges.into_iter().find(|(_, value, max)| !(1..=*max).contains(value)) {
+            None => Ok(()),
+            Some((name, value, max)) => Err(Error::Usage(format!(
+                "the denoiser's {name} are {value}; they must be within 1 and {max}"
+            ))),
+        }
+    }
+
+    /// In the precision that the device offers.
+    fn held_on(self, gpu: &Gpu) -> Self {
+        Self { precision: self.precision.on(gpu), ..self }
+    }
+
+    fn channels(self) -> usize {
+        self.channels as usize
+    }
+}
+
+/// The denoiser, its parameters and the memory of one view.
+#[derive(Debug)]
+pub struct Denoiser {
+    gpu: Gpu,
+    settings: DenoiserSettings,
+    /// The same in the precision that the device offers.
+    held: DenoiserSettings,
+    parameters: Parameters,
+    stages: Vec<Stage>,
+    kernels: Kernels,
+    reserved: Extent,
+    memory: Memory,
+    earlier: Earlier,
+    /// The size of the forward pass that the memory holds.
+    recorded: Option<UVec2>,
+}
+
+/// Where the layers of a stage lie in the parameters.
+#[derive(Clone, Copy, Debug)]
+struct Stage {
+    number: usize,
+    conv_in: u32,
+    conv: u32,
+    norm: u32,
+    conv_out: u32,
+}
+
+#[derive(Debug)]
+struct Kernels {
+    channels: u32,
+    repeats: usize,
+    conv_in: Conv,
+    conv: Inner,
+    conv_out: Conv,
+    norm: Norm,
+    relu_backward: ReluBackward,
+    residual: Pipeline<residual::Kernel>,
+    residual_backward: Pipeline<residual_backward::Kernel>,
+}
+
+impl Denoiser {
+    /// Adam's learning rate in LITA-GS.
+    pub const LEARNING_RATE: f64 = 5e-5;
+
+    /// Draws the weights; memory for a view comes with [`Denoiser::reserve`].
+    ///
+    /// # Errors
+    /// A setting is out of range, the driver refuses a kernel, or the device is out of memory.
+    pub fn new(gpu: &Gpu, settings: DenoiserSettings, seed: u64) -> Result<Self> {
+        settings.check()?;
+        let mut layout = Layout::new(Stream::new(seed, STREAM));
+        let channels = settings.channels;
+        let stage = |k| Stage {
+            number: k as usize,
+            conv_in: layout.conv(&format!("{k}.conv_in"), RGB, channels),
+            conv: layout.conv(&format!("{k}.conv"), channels, channels),
+            norm: layout.norm(&format!("{k}.norm"), channels),
+            conv_out: match settings.form {
+                Form::Identity => layout.zero_conv(&format!("{k}.conv_out"), channels, RGB),
+                Form::Paper => layout.conv(&format!("{k}.conv_out"), channels, RGB),
+            },
+        };
+        let stages = (0..settings.stages).map(stage).collect();
+        let reserved = Extent::default();
+        let held = settings.held_on(gpu);
+        Ok(Self {
+            gpu: gpu.clone(),
+            settings,
+            held,
+            parameters: layout.upload(
+                gpu,
+                ("denoiser", Self::LEARNING_RATE),
+                serde_json::json!(settings).to_string(),
+            )?,
+            stages,
+            kernels: Kernels::new(gpu, settings)?,
+            reserved,
+            memory: Memory::new(gpu, held, reserved)?,
+            earlier: Earlier::default(),
+            recorded: None,
+        })
+    }
+
+    /// What it was made with.
+    pub fn settings(&self) -> DenoiserSettings {
+        self.settings
+    }
+
+    /// The parameters of all stages and their gradients.
+    pub fn parameters(&self) -> &Parameters {
+        &self.parameters
+    }
+
+    /// As [`Denoiser::parameters`], to be changed.
+    pub fn parameters_mut(&mut self) -> &mut Parameters {
+        &mut self.parameters
+    }
+
+    /// Makes the last layer of every stage zero: in the identity form what goes in comes out.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub fn become_identity(&mut self) -> Result<()> {
+        let mut values = self.gpu.read(&self.parameters.values)?;
+        for tensor in self.parameters.tensors().iter().filter(|of| of.name.contains("conv_out")) {
+            values[tensor.offset..][..tensor.len()].fill(0.0);
+        }
+        self.gpu.write(&mut self.parameters.values, &values)
+    }
+
+    /// How far a pixel's result looks, in pixels, beside the norms, which look at the whole view.
+    pub fn margin(&self) -> u32 {
+        self.settings.stages * (self.settings.repeats + 2)
+    }
+
+    /// The memory that [`Denoiser::reserve`] takes for a view.
+    pub fn bytes(settings: DenoiserSettings, size: UVec2) -> u64 {
+        Extent::of(settings, size).bytes(settings)
+    }
+
+    /// The memory that [`Denoiser::keep_activations`] takes for a view beside it.
+    pub fn kept_bytes(settings: DenoiserSettings, size: UVec2) -> u64 {
+        Earlier::bytes(settings, Extent::of(settings, size))
+    }
+
+    /// Whether the device binds every map of a view of `size`.
+    pub fn fits_on(gpu: &Gpu, settings: DenoiserSettings, size: UVec2) -> bool {
+        let held = settings.held_on(gpu);
+        Extent::of(held, size).check(gpu, held, size).is_ok()
+    }
+
+    /// Takes the memory for views up to `size`, unless it is there already.
+    ///
+    /// # Errors
+    /// A map exceeds what the device can bind, or the device is out of memory.
+    pub fn reserve(&mut self, size: UVec2) -> Result<()> {
+        let needed = Extent::of(self.held, size);
+        if needed.fits(self.reserved) {
+            return Ok(());
+        }
+        let gpu = &self.gpu;
+        needed.check(gpu, self.held, size)?;
+        // The old memory goes first: both together may not fit.
+        self.recorded = None;
+        let extent = needed.max(std::mem::take(&mut self.reserved));
+        self.memory = Memory::new(gpu, self.held, Extent::default())?;
+        self.memory = Memory::new(gpu, self.held, extent)?;
+        self.reserved = extent;
+        Ok(())
+    }
+
+    /// Keeps the activations of every stage in views up to `size` from now on, where that takes no more than `most` bytes and
+    /// the device has them; says whether it does. No bit of a result follows from it.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub fn keep_activations(&mut self, size: UVec2, most: u64) -> Result<bool> {
+        let (settings, needed) = (self.held, Extent::of(self.held, size));
+        if needed.fits(self.earlier.extent()) {
+            return Ok(true);
+        }
+        let extent = needed.max(self.earlier.extent());
+        if Earlier::bytes(settings, extent) > most {
+            return Ok(false);
+        }
+        (self.recorded, self.earlier) = (None, Earlier::default());
+        match Earlier::new(&self.gpu, settings, extent) {
+            Ok(earlier) => self.earlier = earlier,
+            Err(Error::OutOfMemory { .. } | Error::BufferTooLarge { .. }) => return Ok(false),
+            Err(other) => return Err(other),
+        }
+        Ok(true)
+    }
+
+    /// `R_K` of the last forward pass, (3, H, W), at the beginning of a buffer that is as long as what was reserved.
+    pub fn denoised(&self) -> &Buffer<f32> {
+        &self.memory.denoised[self.memory.denoised.len() - 1]
+    }
+
+    /// Records the passes from `I_0`, the noise map or in the identity form the render, and the render, each (3, H, W), to
+    /// [`Denoiser::denoised`].
+    ///
+    /// # Errors
+    /// The view is empty or no memory is reserved for it, or an image is shorter than the view.
+    pub fn forward(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        size: UVec2,
+        input: &Buffer<f32>,
+        render: &Buffer<f32>,
+    ) -> Result<()> {
+        let (pixels, extent) = (pixel_count(size)?, Extent::of(self.held, size));
+        if !extent.fits(self.reserved) {
+            return Err(out_of_turn("denoiser", size, "reserve memory for that size first"));
+        }
+        check_images(pixels, [input, render])?;
+        let Self { kernels, parameters, earlier, .. } = self;
+        let Memory { activations: shared, denoised, .. } = &mut self.memory;
+        for (k, stage) in self.stages.iter().enumerate() {
+            let (before, from_here) = denoised.split_at_mut(k);
+            let stage_input = before.last().unwrap_or(input);
+            let own = earlier.of(k, extent, shared);
+            kernels.conv.prepare(pass, Way::Forward, stage.inner(&parameters.values))?;
+            kernels.stage_forward(pass, size, stage, &parameters.values, stage_input, own)?;
+            let value_count = RGB * pixels as u32;
+            pass.dispatch(
+                &kernels.residual,
+                &residual::Params { value_count },
+                residual::Buffers {
+                    render: render.slice(),
+                    stage_input: stage_input.slice(),
+                    update: own.update.slice(),
+                    denoised: from_here[0].slice_mut(),
+                },
+                Threads::Exactly([value_count, 1, 1]),
+            )?;
+        }
+        self.recorded = Some(size);
+        Ok(())
+    }
+
+    /// Records the passes from `dL/dR_K` back: overwrites the gradients of the parameters, writes `d_input` and adds to
+    /// `d_render`, each (3, H, W), what the render says beside `I_0`: nothing in the identity form. Inputs and parameters are
+    /// those of the forward pass before it.
+    ///
+    /// # Errors
+    /// There is no forward pass of that size before it, or an image is shorter than the view.
+    #[expect(clippy::too_many_arguments, reason = "three images in, two gradients out")]
+    pub fn backward(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        size: UVec2,
+        input: &Buffer<f32>,
+        render: &Buffer<f32>,
+        d_denoised: &Buffer<f32>,
+        d_input: &mut Buffer<f32>,
+        d_render: &mut Buffer<f32>,
+    ) -> Result<()> {
+        let pixels = pixel_count(size)?;
+        check_images(pixels, [input, render, d_denoised, d_input, d_render])?;
+        if self.recorded.take() != Some(size) {
+            let remedy = "each backward pass needs a forward pass of its own before it";
+            return Err(out_of_turn("denoiser", size, remedy));
+        }
+        let Self { kernels, memory, earlier, parameters, stages, held, .. } = self;
+        let extent = Extent::of(*held, size);
+        let are_kept = extent.fits(earlier.extent());
+        pass.fill(&mut parameters.gradients, 0);
+        for stage in stages.iter() {
+            kernels.conv.prepare(pass, Way::Backward, stage.inner(&parameters.values))?;
+        }
+        let last = stages.len() - 1;
+        for (k, stage) in stages.iter().enumerate().rev() {
+            let stage_input = if k == 0 { input } else { &memory.denoised[k - 1] };
+            let activations = earlier.of(k, extent, &mut memory.activations);
+            if k < last && !are_kept {
+                let values = &parameters.values;
+                kernels.stage_forward(pass, size, stage, values, stage_input, activations)?;
+            }
+            // The two images take turns, so that what a stage reads is never what it writes.
+            let [even, odd] = &mut memory.d_denoised;
+            let (own, other) = if k % 2 == 0 { (even, odd) } else { (odd, even) };
+            let d_output = if k == last { d_denoised } else { &*other };
+            let d_stage_input = if k == 0 { &mut *d_input } else { own };
+            let value_count = RGB * pixels as u32;
+            pass.dispatch(
+                &kernels.residual_backward,
+                &residual_backward::Params { value_count },
+                residual_backward::Buffers {
+                    render: render.slice(),
+                    stage_input: stage_input.slice(),
+                    update: activations.update.slice(),
+                    d_denoised: d_output.slice(),
+                    d_update: memory.d_update.slice_mut(),
+                    d_stage_input: d_stage_input.slice_mut(),
+                    d_render: d_render.slice_mut(),
+                },
+                Threads::Exactly([value_count, 1, 1]),
+            )?;
+            let maps = Maps {
+                activations,
+                d_features: &mut memory.d_features,
+                d_convolved: &mut memory.d_convolved,
+                d_packed: &mut memory.d_packed,
+                partials: &mut memory.partials,
+            };
+            let ends = Ends { stage_input, d_update: &memory.d_update, d_stage_input };
+            kernels.stage_backward(pass, size, stage, parameters, maps, ends)?;
+        }
+        Ok(())
+    }
+}
+
+/// What the backward pass of a stage reads and overwrites.
+struct Maps<'a> {
+    activations: &'a mut Activations,
+    d_features: &'a mut Buffer<f32>,
+    d_convolved: &'a mut Buffer<f32>,
+    d_packed: &'a mut PackedMap,
+    partials: &'a mut Buffer<f32>,
+}
+
+/// The images at both ends of a stage's network.
+struct Ends<'a> {
+    stage_input: &'a Buffer<f32>,
+    d_update: &'a Buffer<f32>,
+    /// Added to.
+    d_stage_input: &'a mut Buffer<f32>,
+}
+
+impl Kernels {
+    fn new(gpu: &Gpu, settings: DenoiserSettings) -> Result<Self> {
+        let DenoiserSettings { channels, precision, form, .. } = settings;
+        let Properties { name, cooperative_matrix, .. } = gpu.properties();
+        if precision == Precision::Half && cooperative_matrix.is_none() {
+            tracing::warn!("{name} offers no 16-bit matrices: the denoiser is in single precision");
+        }
+        let adds = Adds::InputGradient;
+        let identity = form == Form::Identity;
+        let activation = if identity { Activation::None } else { Activation::Sigmoid };
+        Ok(Self {
+            channels,
+            repeats: settings.repeats as usize,
+            conv_in: Conv::new(gpu, [RGB, channels], Activation::Relu, adds)?,
+            conv: Inner::new(gpu, channels, settings.stages, adds, precision)?,
+            conv_out: Conv::new(gpu, [channels, RGB], activation, Adds::Nothing)?,
+            norm: Norm::new(gpu, channels)?,
+            relu_backward: ReluBackward::new(gpu)?,
+            residual: gpu.pipeline(&residual::Constants { identity })?,
+            residual_backward: gpu.pipeline(&residual_backward::Constants { identity })?,
+        })
+    }
+
+    /// The activations of a stage.
+    fn stage_forward(
+        &self,
+        pass: &mut Recorder<'_>,
+        size: UVec2,
+        stage: &Stage,
+        values: &Buffer<f32>,
+        input: &Buffer<f32>,
+        activations: &mut Activations,
+    ) -> Result<()> {
+        let first = activations.first_features();
+        self.conv_in.forward(pass, size, stage.conv_in, values, input, first)?;
+        for repeat in 0..self.repeats {
+            let Repeat { shortcut, packed, convolved, norm, target } = activations.repeat(repeat);
+            let map = Map { single: shortcut, packed };
+            self.conv.forward(pass, size, stage.inner(values), map, convolved)?;
+            let images = Forward { source: convolved, shortcut, target };
+            self.norm.forward(pass, stage.norm_use(size, repeat), values, norm, images)?;
+        }
+        let (last, update) = activations.ends(self.repeats);
+        self.conv_out.forward(pass, size, stage.conv_out, values, last, update)
+    }
+
+    /// From the gradient of the last layer's sum to that of the stage's input; adds those of the stage's parameters.
+    fn stage_backward(
+        &self,
+        pass: &mut Recorder<'_>,
+        size: UVec2,
+        stage: &Stage,
+        parameters: &mut Parameters,
+        maps: Maps<'_>,
+        ends: Ends<'_>,
+    ) -> Result<()> {
+        let Parameters { values, gradients, .. } = parameters;
+        let Maps { activations, d_features, d_convolved, d_packed, partials } = maps;
+        let last = activations.features(self.repeats);
+        let seen = Seen { source: last, d_target: ends.d_update };
+        self.conv_out.weight_gradient(pass, size, stage.conv_out, seen, partials, gradients)?;
+        self.conv_out.data_gradient(
+            pass,
+            size,
+            stage.conv_out,
+            values,
+            ends.d_update,
+            d_features,
+        )?;
+        for repeat in (0..self.repeats).rev() {
+            let (of, Activations { convolved, norm, .. }) =
+                (stage.norm_use(size, repeat), &mut *activations);
+            let (d_target, d_source) = (&*d_features, &mut *d_convolved);
+            let images = Backward { source: &convolved[repeat], d_target, d_source };
+            self.norm.backward(pass, of, values, gradients, norm, images)?;
+            let source = (activations.features(repeat), &activations.packed[repeat]);
+            let d_target = Map { single: &*d_convolved, packed: &mut *d_packed };
+            let strips = Strips { partials: &mut *partials, gradients: &mut *gradients };
+            // Along the shortcut the gradient stays as it is: the convolution's is added to it.
+            let layer = stage.inner(values);
+            self.conv.backward(pass, size, layer, source, d_target, d_features, strips)?;
+        }
+        let value_count = self.channels * size.element_product();
+        let first = activations.features(0);
+        self.relu_backward.record(pass, value_count, first, d_features)?;
+        let seen = Seen { source: ends.stage_input, d_target: &*d_features };
+        self.conv_in.weight_gradient(pass, size, stage.conv_in, seen, partials, gradients)?;
+        let d_input = ends.d_stage_input;
+        self.conv_in.data_gradient(pass, size, stage.conv_in, values, d_features, d_input)
+    }
+}
+
+impl Stage {
+    /// The layer that is repeated.
+    fn inner(self, values: &Buffer<f32>) -> Layer<'_> {
+        Layer { number: self.number, offset: self.conv, values }
+    }
+
+    fn norm_use(&self, size: UVec2, repeat: usize) -> Use {
+        Use { pixel_count: size.element_product(), offset: self.norm, repeat: repeat as u32 }
+    }
+}

@@ -1,0 +1,165 @@
+//! LPIPS (Zhang et al. 2018, version 0.1): how far two pictures are apart to a network's eye. Lower is more alike.
+
+use std::path::Path;
+
+use glam::UVec2;
+
+use crate::base::input;
+use crate::gpu::Gpu;
+pub use crate::networks::Network;
+use crate::networks::{TensorFile, Trunk, published};
+use crate::photographs::image::Image;
+use crate::{Error, Result};
+
+/// What makes a picture the network's input: minus `SHIFT`, over `SCALE`, for each channel. It is meant for [-1, 1].
+const SHIFT: [f32; 3] = [-0.030, -0.088, -0.188];
+const SCALE: [f32; 3] = [0.458, 0.448, 0.450];
+
+/// The values that black and white have when they are given to the measure.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Range {
+    /// [-1, 1], as the measure's authors made it.
+    #[default]
+    Signed,
+    /// [0, 1], as the code of 3DGS gives it pictures.
+    Unit,
+}
+
+impl Range {
+    /// Each of them.
+    pub const ALL: [Self; 2] = [Self::Signed, Self::Unit];
+
+    /// The name on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Signed => "signed",
+            Self::Unit => "unit",
+        }
+    }
+
+    fn of_unit(self, value: f32) -> f32 {
+        match self {
+            Self::Signed => 2.0 * value - 1.0,
+            Self::Unit => value,
+        }
+    }
+}
+
+/// Which LPIPS a number is: those of two measures do not compare.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Measure {
+    /// Whose activations are compared.
+    pub network: Network,
+    /// What the network is given.
+    pub range: Range,
+}
+
+impl Measure {
+    /// Each of them.
+    pub fn all() -> impl Iterator<Item = Self> {
+        let of = |network| Range::ALL.map(|range| Self { network, range });
+        Network::ALL.into_iter().flat_map(of)
+    }
+
+    /// The name of its numbers in JSON: `lpips` for the default, else network and range behind it, as `lpips_vgg_unit`.
+    pub fn key(self) -> String {
+        if self == Self::default() {
+            return "lpips".to_owned();
+        }
+        format!("lpips_{}_{}", self.network.name(), self.range.name())
+    }
+
+    /// The head of a column of its numbers.
+    pub fn title(self) -> String {
+        if self == Self::default() {
+            return "LPIPS".to_owned();
+        }
+        format!("LPIPS {} {}", self.network.name(), self.range.name())
+    }
+}
+
+/// The measure, on the device.
+#[derive(Debug)]
+pub struct Lpips {
+    trunk: Trunk,
+    range: Range,
+    /// How much each channel counts of each layer that is compared.
+    weights: Vec<Vec<f32>>,
+}
+
+impl Lpips {
+    /// The measure with the weights of a safetensors file: the tensors of `lpips.LPIPS(net='alex')` or `(net='vgg')` under
+    /// its names. They tell which network it is.
+    ///
+    /// # Errors
+    /// [`Error::Input`]: the file is no network's, or names what is missing, of another shape or not finite; the device is out
+    /// of memory.
+    pub fn load(gpu: &Gpu, path: impl AsRef<Path>, range: Range) -> Result<Self> {
+        let path = path.as_ref();
+        let bytes = input::bytes(path)?;
+        let file = TensorFile::of(&bytes).map_err(|error| {
+            Error::input(path, format!("is no whole safetensors file ({error})"))
+        })?;
+        let network = Network::of(path, &file)?;
+        let trunk = Trunk::new(gpu, path, &file, network)?;
+        let weights = network.compared_channels().enumerate().map(|(index, channels)| {
+            published(path, &file, &format!("lin{index}.model.1.weight"), &[1, channels, 1, 1])
+        });
+        Ok(Self { trunk, range, weights: weights.collect::<Result<_>>()? })
+    }
+
+    /// Which LPIPS its distances are.
+    pub fn measure(&self) -> Measure {
+        Measure { network: self.trunk.network, range: self.range }
+    }
+
+    /// The distance of two pictures of one size, sRGB in [0, 1]; 0 for equal ones.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] where the sizes differ, are too small, or are too large for a binding of the device; the device is out
+    /// of memory or lost.
+    pub fn distance(&self, gpu: &Gpu, render: &Image, reference: &Image) -> Result<f64> {
+        let size = |image: &Image| UVec2::new(image.width, image.height);
+        if size(render) != size(reference) {
+            let problem = "two pictures of different sizes cannot be compared";
+            return Err(Error::Usage(problem.to_owned()));
+        }
+        self.trunk.check(gpu, size(render))?;
+        let seen =
+            |image: &Image| self.trunk.activations(gpu, size(image), &self.network_input(image));
+        let (a, b) = (seen(render)?, seen(reference)?);
+        let layers = a.iter().zip(&b).zip(&self.weights);
+        Ok(layers.map(|((a, b), weights)| layer_distance(a, b, weights)).sum())
+    }
+
+    fn network_input(&self, image: &Image) -> Vec<f32> {
+        let pixels = image.pixel_count();
+        let value = |(at, &value): (usize, &f32)| {
+            let channel = at / pixels;
+            (self.range.of_unit(value) - SHIFT[channel]) / SCALE[channel]
+        };
+        image.data.iter().enumerate().map(value).collect()
+    }
+}
+
+/// The mean over the pixels of the weighted squared differences of the unit vectors across the channels.
+fn layer_distance(a: &[f32], b: &[f32], weights: &[f32]) -> f64 {
+    /// The published measure's, which keeps zero vectors zero.
+    const EPSILON: f64 = 1e-10;
+    let pixels = a.len() / weights.len();
+    let lengths = |values: &[f32]| -> Vec<f64> {
+        let mut squares = vec![0.0; pixels];
+        for plane in values.chunks_exact(pixels) {
+            squares.iter_mut().zip(plane).for_each(|(sum, &v)| *sum += f64::from(v).powi(2));
+        }
+        squares.into_iter().map(|square| square.sqrt() + EPSILON).collect()
+    };
+    let (length_a, length_b) = (lengths(a), lengths(b));
+    let mut sum = 0.0;
+    for ((a, b), &weight) in a.chunks_exact(pixels).zip(b.chunks_exact(pixels)).zip(weights) {
+        let differences = (0..pixels)
+            .map(|i| (f64::from(a[i]) / length_a[i] - f64::from(b[i]) / length_b[i]).powi(2));
+        sum += f64::from(weight) * differences.sum::<f64>();
+    }
+    sum / pixels as f64
+}

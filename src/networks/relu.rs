@@ -1,0 +1,36 @@
+//! The gradient of a `ReLU`.
+
+use crate::Result;
+use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
+use crate::kernels::relu_backward;
+
+/// Stops gradients where a `ReLU` gave zero.
+#[derive(Debug)]
+pub(super) struct ReluBackward(Pipeline<relu_backward::Kernel>);
+
+impl ReluBackward {
+    /// # Errors
+    /// The device refuses the kernel.
+    pub(super) fn new(gpu: &Gpu) -> Result<Self> {
+        Ok(Self(gpu.pipeline(&relu_backward::Constants::default())?))
+    }
+
+    /// Records it for the first `value_count` values of `activations`, what the `ReLU` gave, and of their gradient.
+    pub(super) fn record(
+        &self,
+        pass: &mut Recorder<'_>,
+        value_count: u32,
+        activations: &Buffer<f32>,
+        gradient: &mut Buffer<f32>,
+    ) -> Result<()> {
+        pass.dispatch(
+            &self.0,
+            &relu_backward::Params { value_count },
+            relu_backward::Buffers {
+                activations: activations.slice(),
+                gradient: gradient.slice_mut(),
+            },
+            Threads::Exactly([value_count, 1, 1]),
+        )
+    }
+}

@@ -1,0 +1,273 @@
+//! The tonemapper: three convolutions that turn illumination times denoised image into what the camera saw.
+
+use glam::UVec2;
+
+use super::conv::{Activation, Adds, Conv, Precision, Seen, partial_count};
+use super::parameters::{Layout, Parameters};
+use super::relu::ReluBackward;
+use super::{Form, RGB, check_binding, check_images, out_of_turn, pixel_count};
+use crate::Result;
+use crate::base::random::Stream;
+use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
+use crate::kernels::{product, product_backward};
+
+/// The stream of random numbers that the weights are drawn from.
+const STREAM: u64 = 6;
+
+/// Feature maps of both inner layers.
+const CHANNELS: u32 = 16;
+
+/// conv 3 to 16, `ReLU`, conv 16 to 16, `ReLU`, conv 16 to 3, nothing behind it; zero padding 1. In the identity form what
+/// goes in is added to what comes out.
+#[derive(Debug)]
+pub struct Tonemapper {
+    gpu: Gpu,
+    form: Form,
+    parameters: Parameters,
+    /// Where the layers lie in the parameters.
+    offsets: [u32; 3],
+    convs: [Conv; 3],
+    product: Pipeline<product::Kernel>,
+    product_backward: Pipeline<product_backward::Kernel>,
+    relu_backward: ReluBackward,
+    reserved: [usize; 2],
+    memory: Memory,
+    /// The size of the forward pass that the memory holds.
+    recorded: Option<UVec2>,
+}
+
+#[derive(Debug)]
+struct Memory {
+    /// (3, H, W)
+    product: Buffer<f32>,
+    /// Both (16, H, W).
+    features: [Buffer<f32>; 2],
+    /// (3, H, W)
+    output: Buffer<f32>,
+    /// Both (16, H, W).
+    d_features: [Buffer<f32>; 2],
+    /// (3, H, W)
+    d_product: Buffer<f32>,
+    partials: Buffer<f32>,
+}
+
+impl Tonemapper {
+    /// Adam's learning rate in LITA-GS.
+    pub const LEARNING_RATE: f64 = 1e-4;
+
+    /// Draws the weights; memory for a view comes with [`Tonemapper::reserve`].
+    ///
+    /// # Errors
+    /// The driver refuses a kernel, or the device is out of memory.
+    pub fn new(gpu: &Gpu, form: Form, seed: u64) -> Result<Self> {
+        let mut layout = Layout::new(Stream::new(seed, STREAM));
+        let offsets = [
+            layout.conv("conv1", RGB, CHANNELS),
+            layout.conv("conv2", CHANNELS, CHANNELS),
+            match form {
+                Form::Identity => layout.zero_conv("conv3", CHANNELS, RGB),
+                Form::Paper => layout.conv("conv3", CHANNELS, RGB),
+            },
+        ];
+        let (relu, none) = (Activation::Relu, Activation::None);
+        let [adds_input, adds_output] = match form {
+            Form::Identity => [Adds::InputGradient, Adds::Output],
+            Form::Paper => [Adds::Nothing; 2],
+        };
+        Ok(Self {
+            gpu: gpu.clone(),
+            form,
+            parameters: layout.upload(gpu, ("tonemapper", Self::LEARNING_RATE), "{}".to_owned())?,
+            offsets,
+            convs: [
+                Conv::new(gpu, [RGB, CHANNELS], relu, adds_input)?,
+                Conv::new(gpu, [CHANNELS, CHANNELS], relu, Adds::Nothing)?,
+                Conv::new(gpu, [CHANNELS, RGB], none, adds_output)?,
+            ],
+            product: gpu.pipeline(&product::Constants::default())?,
+            product_backward: gpu.pipeline(&product_backward::Constants::default())?,
+            relu_backward: ReluBackward::new(gpu)?,
+            reserved: [0; 2],
+            memory: Memory::new(gpu, [0; 2])?,
+            recorded: None,
+        })
+    }
+
+    /// The parameters and their gradients.
+    pub fn parameters(&self) -> &Parameters {
+        &self.parameters
+    }
+
+    /// As [`Tonemapper::parameters`], to be changed.
+    pub fn parameters_mut(&mut self) -> &mut Parameters {
+        &mut self.parameters
+    }
+
+    /// How far a pixel's result looks, in pixels.
+    pub fn margin(&self) -> u32 {
+        self.convs.len() as u32
+    }
+
+    /// Whether the device binds every map of a view of `size`.
+    pub fn fits_on(gpu: &Gpu, size: UVec2) -> bool {
+        check_maps(gpu, size).is_ok()
+    }
+
+    /// Takes the memory for views up to `size`, unless it is there already.
+    ///
+    /// # Errors
+    /// A map exceeds what the device can bind, or the device is out of memory.
+    pub fn reserve(&mut self, size: UVec2) -> Result<()> {
+        if self.fits(size) {
+            return Ok(());
+        }
+        let [pixels, partials] = lengths(size);
+        check_maps(&self.gpu, size)?;
+        let extent = [pixels.max(self.reserved[0]), partials.max(self.reserved[1])];
+        // The old memory goes first: both together may not fit.
+        (self.recorded, self.reserved) = (None, [0; 2]);
+        self.memory = Memory::new(&self.gpu, [0; 2])?;
+        self.memory = Memory::new(&self.gpu, extent)?;
+        self.reserved = extent;
+        Ok(())
+    }
+
+    fn fits(&self, size: UVec2) -> bool {
+        lengths(size).into_iter().zip(self.reserved).all(|(needed, held)| needed <= held)
+    }
+
+    /// The image of the last forward pass, (3, H, W), not clamped, at the beginning of a buffer that is as long as what
+    /// was reserved.
+    pub fn output(&self) -> &Buffer<f32> {
+        &self.memory.output
+    }
+
+    /// Records the passes from illumination and denoised image, each (3, H, W), to [`Tonemapper::output`].
+    ///
+    /// # Errors
+    /// The view is empty or no memory is reserved for it, or an image is shorter than the view.
+    pub fn forward(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        size: UVec2,
+        illumination: &Buffer<f32>,
+        denoised: &Buffer<f32>,
+    ) -> Result<()> {
+        let pixels = pixel_count(size)?;
+        if !self.fits(size) {
+            return Err(out_of_turn("tonemapper", size, "reserve memory for that size first"));
+        }
+        check_images(pixels, [illumination, denoised])?;
+        let Memory { product, features: [first, second], output, .. } = &mut self.memory;
+        let value_count = RGB * pixels as u32;
+        pass.dispatch(
+            &self.product,
+            &product::Params { value_count },
+            product::Buffers {
+                illumination: illumination.slice(),
+                denoised: denoised.slice(),
+                target: product.slice_mut(),
+            },
+            Threads::Exactly([value_count, 1, 1]),
+        )?;
+        let ([conv_in, conv, conv_out], [at_in, at, at_out]) = (&self.convs, self.offsets);
+        let values = &self.parameters.values;
+        conv_in.forward(pass, size, at_in, values, product, first)?;
+        conv.forward(pass, size, at, values, first, second)?;
+        if self.form == Form::Identity {
+            pass.copy(product, output);
+        }
+        conv_out.forward(pass, size, at_out, values, second, output)?;
+        self.recorded = Some(size);
+        Ok(())
+    }
+
+    /// Records the passes from dL/d output back: overwrites the gradients of the parameters, writes `d_illumination`
+    /// and adds to `d_denoised`, each (3, H, W). Inputs and parameters are those of the forward pass before it.
+    ///
+    /// # Errors
+    /// There is no forward pass of that size before it, or an image is shorter than the view.
+    #[expect(clippy::too_many_arguments, reason = "three images in, two gradients out")]
+    pub fn backward(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        size: UVec2,
+        illumination: &Buffer<f32>,
+        denoised: &Buffer<f32>,
+        d_output: &Buffer<f32>,
+        d_illumination: &mut Buffer<f32>,
+        d_denoised: &mut Buffer<f32>,
+    ) -> Result<()> {
+        let pixels = pixel_count(size)?;
+        check_images(pixels, [illumination, denoised, d_output, d_illumination, d_denoised])?;
+        if self.recorded.take() != Some(size) {
+            let remedy = "each backward pass needs a forward pass of its own before it";
+            return Err(out_of_turn("tonemapper", size, remedy));
+        }
+        let Memory { product, features, d_features, d_product, partials, .. } = &mut self.memory;
+        let Parameters { values, gradients, .. } = &mut self.parameters;
+        let ([conv_in, conv, conv_out], [at_in, at, at_out]) = (&self.convs, self.offsets);
+        let ([first, second], [d_first, d_second]) = (features, d_features);
+        let threads = |value_count| Threads::Exactly([value_count, 1, 1]);
+        pass.fill(gradients, 0);
+
+        let seen = Seen { source: second, d_target: d_output };
+        conv_out.weight_gradient(pass, size, at_out, seen, partials, gradients)?;
+        conv_out.data_gradient(pass, size, at_out, values, d_output, d_second)?;
+        let value_count = CHANNELS * pixels as u32;
+        self.relu_backward.record(pass, value_count, second, d_second)?;
+        let seen = Seen { source: first, d_target: d_second };
+        conv.weight_gradient(pass, size, at, seen, partials, gradients)?;
+        conv.data_gradient(pass, size, at, values, d_second, d_first)?;
+        self.relu_backward.record(pass, value_count, first, d_first)?;
+        if self.form == Form::Identity {
+            pass.copy(d_output, d_product);
+        }
+        let seen = Seen { source: product, d_target: d_first };
+        conv_in.weight_gradient(pass, size, at_in, seen, partials, gradients)?;
+        conv_in.data_gradient(pass, size, at_in, values, d_first, d_product)?;
+        let value_count = RGB * pixels as u32;
+        pass.dispatch(
+            &self.product_backward,
+            &product_backward::Params { value_count },
+            product_backward::Buffers {
+                illumination: illumination.slice(),
+                denoised: denoised.slice(),
+                d_target: d_product.slice(),
+                d_illumination: d_illumination.slice_mut(),
+                d_denoised: d_denoised.slice_mut(),
+            },
+            threads(value_count),
+        )
+    }
+}
+
+/// Pixels, and partial sums of the largest layer's gradient.
+fn lengths(size: UVec2) -> [usize; 2] {
+    [
+        size.x as usize * size.y as usize,
+        partial_count(size, [CHANNELS, CHANNELS], Precision::Single),
+    ]
+}
+
+/// # Errors
+/// The device does not bind what a view of `size` takes.
+fn check_maps(gpu: &Gpu, size: UVec2) -> Result<()> {
+    let [pixels, _] = lengths(size);
+    check_binding(gpu, "the tonemapper's feature maps", size, CHANNELS as usize * pixels)
+}
+
+impl Memory {
+    fn new(gpu: &Gpu, [pixels, partials]: [usize; 2]) -> Result<Self> {
+        let map = |name| gpu.uninit(name, CHANNELS as usize * pixels);
+        let image = |name| gpu.uninit(name, RGB as usize * pixels);
+        Ok(Self {
+            product: image("product")?,
+            features: [map("features")?, map("features")?],
+            output: image("output")?,
+            d_features: [map("d_features")?, map("d_features")?],
+            d_product: image("d_product")?,
+            partials: gpu.uninit("partials", partials)?,
+        })
+    }
+}

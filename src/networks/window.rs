@@ -1,0 +1,152 @@
+//! Windows: the rectangle of a view that the networks run on.
+//!
+//! The networks' losses are means over pixels, so a random crop estimates them without bias. What a crop's pixels get
+//! from the networks depends on a margin around them, the receptive field: the window is the crop with its margin, cut
+//! off at the image, where the zero padding of the whole view is right anyway.
+
+use std::ops::Range;
+
+use glam::UVec2;
+
+use crate::base::random::Stream;
+use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
+use crate::kernels::{window_gather, window_scatter};
+use crate::{Error, Result};
+
+/// A rectangle of a view, and within it the crop that counts.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Window {
+    /// The window's corner in the view, pixels.
+    pub origin: UVec2,
+    /// Its size, pixels.
+    pub size: UVec2,
+    /// The crop's corner in the window, pixels.
+    pub crop_origin: UVec2,
+    /// The crop's size, pixels.
+    pub crop_size: UVec2,
+}
+
+impl Window {
+    /// A whole view of this size.
+    pub fn whole(view: UVec2) -> Self {
+        Self { origin: UVec2::ZERO, size: view, crop_origin: UVec2::ZERO, crop_size: view }
+    }
+
+    /// A random crop with `margin` pixels around it: one of the equal cells, at most `side` pixels wide and high, that
+    /// part the view. It is the cell of a uniformly drawn pixel, so that means over crops have the mean over the view
+    /// as their expectation: a crop at a random corner would see the view's middle more often than its edges.
+    /// The draw depends on the stream and `draw` alone.
+    pub fn random(view: UVec2, side: u32, margin: u32, stream: &Stream, draw: u64) -> Self {
+        let cells = UVec2::new(view.x.div_ceil(side), view.y.div_ceil(side));
+        let uniform = |axis: u64, extent: u32| {
+            ((stream.uniform(2 * draw + axis) * f64::from(extent)) as u32).min(extent - 1)
+        };
+        let pixel = UVec2::new(uniform(0, view.x), uniform(1, view.y));
+        // Cell i of n begins at floor(i view / n): its pixels x are those with floor(((x + 1) n - 1) / view) = i.
+        let cell = ((pixel + 1) * cells - 1) / view;
+        let [corner, crop_end] = [cell, cell + 1].map(|cell| cell * view / cells);
+        let origin = corner.saturating_sub(UVec2::splat(margin));
+        let end = crop_end.saturating_add(UVec2::splat(margin)).min(view);
+        Self {
+            origin,
+            size: end - origin,
+            crop_origin: corner - origin,
+            crop_size: crop_end - corner,
+        }
+    }
+}
+
+/// Copies windows out of images, and adds them back.
+#[derive(Debug)]
+pub struct Windows {
+    gather: Pipeline<window_gather::Kernel>,
+    scatter: Pipeline<window_scatter::Kernel>,
+}
+
+impl Windows {
+    /// The kernels on this device.
+    ///
+    /// # Errors
+    /// The device refuses a pipeline.
+    pub fn new(gpu: &Gpu) -> Result<Self> {
+        Ok(Self {
+            gather: gpu.pipeline(&window_gather::Constants::default())?,
+            scatter: gpu.pipeline(&window_scatter::Constants::default())?,
+        })
+    }
+
+    /// Records `content = image[planes, window]`; `image` is (planes, H, W) of a view of `size`.
+    ///
+    /// # Errors
+    /// A buffer is too short for it.
+    pub fn gather(
+        &self,
+        pass: &mut Recorder<'_>,
+        image: &Buffer<f32>,
+        size: UVec2,
+        planes: Range<usize>,
+        window: &Window,
+        content: &mut Buffer<f32>,
+    ) -> Result<()> {
+        check(image, size, &planes, window, content)?;
+        let plane_count = planes.len() as u32;
+        let (origin, first_plane) = (window.origin, planes.start as u32);
+        let window = window.size;
+        pass.dispatch(
+            &self.gather,
+            &window_gather::Params { size, origin, window, first_plane, plane_count },
+            window_gather::Buffers { image: image.slice(), content: content.slice_mut() },
+            Threads::Exactly([plane_count * window.element_product(), 1, 1]),
+        )
+    }
+
+    /// Records `image[planes, window] += content`.
+    ///
+    /// # Errors
+    /// A buffer is too short for it.
+    pub fn scatter(
+        &self,
+        pass: &mut Recorder<'_>,
+        content: &Buffer<f32>,
+        window: &Window,
+        planes: Range<usize>,
+        size: UVec2,
+        image: &mut Buffer<f32>,
+    ) -> Result<()> {
+        check(image, size, &planes, window, content)?;
+        let plane_count = planes.len() as u32;
+        let (origin, first_plane) = (window.origin, planes.start as u32);
+        let window = window.size;
+        pass.dispatch(
+            &self.scatter,
+            &window_scatter::Params { size, origin, window, first_plane, plane_count },
+            window_scatter::Buffers { content: content.slice(), image: image.slice_mut() },
+            Threads::Exactly([plane_count * window.element_product(), 1, 1]),
+        )
+    }
+}
+
+/// A kernel that runs beyond a buffer corrupts its neighbours: refuse before anything is recorded.
+fn check(
+    image: &Buffer<f32>,
+    size: UVec2,
+    planes: &Range<usize>,
+    window: &Window,
+    content: &Buffer<f32>,
+) -> Result<()> {
+    let pixels = |size: UVec2| size.x as usize * size.y as usize;
+    if (window.origin + window.size).cmpgt(size).any() {
+        return Err(Error::Usage(format!("{window:?} does not lie in a view of {size} pixels")));
+    }
+    for (buffer, needed) in
+        [(image, planes.end * pixels(size)), (content, planes.len() * pixels(window.size))]
+    {
+        if buffer.len() < needed {
+            let (name, len) = (buffer.name(), buffer.len());
+            return Err(Error::Usage(format!(
+                "buffer `{name}` holds {len} values, the window needs {needed}"
+            )));
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,21 @@
+//! From photographs on disk to the targets that supervise training.
+//!
+//! In: image files, camera files, tone curves. Out: [`dataset::Dataset`], images, and pseudo-GT targets on the device.
+//!
+//! - [`image`]: float images and their files
+//! - [`metrics`]: PSNR and SSIM of a render against its reference image
+//! - [`tone`]: curves that brighten a photograph
+//! - [`fit`]: the constants of a curve from pairs of photographs
+//! - [`dataset`]: photographs with their cameras and points, from disk
+//! - [`pseudo_gt`]: dark photograph and curve to target, on the device
+//! - [`structure`]: the edges of a pseudo-GT that do not depend on its illumination
+
+#[cfg(feature = "io")]
+pub mod dataset;
+#[cfg(feature = "fit")]
+pub mod fit;
+pub mod image;
+pub mod metrics;
+pub mod pseudo_gt;
+pub mod structure;
+pub mod tone;

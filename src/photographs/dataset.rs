@@ -1,0 +1,420 @@
+//! Datasets: photographs on disk become views with undistorted cameras, a split and points.
+//!
+//! The format is found by looking: NeRF-style `transforms*.json` first (the layouts of LOM and `RealX3D` included), then a
+//! COLMAP model. What the model trains on is the dark photograph (`View::image`); a normal-light photograph of the
+//! same name is a test view's reference image (`View::reference`), used for scores only and loaded for test views only.
+
+mod colmap;
+mod fingerprint;
+mod listed;
+mod listing;
+mod masks;
+mod members;
+mod names;
+mod options;
+mod pixels;
+mod place;
+mod points;
+mod similarity;
+mod split;
+pub mod synthetic;
+mod transforms;
+mod undistort;
+mod unused;
+
+use std::borrow::Cow;
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+use glam::DVec3;
+
+use crate::camera::Camera;
+use crate::photographs::image::files::Files;
+use crate::photographs::image::{Image, Mask};
+use crate::{Error, Result};
+pub use fingerprint::Fingerprint;
+use listed::{ListedView, Listing};
+use listing::{list, warn};
+use members::with_held_out;
+pub use options::{DepthOptions, LoadOptions};
+pub use pixels::Original;
+use pixels::Source;
+use points::points;
+use split::{TEST_EVERY, say_whose_split_gives_way, split};
+
+/// Photographs with cameras, and points of the scene they show.
+#[derive(Clone, Debug)]
+pub struct Dataset {
+    /// The folder it was loaded from.
+    pub root: PathBuf,
+    /// Sorted by name; at least one training view has an image.
+    pub views: Vec<View>,
+    /// In the cameras' world; empty where the dataset has none.
+    pub points: Vec<Point>,
+    /// What was left out, one line each: the photograph and why.
+    pub skipped: Vec<String>,
+}
+
+/// A photograph's place in the dataset.
+#[derive(Clone, Debug)]
+pub struct View {
+    /// The photograph's file name without extension, behind that of its folder where several folders have such a file
+    /// (`a_001`); unique.
+    pub name: String,
+    /// Whether it is trained on or scored.
+    pub split: Split,
+    /// Undistorted, at the loaded resolution.
+    pub camera: Camera,
+    /// The photograph to train on; of every training view it is here, or is read anew whenever it is looked at
+    /// ([`View::loaded`]).
+    pub image: Option<Image>,
+    /// Where it is read from, if its own size is larger or it is not kept.
+    pub original: Option<Original>,
+    /// The normal-light photograph to score against, of the camera's size; test views only. As with the photograph, it is
+    /// here or read anew ([`View::loaded_reference`]).
+    pub reference: Option<Image>,
+    /// Where it is read from, if it is not kept.
+    pub reference_file: Option<Original>,
+    /// Which of its pixels count, of the camera's size; none where all do.
+    pub mask: Option<Mask>,
+    /// Depth from elsewhere, (H, W) of the camera's size, in units and with an offset of its own; larger is farther.
+    /// Training views only, and none where it says nothing, being the same everywhere.
+    pub depth: Option<Vec<f32>>,
+}
+
+impl View {
+    /// One that has a camera, a photograph or none, and nothing else.
+    pub fn new(name: &str, split: Split, camera: Camera, image: Option<Image>) -> Self {
+        Self {
+            name: name.to_owned(),
+            split,
+            camera,
+            image,
+            original: None,
+            reference: None,
+            reference_file: None,
+            mask: None,
+            depth: None,
+        }
+    }
+
+    /// Whether the view is trained on.
+    pub fn is_train(&self) -> bool {
+        self.split == Split::Train
+    }
+
+    /// Whether it is for training, be it that it is kept from it to tell when it has converged.
+    pub fn is_for_training(&self) -> bool {
+        self.split != Split::Test
+    }
+
+    /// The planes of one of its images, of any size, without the pixels that do not count.
+    pub fn counted<'a>(&self, image: &'a Image) -> Cow<'a, [f32]> {
+        match &self.mask {
+            Some(mask) => mask.counted(image).into(),
+            None => (&image.data).into(),
+        }
+    }
+
+    /// One of its images, of any size, of which the pixels that do not count are black.
+    pub fn blacked_out(&self, image: Image) -> Image {
+        match &self.mask {
+            Some(mask) => mask.blacked_out(image),
+            None => image,
+        }
+    }
+
+    /// Whether there is a photograph, kept or to be read anew.
+    pub fn has_photograph(&self) -> bool {
+        self.image.is_some() || self.original.is_some()
+    }
+
+    /// Whether there is a reference image, kept or to be read anew.
+    pub fn has_reference(&self) -> bool {
+        self.reference.is_some() || self.reference_file.is_some()
+    }
+
+    /// The photograph at the size of the view's camera; none where the view has none.
+    ///
+    /// # Errors
+    /// [`Error::Input`] where it was not kept and its file can no longer be read.
+    pub fn loaded(&self) -> Result<Option<Cow<'_, Image>>> {
+        self.kept_or_read(self.image.as_ref(), self.original.as_ref())
+    }
+
+    /// The reference image, of the same size; none where the view has none.
+    ///
+    /// # Errors
+    /// As [`View::loaded`].
+    pub fn loaded_reference(&self) -> Result<Option<Cow<'_, Image>>> {
+        self.kept_or_read(self.reference.as_ref(), self.reference_file.as_ref())
+    }
+
+    fn kept_or_read<'a>(
+        &self,
+        kept: Option<&'a Image>,
+        file: Option<&Original>,
+    ) -> Result<Option<Cow<'a, Image>>> {
+        let size = (self.camera.width, self.camera.height);
+        match (kept, file) {
+            (Some(image), _) => Ok(Some(Cow::Borrowed(image))),
+            (None, Some(file)) => file.load_at(size).map(Cow::Owned).map(Some),
+            (None, None) => Ok(None),
+        }
+    }
+
+    /// The photograph as its camera took it, undistorted and not shrunk; none where the view has none.
+    ///
+    /// # Errors
+    /// [`Error::Input`] where it was shrunk on loading and its file can no longer be read.
+    pub fn photograph(&self) -> Result<Option<Cow<'_, Image>>> {
+        match &self.original {
+            Some(original) => original.load().map(Cow::Owned).map(Some),
+            None => Ok(self.image.as_ref().map(Cow::Borrowed)),
+        }
+    }
+}
+
+/// What a view is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Split {
+    /// Trained on.
+    Train,
+    /// Held out, for scores.
+    Test,
+    /// A training photograph that is kept from training, to tell when it has converged.
+    HeldOut,
+}
+
+/// The files of one view.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Photograph {
+    /// The file name without extension; unique.
+    pub name: String,
+    /// Whether it is trained on or scored.
+    pub split: Split,
+    /// The dark photograph.
+    pub input: PathBuf,
+    /// The normal-light photograph to score against; test views only.
+    pub reference: Option<PathBuf>,
+    /// The mask, whose black pixels do not count.
+    pub mask: Option<PathBuf>,
+}
+
+/// A triangulated point of the scene.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Point {
+    /// World space.
+    pub position: DVec3,
+    /// Indices into [`Dataset::views`] of those that see it, ascending; may be empty.
+    pub views: Vec<u32>,
+}
+
+/// Folders that hold the dark input where a normal-light twin lies beside them.
+const DARK_FOLDERS: [&str; 2] = ["low", "images_low"];
+/// Folders that may hold the normal-light twin.
+const NORMAL_FOLDERS: [&str; 4] = ["high", "val", "test", "images"];
+/// Folders that may hold depth maps.
+const DEPTH_FOLDERS: [&str; 2] = ["depth", "depth_maps"];
+
+impl Dataset {
+    /// Loads the dataset below `root`.
+    ///
+    /// Frames whose file is absent or does not decode are named in [`Dataset::skipped`]; test views stay as poses.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] for a downscale that makes no sense; [`Error::Input`] naming the folder or file where there is
+    /// no dataset, no training photograph left, a file cut short, two views of one name, an unsupported camera model,
+    /// or a photograph whose size contradicts its camera.
+    ///
+    /// ```no_run
+    /// use nightsplat::photographs::dataset::{Dataset, LoadOptions};
+    ///
+    /// let options = LoadOptions { downscale: 4.0, ..LoadOptions::default() };
+    /// let dataset = Dataset::load("photos", &options)?;
+    /// println!("{} to train on, {} points", dataset.train_views().count(), dataset.points.len());
+    /// # Ok::<(), nightsplat::Error>(())
+    /// ```
+    pub fn load(root: impl AsRef<Path>, options: &LoadOptions) -> Result<Self> {
+        let root = root.as_ref();
+        options.check()?;
+        let files = Files::default();
+        let Listing { mut frames, mut skipped, remarks } = list(root, &files)?;
+        say_whose_split_gives_way(root, &frames, options);
+        split(root, &mut frames, options.test_every, &files)?;
+
+        let sources = sources(root, &frames, options, &files, &mut skipped);
+        let views = pixels::load(sources, options, &mut skipped)?;
+        if !views.iter().any(|view| view.split == Split::Train) {
+            let first = skipped.first().map(|line| format!(" ({line})")).unwrap_or_default();
+            let problem = format!(
+                "no photograph is left to train on{first}; check the image folders and the split"
+            );
+            return Err(Error::input(root, problem));
+        }
+        // Behind what may end it: an error is said alone.
+        warn(&remarks);
+        let views = with_held_out(views, options.hold_out);
+        let points = points(root, &views)?;
+        for line in &skipped {
+            tracing::warn!("skipped {line}");
+        }
+        tracing::info!(
+            "{}: {} views, {} points, {} skipped",
+            root.display(),
+            views.len(),
+            points.len(),
+            skipped.len()
+        );
+        let mut dataset = Self { root: root.to_owned(), views, points, skipped };
+        dataset.leave_out_far_points();
+        dataset.say_what_stands_elsewhere();
+        Ok(dataset)
+    }
+
+    /// What says which views are held out, in words.
+    pub fn split_rule(root: &Path, options: &LoadOptions) -> String {
+        let has_test = transforms::find(root).iter().any(|(_, split)| *split == Some(Split::Test));
+        match options.test_every {
+            Some(0) => "none, as asked for".to_owned(),
+            Some(every) => format!("every {every}th by name, as asked for"),
+            None if has_test => "as the transforms files say".to_owned(),
+            None if root.join("test.txt").is_file() => "as test.txt says".to_owned(),
+            None => format!("every {TEST_EVERY}th by name"),
+        }
+    }
+
+    /// Whether `root` is a folder that [`Dataset::load`] finds cameras in.
+    pub fn is_at(root: &Path) -> bool {
+        !transforms::find(root).is_empty() || !colmap::find(root, &["cameras", "images"]).is_empty()
+    }
+
+    /// Of the models that COLMAP left in the folders of `folder` the one that places the most photographs, with their names.
+    ///
+    /// # Errors
+    /// [`Error::Input`] where a model is damaged.
+    pub fn largest_model(folder: &Path) -> Result<Option<(PathBuf, Vec<String>)>> {
+        let models = colmap::models_in(folder, &["cameras", "images", "points3D"]);
+        let Some((model, _)) = colmap::largest(&models, |_| true)? else { return Ok(None) };
+        let names = colmap::read_images(model)?.into_iter().map(|image| image.name);
+        Ok(Some((model.to_owned(), names.collect())))
+    }
+
+    /// The files of the views below `root`, sorted by name, without reading a pixel.
+    ///
+    /// # Errors
+    /// As [`Dataset::load`], but for what is wrong with pixels.
+    pub fn photographs(root: &Path, options: &LoadOptions) -> Result<Vec<Photograph>> {
+        let (photographs, skipped, remarks) = Self::listed(root, options)?;
+        warn(&remarks);
+        for line in &skipped {
+            tracing::warn!("skipped {line}");
+        }
+        Ok(photographs)
+    }
+
+    /// The same, what was left out, and what is to be said of the folder.
+    pub(crate) fn listed(
+        root: &Path,
+        options: &LoadOptions,
+    ) -> Result<(Vec<Photograph>, Vec<String>, Vec<String>)> {
+        options.check()?;
+        let files = Files::default();
+        let Listing { mut frames, mut skipped, remarks } = list(root, &files)?;
+        split(root, &mut frames, options.test_every, &files)?;
+        let sources = sources(root, &frames, options, &files, &mut skipped);
+        let photograph = |source: Source| {
+            let Source { name, split, input, reference, mask, .. } = source;
+            Some(Photograph { name, split, input: input?, reference, mask })
+        };
+        Ok((sources.into_iter().filter_map(photograph).collect(), skipped, remarks))
+    }
+}
+
+/// Which files each view reads. A training view without its photograph is left out, a test view stays as a pose.
+fn sources(
+    root: &Path,
+    frames: &[ListedView],
+    options: &LoadOptions,
+    files: &Files,
+    skipped: &mut Vec<String>,
+) -> Vec<Source> {
+    let training = frames.iter().filter(|frame| frame.split == Some(Split::Train));
+    let training_folders: BTreeSet<&str> = training.map(ListedView::folder).collect();
+    let mut sources = Vec::new();
+    for frame in frames {
+        let split = frame.split.unwrap_or(Split::Train);
+        // A test listing names the normal-light photographs (LOM, RealX3D) unless training frames lie there too.
+        let lists_input = split == Split::Train || training_folders.contains(frame.folder());
+        let input = frame.input(root, lists_input, files);
+        let reference = match &options.reference {
+            _ if split == Split::Train => None,
+            Some(folder) => frame.find(folder, files),
+            None => frame.reference(root, input.as_ref(), files),
+        };
+        if input.is_none() && reference.is_none() {
+            let kept = if split == Split::Test { "; its pose is kept" } else { "" };
+            skipped.push(format!("{}: the file is absent{kept}", frame.listed));
+        }
+        if input.is_some() || split == Split::Test {
+            let input = input.filter(|_| split == Split::Train || options.load_low_test);
+            let depth = (options.depth.load && split == Split::Train)
+                .then(|| frame.depth(root, options.depth.folder.as_deref(), files))
+                .flatten();
+            let mask = masks::find(root, frame, files);
+            let ListedView { name, lens, view_from_world, .. } = frame.clone();
+            let camera = (lens, view_from_world);
+            sources.push(Source::new((name, split), camera, [input, reference, mask, depth]));
+        }
+    }
+    if let Some(folder) = &options.reference
+        && sources.iter().all(|source| source.reference.is_none())
+    {
+        tracing::warn!(
+            "{}: holds no photograph named like a test view; nothing will be scored",
+            folder.display()
+        );
+    }
+    sources
+}
+
+impl ListedView {
+    /// The folder it is listed in.
+    fn folder(&self) -> &str {
+        self.listed.rsplit_once('/').map_or("", |(folder, _)| folder)
+    }
+
+    /// The photograph of the same name in another folder: at the same place below it, or directly in it.
+    fn find(&self, folder: &Path, files: &Files) -> Option<PathBuf> {
+        files
+            .find(folder, names::below_first(&self.listed))
+            .or_else(|| files.find(folder, &self.name))
+    }
+
+    /// The dark photograph; the listed file counts as that where nothing darker lies beside it.
+    fn input(&self, root: &Path, lists_input: bool, files: &Files) -> Option<PathBuf> {
+        if self.folder().split('/').any(|part| DARK_FOLDERS.contains(&part)) {
+            return self.file.clone();
+        }
+        let beside = DARK_FOLDERS.iter().find_map(|folder| self.find(&root.join(folder), files));
+        beside.or_else(|| self.file.clone().filter(|_| lists_input))
+    }
+
+    /// The depth map: named like the photograph, or that behind `depth_`.
+    fn depth(&self, root: &Path, folder: Option<&Path>, files: &Files) -> Option<PathBuf> {
+        let folders = match folder {
+            Some(folder) => vec![folder.to_owned()],
+            None => DEPTH_FOLDERS.map(|name| root.join(name)).to_vec(),
+        };
+        folders.iter().find_map(|folder| {
+            self.find(folder, files).or_else(|| files.find(folder, &format!("depth_{}", self.name)))
+        })
+    }
+
+    /// The normal-light photograph: the listed file where it is not the input, else one of that name beside it.
+    fn reference(&self, root: &Path, input: Option<&PathBuf>, files: &Files) -> Option<PathBuf> {
+        let beside =
+            NORMAL_FOLDERS.iter().filter_map(|folder| self.find(&root.join(folder), files));
+        self.file.clone().into_iter().chain(beside).find(|file| Some(file) != input)
+    }
+}

@@ -1,0 +1,91 @@
+//! Which dataset it is: names, sizes, poses and pixels of what is trained on, as checksums.
+
+use std::collections::BTreeMap;
+
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use super::{Dataset, View};
+use crate::Result;
+use crate::base::hash::{self, Hasher};
+use crate::camera::CameraModel;
+
+/// What distinguishes one dataset from another, as it was loaded.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Fingerprint {
+    /// Camera and photograph of each view that is for training, by name.
+    views: BTreeMap<String, [String; 2]>,
+    /// The points.
+    points: String,
+}
+
+impl Fingerprint {
+    /// Reads every pixel once.
+    ///
+    /// # Errors
+    /// A photograph that was not kept can no longer be read.
+    pub fn of(dataset: &Dataset) -> Result<Self> {
+        let views = dataset.views.par_iter().filter(|view| view.is_for_training());
+        let views = views
+            .map(|view| Ok((view.name.clone(), [camera(view), pixels(view)?].map(hash::text))));
+        let mut points = Hasher::default();
+        for point in &dataset.points {
+            points.write_numbers(&point.position.to_array());
+        }
+        Ok(Self { views: views.collect::<Result<_>>()?, points: hash::text(points.finish()) })
+    }
+
+    /// All of it in one checksum.
+    pub fn checksum(&self) -> String {
+        let mut hasher = Hasher::default();
+        for (name, [camera, pixels]) in &self.views {
+            [name, camera, pixels].into_iter().for_each(|text| hasher.write(text.as_bytes()));
+        }
+        hasher.write(self.points.as_bytes());
+        hash::text(hasher.finish())
+    }
+
+    /// The first thing in which the dataset that `self` was taken of differs from another.
+    pub fn difference(&self, other: &Self) -> Option<String> {
+        let missing =
+            |a: &Self, b: &Self| a.views.keys().find(|name| !b.views.contains_key(*name)).cloned();
+        if let Some(name) = missing(self, other) {
+            return Some(format!("view {name} is gone"));
+        }
+        if let Some(name) = missing(other, self) {
+            return Some(format!("view {name} is new"));
+        }
+        for ((name, [camera, pixels]), [other_camera, other_pixels]) in
+            self.views.iter().zip(other.views.values())
+        {
+            if camera != other_camera {
+                return Some(format!("view {name} has another camera or pose"));
+            }
+            if pixels != other_pixels {
+                return Some(format!("view {name} shows other pixels"));
+            }
+        }
+        (self.points != other.points).then(|| "its points are others".to_owned())
+    }
+}
+
+fn camera(View { camera, .. }: &View) -> u64 {
+    let mut hasher = Hasher::default();
+    hasher.write_numbers(&[camera.width.into(), camera.height.into()]);
+    hasher.write_numbers(&camera.focal.to_array());
+    hasher.write_numbers(&camera.principal_point.to_array());
+    hasher.write_numbers(&camera.view_from_world.to_cols_array());
+    if let CameraModel::Fisheye(lens) = camera.model {
+        hasher.write_numbers(&lens.coefficients);
+    }
+    hasher.finish()
+}
+
+fn pixels(view: &View) -> Result<u64> {
+    let mut hasher = Hasher::default();
+    let image = view.loaded()?;
+    for numbers in image.iter().map(|image| &image.data).chain(&view.depth) {
+        hasher.write(bytemuck::cast_slice(numbers));
+    }
+    Ok(hasher.finish())
+}

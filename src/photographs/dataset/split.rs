@@ -1,0 +1,93 @@
+//! Which views are held out.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use super::listed::ListedView;
+use super::{LoadOptions, Split, names};
+use crate::Result;
+use crate::base::input;
+use crate::photographs::image::files::Files;
+
+/// Every eighth of the name-sorted views is held out where nothing else says which.
+pub(super) const TEST_EVERY: usize = 8;
+
+/// Frames that the listing did not assign: by `test.txt` (a name a line), else every eighth. Sorted by name already. Where
+/// it is asked for, every so many instead, whatever else says; 0: none.
+pub(super) fn split(
+    root: &Path,
+    frames: &mut [ListedView],
+    test_every: Option<usize>,
+    files: &Files,
+) -> Result<()> {
+    if let Some(every) = test_every {
+        split_anew(root, frames, every, files);
+        return Ok(());
+    }
+    let path = root.join("test.txt");
+    let mut undecided: Vec<&mut ListedView> =
+        frames.iter_mut().filter(|frame| frame.split.is_none()).collect();
+    if undecided.is_empty() || !path.is_file() {
+        for (index, frame) in undecided.into_iter().enumerate() {
+            frame.split = Some(if index % TEST_EVERY == 0 { Split::Test } else { Split::Train });
+        }
+        return Ok(());
+    }
+    let text = input::text(&path)?;
+    let known: BTreeSet<String> = undecided.iter().map(|frame| frame.name.clone()).collect();
+    let lines = text.lines().map(str::trim).filter(|line| !line.is_empty());
+    let (mut held_out, mut unknown) = (BTreeSet::new(), BTreeSet::new());
+    for line in lines {
+        match names::possible(line).into_iter().find(|name| known.contains(name)) {
+            Some(name) => held_out.insert(name),
+            None => unknown.insert(line.to_owned()),
+        };
+    }
+    for frame in &mut undecided {
+        frame.split = Some(if held_out.contains(&frame.name) { Split::Test } else { Split::Train });
+    }
+    if let Some(name) = unknown.first() {
+        tracing::warn!(
+            "{}: {} names match no view, the first is {name}",
+            path.display(),
+            unknown.len()
+        );
+    }
+    Ok(())
+}
+
+/// Says where the dataset has a split that is asked to give way to another.
+pub(super) fn say_whose_split_gives_way(root: &Path, frames: &[ListedView], options: &LoadOptions) {
+    let own = if frames.iter().any(|frame| frame.split.is_some()) {
+        Some("its transforms files")
+    } else {
+        Some("its test.txt").filter(|_| root.join("test.txt").is_file())
+    };
+    if let Some((own, every)) = own.zip(options.test_every) {
+        tracing::warn!(
+            "{}: {own} split the views, which gives way to test_every = {every}; scores do not compare with \
+             those of its own split",
+            root.display()
+        );
+    }
+}
+
+/// Holds out every so many views by name in place of the dataset's own split. A listed test view of which there is no dark
+/// photograph cannot be trained on: it stays a pose.
+fn split_anew(root: &Path, frames: &mut [ListedView], every: usize, files: &Files) {
+    let training = frames.iter().filter(|frame| frame.split == Some(Split::Train));
+    let training_folders: BTreeSet<String> =
+        training.map(|frame| frame.folder().to_owned()).collect();
+    let mut place = 0;
+    for frame in frames {
+        let lists_input =
+            frame.split != Some(Split::Test) || training_folders.contains(frame.folder());
+        let is_posed_only =
+            frame.split == Some(Split::Test) && frame.input(root, lists_input, files).is_none();
+        if !is_posed_only {
+            let is_test = every > 0 && place % every == 0;
+            frame.split = Some(if is_test { Split::Test } else { Split::Train });
+            place += 1;
+        }
+    }
+}

@@ -1,0 +1,50 @@
+//! What lies beside a dataset's photographs and is not used, said so that nobody wonders.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+use super::listed::ListedView;
+use crate::photographs::image::files::{photographs_in, unread_in};
+
+/// A line where most photographs have no pose, and one for each folder with pictures that are not read.
+pub(super) fn remarks(root: &Path, frames: &[ListedView]) -> Vec<String> {
+    let used: BTreeSet<&Path> = frames.iter().filter_map(|frame| frame.file.as_deref()).collect();
+    let images = root.join("images");
+    let all_below = used.iter().any(|file| file.starts_with(&images));
+    let mut folders: BTreeSet<PathBuf> =
+        used.iter().filter_map(|file| file.parent()).map(Path::to_owned).collect();
+    if all_below {
+        add_folders_below(&images, &mut folders);
+    }
+    // Beside a folder of dark photographs its normal-light twin has the other half of the listing.
+    let stems: BTreeSet<_> = used.iter().filter_map(|file| file.file_stem()).collect();
+    let is_used = |file: &PathBuf| {
+        let has_twin =
+            !file.starts_with(&images) && stems.contains(&file.file_stem().unwrap_or_default());
+        used.contains(file.as_path()) || has_twin
+    };
+    let photographs: Vec<PathBuf> =
+        folders.iter().flat_map(|folder| photographs_in(folder).unwrap_or_default()).collect();
+    let without_pose: Vec<&PathBuf> = photographs.iter().filter(|file| !is_used(file)).collect();
+    let mut remarks = vec![];
+    let (count, of) = (without_pose.len(), photographs.len());
+    if let Some(first) = without_pose.first().filter(|_| 2 * count > of) {
+        let first = first.strip_prefix(root).unwrap_or(first).display();
+        remarks.push(format!(
+            "{}: {count} of {of} photographs have no pose and are not used, {first} the first; `nightsplat pose` finds those of dark photographs",
+            root.display()
+        ));
+    }
+    remarks.extend(folders.iter().filter_map(|folder| unread_in(folder)));
+    remarks
+}
+
+fn add_folders_below(folder: &Path, folders: &mut BTreeSet<PathBuf>) {
+    folders.insert(folder.to_owned());
+    for entry in std::fs::read_dir(folder).into_iter().flatten().flatten() {
+        // A link may lead back up.
+        if entry.file_type().is_ok_and(|kind| kind.is_dir()) {
+            add_folders_below(&entry.path(), folders);
+        }
+    }
+}

@@ -1,0 +1,176 @@
+//! Joint histograms of dark values and reference values: what a fit needs of millions of pixels.
+
+use crate::photographs::tone::measurable;
+
+/// Reference values are counted by 8-bit code value.
+const LEVELS: usize = 256;
+
+/// The bits of an f32 that tell columns apart drop the last twelve: values of 8-bit files stay apart, values closer than
+/// 2^-11 of each other share a column.
+const KEY_SHIFT: u32 = 12;
+
+/// The key of the greatest value, 65504.
+const LARGEST_KEY: usize = (65504.0_f32.to_bits() >> KEY_SHIFT) as usize;
+
+/// Pixels of one reference value, within a column.
+#[derive(Clone, Copy, Debug)]
+pub struct Cell {
+    level: u8,
+    count: f64,
+}
+
+impl Cell {
+    /// The reference value, in [0, 1].
+    pub fn y(self) -> f64 {
+        f64::from(self.level) / (LEVELS - 1) as f64
+    }
+
+    /// How many pixels, each times its weight.
+    pub fn count(self) -> f64 {
+        self.count
+    }
+}
+
+/// Pixels whose dark value is alike.
+#[derive(Clone, Debug, Default)]
+pub struct Column {
+    /// The mean of their dark values.
+    pub x: f64,
+    /// How many they are.
+    pub count: f64,
+    /// The sum of their reference values, as exact as f64.
+    pub sum_y: f64,
+    /// The sum of the squares of their reference values.
+    pub sum_y2: f64,
+    /// Their reference values to 8 bits, ascending.
+    pub cells: Vec<Cell>,
+}
+
+/// Columns by ascending dark value, none of them empty.
+#[derive(Clone, Debug, Default)]
+pub struct Histogram {
+    /// The columns.
+    pub columns: Vec<Column>,
+}
+
+/// A column that is being filled.
+#[derive(Clone)]
+struct Open {
+    sums: [f64; 3],
+    counts: [f64; LEVELS],
+}
+
+impl Open {
+    const EMPTY: Self = Self { sums: [0.0; 3], counts: [0.0; LEVELS] };
+
+    fn closed(&self) -> Option<Column> {
+        let count: f64 = self.counts.iter().sum();
+        let cells = self.counts.iter().zip(0..=u8::MAX).filter(|&(&count, _)| count > 0.0);
+        let cells = cells.map(|(&count, level)| Cell { level, count }).collect();
+        let [sum_x, sum_y, sum_y2] = self.sums;
+        (count > 0.0).then(|| Column { x: sum_x / count, count, sum_y, sum_y2, cells })
+    }
+}
+
+impl Histogram {
+    /// The pixels of one plane, (H, W) each: one column per dark value, exact for 8-bit photographs. Reference values
+    /// count within [0, 1], dark values as the statistics take them.
+    pub fn of(dark: &[f32], reference: &[f32]) -> Self {
+        let key = |x: f32| (measurable(x).to_bits() >> KEY_SHIFT) as usize;
+        let mut columns = vec![0_u32; LARGEST_KEY + 1];
+        for &x in dark {
+            columns[key(x)] = 1;
+        }
+        let mut used = 0;
+        for column in columns.iter_mut().filter(|column| **column > 0) {
+            *column = used;
+            used += 1;
+        }
+        let mut open = vec![Open::EMPTY; used as usize];
+        for (&x, &y) in dark.iter().zip(reference) {
+            let column = &mut open[columns[key(x)] as usize];
+            let y = measurable(y).min(1.0);
+            column.counts[(y * (LEVELS - 1) as f32).round() as usize] += 1.0;
+            let y = f64::from(y);
+            for (sum, value) in column.sums.iter_mut().zip([f64::from(measurable(x)), y, y * y]) {
+                *sum += value;
+            }
+        }
+        Self { columns: open.iter().filter_map(Open::closed).collect() }
+    }
+
+    /// Several histograms in one of `bins` columns, each with a factor for its dark values and a weight for its counts.
+    ///
+    /// Of a value t the bin is that of t / (1 + t): fine in the shadows, and the few values far above 1 have bins of
+    /// their own instead of deciding the width of all.
+    pub fn pooled<'a>(parts: impl IntoIterator<Item = (&'a Self, [f64; 2])>, bins: usize) -> Self {
+        let mut open = vec![Open::EMPTY; bins];
+        for (histogram, [factor, weight]) in parts {
+            for column in &histogram.columns {
+                let t = column.x * factor;
+                let bin = (t / (1.0 + t) * bins as f64) as usize;
+                let into = &mut open[bin.min(bins - 1)];
+                let sums = [t * column.count, column.sum_y, column.sum_y2];
+                for (sum, value) in into.sums.iter_mut().zip(sums) {
+                    *sum += weight * value;
+                }
+                for cell in &column.cells {
+                    into.counts[usize::from(cell.level)] += weight * cell.count;
+                }
+            }
+        }
+        Self { columns: open.iter().filter_map(Open::closed).collect() }
+    }
+
+    /// How many pixels it counts.
+    pub fn count(&self) -> f64 {
+        self.columns.iter().map(|column| column.count).sum()
+    }
+
+    /// The sums of the residuals y - f(x) and of their squares over all pixels, exact but for what columns share.
+    pub fn residuals(&self, f: impl Fn(f64) -> f64) -> [f64; 2] {
+        self.columns.iter().fold([0.0; 2], |[sum, squares], column| {
+            let (y, Column { count, sum_y, sum_y2, .. }) = (f(column.x), column);
+            [sum + sum_y - count * y, squares + sum_y2 - 2.0 * y * sum_y + count * y * y]
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Histogram;
+
+    #[test]
+    fn sums_are_those_of_the_pixels_however_they_are_pooled() {
+        let dark: Vec<f32> = (0..5000).map(|i| (i % 61) as f32 / 255.0).collect();
+        let reference: Vec<f32> = (0..5000).map(|i| (i * 7 % 256) as f32 / 255.0).collect();
+        let histogram = Histogram::of(&dark, &reference);
+        assert_eq!(histogram.columns.len(), 61);
+        let f = |x: f64| 3.0 * x;
+        let direct = dark.iter().zip(&reference).map(|(&x, &y)| f64::from(y) - f(x.into()));
+        let direct = direct.fold([0.0; 2], |[sum, squares], r| [sum + r, squares + r * r]);
+        let close = |found: [f64; 2]| {
+            found.iter().zip(direct).all(|(a, b)| (a - b).abs() < 1e-8 * b.abs().max(1.0))
+        };
+        assert!(close(histogram.residuals(f)));
+        let pooled = Histogram::pooled([(&histogram, [4.0, 0.5]), (&histogram, [4.0, 1.5])], 4096);
+        assert_eq!((pooled.count(), pooled.columns.len()), (10_000.0, 61));
+        assert!(close(pooled.residuals(|t| f(t / 4.0)).map(|sum| sum / 2.0)));
+        // Every column's cells are its pixels.
+        for column in &pooled.columns {
+            let sum: f64 = column.cells.iter().map(|cell| cell.count() * cell.y()).sum();
+            assert!((sum - column.sum_y).abs() < 1e-4 * column.count);
+        }
+    }
+
+    #[test]
+    fn values_without_meaning_and_no_values_at_all_are_counted_as_the_statistics_do() {
+        let histogram =
+            Histogram::of(&[f32::NAN, -1.0, f32::INFINITY, 1e9], &[2.0, f32::NAN, 0.5, 0.5]);
+        let x: Vec<f64> = histogram.columns.iter().map(|column| column.x).collect();
+        assert_eq!(x, [0.0, 65504.0]);
+        assert_eq!(histogram.columns[0].sum_y, 1.0);
+        assert!(Histogram::of(&[], &[]).columns.is_empty());
+        assert!(Histogram::pooled([], 8).columns.is_empty());
+    }
+}

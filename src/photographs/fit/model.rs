@@ -1,0 +1,297 @@
+//! A family as a function of the numbers that a fit may change.
+
+use super::{FitOptions, Pair};
+use crate::photographs::tone::{
+    Constant, Dual, Family, Law, Numbers, PhotographCurve, Real, Statistics, ToneSettings, White,
+    clamped, curve_at, law,
+};
+use crate::{Error, Result};
+
+/// Where a number belongs among the [`ToneSettings`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Place {
+    Shape(usize),
+    Theta,
+    Alpha,
+    GainC,
+    BaseGain,
+}
+
+/// A setting that no family lists among its constants; it starts where the family has it.
+const fn setting(name: &'static str, low: f64, high: f64) -> Constant {
+    Constant { name, default: low, start: low, bounds: [low, high] }
+}
+const THETA: Constant = setting("theta", 0.05, 1.0);
+const ALPHA: Constant = setting("alpha", 0.0, 0.5);
+const GAIN_C: Constant = setting("gain_c", 0.0, 20.0);
+const BASE_GAIN: Constant = setting("base_gain", 0.1, 10.0);
+
+/// A family with the list of what is fitted.
+#[derive(Clone, Debug)]
+pub(super) struct Model {
+    pub(super) family: &'static Family,
+    places: Vec<Place>,
+    /// In the order of every vector of values.
+    pub(super) free: Vec<Constant>,
+}
+
+/// What the exposure of a photograph makes of a curve.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Exposure {
+    statistics: Statistics,
+    channel: usize,
+}
+
+impl Exposure {
+    /// Of several photographs together: t is all there is.
+    pub(super) const POOLED: Self = Self {
+        statistics: Statistics {
+            p10: 1.0,
+            p80: 1.0,
+            p90: 1.0,
+            mean_luminance: 0.0,
+            mean: 1.0,
+            channel_means: [1.0; 3],
+        },
+        channel: 0,
+    };
+
+    pub(super) fn of(statistics: Statistics, channel: usize) -> Self {
+        Self { statistics, channel }
+    }
+
+    pub(super) fn p90(&self) -> f64 {
+        self.statistics.p90.into()
+    }
+}
+
+impl Model {
+    /// # Errors
+    /// [`Error::Usage`] where the family has nothing to fit.
+    pub(super) fn new(family: &'static Family, options: &FitOptions) -> Result<Self> {
+        let mut places: Vec<Place> = (0..family.constants.len()).map(Place::Shape).collect();
+        match family.white {
+            White::One => {}
+            White::P90 if options.adapt || family.alpha > 0.0 || family.gain_c > 0.0 => {
+                places.extend([Place::Alpha, Place::GainC]);
+                if family.law == Law::Rescaled {
+                    places.push(Place::BaseGain);
+                }
+            }
+            White::P90 => {}
+            White::Mean | White::P80 | White::MeanLuminance | White::ChannelMeans => {
+                places.push(Place::Theta);
+            }
+        }
+        if places.is_empty() {
+            return Err(Error::Usage(format!(
+                "the curve `{}` has no constants to fit",
+                family.name
+            )));
+        }
+        let settings = ToneSettings::new(family.curve);
+        let own =
+            |constant: Constant, value: f64| Constant { default: value, start: value, ..constant };
+        let free = places.iter().map(|&place| match place {
+            Place::Shape(index) => family.constants[index],
+            Place::Theta => own(THETA, settings.theta),
+            Place::Alpha => own(ALPHA, settings.alpha),
+            Place::GainC => own(GAIN_C, settings.gain_c),
+            Place::BaseGain => own(BASE_GAIN, settings.base_gain),
+        });
+        Ok(Self { free: free.collect(), family, places })
+    }
+
+    /// Whether photographs with different statistics have different curves of t.
+    pub(super) fn differs_by_photograph(&self) -> bool {
+        self.places.iter().any(|place| !matches!(place, Place::Shape(_)))
+    }
+
+    /// Whether the channels of a photograph have different curves.
+    pub(super) fn differs_by_channel(&self) -> bool {
+        self.family.white == White::ChannelMeans
+    }
+
+    /// Whether the shape f has constants; otherwise the curve rises whatever black level, white and gain are.
+    pub(super) fn has_shape(&self) -> bool {
+        !self.family.constants.is_empty()
+    }
+
+    /// The curve with these values.
+    pub(super) fn settings(&self, values: &[f64]) -> ToneSettings {
+        let mut settings = ToneSettings::new(self.family.curve);
+        for (&place, &value) in self.places.iter().zip(values) {
+            match place {
+                Place::Shape(index) => settings.constants[index] = value,
+                Place::Theta => settings.theta = value,
+                Place::Alpha => settings.alpha = value,
+                Place::GainC => settings.gain_c = value,
+                Place::BaseGain => settings.base_gain = value,
+            }
+        }
+        settings
+    }
+
+    /// What a photograph of this exposure gets with these values.
+    pub(super) fn curve(&self, values: &[f64], exposure: &Exposure) -> Curve<f64> {
+        self.curve_of(&Numbers::from(&self.settings(values)), exposure)
+    }
+
+    /// The same with its derivatives by every value.
+    pub(super) fn slopes(&self, values: &[f64], exposure: &Exposure) -> Slopes {
+        let numbers = Numbers::<Dual>::from(&self.settings(values));
+        let by = |&place: &Place| {
+            let mut numbers = numbers;
+            let variable = match place {
+                Place::Shape(index) => &mut numbers.constants[index],
+                Place::Theta => &mut numbers.theta,
+                Place::Alpha => &mut numbers.alpha,
+                Place::GainC => &mut numbers.gain_c,
+                Place::BaseGain => &mut numbers.base_gain,
+            };
+            variable.derivative = 1.0;
+            self.curve_of(&numbers, exposure)
+        };
+        Slopes(self.places.iter().map(by).collect())
+    }
+
+    fn curve_of<T: Real>(&self, numbers: &Numbers<T>, exposure: &Exposure) -> Curve<T> {
+        let family = self.family;
+        let curve = law(family, family.white, numbers, &exposure.statistics);
+        let white = match family.white {
+            White::ChannelMeans => curve.constants[exposure.channel],
+            _ => curve.white,
+        };
+        let number = family.curve.constant();
+        Curve { number, p90: exposure.p90(), curve: PhotographCurve { white, ..curve } }
+    }
+}
+
+/// The curve of a photograph, or of one of its channels, as a function of t = x / p90.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Curve<T> {
+    /// A `CURVE_*`.
+    number: u32,
+    p90: f64,
+    curve: PhotographCurve<T>,
+}
+
+impl<T: Real> Curve<T> {
+    /// At t, clamped.
+    pub(super) fn at(&self, t: f64) -> T {
+        clamped(self.raw_at(t))
+    }
+
+    /// At t, before it is clamped.
+    pub(super) fn raw_at(&self, t: f64) -> T {
+        let PhotographCurve { white, offset, gain, constants } = &self.curve;
+        curve_at(self.number, T::of(t * self.p90) / *white, [*offset, *gain], constants)
+    }
+}
+
+/// The derivatives of a curve by every value of its model; those that are no numbers count as 0.
+#[derive(Clone, Debug)]
+pub(super) struct Slopes(Vec<Curve<Dual>>);
+
+impl Slopes {
+    /// Of the clamped curve at t.
+    pub(super) fn at(&self, t: f64) -> impl Iterator<Item = f64> {
+        self.0.iter().map(move |curve| counted(curve.at(t)))
+    }
+
+    /// Of the curve at t before it is clamped.
+    pub(super) fn raw_at(&self, t: f64) -> impl Iterator<Item = f64> {
+        self.0.iter().map(move |curve| counted(curve.raw_at(t)))
+    }
+}
+
+fn counted(number: Dual) -> f64 {
+    if number.derivative.is_finite() { number.derivative } else { 0.0 }
+}
+
+/// The PSNR over all pixels and channels of what `settings` makes of the dark photograph, dB.
+pub fn psnr(settings: &ToneSettings, pair: &Pair) -> f64 {
+    let model = Model { family: settings.curve.family(), places: vec![], free: vec![] };
+    let numbers = Numbers::<f64>::from(settings);
+    let [mut count, mut squares] = [0.0; 2];
+    for (channel, histogram) in pair.channels.iter().enumerate() {
+        let exposure = Exposure::of(pair.statistics, channel);
+        let curve = model.curve_of(&numbers, &exposure);
+        squares += histogram.residuals(|x| curve.at(x / exposure.p90()))[1];
+        count += histogram.count();
+    }
+    -10.0 * (squares.max(0.0) / count).log10()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::photographs::tone::{FAMILIES, ToneCurve};
+
+    #[test]
+    fn every_family_is_what_the_kernels_make_of_it() {
+        let statistics = Statistics {
+            p10: 0.01,
+            p80: 0.11,
+            p90: 0.13,
+            mean_luminance: 0.06,
+            mean: 0.055,
+            channel_means: [0.05, 0.06, 0.055],
+        };
+        for family in &FAMILIES {
+            let settings = ToneSettings::new(family.curve);
+            let parameters = settings.parameters(&statistics);
+            let model = Model { family, places: vec![], free: vec![] };
+            let numbers = Numbers::<f64>::from(&settings);
+            for x in [0.0, 0.004, 0.03, 0.13, 0.3, 0.9] {
+                for channel in 0..3 {
+                    let exposure = Exposure::of(statistics, channel);
+                    let found = model.curve_of(&numbers, &exposure).at(x / exposure.p90());
+                    let expected = if family.curve == ToneCurve::PerChannel {
+                        clamped(x as f32 / parameters.constants[channel])
+                    } else {
+                        family.curve.apply(x as f32, &parameters)
+                    };
+                    let error = (found - f64::from(expected)).abs();
+                    assert!(error < 2e-6, "{}({x}): {found}, not {expected}", family.name);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn gradients_are_those_of_central_differences() {
+        let statistics = Statistics {
+            p10: 0.02,
+            p80: 0.2,
+            p90: 0.3,
+            mean_luminance: 0.15,
+            mean: 0.14,
+            channel_means: [0.14; 3],
+        };
+        let exposure = Exposure::of(statistics, 1);
+        for family in FAMILIES.iter().filter(|family| family.white != White::One) {
+            let model =
+                Model::new(family, &FitOptions { adapt: true, ..FitOptions::default() }).unwrap();
+            let values: Vec<f64> = model.free.iter().map(|constant| constant.start).collect();
+            for t in [0.05, 0.17, 0.61] {
+                for (index, exact) in model.slopes(&values, &exposure).raw_at(t).enumerate() {
+                    let h = 1e-6 * values[index].abs().max(1e-3);
+                    let at = |shift: f64| {
+                        let mut values = values.clone();
+                        values[index] += shift;
+                        model.curve(&values, &exposure).raw_at(t)
+                    };
+                    let difference = (at(h) - at(-h)) / (2.0 * h);
+                    let what = model.free[index].name;
+                    let error = (exact - difference).abs();
+                    assert!(
+                        error < 1e-6 * (1.0 + exact.abs()),
+                        "{} by {what}: {exact}, not {difference}",
+                        family.name
+                    );
+                }
+            }
+        }
+    }
+}

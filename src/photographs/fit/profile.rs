@@ -1,0 +1,395 @@
+//! A camera profile from pairs of photographs: [`Profile`], by robust least squares on colours.
+//!
+//! The channels of a profile do not depend on each other. For each one in turn, until nothing moves:
+//!
+//! ```text
+//! segments    non-negative least squares of the 16 rises, given u = a v + b, with a light penalty on bends
+//! a, b        a damped Gauss-Newton step, given the segments; u is rescaled to [0, 1] behind it
+//! weights     Huber's, by the residuals of both
+//! ```
+//!
+//! Dark values are brought to one exposure first: v = 1 - exp(-k x) with the gain k that the rule of the automatic curve
+//! gives the photograph ([`Exposure`]). It follows the exposure and lies within [0, 1], so that segments of equal width are
+//! all used; as t = x / p90 the same fit scored .6 dB less on its own scene and on others.
+
+use std::path::{Path, PathBuf};
+
+use nalgebra::{SMatrix, SVector};
+use rayon::prelude::*;
+use serde::Serialize;
+
+use super::pairs::{files_of, name_of};
+use crate::kernels::tone_profile::SEGMENTS;
+use crate::photographs::image::Image;
+use crate::photographs::tone::{Exposure, LuminanceHistogram, Profile, measurable, soft};
+use crate::{Error, Result};
+
+const KNOTS: usize = SEGMENTS as usize + 1;
+
+/// Colours that a fit looks at, over all photographs.
+const COLOURS: usize = 200_000;
+/// Rounds of segments, weights and mixing.
+const ROUNDS: usize = 30;
+/// Sweeps of the descent to the rises.
+const SWEEPS: usize = 400;
+/// The weight of squared bends of the segments beside the mean squared residual: what no colour falls on goes straight on.
+const BEND: f64 = 1e-5;
+/// Of a channel's u, what lies below 0 and above 1 together.
+const CUT: f64 = 1e-3;
+/// Least scale of the residuals, as for curves.
+const LEAST_SCALE: f64 = 0.25 / 255.0;
+/// The file's digits: 4 behind the point, a fortieth of a code value. More are not determined by 8-bit references.
+const UNITS: f64 = 1e4;
+
+/// The pairs of a scene as colours, brought to one exposure.
+#[derive(Clone, Debug)]
+pub struct ColourScene {
+    /// The folder's name.
+    pub name: String,
+    /// By name; none of them black.
+    pub pairs: Vec<ColourPair>,
+}
+
+/// Dark colours of a photograph times its gain, and what they are in its reference.
+#[derive(Clone, Debug)]
+pub struct ColourPair {
+    /// The dark photograph.
+    pub path: PathBuf,
+    /// k x, and the reference.
+    pub colours: Vec<[[f32; 3]; 2]>,
+}
+
+/// How well a profile does on pairs, as the mean of their PSNRs over all channels, dB, beside the automatic curve without
+/// a reference.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct ProfileScores {
+    /// The profile.
+    pub profile: f64,
+    /// The automatic curve, lambda = 0.
+    pub auto: f64,
+}
+
+/// A scene, or a part of one, that a profile was not fitted to.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct ProfileFold {
+    /// The scene's name, or that of the part.
+    pub name: String,
+    /// How many pairs it holds.
+    pub pairs: usize,
+    /// Of a profile of all other pairs.
+    pub scores: ProfileScores,
+}
+
+impl ColourScene {
+    /// Pairs as [`super::Scene::load`] finds them.
+    ///
+    /// # Errors
+    /// As there.
+    pub fn load(folder: &Path, normal: Option<&Path>) -> Result<Self> {
+        let (files, dark) = files_of(folder, normal)?;
+        let share = (COLOURS / files.len()).max(1);
+        let load = |(dark, reference): &(PathBuf, PathBuf)| {
+            sampled(dark, &Image::load(dark)?, &Image::load(reference)?, share)
+        };
+        let photographs = files.par_iter().map(load).collect::<Result<Vec<_>>>()?;
+        let Some(exposure) = Exposure::of(photographs.iter().map(|(_, y)| y), None) else {
+            let problem = "every photograph is as good as black: a profile takes one pair at least";
+            return Err(Error::input(dark, problem));
+        };
+        let mut pairs = vec![];
+        for (mut pair, luminance) in photographs {
+            if crate::photographs::tone::is_black(&luminance) {
+                tracing::warn!("left out: {} is as good as black", pair.path.display());
+                continue;
+            }
+            let gain = exposure.gain_of(&luminance, None) as f32;
+            pair.colours.iter_mut().for_each(|[dark, _]| *dark = dark.map(|x| gain * x));
+            pairs.push(pair);
+        }
+        Ok(Self { name: name_of(folder), pairs })
+    }
+}
+
+/// About `count` colours of a pair, evenly spaced, and the luminance of all of the dark photograph.
+fn sampled(
+    path: &Path,
+    dark: &Image,
+    reference: &Image,
+    count: usize,
+) -> Result<(ColourPair, LuminanceHistogram)> {
+    let pixels = dark.pixel_count();
+    if (dark.width, dark.height) != (reference.width, reference.height) || pixels == 0 {
+        let problem = format!(
+            "is {}x{} but its reference {}x{}; a pair must show the same pixels",
+            dark.width, dark.height, reference.width, reference.height
+        );
+        return Err(Error::input(path, problem));
+    }
+    let colour = |image: &Image, i: usize| {
+        [0, 1, 2].map(|channel| measurable(image.data[channel * pixels + i]))
+    };
+    // An odd step does not keep to the columns of an even width.
+    let step = (pixels / count).max(1) | 1;
+    let both = |i| [colour(dark, i), colour(reference, i).map(|y| y.min(1.0))];
+    let colours = (0..pixels).step_by(step).map(both).collect();
+    let luminance = LuminanceHistogram::of(&dark.data);
+    Ok((ColourPair { path: path.to_owned(), colours }, luminance))
+}
+
+/// The profile of all pairs; residuals beyond `huber` times their scale weigh less.
+///
+/// # Errors
+/// [`Error::Usage`] where there is no pair or `huber` is not above 0, [`Error::Input`] where the photographs are of one
+/// colour.
+pub fn fit_profile(scenes: &[(&str, Vec<&ColourPair>)], huber: f64) -> Result<Profile> {
+    let pairs: Vec<&ColourPair> = scenes.iter().flat_map(|(_, pairs)| pairs).copied().collect();
+    let Some(first) = pairs.first() else {
+        return Err(Error::Usage("there are no pairs: a profile takes one at least".to_owned()));
+    };
+    // Positive phrasing: a NaN fails the test too.
+    let is_positive = huber > 0.0;
+    if !is_positive {
+        let problem = format!("`FitOptions::huber` is {huber}; it must be above 0");
+        return Err(Error::Usage(problem));
+    }
+    let colours = || pairs.iter().flat_map(|pair| &pair.colours);
+    let v = |t: f32| 1.0 - (-f64::from(t)).exp();
+    let inputs: Vec<SVector<f64, 4>> = colours()
+        .map(|[dark, _]| SVector::from([v(dark[0]), v(dark[1]), v(dark[2]), 1.0]))
+        .collect();
+    let fitted = (0..3).into_par_iter().map(|channel| {
+        let outputs: Vec<f64> = colours().map(|[_, light]| light[channel].into()).collect();
+        Channel::fit(channel, &inputs, &outputs, huber)
+    });
+    let fitted = fitted.collect::<Option<Vec<Channel>>>().ok_or_else(|| {
+        let problem = "is of one colour, as are all pairs: there is nothing to fit a profile to";
+        Error::input(&first.path, problem)
+    })?;
+    let rounded = |x: f64| (UNITS * x).round() / UNITS;
+    let of = |channel: usize| {
+        let Channel { mix, values } = &fitted[channel];
+        let gain = mix.fixed_rows::<3>(0).sum();
+        // The last weight takes what rounding leaves, so that the row still sums to 1.
+        let [r, g] = [0, 1].map(|from| rounded(mix[from] / gain));
+        let values: Vec<f64> = values.iter().map(|y| rounded(y.clamp(0.0, 1.0))).collect();
+        ([r, g, rounded(1.0 - r - g)], rounded(gain), rounded(mix[3]), values)
+    };
+    let [red, green, blue] = [of(0), of(1), of(2)];
+    let mut names: Vec<&str> = scenes.iter().map(|(name, _)| *name).collect();
+    names.dedup();
+    let profile = Profile {
+        reference: names.join(", "),
+        pairs: pairs.len(),
+        matrix: [red.0, green.0, blue.0],
+        gain: [red.1, green.1, blue.1],
+        bias: [red.2, green.2, blue.2],
+        segments: [red.3, green.3, blue.3],
+    };
+    profile.check().map_err(Error::Usage)?;
+    Ok(profile)
+}
+
+/// One channel of a profile.
+struct Channel {
+    /// Weights of the channels, and the bias.
+    mix: SVector<f64, 4>,
+    /// At the knots.
+    values: [f64; KNOTS],
+}
+
+impl Channel {
+    /// None where u has no range.
+    fn fit(
+        channel: usize,
+        inputs: &[SVector<f64, 4>],
+        outputs: &[f64],
+        huber: f64,
+    ) -> Option<Self> {
+        let mut mix = SVector::zeros();
+        mix[channel] = 1.0;
+        let mut fitted = Self { mix: stretched(mix, inputs)?, values: [0.0; KNOTS] };
+        let (mut weights, mut damping) = (vec![1.0; outputs.len()], 1e-3);
+        for round in 0..ROUNDS {
+            fitted.fit_segments(inputs, outputs, &weights);
+            let mut sizes: Vec<f64> = fitted.residuals(inputs, outputs).map(f64::abs).collect();
+            let middle = sizes.len() / 2;
+            let median = *sizes.select_nth_unstable_by(middle, f64::total_cmp).1;
+            let limit = huber * (1.4826 * median).max(LEAST_SCALE);
+            weights =
+                fitted.residuals(inputs, outputs).map(|r| (limit / r.abs()).min(1.0)).collect();
+            if round + 1 < ROUNDS {
+                damping = fitted.step(inputs, outputs, &weights, damping)?;
+            }
+        }
+        Some(fitted)
+    }
+
+    /// The segment of u, and how far along it u lies.
+    fn place(&self, input: &SVector<f64, 4>) -> (usize, f64) {
+        let place = f64::from(SEGMENTS) * self.mix.dot(input).clamp(0.0, 1.0);
+        let segment = (place as usize).min(KNOTS - 2);
+        (segment, place - segment as f64)
+    }
+
+    fn residuals(&self, inputs: &[SVector<f64, 4>], outputs: &[f64]) -> impl Iterator<Item = f64> {
+        inputs.iter().zip(outputs).map(|(input, y)| {
+            let (segment, along) = self.place(input);
+            let [low, high] = [segment, segment + 1].map(|knot| self.values[knot]);
+            y - (low + along * (high - low))
+        })
+    }
+
+    /// The value at 0 and the rises, none of them negative, by coordinate descent on the normal equations.
+    fn fit_segments(&mut self, inputs: &[SVector<f64, 4>], outputs: &[f64], weights: &[f64]) {
+        type Square = SMatrix<f64, KNOTS, KNOTS>;
+        let (mut normal, mut right) = (Square::zeros(), SVector::<f64, KNOTS>::zeros());
+        for ((input, y), weight) in inputs.iter().zip(outputs).zip(weights) {
+            let (low, along) = self.place(input);
+            let hats = [(low, 1.0 - along), (low + 1, along)];
+            for (i, a) in hats {
+                right[i] += weight * a * y;
+                for (j, b) in hats {
+                    normal[(i, j)] += weight * a * b;
+                }
+            }
+        }
+        let bend = BEND * weights.iter().sum::<f64>();
+        for i in 1..KNOTS - 1 {
+            let second = [(i - 1, 1.0), (i, -2.0), (i + 1, 1.0)];
+            for (i, a) in second {
+                for (j, b) in second {
+                    normal[(i, j)] += bend * a * b * f64::from(SEGMENTS);
+                }
+            }
+        }
+        // A value at a knot is the sum of the rises up to there.
+        let sums = Square::from_fn(|row, column| f64::from(u8::from(column <= row)));
+        let (normal, right) = (sums.transpose() * normal * sums, sums.transpose() * right);
+        let mut rises = SVector::<f64, KNOTS>::from_fn(|i, _| match i {
+            0 => self.values[0],
+            _ => self.values[i] - self.values[i - 1],
+        });
+        for _ in 0..SWEEPS {
+            for i in 0..KNOTS {
+                let slope = right[i] - normal.row(i).transpose().dot(&rises);
+                rises[i] = (rises[i] + slope / normal[(i, i)]).max(0.0);
+            }
+        }
+        let values = sums * rises;
+        self.values = std::array::from_fn(|i| values[i]);
+    }
+
+    /// A step of weights and bias, taken only if it helps; the damping of the next one. None where u has no range left.
+    fn step(
+        &mut self,
+        inputs: &[SVector<f64, 4>],
+        outputs: &[f64],
+        weights: &[f64],
+        damping: f64,
+    ) -> Option<f64> {
+        let (mut normal, mut right) = (SMatrix::<f64, 4, 4>::zeros(), SVector::<f64, 4>::zeros());
+        let residuals = self.residuals(inputs, outputs);
+        for ((input, residual), weight) in inputs.iter().zip(residuals).zip(weights) {
+            let u = self.mix.dot(input);
+            if !(0.0..=1.0).contains(&u) {
+                continue;
+            }
+            let (segment, _) = self.place(input);
+            let slope = f64::from(SEGMENTS) * (self.values[segment + 1] - self.values[segment]);
+            normal += weight * slope * slope * input * input.transpose();
+            right += weight * slope * residual * input;
+        }
+        let loss = |channel: &Self| -> f64 {
+            let residuals = channel.residuals(inputs, outputs).zip(weights);
+            residuals.map(|(residual, weight)| weight * residual * residual).sum()
+        };
+        let scale = normal.trace().max(f64::MIN_POSITIVE);
+        let damped = normal + SMatrix::identity() * (damping * scale);
+        let moved = damped
+            .lu()
+            .solve(&right)
+            .map(|step| Self { mix: self.mix + step, values: self.values });
+        // Grey must get brighter with light.
+        let helps =
+            |moved: &Self| moved.mix.fixed_rows::<3>(0).sum() > 0.05 && loss(moved) < loss(self);
+        match moved.filter(helps) {
+            Some(moved) => {
+                self.mix = stretched(moved.mix, inputs)?;
+                Some((0.3 * damping).max(1e-9))
+            }
+            None => Some(10.0 * damping),
+        }
+    }
+}
+
+/// The mix that has u from 0 to 1 on the inputs but for [`CUT`] of them; none where they are all one.
+fn stretched(mix: SVector<f64, 4>, inputs: &[SVector<f64, 4>]) -> Option<SVector<f64, 4>> {
+    let mut u: Vec<f64> = inputs.iter().map(|input| mix.dot(input)).collect();
+    let last = u.len() - 1;
+    let mut at = |share: f64| {
+        let rank = (share * last as f64) as usize;
+        *u.select_nth_unstable_by(rank, f64::total_cmp).1
+    };
+    let [low, high] = [at(0.5 * CUT), at(1.0 - 0.5 * CUT)];
+    let mut stretched = mix / (high - low);
+    stretched[3] -= low / (high - low);
+    (high - low > 1e-6).then_some(stretched)
+}
+
+/// Scores of a profile and of the automatic curve on pairs.
+pub fn profile_scores(profile: &Profile, pairs: &[&ColourPair]) -> ProfileScores {
+    let mean = |map: &(dyn Fn([f64; 3]) -> [f64; 3] + Sync)| {
+        let psnr = |pair: &&ColourPair| {
+            let squares = pair.colours.iter().flat_map(|[dark, light]| {
+                let mapped = map(dark.map(f64::from));
+                [0, 1, 2].map(|channel| (mapped[channel] - f64::from(light[channel])).powi(2))
+            });
+            -10.0 * (squares.sum::<f64>() / (3 * pair.colours.len()) as f64).log10()
+        };
+        // In order: a sum of floats depends on it.
+        let scores: Vec<f64> = pairs.par_iter().map(psnr).collect();
+        scores.iter().sum::<f64>() / pairs.len() as f64
+    };
+    ProfileScores { profile: mean(&|t| profile.value(t)), auto: mean(&|t| t.map(|t| soft(t, 1.0))) }
+}
+
+/// Leaves out each scene in turn, of a single one every `folds`-th pair, and scores a profile of the others on it.
+///
+/// # Errors
+/// [`Error::Usage`] where there is a single pair or fold; those of [`fit_profile`].
+pub fn cross_validate_profile(
+    scenes: &[ColourScene],
+    folds: usize,
+    huber: f64,
+) -> Result<Vec<ProfileFold>> {
+    let parts: Vec<(String, &str, Vec<&ColourPair>)> = match scenes {
+        [scene] => {
+            let count = scene.pairs.len().min(folds);
+            if count < 2 {
+                let pairs = scene.pairs.len();
+                return Err(Error::Usage(format!(
+                    "{pairs} pairs in {folds} folds leave none to fit to or none to validate on; it takes two pairs in \
+                     two folds"
+                )));
+            }
+            let fold = |index: usize| {
+                let pairs = scene.pairs.iter().skip(index).step_by(count).collect();
+                (format!("{} {}/{count}", scene.name, index + 1), scene.name.as_str(), pairs)
+            };
+            (0..count).map(fold).collect()
+        }
+        _ => scenes
+            .iter()
+            .map(|scene| (scene.name.clone(), scene.name.as_str(), scene.pairs.iter().collect()))
+            .collect(),
+    };
+    let held_out = |index: usize| {
+        let others = parts.iter().enumerate().filter(|(other, _)| *other != index);
+        let others: Vec<_> = others.map(|(_, (_, scene, pairs))| (*scene, pairs.clone())).collect();
+        let profile = fit_profile(&others, huber)?;
+        let (name, _, pairs) = &parts[index];
+        let scores = profile_scores(&profile, pairs);
+        Ok(ProfileFold { name: name.clone(), pairs: pairs.len(), scores })
+    };
+    (0..parts.len()).map(held_out).collect()
+}

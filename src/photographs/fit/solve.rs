@@ -1,0 +1,441 @@
+//! Least squares: Levenberg-Marquardt within the bounds, restarted from several places, reweighted after Huber.
+
+use levenberg_marquardt::{LeastSquaresProblem, LevenbergMarquardt};
+use nalgebra::{DMatrix, DVector, Dyn, Owned};
+
+use super::model::{Curve, Exposure, Model, Slopes};
+use super::{Channels, FitOptions, Histogram, Pair, Weighting};
+use crate::base::random::Stream;
+use crate::photographs::tone::Statistics;
+
+/// Values that share a curve of t.
+pub(super) struct Group {
+    pub(super) exposure: Exposure,
+    /// Of t = x / p90.
+    pub(super) histogram: Histogram,
+}
+
+/// The pairs with their weights as the model sees them: all in one group where t alone decides.
+fn groups(model: &Model, pairs: &[&Pair], weights: &[f64], options: &FitOptions) -> Vec<Group> {
+    let all = pairs.iter().zip(weights).flat_map(|(pair, &weight)| {
+        parts(model, pair, options.channels).into_iter().map(move |(exposure, histograms)| {
+            let scaled = |histogram| (histogram, [1.0 / exposure.p90(), weight]);
+            (exposure, histograms.into_iter().map(scaled).collect::<Vec<_>>())
+        })
+    });
+    let group =
+        |(exposure, parts)| Group { exposure, histogram: Histogram::pooled(parts, options.bins) };
+    if model.differs_by_photograph() {
+        all.map(group).collect()
+    } else {
+        vec![group((Exposure::POOLED, all.flat_map(|(_, parts)| parts).collect()))]
+    }
+}
+
+/// The histograms of a pair that are fitted, by the exposure they share.
+pub(super) fn parts<'a>(
+    model: &Model,
+    pair: &'a Pair,
+    channels: Channels,
+) -> Vec<(Exposure, Vec<&'a Histogram>)> {
+    let exposure = |channel| Exposure::of(pair.statistics, channel);
+    if model.differs_by_channel() {
+        return (0..3).map(|channel| (exposure(channel), vec![&pair.channels[channel]])).collect();
+    }
+    let histograms = match channels {
+        Channels::Rgb => pair.channels.iter().collect(),
+        Channels::Luminance => vec![&pair.luminance],
+    };
+    vec![(exposure(0), histograms)]
+}
+
+/// How many values of a pair are fitted, and the sums of their residuals and of the squares.
+pub(super) fn pair_residuals(
+    model: &Model,
+    values: &[f64],
+    pair: &Pair,
+    channels: Channels,
+) -> (f64, [f64; 2]) {
+    let parts = parts(model, pair, channels).into_iter();
+    let mut found = (0.0, [0.0; 2]);
+    for (exposure, histogram) in
+        parts.flat_map(|(exposure, parts)| parts.into_iter().map(move |part| (exposure, part)))
+    {
+        let pooled = if model.differs_by_photograph() { exposure } else { Exposure::POOLED };
+        let curve = model.curve(values, &pooled);
+        let [sum, squares] = histogram.residuals(|x| curve.at(x / exposure.p90()));
+        found.0 += histogram.count();
+        found.1 = [found.1[0] + sum, found.1[1] + squares];
+    }
+    found
+}
+
+/// What a fit found.
+pub(super) struct Solution {
+    pub(super) values: Vec<f64>,
+    /// Of each pair; of all values together the mean is 1.
+    pub(super) weights: Vec<f64>,
+    /// Residuals beyond it weigh less; none where all weigh the same.
+    pub(super) delta: Option<f64>,
+    /// Whether the clamped curve never falls, to within [`TOLERANCE`].
+    pub(super) rises: bool,
+    /// Whether the curve never passes 1, to within [`TOLERANCE`].
+    pub(super) bounded: bool,
+}
+
+/// A column with its weight and the mean of its reference values, under the weights of its cells.
+struct Row {
+    group: usize,
+    t: f64,
+    /// Of all weights.
+    weight: f64,
+    y: f64,
+}
+
+/// How far a constraint may be broken.
+const TOLERANCE: f64 = 1e-6;
+/// How much a broken constraint weighs against the residuals, one after another until it holds.
+const STRENGTHS: [f64; 3] = [1e1, 1e3, 1e5];
+/// Where constraints are held to, points of t.
+const GRID: usize = 128;
+/// Constraints hold at least up to this t.
+const LEAST_END: f64 = 3.0;
+/// Random places that are looked at, and the best of them that a fit begins from, beside the table's start.
+const PLACES: usize = 24;
+const STARTS: usize = 3;
+/// Evaluations of a descent, per constant.
+const PATIENCE: usize = 30;
+/// Rounds of reweighting, and those of them that estimate the residuals' scale anew.
+const ROUNDS: usize = 30;
+const SCALE_ROUNDS: usize = 6;
+/// A round that moves no constant by more than this share of its range is the last.
+const SETTLED: f64 = 1e-6;
+/// The least scale of the residuals: a quarter of an 8-bit code value, as rounding leaves it.
+const LEAST_SCALE: f64 = 0.25 / 255.0;
+
+pub(super) struct Solver<'a> {
+    model: &'a Model,
+    pairs: &'a [&'a Pair],
+    options: &'a FitOptions,
+    pub(super) groups: Vec<Group>,
+    /// Where constraints are tested, of a photograph like the mean of all.
+    grid: Vec<f64>,
+    exposure: Exposure,
+}
+
+impl<'a> Solver<'a> {
+    pub(super) fn new(model: &'a Model, pairs: &'a [&'a Pair], options: &'a FitOptions) -> Self {
+        let groups = groups(model, pairs, &vec![1.0; pairs.len()], options);
+        let exposure = if model.differs_by_photograph() {
+            let statistics: Vec<Statistics> = pairs.iter().map(|pair| pair.statistics).collect();
+            Exposure::of(Statistics::mean_of(&statistics).unwrap_or_default(), 0)
+        } else {
+            Exposure::POOLED
+        };
+        let last = groups.iter().filter_map(|group| group.histogram.columns.last());
+        let end = last.map(|column| column.x).fold(LEAST_END, f64::max);
+        // Evenly in t / (1 + t), as the columns.
+        let t = |i: usize| {
+            let share = i as f64 / (GRID - 1) as f64 * end / (1.0 + end);
+            share / (1.0 - share)
+        };
+        let grid = (0..GRID).map(t).collect();
+        Self { model, pairs, options, groups, grid, exposure }
+    }
+
+    pub(super) fn solve(&mut self) -> Solution {
+        let FitOptions { huber, weighting, .. } = *self.options;
+        let mut weights = vec![1.0; self.pairs.len()];
+        let mut values = self.best_of_many_starts(&self.rows(&|_| 1.0, &[]));
+        let mut delta = None;
+        for round in 0..ROUNDS {
+            if weighting == Weighting::Photographs {
+                weights = self.weights(&values);
+                self.groups = groups(self.model, self.pairs, &weights, self.options);
+            } else if huber.is_infinite() {
+                break;
+            }
+            if huber.is_finite() && round < SCALE_ROUNDS {
+                delta = Some(huber * self.scale(&values));
+            }
+            let limit = delta.unwrap_or(f64::INFINITY);
+            let weight =
+                |residual: f64| if residual.abs() > limit { limit / residual.abs() } else { 1.0 };
+            let after = self.minimize(&self.rows(&weight, &values), &values);
+            let before = std::mem::replace(&mut values, after);
+            let moved = self.model.free.iter().zip(before.iter().zip(&values)).map(
+                |(constant, (before, after))| {
+                    (before - after).abs() / (constant.bounds[1] - constant.bounds[0])
+                },
+            );
+            if round >= SCALE_ROUNDS && moved.fold(0.0, f64::max) < SETTLED {
+                break;
+            }
+        }
+        let [fall, excess] = self.violations(&values);
+        Solution { values, weights, delta, rises: fall <= TOLERANCE, bounded: excess <= TOLERANCE }
+    }
+
+    /// The weight of every pair: one over the mean of its squared residuals.
+    fn weights(&self, values: &[f64]) -> Vec<f64> {
+        let of_pair = |pair: &&Pair| {
+            let (count, squares) = pair_residuals(self.model, values, pair, self.options.channels);
+            (count, 1.0 / (squares[1] / count).max(LEAST_SCALE * LEAST_SCALE))
+        };
+        let weights: Vec<(f64, f64)> = self.pairs.iter().map(of_pair).collect();
+        let mean = weights.iter().map(|(count, weight)| count * weight).sum::<f64>()
+            / weights.iter().map(|(count, _)| count).sum::<f64>();
+        weights.into_iter().map(|(_, weight)| weight / mean).collect()
+    }
+
+    /// The residuals' scale: 1.4826 times the median of their sizes, the standard deviation were they normal.
+    fn scale(&self, values: &[f64]) -> f64 {
+        (1.4826 * quantile(&mut self.sizes(values), 0.5)).max(LEAST_SCALE)
+    }
+
+    /// The size of every cell's residual, with its count.
+    pub(super) fn sizes(&self, values: &[f64]) -> Vec<(f64, f64)> {
+        let mut sizes = vec![];
+        for (group, curve) in self.groups.iter().zip(self.curves(values)) {
+            for column in &group.histogram.columns {
+                let y = curve.at(column.x);
+                sizes.extend(column.cells.iter().map(|cell| ((cell.y() - y).abs(), cell.count())));
+            }
+        }
+        sizes
+    }
+
+    /// The curve of every group.
+    fn curves(&self, values: &[f64]) -> Vec<Curve<f64>> {
+        self.groups.iter().map(|group| self.model.curve(values, &group.exposure)).collect()
+    }
+
+    /// A row per column, towards the family's own curve as far as the options say: within one the model has one value, so the weighted mean is all that counts. Without values
+    /// every cell weighs by its count.
+    fn rows(&self, weight: &dyn Fn(f64) -> f64, values: &[f64]) -> Vec<Row> {
+        let (mut rows, curves) = (vec![], self.curves(values));
+        for (index, group) in self.groups.iter().enumerate() {
+            for column in &group.histogram.columns {
+                let t = column.x;
+                if values.is_empty() {
+                    rows.push(Row {
+                        group: index,
+                        t,
+                        weight: column.count,
+                        y: column.sum_y / column.count,
+                    });
+                    continue;
+                }
+                let model = curves[index].at(t);
+                let weighted = column
+                    .cells
+                    .iter()
+                    .map(|cell| (cell.count() * weight(cell.y() - model), cell.y()));
+                let [sum, sum_y] =
+                    weighted.fold([0.0; 2], |[sum, sum_y], (w, y)| [sum + w, sum_y + w * y]);
+                rows.push(Row { group: index, t, weight: sum, y: sum_y / sum });
+            }
+        }
+        let total: f64 = rows.iter().map(|row| row.weight).sum();
+        let start: Vec<f64> = self.model.free.iter().map(|constant| constant.start).collect();
+        let own = self.curves(&start);
+        let prior = self.options.prior / self.pairs.len() as f64;
+        for row in &mut rows {
+            row.weight /= total;
+            if prior > 0.0 {
+                row.y = (row.y + prior * own[row.group].at(row.t)) / (1.0 + prior);
+            }
+        }
+        rows
+    }
+
+    /// The best of what several starts lead to.
+    fn best_of_many_starts(&self, rows: &[Row]) -> Vec<f64> {
+        let free = &self.model.free;
+        let start: Vec<f64> = free.iter().map(|constant| constant.start).collect();
+        let stream = Stream::new(u64::from(self.model.family.curve.constant()), 0);
+        let jittered = |place: usize| -> Vec<f64> {
+            let value = |(index, constant)| {
+                let normal = stream.normal((place * free.len() + index) as u64);
+                within(constant, place_of(constant, constant_start(constant)) + 1.5 * normal)
+            };
+            free.iter().enumerate().map(value).collect()
+        };
+        let with_cost =
+            |values: Vec<f64>| (self.problem(rows, &values, STRENGTHS[0]).cost(), values);
+        let mut places: Vec<(f64, Vec<f64>)> =
+            (0..PLACES).map(|place| with_cost(jittered(place))).collect();
+        places.push(with_cost(free.iter().map(|constant| constant.default).collect()));
+        places.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let tried = std::iter::once(start).chain(places.into_iter().map(|(_, place)| place));
+        let found = tried.take(1 + STARTS).map(|place| with_cost(self.minimize(rows, &place)));
+        found.min_by(|a, b| a.0.total_cmp(&b.0)).map_or_else(Vec::new, |(_, values)| values)
+    }
+
+    fn minimize(&self, rows: &[Row], start: &[f64]) -> Vec<f64> {
+        let mut values = start.to_vec();
+        for strength in STRENGTHS {
+            let problem = self.problem(rows, &values, strength);
+            let (problem, report) =
+                LevenbergMarquardt::new().with_tol(1e-10).with_patience(PATIENCE).minimize(problem);
+            tracing::trace!(
+                "{}: {:?} after {}",
+                self.model.family.name,
+                report.termination,
+                report.number_of_evaluations
+            );
+            values = problem.values;
+            let [fall, excess] = self.violations(&values);
+            if fall <= TOLERANCE && !(self.options.bounded && excess > TOLERANCE) {
+                break;
+            }
+        }
+        values
+    }
+
+    fn problem<'b>(&'b self, rows: &'b [Row], start: &[f64], strength: f64) -> Problem<'b> {
+        let position =
+            self.model.free.iter().zip(start).map(|(constant, value)| place_of(constant, *value));
+        let position = DVector::from_iterator(start.len(), position);
+        let mut problem =
+            Problem { solver: self, rows, strength, values: vec![], position: DVector::zeros(0) };
+        problem.set_params(&position);
+        problem
+    }
+
+    /// The deepest fall of the clamped curve from point to point, and the most by which it passes 1.
+    fn violations(&self, values: &[f64]) -> [f64; 2] {
+        self.broken(values)
+            .into_iter()
+            .fold([0.0; 2], |[fall, excess], [a, b]| [f64::max(fall, a), f64::max(excess, b)])
+    }
+
+    /// Of every point of the grid, by how much the clamped curve falls to the next, and passes 1.
+    fn broken(&self, values: &[f64]) -> Vec<[f64; 2]> {
+        let curve = self.model.curve(values, &self.exposure);
+        let raw: Vec<f64> = self.grid.iter().map(|&t| curve.raw_at(t)).collect();
+        let next = raw.iter().skip(1).chain(raw.last());
+        let fall = |raw: f64, next: f64| (raw.clamp(0.0, 1.0) - next.clamp(0.0, 1.0)).max(0.0);
+        raw.iter().zip(next).map(|(&raw, &next)| [fall(raw, next), (raw - 1.0).max(0.0)]).collect()
+    }
+}
+
+/// The start, or what is inside the bounds next to it.
+fn constant_start(constant: &crate::photographs::tone::Constant) -> f64 {
+    let [low, high] = constant.bounds;
+    constant.start.clamp(low + 0.01 * (high - low), high - 0.01 * (high - low))
+}
+
+/// Where on the whole line a value between the bounds lies: the logit of its share.
+fn place_of(constant: &crate::photographs::tone::Constant, value: f64) -> f64 {
+    let [low, high] = constant.bounds;
+    let share = ((value - low) / (high - low)).clamp(1e-6, 1.0 - 1e-6);
+    (share / (1.0 - share)).ln()
+}
+
+/// Inverse of [`place_of`].
+fn within(constant: &crate::photographs::tone::Constant, place: f64) -> f64 {
+    let [low, high] = constant.bounds;
+    low + (high - low) / (1.0 + (-place).exp())
+}
+
+/// The value below which `share` of the counts lie, of (value, count); 0 of none.
+pub(super) fn quantile(sizes: &mut [(f64, f64)], share: f64) -> f64 {
+    sizes.sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
+    let mut left = share * sizes.iter().map(|(_, count)| count).sum::<f64>();
+    let found = sizes.iter().find(|(_, count)| {
+        left -= count;
+        left <= 0.0
+    });
+    found.map_or(0.0, |(size, _)| *size)
+}
+
+/// Residuals: one per row, then two per point of the grid, 0 where the constraint holds.
+struct Problem<'a> {
+    solver: &'a Solver<'a>,
+    rows: &'a [Row],
+    strength: f64,
+    values: Vec<f64>,
+    position: DVector<f64>,
+}
+
+impl Problem<'_> {
+    fn cost(&self) -> f64 {
+        self.all_residuals().norm_squared()
+    }
+
+    fn is_constrained(&self) -> bool {
+        self.solver.model.has_shape()
+    }
+
+    fn all_residuals(&self) -> DVector<f64> {
+        let curves = self.solver.curves(&self.values);
+        let residual = |row: &Row| row.weight.sqrt() * (curves[row.group].at(row.t) - row.y);
+        let mut residuals: Vec<f64> = self.rows.iter().map(residual).collect();
+        if self.is_constrained() {
+            let broken = self.solver.broken(&self.values);
+            let bounded = self.solver.options.bounded;
+            let excess = |excess: f64| if bounded { excess } else { 0.0 };
+            let broken = broken.into_iter().flat_map(|[fall, above]| [fall, excess(above)]);
+            residuals.extend(broken.map(|amount| self.strength * amount));
+        }
+        DVector::from_vec(residuals)
+    }
+}
+
+impl LeastSquaresProblem<f64, Dyn, Dyn> for Problem<'_> {
+    type ResidualStorage = Owned<f64, Dyn>;
+    type JacobianStorage = Owned<f64, Dyn, Dyn>;
+    type ParameterStorage = Owned<f64, Dyn>;
+
+    fn set_params(&mut self, position: &DVector<f64>) {
+        let free = &self.solver.model.free;
+        self.values =
+            free.iter().zip(position).map(|(constant, &place)| within(constant, place)).collect();
+        self.position.clone_from(position);
+    }
+
+    fn params(&self) -> DVector<f64> {
+        self.position.clone()
+    }
+
+    fn residuals(&self) -> Option<DVector<f64>> {
+        Some(self.all_residuals())
+    }
+
+    fn jacobian(&self) -> Option<DMatrix<f64>> {
+        let Solver { model, ref groups, options, ref grid, ref exposure, .. } = *self.solver;
+        let values = &self.values;
+        let constrained = if self.is_constrained() { 2 * grid.len() } else { 0 };
+        let mut jacobian = DMatrix::zeros(self.rows.len() + constrained, values.len());
+        let slope = |index: usize| {
+            let [low, high] = model.free[index].bounds;
+            (values[index] - low) * (high - values[index]) / (high - low)
+        };
+        let slopes: Vec<f64> = (0..values.len()).map(slope).collect();
+        let mut set = |row: usize, factor: f64, gradient: &mut dyn Iterator<Item = f64>| {
+            for (index, derivative) in gradient.enumerate() {
+                jacobian[(row, index)] += factor * derivative * slopes[index];
+            }
+        };
+        let of_group = |group: &Group| model.slopes(values, &group.exposure);
+        let of_groups: Vec<Slopes> = groups.iter().map(of_group).collect();
+        for (index, row) in self.rows.iter().enumerate() {
+            set(index, row.weight.sqrt(), &mut of_groups[row.group].at(row.t));
+        }
+        if constrained > 0 {
+            let on_grid = model.slopes(values, exposure);
+            for (index, [fall, excess]) in self.solver.broken(values).into_iter().enumerate() {
+                let row = self.rows.len() + 2 * index;
+                if fall > 0.0 {
+                    set(row, self.strength, &mut on_grid.at(grid[index]));
+                    set(row, -self.strength, &mut on_grid.at(grid[index + 1]));
+                }
+                if options.bounded && excess > 0.0 {
+                    set(row + 1, self.strength, &mut on_grid.raw_at(grid[index]));
+                }
+            }
+        }
+        Some(jacobian)
+    }
+}

@@ -1,0 +1,224 @@
+//! Photographs as planar float images, and the files they come from and go to.
+//!
+//! Values are sRGB-encoded, as an 8-bit file stores them divided by 255. EXR files hold linear light by
+//! convention; they are encoded on the way in and decoded on the way out (IEC 61966-2-1, linear toe included,
+//! the power law continued above 1).
+
+#[cfg(feature = "io")]
+mod budget;
+#[cfg(feature = "io")]
+mod codec;
+#[cfg(feature = "io")]
+mod exif;
+#[cfg(feature = "io")]
+mod exr_file;
+#[cfg(feature = "io")]
+pub(crate) mod files;
+#[cfg(feature = "io")]
+mod jpeg;
+mod mask;
+#[cfg(feature = "io")]
+mod orientation;
+#[cfg(feature = "raw")]
+mod raw;
+#[cfg(feature = "io")]
+mod source;
+
+#[cfg(feature = "io")]
+pub use exif::exposure_value;
+#[cfg(feature = "io")]
+pub use jpeg::exif_segment;
+pub use mask::Mask;
+#[cfg(feature = "io")]
+pub use orientation::Orientation;
+use rayon::prelude::*;
+
+/// A colour image: planes of red, green and blue, sRGB-encoded, [0, 1] but for EXR input, which may exceed 1.
+///
+/// The centre of the pixel in column `x` and row `y` lies at `(x + 0.5, y + 0.5)`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Image {
+    /// Pixels per row.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+    /// `(3, height, width)`, row-major.
+    pub data: Vec<f32>,
+}
+
+/// Planes from pixels of red, green and blue.
+#[cfg(feature = "io")]
+fn from_interleaved(width: u32, height: u32, values: &[f32]) -> Image {
+    let data = (0..3).flat_map(|plane| values.iter().skip(plane).step_by(3).copied()).collect();
+    Image { width, height, data }
+}
+
+/// Middle grey in linear light: the mean of a photograph that is exposed as a meter has it.
+pub const MIDDLE_GREY: f32 = 0.18;
+
+/// The sRGB encoding of a linear-light value; inverse of [`linear_from_srgb`].
+pub fn srgb_from_linear(linear: f32) -> f32 {
+    if linear <= 0.003_130_8 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }
+}
+
+/// The linear light of an sRGB-encoded value.
+pub fn linear_from_srgb(srgb: f32) -> f32 {
+    if srgb <= 0.040_45 { srgb / 12.92 } else { ((srgb + 0.055) / 1.055).powf(2.4) }
+}
+
+impl Image {
+    /// An image of one colour.
+    pub fn filled(width: u32, height: u32, color: [f32; 3]) -> Self {
+        Self::from_fn(width, height, |_, _| color)
+    }
+
+    /// An image whose pixel in column `x` and row `y` is `color(x, y)`.
+    pub fn from_fn(width: u32, height: u32, color: impl Fn(u32, u32) -> [f32; 3]) -> Self {
+        let pixels = width as usize * height as usize;
+        let mut data = vec![0.0; 3 * pixels];
+        let positions = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
+        for (index, (x, y)) in positions.enumerate() {
+            for (plane, value) in color(x, y).into_iter().enumerate() {
+                data[plane * pixels + index] = value;
+            }
+        }
+        Self { width, height, data }
+    }
+
+    /// How many photographs of so many pixels are to be decoded and looked at side by side: as many as leave memory for
+    /// other things.
+    #[cfg(feature = "io")]
+    pub(crate) fn decoded_at_once(pixels: u64) -> usize {
+        /// Of what is at work at once.
+        const MOST: u64 = 1 << 30;
+        /// Pixels as a file has them, as floats, and once more in another order.
+        const BYTES_PER_PIXEL: u64 = 40;
+        usize::try_from(MOST / (BYTES_PER_PIXEL * pixels.max(1))).unwrap_or(usize::MAX).max(1)
+    }
+
+    /// Pixels per plane.
+    pub fn pixel_count(&self) -> usize {
+        self.width as usize * self.height as usize
+    }
+
+    /// The colour in column `x` and row `y`; panics outside the image.
+    pub fn pixel(&self, x: u32, y: u32) -> [f32; 3] {
+        let index = y as usize * self.width as usize + x as usize;
+        [0, 1, 2].map(|plane| self.data[plane * self.pixel_count() + index])
+    }
+
+    /// The image at another size: every output pixel is the mean of the area it covers (a box filter, in float).
+    ///
+    /// At an integer factor that is the mean of whole pixels. Sides below 1 count as 1.
+    pub fn resized(&self, width: u32, height: u32) -> Self {
+        let (width, height) = (width.max(1), height.max(1));
+        if (width, height) == (self.width, self.height) {
+            return self.clone();
+        }
+        let columns = area_weights(self.width, width);
+        let rows = area_weights(self.height, height);
+        let stride = self.width as usize;
+        let data = (0..3 * height as usize)
+            .into_par_iter()
+            .flat_map_iter(|row| {
+                let (plane, y) = (row / height as usize, row % height as usize);
+                let plane = &self.data[plane * self.pixel_count()..][..self.pixel_count()];
+                let mut line = vec![0.0_f64; stride];
+                for (source, weight) in rows[y].taps() {
+                    for (sum, value) in line.iter_mut().zip(&plane[source * stride..][..stride]) {
+                        *sum += weight * f64::from(*value);
+                    }
+                }
+                let mean = move |taps: &Area| {
+                    taps.taps().map(|(x, weight)| weight * line[x]).sum::<f64>() as f32
+                };
+                columns.iter().map(mean)
+            })
+            .collect();
+        Self { width, height, data }
+    }
+}
+
+/// The input pixels that one output pixel covers along one axis, with weights that sum to 1.
+struct Area {
+    first: usize,
+    weights: Vec<f64>,
+}
+
+impl Area {
+    fn taps(&self) -> impl Iterator<Item = (usize, f64)> + '_ {
+        self.weights.iter().enumerate().map(|(index, weight)| (self.first + index, *weight))
+    }
+}
+
+/// In units of 1/output input pixels, so that every boundary is an integer and integer factors are exact.
+fn area_weights(input: u32, output: u32) -> Vec<Area> {
+    let (input, output) = (u64::from(input), u64::from(output));
+    let area = |index: u64| {
+        let (start, end) = (index * input, (index + 1) * input);
+        let (first, last) = (start / output, (end - 1) / output);
+        let covered = |pixel: u64| end.min((pixel + 1) * output) - start.max(pixel * output);
+        let weights = (first..=last).map(|pixel| covered(pixel) as f64 / input as f64).collect();
+        Area { first: first as usize, weights }
+    };
+    (0..output).map(area).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    pub(super) fn gradient(width: u32, height: u32) -> Image {
+        Image::from_fn(width, height, |x, y| {
+            let (x, y) = (x as f32 / width as f32, y as f32 / height as f32);
+            [x, y, (0.3 + x * y) % 1.0]
+        })
+    }
+
+    pub(super) fn worst(a: &Image, b: &Image) -> f32 {
+        assert_eq!((a.width, a.height), (b.width, b.height));
+        a.data.iter().zip(&b.data).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
+    }
+
+    #[test]
+    fn the_transfer_functions_invert_each_other_and_meet_at_the_toe() {
+        for step in 0..=4000 {
+            let srgb = step as f32 / 1000.0;
+            assert!(
+                (srgb_from_linear(linear_from_srgb(srgb)) - srgb).abs() < 2e-6 * srgb.max(1.0),
+                "{srgb}"
+            );
+        }
+        assert!((srgb_from_linear(0.003_130_8) - srgb_from_linear(0.003_130_9)).abs() < 1e-5);
+    }
+
+    #[test]
+    fn shrinking_by_an_integer_takes_the_mean_of_whole_pixels() {
+        let image = gradient(12, 9);
+        let third = image.resized(4, 3);
+        for (x, y) in (0..3).flat_map(|y| (0..4).map(move |x| (x, y))) {
+            let block = (0..9).map(|index| image.pixel(3 * x + index % 3, 3 * y + index / 3));
+            let mean = block.fold([0.0_f64; 3], |sum, color| {
+                [0, 1, 2].map(|plane| sum[plane] + f64::from(color[plane]) / 9.0)
+            });
+            for (ours, mean) in third.pixel(x, y).into_iter().zip(mean) {
+                assert!((f64::from(ours) - mean).abs() < 1e-7);
+            }
+        }
+    }
+
+    #[test]
+    fn resizing_to_any_size_keeps_the_mean_and_constants() {
+        let image = gradient(13, 11);
+        let mean = |image: &Image| {
+            image.data.iter().copied().map(f64::from).sum::<f64>() / image.data.len() as f64
+        };
+        for (width, height) in [(5, 4), (13, 11), (12, 3), (1, 1), (20, 17), (0, 0)] {
+            let other = image.resized(width, height);
+            assert_eq!(other.data.len(), 3 * other.pixel_count());
+            assert!((mean(&other) - mean(&image)).abs() < 1e-6, "{width}x{height}");
+            let flat = Image::filled(13, 11, [0.1, 0.5, 0.9]).resized(width, height);
+            assert!(worst(&flat, &Image::filled(flat.width, flat.height, [0.1, 0.5, 0.9])) < 1e-7);
+        }
+    }
+}

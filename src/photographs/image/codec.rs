@@ -1,0 +1,401 @@
+//! Photographs from and to files: PNG, JPEG, WebP, TIFF and EXR in, PNG and EXR out.
+
+use std::fs::File;
+use std::io::{BufReader, Cursor};
+use std::path::Path;
+
+use ::image::{
+    DynamicImage, ExtendedColorType, ImageDecoder, ImageEncoder, ImageError, ImageFormat,
+    ImageReader,
+    codecs::{jpeg::JpegEncoder, png::PngEncoder},
+    error::UnsupportedErrorKind,
+};
+
+#[cfg(not(feature = "raw"))]
+use super::files::RAW_REMEDY;
+use super::files::{HEIC_REMEDY, is_raw};
+use super::source::{Source, not_an_image, reader};
+use super::{Image, budget, exr_file, from_interleaved, jpeg, linear_from_srgb, srgb_from_linear};
+use crate::base::input;
+use crate::base::output::write_whole;
+use crate::{Error, Result};
+
+fn bytes_of(path: &Path) -> Result<Vec<u8>> {
+    input::bytes(path)
+}
+
+fn file_reader(path: &Path) -> Result<ImageReader<Box<dyn Source>>> {
+    let opened = File::open(path).and_then(|file| reader(BufReader::new(file)));
+    opened.map_err(|error| Error::input(path, format!("cannot be read: {error}")))
+}
+
+impl Image {
+    /// Reads an 8- or 16-bit PNG or TIFF, a JPEG, a WebP or an EXR file as it is stored ([`Image::load_upright`] turns it);
+    /// the content decides, not the file's name.
+    ///
+    /// Alpha is dropped, grey is repeated, camera RAW (feature `raw`) is linear light. Of an EXR file the first layer's R, G and B
+    /// (or Y) are taken as linear light; values that are negative or not finite become 0, with a warning that counts them
+    /// ([`super::Mask::load`] hides the pixels of the latter).
+    ///
+    /// # Errors
+    /// [`Error::Input`] names the file when it cannot be read, is cut short or is of another format.
+    pub fn load(path: impl AsRef<Path>) -> Result<Self> {
+        let encode = |linear: f32| (linear >= 0.0).then(|| srgb_from_linear(linear));
+        let path = path.as_ref();
+        Self::decode(path, bytes_of(path)?, encode)
+    }
+
+    /// The same for numbers that are no colour, such as depth: EXR values are taken as they are, also negative ones.
+    ///
+    /// # Errors
+    /// As [`Image::load`].
+    pub fn load_as_stored(path: impl AsRef<Path>) -> Result<Self> {
+        let path = path.as_ref();
+        Self::decode(path, bytes_of(path)?, Some)
+    }
+
+    fn decode(path: &Path, bytes: Vec<u8>, from_exr_value: exr_file::FromExrValue) -> Result<Self> {
+        budget::check(path, &bytes)?;
+        if bytes.starts_with(&exr_file::MAGIC) {
+            return exr_file::load(path, bytes, from_exr_value);
+        }
+        if bytes.starts_with(&jpeg::MAGIC)
+            && let Some(image) = jpeg::load(path, &bytes)?
+        {
+            return Ok(image);
+        }
+        refuse_heic(path, &bytes)?;
+        if is_raw(path) {
+            return load_raw(path, bytes);
+        }
+        let reader = reader(Cursor::new(bytes));
+        let decoded = reader.map_err(ImageError::from).and_then(ImageReader::decode);
+        Ok(from_decoded(decoded.map_err(|error| undecodable(path, &error))?))
+    }
+
+    /// The alpha of a PNG, WebP or TIFF file, and 0 where a value of an EXR file is not finite, in all three planes; none of a
+    /// file that hides nothing.
+    ///
+    /// # Errors
+    /// [`Error::Input`] names the file when it cannot be read.
+    pub(super) fn load_alpha(path: &Path) -> Result<Option<Self>> {
+        if is_raw(path) {
+            return Ok(None);
+        }
+        let reader = file_reader(path)?;
+        if reader.format() == Some(ImageFormat::OpenExr) {
+            let bytes = bytes_of(path)?;
+            budget::check(path, &bytes)?;
+            return exr_file::finite_part(path, bytes);
+        }
+        let with_alpha = [ImageFormat::Png, ImageFormat::WebP, ImageFormat::Tiff];
+        if !reader.format().is_some_and(|format| with_alpha.contains(&format)) {
+            return Ok(None);
+        }
+        let decoder = reader.into_decoder().map_err(|error| not_an_image(path, &error))?;
+        if !decoder.color_type().has_alpha() {
+            return Ok(None);
+        }
+        let decoded =
+            DynamicImage::from_decoder(decoder).map_err(|error| not_an_image(path, &error))?;
+        let (width, height) = (decoded.width(), decoded.height());
+        let values = decoded.into_rgba32f().into_raw();
+        let alpha: Vec<f32> = values.into_iter().skip(3).step_by(4).collect();
+        let hides = alpha.iter().any(|&value| value < 1.0);
+        Ok(hides.then(|| Self { width, height, data: alpha.repeat(3) }))
+    }
+
+    /// Width and height of an image file, from its header alone.
+    ///
+    /// # Errors
+    /// [`Error::Input`] names the file when it is no image.
+    pub fn size_of(path: impl AsRef<Path>) -> Result<(u32, u32)> {
+        let path = path.as_ref();
+        if is_raw(path) {
+            return raw_size(path);
+        }
+        let reader = file_reader(path)?;
+        if reader.format() != Some(ImageFormat::OpenExr) {
+            return reader.into_dimensions().map_err(|error| not_an_image(path, &error));
+        }
+        let meta = exr::meta::MetaData::read_from_buffered(reader.into_inner(), false)
+            .map_err(|error| not_an_image(path, &error))?;
+        let size = meta.headers.first().map(|header| header.layer_size);
+        let size = size.ok_or_else(|| Error::input(path, "this EXR file has no layer"))?;
+        Ok((size.width() as u32, size.height() as u32))
+    }
+
+    /// Writes an 8-bit RGB PNG: values clamped to [0, 1], rounded to nearest.
+    ///
+    /// # Errors
+    /// [`Error::Output`] names the file; nothing half-written is left under its name.
+    pub fn save_png8(&self, path: impl AsRef<Path>) -> Result<()> {
+        self.save_png(path.as_ref(), &self.to_rgb8(), ExtendedColorType::Rgb8)
+    }
+
+    /// The file that [`Image::save_png8`] writes.
+    ///
+    /// # Errors
+    /// None but for what no memory is left for.
+    pub fn to_png8(&self) -> Result<Vec<u8>> {
+        let mut file = Vec::new();
+        PngEncoder::new(&mut file)
+            .write_image(&self.to_rgb8(), self.width, self.height, ExtendedColorType::Rgb8)
+            .map_err(|error| Error::output("a picture", format!("cannot be encoded: {error}")))?;
+        Ok(file)
+    }
+
+    /// Red, green and blue of every pixel in 8 bits: values clamped to [0, 1], rounded to nearest.
+    pub fn to_rgb8(&self) -> Vec<u8> {
+        self.interleaved().map(|value| (value.clamp(0.0, 1.0) * 255.0).round() as u8).collect()
+    }
+
+    /// A JPEG file of a quality from 1 to 100, values clamped to [0, 1].
+    ///
+    /// # Errors
+    /// [`Error::Output`] where the image has no pixels, or more to a side than JPEG counts.
+    pub fn to_jpeg(&self, quality: u8) -> Result<Vec<u8>> {
+        let mut file = Vec::new();
+        JpegEncoder::new_with_quality(&mut file, quality)
+            .write_image(&self.to_rgb8(), self.width, self.height, ExtendedColorType::Rgb8)
+            .map_err(|error| Error::output("a picture", format!("cannot be encoded: {error}")))?;
+        Ok(file)
+    }
+
+    /// Writes a JPEG of little loss, values clamped to [0, 1], with an Exif segment, where there is one, behind its start.
+    ///
+    /// # Errors
+    /// [`Error::Output`] names the file; nothing half-written is left under its name.
+    pub fn save_jpeg(&self, path: impl AsRef<Path>, exif: Option<&[u8]>) -> Result<()> {
+        const QUALITY: u8 = 97;
+        let file = self.to_jpeg(QUALITY)?;
+        let (start, rest) = file.split_at(jpeg::MAGIC.len());
+        write_whole(path.as_ref(), &[start, exif.unwrap_or_default(), rest].concat())
+    }
+
+    /// Writes a 16-bit RGB PNG: values clamped to [0, 1], rounded to nearest.
+    ///
+    /// # Errors
+    /// [`Error::Output`] names the file; nothing half-written is left under its name.
+    pub fn save_png16(&self, path: impl AsRef<Path>) -> Result<()> {
+        let samples =
+            self.interleaved().map(|value| (value.clamp(0.0, 1.0) * 65_535.0).round() as u16);
+        let bytes: Vec<u8> = samples.flat_map(u16::to_ne_bytes).collect();
+        self.save_png(path.as_ref(), &bytes, ExtendedColorType::Rgb16)
+    }
+
+    /// Writes a 32-bit float EXR in linear light, unclamped: [`Image::load`] gives the same values back to rounding.
+    ///
+    /// # Errors
+    /// [`Error::Output`] names the file; nothing half-written is left under its name.
+    pub fn save_exr(&self, path: impl AsRef<Path>) -> Result<()> {
+        exr_file::save(self, path.as_ref(), linear_from_srgb)
+    }
+
+    /// The same for numbers that are no colour: they are written as they are.
+    ///
+    /// # Errors
+    /// As [`Image::save_exr`].
+    pub fn save_exr_as_stored(&self, path: impl AsRef<Path>) -> Result<()> {
+        exr_file::save(self, path.as_ref(), |value| value)
+    }
+
+    fn interleaved(&self) -> impl Iterator<Item = f32> + '_ {
+        let pixels = self.pixel_count();
+        (0..pixels).flat_map(move |index| [0, 1, 2].map(|plane| self.data[plane * pixels + index]))
+    }
+
+    fn save_png(&self, path: &Path, bytes: &[u8], color: ExtendedColorType) -> Result<()> {
+        let mut file = Vec::new();
+        PngEncoder::new(&mut file)
+            .write_image(bytes, self.width, self.height, color)
+            .map_err(|error| Error::output(path, format!("cannot be encoded: {error}")))?;
+        write_whole(path, &file)
+    }
+}
+
+/// What phones write has no free decoder: the message says what converts it.
+fn refuse_heic(path: &Path, bytes: &[u8]) -> Result<()> {
+    let brands: [&[u8]; 6] = [b"heic", b"heix", b"hevc", b"heim", b"mif1", b"msf1"];
+    let is_heic = bytes.get(4..8) == Some(b"ftyp")
+        && bytes.get(8..12).is_some_and(|brand| brands.contains(&brand));
+    if is_heic { Err(Error::input(path, format!("is HEIC; {HEIC_REMEDY}"))) } else { Ok(()) }
+}
+
+/// What is damaged is told from what is whole and not read, such as a TIFF of floats, which does not say whether they are linear
+/// light.
+fn undecodable(path: &Path, error: &ImageError) -> Error {
+    match error {
+        ImageError::Unsupported(kind)
+            if !matches!(kind.kind(), UnsupportedErrorKind::Format(_)) =>
+        {
+            let problem =
+                format!("is not read ({kind}); save it with 8 or 16 bits, or linear light as EXR");
+            Error::input(path, problem)
+        }
+        damage => not_an_image(path, damage),
+    }
+}
+
+#[cfg(feature = "raw")]
+use super::raw::{load as load_raw, size_of as raw_size};
+
+#[cfg(not(feature = "raw"))]
+fn load_raw(path: &Path, _: Vec<u8>) -> Result<Image> {
+    Err(Error::input(path, format!("is camera RAW, which this build does not read; {RAW_REMEDY}")))
+}
+
+#[cfg(not(feature = "raw"))]
+fn raw_size(path: &Path) -> Result<(u32, u32)> {
+    load_raw(path, vec![]).map(|image| (image.width, image.height))
+}
+
+fn from_decoded(decoded: DynamicImage) -> Image {
+    let (width, height) = (decoded.width(), decoded.height());
+    let wide = decoded.color().bytes_per_pixel() > decoded.color().channel_count();
+    let interleaved: Vec<f32> = if wide {
+        decoded
+            .into_rgb16()
+            .into_raw()
+            .into_iter()
+            .map(|value| f32::from(value) / 65_535.0)
+            .collect()
+    } else {
+        decoded.into_rgb8().into_raw().into_iter().map(|value| f32::from(value) / 255.0).collect()
+    };
+    from_interleaved(width, height, &interleaved)
+}
+
+#[cfg(test)]
+mod tests {
+    use ::image::{ImageBuffer, Luma, LumaA, Rgb, Rgba};
+
+    use super::super::tests::{gradient, worst};
+    use super::*;
+
+    /// A path in a folder that goes when the second is dropped.
+    fn file(name: &str) -> (std::path::PathBuf, tempfile::TempDir) {
+        let folder = tempfile::tempdir().unwrap();
+        (folder.path().join(name), folder)
+    }
+
+    #[test]
+    fn every_png_layout_gives_the_same_colours_and_alpha_is_dropped() {
+        let (path, _folder) = file("a.png");
+        let grey = |x: u32, y: u32| (40 * x + 7 * y) as u8;
+        let expected = Image::from_fn(5, 3, |x, y| [f32::from(grey(x, y)) / 255.0; 3]);
+        let save: [&dyn Fn() -> ::image::ImageResult<()>; 6] = [
+            &|| ImageBuffer::from_fn(5, 3, |x, y| Luma([grey(x, y)])).save(&path),
+            &|| ImageBuffer::from_fn(5, 3, |x, y| LumaA([grey(x, y), 9])).save(&path),
+            &|| ImageBuffer::from_fn(5, 3, |x, y| Rgb([grey(x, y); 3])).save(&path),
+            &|| {
+                ImageBuffer::from_fn(5, 3, |x, y| Rgba([grey(x, y), grey(x, y), grey(x, y), 0]))
+                    .save(&path)
+            },
+            &|| ImageBuffer::from_fn(5, 3, |x, y| Luma([u16::from(grey(x, y)) * 257])).save(&path),
+            &|| {
+                ImageBuffer::from_fn(5, 3, |x, y| Rgb([u16::from(grey(x, y)) * 257; 3])).save(&path)
+            },
+        ];
+        for (layout, save) in save.iter().enumerate() {
+            save().unwrap();
+            assert!(worst(&Image::load(&path).unwrap(), &expected) < 1e-7, "layout {layout}");
+            assert_eq!(Image::size_of(&path).unwrap(), (5, 3));
+        }
+    }
+
+    #[test]
+    fn what_is_saved_is_loaded_to_the_formats_precision() {
+        let image = gradient(7, 5);
+        let (path, _folder) = file("a");
+        image.save_png8(&path).unwrap();
+        assert!(worst(&Image::load(&path).unwrap(), &image) <= 0.5 / 255.0 + 1e-6);
+        image.save_png16(&path).unwrap();
+        assert!(worst(&Image::load(&path).unwrap(), &image) <= 0.5 / 65_535.0 + 1e-6);
+        let bright = Image { data: image.data.iter().map(|value| 3.0 * value).collect(), ..image };
+        bright.save_exr(&path).unwrap();
+        assert!(worst(&Image::load(&path).unwrap(), &bright) < 1e-5);
+        assert_eq!(Image::size_of(&path).unwrap(), (7, 5));
+    }
+
+    #[test]
+    fn an_exr_is_linear_light_and_its_unusable_values_count_as_black() {
+        let (path, _folder) = file("a.exr");
+        let values = [0.5_f32, 0.001, f32::NAN, f32::INFINITY, -0.5, 4.0];
+        exr::prelude::write_rgb_file(&path, 6, 1, |x, _| (values[x], values[x], values[x]))
+            .unwrap();
+        let loaded = Image::load(&path).unwrap();
+        let expected =
+            [0.735_357, 0.012_92, 0.0, 0.0, 0.0, 1.055 * 4.0_f32.powf(1.0 / 2.4) - 0.055];
+        for (x, expected) in expected.into_iter().enumerate() {
+            assert!((loaded.data[x] - expected).abs() < 1e-5, "{}: {}", values[x], loaded.data[x]);
+        }
+    }
+
+    #[test]
+    fn a_grey_exr_is_grey_and_one_without_colour_is_refused() {
+        use exr::prelude::{SpecificChannels, Vec2, WritableImage};
+        let (path, _folder) = file("a.exr");
+        let save = |name: &str| {
+            let channels = SpecificChannels::build().with_channel(name);
+            let channels = channels.with_pixel_fn(|Vec2(x, _): Vec2<usize>| (0.25_f32 * x as f32,));
+            exr::image::Image::from_channels((3, 2), channels).write().to_file(&path).unwrap();
+        };
+        save("Y");
+        let [red, green, blue] = Image::load(&path).unwrap().pixel(2, 1);
+        assert!((red - 0.735_357).abs() < 1e-5 && red == green && green == blue);
+        save("Z");
+        assert!(Image::load(&path).unwrap_err().to_string().contains("neither R nor Y"));
+    }
+
+    #[test]
+    fn a_jpeg_is_loaded_whole_or_refused() {
+        let (path, _folder) = file("a.jpg");
+        ImageBuffer::from_fn(64, 48, |x, y| Rgb([(x * 3) as u8, (y * 4) as u8, 90]))
+            .save(&path)
+            .unwrap();
+        let pixel = Image::load(&path).unwrap().pixel(40, 20);
+        assert!(
+            (pixel[0] - 120.0 / 255.0).abs() < 0.06 && (pixel[1] - 80.0 / 255.0).abs() < 0.06,
+            "{pixel:?}"
+        );
+        let bytes = std::fs::read(&path).unwrap();
+        for length in 0..bytes.len() - 1 {
+            std::fs::write(&path, &bytes[..length]).unwrap();
+            let error = Image::load(&path).unwrap_err().to_string();
+            assert!(error.contains("a.jpg") && !error.contains('\n'), "{length}: {error}");
+        }
+    }
+
+    #[test]
+    fn a_file_that_is_no_image_is_named() {
+        let (path, _folder) = file("noise.png");
+        assert!(Image::load(&path).unwrap_err().to_string().contains("noise.png: cannot be read"));
+        let (exr, _exr_folder) = file("whole.exr");
+        gradient(9, 9).save_exr(&exr).unwrap();
+        let exr = std::fs::read(exr).unwrap();
+        for bytes in [
+            &b""[..],
+            b"not an image",
+            b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR",
+            &exr_file::MAGIC,
+            &exr[..exr.len() / 2],
+        ] {
+            std::fs::write(&path, bytes).unwrap();
+            let error = Image::load(&path).unwrap_err().to_string();
+            assert!(error.contains("noise.png: is not a readable"), "{error}");
+        }
+    }
+
+    #[test]
+    fn a_failed_write_leaves_nothing_behind() {
+        let (path, folder) = file("taken");
+        std::fs::create_dir(&path).unwrap();
+        let error = gradient(4, 4).save_png8(&path).unwrap_err();
+        assert!(
+            matches!(&error, Error::Output { .. }) && error.to_string().contains("taken"),
+            "{error}"
+        );
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
+}

@@ -1,0 +1,101 @@
+//! EXR: numbers as they are, linear light by convention.
+
+use std::io::Cursor;
+use std::path::Path;
+
+use exr::prelude::{ReadChannels, ReadLayers, SpecificChannels, Vec2, WritableImage};
+
+use super::Image;
+use super::source::{Source, not_an_image};
+use crate::base::output::write_whole;
+use crate::{Error, Result};
+
+/// What an EXR file begins with.
+pub(super) const MAGIC: [u8; 4] = [0x76, 0x2F, 0x31, 0x01];
+
+/// What a finite value of an EXR file means; none where it makes no sense.
+pub(super) type FromExrValue = fn(f32) -> Option<f32>;
+
+/// The first layer's R, G and B (or Y), each value through `from_exr_value`. Values that mean nothing become 0, with a warning
+/// that counts them.
+///
+/// # Errors
+/// [`Error::Input`] names the file when it is damaged or has no such channels.
+pub(super) fn load(path: &Path, bytes: Vec<u8>, from_exr_value: FromExrValue) -> Result<Image> {
+    let mut image = decoded(path, bytes)?;
+    let mut replaced = 0_usize;
+    for value in &mut image.data {
+        let usable = Some(*value).filter(|value| value.is_finite()).and_then(from_exr_value);
+        replaced += usize::from(usable.is_none());
+        *value = usable.unwrap_or(0.0);
+    }
+    if replaced > 0 {
+        tracing::warn!(
+            "{}: {replaced} values are negative colours or not finite; they count as 0",
+            path.display()
+        );
+    }
+    Ok(image)
+}
+
+/// 1 where all values of a pixel are finite, 0 elsewhere, in all three planes; none where all are.
+///
+/// # Errors
+/// As [`load`].
+pub(super) fn finite_part(path: &Path, bytes: Vec<u8>) -> Result<Option<Image>> {
+    let Image { width, height, data } = decoded(path, bytes)?;
+    let pixels = data.len() / 3;
+    let is_finite = |pixel: usize| (0..3).all(|plane| data[plane * pixels + pixel].is_finite());
+    let shown: Vec<f32> = (0..pixels).map(|pixel| f32::from(is_finite(pixel))).collect();
+    let hides = shown.contains(&0.0);
+    Ok(hides.then(|| Image { width, height, data: shown.repeat(3) }))
+}
+
+/// The first layer's R, G and B (or Y), as they are.
+fn decoded(path: &Path, bytes: Vec<u8>) -> Result<Image> {
+    let bytes: Box<dyn Source> = Box::new(Cursor::new(bytes));
+    let image = exr::prelude::read()
+        .no_deep_data()
+        .largest_resolution_level()
+        .all_channels()
+        .first_valid_layer()
+        .all_attributes()
+        .from_buffered(bytes)
+        .map_err(|error| not_an_image(path, &error))?;
+    let layer = image.layer_data;
+    let pixels = layer.size.width() * layer.size.height();
+    let channel = |name: &str| layer.channel_data.list.iter().find(|channel| channel.name.eq(name));
+    let mut data = Vec::with_capacity(3 * pixels);
+    for name in ["R", "G", "B"] {
+        let channel = channel(name).or_else(|| channel("Y"));
+        let channel = channel
+            .ok_or_else(|| Error::input(path, format!("this EXR file has neither {name} nor Y")))?;
+        if channel.sample_data.len() != pixels {
+            return Err(Error::input(
+                path,
+                "this EXR file has subsampled channels; save it as plain RGB",
+            ));
+        }
+        data.extend(channel.sample_data.values_as_f32());
+    }
+    let (width, height) = (layer.size.width() as u32, layer.size.height() as u32);
+    Ok(Image { width, height, data })
+}
+
+/// Writes R, G and B as 32-bit floats, each value through `to_exr_value`.
+///
+/// # Errors
+/// [`Error::Output`] names the file; nothing is left of it.
+pub(super) fn save(image: &Image, path: &Path, to_exr_value: fn(f32) -> f32) -> Result<()> {
+    let channels = SpecificChannels::rgb(|Vec2(x, y): Vec2<usize>| {
+        let [red, green, blue] = image.pixel(x as u32, y as u32).map(to_exr_value);
+        (red, green, blue)
+    });
+    let size = (image.width as usize, image.height as usize);
+    let mut file = Cursor::new(Vec::new());
+    exr::image::Image::from_channels(size, channels)
+        .write()
+        .to_buffered(&mut file)
+        .map_err(|error| Error::output(path, format!("cannot be encoded: {error}")))?;
+    write_whole(path, file.get_ref())
+}

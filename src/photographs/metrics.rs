@@ -1,0 +1,241 @@
+//! Scores of a render against its reference image: PSNR and SSIM, in f64, on sRGB-encoded values with peak 1.
+
+use std::borrow::Cow;
+
+use rayon::prelude::*;
+
+use crate::photographs::image::{Image, Mask};
+use crate::{Error, Result};
+
+/// What one render scores, or the mean over several.
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+pub struct Scores {
+    /// PSNR of the mean squared error over all channels, dB; see [`psnr`].
+    pub psnr: f64,
+    /// The mean of the three channels' PSNRs, dB; see [`psnr_channel_mean`].
+    pub psnr_channel_mean: f64,
+    /// Mean structural similarity; see [`ssim`].
+    pub ssim: f64,
+    /// The distance to a network's eye, where its weights are at hand: `lpips::Lpips` adds it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub lpips: Option<f64>,
+}
+
+impl Scores {
+    /// Every score of `render` against `reference`.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] where the images differ in size.
+    pub fn of(render: &Image, reference: &Image) -> Result<Self> {
+        Ok(Self {
+            psnr: psnr(render, reference)?,
+            psnr_channel_mean: psnr_channel_mean(render, reference)?,
+            ssim: ssim(render, reference)?,
+            lpips: None,
+        })
+    }
+
+    /// Every score over the pixels that count alone; see [`counted`].
+    ///
+    /// # Errors
+    /// As [`Scores::of`]; no pixel counts.
+    pub fn of_counted(render: &Image, reference: &Image, mask: Option<&Mask>) -> Result<Self> {
+        let Some(mask) = mask else { return Self::of(render, reference) };
+        let mask = mask.resized(render.width, render.height);
+        let errors = weighted_errors(render, reference, &mask)?;
+        let shown = counted(render, reference, Some(&mask));
+        let width = render.width as usize;
+        let ssim = channels(&shown, reference)?
+            .into_par_iter()
+            .map(|(a, b)| weighted_mean(ssim_map(a, b, width), &mask));
+        let ssim: Vec<f64> = ssim.collect();
+        Ok(Self {
+            psnr: decibels(mean(&errors)),
+            psnr_channel_mean: mean(&errors.map(decibels)),
+            ssim: mean(&ssim),
+            lpips: None,
+        })
+    }
+
+    /// The mean of each score; none of nothing.
+    pub fn mean(scores: &[Self]) -> Option<Self> {
+        let mean =
+            |score: fn(&Self) -> f64| scores.iter().map(score).sum::<f64>() / scores.len() as f64;
+        (!scores.is_empty()).then(|| Self {
+            psnr: mean(|scores| scores.psnr),
+            psnr_channel_mean: mean(|scores| scores.psnr_channel_mean),
+            ssim: mean(|scores| scores.ssim),
+            lpips: scores
+                .iter()
+                .map(|scores| scores.lpips)
+                .sum::<Option<f64>>()
+                .map(|sum| sum / scores.len() as f64),
+        })
+    }
+}
+
+/// The render, and in place of what a mask of its size hides the reference: a measure of what is around a pixel sees no
+/// difference there.
+pub fn counted<'a>(render: &'a Image, reference: &Image, mask: Option<&Mask>) -> Cow<'a, Image> {
+    let Some(mask) = mask else { return Cow::Borrowed(render) };
+    let weights = mask.weights.iter().cycle();
+    let shown = render.data.iter().zip(&reference.data).zip(weights);
+    let data = shown.map(|((&a, &b), &w)| w * a + (1.0 - w) * b).collect();
+    Cow::Owned(Image { data, ..*render })
+}
+
+/// Peak signal-to-noise ratio over all pixels and channels, dB; infinite for equal images.
+///
+/// # Errors
+/// [`Error::Usage`] where the images differ in size.
+pub fn psnr(render: &Image, reference: &Image) -> Result<f64> {
+    let errors = channel_mean_squared_errors(render, reference)?;
+    Ok(decibels(mean(&errors)))
+}
+
+/// As [`psnr`], over the pixels that count alone.
+///
+/// # Errors
+/// As there.
+pub fn psnr_of_counted(render: &Image, reference: &Image, mask: Option<&Mask>) -> Result<f64> {
+    let Some(mask) = mask else { return psnr(render, reference) };
+    Ok(decibels(mean(&weighted_errors(
+        render,
+        reference,
+        &mask.resized(render.width, render.height),
+    )?)))
+}
+
+/// The mean of the PSNRs of the three channels, dB: what the paper's code computes, never below [`psnr`].
+///
+/// # Errors
+/// [`Error::Usage`] where the images differ in size.
+pub fn psnr_channel_mean(render: &Image, reference: &Image) -> Result<f64> {
+    Ok(mean(&channel_mean_squared_errors(render, reference)?.map(decibels)))
+}
+
+/// Mean structural similarity over all pixels and channels (Wang et al. 2004): an 11x11 Gaussian window with sigma
+/// 1.5 and zero padding, C1 = 0.01^2, C2 = 0.03^2, as in 3DGS.
+///
+/// # Errors
+/// [`Error::Usage`] where the images differ in size.
+pub fn ssim(render: &Image, reference: &Image) -> Result<f64> {
+    let pairs = channels(render, reference)?;
+    let width = render.width as usize;
+    let ssim: Vec<f64> = pairs.into_par_iter().map(|(a, b)| ssim_of_channel(a, b, width)).collect();
+    Ok(mean(&ssim))
+}
+
+/// The three pairs of planes, (H, W) each.
+fn channels<'a>(render: &'a Image, reference: &'a Image) -> Result<[(&'a [f32], &'a [f32]); 3]> {
+    let size = |image: &Image| (image.width as usize, image.height as usize);
+    let ((width, height), other) = (size(render), size(reference));
+    if (width, height) != other {
+        return Err(Error::Usage(format!(
+            "the render is {width}x{height} and the reference {}x{}; only images of one size can be compared",
+            other.0, other.1
+        )));
+    }
+    let pixels = width * height;
+    if pixels == 0 || render.data.len() != 3 * pixels || reference.data.len() != 3 * pixels {
+        return Err(Error::Usage("an image without pixels cannot be compared".to_owned()));
+    }
+    let plane = |channel: usize| channel * pixels..(channel + 1) * pixels;
+    Ok([0, 1, 2].map(|channel| (&render.data[plane(channel)], &reference.data[plane(channel)])))
+}
+
+fn channel_mean_squared_errors(render: &Image, reference: &Image) -> Result<[f64; 3]> {
+    let mean_squared_error = |(a, b): (&[f32], &[f32])| {
+        let squared = a.iter().zip(b).map(|(&a, &b)| (f64::from(a) - f64::from(b)).powi(2));
+        squared.sum::<f64>() / a.len() as f64
+    };
+    Ok(channels(render, reference)?.map(mean_squared_error))
+}
+
+/// The mean squared error of each channel, of the pixels that count.
+fn weighted_errors(render: &Image, reference: &Image, mask: &Mask) -> Result<[f64; 3]> {
+    if mask.hides_all() {
+        return Err(Error::Usage(
+            "a mask that hides every pixel leaves none to compare".to_owned(),
+        ));
+    }
+    let squared = |(&a, &b): (&f32, &f32)| (f64::from(a) - f64::from(b)).powi(2);
+    let of_channel = |(a, b): (&[f32], &[f32])| weighted_mean(a.iter().zip(b).map(squared), mask);
+    Ok(channels(render, reference)?.map(of_channel))
+}
+
+fn weighted_mean(values: impl IntoIterator<Item = f64>, mask: &Mask) -> f64 {
+    let weights = || mask.weights.iter().copied().map(f64::from);
+    let pairs = values.into_iter().zip(weights());
+    pairs.map(|(value, weight)| value * weight).sum::<f64>() / weights().sum::<f64>()
+}
+
+fn decibels(mean_squared_error: f64) -> f64 {
+    -10.0 * mean_squared_error.log10()
+}
+
+fn mean(values: &[f64]) -> f64 {
+    values.iter().sum::<f64>() / values.len() as f64
+}
+
+fn ssim_of_channel(a: &[f32], b: &[f32], width: usize) -> f64 {
+    ssim_map(a, b, width).iter().sum::<f64>() / a.len() as f64
+}
+
+/// SSIM of every pixel.
+fn ssim_map(a: &[f32], b: &[f32], width: usize) -> Vec<f64> {
+    const C1: f64 = 0.01 * 0.01;
+    const C2: f64 = 0.03 * 0.03;
+    let blurred = |value: fn(f64, f64) -> f64| {
+        blur(&a.iter().zip(b).map(|(&a, &b)| value(a.into(), b.into())).collect::<Vec<_>>(), width)
+    };
+    let (mean_a, mean_b) = (blurred(|a, _| a), blurred(|_, b| b));
+    let (square_a, square_b, product) =
+        (blurred(|a, _| a * a), blurred(|_, b| b * b), blurred(|a, b| a * b));
+    let ssim = |i: usize| {
+        let (mean_a, mean_b) = (mean_a[i], mean_b[i]);
+        let (var_a, var_b) = (square_a[i] - mean_a * mean_a, square_b[i] - mean_b * mean_b);
+        let cov = product[i] - mean_a * mean_b;
+        let luminance = (2.0 * mean_a * mean_b + C1) / (mean_a * mean_a + mean_b * mean_b + C1);
+        luminance * (2.0 * cov + C2) / (var_a + var_b + C2)
+    };
+    (0..a.len()).map(ssim).collect()
+}
+
+/// Taps of the window to either side of the centre.
+const RADIUS: usize = 5;
+
+/// The normalised 1D window.
+fn window() -> [f64; 2 * RADIUS + 1] {
+    const SIGMA: f64 = 1.5;
+    let tap = |i: usize| (-(i as f64 - RADIUS as f64).powi(2) / (2.0 * SIGMA * SIGMA)).exp();
+    let taps: [f64; 2 * RADIUS + 1] = std::array::from_fn(tap);
+    taps.map(|value| value / taps.iter().sum::<f64>())
+}
+
+/// Convolves a plane of rows of `width` with the window, zero outside: first down the columns, then along the rows.
+fn blur(plane: &[f64], width: usize) -> Vec<f64> {
+    let (window, height) = (window(), plane.len() / width);
+    let mut blurred = vec![0.0; plane.len()];
+    let mut column_sums = vec![0.0; width + 2 * RADIUS];
+    for (y, out) in blurred.chunks_exact_mut(width).enumerate() {
+        column_sums.fill(0.0);
+        for row in y.saturating_sub(RADIUS)..(y + RADIUS + 1).min(height) {
+            add_scaled(
+                &mut column_sums[RADIUS..RADIUS + width],
+                &plane[row * width..][..width],
+                window[row + RADIUS - y],
+            );
+        }
+        for (shift, tap) in window.into_iter().enumerate() {
+            add_scaled(out, &column_sums[shift..shift + width], tap);
+        }
+    }
+    blurred
+}
+
+fn add_scaled(out: &mut [f64], row: &[f64], factor: f64) {
+    for (out, value) in out.iter_mut().zip(row) {
+        *out += factor * value;
+    }
+}

@@ -1,0 +1,70 @@
+//! Photographs from the host, one at a time, in tiles where one exceeds what the device binds.
+
+use super::PseudoGt;
+use crate::Result;
+use crate::gpu::Buffer;
+use crate::photographs::image::Image;
+use crate::photographs::tone::{Lift, Measured};
+
+impl PseudoGt {
+    /// Measures the planes (3, pixels) of a photograph.
+    ///
+    /// # Errors
+    /// There are no pixels, or the device is out of memory or lost.
+    pub fn measure(&mut self, planes: &[f32]) -> Result<Measured> {
+        let tiles = self.tiles(planes)?;
+        let tiles: Vec<&Buffer<f32>> = tiles.iter().collect();
+        let gpu = self.gpu.clone();
+        gpu.run("tone statistics", |pass| self.statistics_of_tiles(pass, &tiles))?;
+        let (statistics, luminance) = (self.measured()?, self.luminance_histogram()?);
+        Ok(Measured { statistics, luminance, camera: None })
+    }
+
+    /// The target that a photograph becomes, of its own size.
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub fn lifted(&self, photograph: &Image, lift: &Lift) -> Result<Image> {
+        let mut target = photograph.clone();
+        if lift.weight < 1.0 {
+            target.data.iter_mut().for_each(|x| *x = if *x > 0.0 { x.min(1.0) } else { 0.0 });
+        }
+        if lift.weight == 0.0 {
+            return Ok(target);
+        }
+        let parameters = self.gpu.buffer("tone parameters", &[lift.parameters])?;
+        let pixels = photograph.pixel_count();
+        let mut first = 0;
+        for tile in self.tiles(&photograph.data)? {
+            let mut mapped = self.gpu.uninit("pseudo-GT", tile.len())?;
+            self.gpu.run("tone", |pass| self.map(pass, &tile, &parameters, 0, &mut mapped))?;
+            let count = tile.len() / 3;
+            for (plane, values) in self.gpu.read(&mapped)?.chunks_exact(count).enumerate() {
+                let target = &mut target.data[plane * pixels + first..][..count];
+                if lift.weight == 1.0 {
+                    target.copy_from_slice(values);
+                } else {
+                    target.iter_mut().zip(values).for_each(|(x, y)| *x += lift.weight * (y - *x));
+                }
+            }
+            first += count;
+        }
+        Ok(target)
+    }
+
+    /// Runs of pixels, each planar (3, count), that the device can bind.
+    fn tiles(&self, planes: &[f32]) -> Result<Vec<Buffer<f32>>> {
+        let pixels = planes.len() / 3;
+        let bytes_per_pixel = 3 * size_of::<f32>() as u64;
+        let most = (self.gpu.properties().max_storage_buffer_range / bytes_per_pixel) as usize;
+        if pixels <= most {
+            return Ok(vec![self.gpu.buffer("photograph", planes)?]);
+        }
+        let tile = |first: usize| {
+            let count = most.min(pixels - first);
+            let plane = |plane: usize| &planes[plane * pixels + first..][..count];
+            self.gpu.buffer("photograph", &[plane(0), plane(1), plane(2)].concat())
+        };
+        (0..pixels).step_by(most).map(tile).collect()
+    }
+}

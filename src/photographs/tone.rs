@@ -1,0 +1,160 @@
+//! Tone curves: a dark photograph in, the pseudo-GT that training aims at out.
+//!
+//! Every curve acts on sRGB-encoded values as stored, divided by 255, without linearisation:
+//!
+//! ```text
+//! none    x
+//! linear  x theta / mean(x)
+//! ASE     delta0 + (1 - delta0) (1 - exp(-g t))              g = g0 + c Y
+//! AP3     delta0 + b (0.0720 t^3 - 0.4376 t^2 + 0.9948 t)    b = 1 + c Y
+//! others  delta0 + b f(t)                                    delta0 = 0, b = 1 unless told
+//! auto    delta + (1 - delta) [(1 - lambda) s(x) + lambda x s(Y) / Y]    s(x) = 1 - exp(-k x), delta = 0.075
+//! ```
+//!
+//! clamped to [0, 1], where t = x / p90, Y is the mean luminance, and the black level
+//! delta0 = alpha (1 - p10 / p90)^beta is high where shadows are crushed. The statistics are those of
+//! one photograph, or the means over a scene's, see [`Statistics`]. The gain k of the automatic curve, whose Y is the pixel's,
+//! follows from the luminance of all photographs, see [`Exposure`]; so may that of every other curve. [`FAMILIES`] is the table of all curves; a [`Table`]
+//! of values from a file is a curve too, and so is a camera's [`Profile`].
+
+mod exposure;
+mod families;
+#[cfg(feature = "io")]
+mod file;
+mod histogram;
+mod law;
+mod lift;
+mod profile;
+mod real;
+mod settings;
+mod statistics;
+mod table;
+
+use std::fmt;
+use std::str::FromStr;
+
+#[cfg(feature = "io")]
+pub(crate) use self::exposure::all_black;
+pub use self::exposure::{Exposure, exposed_anew, is_black, soft};
+pub use self::families::{Constant, FAMILIES, Family, Law, ToneCurve, White};
+#[cfg(feature = "io")]
+pub use self::file::CurveChoice;
+pub use self::histogram::LuminanceHistogram;
+pub(crate) use self::histogram::{BIN_SHIFT, FIRST_PREFIX};
+#[cfg(feature = "fit")]
+pub(crate) use self::law::{Numbers, PhotographCurve, law};
+pub(crate) use self::law::{clamped, curve_at, tone_curve};
+pub use self::lift::{Lift, Measured, Scene};
+pub use self::profile::Profile;
+pub(crate) use self::profile::profiled;
+#[cfg(feature = "fit")]
+pub(crate) use self::real::Dual;
+pub use self::real::Real;
+pub use self::settings::{GainChoice, ToneSettings};
+pub(crate) use self::statistics::{Rank, luminance, measurable};
+pub use self::statistics::{Statistics, percentile};
+pub(crate) use self::table::interpolate;
+pub use self::table::{Table, TableInput};
+pub use crate::kernels::ToneParameters;
+use crate::{Error, Result};
+
+/// The name of the curve that a table of values makes.
+const TABLE_NAME: &str = "table";
+
+/// The name of the curve whose gain the photographs give.
+const AUTO_NAME: &str = "auto";
+
+/// The name of the curve that a camera profile makes.
+const PROFILE_NAME: &str = "profile";
+
+impl ToneCurve {
+    /// The curve's row in the table; of a [`Table`] or a [`Profile`] that of `none`, as it has no formula, and of the
+    /// automatic curve that of `ase`, which is its formula on grey.
+    pub fn family(self) -> &'static Family {
+        &FAMILIES[match self {
+            Self::Table | Self::Profile => Self::None,
+            Self::Auto => Self::Ase,
+            family => family,
+        } as usize]
+    }
+
+    /// The name on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Table => TABLE_NAME,
+            Self::Auto => AUTO_NAME,
+            Self::Profile => PROFILE_NAME,
+            family => family.family().name,
+        }
+    }
+
+    /// The curve's number in `include/curves.glsl`: the specialization constant `TONE_CURVE`.
+    pub fn constant(self) -> u32 {
+        self as u32
+    }
+
+    /// The curve at t = x / white, in [0, 1], as exact as f64 allows.
+    ///
+    /// `lum_preserve` and `per_channel` are straight lines here: what they do depends on more than one value.
+    pub fn value(self, t: f64, offset: f64, gain: f64, constants: &[f64]) -> f64 {
+        let constants = families::padded(constants);
+        clamped(curve_at(self.constant(), t, [offset, gain], &constants))
+    }
+
+    /// The curve at the sRGB-encoded value `x`, in the arithmetic of the kernels.
+    pub fn apply(self, x: f32, parameters: &ToneParameters) -> f32 {
+        tone_curve(self.constant(), x, parameters)
+    }
+
+    /// Whether each value of the target depends on one value of the photograph alone, by a formula.
+    pub(crate) fn is_formula(self) -> bool {
+        !matches!(
+            self,
+            Self::Table | Self::LumPreserve | Self::PerChannel | Self::Auto | Self::Profile
+        )
+    }
+
+    /// All names, for help texts and errors.
+    pub fn names() -> String {
+        let families = Self::ALL.map(Self::name).join(", ");
+        format!("{AUTO_NAME}, {families}")
+    }
+}
+
+impl fmt::Display for ToneCurve {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(self.name())
+    }
+}
+
+impl FromStr for ToneCurve {
+    type Err = Error;
+
+    fn from_str(name: &str) -> Result<Self> {
+        // Every name is in small letters; papers write AP3.
+        let small = name.to_ascii_lowercase();
+        match small.as_str() {
+            TABLE_NAME => return Ok(Self::Table),
+            AUTO_NAME => return Ok(Self::Auto),
+            PROFILE_NAME => return Ok(Self::Profile),
+            _ => {}
+        }
+        Family::find(&small).map(|family| family.curve).ok_or_else(|| {
+            Error::Usage(format!("unknown curve `{name}`; the curves are {}", Self::names()))
+        })
+    }
+}
+
+impl TryFrom<String> for ToneCurve {
+    type Error = Error;
+
+    fn try_from(name: String) -> Result<Self> {
+        name.parse()
+    }
+}
+
+impl From<ToneCurve> for String {
+    fn from(curve: ToneCurve) -> Self {
+        curve.name().to_owned()
+    }
+}

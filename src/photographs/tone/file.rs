@@ -1,0 +1,125 @@
+//! Curves from files: settings in TOML, tables in CSV or .cube.
+
+use std::fmt;
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+
+use super::{Profile, Table, ToneCurve, ToneSettings};
+use crate::base::input;
+use crate::{Error, Result};
+
+/// What `--curve` names.
+#[derive(Clone, Debug, PartialEq)]
+pub enum CurveChoice {
+    /// A curve of the table.
+    Named(ToneCurve),
+    /// A TOML file with settings (a run's config.toml too), or a CSV or .cube file with values.
+    File(PathBuf),
+}
+
+/// The extensions of files that hold a curve.
+const EXTENSIONS: [&str; 3] = ["toml", "csv", "cube"];
+
+impl FromStr for CurveChoice {
+    type Err = Error;
+
+    fn from_str(text: &str) -> Result<Self> {
+        if EXTENSIONS.contains(&extension(Path::new(text)).as_str()) {
+            return Ok(Self::File(text.into()));
+        }
+        match text.parse() {
+            Ok(ToneCurve::Table) => Err(Error::Usage(
+                "a table of values is named by its file: FILE.csv or FILE.cube".to_owned(),
+            )),
+            Ok(ToneCurve::Profile) => Err(Error::Usage(
+                "a camera profile is named by its file: --profile FILE".to_owned(),
+            )),
+            Ok(curve) => Ok(Self::Named(curve)),
+            Err(error) => Err(Error::Usage(format!("{error}, or a .toml, .csv or .cube file"))),
+        }
+    }
+}
+
+impl fmt::Display for CurveChoice {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Named(curve) => curve.fmt(f),
+            Self::File(path) => f.pad(&path.file_stem().unwrap_or_default().to_string_lossy()),
+        }
+    }
+}
+
+impl From<ToneCurve> for CurveChoice {
+    fn from(curve: ToneCurve) -> Self {
+        Self::Named(curve)
+    }
+}
+
+impl CurveChoice {
+    /// The curve with the constants that its row or its file gives.
+    ///
+    /// # Errors
+    /// [`Error::Input`] names the file and what is wrong in it.
+    pub fn settings(&self) -> Result<ToneSettings> {
+        match self {
+            Self::Named(curve) => Ok(ToneSettings::new(*curve)),
+            Self::File(path) => ToneSettings::load(path),
+        }
+    }
+}
+
+impl ToneSettings {
+    /// Reads a curve from a file: `.csv` and `.cube` hold a [`Table`], everything else is TOML with the settings, at the
+    /// top or below `[tone]`.
+    ///
+    /// # Errors
+    /// [`Error::Input`] names the file and what is wrong in it.
+    pub fn load(path: &Path) -> Result<Self> {
+        let text = input::text(path)?;
+        let wrong = |problem: String| Error::input(path, format!("is no tone curve: {problem}"));
+        let settings = match extension(path).as_str() {
+            "csv" => Self::of_table(Table::from_csv(&text).map_err(wrong)?),
+            "cube" => Self::of_table(Table::from_cube(&text).map_err(wrong)?),
+            _ => from_toml(&text).map_err(wrong)?,
+        };
+        settings.check().map_err(|error| wrong(error.to_string()))?;
+        Ok(settings)
+    }
+}
+
+impl Profile {
+    /// Reads a profile that `nightsplat fit --profile` wrote.
+    ///
+    /// # Errors
+    /// [`Error::Input`] names the file and what is wrong in it.
+    pub fn load(path: &Path) -> Result<Self> {
+        let text = input::text(path)?;
+        let wrong =
+            |problem: String| Error::input(path, format!("is no camera profile: {problem}"));
+        let profile: Self =
+            toml::from_str(&text).map_err(|error| wrong(error.message().replace('\n', " ")))?;
+        profile.check().map_err(wrong)?;
+        Ok(profile)
+    }
+}
+
+fn from_toml(text: &str) -> Result<ToneSettings, String> {
+    let one_line = |error: &toml::de::Error| error.message().replace('\n', " ");
+    let mut whole: toml::Table = text.parse().map_err(|error| one_line(&error))?;
+    let tone = match whole.remove("tone") {
+        Some(toml::Value::Table(tone)) => tone,
+        Some(_) => return Err("`tone` is no table".to_owned()),
+        None => whole,
+    };
+    if tone.contains_key("segments") {
+        return Err("it is a camera profile; name it with --profile".to_owned());
+    }
+    if !["curve", "family", "table", "profile"].iter().any(|key| tone.contains_key(*key)) {
+        return Err("it names no curve; add curve = \"NAME\"".to_owned());
+    }
+    tone.try_into().map_err(|error| one_line(&error))
+}
+
+fn extension(path: &Path) -> String {
+    path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase()
+}

@@ -1,0 +1,495 @@
+//! A curve with all its constants, as the command line, TOML files and run directories give it.
+
+use std::collections::BTreeMap;
+use std::str::FromStr;
+
+use serde::{Deserialize, Serialize};
+
+use super::exposure::BLACK_LEVEL;
+use super::families::{White, padded};
+use super::law::{Numbers, black_level, law};
+use super::real::Real;
+use super::{Profile, Statistics, Table, ToneCurve, ToneParameters};
+use crate::{Error, Result};
+
+/// lambda where none is given: the references of views keep more colour than single curves leave.
+const COLOUR: f64 = 1.0 / 3.0;
+
+/// A shape that passes this near p90 has a pole there.
+const LARGEST_SHAPE: f64 = 1e8;
+
+/// A curve and its constants; what a photograph adds to them are its [`Statistics`].
+///
+/// In TOML everything but `curve` may be left out; where there are `[constants]`, all of the family's must be there.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "Written", into = "Written")]
+pub struct ToneSettings {
+    /// The family.
+    pub curve: ToneCurve,
+    /// c: how much a brighter photograph raises the gain.
+    pub gain_c: f64,
+    /// theta: the mean over all channels that the linear curve aims at, before clipping.
+    pub theta: f64,
+    /// alpha: the highest black level.
+    pub alpha: f64,
+    /// beta: how fast the black level falls as p10 approaches p90; 0: it is alpha for every photograph.
+    pub beta: f64,
+    /// g0: the gain of ASE on a black photograph.
+    pub base_gain: f64,
+    /// Whether one curve serves a scene: its statistics are the means over the training views, its gain that of all of
+    /// them together.
+    pub scene_statistics: bool,
+    /// Whether the gain is solved for the brightness that [`super::Exposure`] finds: t is k x then, in place of x / white,
+    /// and c and g0 have no say. The automatic curve has no other.
+    pub auto_gain: bool,
+    /// The mean luminance of the targets, in place of the one that is found.
+    pub brightness: Option<f64>,
+    /// lambda: how much of the automatic curve keeps the ratios of the channels.
+    pub colour: f64,
+    /// Whether a photograph is lifted at its own size and shrunk behind that. References were shrunk behind their own tone
+    /// curve, and the mean of a curve is not the curve of a mean.
+    pub lift_first: bool,
+    /// The family's constants in the order of [`super::Family::constants`].
+    pub constants: Vec<f64>,
+    /// The values of [`ToneCurve::Table`].
+    pub table: Option<Table>,
+    /// What [`ToneCurve::Profile`] is made of.
+    pub profile: Option<Profile>,
+}
+
+impl<T: Real> From<&ToneSettings> for Numbers<T> {
+    fn from(settings: &ToneSettings) -> Self {
+        Self {
+            theta: T::of(settings.theta),
+            alpha: T::of(settings.alpha),
+            beta: settings.beta,
+            gain_c: T::of(settings.gain_c),
+            base_gain: T::of(settings.base_gain),
+            constants: padded(&settings.constants).map(T::of),
+        }
+    }
+}
+
+impl ToneSettings {
+    /// The family's constants, and the paper's for LOM; c is 3 for ASE and 1 for AP3. The automatic curve lifts before
+    /// photographs are shrunk, the others behind it.
+    pub fn new(curve: ToneCurve) -> Self {
+        let family = curve.family();
+        let is_auto = curve == ToneCurve::Auto;
+        let is_exposed = is_auto || curve == ToneCurve::Profile;
+        Self {
+            curve,
+            gain_c: if is_auto { 0.0 } else { family.gain_c },
+            theta: 0.49,
+            alpha: if is_auto { BLACK_LEVEL } else { family.alpha },
+            beta: 2.5,
+            base_gain: 1.0,
+            scene_statistics: false,
+            auto_gain: is_exposed,
+            brightness: None,
+            colour: COLOUR,
+            lift_first: is_exposed,
+            constants: family.defaults(),
+            table: None,
+            profile: None,
+        }
+    }
+
+    /// Another curve with its own constants, c and alpha; theta, beta, g0, brightness and the choice of statistics stay. The
+    /// same curve keeps everything.
+    #[must_use]
+    pub fn with_curve(&self, curve: ToneCurve) -> Self {
+        if curve == self.curve {
+            return self.clone();
+        }
+        let Self { theta, beta, base_gain, scene_statistics, brightness, .. } = *self;
+        Self { theta, beta, base_gain, scene_statistics, brightness, ..Self::new(curve) }
+    }
+
+    /// The same curve with another gain. One that the photographs ask for belongs to photographs at their own size.
+    #[must_use]
+    pub fn with_gain(self, gain: GainChoice) -> Self {
+        match gain {
+            GainChoice::Auto => Self { auto_gain: true, lift_first: true, ..self },
+            GainChoice::C(gain_c) if self.auto_gain => {
+                Self { gain_c, auto_gain: false, lift_first: false, ..self }
+            }
+            GainChoice::C(gain_c) => Self { gain_c, ..self },
+        }
+    }
+
+    /// The same with every number as the shortest decimal that is the same number to the kernels, which compute in 32 bits.
+    #[must_use]
+    pub fn rounded(self) -> Self {
+        let round = |value: f64| {
+            let single = value as f32;
+            // Of no consequence to a kernel, and hundreds of digits long.
+            let single = if single.is_subnormal() { 0.0 } else { single };
+            single.to_string().parse().unwrap_or(value)
+        };
+        let Self { gain_c, theta, alpha, beta, base_gain, colour, .. } = self;
+        let [gain_c, theta, alpha, beta, base_gain, colour] =
+            [gain_c, theta, alpha, beta, base_gain, colour].map(round);
+        let brightness = self.brightness.map(round);
+        let constants = self.constants.iter().copied().map(round).collect();
+        Self { gain_c, theta, alpha, beta, base_gain, colour, brightness, constants, ..self }
+    }
+
+    /// Whether the gain follows from the photographs' [`super::Exposure`].
+    pub fn takes_exposure(&self) -> bool {
+        self.auto_gain || self.curve == ToneCurve::Auto
+    }
+
+    /// The curve of a table of values.
+    pub fn of_table(table: Table) -> Self {
+        Self { table: Some(table), ..Self::new(ToneCurve::Table) }
+    }
+
+    /// The curve of a camera profile, which follows the exposure of the photographs as the automatic curve does.
+    pub fn of_profile(profile: Profile) -> Self {
+        Self { profile: Some(profile), ..Self::new(ToneCurve::Profile) }
+    }
+
+    /// What the targets know of reference images, where they know any: results are labelled with it.
+    pub fn knows_references(&self) -> Option<String> {
+        self.profile.as_ref().map(Profile::label)
+    }
+
+    /// Refuses constants that leave a curve undefined, decreasing or above white at black.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] names the constant.
+    pub fn check(&self) -> Result<()> {
+        let brightness = self.brightness.unwrap_or(0.5);
+        let rules = [
+            ("`ToneSettings::gain_c`", self.gain_c, self.gain_c >= 0.0, "at least 0"),
+            ("`ToneSettings::theta`", self.theta, self.theta > 0.0, "above 0"),
+            ("alpha", self.alpha, (0.0..=1.0).contains(&self.alpha), "from 0 to 1"),
+            ("beta", self.beta, self.beta >= 0.0, "at least 0"),
+            ("base_gain (g0)", self.base_gain, self.base_gain > 0.0, "above 0"),
+            (
+                "`ToneSettings::colour`",
+                self.colour,
+                (0.0..=1.0).contains(&self.colour),
+                "from 0 to 1",
+            ),
+            (
+                "`ToneSettings::brightness`",
+                brightness,
+                (0.1..=0.9).contains(&brightness),
+                "from 0.1 to 0.9",
+            ),
+        ];
+        for (name, value, holds, rule) in rules {
+            if !(holds && (value as f32).is_finite()) {
+                return Err(Error::Usage(format!(
+                    "{name} is {value}; it must be finite and {rule}"
+                )));
+            }
+        }
+        self.check_gain().and_then(|()| self.check_constants()).map_err(Error::Usage)
+    }
+
+    /// Whether what sets the brightness goes together.
+    fn check_gain(&self) -> Result<(), String> {
+        let name = self.curve.name();
+        let has_gain = self.curve.is_formula() && self.curve != ToneCurve::None;
+        if self.curve == ToneCurve::Auto && self.gain_c != 0.0 {
+            return Err(format!(
+                "the curve `{name}` takes no `ToneSettings::gain_c`; `ToneSettings::brightness` is its mean"
+            ));
+        }
+        if self.curve == ToneCurve::Profile
+            && (self.gain_c != 0.0 || !self.auto_gain || self.brightness.is_some())
+        {
+            return Err("a camera profile is as bright as its references: it takes no `ToneSettings::gain_c` and no \
+                        `ToneSettings::brightness`"
+                .to_owned());
+        }
+        let is_exposed = matches!(self.curve, ToneCurve::Auto | ToneCurve::Profile);
+        if self.auto_gain && !is_exposed && !has_gain {
+            return Err(format!(
+                "the curve `{name}` has no gain that could be solved for; name `auto`, `ase` or `ap3`"
+            ));
+        }
+        if self.brightness.is_some() && !self.takes_exposure() {
+            return Err(format!(
+                "the curve `{name}` has the brightness that its gain gives it; `ToneSettings::brightness` is for a gain \
+                 that is `auto`"
+            ));
+        }
+        Ok(())
+    }
+
+    fn check_constants(&self) -> Result<(), String> {
+        let (name, family) = (self.curve.name(), self.curve.family());
+        match (&self.table, self.curve) {
+            (Some(table), ToneCurve::Table) => table.check()?,
+            (None, ToneCurve::Table) => {
+                return Err("the curve `table` needs a file of values; name a .csv or .cube file"
+                    .to_owned());
+            }
+            (Some(_), _) => return Err(format!("the curve `{name}` takes no table of values")),
+            (None, _) => {}
+        }
+        match (&self.profile, self.curve) {
+            (Some(profile), ToneCurve::Profile) => profile.check()?,
+            (None, ToneCurve::Profile) => {
+                return Err(
+                    "the curve `profile` needs a camera profile; name a file with --profile"
+                        .to_owned(),
+                );
+            }
+            (Some(_), _) => return Err(format!("the curve `{name}` takes no camera profile")),
+            (None, _) => {}
+        }
+        if self.constants.len() != family.constants.len() {
+            let (given, needed) = (self.constants.len(), family.constants.len());
+            return Err(format!("the curve `{name}` has {needed} constants, not {given}"));
+        }
+        for (constant, value) in family.constants.iter().zip(&self.constants) {
+            if !(*value as f32).is_finite() {
+                return Err(format!(
+                    "the constant {} of `{name}` is {value}; it must be finite",
+                    constant.name
+                ));
+            }
+        }
+        // Positive phrasing: a NaN fails the test too.
+        let is_defined = |t: f64| family.shape(t, &self.constants).abs() <= LARGEST_SHAPE;
+        let undefined = (0..=1000).map(|i| f64::from(i) * 0.01).find(|&t| !is_defined(t));
+        match undefined {
+            Some(t) => Err(format!(
+                "the constants of `{name}` leave it undefined at t = {t}; its formula is {}",
+                family.formula
+            )),
+            None => Ok(()),
+        }
+    }
+
+    /// delta0 = alpha (1 - r)^beta: the black level of a photograph with r = p10 / p90. The automatic curve has alpha for
+    /// every photograph.
+    pub fn offset(&self, ratio: f64) -> f64 {
+        if self.curve == ToneCurve::Auto {
+            self.alpha
+        } else {
+            black_level(self.alpha, self.beta, ratio)
+        }
+    }
+
+    /// The curve that these settings give a photograph with these statistics; where the gain follows from the exposure, it
+    /// is another ([`Self::lift`]).
+    pub fn parameters(&self, statistics: &Statistics) -> ToneParameters {
+        if self.curve == ToneCurve::Profile {
+            return ToneParameters { white: 1.0, offset: 0.0, gain: 1.0, constants: [0.0; _] };
+        }
+        if self.curve == ToneCurve::Auto {
+            let mut constants = [0.0; _];
+            constants[0] = self.colour as f32;
+            return ToneParameters { white: 1.0, offset: self.alpha as f32, gain: 1.0, constants };
+        }
+        let numbers = Numbers::<f64>::from(self);
+        let curve = law(self.curve.family(), self.white(), &numbers, statistics);
+        ToneParameters {
+            white: curve.white as f32,
+            offset: curve.offset as f32,
+            gain: curve.gain as f32,
+            constants: curve.constants.map(|constant| constant as f32),
+        }
+    }
+
+    /// The value that t = 1 stands for.
+    pub fn white(&self) -> White {
+        match &self.table {
+            Some(table) => table.input.white(),
+            None if matches!(self.curve, ToneCurve::Auto | ToneCurve::Profile) => White::One,
+            None => self.curve.family().white,
+        }
+    }
+
+    /// The curve at t = x / p90, in [0, 1], for a photograph with these statistics; of a table of three channels, and of a
+    /// profile, green.
+    /// `lum_preserve` and `per_channel` are shown as they map grey.
+    pub fn value(&self, t: f64, statistics: &Statistics) -> f64 {
+        let grey = Statistics { channel_means: [statistics.mean; 3], ..*statistics };
+        let ToneParameters { mut white, offset, gain, constants } = self.parameters(&grey);
+        if self.white() == White::ChannelMeans {
+            white = constants[0];
+        }
+        let t = match self.curve {
+            // As it is without a scene that says k: over k x.
+            ToneCurve::Auto | ToneCurve::Profile => t,
+            _ => t * f64::from(statistics.p90) / f64::from(white),
+        };
+        match (&self.table, &self.profile) {
+            (Some(table), _) => table.value(t, 1),
+            (None, Some(profile)) => profile.value([t; 3])[1],
+            (None, None) => self.curve.value(t, offset.into(), gain.into(), &self.constants),
+        }
+    }
+
+    /// Statistics that leave a curve as its formula has it: no black level, gain 1, and t = 1 where it has white.
+    pub fn plain_statistics(&self) -> Statistics {
+        let theta = self.theta as f32;
+        let means = Statistics { mean: theta, channel_means: [theta; 3], ..Statistics::default() };
+        Statistics { p10: 1.0, p80: theta, p90: 1.0, ..means }
+    }
+
+    /// Whether the target is made once, at upload, instead of in the loss kernels: tables, curves whose channels depend on
+    /// each other, and what is lifted before it is shrunk or lifted in part.
+    pub fn needs_baking(&self) -> bool {
+        !self.curve.is_formula() || self.lift_first || self.takes_exposure()
+    }
+
+    /// The curve that the loss kernels evaluate, as a `CURVE_*`: none on a target that is baked.
+    pub fn loss_curve(&self) -> u32 {
+        if self.needs_baking() { ToneCurve::None.constant() } else { self.curve.constant() }
+    }
+}
+
+/// What `--gain` says.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum GainChoice {
+    /// The gain that the photographs ask for.
+    Auto,
+    /// c: how much a brighter photograph raises the gain.
+    C(f64),
+}
+
+impl FromStr for GainChoice {
+    type Err = Error;
+
+    fn from_str(text: &str) -> Result<Self> {
+        if text == "auto" {
+            return Ok(Self::Auto);
+        }
+        let number = text.parse();
+        number
+            .map(Self::C)
+            .map_err(|_| Error::Usage(format!("`{text}` is no gain; a number, or auto")))
+    }
+}
+
+impl Default for ToneSettings {
+    fn default() -> Self {
+        Self::new(ToneCurve::Auto)
+    }
+}
+
+/// The settings as TOML has them.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Written {
+    curve: Option<ToneCurve>,
+    /// What `curve` was called once.
+    #[serde(skip_serializing)]
+    family: Option<ToneCurve>,
+    gain_c: Option<f64>,
+    theta: Option<f64>,
+    alpha: Option<f64>,
+    beta: Option<f64>,
+    base_gain: Option<f64>,
+    scene_statistics: Option<bool>,
+    auto_gain: Option<bool>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    brightness: Option<f64>,
+    colour: Option<f64>,
+    lift_first: Option<bool>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    constants: Option<BTreeMap<String, f64>>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    table: Option<Table>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    profile: Option<Profile>,
+}
+
+impl TryFrom<Written> for ToneSettings {
+    type Error = String;
+
+    fn try_from(written: Written) -> Result<Self, String> {
+        let given = match (&written.table, &written.profile) {
+            (Some(_), _) => ToneCurve::Table,
+            (None, Some(_)) => ToneCurve::Profile,
+            (None, None) => ToneCurve::Auto,
+        };
+        if written.family.is_some() {
+            static SAID: std::sync::Once = std::sync::Once::new();
+            SAID.call_once(|| {
+                tracing::warn!("`family` of a curve is called `curve` now; the old name is read");
+            });
+            if written.curve.is_some() {
+                return Err(
+                    "it names its family twice, as `curve` and as `family`; leave `family` out"
+                        .to_owned(),
+                );
+            }
+        }
+        let defaults = Self::new(written.curve.or(written.family).unwrap_or(given));
+        let family = defaults.curve.family();
+        let constants = match written.constants {
+            None => defaults.constants,
+            Some(mut values) => {
+                let value = |constant: &super::Constant| {
+                    values.remove(constant.name).ok_or_else(|| {
+                        format!(
+                            "the curve `{}` needs the constant `{}`; its formula is {}",
+                            family.name, constant.name, family.formula
+                        )
+                    })
+                };
+                let constants = family.constants.iter().map(value).collect::<Result<_, _>>()?;
+                if let Some(name) = values.keys().next() {
+                    return Err(format!(
+                        "the curve `{}` has no constant `{name}`; its formula is {}",
+                        family.name, family.formula
+                    ));
+                }
+                constants
+            }
+        };
+        let auto_gain = written.auto_gain.unwrap_or(defaults.auto_gain);
+        let settings = Self {
+            curve: defaults.curve,
+            gain_c: written.gain_c.unwrap_or(defaults.gain_c),
+            theta: written.theta.unwrap_or(defaults.theta),
+            alpha: written.alpha.unwrap_or(defaults.alpha),
+            beta: written.beta.unwrap_or(defaults.beta),
+            base_gain: written.base_gain.unwrap_or(defaults.base_gain),
+            scene_statistics: written.scene_statistics.unwrap_or(defaults.scene_statistics),
+            auto_gain,
+            brightness: written.brightness,
+            colour: written.colour.unwrap_or(defaults.colour),
+            lift_first: written.lift_first.unwrap_or(auto_gain),
+            constants,
+            table: written.table,
+            profile: written.profile,
+        };
+        settings.check_constants()?;
+        Ok(settings)
+    }
+}
+
+impl From<ToneSettings> for Written {
+    fn from(settings: ToneSettings) -> Self {
+        let names = settings.curve.family().constants.iter();
+        let constants: BTreeMap<String, f64> =
+            names.map(|constant| constant.name.to_owned()).zip(settings.constants).collect();
+        Self {
+            curve: Some(settings.curve),
+            family: None,
+            gain_c: Some(settings.gain_c),
+            theta: Some(settings.theta),
+            alpha: Some(settings.alpha),
+            beta: Some(settings.beta),
+            base_gain: Some(settings.base_gain),
+            scene_statistics: Some(settings.scene_statistics),
+            auto_gain: Some(settings.auto_gain),
+            brightness: settings.brightness,
+            colour: Some(settings.colour),
+            lift_first: Some(settings.lift_first),
+            constants: Some(constants).filter(|constants| !constants.is_empty()),
+            table: settings.table,
+            profile: settings.profile,
+        }
+    }
+}

@@ -1,0 +1,143 @@
+//! Leftover transmittance: how much of the background a model lets through.
+//!
+//! A dark surface needs no Gaussians before a black background, and neither a loss nor a score tells the hole from the surface.
+//! What the blend leaves of the light behind it does: the product of 1 - alpha over all splats of a pixel.
+
+use serde::Serialize;
+
+use super::ViewScore;
+use crate::Result;
+use crate::photographs::dataset::{Dataset, View};
+use crate::train::{Background, Rendered};
+
+/// More in the mean over a view is a hole. No view of a model of a real scene leaves more than .095, after 400 to 3 500 steps before
+/// black (docs/benchmarks.md).
+pub const MOST_LEFTOVER: f64 = 0.1;
+
+/// The leftover transmittance of a view, 0 where the model is opaque, 1 where nothing is.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Leftover {
+    /// Over the pixels that count.
+    pub mean: f64,
+    /// The 99 % quantile over these pixels.
+    pub q99: f64,
+}
+
+impl Leftover {
+    /// That of a view's render, over the pixels that its mask shows; none where there are none, or it is no render.
+    pub fn of(rendered: &Rendered, view: &View) -> Option<Self> {
+        let mut counted = rendered.transmittances.clone()?;
+        if let Some(mask) = &view.mask {
+            let mask = mask.resized(rendered.colors.width, rendered.colors.height);
+            let mut weights = mask.weights.iter();
+            counted.retain(|_| weights.next().is_some_and(|&weight| weight >= 0.5));
+        }
+        Self::of_pixels(&mut counted)
+    }
+
+    /// Sorts them in part.
+    fn of_pixels(pixels: &mut [f32]) -> Option<Self> {
+        let rank = (99 * pixels.len()).div_ceil(100).checked_sub(1)?;
+        let mean = pixels.iter().copied().map(f64::from).sum::<f64>() / pixels.len() as f64;
+        let (_, q99, _) = pixels.select_nth_unstable_by(rank, f32::total_cmp);
+        Some(Self { mean, q99: (*q99).into() })
+    }
+
+    /// The mean of each over several views; none of none.
+    pub fn mean(views: impl Iterator<Item = Self>) -> Option<Self> {
+        let (mut sum, mut count) = (Self { mean: 0.0, q99: 0.0 }, 0);
+        for Self { mean, q99 } in views {
+            (sum.mean, sum.q99, count) = (sum.mean + mean, sum.q99 + q99, count + 1);
+        }
+        let count = f64::from(count);
+        (count > 0.0).then(|| Self { mean: sum.mean / count, q99: sum.q99 / count })
+    }
+}
+
+/// What to say of the views of a model that was trained before `background`: one line on the one with the largest hole, and
+/// a remedy; none where every view has at most [`MOST_LEFTOVER`].
+pub fn hole_warning<'a>(
+    views: impl IntoIterator<Item = (&'a str, Leftover)>,
+    background: Background,
+) -> Option<String> {
+    let views: Vec<(&str, Leftover)> = views.into_iter().collect();
+    let open = views.iter().filter(|(_, leftover)| leftover.mean > MOST_LEFTOVER);
+    let (name, worst) = open.clone().max_by(|(_, a), (_, b)| a.mean.total_cmp(&b.mean))?;
+    let cause = match background {
+        Background::Black => {
+            "what is dark can stay empty before black; train with `--background random`"
+        }
+        Background::Random => "no photograph shows what is there; take some that do",
+    };
+    Some(format!(
+        "view {name}: {:.0} % of the background shows through the model (above {:.0} % in {} of {} views): {cause}, or mask what \
+         is to stay empty",
+        100.0 * worst.mean,
+        100.0 * MOST_LEFTOVER,
+        open.count(),
+        views.len()
+    ))
+}
+
+/// Warns of holes in what was scored of a model that was trained before `background`; where nothing was, in some of its
+/// training views, which `render` draws.
+///
+/// # Errors
+/// Those of `render`.
+pub fn warn_of_holes(
+    scored: &[ViewScore],
+    dataset: &Dataset,
+    background: Background,
+    mut render: impl FnMut(&View) -> Result<Rendered>,
+) -> Result<()> {
+    /// The number of training views that are looked at, evenly spread.
+    const MOST: usize = 8;
+    let own = |view: &ViewScore| Some((view.name.clone(), view.leftover?));
+    let mut leftovers: Vec<(String, Leftover)> = scored.iter().filter_map(own).collect();
+    if leftovers.is_empty() {
+        let views: Vec<&View> = dataset.views.iter().filter(|v| v.is_for_training()).collect();
+        for view in views.iter().step_by(views.len().div_ceil(MOST).max(1)) {
+            let leftover = Leftover::of(&render(view)?, view);
+            leftovers.extend(leftover.map(|leftover| (view.name.clone(), leftover)));
+        }
+    }
+    let views = leftovers.iter().map(|(name, leftover)| (name.as_str(), *leftover));
+    if let Some(warning) = hole_warning(views, background) {
+        tracing::warn!("{warning}");
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_mean_and_the_99_percent_quantile_are_of_the_pixels() {
+        let mut pixels: Vec<f32> = (0..200).rev().map(|k| k as f32 / 256.0).collect();
+        let leftover = Leftover::of_pixels(&mut pixels).unwrap();
+        // 198 of 200 have at most 197 / 256.
+        assert_eq!(leftover, Leftover { mean: 99.5 / 256.0, q99: 197.0 / 256.0 });
+        assert_eq!(Leftover::of_pixels(&mut [0.25]), Some(Leftover { mean: 0.25, q99: 0.25 }));
+        assert_eq!(Leftover::of_pixels(&mut []), None);
+        let both =
+            Leftover::mean([leftover, Leftover { mean: 0.0, q99: 1.0 }].into_iter()).unwrap();
+        assert_eq!(both, Leftover { mean: 99.5 / 512.0, q99: 453.0 / 512.0 });
+        assert_eq!(Leftover::mean([].into_iter()), None);
+    }
+
+    #[test]
+    fn the_worst_view_is_named_once_with_what_helps() {
+        let leftover = |mean| Leftover { mean, q99: 1.0 };
+        let views = [("a", leftover(0.3)), ("b", leftover(0.62)), ("c", leftover(0.1))];
+        let said = hole_warning(views, Background::Black).unwrap();
+        for part in ["view b: 62 %", "above 10 % in 2 of 3 views", "--background random", "mask"] {
+            assert!(said.contains(part), "{said}");
+        }
+        assert!(!said.contains('\n'), "{said}");
+        let said = hole_warning(views, Background::Random).unwrap();
+        assert!(said.contains("view b") && !said.contains("--background"), "{said}");
+        assert_eq!(hole_warning([("c", leftover(0.1))], Background::Black), None);
+        assert_eq!(hole_warning([], Background::Black), None);
+    }
+}

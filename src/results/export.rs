@@ -1,0 +1,143 @@
+//! A model in the formats of others: SPZ, glTF, SOG, and a page that holds a viewer of its own.
+//!
+//! Each takes the Gaussians as `model.ply` holds them: in the colours that viewers show and with `OpenCV`'s axes, y down and
+//! z forward. They are the *lit* model, as bright as its targets; a dark one would band, as SPZ keeps a colour in steps of
+//! 1.9 of 255.
+
+pub mod glb;
+pub mod page;
+mod palette;
+pub mod sog;
+pub mod spz;
+
+use std::io::Write as _;
+
+use flate2::{Compression, write::GzEncoder};
+use glam::Vec3;
+
+use crate::splats::scene::Gaussians;
+use crate::{Error, Result};
+
+/// Where a model comes from: what a file says of itself.
+#[derive(Clone, Debug, Default)]
+pub struct Provenance {
+    /// The folder's name of the dataset.
+    pub dataset: String,
+    /// The curve by which its photographs were lifted.
+    pub curve: String,
+    /// The exposure that it shows, in words.
+    pub exposure: String,
+}
+
+/// The program, as files name it.
+pub const GENERATOR: &str = concat!("nightsplat ", env!("CARGO_PKG_VERSION"));
+
+impl Provenance {
+    /// Lines for a header.
+    pub fn lines(&self) -> Vec<String> {
+        let Self { dataset, curve, exposure } = self;
+        let lines = [
+            ("generator", GENERATOR),
+            ("dataset", dataset),
+            ("curve", curve),
+            ("exposure", exposure),
+        ];
+        let line = |(key, value): (&str, &str)| {
+            format!("{key}: {}", value.replace(char::is_control, " ").trim())
+        };
+        lines.into_iter().filter(|(_, value)| !value.is_empty()).map(line).collect()
+    }
+}
+
+/// The sign that each basis function above degree 0 takes when y and z change theirs, in the order of the coefficients.
+const HALF_TURN: [f32; 15] =
+    [-1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, -1.0, 1.0, -1.0, 1.0];
+
+/// The same model turned about x by half a turn: `OpenCV`'s axes become those of OpenGL, y up and z backward. A half turn
+/// changes signs alone, so that every number stays exact.
+pub(crate) fn half_turn(gaussians: &Gaussians) -> Gaussians {
+    let mut turned = gaussians.clone();
+    for mean in turned.means_mut() {
+        *mean = Vec3::new(mean.x, -mean.y, -mean.z);
+    }
+    // T R T with T = diag(1, -1, -1).
+    for [_, _, y, z] in turned.quats_mut() {
+        (*y, *z) = (-*y, -*z);
+    }
+    let coefficients = crate::splats::scene::rest_coefficients(turned.shape.sh_degree);
+    if coefficients > 0 {
+        for rest in turned.rest_mut().chunks_exact_mut(coefficients) {
+            rest.iter_mut().zip(HALF_TURN).for_each(|(value, sign)| *value *= sign);
+        }
+    }
+    turned
+}
+
+/// The rotation as a unit quaternion (w, x, y, z); the identity where it has no length.
+fn unit([w, x, y, z]: [f32; 4]) -> [f32; 4] {
+    let length = (w * w + x * x + y * y + z * z).sqrt();
+    if length > 1e-12 { [w, x, y, z].map(|part| part / length) } else { [1.0, 0.0, 0.0, 0.0] }
+}
+
+fn sigmoid(x: f32) -> f32 {
+    1.0 / (1.0 + (-x).exp())
+}
+
+fn gzip(bytes: &[u8]) -> Result<Vec<u8>> {
+    let mut encoder = GzEncoder::new(vec![], Compression::best());
+    let written = encoder.write_all(bytes).and_then(|()| encoder.finish());
+    written.map_err(|error| Error::output("an export", format!("cannot be compressed: {error}")))
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use glam::{DMat3, DQuat, DVec3};
+
+    use super::*;
+    use crate::base::random::Stream;
+    use crate::reference::sh::sh_basis;
+    use crate::splats::scene::Shape;
+
+    /// Gaussians of ordinary values, drawn.
+    pub(crate) fn drawn(count: usize, sh_degree: u32) -> Gaussians {
+        let mut gaussians = Gaussians::zeros(count, Shape::from(sh_degree));
+        let stream = Stream::new(7, 11);
+        for (index, value) in (0..).zip(&mut gaussians.parameters) {
+            *value = (stream.uniform(index) * 2.0 - 1.0) as f32;
+        }
+        gaussians.means_mut().iter_mut().for_each(|mean| *mean *= 4.0);
+        gaussians.log_scales_mut().iter_mut().for_each(|scale| *scale = *scale * 2.0 - 4.0);
+        gaussians.raw_opacities_mut().iter_mut().for_each(|opacity| *opacity *= 4.0);
+        gaussians.rest_mut().iter_mut().for_each(|value| *value *= 0.3);
+        gaussians
+    }
+
+    #[test]
+    fn a_turned_model_looks_the_same_from_a_turned_camera() {
+        let model = drawn(20, 3);
+        let turned = half_turn(&model);
+        let turn = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
+        let rotation = |[w, x, y, z]: [f32; 4]| {
+            let quat = DQuat::from_xyzw(x.into(), y.into(), z.into(), w.into());
+            DMat3::from_quat(quat.normalize())
+        };
+        let axes = |model: &Gaussians, i: usize| {
+            let scale = DMat3::from_diagonal((model.log_scales()[i].as_dvec3() * 2.0).exp());
+            let rotation = rotation(model.quats()[i]);
+            rotation * scale * rotation.transpose()
+        };
+        for i in 0..model.count {
+            assert_eq!(turned.means()[i].as_dvec3(), turn * model.means()[i].as_dvec3());
+            let difference = axes(&turned, i) - turn * axes(&model, i) * turn;
+            assert!(difference.abs().to_cols_array().iter().all(|&error| error < 1e-6), "{i}");
+            let direction = DVec3::new(0.3, -0.5 + i as f64 / 10.0, 0.7).normalize();
+            let color = |model: &Gaussians, direction: DVec3| {
+                let values = sh_basis(3, direction);
+                let rest = &model.rest()[15 * i..][..15];
+                rest.iter().zip(&values[1..]).map(|(c, b)| c.as_dvec3() * *b).sum::<DVec3>()
+            };
+            let difference = color(&turned, turn * direction) - color(&model, direction);
+            assert!(difference.length() < 1e-6, "{i}: {difference}");
+        }
+    }
+}

@@ -1,0 +1,159 @@
+//! One page with the model, a viewer for it and pictures to compare with: opens from disk, needs nothing but WebGL 2.
+//!
+//! The viewer projects, shades and blends as the kernels do, so that a test view on the page is the render of `eval` but for
+//! the half floats that the page holds.
+
+use half::f16;
+use serde_json::json;
+
+use super::{GENERATOR, Provenance, gzip};
+use crate::camera::{Camera, CameraModel};
+use crate::photographs::image::Image;
+use crate::results::report::{base64, escape, jpeg};
+use crate::splats::scene::Gaussians;
+use crate::{Error, Result};
+
+/// A bookmark: a camera, and pictures of what it saw.
+#[derive(Clone, Debug)]
+pub struct Bookmark {
+    /// The view's name.
+    pub name: String,
+    /// In the coordinates of the Gaussians: a pinhole.
+    pub camera: Camera,
+    /// Each with what it is.
+    pub pictures: Vec<(String, Image)>,
+}
+
+/// What the page shows.
+#[derive(Clone, Debug)]
+pub struct Page<'a> {
+    /// The window's title.
+    pub title: String,
+    /// In the colours that viewers show.
+    pub gaussians: &'a Gaussians,
+    /// What the page says of itself.
+    pub provenance: Provenance,
+    /// The first is where the page begins.
+    pub bookmarks: Vec<Bookmark>,
+    /// Nothing nearer to a camera is shown, in the coordinates of the Gaussians.
+    pub near: f64,
+}
+
+impl Page<'_> {
+    /// The page as HTML.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] for a bookmark that is no pinhole.
+    pub fn html(&self) -> Result<String> {
+        let Self { title, gaussians, provenance, bookmarks, near } = self;
+        let other = bookmarks.iter().find(|own| own.camera.model != CameraModel::Pinhole);
+        if let Some(Bookmark { name, .. }) = other {
+            return Err(Error::Usage(format!(
+                "view {name} is of a fisheye, and the page shows pinholes; load its dataset with `LoadOptions::undistort`"
+            )));
+        }
+        let scene = json!({
+            "generator": GENERATOR,
+            "provenance": provenance.lines(),
+            "count": gaussians.count,
+            "shDegree": gaussians.shape.sh_degree,
+            "near": near,
+            "views": bookmarks.iter().map(view).collect::<Vec<_>>(),
+        });
+        let parts = [
+            ("@TITLE@", escape(title)),
+            ("@STYLE@", include_str!("viewer/style.css").to_owned()),
+            // No text of ours may end the script that holds it.
+            ("@SCENE@", scene.to_string().replace('<', "\\u003c")),
+            ("@VERTEX@", include_str!("viewer/splat.vert").to_owned()),
+            ("@FRAGMENT@", include_str!("viewer/splat.frag").to_owned()),
+            ("@VIEWER@", include_str!("viewer/viewer.js").to_owned()),
+            ("@MODEL@", base64(&gzip(&model(gaussians))?)),
+        ];
+        let mut html = String::new();
+        let mut rest = include_str!("viewer/page.html");
+        while let Some((at, (mark, part))) = parts
+            .iter()
+            .filter_map(|part| Some((rest.find(part.0)?, part)))
+            .min_by_key(|found| found.0)
+        {
+            html.push_str(&rest[..at]);
+            html.push_str(part);
+            rest = &rest[at + mark.len()..];
+        }
+        Ok(html + rest)
+    }
+}
+
+fn view(bookmark: &Bookmark) -> serde_json::Value {
+    let Bookmark { name, camera, pictures } = bookmark;
+    let Camera { width, height, focal, principal_point, view_from_world, .. } = camera;
+    let pictures =
+        pictures.iter().map(|(label, image)| json!({ "label": label, "image": jpeg(image) }));
+    json!({
+        "name": name,
+        "size": [width, height],
+        "focal": focal.to_array(),
+        "principalPoint": principal_point.to_array(),
+        "viewFromWorld": view_from_world.to_cols_array(),
+        "pictures": pictures.collect::<Vec<_>>(),
+    })
+}
+
+/// Positions in floats, then everything else in half floats: opacities, logarithms of the scales, rotations and
+/// coefficients, each Gaussian after the other.
+fn model(gaussians: &Gaussians) -> Vec<u8> {
+    let mut bytes: Vec<u8> = bytemuck::cast_slice(gaussians.means()).to_vec();
+    let coefficients = crate::splats::scene::rest_coefficients(gaussians.shape.sh_degree);
+    let mut push =
+        |value: f32| bytes.extend(f16::from_f32(value.clamp(-65_504.0, 65_504.0)).to_le_bytes());
+    gaussians.raw_opacities().iter().for_each(|&value| push(value));
+    gaussians.log_scales().iter().flat_map(|scale| scale.to_array()).for_each(&mut push);
+    gaussians.quats().iter().flat_map(|&quat| super::unit(quat)).for_each(&mut push);
+    for (i, dc) in gaussians.dc().iter().enumerate() {
+        dc.to_array().into_iter().for_each(&mut push);
+        let rest = &gaussians.rest()[coefficients * i..][..coefficients];
+        rest.iter().flat_map(|value| value.to_array()).for_each(&mut push);
+    }
+    bytes
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::camera::KannalaBrandt;
+    use crate::results::export::tests::drawn;
+
+    #[test]
+    fn a_page_is_one_file_in_which_no_name_ends_a_script() {
+        let gaussians = drawn(5, 1);
+        let camera = Camera {
+            width: 40,
+            height: 30,
+            focal: glam::DVec2::splat(35.0),
+            principal_point: glam::DVec2::new(20.0, 15.0),
+            model: CameraModel::Pinhole,
+            view_from_world: glam::DAffine3::IDENTITY,
+        };
+        let evil = "</script><b>@MODEL@";
+        let picture = (evil.to_owned(), Image::from_fn(4, 3, |_, _| [0.5; 3]));
+        let page = Page {
+            title: evil.to_owned(),
+            gaussians: &gaussians,
+            provenance: Provenance { dataset: evil.to_owned(), ..Provenance::default() },
+            bookmarks: vec![Bookmark { name: evil.to_owned(), camera, pictures: vec![picture] }],
+            near: 0.2,
+        };
+        let html = page.html().unwrap();
+        let mut of_fisheye = page.clone();
+        of_fisheye.bookmarks[0].camera.model = CameraModel::Fisheye(KannalaBrandt::default());
+        let refused = of_fisheye.html().unwrap_err().to_string();
+        assert!(refused.contains("fisheye") && refused.contains("undistort"), "{refused}");
+        assert!(!html.contains("<b>"));
+        assert_eq!(html.matches("<script").count(), html.matches("</script>").count());
+        for outside in ["http://", "https://", "src=\"/", "@import"] {
+            assert!(!html.contains(outside), "{outside}");
+        }
+        assert_eq!(model(&gaussians).len(), 5 * (12 + 2 * (1 + 3 + 4 + 12)));
+    }
+}

@@ -1,0 +1,161 @@
+//! One self-contained HTML page of a run: tables, plots and pictures side by side, without external resources.
+
+use std::fmt::Write as _;
+
+use crate::photographs::image::Image;
+
+pub use self::bars::{Bar, bars};
+pub(crate) use self::data_uri::{base64, jpeg};
+pub use self::distribution::{Distribution, distributions};
+pub use self::plot::{
+    Mark, Series, VerticalLine, plot, plot_in_groups, plot_points, plot_with_lines, svg_file,
+};
+pub use self::table::{Best, Column, Table};
+pub use self::traces::{Trace, traces};
+
+mod axis;
+mod bars;
+mod data_uri;
+mod distribution;
+mod plot;
+mod table;
+mod traces;
+
+/// A page. Every text is escaped; `plots` are SVG as [`plot`] and [`bars`] give it.
+#[derive(Clone, Debug, Default)]
+pub struct Report {
+    /// The heading, also the window's title.
+    pub title: String,
+    /// The paragraphs under the heading.
+    pub intro: Vec<String>,
+    /// Rows of pictures, in order.
+    pub comparisons: Vec<Comparison>,
+    /// What is so, in words, in order.
+    pub facts: Vec<Facts>,
+    /// Tables of numbers, in order.
+    pub tables: Vec<Table>,
+    /// Plots, in order.
+    pub plots: Vec<String>,
+}
+
+/// A table of words.
+#[derive(Clone, Debug, Default)]
+pub struct Facts {
+    /// The caption.
+    pub title: String,
+    /// A name and what is said of it, in each row.
+    pub rows: Vec<[String; 2]>,
+}
+
+/// Pictures of one view side by side.
+#[derive(Clone, Debug, Default)]
+pub struct Comparison {
+    /// The view's name.
+    pub title: String,
+    /// From left to right.
+    pub pictures: Vec<Picture>,
+}
+
+/// A picture with what is said beneath it.
+#[derive(Clone, Debug)]
+pub struct Picture {
+    /// What it shows.
+    pub caption: String,
+    /// Its scores in a few words; may be empty.
+    pub scores: String,
+    /// The picture itself, embedded as an 8-bit PNG.
+    pub image: Image,
+}
+
+impl Report {
+    /// The page as HTML: pictures, facts, tables, plots.
+    pub fn html(&self) -> String {
+        self.page(&(self.pictures_html() + &self.tables_html() + &self.plots_html()))
+    }
+
+    /// The same with the plots first and the tables last.
+    pub fn html_plots_first(&self) -> String {
+        self.page(&(self.plots_html() + &self.pictures_html() + &self.tables_html()))
+    }
+
+    fn tables_html(&self) -> String {
+        let facts = self.facts.iter().map(Facts::html);
+        facts.chain(self.tables.iter().map(Table::html)).collect()
+    }
+
+    fn plots_html(&self) -> String {
+        let figure = |plot: &String| format!("<figure class=\"plot\">{plot}</figure>\n");
+        let plots: String = self.plots.iter().map(figure).collect();
+        if plots.is_empty() { plots } else { format!("<div class=\"plots\">\n{plots}</div>\n") }
+    }
+
+    fn pictures_html(&self) -> String {
+        self.comparisons.iter().map(Comparison::html).collect()
+    }
+
+    /// The page around its body.
+    fn page(&self, body: &str) -> String {
+        let title = escape(&self.title);
+        let mut html = format!(
+            "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
+             <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
+             <title>{title}</title>\n<style>\n{}</style>\n</head>\n<body>\n<h1>{title}</h1>\n",
+            include_str!("report/style.css")
+        );
+        // Writing to a string cannot fail, so the results below hold nothing.
+        for paragraph in &self.intro {
+            let _ = writeln!(html, "<p>{}</p>", escape(paragraph));
+        }
+        html + body + "</body>\n</html>\n"
+    }
+}
+
+impl Facts {
+    fn html(&self) -> String {
+        let row = |[name, said]: &[String; 2]| {
+            format!("<tr><th scope=\"row\">{}</th><td>{}</td></tr>\n", escape(name), escape(said))
+        };
+        let rows: String = self.rows.iter().map(row).collect();
+        let title = escape(&self.title);
+        format!(
+            "<table class=\"facts\">\n<caption>{title}</caption>\n<tbody>\n{rows}</tbody>\n</table>\n"
+        )
+    }
+}
+
+impl Comparison {
+    fn html(&self) -> String {
+        let mut html =
+            format!("<section>\n<h2>{}</h2>\n<div class=\"pictures\">\n", escape(&self.title));
+        for Picture { caption, scores, image } in &self.pictures {
+            let caption = escape(caption);
+            let _ = writeln!(
+                html,
+                "<figure><img src=\"{}\" width=\"{}\" height=\"{}\" alt=\"{caption}\">\
+                 <figcaption><b>{caption}</b> <span>{}</span></figcaption></figure>",
+                data_uri::png(image),
+                image.width,
+                image.height,
+                escape(scores)
+            );
+        }
+        html.push_str("</div>\n</section>\n");
+        html
+    }
+}
+
+/// Text as HTML and SVG show it, also inside a quoted attribute.
+pub(crate) fn escape(text: &str) -> String {
+    let mut escaped = String::with_capacity(text.len());
+    for character in text.chars() {
+        match character {
+            '&' => escaped.push_str("&amp;"),
+            '<' => escaped.push_str("&lt;"),
+            '>' => escaped.push_str("&gt;"),
+            '"' => escaped.push_str("&quot;"),
+            '\'' => escaped.push_str("&#39;"),
+            other => escaped.push(other),
+        }
+    }
+    escaped
+}

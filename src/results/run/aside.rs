@@ -1,0 +1,161 @@
+//! What a run directory held before: kept until the new run has done a step, and what a killed process left behind.
+
+use std::path::{Path, PathBuf};
+
+use super::files::{FILES, unwritable};
+use crate::Result;
+
+/// Where the files of a run wait that is being replaced.
+const ASIDE: &str = ".replaced";
+
+/// The files of a run that was there before. Dropped, they are back where they were; [`Aside::give_up`] ends them.
+#[derive(Debug, Default)]
+pub(super) struct Aside(Option<PathBuf>);
+
+impl Aside {
+    /// Moves the files of the run out of the way.
+    ///
+    /// # Errors
+    /// The directory cannot be written.
+    pub(super) fn set(run: &Path) -> Result<Self> {
+        let aside = run.join(ASIDE);
+        let held: Vec<&str> = FILES.into_iter().filter(|file| run.join(file).exists()).collect();
+        if held.is_empty() {
+            return Ok(Self(None));
+        }
+        let failed = |error| unwritable(run, &error);
+        std::fs::create_dir_all(&aside).map_err(failed)?;
+        let guard = Self(Some(run.to_owned()));
+        for file in held {
+            std::fs::rename(run.join(file), aside.join(file)).map_err(failed)?;
+        }
+        Ok(guard)
+    }
+
+    /// The new run has come to be: the old one goes.
+    ///
+    /// # Errors
+    /// The directory cannot be written.
+    pub(super) fn give_up(&mut self) -> Result<()> {
+        let Some(run) = self.0.take() else { return Ok(()) };
+        std::fs::remove_dir_all(run.join(ASIDE)).map_err(|error| unwritable(&run, &error))
+    }
+}
+
+impl Drop for Aside {
+    fn drop(&mut self) {
+        if let Some(run) = self.0.take() {
+            // What failed before this is worth reporting; the next start tries again.
+            let _ = restore(&run);
+        }
+    }
+}
+
+/// Puts a directory in order whose last process was killed: a run that was being replaced is back, and what was half
+/// written is gone. For whoever holds its lock.
+///
+/// # Errors
+/// The directory cannot be written.
+pub(super) fn recover(run: &Path) -> Result<()> {
+    restore(run).map_err(|error| unwritable(run, &error))?;
+    for entry in std::fs::read_dir(run).map_err(|error| unwritable(run, &error))?.flatten() {
+        if entry.file_name().to_str().is_some_and(is_half_written) {
+            std::fs::remove_file(entry.path()).map_err(|error| unwritable(run, &error))?;
+        }
+    }
+    Ok(())
+}
+
+/// Moves what waits back, over what had begun in its place.
+fn restore(run: &Path) -> std::io::Result<()> {
+    let aside = run.join(ASIDE);
+    if !aside.is_dir() {
+        return Ok(());
+    }
+    for file in FILES {
+        let (kept, begun) = (aside.join(file), run.join(file));
+        if kept.exists() {
+            std::fs::rename(kept, begun)?;
+        } else if aside.join("config.toml").exists() && begun.exists() {
+            std::fs::remove_file(begun)?;
+        }
+    }
+    std::fs::remove_dir(aside)
+}
+
+/// Whether a file of this name is what a killed process leaves: a run's own under another name, or that which safetensors
+/// writes first.
+fn is_half_written(name: &str) -> bool {
+    let of_run = name.strip_suffix(".partial").is_some_and(|file| FILES.contains(&file));
+    let drawn = name.strip_prefix(".tmp");
+    of_run
+        || drawn.is_some_and(|drawn| {
+            drawn.len() == 6 && drawn.bytes().all(|b| b.is_ascii_alphanumeric())
+        })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn content(run: &Path) -> Vec<(String, String)> {
+        let mut content: Vec<_> = std::fs::read_dir(run)
+            .unwrap()
+            .map(|entry| entry.unwrap().path())
+            .map(|path| {
+                let name = path.file_name().unwrap().to_str().unwrap().to_owned();
+                (name, std::fs::read_to_string(path).unwrap_or_default())
+            })
+            .collect();
+        content.sort();
+        content
+    }
+
+    /// A finished run, something of its owner's, and nothing else.
+    fn run() -> tempfile::TempDir {
+        let folder = tempfile::tempdir().unwrap();
+        for name in ["config.toml", "model.ply", "metrics.json", "notes.txt"] {
+            std::fs::write(folder.path().join(name), format!("old {name}")).unwrap();
+        }
+        folder
+    }
+
+    #[test]
+    fn a_replaced_run_is_back_unless_the_new_one_has_come_to_be() {
+        let folder = run();
+        let before = content(folder.path());
+        let aside = Aside::set(folder.path()).unwrap();
+        assert!(!folder.path().join("model.ply").exists());
+        // The new run begins files of both kinds.
+        std::fs::write(folder.path().join("config.toml"), "new").unwrap();
+        std::fs::write(folder.path().join("train.csv"), "new").unwrap();
+        drop(aside);
+        assert_eq!(content(folder.path()), before);
+
+        // A process that is killed drops nothing; the next one finds the old run.
+        let aside = Aside::set(folder.path()).unwrap();
+        std::fs::write(folder.path().join("config.toml"), "new").unwrap();
+        std::mem::forget(aside);
+        recover(folder.path()).unwrap();
+        assert_eq!(content(folder.path()), before);
+
+        let mut aside = Aside::set(folder.path()).unwrap();
+        aside.give_up().unwrap();
+        drop(aside);
+        assert_eq!(content(folder.path()), [("notes.txt".to_owned(), "old notes.txt".to_owned())]);
+    }
+
+    #[test]
+    fn what_a_killed_process_left_half_written_is_gone_and_nothing_else() {
+        let folder = run();
+        let before = content(folder.path());
+        for name in [".tmpAb3xYz", "model.ply.partial", "checkpoint.safetensors.partial"] {
+            std::fs::write(folder.path().join(name), "half").unwrap();
+        }
+        recover(folder.path()).unwrap();
+        assert_eq!(content(folder.path()), before);
+        for name in [".tmp", ".tmpfile", ".tmp-notes", "notes.txt.partial"] {
+            assert!(!is_half_written(name), "{name}");
+        }
+    }
+}

@@ -1,0 +1,57 @@
+//! `done.json`: that a run is whole, and of which configuration and dataset it is. Whoever schedules runs asks for it, and
+//! a run that is asked for again finds itself done.
+
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+
+use super::files::DONE;
+use crate::base::output::write_whole;
+use crate::photographs::dataset::{Dataset, Fingerprint};
+use crate::train::{Ended, TrainConfig};
+use crate::{Error, Result};
+
+#[derive(Debug, PartialEq, Serialize, Deserialize)]
+struct Done {
+    /// Checksum of what a result depends on.
+    configuration: String,
+    /// Checksum of what was trained on.
+    dataset: String,
+    /// The last step.
+    steps: u64,
+    /// How it ended; older files do not say.
+    #[serde(default)]
+    ended: Option<Ended>,
+}
+
+/// Writes the sign, after everything else.
+pub(super) fn save(
+    run: &Path,
+    config: &TrainConfig,
+    dataset: &Fingerprint,
+    ended: &Ended,
+) -> Result<()> {
+    let done = Done {
+        configuration: config.checksum()?,
+        dataset: dataset.checksum(),
+        steps: ended.step,
+        ended: Some(*ended),
+    };
+    let text =
+        serde_json::to_string_pretty(&done).map_err(|error| Error::Usage(error.to_string()))?;
+    write_whole(&run.join(DONE), (text + "\n").as_bytes())
+}
+
+/// The step that ended the run in a directory, if it is the whole of one of this configuration on this dataset.
+///
+/// # Errors
+/// None for a configuration that [`TrainConfig::check`] accepts.
+pub fn done_steps(run: &Path, config: &TrainConfig, dataset: &Dataset) -> Result<Option<u64>> {
+    let text = std::fs::read_to_string(run.join(DONE)).unwrap_or_default();
+    let is_whole = ["model.ply", "metrics.json"].iter().all(|file| run.join(file).is_file());
+    let done = serde_json::from_str::<Done>(&text).ok().filter(|_| is_whole);
+    let Some(done) = done else { return Ok(None) };
+    let is_same = done.configuration == config.checksum()?
+        && done.dataset == Fingerprint::of(dataset)?.checksum();
+    Ok(is_same.then_some(done.steps))
+}

@@ -1,0 +1,130 @@
+//! What a run directory holds, read back.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs::File;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+use super::directory::view_lines;
+use super::files::{EXPOSURES, NETWORKS, PLAN, VIEWS};
+use super::generations;
+use crate::gpu::Gpu;
+use crate::loss::exposure::{Affine, table};
+use crate::photographs::dataset::Dataset;
+use crate::splats::scene::{Features, Gaussians, ply};
+use crate::train::{ModelConfig, Networks, TrainConfig};
+use crate::{Error, Result};
+
+/// Whether a directory holds a run that reached its end.
+pub fn is_finished(run: &Path) -> bool {
+    run.join("metrics.json").exists()
+}
+
+/// What `metrics.json` says; null where it does not exist.
+pub fn load_metrics(run: &Path) -> serde_json::Value {
+    let text = std::fs::read(run.join("metrics.json")).ok();
+    text.and_then(|text| serde_json::from_slice(&text).ok()).unwrap_or_default()
+}
+
+/// The configuration of a finished or unfinished run.
+///
+/// # Errors
+/// The directory holds none.
+pub fn load_config(run: &Path) -> Result<TrainConfig> {
+    let path = run.join("config.toml");
+    if !path.is_file() {
+        let problem =
+            "is no run directory: it has no config.toml; name what `nightsplat train` wrote";
+        return Err(Error::input(run, problem));
+    }
+    Ok(TrainConfig::load(&path)?.with_paths_from(run))
+}
+
+/// The plan that a run keeps to; none where it keeps to none.
+pub fn plan_of(run: &Path) -> Option<PathBuf> {
+    Some(run.join(PLAN)).filter(|path| path.is_file())
+}
+
+/// The step of the model of a run that did not come to its end; none of a finished one, and where none is known.
+pub fn stopped_at(run: &Path) -> Option<u64> {
+    if is_finished(run) {
+        return None;
+    }
+    // The header of a safetensors file, length first, is JSON with a note in which the checkpoint says what it is.
+    let mut file = File::open(generations::newest(run)?).ok()?;
+    let mut length = [0; 8];
+    file.read_exact(&mut length).ok()?;
+    let mut header = String::new();
+    file.take(u64::from_le_bytes(length)).read_to_string(&mut header).ok()?;
+    let header: serde_json::Value = serde_json::from_str(&header).ok()?;
+    let note = header["__metadata__"]["checkpoint"].as_str()?;
+    serde_json::from_str::<serde_json::Value>(note).ok()?["step"].as_u64()
+}
+
+/// The trained Gaussians of a run.
+///
+/// # Errors
+/// The run has not been trained to its end or a checkpoint, or the file is cut short.
+pub fn load_model(run: &Path, raw_colors: bool) -> Result<Gaussians> {
+    let path = run.join("model.ply");
+    if !path.is_file() {
+        let problem = "has no model.ply: the run did not finish, nor come to a checkpoint; train it again, or go on with \
+                       --resume";
+        return Err(Error::input(run, problem));
+    }
+    let mut gaussians = ply::load(path)?;
+    if raw_colors {
+        gaussians.shift_colors(0.5);
+    }
+    Ok(gaussians)
+}
+
+/// The trained networks of a run; none where its model has none. `features` are those that its Gaussians came to have:
+/// a part that found nothing to learn from has none, whatever the configuration asks for.
+///
+/// # Errors
+/// Their file is missing or damaged, or holds networks of another configuration.
+pub fn load_networks(
+    gpu: &Gpu,
+    run: &Path,
+    model: &ModelConfig,
+    features: Features,
+) -> Result<Option<Networks>> {
+    if !model.denoiser && !model.tonemapper {
+        return Ok(None);
+    }
+    let mut networks = Networks::new(gpu, model, features, 0)?;
+    networks.load(&run.join(NETWORKS))?;
+    Ok(Some(networks))
+}
+
+/// What the exposures of a run's training views make of its model, by name; none where it has learned none.
+///
+/// # Errors
+/// The file is damaged.
+pub fn load_exposures(run: &Path) -> Result<BTreeMap<String, Affine>> {
+    let path = run.join(EXPOSURES);
+    let known = if path.is_file() { table::load(&path)? } else { vec![] };
+    Ok(known.into_iter().filter_map(|known| Some((known.name, known.affine?))).collect())
+}
+
+/// How the views of a dataset differ from those that a run was trained and scored on, in words; none where they are the
+/// same, or the run does not say which those were.
+pub fn other_views(run: &Path, dataset: &Dataset) -> Option<String> {
+    let text = std::fs::read_to_string(run.join(VIEWS)).ok()?;
+    let own: BTreeSet<&str> = text.lines().skip(1).collect();
+    let lines = view_lines(dataset);
+    let others: BTreeSet<&str> = lines.iter().map(String::as_str).collect();
+    let [gone, new] = [own.difference(&others), others.difference(&own)].map(|lines| {
+        let lines: Vec<&str> = lines.copied().collect();
+        lines.first().map(|first| format!("{} (the first: {first})", lines.len()))
+    });
+    match (gone, new) {
+        (None, None) => None,
+        (Some(gone), Some(new)) => {
+            Some(format!("{gone} views of the run are not in it, {new} are new"))
+        }
+        (Some(gone), None) => Some(format!("{gone} views of the run are not in it")),
+        (None, Some(new)) => Some(format!("{new} views are new")),
+    }
+}

@@ -1,0 +1,494 @@
+//! Trains into a run directory and tells an observer.
+
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use super::directory::Progress;
+use super::files::{ENDED, HELD_OUT_COURSE, SPENT, TARGET_EXPOSURE};
+use super::meter::{Meter, Spent};
+use super::tensorboard::EventFile;
+use super::{Event, Requests, RunDirectory, Trained, done, generations, load};
+use crate::gpu::Gpu;
+use crate::photographs::dataset::{Dataset, View};
+use crate::results::eval::{self, Compared, ViewScore, Yardstick};
+use crate::splats::attributes::{ATTRIBUTES, AttributeSpec};
+use crate::train::diagnose::Plan;
+use crate::train::{Ended, Learning, MemoryEstimate, StepReport, TrainConfig, Trainer};
+use crate::{Error, Result, Stop};
+
+/// What becomes of a run that the directory already holds.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum HeldRun {
+    /// It stays: nothing is trained.
+    #[default]
+    Refuse,
+    /// It is deleted.
+    Replace,
+    /// It goes on from its checkpoint, to the bits that it would have had in one go; without one it begins anew.
+    Resume,
+}
+
+/// How a run comes to be, and what may be asked of it.
+#[derive(Clone, Debug, Default)]
+pub struct Session<'a> {
+    /// The plan that its configuration and dataset follow already; it is kept in the run directory.
+    pub plan: Option<&'a Plan>,
+    /// What becomes of a run that is there.
+    pub held: HeldRun,
+    /// What is asked of it on the way.
+    pub requests: Requests,
+}
+
+/// Trains `config` on `dataset`, scores the test views and writes the run directory `out`.
+///
+/// `observe` is told every [`Event`] on the calling thread. `dataset` is what [`TrainConfig::load_options`] loads.
+///
+/// # Errors
+/// The directory holds a run that `held` keeps, or cannot be written; the configuration makes no sense or is not that of
+/// the run that is to go on; a loss is not finite; the device is out of memory or lost.
+///
+/// ```no_run
+/// use std::path::Path;
+///
+/// use nightsplat::photographs::dataset::Dataset;
+/// use nightsplat::gpu::{DeviceChoice, Gpu};
+/// use nightsplat::results::run::{self, Event, HeldRun};
+/// use nightsplat::train::TrainConfig;
+///
+/// let config = TrainConfig { dataset: "photos".into(), steps: 2000, ..TrainConfig::default() };
+/// let gpu = Gpu::new(&DeviceChoice::Best)?;
+/// let dataset = Dataset::load(&config.dataset, &config.load_options())?;
+/// let trained = run::train(&gpu, &config, &dataset, Path::new("run"), HeldRun::Refuse, |event| {
+///     if let Event::Step(report) = event {
+///         println!("step {}: loss {:.4}", report.step, report.loss);
+///     }
+/// })?;
+/// println!("{} Gaussians in {:.0} s", trained.trainer.gaussian_count(), trained.spent.seconds);
+/// # Ok::<(), nightsplat::Error>(())
+/// ```
+pub fn train(
+    gpu: &Gpu,
+    config: &TrainConfig,
+    dataset: &Dataset,
+    out: &Path,
+    held: HeldRun,
+    observe: impl FnMut(Event<'_>),
+) -> Result<Trained> {
+    train_in(gpu, config, dataset, out, &Session { held, ..Session::default() }, observe)
+}
+
+/// As [`train`], in a [`Session`].
+///
+/// # Errors
+/// As there, and [`Error::Stopped`] where the run was asked to stop or has taken `TrainConfig::max_minutes`.
+pub fn train_in(
+    gpu: &Gpu,
+    config: &TrainConfig,
+    dataset: &Dataset,
+    out: &Path,
+    session: &Session<'_>,
+    mut observe: impl FnMut(Event<'_>),
+) -> Result<Trained> {
+    gpu.reset_peak_memory();
+    let (mut directory, mut trainer) = begin(gpu, config, dataset, out, session.held)?;
+    if let Some(plan) = session.plan {
+        directory.save_plan(plan)?;
+    }
+    directory.save_views(dataset)?;
+    let memory = trainer.memory_estimate()?;
+    say_what_is_short(gpu, &memory);
+    observe(Event::Started {
+        step: trainer.steps_done(),
+        steps: trainer.last_step(),
+        may_end_early: trainer.may_end_early(),
+        memory: &memory,
+    });
+    let mut course = Course::new(gpu, config, dataset, &directory, &trainer);
+    let requests = &session.requests;
+    let losses = course.train_to_the_end(&mut trainer, &mut directory, requests, &mut observe);
+    let losses = losses.inspect_err(|error| course.rescue(error, &mut trainer, &mut directory))?;
+    let finished = course.finish(&mut trainer, &mut directory, &mut observe);
+    let (ended, scored, spent) =
+        finished.inspect_err(|error| course.rescue(error, &mut trainer, &mut directory))?;
+    let (gaussians, steps) = (trainer.gaussian_count(), trainer.steps_done());
+    let mut metrics = eval::metrics(&scored, spent.seconds, gaussians, steps);
+    metrics[SPENT] = serde_json::json!(spent);
+    eval::add_reference(&mut metrics, &config.tone);
+    if let Some(exposure) = trainer.target_exposure() {
+        metrics[TARGET_EXPOSURE] = serde_json::json!(exposure);
+    }
+    if config.exposure.learn == Learning::On {
+        eval::add_exposure(&mut metrics, &scored);
+    }
+    metrics[ENDED] = serde_json::json!(ended);
+    if let Some(course) = held_out_course(&trainer) {
+        metrics[HELD_OUT_COURSE] = course;
+    }
+    directory.save_metrics(&metrics)?;
+    done::save(out, config, trainer.fingerprint(), &ended)?;
+    let trained = Trained { trainer, ended, scored, losses, spent };
+    observe(Event::Finished(&trained));
+    Ok(trained)
+}
+
+/// Warns where the driver has less memory for us than the run may come to need.
+fn say_what_is_short(gpu: &Gpu, memory: &MemoryEstimate) {
+    let Some(budget) = gpu.memory_budget() else { return };
+    let left = budget.budget.saturating_sub(budget.usage) + gpu.memory_in_use();
+    if memory.most_device > left {
+        let mebibytes = |bytes: u64| bytes >> 20;
+        tracing::warn!(
+            "{} Gaussians may take {} MiB of the device, {} MiB are free: max_vram or max_gaussians stops growth in time",
+            memory.most_gaussians,
+            mebibytes(memory.most_device),
+            mebibytes(left)
+        );
+    }
+}
+
+/// A new run, or one that is taken up again.
+fn begin(
+    gpu: &Gpu,
+    config: &TrainConfig,
+    dataset: &Dataset,
+    out: &Path,
+    held: HeldRun,
+) -> Result<(RunDirectory, Trainer)> {
+    // A tile that does not suit the device is said before there is a directory.
+    config.render_settings().tile_on(gpu)?;
+    match held {
+        HeldRun::Refuse => RunDirectory::check(out, false)?,
+        HeldRun::Replace => RunDirectory::check(out, true)?,
+        HeldRun::Resume => RunDirectory::check_resumed(out)?,
+    }
+    let lock = RunDirectory::lock(out)?;
+    let resumes = held == HeldRun::Resume;
+    let checkpoint = if resumes { generations::newest(out) } else { None };
+    let mut config =
+        with_tile_and_frame(gpu, config, dataset, checkpoint.is_some().then_some(out))?;
+    // A disk that has room for the run has it for photographs.
+    config.spool.get_or_insert_with(|| out.to_owned());
+    let config = &config;
+    let mut trainer = Trainer::new(gpu, config.clone(), dataset)?;
+    if let Some(checkpoint) = checkpoint {
+        trainer.restore(&checkpoint)?;
+        let step = trainer.steps_done();
+        tracing::info!("{} goes on after step {step}", out.display());
+        let mut directory = RunDirectory::resume(out, lock, config, step)?;
+        // What it had of a later step is gone: the model is that of the checkpoint again.
+        directory.save_trained(&mut trainer)?;
+        return Ok((directory, trainer));
+    }
+    // Without a checkpoint, an unfinished run is nothing to lose.
+    let replaces = match held {
+        HeldRun::Refuse => false,
+        HeldRun::Replace => true,
+        HeldRun::Resume => !load::is_finished(out),
+    };
+    Ok((RunDirectory::create_locked(out, lock, config, replaces)?, trainer))
+}
+
+/// The configuration with the tile and the frame that are to be recorded: the same ones give the same bits, whatever is
+/// measured later. Each is the configuration's own, else that of the run that is `resumed`, else the fastest known on the
+/// device and that of the dataset. A run that records no frame was trained in the world.
+fn with_tile_and_frame(
+    gpu: &Gpu,
+    config: &TrainConfig,
+    dataset: &Dataset,
+    resumed: Option<&Path>,
+) -> Result<TrainConfig> {
+    let mut config = config.clone();
+    if let Some(run) = resumed {
+        let recorded = load::load_config(run)?;
+        let tile = recorded.tile.filter(|&tile| gpu.properties().suits_tile(tile));
+        config.tile = config.tile.or(tile);
+        config.frame = Some(recorded.frame.unwrap_or_default());
+    }
+    let patches = dataset.views.iter().flat_map(|view| config.patches(gpu, &view.camera));
+    let sizes: Vec<[u32; 2]> = patches.map(|patch| patch.size.to_array()).collect();
+    config.tile = Some(config.render_settings().tile_for(gpu, sizes.into_iter())?);
+    config.frame.get_or_insert_with(|| dataset.frame());
+    Ok(config)
+}
+
+/// How far a run has come, and what that took.
+struct Course<'a> {
+    gpu: &'a Gpu,
+    config: &'a TrainConfig,
+    dataset: &'a Dataset,
+    meter: Meter,
+    /// Steps that were done before.
+    begin: u64,
+    /// Steps that are in a checkpoint.
+    saved: u64,
+    progress: Vec<Progress>,
+    /// Once something was scored.
+    yardstick: Option<Yardstick>,
+    /// For `TensorBoard`, once there is something to tell.
+    events: Option<EventFile>,
+    /// Scores of the held-out views that are told.
+    told: usize,
+    /// Whether the run may end early, as far as that is told.
+    may_end_early: bool,
+}
+
+impl<'a> Course<'a> {
+    fn new(
+        gpu: &'a Gpu,
+        config: &'a TrainConfig,
+        dataset: &'a Dataset,
+        directory: &RunDirectory,
+        trainer: &Trainer,
+    ) -> Self {
+        let (meter, begin) = (Meter::new(directory.seconds_before()), trainer.steps_done());
+        let progress = directory.progress(begin);
+        Self {
+            gpu,
+            config,
+            dataset,
+            meter,
+            begin,
+            saved: begin,
+            progress,
+            yardstick: None,
+            events: None,
+            told: trainer.held_out_scores().count(),
+            may_end_early: trainer.may_end_early(),
+        }
+    }
+
+    /// Logs every step, writes checkpoints and ends early where that is asked for; gives the losses.
+    fn train_to_the_end(
+        &mut self,
+        trainer: &mut Trainer,
+        directory: &mut RunDirectory,
+        requests: &Requests,
+        observe: &mut impl FnMut(Event<'_>),
+    ) -> Result<Vec<f64>> {
+        let (config, mut losses) = (self.config, vec![]);
+        let (begin, mut saved) = (Instant::now(), Instant::now());
+        let is_over = |since: Instant, minutes: f64| {
+            minutes > 0.0 && since.elapsed() >= Duration::from_secs_f64(60.0 * minutes)
+        };
+        while !trainer.has_ended() {
+            let next = |every| (trainer.steps_done() + 1).checked_next_multiple_of(every);
+            let until = [config.eval_every, config.checkpoint_every, config.hash_every];
+            let until = until.into_iter().filter_map(next).min().unwrap_or(config.steps);
+            let reports = self.meter.of(|| trainer.advance(until))?;
+            for report in &reports {
+                losses.push(report.loss);
+                directory.log(report)?;
+                observe(Event::Step(report));
+            }
+            directory.flush_log()?;
+            if !reports.is_empty() {
+                directory.settle()?;
+            }
+            if config.tensorboard {
+                self.tell_events(trainer, directory, &reports)?;
+            }
+            self.tell_scores(trainer, directory, observe)?;
+            let Some(step) = reports.last().map(|report| report.step) else { continue };
+            let falls_on = |every: u64| every > 0 && step.is_multiple_of(every);
+            if falls_on(config.hash_every) {
+                directory.log_hashes(step, &trainer.gaussians_in_frame()?)?;
+            }
+            let stop =
+                requests.stops().or(is_over(begin, config.max_minutes).then_some(Stop::TimeUp));
+            let stop = stop.filter(|_| !trainer.has_ended());
+            let is_last = trainer.has_ended() && config.checkpoint_every > 0;
+            let saves = requests.takes_save() || is_over(saved, config.checkpoint_minutes);
+            if falls_on(config.checkpoint_every) || is_last || saves || stop.is_some() {
+                directory.save_checkpoint(trainer)?;
+                (self.saved, saved) = (step, Instant::now());
+                observe(Event::Checkpointed { step });
+            }
+            if let Some(cause) = stop {
+                return Err(Error::Stopped { run: directory.path().to_owned(), step, cause });
+            }
+            if falls_on(config.eval_every) && !trainer.has_ended() {
+                self.evaluate(trainer, directory, observe)?;
+            }
+        }
+        Ok(losses)
+    }
+
+    /// Restores the best model where the last is worse, scores the test views and writes the model.
+    fn finish(
+        &mut self,
+        trainer: &mut Trainer,
+        directory: &mut RunDirectory,
+        observe: &mut impl FnMut(Event<'_>),
+    ) -> Result<(Ended, Vec<ViewScore>, Spent)> {
+        let ended = trainer.end()?;
+        if let Some(events) = &mut self.events {
+            events.text(ended.step, "run/ended", &ended.to_string())?;
+        }
+        observe(Event::Ended(&ended));
+        trainer.leave_out_what_gains_nothing()?;
+        let spent = self.meter.spent(self.gpu.peak_memory());
+        let scored = self.evaluate(trainer, directory, observe)?;
+        let render = |view: &View| trainer.render(&view.camera);
+        eval::warn_of_holes(&scored, self.dataset, self.config.background, render)?;
+        directory.save_trained(trainer)?;
+        Ok((ended, scored, spent))
+    }
+
+    /// Saves what was trained before an error that leaves it as it was: nothing but memory, a file or the like was missing.
+    fn rescue(&self, error: &Error, trainer: &mut Trainer, directory: &mut RunDirectory) {
+        let is_lost = matches!(
+            error,
+            Error::Stopped { .. }
+                | Error::DeviceLost { .. }
+                | Error::NotFinite { .. }
+                | Error::ParameterNotFinite { .. }
+                | Error::Disagrees { .. }
+        );
+        let step = trainer.steps_done();
+        if is_lost || step <= self.saved {
+            return;
+        }
+        match directory.save_checkpoint(trainer) {
+            Ok(()) => tracing::warn!("the run ends early; its {step} steps are saved"),
+            Err(error) => {
+                tracing::warn!("the run ends early, and its last steps are lost: {error}");
+            }
+        }
+    }
+
+    /// Scores the test views, which takes none of the run's time.
+    fn evaluate(
+        &mut self,
+        trainer: &mut Trainer,
+        directory: &RunDirectory,
+        observe: &mut impl FnMut(Event<'_>),
+    ) -> Result<Vec<ViewScore>> {
+        let mut yardstick = match self.yardstick.take() {
+            Some(known) => known,
+            None => Yardstick::of(self.gpu, &self.config.tone, self.dataset)?,
+        };
+        let (step, mut is_first) = (trainer.steps_done(), true);
+        let render = |view: &View| trainer.render(&view.camera);
+        let scored = eval::score_by(&mut yardstick, self.dataset, render, |score, compared| {
+            if self.config.exposure.learn == Learning::On {
+                score.aligned = Some(compared.aligned()?);
+            }
+            if std::mem::take(&mut is_first) {
+                self.tell_events_pictures(step, score, compared)?;
+            }
+            Ok(())
+        })?;
+        self.yardstick = Some(yardstick);
+        observe(Event::Evaluated { step, scored: &scored });
+        self.tell_events_scores(step, &scored)?;
+        if let Some(scores) = eval::means(&scored).0.filter(|_| self.config.eval_every > 0) {
+            let (gaussians, spent) = (trainer.gaussian_count(), self.meter.spent(0));
+            // A finished run that goes on begins where it was scored last.
+            self.progress.retain(|earlier| earlier.step < step);
+            self.progress.push(Progress::new(step, gaussians, scored.len(), &scores, &spent));
+            directory.save_progress(&self.progress)?;
+        }
+        Ok(scored)
+    }
+}
+
+impl Course<'_> {
+    /// Writes what `TensorBoard` draws over the steps, of every tenth.
+    fn tell_events(
+        &mut self,
+        trainer: &Trainer,
+        directory: &RunDirectory,
+        reports: &[StepReport],
+    ) -> Result<()> {
+        const EVERY: u64 = 10;
+        let events = match &mut self.events {
+            Some(events) => events,
+            None => self.events.insert(directory.events(self.begin)?),
+        };
+        let named = |group: &str, name: &str, value| (format!("{group}/{name}"), value);
+        for StepReport { step, loss, terms, gaussians, milliseconds, .. } in reports {
+            if !step.is_multiple_of(EVERY) && *step < trainer.last_step() {
+                continue;
+            }
+            let mut values = vec![("loss/all".to_owned(), *loss)];
+            values.extend(terms.iter().map(|(term, value)| named("loss", term.column, *value)));
+            values.push(("model/Gaussians".to_owned(), *gaussians as f64));
+            values.push(("model/milliseconds a step".to_owned(), *milliseconds));
+            let rates = trainer.learning_rates(*step);
+            let rate = |own: &AttributeSpec| named("rates", own.name, rates[own.attribute]);
+            values.extend(ATTRIBUTES.iter().map(rate));
+            events.scalars(*step, &values)?;
+        }
+        events.flush()
+    }
+
+    /// Writes and tells every score of the held-out views since the last call, and the last step once that is certain.
+    fn tell_scores(
+        &mut self,
+        trainer: &Trainer,
+        directory: &RunDirectory,
+        observe: &mut impl FnMut(Event<'_>),
+    ) -> Result<()> {
+        let scores: Vec<(u64, f64)> = trainer.held_out_scores().collect();
+        if scores.len() > self.told {
+            directory.save_held_out(&scores)?;
+        }
+        for &(step, psnr) in scores.get(self.told..).unwrap_or_default() {
+            observe(Event::HeldOut { step, psnr });
+            if let Some(events) = &mut self.events {
+                events
+                    .scalars(step, &[("held-out views against targets/PSNR".to_owned(), psnr)])?;
+            }
+        }
+        if self.may_end_early && !trainer.may_end_early() {
+            observe(Event::LastStep { step: trainer.steps_done(), last: trainer.last_step() });
+        }
+        (self.told, self.may_end_early) = (scores.len(), trainer.may_end_early());
+        Ok(())
+    }
+
+    /// Writes how a test view looks, and what it should be.
+    fn tell_events_pictures(
+        &mut self,
+        step: u64,
+        ViewScore { name, against, .. }: &ViewScore,
+        Compared { render, target, .. }: &Compared<'_>,
+    ) -> Result<()> {
+        let Some(events) = &mut self.events else { return Ok(()) };
+        for (what, image) in [("render", render), (against.name(), target)] {
+            let size = [image.width, image.height];
+            events.picture(step, &format!("view {name}/{what}"), size, &image.to_png8()?)?;
+        }
+        Ok(())
+    }
+
+    /// Writes the mean scores.
+    fn tell_events_scores(&mut self, step: u64, scored: &[ViewScore]) -> Result<()> {
+        let (Some(events), Some(first)) = (&mut self.events, scored.first()) else { return Ok(()) };
+        let group = format!("test views against {}", first.against.name());
+        if let Some(mean) = eval::means(scored).0 {
+            let values = [
+                ("PSNR", mean.psnr),
+                ("channel-mean PSNR", mean.psnr_channel_mean),
+                ("SSIM", mean.ssim),
+            ];
+            events
+                .scalars(step, &values.map(|(name, value)| (format!("{group}/{name}"), value)))?;
+        }
+        events.flush()
+    }
+}
+
+/// How the held-out views' scores came to their end, for `metrics.json`: the last, and how far the last ten lie apart.
+fn held_out_course(trainer: &Trainer) -> Option<serde_json::Value> {
+    const LAST: usize = 10;
+    let scores: Vec<f64> =
+        trainer.held_out_scores().rev().take(LAST).map(|(_, psnr)| psnr).collect();
+    let (lowest, highest) =
+        (scores.iter().copied().reduce(f64::min)?, scores.iter().copied().reduce(f64::max)?);
+    Some(serde_json::json!({
+        "psnr": scores.first(),
+        "scores": scores.len(),
+        "spread": highest - lowest,
+    }))
+}

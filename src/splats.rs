@@ -1,0 +1,22 @@
+//! Gaussians: how they lie in memory, how they are drawn, and how they learn.
+//!
+//! In: points or a model file, cameras, the gradient of the loss with respect to a render. Out: renders, and better
+//! Gaussians.
+//!
+//! - [`attributes`]: the one table of what every Gaussian has
+//! - [`halves`]: numbers that are kept in 16 bits
+//! - [`batches`]: Gaussians of more planes than one binding holds
+//! - [`scene`]: Gaussians on the host, PLY
+//! - [`sort`]: scan and radix sort on the device
+//! - [`optimizer`]: Adam, what it learns beside the Gaussians, and the schedules of its rates
+//! - [`render`]: the differentiable rasteriser
+//! - [`densify`]: clone, split, prune
+
+pub mod attributes;
+pub mod batches;
+pub mod densify;
+pub mod halves;
+pub mod optimizer;
+pub mod render;
+pub mod scene;
+pub mod sort;

@@ -1,0 +1,171 @@
+//! The one table of what every Gaussian has: columns in memory, learning rates, PLY properties.
+//!
+//! Plain data without dependencies, since the build script reads it, too: the shaders include `attributes.glsl`, which
+//! is made from it. Parameters are planes in one float array: all means, then all quats, and so on in the order of the
+//! rows. The features and the higher SH coefficients, whose width depends on the scene, come last.
+
+/// Something that every Gaussian has.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Attribute {
+    /// Position in the world.
+    Means,
+    /// Rotation, (w, x, y, z), not normalised.
+    Quats,
+    /// Natural logarithms of the standard deviations along the rotated axes.
+    LogScales,
+    /// Opacity before the sigmoid.
+    RawOpacities,
+    /// SH coefficients of degree 0, RGB; the colour is 0.5 + [`SH_C0`](crate::splats::scene::SH_C0) times this.
+    Dc,
+    /// What is blended beside colour, in the order of [`FEATURES`](crate::splats::scene::FEATURES).
+    Features,
+    /// SH coefficients above degree 0, coefficient-major, RGB.
+    Rest,
+}
+
+/// All that is to know about one attribute.
+#[derive(Debug)]
+pub struct AttributeSpec {
+    /// Which attribute this row describes.
+    pub attribute: Attribute,
+    /// The name used in config.toml; `NAME_COLUMN` in GLSL.
+    pub name: &'static str,
+    /// Floats per Gaussian.
+    pub width: Width,
+    /// What they are.
+    pub content: &'static str,
+    /// Adam's initial learning rate (3DGS's `OptimizationParams`).
+    pub learning_rate: f64,
+    /// The PLY properties (INRIA layout).
+    pub ply: Ply,
+    /// The attribute's place among the attributes in a PLY file.
+    pub ply_place: usize,
+}
+
+/// The floats per Gaussian of an attribute.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Width {
+    /// Always as many.
+    Fixed(usize),
+    /// As many as the scene has features.
+    Features,
+    /// Three for each SH coefficient above degree 0.
+    Rest,
+}
+
+/// The names of an attribute's PLY properties.
+#[derive(Clone, Copy, Debug)]
+pub enum Ply {
+    /// Each by itself.
+    Named(&'static [&'static str]),
+    /// A prefix and the number of the component.
+    Numbered(&'static str),
+    /// Those of the features that the scene has.
+    Features,
+}
+
+/// The rows in the order of the planes.
+pub const ATTRIBUTES: [AttributeSpec; 7] = [
+    AttributeSpec {
+        attribute: Attribute::Means,
+        name: "means",
+        width: Width::Fixed(3),
+        content: "x, y, z in the world",
+        learning_rate: 1.6e-4,
+        ply: Ply::Named(&["x", "y", "z"]),
+        ply_place: 0,
+    },
+    AttributeSpec {
+        attribute: Attribute::Quats,
+        name: "quats",
+        width: Width::Fixed(4),
+        content: "w, x, y, z, not normalised",
+        learning_rate: 1e-3,
+        ply: Ply::Numbered("rot_"),
+        ply_place: 6,
+    },
+    AttributeSpec {
+        attribute: Attribute::LogScales,
+        name: "log_scales",
+        width: Width::Fixed(3),
+        content: "ln of the standard deviations",
+        learning_rate: 5e-3,
+        ply: Ply::Numbered("scale_"),
+        ply_place: 5,
+    },
+    AttributeSpec {
+        attribute: Attribute::RawOpacities,
+        name: "raw_opacities",
+        width: Width::Fixed(1),
+        content: "before the sigmoid",
+        learning_rate: 0.05,
+        ply: Ply::Named(&["opacity"]),
+        ply_place: 4,
+    },
+    AttributeSpec {
+        attribute: Attribute::Dc,
+        name: "dc",
+        width: Width::Fixed(3),
+        content: "SH degree 0, RGB",
+        learning_rate: 2.5e-3,
+        ply: Ply::Numbered("f_dc_"),
+        ply_place: 1,
+    },
+    AttributeSpec {
+        attribute: Attribute::Features,
+        name: "features",
+        width: Width::Features,
+        content: "what is blended beside colour",
+        learning_rate: 1.25e-4,
+        ply: Ply::Features,
+        ply_place: 3,
+    },
+    AttributeSpec {
+        attribute: Attribute::Rest,
+        name: "rest",
+        width: Width::Rest,
+        content: "SH above degree 0, coefficient-major, RGB",
+        learning_rate: 1.25e-4,
+        ply: Ply::Numbered("f_rest_"),
+        ply_place: 2,
+    },
+];
+
+/// SH coefficients above degree 0: (degree + 1)^2 - 1.
+pub const fn rest_coefficients(sh_degree: u32) -> usize {
+    ((sh_degree + 1) * (sh_degree + 1) - 1) as usize
+}
+
+/// Floats per Gaussian, all attributes together.
+pub fn column_count(feature_count: usize, sh_degree: u32) -> usize {
+    Attribute::Rest.column(feature_count) + 3 * rest_coefficients(sh_degree)
+}
+
+/// First column and width of every plane, of Gaussians of `column_count` floats, of which `feature_count` are features.
+pub fn planes(feature_count: usize, column_count: usize) -> [(usize, usize); ATTRIBUTES.len()] {
+    ATTRIBUTES.each_ref().map(|spec| {
+        let column = spec.attribute.column(feature_count);
+        let width = match spec.width {
+            Width::Fixed(width) => width,
+            Width::Features => feature_count,
+            Width::Rest => column_count.saturating_sub(column),
+        };
+        (column, width)
+    })
+}
+
+impl Attribute {
+    /// The attribute's row of [`ATTRIBUTES`].
+    pub const fn spec(self) -> &'static AttributeSpec {
+        &ATTRIBUTES[self as usize]
+    }
+
+    /// The floats per Gaussian that come before this attribute: its plane begins at this times the number of Gaussians.
+    pub fn column(self, feature_count: usize) -> usize {
+        let width = |spec: &AttributeSpec| match spec.width {
+            Width::Fixed(width) => width,
+            Width::Features | Width::Rest => feature_count,
+        };
+        ATTRIBUTES[..self as usize].iter().map(width).sum()
+    }
+}

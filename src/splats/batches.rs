@@ -1,0 +1,201 @@
+//! Gaussians in batches: planes of more of them than one binding spans lie batch behind batch.
+//!
+//! A pass over Gaussians is dispatched for one batch after the other, and bound to the slices that hold it. Most devices
+//! bind gigabytes, and there is one batch; some bind 128 MiB, the planes of half a million Gaussians of SH degree 3.
+
+use std::ops::Range;
+
+use crate::Result;
+use crate::gpu::{Buffer, Gpu, Slice, SliceMut};
+use crate::splats::attributes::planes;
+
+/// How the planes of so many Gaussians lie in a buffer.
+#[derive(Clone, Copy, Debug)]
+pub struct Batches {
+    count: usize,
+    columns: usize,
+    features: usize,
+    /// The most Gaussians of a batch.
+    size: usize,
+}
+
+/// Gaussians whose planes follow each other.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Batch {
+    /// How many Gaussians lie before it.
+    pub first: usize,
+    /// How many it is of.
+    pub count: usize,
+    columns: usize,
+}
+
+/// A batch begins at a multiple of this, where every device lets a binding begin, whatever it has of each Gaussian.
+const ALIGNMENT: usize = 64;
+
+impl Batches {
+    /// Of `count` Gaussians with `columns` floats each, of which `features` are features.
+    pub fn new(gpu: &Gpu, count: usize, [columns, features]: [usize; 2]) -> Self {
+        let floats = gpu.properties().max_storage_buffer_range / size_of::<f32>() as u64;
+        // A kernel counts floats in 32 bits.
+        let floats = floats.min(u64::from(u32::MAX)) as usize;
+        let size = (floats / columns.max(1) / ALIGNMENT).max(1) * ALIGNMENT;
+        Self { count, columns, features, size }
+    }
+
+    /// The same Gaussians with so many words each in the place of their floats.
+    pub(crate) fn with_columns(self, columns: usize) -> Self {
+        Self { columns, ..self }
+    }
+
+    /// One after the other; of no Gaussians an empty one.
+    pub fn iter(&self) -> impl Iterator<Item = Batch> + use<> {
+        let Self { count, columns, size, .. } = *self;
+        let begins = (0..count.max(1)).step_by(size);
+        begins.map(move |first| Batch { first, count: size.min(count - first), columns })
+    }
+
+    /// A buffer of planes in batches, from planes of all Gaussians.
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub fn upload(&self, gpu: &Gpu, name: &str, planes: &[f32]) -> Result<Buffer<f32>> {
+        let mut buffer = self.uninit(gpu, name)?;
+        self.write(gpu, &mut buffer, planes)?;
+        Ok(buffer)
+    }
+
+    /// A buffer of planes whose contents are undefined.
+    ///
+    /// # Errors
+    /// The device is out of memory.
+    pub fn uninit(&self, gpu: &Gpu, name: &str) -> Result<Buffer<f32>> {
+        gpu.uninit_in_windows(name, self.count * self.columns)
+    }
+
+    /// A buffer of planes of zeros.
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub fn zeros(&self, gpu: &Gpu, name: &str) -> Result<Buffer<f32>> {
+        gpu.zeroed(self.uninit(gpu, name)?)
+    }
+
+    /// Overwrites the planes in a buffer with others, which are of all Gaussians.
+    ///
+    /// # Errors
+    /// The buffer is shorter, or the device is out of memory or lost.
+    pub fn write<'a>(
+        &self,
+        gpu: &Gpu,
+        buffer: impl Into<SliceMut<'a, f32>>,
+        planes: &[f32],
+    ) -> Result<()> {
+        if self.count <= self.size {
+            return gpu.write(buffer, planes);
+        }
+        let batched: Vec<f32> = self.parts().flat_map(|part| &planes[part]).copied().collect();
+        gpu.write(buffer, &batched)
+    }
+
+    /// The planes of all Gaussians, from those in a buffer.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub fn read<'a>(&self, gpu: &Gpu, buffer: impl Into<Slice<'a, f32>>) -> Result<Vec<f32>> {
+        let mut batched = gpu.read(buffer)?;
+        batched.truncate(self.count * self.columns);
+        if self.count <= self.size {
+            return Ok(batched);
+        }
+        let mut planes = vec![0.0; batched.len()];
+        let mut rest = batched.as_slice();
+        for part in self.parts() {
+            let (own, others) = rest.split_at(part.len());
+            planes[part].copy_from_slice(own);
+            rest = others;
+        }
+        Ok(planes)
+    }
+
+    /// Where a float of a buffer is among the planes of all Gaussians.
+    pub fn place_of(&self, float: usize) -> usize {
+        let mut before = 0;
+        for part in self.parts() {
+            if float < before + part.len() {
+                return part.start + float - before;
+            }
+            before += part.len();
+        }
+        float
+    }
+
+    /// What of the planes of all Gaussians lies where in a buffer, from its begin on.
+    fn parts(&self) -> impl Iterator<Item = Range<usize>> + use<> {
+        let Self { count, columns, features, .. } = *self;
+        self.iter().flat_map(move |batch| {
+            planes(features, columns).map(|(column, width)| {
+                let begin = column * count + width * batch.first;
+                begin..begin + width * batch.count
+            })
+        })
+    }
+}
+
+impl Batch {
+    /// What a buffer of planes in batches holds of it.
+    ///
+    /// # Errors
+    /// The buffer is shorter.
+    pub fn planes<'a>(&self, planes: impl Into<Slice<'a, f32>>) -> Result<Slice<'a, f32>> {
+        self.rows(planes, self.columns)
+    }
+
+    /// The same to write.
+    ///
+    /// # Errors
+    /// The buffer is shorter.
+    pub fn planes_mut<'a>(
+        &self,
+        planes: impl Into<SliceMut<'a, f32>>,
+    ) -> Result<SliceMut<'a, f32>> {
+        self.rows_mut(planes, self.columns)
+    }
+
+    /// What a buffer of `each` elements per Gaussian, those of one after those of another, holds of it.
+    ///
+    /// # Errors
+    /// The buffer is shorter.
+    pub fn rows<'a, T: bytemuck::Pod>(
+        &self,
+        rows: impl Into<Slice<'a, T>>,
+        each: usize,
+    ) -> Result<Slice<'a, T>> {
+        rows.into().range(self.range(each))
+    }
+
+    /// The same to write.
+    ///
+    /// # Errors
+    /// The buffer is shorter.
+    pub fn rows_mut<'a, T: bytemuck::Pod>(
+        &self,
+        rows: impl Into<SliceMut<'a, T>>,
+        each: usize,
+    ) -> Result<SliceMut<'a, T>> {
+        rows.into().range(self.range(each))
+    }
+
+    fn range(&self, each: usize) -> Range<usize> {
+        self.first * each..(self.first + self.count) * each
+    }
+
+    /// How many Gaussians it is of, as kernels count.
+    pub fn gaussian_count(&self) -> u32 {
+        self.count as u32
+    }
+
+    /// How many lie before it, as kernels count.
+    pub fn first_gaussian(&self) -> u32 {
+        self.first as u32
+    }
+}

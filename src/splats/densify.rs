@@ -1,0 +1,520 @@
+//! Density control: Gaussians that the views pull at multiply, faint ones go (Kerbl et al. 2023, section 5.2).
+//!
+//! ```text
+//! score -> sort by need -> decide -> scan of the offspring -> counts to the host -> scatter
+//! ```
+//!
+//! The device decides; the host reads four counts and makes room. What comes of the Gaussians is written plane set by
+//! plane set into the buffer that is free, which the gradients of the last step leave: no memory beyond what training
+//! holds, and buffers grow with headroom, so most rounds allocate nothing.
+
+mod gaussians;
+
+pub use gaussians::DeviceGaussians;
+
+use std::iter;
+use std::str::FromStr;
+
+use serde::{Deserialize, Serialize};
+
+use crate::camera::{Camera, Patch};
+use crate::gpu::{Buffer, Gpu, Pipeline, Threads};
+use crate::kernels::fate::{
+    TALLY_CANDIDATES, TALLY_CLONED, TALLY_PRUNED, TALLY_SPLIT, TALLY_WORDS,
+};
+use crate::kernels::{self, densify_decide, densify_moments, densify_scatter, densify_score};
+use crate::splats::batches::{Batch, Batches};
+use crate::splats::halves::Bits;
+use crate::splats::sort::{Count, RadixSort, Scan};
+use crate::{Error, Result};
+
+/// What comes of a Gaussian that multiplies.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum DensityControl {
+    /// Two halves along its longest axis that together cover what it covered: the render stays nearly as it was.
+    #[default]
+    Conserving,
+    /// LITA-GS's: a small one gets a copy at a position drawn from it, a large one is replaced by two smaller ones at
+    /// drawn positions. Opacities are never reset and large Gaussians are not pruned.
+    Paper,
+}
+
+impl FromStr for DensityControl {
+    type Err = Error;
+
+    fn from_str(name: &str) -> Result<Self> {
+        match name {
+            "conserving" => Ok(Self::Conserving),
+            "paper" => Ok(Self::Paper),
+            _ => {
+                let problem = format!("unknown density control `{name}`; conserving or paper");
+                Err(Error::Usage(problem))
+            }
+        }
+    }
+}
+
+/// Which Gaussians multiply and which go.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct DensifySettings {
+    /// What comes of those that multiply.
+    pub control: DensityControl,
+    /// Mean norm of the screen-space gradient, in normalised device units, above which a Gaussian multiplies.
+    pub gradient_threshold: f64,
+    /// The largest standard deviation, in world units, up to which the paper's control clones; beyond, it splits.
+    pub split_scale: f64,
+    /// Fainter Gaussians go, in (0, 1).
+    pub min_opacity: f64,
+    /// There never come to be more; growth goes to those with the largest gradients.
+    pub max_gaussians: usize,
+    /// The near plane of the cameras, world units.
+    pub near: f64,
+    /// Where the drawn positions come from.
+    pub seed: u64,
+}
+
+/// What the steps since the last round have gathered, per Gaussian, and a buffer to work with.
+#[derive(Debug)]
+pub struct DensifyInputs<'a> {
+    /// Sums of the norms of the screen-space gradients, in normalised device units.
+    pub grad_norm_sums: &'a mut Buffer<f32>,
+    /// In how many steps the Gaussian was seen.
+    pub visit_counts: &'a mut Buffer<u32>,
+    /// The gradients, as planes; what they hold is lost.
+    pub gradients: &'a mut Buffer<f32>,
+}
+
+/// When a round takes place.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Round {
+    /// The step it follows.
+    pub step: u64,
+    /// How many rounds are left, this one included. Each takes its share of the room below the limit; 1 takes it all.
+    pub rounds_left: u64,
+    /// The most Gaussians that the views leave room for; [`DensifySettings::max_gaussians`] holds as well.
+    pub most: usize,
+}
+
+/// How often a round is tried at the most; the last trial splits nothing.
+const TRIALS: usize = 5;
+
+/// The largest mean squared change of a camera's view by one split, in units of the squared contrast of what the Gaussian
+/// covers, as `view_change` in `densify_score.comp` estimates it. It keeps a split from
+/// changing a view of 30 dB by .1 dB where the contrast is .3 (docs/benchmarks.md).
+pub const LARGEST_CHANGE: f32 = 2e-4;
+
+/// What one round did.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct DensifyReport {
+    /// Gaussians that got a copy.
+    pub cloned: usize,
+    /// Gaussians that two smaller ones replaced.
+    pub split: usize,
+    /// Gaussians that went.
+    pub pruned: usize,
+    /// Gaussians there are now.
+    pub count: usize,
+    /// Gaussians that would have multiplied had there been room.
+    pub refused: usize,
+}
+
+/// The kernels of density control.
+#[derive(Debug)]
+pub struct Densifier {
+    gpu: Gpu,
+    settings: DensifySettings,
+    /// What conserving splits may not change. None of the paper's control.
+    cameras: Buffer<kernels::Camera>,
+    score: Pipeline<densify_score::Kernel>,
+    decide: Pipeline<densify_decide::Kernel>,
+    scatter: Pipeline<densify_scatter::Kernel>,
+    moments: Pipeline<densify_moments::Kernel>,
+    sort: RadixSort,
+    scan: Scan,
+    scratch: Scratch,
+}
+
+/// The decision for every Gaussian.
+#[derive(Debug)]
+struct Scratch {
+    keys: Buffer<u32>,
+    ids: Buffer<u32>,
+    fates: Buffer<u32>,
+    offspring_counts: Buffer<u32>,
+    offsets: Buffer<u32>,
+    tally: Buffer<u32>,
+    total: Buffer<u32>,
+    count: Buffer<u32>,
+}
+
+impl Scratch {
+    fn new(gpu: &Gpu, capacity: usize) -> Result<Self> {
+        Ok(Self {
+            keys: gpu.uninit("densify_keys", capacity)?,
+            ids: gpu.uninit("densify_ids", capacity)?,
+            fates: gpu.uninit("fates", capacity)?,
+            offspring_counts: gpu.uninit("offspring_counts", capacity)?,
+            offsets: gpu.uninit("offspring_offsets", capacity)?,
+            tally: gpu.uninit("densify_tally", TALLY_WORDS as usize)?,
+            total: gpu.uninit("offspring_total", 1)?,
+            count: gpu.uninit("gaussian_count", 1)?,
+        })
+    }
+}
+
+impl Densifier {
+    /// The kernels on this device. A Gaussian is not split where that would change what one of `cameras` sees, in world
+    /// space; the paper's control splits it all the same.
+    ///
+    /// # Errors
+    /// A setting makes no sense, or the device refuses a pipeline.
+    pub fn new(gpu: &Gpu, settings: DensifySettings, cameras: &[Camera]) -> Result<Self> {
+        let DensifySettings { gradient_threshold, split_scale, min_opacity, .. } = settings;
+        for (name, value, upper) in [
+            ("gradient threshold", gradient_threshold, f64::INFINITY),
+            ("split scale", split_scale, f64::INFINITY),
+            ("minimum opacity", min_opacity, 1.0),
+        ] {
+            if !(0.0..upper).contains(&value) {
+                let problem = format!(
+                    "density control: the {name} is {value}; it must be within 0 and {upper}"
+                );
+                return Err(Error::Usage(problem));
+            }
+        }
+        let conserving = settings.control == DensityControl::Conserving;
+        let cameras = if conserving { cameras } else { &[] };
+        let cameras: Vec<kernels::Camera> =
+            cameras.iter().map(|camera| (&Patch::from(camera)).into()).collect();
+        Ok(Self {
+            gpu: gpu.clone(),
+            settings,
+            cameras: gpu.buffer("cameras", &cameras)?,
+            score: gpu.pipeline(&densify_score::Constants::default())?,
+            decide: gpu.pipeline(&densify_decide::Constants { conserving })?,
+            scatter: gpu.pipeline(&densify_scatter::Constants { conserving })?,
+            moments: gpu.pipeline(&densify_moments::Constants::default())?,
+            sort: RadixSort::new(gpu, 0)?,
+            scan: Scan::new(gpu, 0)?,
+            scratch: Scratch::new(gpu, 0)?,
+        })
+    }
+
+    /// One round of density control: prunes and splits `gaussians`, or clones them under the paper's control. The statistics
+    /// are to be zeroed for the new count; buffers that were too short for it are longer.
+    ///
+    /// `keeps` looks at the new parameters, `(columns x count)`, before anything is final, and says which share of the splits
+    /// may stay: 1 or more for all of them. Else the round is tried again with as many fewer, those with the largest
+    /// gradients first, and at last with none.
+    ///
+    /// # Errors
+    /// A buffer is shorter than the Gaussians need, `keeps` fails, or the device is out of memory: the Gaussians are as
+    /// they were then. Or the device is lost.
+    pub fn densify(
+        &mut self,
+        gaussians: &mut DeviceGaussians,
+        mut inputs: DensifyInputs<'_>,
+        round: Round,
+        mut keeps: impl FnMut(&Buffer<f32>, usize) -> Result<f64>,
+    ) -> Result<DensifyReport> {
+        check(gaussians, &inputs)?;
+        let limit = self.settings.max_gaussians.min(round.most);
+        let mut most_added = u32::MAX;
+        for trial in 1..=TRIALS {
+            let tally = self.decide(gaussians, &inputs, limit, most_added, round)?;
+            let report = report(gaussians.count, &tally);
+            let added = report.split + report.cloned;
+            if added + report.pruned == 0 {
+                return Ok(report);
+            }
+            let mut room = self.room(gaussians, &inputs, report.count, limit)?;
+            self.scatter(gaussians, &mut inputs, &mut room, &report, round.step)?;
+            let new = room.words.as_ref().unwrap_or(inputs.gradients);
+            let share = if added == 0 { 1.0 } else { keeps(new, report.count)? };
+            if share >= 1.0 {
+                self.commit(gaussians, inputs, room, &report)?;
+                return Ok(report);
+            }
+            tracing::debug!("step {}: of {added} splits, {share:.3} may stay", round.step);
+            most_added = if trial + 1 < TRIALS { (share * added as f64) as u32 } else { 0 };
+        }
+        Err(Error::Usage("density control: the last trial of a round splits nothing".to_owned()))
+    }
+
+    /// What a round takes beside the Gaussians, for each, in bytes.
+    #[cfg(feature = "io")]
+    pub(crate) fn bytes_per_gaussian(&self) -> usize {
+        5 * size_of::<u32>() + self.sort.bytes_per_item()
+    }
+
+    /// Leaves every fate and every place on the device, and returns the counts.
+    fn decide(
+        &mut self,
+        gaussians: &DeviceGaussians,
+        DensifyInputs { grad_norm_sums, visit_counts, .. }: &DensifyInputs<'_>,
+        limit: usize,
+        most_added: u32,
+        round: Round,
+    ) -> Result<Vec<u32>> {
+        let DeviceGaussians { count, feature_count, ref parameters, .. } = *gaussians;
+        let columns = gaussians.parameter_columns();
+        if self.scratch.keys.len() < count as usize {
+            self.scratch = Scratch::new(&self.gpu, grad_norm_sums.len())?;
+        }
+        let DensifySettings { gradient_threshold, split_scale, min_opacity, near, .. } =
+            self.settings;
+        let camera_count = self.cameras.len() as u32;
+        let score = |batch: Batch| densify_score::Params {
+            gaussian_count: batch.gaussian_count(),
+            column_count: columns as u32,
+            feature_count,
+            gradient_threshold: gradient_threshold as f32,
+            min_raw_opacity: (min_opacity / (1.0 - min_opacity)).ln() as f32,
+            first_gaussian: batch.first_gaussian(),
+            camera_count,
+            near: near as f32,
+            largest_change: LARGEST_CHANGE,
+        };
+        let decide = |batch: Batch| densify_decide::Params {
+            gaussian_count: count,
+            first_gaussian: batch.first_gaussian(),
+            batch_count: batch.gaussian_count(),
+            max_gaussians: limit.min(u32::MAX as usize) as u32,
+            rounds_left: round.rounds_left.clamp(1, u64::from(u32::MAX)) as u32,
+            split_log_scale: split_scale.ln() as f32,
+            most_added,
+        };
+        let batches = gaussians.batches(&self.gpu);
+        let Self { scratch, sort, scan, cameras, .. } = self;
+        self.gpu.write(&mut scratch.count, &[count])?;
+        let mut download = None;
+        self.gpu.run("densify_decide", |pass| {
+            pass.fill(&mut scratch.tally, 0);
+            for batch in batches.iter() {
+                let buffers = densify_score::Buffers {
+                    parameters: batch.rows(parameters, columns)?,
+                    grad_norm_sums: batch.rows(&**grad_norm_sums, 1)?,
+                    visit_counts: batch.rows(&**visit_counts, 1)?,
+                    keys: batch.rows_mut(&mut scratch.keys, 1)?,
+                    ids: batch.rows_mut(&mut scratch.ids, 1)?,
+                    tally: scratch.tally.slice_mut(),
+                    cameras: cameras.slice(),
+                };
+                let threads = Threads::Exactly([batch.gaussian_count(), 1, 1]);
+                pass.dispatch(&self.score, &score(batch), buffers, threads)?;
+            }
+            let counted = Count { counts: &scratch.count, index: 0 };
+            sort.record(pass, counted, &mut scratch.keys, &mut scratch.ids, u32::BITS)?;
+            for batch in batches.iter() {
+                let buffers = densify_decide::Buffers {
+                    parameters: batch.rows(parameters, columns)?,
+                    sorted_keys: scratch.keys.slice(),
+                    sorted_ids: scratch.ids.slice(),
+                    tally: scratch.tally.slice_mut(),
+                    fates: scratch.fates.slice_mut(),
+                    offspring_counts: scratch.offspring_counts.slice_mut(),
+                };
+                let threads = Threads::Exactly([count, 1, 1]);
+                pass.dispatch(&self.decide, &decide(batch), buffers, threads)?;
+            }
+            let Scratch { offspring_counts, offsets, total, .. } = scratch;
+            scan.record(pass, counted, offspring_counts, offsets, total)?;
+            download = Some(pass.download(&scratch.tally)?);
+            Ok(())
+        })?;
+        download.map_or_else(|| Ok(vec![]), |tally| tally.wait())
+    }
+
+    /// Writes the new parameters beside the old ones: to the words of `room`, or the gradients.
+    fn scatter(
+        &self,
+        gaussians: &DeviceGaussians,
+        inputs: &mut DensifyInputs<'_>,
+        room: &mut Room,
+        report: &DensifyReport,
+        step: u64,
+    ) -> Result<()> {
+        let DeviceGaussians { feature_count, ref parameters, .. } = *gaussians;
+        let columns = gaussians.parameter_columns();
+        let seed = self.settings.seed;
+        let params = |from: Batch, to: Batch| densify_scatter::Params {
+            gaussian_count: from.gaussian_count(),
+            new_gaussian_count: to.gaussian_count(),
+            column_count: columns as u32,
+            feature_count,
+            seed: (seed ^ (seed >> 32)) as u32,
+            step: step as u32,
+            first_gaussian: from.first_gaussian(),
+            first_new_gaussian: to.first_gaussian(),
+        };
+        let target = match &mut room.words {
+            Some(words) => words,
+            None => {
+                take(&mut room.planes, inputs.gradients);
+                &mut *inputs.gradients
+            }
+        };
+        let Scratch { fates, offsets, .. } = &self.scratch;
+        let pairs = self.pairs(gaussians, report);
+        self.gpu.run("densify_scatter", |pass| {
+            for &(from, to) in &pairs {
+                let buffers = densify_scatter::Buffers {
+                    parameters: from.rows(parameters, columns)?,
+                    fates: from.rows(fates, 1)?,
+                    offsets: from.rows(offsets, 1)?,
+                    new_parameters: to.rows_mut(&mut *target, columns)?,
+                };
+                let threads = Threads::Exactly([from.gaussian_count(), 1, 1]);
+                pass.dispatch(&self.scatter, &params(from, to), buffers, threads)?;
+            }
+            Ok(())
+        })
+    }
+
+    /// Makes what was scattered the parameters, and carries the moments over: each plane set leaves its own buffer as the
+    /// next one's spare.
+    fn commit(
+        &self,
+        gaussians: &mut DeviceGaussians,
+        inputs: DensifyInputs<'_>,
+        Room { mut planes, mut words, statistics }: Room,
+        report: &DensifyReport,
+    ) -> Result<()> {
+        let DeviceGaussians { column_count, feature_count, .. } = *gaussians;
+        let params = |from: Batch, to: Batch| densify_moments::Params {
+            gaussian_count: from.gaussian_count(),
+            new_gaussian_count: to.gaussian_count(),
+            column_count,
+            feature_count,
+            first_new_gaussian: to.first_gaussian(),
+        };
+        let DensifyInputs { grad_norm_sums, visit_counts, gradients: spare } = inputs;
+        let Scratch { fates, offsets, .. } = &self.scratch;
+        let pairs = self.pairs(gaussians, report);
+        let DeviceGaussians { parameters, moments, .. } = &mut *gaussians;
+        std::mem::swap(parameters, words.as_mut().unwrap_or(spare));
+        self.gpu.run("densify_moments", |pass| {
+            for (_, moments) in moments.planes_mut() {
+                take(&mut planes, spare);
+                for &(from, to) in &pairs {
+                    let buffers = densify_moments::Buffers {
+                        moments: from.planes(&*moments)?.words(),
+                        fates: from.rows(fates, 1)?,
+                        offsets: from.rows(offsets, 1)?,
+                        new_moments: to.planes_mut(&mut *spare)?.words(),
+                    };
+                    let threads = Threads::Exactly([from.gaussian_count(), 1, 1]);
+                    pass.dispatch(&self.moments, &params(from, to), buffers, threads)?;
+                }
+                std::mem::swap(moments, spare);
+            }
+            take(&mut planes, spare);
+            Ok(())
+        })?;
+        if let Some((sums, counts)) = statistics {
+            (*grad_norm_sums, *visit_counts) = (sums, counts);
+        }
+        gaussians.count = report.count as u32;
+        Ok(())
+    }
+
+    /// Every batch with each of the new ones that its Gaussians go to.
+    fn pairs(&self, gaussians: &DeviceGaussians, report: &DensifyReport) -> Vec<(Batch, Batch)> {
+        let DeviceGaussians { column_count, feature_count, .. } = *gaussians;
+        let dimensions = [column_count, feature_count].map(|n| n as usize);
+        let (old, new) =
+            (gaussians.batches(&self.gpu), Batches::new(&self.gpu, report.count, dimensions));
+        old.iter().flat_map(|from| new.iter().map(move |to| (from, to))).collect()
+    }
+
+    /// What takes the place of buffers that are too short for `count` Gaussians, all of it before one of them goes.
+    fn room(
+        &self,
+        gaussians: &DeviceGaussians,
+        inputs: &DensifyInputs<'_>,
+        count: usize,
+        limit: usize,
+    ) -> Result<Room> {
+        let DeviceGaussians { column_count, parameters, moments, rest, .. } = gaussians;
+        let (columns, capacity) = (*column_count as usize, capacity(count, limit));
+        let buffer = |columns| self.gpu.uninit_in_windows("planes", capacity * columns);
+        // Parameters with halves are too short to take turns with floats.
+        let (turns, words) = match rest {
+            Bits::Single => (Some(parameters), None),
+            Bits::Half => (None, Some(buffer(gaussians.parameter_columns())?)),
+        };
+        // In the order in which they are free.
+        let planes = iter::once(&*inputs.gradients).chain(turns);
+        let planes = planes.chain(moments.planes().into_iter().map(|(_, plane)| plane));
+        let planes = planes.map(|plane| {
+            let is_short = plane.len() < count * columns;
+            is_short.then(|| buffer(columns)).transpose()
+        });
+        let planes = planes.collect::<Result<Vec<_>>>()?.into_iter();
+        let statistics = if inputs.grad_norm_sums.len() < count {
+            let sums = self.gpu.uninit("grad_norm_sums", capacity)?;
+            Some((sums, self.gpu.uninit("visit_counts", capacity)?))
+        } else {
+            None
+        };
+        Ok(Room { planes, words, statistics })
+    }
+}
+
+/// Buffers for more Gaussians.
+struct Room {
+    /// Those that a plane set is to take in turn, where its own is too short.
+    planes: std::vec::IntoIter<Option<Buffer<f32>>>,
+    /// What parameters with halves go to.
+    words: Option<Buffer<f32>>,
+    statistics: Option<(Buffer<f32>, Buffer<u32>)>,
+}
+
+/// Puts the next of `planes` in the place of `spare`, which goes once the device is done with it.
+fn take(planes: &mut impl Iterator<Item = Option<Buffer<f32>>>, spare: &mut Buffer<f32>) {
+    if let Some(longer) = planes.next().flatten() {
+        *spare = longer;
+    }
+}
+
+/// How many Gaussians to make room for where there are to be `count`: half as many again, within the limit.
+pub(crate) fn capacity(count: usize, limit: usize) -> usize {
+    (count + count / 2).min(limit).max(count)
+}
+
+fn report(count: u32, tally: &[u32]) -> DensifyReport {
+    let tally = |place: u32| tally.get(place as usize).map_or(0, |&count| count as usize);
+    let (cloned, split, pruned) = (tally(TALLY_CLONED), tally(TALLY_SPLIT), tally(TALLY_PRUNED));
+    DensifyReport {
+        cloned,
+        split,
+        pruned,
+        count: count as usize - pruned + cloned + split,
+        refused: tally(TALLY_CANDIDATES) - cloned - split,
+    }
+}
+
+/// A kernel that runs beyond a buffer reads its neighbours: refuse before anything is recorded.
+fn check(gaussians: &DeviceGaussians, inputs: &DensifyInputs<'_>) -> Result<()> {
+    let DeviceGaussians { count, column_count, feature_count, parameters, moments, .. } = gaussians;
+    let (count, columns) = (*count as usize, *column_count as usize);
+    let DensifyInputs { grad_norm_sums, visit_counts, .. } = inputs;
+    let words = count * gaussians.parameter_columns();
+    let parameters = iter::once((parameters.name(), parameters.len(), words));
+    let moments =
+        moments.planes().into_iter().map(|(name, plane)| (name, plane.len(), count * columns));
+    let per_gaussian = [
+        (grad_norm_sums.name(), grad_norm_sums.len(), count),
+        (visit_counts.name(), visit_counts.len(), count),
+    ];
+    if columns < crate::splats::scene::width(0) + *feature_count as usize {
+        return Err(Error::Usage(format!("density control: {columns} floats make no Gaussian")));
+    }
+    match parameters.chain(moments).chain(per_gaussian).find(|(_, len, needed)| len < needed) {
+        Some((name, len, needed)) => Err(Error::Usage(format!(
+            "buffer `{name}` holds {len} elements, density control needs {needed}"
+        ))),
+        None => Ok(()),
+    }
+}

@@ -1,0 +1,135 @@
+//! Numbers that are kept in 16 bits: SH coefficients above degree 0, two in a word of the planes, as include/half.glsl has
+//! them.
+
+use serde::{Deserialize, Serialize};
+
+use crate::kernels::half::{LARGEST_HALF, SMALLEST_HALF};
+use crate::splats::attributes::Attribute;
+
+/// In how many bits the numbers of a training are kept; they are computed in 32.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Bits {
+    /// 32.
+    #[default]
+    #[serde(rename = "32")]
+    Single,
+    /// 16, rounded up or down by chance, which is a hash: the same in every run.
+    #[serde(rename = "16")]
+    Half,
+}
+
+impl Bits {
+    /// Words per Gaussian whose SH coefficients above degree 0 are so many bits each, of `columns` numbers of which `features`
+    /// are features.
+    pub fn columns(self, [columns, features]: [usize; 2]) -> usize {
+        match self {
+            Self::Single => columns,
+            Self::Half => Halves::new(0, [columns, features]).columns(),
+        }
+    }
+}
+
+/// How Gaussians with halves differ from those of floats alone.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Halves {
+    count: usize,
+    /// Words of each before the halves.
+    before: usize,
+    /// Coefficients of each.
+    own: usize,
+}
+
+impl Halves {
+    /// Of `count` Gaussians that have `columns` floats each, of which `features` are features.
+    pub(crate) fn new(count: usize, [columns, features]: [usize; 2]) -> Self {
+        let before = Attribute::Rest.column(features);
+        Self { count, before, own: columns - before }
+    }
+
+    /// Words of each.
+    pub(crate) fn columns(self) -> usize {
+        self.before + self.own.div_ceil(2)
+    }
+
+    /// Planes of floats with halves in the place of the coefficients, each the nearest.
+    pub(crate) fn pack(self, floats: &[f32]) -> Vec<f32> {
+        let word = |pair: &[f32]| {
+            let halves = [0, 1].map(|k| u32::from(pair.get(k).map_or(0, |&value| nearest(value))));
+            f32::from_bits(halves[0] | halves[1] << 16)
+        };
+        let (planes, rest) = floats.split_at(self.before * self.count);
+        let words = rest.chunks_exact(self.own.max(1)).flat_map(|own| own.chunks(2).map(word));
+        planes.iter().copied().chain(words).collect()
+    }
+
+    /// The floats that planes with halves stand for.
+    pub(crate) fn unpack(self, words: &[f32]) -> Vec<f32> {
+        let (planes, rest) = words.split_at(self.before * self.count);
+        let floats = rest.chunks_exact(self.own.div_ceil(2).max(1)).flat_map(|own| {
+            let bits = own.iter().map(|word| word.to_bits());
+            bits.flat_map(|bits| [bits, bits >> 16].map(|half| value(half as u16))).take(self.own)
+        });
+        planes.iter().copied().chain(floats).collect()
+    }
+}
+
+/// What a half stands for. None is subnormal, infinite or NaN.
+pub(crate) fn value(half: u16) -> f32 {
+    let (sign, magnitude) = (u32::from(half >> 15), u32::from(half & 0x7fff));
+    let shifted = if magnitude == 0 { 0 } else { (magnitude << 13) + ((127 - 15) << 23) };
+    f32::from_bits(sign << 31 | shifted)
+}
+
+/// The half that is nearest to a number, of two the even one.
+pub(crate) fn nearest(value: f32) -> u16 {
+    let (smallest, largest) = (SMALLEST_HALF as f32, LARGEST_HALF as f32);
+    let magnitude = value.abs().min(largest);
+    let sign = u16::from(value.is_sign_negative()) << 15;
+    if magnitude < smallest {
+        // Of zero and the smallest.
+        return sign | if magnitude > smallest / 2.0 { 1 << 10 } else { 0 };
+    }
+    let bits = magnitude.to_bits() - ((127 - 15) << 23);
+    let rounded = (bits + 0x0fff + (bits >> 13 & 1)) >> 13;
+    sign | rounded as u16
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Halves, nearest, value};
+    use crate::splats::attributes::column_count;
+
+    #[test]
+    fn every_half_comes_back_and_numbers_become_the_nearest() {
+        for half in (0..=u16::MAX).filter(|half| matches!(half & 0x7fff, 0 | 0x0400..=0x7bff)) {
+            assert_eq!(nearest(value(half)), half, "{half:#x}");
+            let next = half + 1;
+            if (0x0400..0x7bff).contains(&half) {
+                let (a, b) = (value(half), value(next));
+                assert_eq!(nearest(a + 0.499 * (b - a)), half);
+                assert_eq!(nearest(a + 0.501 * (b - a)), next);
+                assert_eq!(nearest(-(a + 0.501 * (b - a))), next | 0x8000);
+            }
+        }
+        assert_eq!(value(0x3c00), 1.0);
+        assert_eq!(value(0xc000), -2.0);
+        assert_eq!(value(nearest(1e9)), 65504.0);
+        assert_eq!(value(nearest(2e-5)), 0.0);
+    }
+
+    #[test]
+    fn planes_of_every_degree_come_back() {
+        for (degree, words) in (0..=3).zip([16, 21, 28, 39]) {
+            for count in [0, 1, 5] {
+                let columns = column_count(2, degree);
+                let halves = Halves::new(count, [columns, 2]);
+                assert_eq!(halves.columns(), words);
+                let planes: Vec<f32> =
+                    (0..count * columns).map(|i| value(nearest(i as f32 * 0.25))).collect();
+                let packed = halves.pack(&planes);
+                assert_eq!(packed.len(), count * words);
+                assert_eq!(halves.unpack(&packed), planes);
+            }
+        }
+    }
+}

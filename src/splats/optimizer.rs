@@ -1,0 +1,320 @@
+//! Adam over the Gaussians' planes and over what else is learned, and the schedules of its learning rates.
+
+mod finite;
+mod learnable;
+mod schedule;
+
+pub use finite::FiniteCheck;
+pub use learnable::Learnable;
+pub use schedule::{LearningRates, Schedule};
+
+use std::sync::OnceLock;
+
+use crate::gpu::{Buffer, Gpu, Kernel, Pipeline, Recorder, Slice, SliceMut, Threads};
+use crate::kernels::{adam, adam_rest};
+use crate::splats::batches::Batch;
+use crate::splats::halves::Bits;
+use crate::{Error, Result};
+
+/// The exponential means of the gradients and of their squares: planes, as the parameters are, in buffers or in slices of
+/// buffers.
+#[derive(Debug)]
+pub enum Moments<P = Buffer<f32>> {
+    /// Both in 32 bits.
+    Single {
+        /// Of the gradients.
+        first: P,
+        /// Of their squares.
+        second: P,
+    },
+    /// Both in the bits of one float: the upper half of the first's bits above that of the second's.
+    Half(P),
+}
+
+impl Moments {
+    /// Zero moments for `len` parameters.
+    ///
+    /// # Errors
+    /// The device is out of memory.
+    pub fn zeros(gpu: &Gpu, len: usize) -> Result<Self> {
+        Self::of(Bits::Single, |name| gpu.zeros(name, len))
+    }
+
+    /// Moments of what makes their planes, by name.
+    pub(crate) fn of(
+        bits: Bits,
+        mut plane: impl FnMut(&'static str) -> Result<Buffer<f32>>,
+    ) -> Result<Self> {
+        Ok(match bits {
+            Bits::Single => {
+                Self::Single { first: plane("first_moments")?, second: plane("second_moments")? }
+            }
+            Bits::Half => Self::Half(plane("moments")?),
+        })
+    }
+
+    /// All of them, for a step of Adam.
+    pub fn slice_mut(&mut self) -> Moments<SliceMut<'_, f32>> {
+        match self {
+            Self::Single { first, second } => {
+                Moments::Single { first: first.slice_mut(), second: second.slice_mut() }
+            }
+            Self::Half(both) => Moments::Half(both.slice_mut()),
+        }
+    }
+
+    /// Those of a batch of Gaussians.
+    ///
+    /// # Errors
+    /// The planes are shorter.
+    pub fn of_batch(&mut self, batch: &Batch) -> Result<Moments<SliceMut<'_, f32>>> {
+        Ok(match self {
+            Self::Single { first, second } => Moments::Single {
+                first: batch.planes_mut(first)?,
+                second: batch.planes_mut(second)?,
+            },
+            Self::Half(both) => Moments::Half(batch.planes_mut(both)?),
+        })
+    }
+}
+
+impl<P> Moments<P> {
+    /// Their planes, by name.
+    pub(crate) fn planes(&self) -> Vec<(&'static str, &P)> {
+        match self {
+            Self::Single { first, second } => {
+                vec![("first_moments", first), ("second_moments", second)]
+            }
+            Self::Half(both) => vec![("moments", both)],
+        }
+    }
+
+    /// Their planes, by name.
+    pub(crate) fn planes_mut(&mut self) -> Vec<(&'static str, &mut P)> {
+        match self {
+            Self::Single { first, second } => {
+                vec![("first_moments", first), ("second_moments", second)]
+            }
+            Self::Half(both) => vec![("moments", both)],
+        }
+    }
+
+    /// Their planes, by name.
+    #[cfg(feature = "io")]
+    pub(crate) fn into_planes(self) -> Vec<(&'static str, P)> {
+        match self {
+            Self::Single { first, second } => {
+                vec![("first_moments", first), ("second_moments", second)]
+            }
+            Self::Half(both) => vec![("moments", both)],
+        }
+    }
+
+    /// In how many bits they are.
+    pub fn bits(&self) -> Bits {
+        match self {
+            Self::Single { .. } => Bits::Single,
+            Self::Half(_) => Bits::Half,
+        }
+    }
+}
+
+impl<'a> Moments<SliceMut<'a, f32>> {
+    /// The same for one use.
+    fn reborrow(&mut self) -> Moments<SliceMut<'_, f32>> {
+        match self {
+            Self::Single { first, second } => {
+                Moments::Single { first: first.reborrow(), second: second.reborrow() }
+            }
+            Self::Half(both) => Moments::Half(both.reborrow()),
+        }
+    }
+
+    /// What a kernel binds: the first, the second, and what holds both; those there are not are empty.
+    fn bindings(self) -> Result<[SliceMut<'a, f32>; 3]> {
+        match self {
+            Self::Single { first, second } => {
+                let len = first.len();
+                let [first, both] = first.split([0..len, 0..0])?;
+                Ok([first, second, both])
+            }
+            Self::Half(both) => {
+                let len = both.len();
+                both.split([0..0, 0..0, 0..len])
+            }
+        }
+    }
+}
+
+/// The planes that a step of [`Adam`] works on; each holds `column_count * gaussian_count` floats or more.
+#[derive(Debug)]
+pub struct AdamBuffers<'a> {
+    /// What is optimised.
+    pub parameters: SliceMut<'a, f32>,
+    /// dL/d parameters; one that is not finite counts as zero.
+    pub gradients: Slice<'a, f32>,
+    /// The moments, updated.
+    pub moments: Moments<SliceMut<'a, f32>>,
+}
+
+impl AdamBuffers<'_> {
+    /// The same for one step of two.
+    pub(crate) fn reborrow(&mut self) -> AdamBuffers<'_> {
+        let Self { parameters, gradients, moments } = self;
+        AdamBuffers {
+            parameters: parameters.reborrow(),
+            gradients: *gradients,
+            moments: moments.reborrow(),
+        }
+    }
+}
+
+/// Adam with beta 0.9 and 0.999, epsilon 1e-15 (Kingma and Ba 2015; the constants of 3DGS).
+#[derive(Debug)]
+pub struct Adam {
+    gpu: Gpu,
+    /// With moments of 32 bits and, once there are any, of 16.
+    floats: [OnceLock<Pipeline<adam::Kernel>>; 2],
+    /// The same for SH coefficients in halves.
+    halves: [OnceLock<Pipeline<adam_rest::Kernel>>; 2],
+}
+
+impl Adam {
+    /// The kernel on this device; those for halves come when there are some.
+    ///
+    /// # Errors
+    /// The device refuses it.
+    pub fn new(gpu: &Gpu) -> Result<Self> {
+        let adam =
+            Self { gpu: gpu.clone(), floats: Default::default(), halves: Default::default() };
+        adam.pipeline(&adam.floats, false, &adam::Constants { half_moments: false })?;
+        Ok(adam)
+    }
+
+    /// Records step number `step`, from 1, over the first `column_count` columns of `gaussian_count` Gaussians, of which
+    /// `feature_count` are features. Nothing changes while the first element of `status`, the sticky word, is not zero.
+    ///
+    /// # Errors
+    /// A buffer is shorter than that, the step is 0, or the device refuses the kernel.
+    pub fn record(
+        &self,
+        pass: &mut Recorder<'_>,
+        step: u64,
+        rates: &LearningRates,
+        [gaussian_count, column_count, feature_count]: [u32; 3],
+        AdamBuffers { parameters, gradients, moments }: AdamBuffers<'_>,
+        status: &Buffer<u32>,
+    ) -> Result<()> {
+        let len = gaussian_count as usize * column_count as usize;
+        check(step, status, [(parameters.as_slice(), len), (gradients, len)], (&moments, len))?;
+        let half_moments = moments.bits() == Bits::Half;
+        let constants = adam::Constants { half_moments };
+        let pipeline = self.pipeline(&self.floats, half_moments, &constants)?;
+        let [first_moments, second_moments, both_moments] = moments.bindings()?;
+        let (uncorrected, second_correction) = corrections(step);
+        pass.dispatch(
+            pipeline,
+            &adam::Params {
+                gaussian_count,
+                column_count,
+                feature_count,
+                second_correction,
+                step: step as u32,
+                rates: rates.0.map(|rate| (rate / uncorrected) as f32),
+            },
+            adam::Buffers {
+                parameters,
+                gradients,
+                first_moments,
+                second_moments,
+                both_moments,
+                status: status.slice(),
+            },
+            Threads::Exactly([(len as u32).div_ceil(4), 1, 1]),
+        )
+    }
+
+    /// The same for SH coefficients in halves, `coefficient_count` of each Gaussian behind `first_column` columns.
+    ///
+    /// # Errors
+    /// As [`Adam::record`].
+    pub fn record_halves(
+        &self,
+        pass: &mut Recorder<'_>,
+        step: u64,
+        rate: f64,
+        [gaussian_count, first_column, coefficient_count]: [u32; 3],
+        AdamBuffers { parameters, gradients, moments }: AdamBuffers<'_>,
+        status: &Buffer<u32>,
+    ) -> Result<()> {
+        let len = |own: u32| gaussian_count as usize * (first_column + own) as usize;
+        let (words, floats) = (len(coefficient_count.div_ceil(2)), len(coefficient_count));
+        let planes = [(parameters.as_slice(), words), (gradients, floats)];
+        check(step, status, planes, (&moments, floats))?;
+        let half_moments = moments.bits() == Bits::Half;
+        let constants = adam_rest::Constants { half_moments };
+        let pipeline = self.pipeline(&self.halves, half_moments, &constants)?;
+        let [first_moments, second_moments, both_moments] = moments.bindings()?;
+        let (uncorrected, second_correction) = corrections(step);
+        pass.dispatch(
+            pipeline,
+            &adam_rest::Params {
+                gaussian_count,
+                first_column,
+                coefficient_count,
+                rate: (rate / uncorrected) as f32,
+                second_correction,
+                step: step as u32,
+            },
+            adam_rest::Buffers {
+                parameters: parameters.words(),
+                gradients,
+                first_moments,
+                second_moments,
+                both_moments: both_moments.words(),
+                status: status.slice(),
+            },
+            Threads::Exactly([gaussian_count * coefficient_count.div_ceil(4), 1, 1]),
+        )
+    }
+
+    fn pipeline<'a, K: Kernel>(
+        &self,
+        pipelines: &'a [OnceLock<Pipeline<K>>; 2],
+        half_moments: bool,
+        constants: &K::Constants,
+    ) -> Result<&'a Pipeline<K>> {
+        let place = &pipelines[usize::from(half_moments)];
+        if let Some(pipeline) = place.get() {
+            return Ok(pipeline);
+        }
+        let pipeline = self.gpu.pipeline(constants)?;
+        Ok(place.get_or_init(|| pipeline))
+    }
+}
+
+/// A kernel that runs beyond a buffer writes into its neighbours: refuse before anything is recorded.
+fn check(
+    step: u64,
+    status: &Buffer<u32>,
+    planes: [(Slice<'_, f32>, usize); 2],
+    (moments, len): (&Moments<SliceMut<'_, f32>>, usize),
+) -> Result<()> {
+    let moments = moments.planes().into_iter().map(|(_, plane)| (plane.as_slice(), len));
+    if let Some((short, needed)) = planes.into_iter().chain(moments).find(|(b, n)| b.len() < *n) {
+        let (name, has) = (short.name(), short.len());
+        let what = format!("buffer `{name}` holds {has} floats, Adam needs {needed}");
+        return Err(Error::Usage(what));
+    }
+    if step == 0 || status.is_empty() {
+        let what = "Adam counts steps from 1 and needs a status word";
+        return Err(Error::Usage(what.to_owned()));
+    }
+    Ok(())
+}
+
+/// 1 - b1^t and 1 / sqrt(1 - b2^t), taken in double precision: 1 - 0.999^t loses four digits to cancellation at t = 1.
+fn corrections(step: u64) -> (f64, f32) {
+    let uncorrected = |beta: f64| 1.0 - beta.powf(step as f64);
+    (uncorrected(0.9), (1.0 / uncorrected(0.999).sqrt()) as f32)
+}

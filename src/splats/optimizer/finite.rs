@@ -1,0 +1,52 @@
+//! Whether what is learned is still numbers.
+
+use crate::gpu::{Buffer, Gpu, Pipeline, Slice, Threads};
+use crate::kernels::first_not_finite;
+use crate::{Error, Result};
+
+/// Looks for NaN and infinity on the device, for a small part of what a step takes.
+#[derive(Debug)]
+pub struct FiniteCheck {
+    pipeline: Pipeline<first_not_finite::Kernel>,
+    /// The least index; [`NONE`] where there is none.
+    first: Buffer<u32>,
+}
+
+const NONE: u32 = u32::MAX;
+
+impl FiniteCheck {
+    /// The kernel on this device.
+    ///
+    /// # Errors
+    /// The device refuses the pipeline.
+    pub fn new(gpu: &Gpu) -> Result<Self> {
+        let pipeline = gpu.pipeline(&first_not_finite::Constants::default())?;
+        Ok(Self { pipeline, first: gpu.uninit("first_not_finite", 1)? })
+    }
+
+    /// The index of the first of `count` values that is not finite.
+    ///
+    /// # Errors
+    /// The buffer holds fewer, or the device was lost.
+    pub fn first<'a>(
+        &mut self,
+        gpu: &Gpu,
+        values: impl Into<Slice<'a, f32>>,
+        count: usize,
+    ) -> Result<Option<usize>> {
+        let values = values.into();
+        if values.len() < count {
+            let (name, has) = (values.name(), values.len());
+            return Err(Error::Usage(format!("buffer `{name}` holds {has} values, not {count}")));
+        }
+        gpu.run("first_not_finite", |pass| {
+            pass.fill(&mut self.first, NONE);
+            let params = first_not_finite::Params { value_count: count as u32 };
+            let buffers = first_not_finite::Buffers { values, first: self.first.slice_mut() };
+            let threads = Threads::Exactly([(count as u32).div_ceil(4), 1, 1]);
+            pass.dispatch(&self.pipeline, &params, buffers, threads)
+        })?;
+        let first = gpu.read(&self.first)?.first().copied();
+        Ok(first.filter(|&first| first != NONE).map(|first| first as usize))
+    }
+}

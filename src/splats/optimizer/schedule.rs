@@ -1,0 +1,297 @@
+//! What changes with the step: learning rates, SH degree, gradient damping, density control.
+
+use std::collections::BTreeMap;
+use std::ops::{Index, IndexMut};
+
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+
+use crate::splats::attributes::{ATTRIBUTES, Attribute};
+
+/// Adam's learning rate of each attribute, by its name in TOML; that of the means in world units.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct LearningRates(pub [f64; ATTRIBUTES.len()]);
+
+impl LearningRates {
+    /// One rate for every column.
+    pub const fn uniform(rate: f64) -> Self {
+        Self([rate; ATTRIBUTES.len()])
+    }
+
+    /// Every rate times `factor`.
+    pub fn scaled(self, factor: f64) -> Self {
+        Self(self.0.map(|rate| factor * rate))
+    }
+}
+
+/// Those of the table.
+impl Default for LearningRates {
+    fn default() -> Self {
+        Self(ATTRIBUTES.each_ref().map(|spec| spec.learning_rate))
+    }
+}
+
+impl Index<Attribute> for LearningRates {
+    type Output = f64;
+
+    fn index(&self, attribute: Attribute) -> &f64 {
+        &self.0[attribute as usize]
+    }
+}
+
+impl IndexMut<Attribute> for LearningRates {
+    fn index_mut(&mut self, attribute: Attribute) -> &mut f64 {
+        &mut self.0[attribute as usize]
+    }
+}
+
+impl Serialize for LearningRates {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_map(ATTRIBUTES.iter().map(|spec| spec.name).zip(self.0))
+    }
+}
+
+impl<'de> Deserialize<'de> for LearningRates {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let mut rates = Self::default();
+        for (name, rate) in BTreeMap::<String, f64>::deserialize(deserializer)? {
+            let spec = ATTRIBUTES.iter().find(|spec| spec.name == name).ok_or_else(|| {
+                let names = ATTRIBUTES.each_ref().map(|spec| spec.name).join(", ");
+                D::Error::custom(format!("unknown attribute `{name}`, expected one of {names}"))
+            })?;
+            rates[spec.attribute] = rate;
+        }
+        Ok(rates)
+    }
+}
+
+/// The schedules as functions of the step, counted from 1. The defaults are those of 3DGS (Kerbl et al. 2023) but for
+/// density control, which begins early, and for the first steps, which see small views.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Schedule {
+    /// The rates at the start; that of the means for a scene of extent 1.
+    pub initial_rates: LearningRates,
+    /// The rate of the means at the end of its decay, for a scene of extent 1.
+    pub final_means_rate: f64,
+    /// The steps over which the rate of the means decays exponentially.
+    pub means_rate_steps: u64,
+    /// All rates but the opacity's begin at this many times themselves
+    pub boost: f64,
+    /// and fall to themselves, exponentially, over so many steps.
+    pub boost_steps: u64,
+    /// The SH degree in use grows by one every so many steps, from 0.
+    pub sh_degree_interval: u64,
+    /// Density control acts after this step,
+    pub densify_after: u64,
+    /// before this one,
+    pub densify_before: u64,
+    /// and every so many steps.
+    pub densify_interval: u64,
+    /// The last steps of a run, a third of it at most: the model settles. There is no density control, and all learning
+    /// rates decay
+    pub settle_steps: u64,
+    /// exponentially, to this part of themselves.
+    pub settle_rate: f64,
+    /// Views are a quarter of their width and height before the first of these steps, half before the second.
+    pub resolution_steps: [u64; 2],
+    /// The weight of the near-camera damping is 1 before the first of these steps, 1/2 before the second, then 0.
+    pub damping_steps: [u64; 2],
+}
+
+impl Default for Schedule {
+    fn default() -> Self {
+        Self {
+            initial_rates: LearningRates::default(),
+            final_means_rate: 1.6e-6,
+            means_rate_steps: 30_000,
+            boost: 4.0,
+            boost_steps: 600,
+            sh_degree_interval: 1_000,
+            densify_after: 50,
+            densify_before: 3_000,
+            densify_interval: 100,
+            settle_steps: 0,
+            settle_rate: 0.05,
+            resolution_steps: [0, 200],
+            damping_steps: [4_000, 7_000],
+        }
+    }
+}
+
+impl Schedule {
+    /// Density control acts between steps 500 and 5 000, every 200 steps, and every step sees whole views (LITA-GS).
+    pub fn paper() -> Self {
+        Self {
+            boost: 1.0,
+            boost_steps: 0,
+            densify_after: 500,
+            densify_before: 5_000,
+            densify_interval: 200,
+            resolution_steps: [0, 0],
+            ..Self::default()
+        }
+    }
+
+    /// The rates of `step` in a scene of `extent`: the means' decay log-linearly, the others stay.
+    pub fn learning_rates(&self, step: u64, extent: f64) -> LearningRates {
+        let done = (step as f64 / self.means_rate_steps.max(1) as f64).min(1.0);
+        let mut rates = self.initial_rates;
+        let decay = (self.final_means_rate / rates[Attribute::Means]).powf(done);
+        rates[Attribute::Means] = rates[Attribute::Means] * decay * extent;
+        let left = 1.0 - (step as f64 / self.boost_steps.max(1) as f64).min(1.0);
+        if left > 0.0 {
+            let boost = self.boost.powf(left);
+            let opacity = rates[Attribute::RawOpacities];
+            rates.0.iter_mut().for_each(|rate| *rate *= boost);
+            rates[Attribute::RawOpacities] = opacity;
+        }
+        rates
+    }
+
+    /// The SH degree that `step` trains, at most `max`.
+    pub fn sh_degree(&self, step: u64, max: u32) -> u32 {
+        let degree = step / self.sh_degree_interval.max(1);
+        degree.min(u64::from(max)) as u32
+    }
+
+    /// Whether density control acts at the end of `step`.
+    pub fn densifies_at(&self, step: u64) -> bool {
+        step > self.densify_after
+            && step < self.densify_before
+            && step.is_multiple_of(self.densify_interval.max(1))
+    }
+
+    /// The step behind which density control acts first, if it ever does.
+    pub fn first_round(&self) -> u64 {
+        let interval = self.densify_interval.max(1);
+        (self.densify_after / interval).saturating_add(1).saturating_mul(interval)
+    }
+
+    /// What learning rates are multiplied by after this share of the settling phase.
+    pub fn settling_rate(&self, done: f64) -> f64 {
+        self.settle_rate.powf(done.clamp(0.0, 1.0))
+    }
+
+    /// How often the views of `step` are halved.
+    pub fn resolution_level(&self, step: u64) -> usize {
+        match self.resolution_steps {
+            [quarter, _] if step < quarter => 2,
+            [_, half] if step < half => 1,
+            _ => 0,
+        }
+    }
+
+    /// How many levels of resolution the steps use.
+    pub fn resolution_levels(&self) -> usize {
+        1 + self.resolution_level(1)
+    }
+
+    /// The number of rounds of density control from the end of `step` on, one there included, where none comes after
+    /// step `last`.
+    pub fn rounds_left(&self, step: u64, last: u64) -> u64 {
+        let interval = self.densify_interval.max(1);
+        self.densify_before.saturating_sub(1).min(last).saturating_sub(step) / interval + 1
+    }
+
+    /// The weight w of the near-camera damping of the screen gradients that density control reads: they are
+    /// multiplied by w min(1, (z / extent)^2) + 1 - w (Pixel-GS).
+    pub fn damping_weight(&self, step: u64) -> f32 {
+        match self.damping_steps {
+            [full, _] if step < full => 1.0,
+            [_, half] if step < half => 0.5,
+            _ => 0.0,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_means_rate_decays_a_hundredfold_and_stays() {
+        let schedule = Schedule::paper();
+        let rate = |step| schedule.learning_rates(step, 2.0)[Attribute::Means];
+        assert!((rate(0) - 3.2e-4).abs() < 1e-12);
+        assert!((rate(15_000) - 3.2e-5).abs() < 1e-12);
+        assert!((rate(30_000) - 3.2e-6).abs() < 1e-12);
+        assert!((rate(90_000) - 3.2e-6).abs() < 1e-12);
+        assert_eq!(schedule.learning_rates(7, 2.0)[Attribute::Quats], 0.001);
+    }
+
+    #[test]
+    fn the_sh_degree_grows_every_thousand_steps() {
+        let schedule = Schedule::default();
+        let degrees =
+            [1, 999, 1_000, 2_999, 3_000, 100_000].map(|step| schedule.sh_degree(step, 3));
+        assert_eq!(degrees, [0, 0, 1, 2, 3, 3]);
+        assert_eq!(schedule.sh_degree(5_000, 1), 1);
+    }
+
+    #[test]
+    fn density_control_acts_strictly_inside_its_window() {
+        let schedule = Schedule::paper();
+        let steps: Vec<u64> = (0..=6_000).filter(|&step| schedule.densifies_at(step)).collect();
+        assert_eq!((steps[0], steps[1], *steps.last().unwrap()), (600, 800, 4_800));
+        assert!(!Schedule { densify_after: 600, ..schedule.clone() }.densifies_at(600));
+        for (densify_after, densify_interval) in [(500, 200), (600, 200), (50, 100), (0, 1), (7, 0)]
+        {
+            let schedule = Schedule { densify_after, densify_interval, ..schedule.clone() };
+            let first = (1..).find(|&step| schedule.densifies_at(step));
+            assert_eq!(first, Some(schedule.first_round()));
+        }
+    }
+
+    #[test]
+    fn the_rounds_left_fall_to_one() {
+        let schedule = Schedule::paper();
+        assert_eq!(
+            [600, 800, 4_600, 4_800].map(|step| schedule.rounds_left(step, 9_000)),
+            [22, 21, 2, 1]
+        );
+        assert_eq!([600, 800].map(|step| schedule.rounds_left(step, 1_100)), [3, 2]);
+    }
+
+    #[test]
+    fn a_boost_fades_and_leaves_the_rates_as_they_are() {
+        let schedule = Schedule { boost: 4.0, boost_steps: 100, ..Schedule::paper() };
+        let rate = |step| schedule.learning_rates(step, 1.0)[Attribute::Quats];
+        assert_eq!(schedule.learning_rates(0, 1.0)[Attribute::RawOpacities], 0.05);
+        assert!((rate(0) - 0.004).abs() < 1e-12 && (rate(50) - 0.002).abs() < 1e-12);
+        for step in [100, 5_000] {
+            assert_eq!(
+                schedule.learning_rates(step, 1.0),
+                Schedule::paper().learning_rates(step, 1.0)
+            );
+        }
+    }
+
+    #[test]
+    fn views_grow_to_their_size() {
+        let schedule = Schedule { resolution_steps: [10, 20], ..Schedule::paper() };
+        assert_eq!([1, 9, 10, 19, 20].map(|step| schedule.resolution_level(step)), [2, 2, 1, 1, 0]);
+        assert_eq!((schedule.resolution_levels(), Schedule::paper().resolution_levels()), (3, 1));
+    }
+
+    #[test]
+    fn damping_fades_in_two_steps() {
+        let schedule = Schedule::default();
+        let weights = [1, 3_999, 4_000, 6_999, 7_000].map(|step| schedule.damping_weight(step));
+        assert_eq!(weights, [1.0, 1.0, 0.5, 0.5, 0.0]);
+    }
+
+    #[test]
+    fn an_interval_of_zero_does_not_divide_by_zero() {
+        let schedule = Schedule {
+            means_rate_steps: 0,
+            sh_degree_interval: 0,
+            densify_interval: 0,
+            ..Default::default()
+        };
+        assert!(schedule.learning_rates(1, 1.0)[Attribute::Means].is_finite());
+        assert_eq!(schedule.sh_degree(2, 3), 2);
+        assert!(schedule.densifies_at(501));
+        assert!(schedule.rounds_left(1, 1) > 0);
+    }
+}

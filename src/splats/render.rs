@@ -1,0 +1,511 @@
+//! The differentiable rasteriser: Gaussians and a camera in, a render out; its gradient in, theirs out.
+//!
+//! ```text
+//! project -> sort by depth -> order_counts -> emit -> sort by tile -> blend_forward
+//!     -> [loss] -> blend_backward -> project_backward
+//! ```
+//!
+//! Counts stay on the device. Where the intersections of a view exceed the memory reserved for them, a status flag is
+//! raised, nothing is rendered or updated, and the host grows the buffers and redoes the step ([`Renderer::grow`]).
+
+mod cameras;
+mod frame;
+mod limits;
+mod pictures;
+mod room;
+mod settings;
+
+use std::collections::BTreeMap;
+
+use glam::{UVec2, Vec2};
+
+use crate::camera::CameraModel;
+use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Statistic, Threads, Tile};
+use crate::kernels::project::DEPTH_BITS;
+use crate::kernels::splat::MAX_CHANNELS;
+use crate::kernels::{
+    self, blend_backward, blend_forward, emit, order_counts, project, project_backward,
+};
+use crate::splats::batches::Batches;
+use crate::splats::halves::Bits;
+use crate::splats::scene::{Shape, width};
+use crate::splats::sort::{Count, RadixSort};
+use crate::{Error, Result};
+
+pub use cameras::{Viewpoint, Viewpoints};
+#[doc(hidden)]
+pub use frame::Frame;
+pub use frame::Status;
+use frame::{RANKS_PER_PARTITION, color_vectors};
+use limits::{longest_run, splats_per_turn};
+pub use settings::RenderSettings;
+
+/// What changes from render to render.
+#[derive(Clone, Copy, Debug)]
+pub struct RenderOptions {
+    /// Degree of the spherical harmonics used, at most the one stored.
+    pub sh_degree: u32,
+    /// What is seen where no splat is, RGB; features are zero there.
+    pub background: [f32; 3],
+}
+
+/// How the screen-space gradient enters the statistics of density control.
+#[derive(Clone, Copy, Debug)]
+pub struct Damping {
+    /// 0 to 1: the fraction that is damped.
+    pub weight: f32,
+    /// Depth from which nothing is damped, in world units.
+    pub depth: f32,
+}
+
+/// Where the backward pass leaves its results, each for all Gaussians.
+#[derive(Debug)]
+pub struct Gradients<'a> {
+    /// (columns x Gaussians): gradient of every parameter.
+    pub parameters: &'a mut Buffer<f32>,
+    /// (Gaussians): sums of the norms of the screen-space gradients in normalised device units.
+    pub grad_norm_sums: &'a mut Buffer<f32>,
+    /// (Gaussians): in how many steps each was seen.
+    pub visit_counts: &'a mut Buffer<u32>,
+}
+
+/// Renders Gaussians, forward and backward. Holds the memory of one view.
+///
+/// ```no_run
+/// use nightsplat::photographs::dataset::{Dataset, LoadOptions};
+/// use nightsplat::gpu::{DeviceChoice, Gpu};
+/// use nightsplat::splats::render::{RenderOptions, RenderSettings, Renderer};
+/// use nightsplat::splats::scene::ply;
+///
+/// let gpu = Gpu::new(&DeviceChoice::Best)?;
+/// let camera = Dataset::load("photos", &LoadOptions::default())?.views[0].camera;
+/// let gaussians = ply::load("run/model.ply")?;
+/// let settings = RenderSettings { shape: gaussians.shape, ..RenderSettings::default() };
+/// let mut renderer = Renderer::new(&gpu, settings)?;
+/// let parameters = gaussians.upload(&gpu)?;
+/// renderer.reserve(gaussians.count, [&camera])?;
+/// let options = RenderOptions { sh_degree: gaussians.shape.sh_degree, background: [0.0; 3] };
+/// renderer.render_image(&parameters, &camera, &options)?.save_png8("view.png")?;
+/// # Ok::<(), nightsplat::Error>(())
+/// ```
+#[derive(Debug)]
+pub struct Renderer {
+    gpu: Gpu,
+    settings: RenderSettings,
+    tile: Tile,
+    /// The most splats of one tile that the blending kernels follow.
+    longest_run: u32,
+    /// By camera model; those of a model come with the first view of it, a pinhole's at once.
+    projections: BTreeMap<u32, Projections>,
+    order_counts: Pipeline<order_counts::Kernel>,
+    emit: Pipeline<emit::Kernel>,
+    blend_forward: Pipeline<blend_forward::Kernel>,
+    blend_backward: Pipeline<blend_backward::Kernel>,
+    depth_sort: RadixSort,
+    tile_sort: RadixSort,
+    frame: Frame,
+}
+
+impl Renderer {
+    /// Builds the kernels; memory comes with [`Renderer::reserve`].
+    ///
+    /// # Errors
+    /// The driver refuses a kernel, or the tile does not suit the device.
+    pub fn new(gpu: &Gpu, settings: RenderSettings) -> Result<Self> {
+        let tile = settings.tile_on(gpu)?;
+        let Tile { size: [tile_width, tile_height], subgroups: subgroups_per_tile } = tile;
+        let channels = settings.channels() as u32;
+        let (alpha_max, partition_size) = (settings.max_alpha, RANKS_PER_PARTITION);
+        let pinhole = CameraModel::Pinhole.number();
+        let projections = Projections::new(gpu, &settings, tile.size, pinhole)?;
+        let shaping_channels = settings.shaping_channels();
+        let (skips_groups, splats_per_turn) = (!gpu.properties().is_cpu, splats_per_turn(gpu));
+        // What every kernel that includes `splat.glsl` is specialised with, and what some are beside it.
+        macro_rules! constants {
+            ($kernel:ident $(, $own:ident)*) => {
+                $kernel::Constants { alpha_max, channels, tile_width, tile_height, $($own,)* }
+            };
+        }
+        Ok(Self {
+            gpu: gpu.clone(),
+            settings,
+            tile,
+            longest_run: longest_run(gpu),
+            projections: BTreeMap::from([(pinhole, projections)]),
+            order_counts: gpu.pipeline(&order_counts::Constants { partition_size })?,
+            emit: gpu.pipeline(&constants!(emit, partition_size))?,
+            blend_forward: gpu.pipeline(&constants!(
+                blend_forward,
+                skips_groups,
+                splats_per_turn,
+                subgroups_per_tile
+            ))?,
+            blend_backward: gpu.pipeline(&constants!(
+                blend_backward,
+                shaping_channels,
+                skips_groups,
+                splats_per_turn,
+                subgroups_per_tile
+            ))?,
+            depth_sort: RadixSort::new(gpu, 0)?,
+            tile_sort: RadixSort::new(gpu, 0)?,
+            frame: Frame::new(gpu, settings.channels())?,
+        })
+    }
+
+    /// Renders Gaussians of another SH degree from now on.
+    ///
+    /// # Errors
+    /// The driver refuses a kernel; the renderer is as it was.
+    pub fn set_sh_degree(&mut self, sh_degree: u32) -> Result<()> {
+        if sh_degree == self.settings.shape.sh_degree {
+            return Ok(());
+        }
+        let shape = Shape { sh_degree, ..self.settings.shape };
+        let settings = RenderSettings { shape, ..self.settings };
+        let own = |&model: &u32| {
+            Ok((model, Projections::new(&self.gpu, &settings, self.tile.size, model)?))
+        };
+        self.projections = self.projections.keys().map(own).collect::<Result<_>>()?;
+        self.settings = settings;
+        Ok(())
+    }
+
+    /// How many intersections the last render had; waits for it.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub fn intersections(&self) -> Result<u32> {
+        Ok(self.gpu.read(&self.frame.counts)?[0])
+    }
+
+    /// The last render, planar (channels, H, W): RGB, then the features.
+    pub fn render(&self) -> &Buffer<f32> {
+        &self.frame.render
+    }
+
+    /// How much of the background the last render lets through, (H, W): 1 where no splat is.
+    pub fn transmittances(&self) -> &Buffer<f32> {
+        &self.frame.transmittances
+    }
+
+    /// What the driver tells of the blend kernels, forward and backward; none where it tells nothing.
+    ///
+    /// # Errors
+    /// The driver refuses a kernel.
+    pub fn blend_statistics(&self) -> Result<Option<[Vec<Statistic>; 2]>> {
+        let forward = self.blend_forward.statistics()?;
+        Ok(forward.zip(self.blend_backward.statistics()?).map(<[_; 2]>::from))
+    }
+
+    /// Everything that the passes of the last render handed each other.
+    #[doc(hidden)]
+    pub fn frame(&self) -> &Frame {
+        &self.frame
+    }
+
+    /// The status words: see [`Status`]. Kernels that change parameters look at the first and do nothing unless it is 0.
+    pub fn status(&self) -> &Buffer<u32> {
+        &self.frame.status
+    }
+
+    /// The last render and the status words, for a loss that reads the one and raises flags in the other.
+    pub fn render_and_status(&mut self) -> (&Buffer<f32>, &mut Buffer<u32>) {
+        (&self.frame.render, &mut self.frame.status)
+    }
+
+    /// What to say of a view whose [`Status::crowd`] is too large for this device.
+    pub fn too_crowded(&self, view: String, splats: u32) -> Error {
+        let [width, height] = self.tile.size;
+        let (tile, device) = (format!("{width}x{height}"), self.gpu.properties().name.clone());
+        Error::Crowded { view, splats, tile, device, limit: self.longest_run }
+    }
+
+    /// Lowers every flag of the status.
+    pub fn clear_status(&mut self, pass: &mut Recorder<'_>) {
+        pass.fill(&mut self.frame.status, 0);
+    }
+
+    /// Records the render of `gaussians` (planes of all attributes, in [`Batches`]) as a camera sees them, or a patch of what it
+    /// sees. The first view of a camera model builds the kernels for it.
+    ///
+    /// # Errors
+    /// The image exceeds what was reserved, a pass exceeds what the device launches, or the driver refuses a kernel.
+    pub fn forward<'a>(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        gaussians: &Buffer<f32>,
+        viewpoint: impl Into<Viewpoint<'a>>,
+        options: &RenderOptions,
+    ) -> Result<()> {
+        let viewpoint = viewpoint.into();
+        let view = self.view(&viewpoint)?;
+        if viewpoint.on_device.is_none() {
+            pass.update(&mut self.frame.camera, &[(&viewpoint.patch).into()])?;
+        }
+        self.record_project(pass, gaussians, &view, options.sh_degree)?;
+        self.record_bins(pass, &view)?;
+        let mut background = [0.0; MAX_CHANNELS as usize];
+        background[..3].copy_from_slice(&options.background);
+        let frame = &mut self.frame;
+        pass.dispatch(
+            &self.blend_forward,
+            &blend_forward::Params {
+                size: view.size,
+                tile_columns: view.tiles.x,
+                longest_run: self.longest_run,
+                background,
+            },
+            blend_forward::Buffers {
+                counts: frame.counts.slice(),
+                sorted_slots: frame.slots.slice(),
+                owners: frame.owners.slice(),
+                splats: frame.splats.slice(),
+                colors: frame.colors.slice(),
+                render: frame.render.slice_mut(),
+                transmittances: frame.transmittances.slice_mut(),
+                sorted_tiles: frame.tiles.slice(),
+                tile_ranges: frame.tile_ranges.slice_mut(),
+                status: frame.status.slice_mut(),
+            },
+            Threads::Workgroups([view.tile_count(), 1, 1]),
+        )
+    }
+
+    /// Records the gradients of the Gaussians, given `d_render`, that of the render recorded last (channels, H, W), which was
+    /// of the same viewpoint.
+    ///
+    /// # Errors
+    /// A pass exceeds what the device launches.
+    #[expect(clippy::too_many_arguments, reason = "what the forward pass takes, and its gradient")]
+    pub fn backward<'a>(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        gaussians: &Buffer<f32>,
+        viewpoint: impl Into<Viewpoint<'a>>,
+        options: &RenderOptions,
+        damping: Damping,
+        d_render: &Buffer<f32>,
+        gradients: Gradients<'_>,
+    ) -> Result<()> {
+        let view = self.view(&viewpoint.into())?;
+        let color_vectors = color_vectors(self.settings.channels());
+        let frame = &mut self.frame;
+        pass.dispatch(
+            &self.blend_backward,
+            &blend_backward::Params { size: view.size, tile_columns: view.tiles.x },
+            blend_backward::Buffers {
+                tile_ranges: frame.tile_ranges.slice(),
+                sorted_slots: frame.slots.slice(),
+                owners: frame.owners.slice(),
+                splats: frame.splats.slice(),
+                colors: frame.colors.slice(),
+                render: frame.render.slice(),
+                d_render: d_render.slice(),
+                records: frame.records.slice_mut(),
+            },
+            Threads::Workgroups([view.tile_count(), 1, 1]),
+        )?;
+        let parameter_columns = self.parameter_columns();
+        let project_backward = &self.projections[&view.model].backward;
+        for batch in self.batches().iter() {
+            let gaussian_count = batch.gaussian_count();
+            let frame = &mut self.frame;
+            pass.dispatch(
+                project_backward,
+                &project_backward::Params {
+                    camera_index: view.camera_index,
+                    half_view: view.half_view,
+                    gaussian_count,
+                    sh_degree: options.sh_degree,
+                    damping_weight: damping.weight,
+                    damping_depth: damping.depth,
+                },
+                project_backward::Buffers {
+                    parameters: batch.rows(gaussians, parameter_columns)?,
+                    splats: batch.rows(&frame.splats, 1)?,
+                    colors: batch.rows(&frame.colors, color_vectors)?,
+                    tile_counts: batch.rows(&frame.tile_counts, 1)?,
+                    emitted: batch.rows(&frame.emitted, 1)?,
+                    records: frame.records.slice(),
+                    status: frame.status.slice_mut(),
+                    gradients: batch.planes_mut(&mut *gradients.parameters)?,
+                    grad_norm_sums: batch.rows_mut(&mut *gradients.grad_norm_sums, 1)?,
+                    visit_counts: batch.rows_mut(&mut *gradients.visit_counts, 1)?,
+                    cameras: view.cameras.unwrap_or(&frame.camera).slice(),
+                },
+                Threads::Exactly([gaussian_count, 1, 1]),
+            )?;
+        }
+        Ok(())
+    }
+
+    fn record_project(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        gaussians: &Buffer<f32>,
+        view: &View<'_>,
+        sh_degree: u32,
+    ) -> Result<()> {
+        let color_vectors = color_vectors(self.settings.channels());
+        let parameter_columns = self.parameter_columns();
+        let (batches, frame) = (self.batches(), &mut self.frame);
+        let project = &self.projections[&view.model].forward;
+        batches.iter().try_for_each(|batch| {
+            pass.dispatch(
+                project,
+                &project::Params {
+                    camera_index: view.camera_index,
+                    near: self.settings.near,
+                    gaussian_count: batch.gaussian_count(),
+                    sh_degree,
+                    first_gaussian: batch.first_gaussian(),
+                },
+                project::Buffers {
+                    parameters: batch.rows(gaussians, parameter_columns)?,
+                    splats: batch.rows_mut(&mut frame.splats, 1)?,
+                    colors: batch.rows_mut(&mut frame.colors, color_vectors)?,
+                    depth_keys: batch.rows_mut(&mut frame.depth_keys, 1)?,
+                    ids: batch.rows_mut(&mut frame.ids, 1)?,
+                    tile_counts: batch.rows_mut(&mut frame.tile_counts, 1)?,
+                    cameras: view.cameras.unwrap_or(&frame.camera).slice(),
+                },
+                Threads::Exactly([batch.gaussian_count(), 1, 1]),
+            )
+        })
+    }
+
+    /// How those that render lie in the buffers of their planes.
+    /// Words per Gaussian of what is rendered.
+    fn parameter_columns(&self) -> usize {
+        let RenderSettings { shape, rest, .. } = self.settings;
+        rest.columns([width(shape), shape.features.width()])
+    }
+
+    fn batches(&self) -> Batches {
+        let (count, shape) = (self.frame.gaussian_count as usize, self.settings.shape);
+        Batches::new(&self.gpu, count, [width(shape), shape.features.width()])
+    }
+
+    /// From projected splats to each tile's list of them, front to back.
+    fn record_bins(&mut self, pass: &mut Recorder<'_>, view: &View<'_>) -> Result<()> {
+        let frame = &mut self.frame;
+        let gaussian_count = frame.gaussian_count;
+        let all = Count { counts: &frame.gaussian_counts, index: 0 };
+        self.depth_sort.record(pass, all, &mut frame.depth_keys, &mut frame.ids, DEPTH_BITS)?;
+        pass.dispatch(
+            &self.order_counts,
+            &order_counts::Params { gaussian_count, capacity: frame.intersection_capacity() },
+            order_counts::Buffers {
+                sorted_ids: frame.ids.slice(),
+                tile_counts: frame.tile_counts.slice(),
+                slots_before: frame.slots_before.slice_mut(),
+                sums: frame.sums.slice_mut(),
+                counts: frame.counts.slice_mut(),
+                status: frame.status.slice_mut(),
+                arrivals: frame.arrivals.slice_mut(),
+            },
+            Threads::Workgroups([gaussian_count.div_ceil(RANKS_PER_PARTITION).max(1), 1, 1]),
+        )?;
+        pass.dispatch(
+            &self.emit,
+            &emit::Params { size: view.size, gaussian_count, tile_columns: view.tiles.x },
+            emit::Buffers {
+                counts: frame.counts.slice(),
+                sorted_ids: frame.ids.slice(),
+                tile_counts: frame.tile_counts.slice(),
+                slots_before: frame.slots_before.slice(),
+                sums: frame.sums.slice(),
+                splats: frame.splats.slice(),
+                tiles: frame.tiles.slice_mut(),
+                slots: frame.slots.slice_mut(),
+                owners: frame.owners.slice_mut(),
+                emitted: frame.emitted.slice_mut(),
+            },
+            Threads::Exactly([gaussian_count, 1, 1]),
+        )?;
+        let emitted = Count { counts: &frame.counts, index: 0 };
+        // One value more than there are tiles: padding sorts behind them all.
+        let bits = u32::BITS - view.tile_count().leading_zeros();
+        self.tile_sort.record(pass, emitted, &mut frame.tiles, &mut frame.slots, bits)
+    }
+
+    /// Columns and rows of tiles.
+    fn tiles(&self, size: UVec2) -> UVec2 {
+        let tile = UVec2::from(self.tile.size);
+        (size + tile - 1) / tile
+    }
+
+    fn view<'a>(&mut self, viewpoint: &Viewpoint<'a>) -> Result<View<'a>> {
+        let Viewpoint { patch, on_device } = viewpoint;
+        let tiles = self.tiles(patch.size);
+        if self.settings.channels() * patch.pixel_count() > self.frame.render.len()
+            || (tiles.x * tiles.y) as usize > self.frame.tile_ranges.len()
+        {
+            let UVec2 { x: width, y: height } = patch.size;
+            let what = format!("a {width}x{height} image exceeds what the renderer reserved");
+            return Err(Error::Usage(what));
+        }
+        let model = patch.camera.model.number();
+        if !self.projections.contains_key(&model) {
+            let own = Projections::new(&self.gpu, &self.settings, self.tile.size, model)?;
+            self.projections.insert(model, own);
+        }
+        let (cameras, camera_index) = on_device.unzip();
+        let camera_index = camera_index.unwrap_or_default();
+        let (size, half_view) = (patch.size, patch.half_view());
+        Ok(View { model, cameras, camera_index, size, half_view, tiles })
+    }
+}
+
+/// The kernels that read Gaussians and camera: of all kernels these alone know the SH degree and the camera model.
+#[derive(Debug)]
+struct Projections {
+    forward: Pipeline<project::Kernel>,
+    backward: Pipeline<project_backward::Kernel>,
+}
+
+impl Projections {
+    fn new(
+        gpu: &Gpu,
+        settings: &RenderSettings,
+        [tile_width, tile_height]: [u32; 2],
+        camera_model: u32,
+    ) -> Result<Self> {
+        let (channels, alpha_max) = (settings.channels() as u32, settings.max_alpha);
+        let (sh_degree, raw_colors) = (settings.shape.sh_degree, settings.raw_colors);
+        let half_rest = settings.rest == Bits::Half;
+        macro_rules! pipeline {
+            ($kernel:ident) => {
+                gpu.pipeline(&$kernel::Constants {
+                    channels,
+                    alpha_max,
+                    tile_width,
+                    tile_height,
+                    sh_degree,
+                    raw_colors,
+                    half_rest,
+                    camera_model,
+                })?
+            };
+        }
+        Ok(Self { forward: pipeline!(project), backward: pipeline!(project_backward) })
+    }
+}
+
+/// A viewpoint as the kernels take it, and the columns and rows of tiles of its image.
+struct View<'a> {
+    model: u32,
+    /// None: those of the renderer.
+    cameras: Option<&'a Buffer<kernels::Camera>>,
+    camera_index: u32,
+    size: UVec2,
+    half_view: Vec2,
+    tiles: UVec2,
+}
+
+impl View<'_> {
+    fn tile_count(&self) -> u32 {
+        self.tiles.x * self.tiles.y
+    }
+}

@@ -1,0 +1,110 @@
+//! How far kernels get on a device that ends loops after so many turns.
+
+use glam::{UVec2, Vec3};
+
+use super::RenderSettings;
+use super::frame::color_vectors;
+use crate::gpu::{Gpu, Properties, Tile};
+use crate::kernels::ProjectedSplat;
+use crate::{Error, Result};
+
+/// How many splats the blending kernels take in one turn of their inner loop. A device that ends loops after so many turns
+/// follows a hundred thousand splats on a tile with two; one and four were measured slower there.
+pub(super) fn splats_per_turn(gpu: &Gpu) -> u32 {
+    if gpu.properties().max_loop_iterations < u32::MAX { 2 } else { 1 }
+}
+
+impl RenderSettings {
+    /// Whether a view of this size is rendered and trained on at once: this device can, and nobody asked for less.
+    pub(crate) fn takes_at_once(&self, gpu: &Gpu, size: UVec2) -> bool {
+        let pixels = u64::from(size.x) * u64::from(size.y);
+        self.patch_pixels.is_none_or(|most| pixels <= most) && self.suits(gpu, size)
+    }
+
+    /// The most Gaussians that this device can render and train: some passes read the splat and the colour of any of them,
+    /// which one binding has to hold. What else there is of them is bound in [`Batches`](crate::splats::batches::Batches).
+    pub fn most_gaussians(&self, gpu: &Gpu) -> usize {
+        let color = color_vectors(self.channels()) * size_of::<Vec3>();
+        let bytes = size_of::<ProjectedSplat>().max(color) as u64;
+        (gpu.properties().max_storage_buffer_range / bytes).min(u32::MAX.into()) as usize
+    }
+
+    /// The tile for views of these sizes: that of [`RenderSettings::tile_on`], twice and more as high where nothing names a
+    /// tile and the device could not follow so many of them.
+    ///
+    /// # Errors
+    /// As there.
+    pub fn tile_for(
+        &self,
+        gpu: &Gpu,
+        sizes: impl Iterator<Item = [u32; 2]> + Clone,
+    ) -> Result<Tile> {
+        let mut tile = self.tile_on(gpu)?;
+        let count = |[width, height]: [u32; 2], tile: Tile| {
+            width.div_ceil(tile.size[0]) as usize * height.div_ceil(tile.size[1]) as usize
+        };
+        let most = most_tiles(gpu);
+        while self.tile.is_none() && sizes.clone().any(|size| count(size, tile) > most) {
+            let higher = Tile { size: [tile.size[0], 2 * tile.size[1]], ..tile };
+            if !gpu.properties().suits_tile(higher) {
+                break;
+            }
+            tile = higher;
+        }
+        Ok(tile)
+    }
+
+    /// Whether this device can render and train on a view of this size.
+    pub(crate) fn suits(&self, gpu: &Gpu, size: UVec2) -> bool {
+        self.check_size(gpu, "", size.to_array()).is_ok()
+    }
+
+    /// Refuses a view that this device cannot render and train on, from its size alone.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] names the view, the limit, and the longest side that it leaves; the tile does not suit the device.
+    pub fn check_size(&self, gpu: &Gpu, view: &str, [width, height]: [u32; 2]) -> Result<()> {
+        let Properties { name: device, max_storage_buffer_range: bindable, .. } = gpu.properties();
+        let [tile_width, tile_height] = self.tile_for(gpu, std::iter::once([width, height]))?.size;
+        let bytes_per_pixel = (self.channels() * size_of::<f32>()) as u64;
+        let bytes = u64::from(width) * u64::from(height) * bytes_per_pixel;
+        let tiles = u64::from(width.div_ceil(tile_width)) * u64::from(height.div_ceil(tile_height));
+        let most = most_tiles(gpu) as u64;
+        let (excess, what) = if bytes > *bindable {
+            let what = format!("its render takes {bytes} bytes, {device} binds {bindable} at most");
+            (bytes as f64 / *bindable as f64, what)
+        } else if tiles > most {
+            let what = format!(
+                "it has {tiles} tiles of {tile_width}x{tile_height} pixels, {device} follows {most}"
+            );
+            (tiles as f64 / most as f64, what)
+        } else {
+            return Ok(());
+        };
+        // A side is rounded, and so are tiles.
+        let longest = 0.99 * f64::from(width.max(height)) / excess.sqrt();
+        Err(Error::Usage(format!(
+            "view {view} is {width}x{height}: {what}; lower `TrainConfig::max_resolution` to {longest:.0}"
+        )))
+    }
+}
+
+/// Turns of a kernel's loops beside those that are counted.
+const SOME_TURNS: u32 = 64;
+
+/// How many tiles a view may have: where every Gaussian of a subgroup covers all of them, `project_backward` makes as
+/// many turns as there are tiles, its lanes taking turns at each; `emit` makes fewer.
+pub(super) fn most_tiles(gpu: &Gpu) -> usize {
+    let Properties { max_loop_iterations, subgroup_size, .. } = *gpu.properties();
+    let turns_of_owners = 2 * subgroup_size;
+    (max_loop_iterations - SOME_TURNS - turns_of_owners) as usize
+}
+
+/// How many splats of a tile the blending kernels get through: of a subgroup of splats they make one turn of the
+/// outer loop and the turns of the inner one; some more find the run, and end a loop.
+pub(super) fn longest_run(gpu: &Gpu) -> u32 {
+    let properties = gpu.properties();
+    let lanes = properties.subgroup_size;
+    let turns_per_batch = 1 + lanes.div_ceil(splats_per_turn(gpu));
+    ((properties.max_loop_iterations - SOME_TURNS) / turns_per_batch).saturating_mul(lanes)
+}

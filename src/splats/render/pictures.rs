@@ -1,0 +1,161 @@
+//! Renders to the host: as much at once as the device takes, patch by patch where that is less than the view.
+
+use glam::UVec2;
+
+use super::{RenderOptions, RenderSettings, Renderer, Status};
+use crate::Result;
+use crate::camera::{Camera, Patch};
+use crate::gpu::Buffer;
+use crate::photographs::image::Image;
+
+impl Renderer {
+    /// What a view is rendered in: all of it where the device takes that at once, else patches that it takes.
+    pub fn patches(&self, camera: &Camera) -> Vec<Patch> {
+        self.patches_with_margin(camera, 0, |_| true)
+    }
+
+    /// The same where around each patch as many pixels of its neighbours are rendered, and the whole suits others, too.
+    pub(crate) fn patches_with_margin(
+        &self,
+        camera: &Camera,
+        margin: u32,
+        suits: impl Fn(UVec2) -> bool,
+    ) -> Vec<Patch> {
+        let settings = RenderSettings { tile: Some(self.tile), ..self.settings };
+        let whole = Patch::from(camera).size;
+        camera.patches(|size| {
+            let around = size.saturating_add(UVec2::splat(2 * margin)).min(whole);
+            let is_small = settings.takes_at_once(&self.gpu, size);
+            is_small && settings.suits(&self.gpu, around) && suits(around)
+        })
+    }
+
+    /// Renders to the host; grows the memory as the view demands.
+    ///
+    /// # Errors
+    /// The image exceeds what was reserved, or the device is out of memory or lost.
+    pub fn render_image(
+        &mut self,
+        gaussians: &Buffer<f32>,
+        camera: &Camera,
+        options: &RenderOptions,
+    ) -> Result<Image> {
+        let mut data = self.render_planes(gaussians, camera, options)?;
+        let Camera { width, height, .. } = *camera;
+        data.truncate(3 * width as usize * height as usize);
+        Ok(Image { width, height, data })
+    }
+
+    /// Renders every channel to the host, (channels, H, W), patch by patch where the device takes no more at once; grows the
+    /// memory as the view demands.
+    ///
+    /// # Errors
+    /// As [`Renderer::render_image`].
+    pub fn render_channels(
+        &mut self,
+        gaussians: &Buffer<f32>,
+        camera: &Camera,
+        options: &RenderOptions,
+    ) -> Result<Vec<f32>> {
+        let mut planes = self.render_planes(gaussians, camera, options)?;
+        planes.truncate(self.settings.channels() * Patch::from(camera).pixel_count());
+        Ok(planes)
+    }
+
+    /// As [`Renderer::render_channels`], and behind the channels how much of the background shows, (channels + 1, H, W).
+    ///
+    /// # Errors
+    /// As [`Renderer::render_image`].
+    pub fn render_planes(
+        &mut self,
+        gaussians: &Buffer<f32>,
+        camera: &Camera,
+        options: &RenderOptions,
+    ) -> Result<Vec<f32>> {
+        let patches = self.patches(camera);
+        if let [whole] = &patches[..] {
+            return self.render_patch(gaussians, whole, options);
+        }
+        self.render_parts(gaussians, &Patch::from(camera), &patches, options)
+    }
+
+    fn render_parts(
+        &mut self,
+        gaussians: &Buffer<f32>,
+        whole: &Patch,
+        parts: &[Patch],
+        options: &RenderOptions,
+    ) -> Result<Vec<f32>> {
+        let mut data = vec![0.0; (self.settings.channels() + 1) * whole.pixel_count()];
+        for part in parts {
+            let own = self.render_patch(gaussians, part, options)?;
+            part.paste((part, &own), (whole, &mut data));
+        }
+        Ok(data)
+    }
+
+    /// How many intersections the Gaussians have in a patch, whether there is room for them or not.
+    ///
+    /// # Errors
+    /// The image exceeds what was reserved, or the device is lost.
+    #[cfg(feature = "io")]
+    pub(crate) fn count_intersections(
+        &mut self,
+        gaussians: &Buffer<f32>,
+        patch: &Patch,
+    ) -> Result<u32> {
+        let options = RenderOptions { sh_degree: 0, background: [0.0; 3] };
+        Ok(self.try_render(gaussians, patch, &options)?.intersections)
+    }
+
+    /// Renders once, and says how that went; no flag is left.
+    fn try_render(
+        &mut self,
+        gaussians: &Buffer<f32>,
+        patch: &Patch,
+        options: &RenderOptions,
+    ) -> Result<Status> {
+        let (gpu, mut status) = (self.gpu.clone(), None);
+        gpu.run("render", |pass| {
+            self.forward(pass, gaussians, *patch, options)?;
+            status = Some(pass.download(&self.frame.status)?);
+            self.clear_status(pass);
+            Ok(())
+        })?;
+        let words = status.map_or_else(|| Ok(vec![]), |status| status.wait())?;
+        Ok(Status::from_words(&words))
+    }
+
+    /// Every channel of one patch, and behind them its [`Renderer::transmittances`], (channels + 1, h, w); where the device
+    /// cannot follow all intersections of it, half by half.
+    ///
+    /// # Errors
+    /// As [`Renderer::render_image`].
+    pub fn render_patch(
+        &mut self,
+        gaussians: &Buffer<f32>,
+        patch: &Patch,
+        options: &RenderOptions,
+    ) -> Result<Vec<f32>> {
+        loop {
+            let status = self.try_render(gaussians, patch, options)?;
+            if status.crowd > 0 {
+                let UVec2 { x: width, y: height } = patch.size;
+                return Err(self.too_crowded(format!("a {width}x{height} render"), status.crowd));
+            }
+            if !status.overflowed {
+                break;
+            }
+            let is_too_much = status.intersections > self.most_intersections();
+            if let Some(halves) = patch.halves().filter(|_| is_too_much) {
+                return self.render_parts(gaussians, patch, &halves, options);
+            }
+            self.grow(status.intersections)?;
+        }
+        let mut planes = self.gpu.read(&self.frame.render)?;
+        planes.truncate(self.settings.channels() * patch.pixel_count());
+        let transmittances = self.gpu.read(&self.frame.transmittances)?;
+        planes.extend_from_slice(&transmittances[..patch.pixel_count()]);
+        Ok(planes)
+    }
+}

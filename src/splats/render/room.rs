@@ -1,0 +1,150 @@
+//! Room for Gaussians, views and intersections, and what it takes.
+
+use glam::UVec2;
+
+use super::Renderer;
+use super::limits::most_tiles;
+use crate::camera::Camera;
+use crate::{Error, Result};
+
+impl Renderer {
+    /// Makes room for `gaussian_count` Gaussians and the images of `cameras`, or their patches.
+    ///
+    /// # Errors
+    /// The device is out of memory.
+    pub fn reserve<'a>(
+        &mut self,
+        gaussian_count: usize,
+        cameras: impl IntoIterator<Item = &'a Camera>,
+    ) -> Result<()> {
+        let mut sizes = vec![];
+        for camera in cameras {
+            sizes.extend(self.patches(camera).iter().map(|patch| patch.size));
+        }
+        self.reserve_with_headroom([gaussian_count; 2], sizes)
+    }
+
+    /// The same for images of these sizes and a number of Gaussians, and where that needs more memory, for another number
+    /// that may follow.
+    ///
+    /// # Errors
+    /// The device is out of memory, or cannot follow so many tiles.
+    pub fn reserve_with_headroom(
+        &mut self,
+        [gaussian_count, capacity]: [usize; 2],
+        sizes: impl IntoIterator<Item = UVec2>,
+    ) -> Result<()> {
+        let (mut pixels, mut tiles) = (0, 0);
+        for size in sizes {
+            let UVec2 { x, y } = self.tiles(size);
+            pixels = pixels.max(size.x as usize * size.y as usize);
+            tiles = tiles.max(x as usize * y as usize);
+            if x as usize * y as usize > most_tiles(&self.gpu) {
+                return Err(self.too_many_tiles(size));
+            }
+        }
+        self.frame.reserve(&self.gpu, [gaussian_count, capacity], pixels, tiles)
+    }
+
+    /// Makes room for `intersections`, and half as many again where the device can bind them; what room there is stays.
+    ///
+    /// # Errors
+    /// The device is out of memory, or cannot bind so many.
+    pub fn grow(&mut self, intersections: u32) -> Result<()> {
+        let headroom =
+            intersections.saturating_add(intersections / 2).min(self.most_intersections());
+        let capacity = headroom.max(intersections);
+        self.set_intersection_capacity(capacity.max(self.frame.intersection_capacity()))
+    }
+
+    /// The most intersections of a view whose records the device can bind at once.
+    pub fn most_intersections(&self) -> u32 {
+        self.frame.most_intersections(&self.gpu)
+    }
+
+    /// What each Gaussian takes beside its own numbers, in bytes.
+    #[cfg(feature = "io")]
+    pub(crate) fn bytes_per_gaussian(&self) -> usize {
+        self.frame.bytes_per_gaussian() + self.depth_sort.bytes_per_item()
+    }
+
+    /// What the buffers take that follow the numbers of Gaussians and intersections, those of the sorts left out, which come
+    /// with the first render; in bytes.
+    #[cfg(feature = "io")]
+    pub(crate) fn reserved_bytes(&self) -> usize {
+        let frame = &self.frame;
+        frame.splats.len() * frame.bytes_per_gaussian()
+            + frame.tiles.len() * frame.bytes_per_intersection()
+    }
+
+    /// What each intersection of a view takes, in bytes.
+    #[cfg(feature = "io")]
+    pub(crate) fn bytes_per_intersection(&self) -> usize {
+        self.frame.bytes_per_intersection() + self.tile_sort.bytes_per_item()
+    }
+
+    /// How many intersections there is room for.
+    #[cfg(feature = "io")]
+    pub(crate) fn intersection_capacity(&self) -> u32 {
+        self.frame.intersection_capacity()
+    }
+
+    /// Makes room for exactly so many intersections.
+    ///
+    /// # Errors
+    /// The device is out of memory.
+    pub fn set_intersection_capacity(&mut self, intersections: u32) -> Result<()> {
+        self.frame.set_intersection_capacity(&self.gpu, intersections)
+    }
+
+    fn too_many_tiles(&self, size: UVec2) -> Error {
+        let (UVec2 { x: width, y: height }, [tile_width, tile_height]) = (size, self.tile.size);
+        let (count, most) = (self.tiles(size).element_product(), most_tiles(&self.gpu));
+        let device = &self.gpu.properties().name;
+        Error::Usage(format!(
+            "a {width}x{height} view has {count} tiles of {tile_width}x{tile_height} pixels, {device} follows {most}; \
+             lower `TrainConfig::patch_pixels` or take a larger `tile`"
+        ))
+    }
+}
+
+#[cfg(all(test, feature = "io"))]
+mod tests {
+    use glam::{DAffine3, DVec2};
+
+    use crate::camera::{Camera, CameraModel};
+    use crate::gpu::{DeviceChoice, Gpu};
+    use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
+    use crate::splats::scene::width;
+
+    /// With the sorts, whose memory comes with the first render.
+    #[test]
+    fn a_render_takes_the_bytes_that_are_foreseen() {
+        let gpu = Gpu::new(&DeviceChoice::Best).unwrap();
+        let (gaussians, intersections) = (200_000, 300_000);
+        let (principal_point, view_from_world) = (DVec2::new(8.0, 4.0), DAffine3::IDENTITY);
+        let focal = DVec2::splat(16.0);
+        let camera = Camera {
+            width: 16,
+            height: 8,
+            focal,
+            principal_point,
+            model: CameraModel::Pinhole,
+            view_from_world,
+        };
+        let settings = RenderSettings::default();
+        let parameters = gpu.zeros("parameters", gaussians * width(settings.shape)).unwrap();
+        let mut renderer = Renderer::new(&gpu, settings).unwrap();
+        let before = gpu.memory_in_use();
+        renderer.reserve(gaussians, [&camera]).unwrap();
+        renderer.set_intersection_capacity(intersections).unwrap();
+        let options = RenderOptions { sh_degree: 3, background: [0.0; 3] };
+        renderer.render_image(&parameters, &camera, &options).unwrap();
+        assert_eq!(renderer.intersection_capacity(), intersections);
+        gpu.free_unused();
+        let taken = (gpu.memory_in_use() - before) as f64;
+        let foreseen = gaussians * renderer.bytes_per_gaussian()
+            + intersections as usize * renderer.bytes_per_intersection();
+        assert!((taken / foreseen as f64 - 1.0).abs() < 0.02, "{taken} {foreseen}");
+    }
+}

@@ -1,0 +1,307 @@
+//! The Gaussians that training begins with.
+
+use std::borrow::Borrow;
+
+use glam::{DMat3, DQuat, DVec2, DVec3, Vec3};
+use nalgebra::{Matrix3, SymmetricEigen};
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use super::neighbours::Neighbours;
+use super::{Gaussians, SH_C0, Shape};
+use crate::base::random::Stream;
+use crate::camera::Camera;
+use crate::photographs::dataset::{Point, Split, View};
+use crate::photographs::image::Image;
+use crate::{Error, Result};
+
+/// What the first Gaussians look like; the points say where they are and in which colour.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Start {
+    /// The opacity of each, in (0, 1).
+    pub opacity: f64,
+    /// Standard deviation in units of the root mean squared distance to the three nearest points, above 0.
+    pub scale: f64,
+    /// The thinnest axis of a disc in units of its longest, in (0, 1]: neighbours that lie on a surface make discs along it.
+    /// 1: all are round.
+    pub thinnest: f64,
+}
+
+/// Denser and smaller than 3DGS begins, which scores higher after as many steps, in less time, since what is opaque hides
+/// what lies behind it (docs/benchmarks.md). Still denser ones score higher yet, but lose more when they are split. Discs
+/// score as round ones do, with more Gaussians.
+impl Default for Start {
+    fn default() -> Self {
+        Self { opacity: 0.2, scale: 0.8, thinnest: 1.0 }
+    }
+}
+
+impl Start {
+    /// 3DGS's, and the paper's.
+    pub const PAPER: Self = Self { opacity: 0.1, scale: 1.0, thinnest: 1.0 };
+
+    /// Refuses values that make no Gaussian, naming the field.
+    ///
+    /// # Errors
+    /// [`Error::Usage`].
+    pub fn check(&self) -> Result<()> {
+        for (name, value, holds, rule) in [
+            (
+                "opacity",
+                self.opacity,
+                self.opacity > 0.0 && self.opacity < 1.0,
+                "above 0 and below 1",
+            ),
+            ("scale", self.scale, (1e-3..=1e3).contains(&self.scale), "0.001 to 1000"),
+            ("thinnest", self.thinnest, (1e-3..=1.0).contains(&self.thinnest), "0.001 to 1"),
+        ] {
+            if !holds {
+                return Err(Error::Usage(format!("start.{name} is {value}; it must be {rule}")));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The least mean squared distance to the neighbours, world units squared (3DGS).
+const LEAST_SQUARED_DISTANCE: f64 = 1e-7;
+
+/// The standard deviation of a Gaussian that has no neighbour at all, world units.
+const LONE_SCALE: f64 = 0.01;
+
+/// One Gaussian per point, in the points' order.
+///
+/// SH degree 0 is such that the colour is `colors[i]` (sRGB-encoded, [0, 1]), nothing above it. Scales are those of `start`
+/// times the root of the mean squared distance to the three nearest other positions (3DGS); coincident points count as one
+/// position, so duplicates do not shrink to nothing. With fewer than four positions the mean goes over those there are; a
+/// single position has the standard deviation 0.01. Features are uniform in [0, 1), drawn from `seed` (LITA-GS).
+///
+/// # Errors
+/// [`Error::Usage`] where a position or colour is not finite or their numbers differ, or [`Start::check`] refuses.
+pub fn from_points(
+    positions: &[DVec3],
+    colors: &[Vec3],
+    shape: impl Into<Shape>,
+    start: &Start,
+    seed: u64,
+) -> Result<Gaussians> {
+    start.check()?;
+    if positions.len() != colors.len() {
+        return Err(Error::Usage(format!(
+            "{} points have {} colours",
+            positions.len(),
+            colors.len()
+        )));
+    }
+    let finite = |(position, color): (&DVec3, &Vec3)| position.is_finite() && color.is_finite();
+    if let Some(point) = positions.iter().zip(colors).position(|pair| !finite(pair)) {
+        return Err(Error::Usage(format!(
+            "point {point} has a position or colour that is not finite"
+        )));
+    }
+
+    let mut gaussians = Gaussians::zeros(positions.len(), shape);
+    for (mean, position) in gaussians.means_mut().iter_mut().zip(positions) {
+        *mean = position.as_vec3();
+    }
+    let ellipsoids = ellipsoids(positions, start);
+    for (quat, ellipsoid) in gaussians.quats_mut().iter_mut().zip(&ellipsoids) {
+        let [x, y, z, w] = ellipsoid.rotation.to_array().map(|part| part as f32);
+        *quat = [w, x, y, z];
+    }
+    for (log_scale, ellipsoid) in gaussians.log_scales_mut().iter_mut().zip(&ellipsoids) {
+        *log_scale = ellipsoid.scales.map(f64::ln).as_vec3();
+    }
+    gaussians.raw_opacities_mut().fill((start.opacity / (1.0 - start.opacity)).ln() as f32);
+    for (dc, color) in gaussians.dc_mut().iter_mut().zip(colors) {
+        *dc = (color - 0.5) / SH_C0;
+    }
+    let draws = Stream::new(seed, 0);
+    for (i, feature) in gaussians.features_mut().iter_mut().enumerate() {
+        *feature = draws.uniform(i as u64) as f32;
+    }
+    Ok(gaussians)
+}
+
+/// Standard deviations along axes of its own, world units.
+#[derive(Clone, Copy)]
+struct Ellipsoid {
+    rotation: DQuat,
+    scales: DVec3,
+}
+
+/// What each point's Gaussian covers.
+fn ellipsoids(positions: &[DVec3], start: &Start) -> Vec<Ellipsoid> {
+    // The nearest position is the point itself.
+    const NEAREST: usize = 1 + 3;
+    /// So many tell the direction of a surface.
+    const AROUND: usize = 1 + 8;
+    // Adding zero turns -0 into 0, so that equal coordinates have equal bits.
+    let key = |position: &DVec3| (*position + 0.0).to_array().map(f64::to_bits);
+    let mut distinct: Vec<_> = positions.iter().map(key).collect();
+    distinct.sort_unstable();
+    distinct.dedup();
+    let distinct = distinct.into_iter().map(|bits| bits.map(f64::from_bits).into());
+    let distinct: Vec<DVec3> = distinct.collect();
+    let round = |scale: f64| Ellipsoid { rotation: DQuat::IDENTITY, scales: DVec3::splat(scale) };
+    if distinct.len() <= 1 {
+        return vec![round(LONE_SCALE * start.scale); positions.len()];
+    }
+
+    let found = distinct.len().min(AROUND);
+    let neighbours = Neighbours::new(distinct);
+    let ellipsoid = |position: &DVec3| {
+        let around = neighbours.nearest::<AROUND>(*position);
+        let others = &around[1..found];
+        let nearest = &others[..others.len().min(NEAREST - 1)];
+        let mean = nearest.iter().map(|(squared, _)| squared).sum::<f64>() / nearest.len() as f64;
+        let scale = start.scale * mean.max(LEAST_SQUARED_DISTANCE).sqrt();
+        if start.thinnest == 1.0 {
+            return round(scale);
+        }
+        let (rotation, spread) = spread(others.iter().map(|(_, other)| *other - *position));
+        let axes = spread.map(|axis| axis.max(start.thinnest));
+        // The area of the disc, the product of its two longer axes, stays that of the round one.
+        let area = axes.element_product() / axes.min_element();
+        Ellipsoid { rotation, scales: axes * (scale / area.sqrt()) }
+    };
+    positions.par_iter().map(ellipsoid).collect()
+}
+
+/// The principal axes of directions, and how far they spread along each: 1 along the one they spread along most. Each
+/// direction counts alike, however long.
+fn spread(directions: impl Iterator<Item = DVec3>) -> (DQuat, DVec3) {
+    let mut moments = Matrix3::zeros();
+    for direction in directions.filter_map(DVec3::try_normalize) {
+        let direction = nalgebra::Vector3::from(direction.to_array());
+        moments += direction * direction.transpose();
+    }
+    let SymmetricEigen { eigenvectors, eigenvalues } = SymmetricEigen::new(moments);
+    let axes = DMat3::from_cols_slice(eigenvectors.as_slice());
+    let axes = if axes.determinant() < 0.0 { -axes } else { axes };
+    let longest = eigenvalues.max().max(f64::MIN_POSITIVE);
+    let spread = DVec3::from_slice(eigenvalues.as_slice()) / longest;
+    (DQuat::from_mat3(&axes).normalize(), spread.max(DVec3::ZERO).map(f64::sqrt))
+}
+
+/// `count` random positions inside what the cameras see, for captures without points; none without cameras.
+///
+/// Each lies at a uniform place of a random camera's image, at a depth that is log-uniform between half the
+/// capture's radius and five times it (radius: the greatest distance of a camera from the cameras' mean; 1 where all
+/// cameras are in one place). A position that a second camera sees is preferred: its depth can be learned.
+pub fn random(cameras: &[Camera], count: usize, seed: u64) -> Vec<DVec3> {
+    const TRIES: u64 = 16;
+    const DRAWS_PER_TRY: u64 = 4;
+    if cameras.is_empty() {
+        return Vec::new();
+    }
+    let radius = radius(cameras);
+    let (near, far) = (0.5 * radius, 5.0 * radius);
+    let draw = |point: u64| {
+        let stream = Stream::new(seed, point);
+        let position = |attempt: u64| {
+            let uniform = |draw: u64| stream.uniform(attempt * DRAWS_PER_TRY + draw);
+            let camera = &cameras[(uniform(0) * cameras.len() as f64) as usize];
+            let pixel = DVec2::new(
+                uniform(1) * f64::from(camera.width),
+                uniform(2) * f64::from(camera.height),
+            );
+            let depth = near * (far / near).powf(uniform(3));
+            // Where a fisheye shows nothing, straight ahead.
+            let in_view = camera.in_view(pixel, depth).unwrap_or(DVec3::Z * depth);
+            camera.view_from_world.inverse().transform_point3(in_view)
+        };
+        let seen_twice = |position: &DVec3| {
+            cameras.iter().filter(|camera| camera.sees(*position).is_some()).nth(1).is_some()
+        };
+        (1..TRIES).map(position).find(seen_twice).unwrap_or_else(|| position(0))
+    };
+    (0..count as u64).into_par_iter().map(draw).collect()
+}
+
+/// The greatest distance of a camera from the cameras' mean, world units; 1 where that is zero.
+fn radius(cameras: &[Camera]) -> f64 {
+    let centers: Vec<DVec3> = cameras.iter().map(Camera::center).collect();
+    let mean = centers.iter().sum::<DVec3>() / centers.len() as f64;
+    let radius = centers.iter().map(|center| center.distance(mean)).fold(0.0, f64::max);
+    // Below this the spread is the rounding of one place's coordinates.
+    let least = 1e-9 * mean.length().max(1.0);
+    if radius > least { radius } else { 1.0 }
+}
+
+/// The colour of each point: the mean of what the training views that see it show in their targets, RGB.
+///
+/// A point is seen by the training views of its track; without any, by every training view that it lies inside of. A
+/// point that no training view sees gets the mean grey of the targets. `target` gives the target of a view (an index
+/// into `views`), or nothing where there is none; it is asked once per training view, in order, so it may compute.
+///
+/// # Errors
+/// Those of `target`.
+pub fn colors_from_views<I: Borrow<Image>>(
+    points: &[Point],
+    views: &[View],
+    mut target: impl FnMut(usize) -> Result<Option<I>>,
+) -> Result<Vec<Vec3>> {
+    let mut seen = vec![[Mean::default(); 2]; points.len()];
+    let mut grey = Mean::default();
+    for (index, view) in views.iter().enumerate().filter(|(_, view)| view.split == Split::Train) {
+        let Some(target) = target(index)? else { continue };
+        let target = target.borrow();
+        grey.add(mean_grey(&view.counted(target)));
+        seen.par_iter_mut().zip(points).for_each(|([tracked, inside], point)| {
+            let Some(pixel) = view.camera.sees(point.position) else { return };
+            if view.mask.as_ref().is_some_and(|mask| mask.hides_around(pixel)) {
+                return;
+            }
+            let color = bilinear(target, pixel);
+            inside.add(color);
+            if point.views.contains(&(index as u32)) {
+                tracked.add(color);
+            }
+        });
+    }
+    let grey = grey.value().unwrap_or(Vec3::splat(0.5));
+    let color = |[tracked, inside]: [Mean; 2]| tracked.value().or(inside.value()).unwrap_or(grey);
+    Ok(seen.into_iter().map(color).collect())
+}
+
+/// A running mean of colours.
+#[derive(Clone, Copy, Default)]
+struct Mean {
+    sum: Vec3,
+    count: u32,
+}
+
+impl Mean {
+    fn add(&mut self, color: Vec3) {
+        self.sum += color;
+        self.count += 1;
+    }
+
+    fn value(self) -> Option<Vec3> {
+        (self.count > 0).then(|| self.sum / self.count as f32)
+    }
+}
+
+fn mean_grey(values: &[f32]) -> Vec3 {
+    let sum: f64 = values.iter().copied().map(f64::from).sum();
+    Vec3::splat((sum / values.len().max(1) as f64) as f32)
+}
+
+/// The image's value at a place in pixels (pixel centres at +0.5), RGB; beyond the outermost centres the edge goes on.
+fn bilinear(image: &Image, pixel: DVec2) -> Vec3 {
+    let (width, height) = (image.width as usize, image.height as usize);
+    let axis = |place: f64, size: usize| {
+        let place = (place - 0.5).clamp(0.0, size.saturating_sub(1) as f64);
+        let low = place as usize;
+        (low, (low + 1).min(size.saturating_sub(1)), place.fract() as f32)
+    };
+    let ((x0, x1, tx), (y0, y1, ty)) = (axis(pixel.x, width), axis(pixel.y, height));
+    let channel = |channel: usize| {
+        let at = |x: usize, y: usize| image.data[(channel * height + y) * width + x];
+        let row = |y: usize| at(x0, y) + tx * (at(x1, y) - at(x0, y));
+        row(y0) + ty * (row(y1) - row(y0))
+    };
+    Vec3::new(channel(0), channel(1), channel(2))
+}

@@ -1,0 +1,97 @@
+//! The nearest of many positions, exactly.
+
+use std::ops::Range;
+
+use glam::DVec3;
+
+/// A balanced k-d tree without nodes: the middle position of every range splits the others along the axis that they
+/// spread widest on, those before it not beyond it, those behind it not below it.
+pub(super) struct Neighbours {
+    positions: Vec<DVec3>,
+    /// Along which axis each position splits its range.
+    axes: Vec<usize>,
+}
+
+impl Neighbours {
+    /// Every position is finite.
+    pub(super) fn new(mut positions: Vec<DVec3>) -> Self {
+        let mut axes = vec![0; positions.len()];
+        split(&mut positions, &mut axes);
+        Self { positions, axes }
+    }
+
+    /// The nearest positions to `place` with their squared distances, by these; infinity where there are no more.
+    pub(super) fn nearest<const COUNT: usize>(&self, place: DVec3) -> [(f64, DVec3); COUNT] {
+        let mut found = [(f64::INFINITY, DVec3::INFINITY); COUNT];
+        self.search(0..self.positions.len(), place, &mut found);
+        found
+    }
+
+    fn search(&self, range: Range<usize>, place: DVec3, found: &mut [(f64, DVec3)]) {
+        if range.is_empty() {
+            return;
+        }
+        let middle = range.start + range.len() / 2;
+        let position = self.positions[middle];
+        let mut candidate = (place.distance_squared(position), position);
+        for slot in found.iter_mut() {
+            if candidate.0 < slot.0 {
+                std::mem::swap(slot, &mut candidate);
+            }
+        }
+        let axis = self.axes[middle];
+        let beyond = place[axis] - position[axis];
+        let (below, above) = (range.start..middle, middle + 1..range.end);
+        let (near, far) = if beyond < 0.0 { (below, above) } else { (above, below) };
+        self.search(near, place, found);
+        // Rounding is monotone: no squared distance comes out below that of its part along one axis.
+        if found.last().is_some_and(|(farthest, _)| beyond * beyond < *farthest) {
+            self.search(far, place, found);
+        }
+    }
+}
+
+fn split(positions: &mut [DVec3], axes: &mut [usize]) {
+    let Some(&first) = positions.first() else { return };
+    let bounds = |(low, high): (DVec3, DVec3), &place: &DVec3| (low.min(place), high.max(place));
+    let (low, high) = positions.iter().fold((first, first), bounds);
+    let axis = (high - low).max_position();
+    let middle = positions.len() / 2;
+    positions.select_nth_unstable_by(middle, |a, b| a[axis].total_cmp(&b[axis]));
+    axes[middle] = axis;
+    let ((below, above), (axes_below, axes_above)) =
+        (positions.split_at_mut(middle), axes.split_at_mut(middle));
+    split(below, axes_below);
+    split(&mut above[1..], &mut axes_above[1..]);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::base::random::Stream;
+
+    #[test]
+    fn the_nearest_are_those_that_a_search_through_all_finds() {
+        let draws = Stream::new(7, 0);
+        for count in [0, 1, 2, 3, 7, 64, 1000] {
+            // On a grid many are equally far, and many share a coordinate with what splits them.
+            for grid in [1e-9, 0.25] {
+                let axis = |draw: u64| (4.0 * draws.uniform(draw) / grid).round() * grid;
+                let position = |i: u64| DVec3::from_array([0, 1, 2].map(|k| axis(3 * i + k)));
+                let positions: Vec<DVec3> = (0..count).map(position).collect();
+                let tree = Neighbours::new(positions.clone());
+                for place in (count..count + 50).map(position).chain(positions.iter().copied()) {
+                    let squared = positions.iter().map(|other| place.distance_squared(*other));
+                    let mut expected: Vec<f64> = squared.chain([f64::INFINITY; 4]).collect();
+                    expected.sort_by(f64::total_cmp);
+                    let found = tree.nearest::<4>(place);
+                    assert_eq!(found.map(|(squared, _)| squared), expected[..4], "{count}, {grid}");
+                    for (squared, position) in found.into_iter().filter(|found| found.0.is_finite())
+                    {
+                        assert_eq!(place.distance_squared(position), squared, "{count}, {grid}");
+                    }
+                }
+            }
+        }
+    }
+}

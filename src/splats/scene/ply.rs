@@ -1,0 +1,300 @@
+//! Gaussians as a PLY file in the INRIA layout that every splat viewer opens.
+//!
+//! Binary little-endian, one vertex per Gaussian: `x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3`.
+//! Features, where the scene has any, stand between `f_rest_*` and `opacity`: `f_depth_0 f_prior_0 f_noise_0..2 f_illu_0..2`,
+//! which viewers skip. Normals are zero; `f_rest_*` is channel-major (all of red, then green, then blue); opacity is before the sigmoid,
+//! scales are logarithms, `rot_0` is w. Source: `save_ply` of the 3DGS code.
+
+use std::collections::HashMap;
+use std::fs;
+use std::io::{BufWriter, Write as _};
+use std::path::Path;
+
+use super::{FEATURES, Feature, Features, Gaussians, MAX_SH_DEGREE, Shape, width};
+use crate::base::input;
+use crate::base::output::write_whole_with;
+use crate::splats::attributes::{
+    ATTRIBUTES, Attribute, AttributeSpec, Ply, planes, rest_coefficients,
+};
+use crate::{Error, Result};
+
+/// A property of the file: its name, the attribute and the component of it that it holds.
+struct Property {
+    name: String,
+    attribute: Attribute,
+    component: usize,
+}
+
+impl Property {
+    /// The property's value is at `begin + stride * gaussian` in [`Gaussians::parameters`].
+    fn address(&self, gaussians: &Gaussians) -> (usize, usize) {
+        let (column, width) = gaussians.columns(self.attribute);
+        (column * gaussians.count + self.component, width)
+    }
+}
+
+/// Every property but the normals, which follow the means, in the order of the file.
+fn properties(shape: Shape) -> Vec<Property> {
+    let mut specs: Vec<&AttributeSpec> = ATTRIBUTES.iter().collect();
+    specs.sort_by_key(|spec| spec.ply_place);
+    let planes = planes(shape.features.width(), width(shape));
+    let of_attribute = |spec: &'static AttributeSpec| {
+        (0..planes[spec.attribute as usize].1).map(move |position| {
+            // The file is channel-major where the scene is coefficient-major.
+            let component = match spec.attribute {
+                Attribute::Rest => {
+                    let coefficients = rest_coefficients(shape.sh_degree);
+                    3 * (position % coefficients) + position / coefficients
+                }
+                _ => position,
+            };
+            let name = match spec.ply {
+                Ply::Named(names) => names[position].to_owned(),
+                Ply::Numbered(prefix) => format!("{prefix}{position}"),
+                Ply::Features => shape.features.ply_property(position),
+            };
+            Property { name, attribute: spec.attribute, component }
+        })
+    };
+    specs.into_iter().flat_map(of_attribute).collect()
+}
+
+/// Writes `gaussians` to `path`; the file appears under its name only once it is complete.
+///
+/// # Errors
+/// [`Error::Output`] where the file cannot be written.
+pub fn save(gaussians: &Gaussians, path: impl AsRef<Path>) -> Result<()> {
+    save_with_comments(gaussians, path, &[])
+}
+
+/// As [`save`], with lines of the header that readers skip.
+///
+/// # Errors
+/// As there.
+pub fn save_with_comments(
+    gaussians: &Gaussians,
+    path: impl AsRef<Path>,
+    comments: &[&str],
+) -> Result<()> {
+    write_whole_with(path.as_ref(), |partial| write(gaussians, partial, comments))
+}
+
+fn write(gaussians: &Gaussians, path: &Path, comments: &[&str]) -> std::io::Result<()> {
+    const NORMALS: [&str; 3] = ["nx", "ny", "nz"];
+    let properties = properties(gaussians.shape);
+    let (means, others) = properties.split_at(3);
+    let mut file = BufWriter::new(fs::File::create(path)?);
+    writeln!(file, "ply\nformat binary_little_endian 1.0")?;
+    for comment in comments {
+        writeln!(file, "comment {comment}")?;
+    }
+    writeln!(file, "element vertex {}", gaussians.count)?;
+    let names = means.iter().map(|property| property.name.as_str());
+    let names = names.chain(NORMALS).chain(others.iter().map(|property| property.name.as_str()));
+    for name in names {
+        writeln!(file, "property float {name}")?;
+    }
+    writeln!(file, "end_header")?;
+
+    let value = |(begin, stride): (usize, usize), gaussian: usize| {
+        gaussians.parameters[begin + stride * gaussian]
+    };
+    let means: Vec<_> = means.iter().map(|property| property.address(gaussians)).collect();
+    let others: Vec<_> = others.iter().map(|property| property.address(gaussians)).collect();
+    let mut row = Vec::with_capacity(properties.len() + NORMALS.len());
+    for gaussian in 0..gaussians.count {
+        row.clear();
+        row.extend(means.iter().map(|&address| value(address, gaussian)));
+        row.extend([0.0; NORMALS.len()]);
+        row.extend(others.iter().map(|&address| value(address, gaussian)));
+        for number in &row {
+            file.write_all(&number.to_le_bytes())?;
+        }
+    }
+    let file = file.into_inner().map_err(std::io::IntoInnerError::into_error)?;
+    // A pipe has no disk to wait for.
+    if file.metadata()?.is_file() { file.sync_all() } else { Ok(()) }
+}
+
+/// Reads Gaussians from a binary little-endian PLY; properties that are not ours are skipped.
+///
+/// # Errors
+/// [`Error::Input`] where the file is missing, of another format, cut short, longer than its header says, or where a
+/// needed property is missing or not finite.
+pub fn load(path: impl AsRef<Path>) -> Result<Gaussians> {
+    let path = path.as_ref();
+    let bytes = input::bytes(path)?;
+    parse(&bytes).map_err(|problem| Error::input(path, problem))
+}
+
+fn parse(bytes: &[u8]) -> Result<Gaussians, String> {
+    let header = Header::parse(bytes)?;
+    let body = &bytes[header.length..];
+    let expected = header.count.checked_mul(header.stride).ok_or("the vertex count is absurd")?;
+    if body.len() < expected {
+        return Err(format!(
+            "is cut short: {} vertices of {} bytes need {expected} bytes, the file holds {}",
+            header.count,
+            header.stride,
+            body.len()
+        ));
+    }
+    if body.len() > expected && !header.more_elements {
+        return Err(format!(
+            "holds {} bytes more than its {} vertices need",
+            body.len() - expected,
+            header.count
+        ));
+    }
+
+    // Before there is memory for them: a vertex that lacks everything takes no byte of the file, however many there are.
+    let shape = header.shape()?;
+    let offset_of = |property: Property| Ok((header.offset(&property.name)?, property));
+    let properties =
+        properties(shape).into_iter().map(offset_of).collect::<Result<Vec<_>, String>>()?;
+    let mut gaussians = Gaussians::zeros(header.count, shape);
+    for (offset, property) in properties {
+        let (begin, stride) = property.address(&gaussians);
+        for (gaussian, vertex) in body[..expected].chunks_exact(header.stride).enumerate() {
+            let [a, b, c, d] = [0, 1, 2, 3].map(|byte| vertex[offset + byte]);
+            let value = f32::from_le_bytes([a, b, c, d]);
+            if !value.is_finite() {
+                return Err(format!(
+                    "vertex {gaussian}: `{}` is {value}, not a finite number",
+                    property.name
+                ));
+            }
+            gaussians.parameters[begin + stride * gaussian] = value;
+        }
+    }
+    Ok(gaussians)
+}
+
+/// What the header says about the vertices.
+struct Header {
+    /// Bytes before the first vertex.
+    length: usize,
+    /// Vertices.
+    count: usize,
+    /// Bytes per vertex.
+    stride: usize,
+    /// Byte offset in the vertex and type of each property.
+    properties: HashMap<String, (usize, String)>,
+    /// Whether elements follow the vertices.
+    more_elements: bool,
+}
+
+impl Header {
+    fn parse(bytes: &[u8]) -> Result<Self, String> {
+        const END: &[u8] = b"end_header";
+        if !bytes.starts_with(b"ply") {
+            return Err("is not a PLY file".to_owned());
+        }
+        let end = bytes
+            .windows(END.len())
+            .position(|window| window == END)
+            .ok_or("is cut short in the header")?;
+        let newline = bytes[end..]
+            .iter()
+            .position(|&byte| byte == b'\n')
+            .ok_or("is cut short in the header")?;
+        let text = std::str::from_utf8(&bytes[..end]).map_err(|_| "the header is not text")?;
+
+        let mut header = Self {
+            length: end + newline + 1,
+            count: 0,
+            stride: 0,
+            properties: HashMap::new(),
+            more_elements: false,
+        };
+        let (mut format_is_known, mut in_vertices) = (false, false);
+        for line in text.lines() {
+            match *line.split_whitespace().collect::<Vec<_>>() {
+                ["format", "binary_little_endian", _] => format_is_known = true,
+                ["format", format, _] => {
+                    return Err(format!(
+                        "is a PLY of format {format}; save it as binary_little_endian"
+                    ));
+                }
+                ["element", "vertex", count] if !in_vertices => {
+                    in_vertices = true;
+                    header.count =
+                        count.parse().map_err(|_| format!("`{count}` is not a vertex count"))?;
+                }
+                ["element", name, _] if !in_vertices => {
+                    return Err(format!(
+                        "element `{name}` comes before the vertices; only vertices are expected"
+                    ));
+                }
+                ["element", ..] => header.more_elements = true,
+                ["property", kind, name] if in_vertices && !header.more_elements => {
+                    header.push(kind, name)?;
+                }
+                ["property", "list", ..] if !header.more_elements => {
+                    return Err("a list property in the vertices is not supported".to_owned());
+                }
+                _ => {}
+            }
+        }
+        if !format_is_known {
+            return Err("does not say its format".to_owned());
+        }
+        if !in_vertices {
+            return Err("has no vertices: `element vertex` is missing".to_owned());
+        }
+        Ok(header)
+    }
+
+    fn push(&mut self, kind: &str, name: &str) -> Result<(), String> {
+        let size = match kind {
+            "char" | "uchar" | "int8" | "uint8" => 1,
+            "short" | "ushort" | "int16" | "uint16" => 2,
+            "int" | "uint" | "int32" | "uint32" | "float" | "float32" => 4,
+            "double" | "float64" => 8,
+            _ => return Err(format!("property `{name}` has the unknown type `{kind}`")),
+        };
+        if self.properties.insert(name.to_owned(), (self.stride, kind.to_owned())).is_some() {
+            return Err(format!("property `{name}` is there twice"));
+        }
+        self.stride += size;
+        Ok(())
+    }
+
+    fn shape(&self) -> Result<Shape, String> {
+        Ok(Shape { sh_degree: self.sh_degree()?, features: self.features() })
+    }
+
+    /// The features whose first property is there.
+    fn features(&self) -> Features {
+        let has = |feature: Feature| {
+            let name = FEATURES[feature as usize].ply_name;
+            self.properties.contains_key(&format!("f_{name}_0"))
+        };
+        Features {
+            depth: has(Feature::Depth),
+            structure: has(Feature::Structure),
+            noise: has(Feature::Noise),
+            illumination: has(Feature::Illumination),
+        }
+    }
+
+    /// The degree whose `f_rest_*` properties are all there.
+    fn sh_degree(&self) -> Result<u32, String> {
+        let found = self.properties.keys().filter(|name| name.starts_with("f_rest_")).count();
+        let degree = (0..=MAX_SH_DEGREE).find(|&degree| 3 * rest_coefficients(degree) == found);
+        degree.ok_or_else(|| {
+            format!("has {found} f_rest_* properties; 0, 9, 24 or 45 make an SH degree of 0 to 3")
+        })
+    }
+
+    /// The byte offset of a float property in the vertex.
+    fn offset(&self, name: &str) -> Result<usize, String> {
+        match self.properties.get(name) {
+            Some((offset, kind)) if kind == "float" || kind == "float32" => Ok(*offset),
+            Some((_, kind)) => Err(format!("property `{name}` is of type {kind}, not float")),
+            None => {
+                Err(format!("has no property `{name}`; is it a point cloud without Gaussians?"))
+            }
+        }
+    }
+}

@@ -1,0 +1,202 @@
+//! The radix sort: least significant digit first, up to 8 bits a pass.
+
+use super::{Count, common_len};
+use crate::Result;
+use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
+use crate::kernels::digit::MAX_DIGIT_BITS;
+use crate::kernels::{sort_downsweep, sort_spine, sort_upsweep};
+
+/// A stable sort of (key, value) pairs of `u32`, ascending by key.
+#[derive(Debug)]
+pub struct RadixSort {
+    gpu: Gpu,
+    upsweep: Pipeline<sort_upsweep::Kernel>,
+    spine: Pipeline<sort_spine::Kernel>,
+    downsweep: Pipeline<sort_downsweep::Kernel>,
+    partition_size: u32,
+    /// With more partitions, the spine is a pass of its own.
+    folded_partitions: u32,
+    /// Workgroups of an upsweep that are done; 0 between upsweeps.
+    arrivals: Buffer<u32>,
+    scratch: Scratch,
+}
+
+/// One subgroup makes the prefix sums of so many partitions in less time than a pass of its own costs. A processor has
+/// no other lanes that would do it at the same time.
+const FOLDED_PARTITIONS_ON_A_GPU: u32 = 16;
+const FOLDED_PARTITIONS_ON_A_CPU: u32 = 1024;
+
+/// What a sort needs beside the pairs themselves.
+#[derive(Debug)]
+struct Scratch {
+    /// Each pass writes the pairs here, then these and the caller's buffers change places.
+    keys: Buffer<u32>,
+    values: Buffer<u32>,
+    /// (partitions, digits)
+    table: Buffer<u32>,
+    /// (digits)
+    digit_totals: Buffer<u32>,
+}
+
+impl RadixSort {
+    /// What its scratch memory takes for each pair, in bytes.
+    #[cfg(feature = "io")]
+    pub(crate) fn bytes_per_item(&self) -> usize {
+        2 * size_of::<u32>() + (size_of::<u32>() << MAX_DIGIT_BITS) / self.partition_size as usize
+    }
+
+    /// A sort with scratch memory for buffers of `capacity` pairs; buffers of another length have it made anew.
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub fn new(gpu: &Gpu, capacity: u32) -> Result<Self> {
+        let partition_size = sort_upsweep::Constants::default().partition_size;
+        let rank_by_ballot = gpu.properties().subgroup_size > MAX_DIGIT_BITS;
+        Ok(Self {
+            gpu: gpu.clone(),
+            upsweep: gpu.pipeline(&sort_upsweep::Constants { partition_size })?,
+            spine: gpu.pipeline(&sort_spine::Constants { partition_size })?,
+            downsweep: gpu
+                .pipeline(&sort_downsweep::Constants { partition_size, rank_by_ballot })?,
+            partition_size,
+            folded_partitions: if gpu.properties().is_cpu {
+                FOLDED_PARTITIONS_ON_A_CPU
+            } else {
+                FOLDED_PARTITIONS_ON_A_GPU
+            },
+            arrivals: gpu.zeros("sort_arrivals", 1)?,
+            scratch: Scratch::new(gpu, capacity, partition_size)?,
+        })
+    }
+
+    /// Records the sort of the first `count` pairs by the lowest `bits` bits of their keys (32 at most); pairs of equal
+    /// bits keep their order. Afterwards `keys` and `values` hold the result, whatever the number of passes, because
+    /// they change places with the sort's own memory: what lay beyond the count is lost. A count beyond the buffers'
+    /// common length is clamped to it.
+    ///
+    /// # Errors
+    /// The buffers' lengths differ, the count's index is outside its buffer, or the device is out of memory.
+    pub fn record(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        count: Count<'_>,
+        keys: &mut Buffer<u32>,
+        values: &mut Buffer<u32>,
+        bits: u32,
+    ) -> Result<()> {
+        count.check()?;
+        let capacity = common_len("sort", &[keys.len(), values.len()])?;
+        if self.scratch.keys.len() != keys.len() {
+            self.scratch = Scratch::new(&self.gpu, capacity, self.partition_size)?;
+        }
+        for (shift, digit_bits) in digits(bits) {
+            self.record_pass(pass, count, keys, values, shift, digit_bits)?;
+            std::mem::swap(keys, &mut self.scratch.keys);
+            std::mem::swap(values, &mut self.scratch.values);
+        }
+        Ok(())
+    }
+
+    /// Orders the pairs by one digit, from `keys` and `values` into the scratch.
+    fn record_pass(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        Count { counts, index: count_index }: Count<'_>,
+        keys: &Buffer<u32>,
+        values: &Buffer<u32>,
+        shift: u32,
+        digit_bits: u32,
+    ) -> Result<()> {
+        let capacity = common_len("sort", &[keys.len(), values.len()])?;
+        let Scratch { keys: sorted_keys, values: sorted_values, table, digit_totals } =
+            &mut self.scratch;
+        let arrivals = &mut self.arrivals;
+        let partitions = capacity.div_ceil(self.partition_size);
+        let folds_spine = partitions <= self.folded_partitions;
+        pass.dispatch(
+            &self.upsweep,
+            &sort_upsweep::Params {
+                count_index,
+                capacity,
+                shift,
+                digit_bits,
+                folds_spine: folds_spine.into(),
+            },
+            sort_upsweep::Buffers {
+                counts: counts.slice(),
+                keys: keys.slice(),
+                table: table.slice_mut(),
+                digit_totals: digit_totals.slice_mut(),
+                arrivals: arrivals.slice_mut(),
+            },
+            Threads::Workgroups([partitions, 1, 1]),
+        )?;
+        if !folds_spine {
+            pass.dispatch(
+                &self.spine,
+                &sort_spine::Params { count_index, capacity, digit_bits },
+                sort_spine::Buffers {
+                    counts: counts.slice(),
+                    table: table.slice_mut(),
+                    digit_totals: digit_totals.slice_mut(),
+                },
+                Threads::Workgroups([1 << digit_bits, 1, 1]),
+            )?;
+        }
+        pass.dispatch(
+            &self.downsweep,
+            &sort_downsweep::Params { count_index, capacity, shift, digit_bits },
+            sort_downsweep::Buffers {
+                counts: counts.slice(),
+                table: table.slice(),
+                digit_totals: digit_totals.slice(),
+                keys: keys.slice(),
+                values: values.slice(),
+                sorted_keys: sorted_keys.slice_mut(),
+                sorted_values: sorted_values.slice_mut(),
+            },
+            Threads::Workgroups([partitions, 1, 1]),
+        )
+    }
+}
+
+impl Scratch {
+    fn new(gpu: &Gpu, capacity: u32, partition_size: u32) -> Result<Self> {
+        let partitions = capacity.div_ceil(partition_size) as usize;
+        Ok(Self {
+            keys: gpu.uninit("sort_keys", capacity as usize)?,
+            values: gpu.uninit("sort_values", capacity as usize)?,
+            table: gpu.uninit("sort_table", partitions << MAX_DIGIT_BITS)?,
+            digit_totals: gpu.uninit("sort_digit_totals", 1 << MAX_DIGIT_BITS)?,
+        })
+    }
+}
+
+/// The lowest bit and the width of each pass's digit. As few passes as possible, and digits as equal as possible: two
+/// digits of 5 bits need an eighth of the counters that 8 and 2 bits do.
+fn digits(bits: u32) -> impl Iterator<Item = (u32, u32)> {
+    let bits = bits.min(u32::BITS);
+    let passes = bits.div_ceil(MAX_DIGIT_BITS);
+    let width = bits.div_ceil(passes.max(1)).max(1);
+    (0..bits).step_by(width as usize).map(move |shift| (shift, width.min(bits - shift)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::digits;
+
+    #[test]
+    fn digits_cover_every_bit_once_in_the_fewest_passes() {
+        for bits in 0..=32 {
+            let digits: Vec<_> = digits(bits).collect();
+            assert_eq!(digits.len() as u32, bits.div_ceil(8), "{bits} bits");
+            let mut next = 0;
+            for (shift, width) in digits {
+                assert_eq!(shift, next, "{bits} bits");
+                assert!((1..=8).contains(&width), "{bits} bits");
+                next += width;
+            }
+            assert_eq!(next, bits);
+        }
+    }
+}

@@ -1,0 +1,390 @@
+//! What a capture is, and what its model needs.
+//!
+//! ```text
+//! photographs as stored -> brightness, code values, noise, blur ┐
+//!                                                               ├-> Diagnosis -> Plan -> TrainConfig
+//! cameras, points -> overlap, exposures ------------------------┘
+//! ```
+//!
+//! Only training photographs are looked at, and no reference image. The host measures; it takes seconds.
+
+mod geometry;
+mod noise;
+mod photograph;
+mod plan;
+mod sharpness;
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+use rayon::prelude::*;
+use serde::Serialize;
+
+use crate::camera::Camera;
+use crate::photographs::dataset::{self, Dataset, LoadOptions, View};
+use crate::photographs::image::{Image, MIDDLE_GREY, Mask, files};
+use crate::photographs::tone::{Exposure, LuminanceHistogram, is_black};
+use crate::{Error, Result};
+use geometry::Shared;
+pub use noise::Noise;
+use photograph::Measured;
+pub use plan::{Number, Plan, PlannedViews, Switch};
+
+/// A view this many times as blurred as the median is named, and at least so many pixels more.
+const BLURRED: [f64; 2] = [1.6, 0.7];
+
+/// What is known of a training photograph. Luminance is that of encoded values unless light is said.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct ViewDiagnosis {
+    /// The view's name.
+    pub name: String,
+    /// Width and height of the photograph as it is stored, pixels.
+    pub size: [u32; 2],
+    /// The 10th percentile of the luminance.
+    pub p10: f64,
+    /// The 90th percentile of the luminance.
+    pub p90: f64,
+    /// p10 / p90; 1 where all is black.
+    pub r: f64,
+    /// The mean luminance.
+    pub mean_luminance: f64,
+    /// The cubic mean of the luminance, what exceeds the 99.9 % quantile counted as that.
+    pub cubic_mean: f64,
+    /// The mean luminance in linear light.
+    pub light: f64,
+    /// How many times more light would expose it as a meter has it: 0.18 / light.
+    pub darkening: f64,
+    /// How much more light it shows of what it shares with others, stops, 0 on the mean; none where it shares too little.
+    pub exposure: Option<f64>,
+    /// The fraction of the values that are 1 or more.
+    pub clipped_fraction: f64,
+    /// The fraction of the values that are 0.
+    pub zero_fraction: f64,
+    /// How many different values there are.
+    pub code_values: usize,
+    /// None where no part is flat and not cut off.
+    pub noise: Option<Noise>,
+    /// The blur of the edges, standard deviation in pixels; none where there are no edges.
+    pub blur: Option<f64>,
+    /// Standard deviation over large regions of log2 of their light: lamps and windows.
+    pub unevenness: f64,
+    /// Points of the dataset that it shows.
+    pub points: usize,
+    /// Of what it shows, the mean fraction of the other training views that look there too.
+    pub overlap: f64,
+    /// It shows next to nothing, and is left out of training.
+    pub is_black: bool,
+}
+
+/// What is known of all training photographs together, those that are as good as black left out; without another word the
+/// mean over the views.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+#[expect(missing_docs, reason = "as in `ViewDiagnosis`")]
+pub struct SceneDiagnosis {
+    pub p10: f64,
+    pub p90: f64,
+    pub r: f64,
+    pub mean_luminance: f64,
+    pub cubic_mean: f64,
+    pub light: f64,
+    /// 0.18 / the mean light.
+    pub darkening: f64,
+    /// How many times brighter the targets would be than the photographs; below 1.5 no curve is needed.
+    pub lift: f64,
+    /// The gain that the rule of `--curve auto` finds, of encoded values.
+    pub gain: f64,
+    /// Standard deviation over the views of their exposure, stops; where the points do not tell, of the gain that each asks
+    /// for.
+    pub exposure_spread: f64,
+    /// Whether shared points told the spread.
+    pub spread_is_measured: bool,
+    /// How much of a view's exposure the curve takes away, of 1, where each view has its own gain.
+    pub exposure_share: f64,
+    pub clipped_fraction: f64,
+    pub zero_fraction: f64,
+    pub code_values: f64,
+    /// Of the patches of all views.
+    pub noise: Option<Noise>,
+    /// The noise that is left in a target once the views that look at a place are averaged, standard deviation of encoded
+    /// values.
+    pub target_noise: f64,
+    /// The median.
+    pub blur: Option<f64>,
+    pub unevenness: f64,
+    pub overlap: f64,
+    /// How many training views look at a point, on the mean.
+    pub views_per_point: f64,
+    /// How many points the dataset has.
+    pub points: usize,
+}
+
+/// What a capture is.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Diagnosis {
+    /// The folder.
+    pub dataset: PathBuf,
+    /// How many views are held out.
+    pub test_views: usize,
+    /// The pixels of all training views as they are loaded.
+    pub pixels: u64,
+    /// What is remarkable, a sentence each.
+    pub remarks: Vec<String>,
+    /// Photographs beside the training photographs that have no pose, by name.
+    pub without_pose: Vec<String>,
+    /// All of them.
+    pub scene: SceneDiagnosis,
+    /// The training views by name.
+    pub views: Vec<ViewDiagnosis>,
+    /// How many training views have a depth map.
+    pub depth_maps: usize,
+    #[serde(skip)]
+    fingerprint: PlannedViews,
+}
+
+impl Diagnosis {
+    /// Looks at the training photographs of a dataset, as stored, and at what its cameras share. `options` are those that it
+    /// was loaded with.
+    ///
+    /// # Errors
+    /// Every photograph is as good as black, or one cannot be read any more.
+    pub fn of(dataset: &Dataset, options: &LoadOptions) -> Result<Self> {
+        let views: Vec<(usize, &View)> =
+            dataset.views.iter().enumerate().filter(|(_, view)| view.is_for_training()).collect();
+        let (files, ..) = Dataset::listed(&dataset.root, options)?;
+        let path = |view: &View| {
+            let file = files.iter().find(|file| file.name == view.name);
+            file.ok_or_else(|| {
+                Error::input(&dataset.root, format!("no longer has photograph {}", view.name))
+            })
+        };
+        let paths = views.iter().map(|(_, view)| path(view)).collect::<Result<Vec<_>>>()?;
+        let shared = Shared::of(dataset, &views)?;
+        let area = |file: &&dataset::Photograph| {
+            Image::size_of(&file.input).map(|(w, h)| u64::from(w) * u64::from(h))
+        };
+        let largest = paths.iter().filter_map(|file| area(file).ok()).max().unwrap_or_default();
+        let (mut photographs, invert) = (vec![], options.invert_masks);
+        for files in paths.chunks(Image::decoded_at_once(largest)) {
+            let loaded = files.par_iter().map(|file| Photograph::load(file, invert));
+            photographs.extend(loaded.collect::<Result<Vec<_>>>()?);
+        }
+        let exposure = Exposure::of(photographs.iter().map(|one| &one.histogram), None);
+        let Some(exposure) = exposure else {
+            let problem = "every training photograph is as good as black (99 % of its pixels are below 2 of 255); \
+                           expose longer";
+            return Err(Error::input(&dataset.root, problem));
+        };
+        let cameras = views.iter().map(|(_, view)| view.camera);
+        let exposure = exposure.seen_by(photographs.iter().map(|one| &one.histogram).zip(cameras));
+        let of_view = |(place, photograph): (usize, &Photograph)| {
+            photograph.diagnosis(&views[place].1.name, &shared, place)
+        };
+        let own: Vec<ViewDiagnosis> = photographs.iter().enumerate().map(of_view).collect();
+        let without_pose = without_pose(&paths, &files, dataset)?;
+        let remarks = remarks(&own, &photographs, &views, &without_pose);
+        let mut scene =
+            SceneDiagnosis::of(&own, photographs, &shared, &exposure, dataset.points.len());
+        // A pixel of a shrunk target is the mean of so many, each way.
+        let shrink = own.iter().map(|view| options.shrink(view.size[0], view.size[1]));
+        scene.target_noise /= shrink.fold(1.0, f64::max);
+        Ok(Self {
+            dataset: dataset.root.clone(),
+            test_views: dataset.test_views().count(),
+            pixels: views.iter().map(|(_, view)| pixels(&view.camera)).sum(),
+            remarks,
+            without_pose,
+            scene,
+            views: own,
+            depth_maps: views.iter().filter(|(_, view)| view.depth.is_some()).count(),
+            fingerprint: PlannedViews::of(dataset),
+        })
+    }
+
+    /// The names of the training views that are as good as black.
+    pub fn black_views(&self) -> Vec<String> {
+        self.views.iter().filter(|view| view.is_black).map(|view| view.name.clone()).collect()
+    }
+}
+
+fn pixels(camera: &Camera) -> u64 {
+    u64::from(camera.width) * u64::from(camera.height)
+}
+
+/// A photograph and what was measured of it.
+struct Photograph {
+    size: [u32; 2],
+    measured: Measured,
+    histogram: LuminanceHistogram,
+}
+
+impl Photograph {
+    fn load(file: &dataset::Photograph, invert_masks: bool) -> Result<Self> {
+        let image = Image::load(&file.input)?;
+        let mask = Mask::load(&file.input, file.mask.as_deref(), invert_masks)?;
+        let counted = mask.map(|mask| mask.counted(&image));
+        let counted = counted.as_deref().unwrap_or(&image.data);
+        Ok(Self {
+            size: [image.width, image.height],
+            measured: Measured::of(&image, counted),
+            histogram: LuminanceHistogram::of(counted),
+        })
+    }
+
+    fn diagnosis(&self, name: &str, shared: &Shared, place: usize) -> ViewDiagnosis {
+        let Self { size, measured, histogram } = self;
+        let [p10, p90] = measured.statistics.percentiles();
+        ViewDiagnosis {
+            name: name.to_owned(),
+            size: *size,
+            p10,
+            p90,
+            r: measured.statistics.printed_ratio(),
+            mean_luminance: measured.statistics.mean_luminance.into(),
+            cubic_mean: histogram.cubic_mean(),
+            light: measured.light,
+            darkening: darkening(measured.light),
+            exposure: shared.exposures[place],
+            clipped_fraction: measured.clipped_fraction,
+            zero_fraction: measured.zero_fraction,
+            code_values: measured.code_values,
+            noise: measured.noise,
+            blur: measured.blur,
+            unevenness: measured.unevenness,
+            points: shared.points[place],
+            overlap: shared.overlaps[place],
+            is_black: is_black(histogram),
+        }
+    }
+}
+
+impl SceneDiagnosis {
+    fn of(
+        views: &[ViewDiagnosis],
+        photographs: Vec<Photograph>,
+        shared: &Shared,
+        exposure: &Exposure,
+        points: usize,
+    ) -> Self {
+        let patches = photographs.into_iter().zip(views).filter(|(_, view)| !view.is_black);
+        let noise = noise::fit(patches.flat_map(|(one, _)| one.measured.patches).collect());
+        let lit: Vec<&ViewDiagnosis> = views.iter().filter(|view| !view.is_black).collect();
+        let mean = |of: fn(&ViewDiagnosis) -> f64| {
+            lit.iter().map(|view| of(view)).sum::<f64>() / lit.len().max(1) as f64
+        };
+        let measured = deviation(lit.iter().filter_map(|view| view.exposure));
+        let light = mean(|view| view.light);
+        Self {
+            p10: mean(|view| view.p10),
+            p90: mean(|view| view.p90),
+            r: mean(|view| view.r),
+            mean_luminance: mean(|view| view.mean_luminance),
+            cubic_mean: mean(|view| view.cubic_mean),
+            light,
+            darkening: darkening(light),
+            lift: exposure.lift(),
+            gain: exposure.gain,
+            exposure_spread: measured.unwrap_or(exposure.spread / std::f64::consts::LN_2),
+            spread_is_measured: measured.is_some(),
+            exposure_share: exposure.share,
+            clipped_fraction: mean(|view| view.clipped_fraction),
+            zero_fraction: mean(|view| view.zero_fraction),
+            code_values: mean(|view| view.code_values as f64),
+            noise,
+            target_noise: noise.map_or(0.0, |noise| target_noise(noise, light, exposure, shared)),
+            blur: geometry::median(lit.iter().filter_map(|view| view.blur).collect()),
+            unevenness: mean(|view| view.unevenness),
+            overlap: mean(|view| view.overlap),
+            views_per_point: shared.views_per_point,
+            points,
+        }
+    }
+}
+
+/// How many times more light would expose a photograph of this mean as a meter has it.
+fn darkening(light: f64) -> f64 {
+    f64::from(MIDDLE_GREY) / light.max(f64::MIN_POSITIVE)
+}
+
+/// The noise of a pixel of the mean light, in the target, averaged over the views that look at a place.
+fn target_noise(noise: Noise, light: f64, exposure: &Exposure, shared: &Shared) -> f64 {
+    let encoded = f64::from(crate::photographs::image::srgb_from_linear(light as f32));
+    let weight = exposure.weight();
+    // The curve's own slope where the photograph's mean lies; without a curve 1.
+    let soft = |x: f64| crate::photographs::tone::soft(x, exposure.gain);
+    let step = 1e-4;
+    let slope = (soft(encoded + step) - soft(encoded - step)) / (2.0 * step);
+    let slope = weight * slope + (1.0 - weight);
+    slope * noise.deviation(light) / noise::slope(light) / shared.views_per_point.max(1.0).sqrt()
+}
+
+/// The standard deviation; none of fewer than two values.
+fn deviation(values: impl Iterator<Item = f64>) -> Option<f64> {
+    let values: Vec<f64> = values.collect();
+    let count = values.len() as f64;
+    let mean = values.iter().sum::<f64>() / count;
+    let variance = values.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / count;
+    (values.len() >= 2).then(|| variance.sqrt())
+}
+
+/// The photographs beside those of the training views that are no view's.
+fn without_pose(
+    paths: &[&dataset::Photograph],
+    files: &[dataset::Photograph],
+    dataset: &Dataset,
+) -> Result<Vec<String>> {
+    let folders: BTreeSet<&Path> = paths.iter().filter_map(|file| file.input.parent()).collect();
+    let mut names = vec![];
+    for folder in folders {
+        let photographs = files::photographs_in(folder)?;
+        let is_a_views = |path: &&PathBuf| files.iter().any(|file| file.input == **path);
+        let others = photographs.iter().filter(|path| !is_a_views(path));
+        let stems = others.filter_map(|path| path.file_stem()?.to_str());
+        let is_posed = |name: &&str| dataset.views.iter().any(|view| view.name == **name);
+        names.extend(stems.filter(|name| !is_posed(name)).map(str::to_owned));
+    }
+    Ok(names)
+}
+
+/// What a user should know before training.
+fn remarks(
+    views: &[ViewDiagnosis],
+    photographs: &[Photograph],
+    cameras: &[(usize, &View)],
+    without_pose: &[String],
+) -> Vec<String> {
+    let mut remarks = vec![];
+    let named = |names: Vec<&str>| match names.len() {
+        0..=4 => names.join(", "),
+        more => format!("{}, and {} more", names[..3].join(", "), more - 3),
+    };
+    let names = |is: &dyn Fn(usize) -> bool| -> Vec<&str> {
+        (0..views.len())
+            .filter(|&place| is(place))
+            .map(|place| views[place].name.as_str())
+            .collect()
+    };
+    let mut say = |names: Vec<&str>, what: &str| {
+        if !names.is_empty() {
+            remarks.push(format!("{} {what}: {}", names.len(), named(names)));
+        }
+    };
+    say(names(&|place| views[place].is_black), "as good as black, left out of training");
+    let checksum = |place: usize| photographs[place].measured.checksum;
+    let repeats = |place: usize| (0..place).any(|other| checksum(other) == checksum(place));
+    say(names(&|place| repeats(place) && !views[place].is_black), "the same photograph as another");
+    let blur = geometry::median(views.iter().filter_map(|view| view.blur).collect());
+    let [times, more] = BLURRED;
+    let is_blurred = |place: usize| {
+        let own = views[place].blur.zip(blur);
+        own.is_some_and(|(own, median)| own > times * median && own > median + more)
+    };
+    say(names(&is_blurred), "blurred more than the others");
+    say(without_pose.iter().map(String::as_str).collect(), "without a pose, not used");
+    let centers: Vec<_> = cameras.iter().map(|(_, view)| view.camera.center()).collect();
+    if cameras.len() == 1 {
+        remarks.push("one photograph tells no depth: other views will not look right".to_owned());
+    } else if centers.windows(2).all(|two| two[0].distance(two[1]) < 1e-9) {
+        remarks.push("all cameras stand in one spot: they tell no depth".to_owned());
+    }
+    remarks
+}

@@ -1,0 +1,202 @@
+//! What the cameras share: points, overlap, and how much brighter one shows a point than another.
+
+use glam::DVec2;
+
+use crate::Result;
+use crate::camera::Camera;
+use crate::photographs::dataset::{Dataset, Point, View};
+use crate::photographs::image::{Image, linear_from_srgb};
+use crate::photographs::tone::{luminance, measurable};
+use crate::splats::scene::init;
+
+/// Random points in front of the cameras where the dataset has none.
+const RANDOM_POINTS: usize = 2000;
+/// More points tell no more of exposures.
+const MOST_POINTS: usize = 20_000;
+/// A point's brightness is the mean over a square of pixels that reaches so far from its middle.
+const REACH: i64 = 2;
+/// A view with fewer shared points has no known exposure.
+const LEAST_SHARED: usize = 12;
+
+/// What the cameras of the training views share.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(super) struct Shared {
+    /// How many points each view shows: those that it helped to triangulate, where the dataset says.
+    pub(super) points: Vec<usize>,
+    /// Of what each view shows, the mean fraction of the other views that look at it too.
+    pub(super) overlaps: Vec<f64>,
+    /// The mean number of views that look at a point.
+    pub(super) views_per_point: f64,
+    /// log2 of how much more light each view shows of what it shares with others, mean 0; none where it shares too little.
+    pub(super) exposures: Vec<Option<f64>>,
+}
+
+impl Shared {
+    /// Of training views, in their order.
+    ///
+    /// # Errors
+    /// A photograph can no longer be read.
+    pub(super) fn of(dataset: &Dataset, views: &[(usize, &View)]) -> Result<Self> {
+        let random;
+        let points = if dataset.points.is_empty() {
+            let cameras: Vec<Camera> = views.iter().map(|(_, view)| view.camera).collect();
+            let point = |position| Point { position, views: vec![] };
+            random = init::random(&cameras, RANDOM_POINTS, 0).into_iter().map(point).collect();
+            &random
+        } else {
+            &dataset.points
+        };
+        let stride = points.len().div_ceil(MOST_POINTS).max(1);
+        let points: Vec<&Point> = points.iter().step_by(stride).collect();
+        let inside = |point: &&Point| -> Vec<usize> {
+            let sees = |view: &View| pixel(&view.camera, point).is_some();
+            (0..views.len()).filter(|&place| sees(views[place].1)).collect()
+        };
+        let seen: Vec<Vec<usize>> = points.iter().map(inside).collect();
+        let tracked: Vec<Vec<usize>> = points.iter().map(|point| track(point, views)).collect();
+        let has_tracks = tracked.iter().any(|track| !track.is_empty());
+        let counted = if has_tracks { &tracked } else { &seen };
+
+        let count = |seen: &[Vec<usize>], place: usize| {
+            seen.iter().filter(|places| places.contains(&place)).count()
+        };
+        let others = views.len().saturating_sub(1).max(1) as f64;
+        let overlap = |place: usize| {
+            let shown = seen.iter().filter(|places| places.contains(&place));
+            let shares: Vec<f64> = shown.map(|places| (places.len() - 1) as f64 / others).collect();
+            shares.iter().sum::<f64>() / shares.len().max(1) as f64
+        };
+        let visible = seen.iter().map(Vec::len).filter(|&count| count > 0);
+        let (sum, visible) = visible.fold((0, 0), |(sum, n), count| (sum + count, n + 1));
+        let own =
+            |place| if dataset.points.is_empty() { 0 } else { stride * count(counted, place) };
+        Ok(Self {
+            points: (0..views.len()).map(own).collect(),
+            overlaps: (0..views.len()).map(overlap).collect(),
+            views_per_point: sum as f64 / visible.max(1) as f64,
+            exposures: if dataset.points.is_empty() {
+                vec![None; views.len()]
+            } else {
+                exposures(&brightness(&points, counted, views)?, views.len())
+            },
+        })
+    }
+}
+
+/// The places of the training views that triangulated a point.
+fn track(point: &Point, views: &[(usize, &View)]) -> Vec<usize> {
+    let place = |&view: &u32| views.iter().position(|(index, _)| *index == view as usize);
+    point.views.iter().filter_map(place).collect()
+}
+
+fn pixel(camera: &Camera, point: &Point) -> Option<DVec2> {
+    let size = DVec2::new(camera.width.into(), camera.height.into());
+    let pixel = camera.project(point.position)?;
+    (pixel.cmpge(DVec2::ZERO).all() && pixel.cmplt(size).all()).then_some(pixel)
+}
+
+/// Of each point (view, log2 of the linear luminance around it), where it is neither black nor white.
+fn brightness(
+    points: &[&Point],
+    seen: &[Vec<usize>],
+    views: &[(usize, &View)],
+) -> Result<Vec<Vec<(usize, f64)>>> {
+    let mut lights = vec![vec![]; points.len()];
+    // One photograph after another: they may have to be read anew.
+    for (place, (_, view)) in views.iter().enumerate() {
+        let Some(image) = view.loaded()? else { continue };
+        for ((point, places), lights) in points.iter().zip(seen).zip(&mut lights) {
+            let at = pixel(&view.camera, point).filter(|_| places.contains(&place));
+            let light = at.and_then(|at| light_around(&image, at));
+            lights.extend(light.map(|light| (place, light.log2())));
+        }
+    }
+    lights.retain(|seen| seen.len() >= 2);
+    Ok(lights)
+}
+
+/// The mean linear luminance around a pixel.
+fn light_around(image: &Image, at: DVec2) -> Option<f64> {
+    let (width, height) = (i64::from(image.width), i64::from(image.height));
+    let (x, y) = (at.x as i64, at.y as i64);
+    if !(REACH..width - REACH).contains(&x) || !(REACH..height - REACH).contains(&y) {
+        return None;
+    }
+    let mut sum = 0.0;
+    for (dy, dx) in (-REACH..=REACH).flat_map(|dy| (-REACH..=REACH).map(move |dx| (dy, dx))) {
+        let rgb = image.pixel((x + dx) as u32, (y + dy) as u32).map(measurable);
+        if rgb.iter().any(|&value| value >= 1.0) {
+            return None;
+        }
+        sum += f64::from(luminance(rgb.map(linear_from_srgb)));
+    }
+    let mean = sum / ((2 * REACH + 1) as f64).powi(2);
+    (mean > 0.0).then_some(mean)
+}
+
+/// Alternating medians: a point's brightness over its views, a view's exposure over its points. Of all points the brighter
+/// half counts, judged without the exposures: noise and whole codes distort the logarithm of little light.
+fn exposures(points: &[Vec<(usize, f64)>], view_count: usize) -> Vec<Option<f64>> {
+    const ROUNDS: usize = 20;
+    let mut exposures = vec![Some(0.0); view_count];
+    let mut kept: Vec<&Vec<(usize, f64)>> = points.iter().collect();
+    for round in 0..ROUNDS {
+        let level = |point: &[(usize, f64)]| {
+            let own = point.iter().filter_map(|&(view, light)| Some(light - exposures[view]?));
+            median(own.collect())
+        };
+        // Once the exposures are about right, they say which points are bright.
+        if round == ROUNDS / 2 {
+            let typical = median(points.iter().filter_map(|point| level(point)).collect());
+            kept.retain(|point| level(point) >= typical);
+        }
+        let mut of_view = vec![vec![]; view_count];
+        for point in &kept {
+            let Some(level) = level(point) else { continue };
+            for &(view, light) in *point {
+                of_view[view].push(light - level);
+            }
+        }
+        let known = |of: Vec<f64>| if of.len() < LEAST_SHARED { None } else { median(of) };
+        exposures = of_view.into_iter().map(known).collect();
+        let known: Vec<f64> = exposures.iter().copied().flatten().collect();
+        let mean = known.iter().sum::<f64>() / known.len().max(1) as f64;
+        exposures.iter_mut().flatten().for_each(|exposure| *exposure -= mean);
+    }
+    exposures
+}
+
+pub(super) fn median(mut values: Vec<f64>) -> Option<f64> {
+    values.sort_unstable_by(f64::total_cmp);
+    let middle = values.len() / 2;
+    let lower = values.get(middle.checked_sub(1 - values.len() % 2)?)?;
+    Some((lower + values[middle]) / 2.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn medians_lie_in_the_middle() {
+        assert_eq!(median(vec![]), None);
+        assert_eq!(median(vec![3.0]), Some(3.0));
+        assert_eq!(median(vec![3.0, 1.0]), Some(2.0));
+        assert_eq!(median(vec![5.0, 1.0, 2.0]), Some(2.0));
+    }
+
+    #[test]
+    fn exposures_are_found_whatever_the_points_show() {
+        let truth = [0.5, -1.0, 0.25, 0.25];
+        let point = |index: usize| -> Vec<(usize, f64)> {
+            let level = -3.0 - 0.1 * (index % 17) as f64;
+            let views = (0..4).filter(|view| view % 3 != index % 3 || index.is_multiple_of(2));
+            views.map(|view| (view, level + truth[view])).collect()
+        };
+        let points: Vec<_> = (0..200).map(point).collect();
+        for (found, truth) in exposures(&points, 4).into_iter().zip(truth) {
+            assert!((found.unwrap() - truth).abs() < 1e-6);
+        }
+        assert_eq!(exposures(&points[..3], 4), [None; 4]);
+    }
+}

@@ -1,0 +1,133 @@
+//! What one photograph is, as it is stored: brightness, code values, noise, blur.
+
+use super::noise::{self, Noise, Patch};
+use super::sharpness;
+use crate::photographs::image::{Image, linear_from_srgb};
+use crate::photographs::tone::{Statistics, luminance, measurable};
+
+/// The longest side of what the blur is measured in, pixels: the middle of a larger photograph.
+const BLUR_SIDE: u32 = 640;
+/// Illumination is what large regions have in common: so many columns and rows of them.
+const REGIONS: [usize; 2] = [8, 6];
+
+/// What is measured of one photograph; fractions are over the values of all channels.
+#[derive(Clone, Debug)]
+pub(super) struct Measured {
+    pub(super) statistics: Statistics,
+    /// The mean luminance in linear light.
+    pub(super) light: f64,
+    pub(super) clipped_fraction: f64,
+    pub(super) zero_fraction: f64,
+    /// Different values, of 2 to the `bits`.
+    pub(super) code_values: usize,
+    pub(super) noise: Option<Noise>,
+    pub(super) patches: Vec<Patch>,
+    pub(super) blur: Option<f64>,
+    /// Standard deviation over large regions of log2 of their linear luminance.
+    pub(super) unevenness: f64,
+    /// Of the pixels.
+    pub(super) checksum: u64,
+}
+
+impl Measured {
+    /// `counted` are the values of the pixels that count.
+    pub(super) fn of(image: &Image, counted: &[f32]) -> Self {
+        let values = counted.len().max(1) as f64;
+        let fraction = |is: fn(f32) -> bool| {
+            counted.iter().filter(|&&value| is(value)).count() as f64 / values
+        };
+        let linear = Linear::of(image);
+        let mut patches = vec![];
+        for plane in linear.planes.chunks(image.pixel_count().max(1)) {
+            patches.extend(noise::patches(plane, image.width as usize, linear.step));
+        }
+        let luminance = luminances(&linear.planes);
+        Self {
+            statistics: Statistics::of(counted),
+            light: mean(&luminance),
+            // Positive phrasing: a NaN is neither.
+            clipped_fraction: fraction(|value| value >= 1.0),
+            zero_fraction: fraction(|value| value <= 0.0),
+            code_values: code_values(counted),
+            noise: noise::fit(patches.clone()),
+            patches,
+            blur: blur(image),
+            unevenness: unevenness(&luminance, image.width as usize),
+            checksum: crate::base::hash::of(bytemuck::cast_slice(&image.data)),
+        }
+    }
+}
+
+/// The planes in linear light.
+struct Linear {
+    planes: Vec<f32>,
+    /// Between two codes, as encoded values; 0 of a float image.
+    step: f64,
+}
+
+impl Linear {
+    fn of(image: &Image) -> Self {
+        let levels = [255.0_f32, 65_535.0].into_iter().find(|&levels| {
+            let is_whole = |&value: &f32| {
+                let code = value * levels;
+                (code - code.round()).abs() <= 2e-3 && (0.0..=levels).contains(&code)
+            };
+            image.data.iter().all(is_whole)
+        });
+        let Some(levels) = levels else {
+            let planes = image.data.iter().map(|&value| linear_from_srgb(measurable(value)));
+            return Self { planes: planes.collect(), step: 0.0 };
+        };
+        let table: Vec<f32> =
+            (0..=levels as u32).map(|code| linear_from_srgb(code as f32 / levels)).collect();
+        let value = |&value: &f32| table[(value * levels).round() as usize];
+        Self { planes: image.data.iter().map(value).collect(), step: 1.0 / f64::from(levels) }
+    }
+}
+
+/// How many different values there are, as 16-bit codes.
+fn code_values(data: &[f32]) -> usize {
+    let mut used = vec![false; 1 << 16];
+    for &value in data {
+        used[(measurable(value).min(1.0) * 65_535.0).round() as usize] = true;
+    }
+    used.into_iter().filter(|&used| used).count()
+}
+
+fn luminances(planes: &[f32]) -> Vec<f32> {
+    let pixels = planes.len() / 3;
+    let pixel = |index: usize| luminance([0, 1, 2].map(|plane| planes[plane * pixels + index]));
+    (0..pixels).map(pixel).collect()
+}
+
+fn mean(values: &[f32]) -> f64 {
+    values.iter().map(|&value| f64::from(value)).sum::<f64>() / values.len().max(1) as f64
+}
+
+/// The blur of the encoded luminance in the middle of the photograph.
+fn blur(image: &Image) -> Option<f64> {
+    let (width, height) = (image.width.min(BLUR_SIDE), image.height.min(BLUR_SIDE));
+    let (left, top) = ((image.width - width) / 2, (image.height - height) / 2);
+    let place = |index: u32| (left + index % width, top + index / width);
+    let pixel = |(x, y)| luminance(image.pixel(x, y).map(measurable));
+    let middle: Vec<f32> = (0..width * height).map(|index| pixel(place(index))).collect();
+    sharpness::blur(&middle, width as usize)
+}
+
+/// The standard deviation over large regions of log2 of their mean; 0 where all is black.
+fn unevenness(luminance: &[f32], width: usize) -> f64 {
+    let height = luminance.len() / width.max(1);
+    let [columns, rows] = REGIONS;
+    let mut regions = vec![(0.0, 0.0); columns * rows];
+    for (index, &value) in luminance.iter().enumerate() {
+        let (x, y) = (index % width * columns / width, index / width * rows / height);
+        let (sum, count) = &mut regions[y * columns + x];
+        *sum += f64::from(value);
+        *count += 1.0;
+    }
+    let means: Vec<f64> = regions.iter().map(|&(sum, count)| sum / f64::max(count, 1.0)).collect();
+    let whole = means.iter().sum::<f64>() / means.len() as f64;
+    // A black corner is no light source: what is below a thousandth of the mean counts as that.
+    let logs: Vec<f64> = means.iter().map(|mean| mean.max(1e-3 * whole).log2()).collect();
+    super::deviation(logs.iter().copied()).filter(|_| whole > 0.0).unwrap_or(0.0)
+}

@@ -1,0 +1,332 @@
+//! What the model of a capture has, and why: what `diagnose` prints, `train` goes by and `plan.toml` holds.
+
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+
+use super::{Diagnosis, SceneDiagnosis};
+use crate::base::input;
+use crate::photographs::dataset::{Dataset, View};
+use crate::photographs::tone::ToneCurve;
+use crate::splats::scene::{Features, Shape, width};
+use crate::train::{Learning, Part, TrainConfig};
+use crate::{Error, Result};
+
+/// Targets less than this many times brighter than their photographs are the photographs: the rule of `--curve auto`.
+const LEAST_LIFT: f64 = 1.5;
+/// Targets whose exposures are spread by more stops are worth learning them. A chair of which the views differ by 1.2 stops,
+/// all but .02 of which the curve takes away, lost .4 dB by it.
+const LEAST_SPREAD: f64 = 0.3;
+/// From this much noise in the average over the views, of encoded values, a denoiser pays (docs/benchmarks.md).
+const LEAST_NOISE: f64 = 0.01;
+/// Light that varies by more stops between large regions is worth an illumination of its own. A hall with one bright window
+/// has 2.6; up to 1 the network bought .2 dB at most for two to four times the time.
+const LEAST_UNEVENNESS: f64 = 3.0;
+/// Each SH coefficient of a channel is to be seen by so many views.
+const VIEWS_PER_COEFFICIENT: f64 = 2.0;
+/// A degree that the schedule reaches later in the run does not settle.
+const LATEST_DEGREE: f64 = 0.8;
+/// Pixels of the training views that a Gaussian is to stand for at least. Leaves that move took 9 where growth was free, a
+/// chair 80.
+const PIXELS_PER_GAUSSIAN: f64 = 8.0;
+/// The fraction of the device's memory that Gaussians may take.
+const MEMORY_SHARE: f64 = 0.5;
+/// Buffers as long as the parameters: themselves, gradients, two moments; with headroom.
+const COPIES: f64 = 4.0 * 1.5;
+
+/// A part of the model: whether it is on, and why.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Switch {
+    /// Whether the model has it.
+    pub on: bool,
+    /// The reason with its figure, a sentence.
+    #[serde(default)]
+    pub why: String,
+}
+
+/// A number of the model, and why it is that.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Number {
+    /// The number.
+    pub value: u64,
+    /// The reason with its figure, a sentence.
+    #[serde(default)]
+    pub why: String,
+}
+
+/// Which dataset a plan is for: its training views by name and loaded size.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PlannedViews {
+    /// How many.
+    pub views: usize,
+    /// Width and height of the first.
+    pub size: [u32; 2],
+    /// Of all names and sizes.
+    pub fingerprint: String,
+}
+
+impl PlannedViews {
+    /// The dataset's own.
+    pub fn of(dataset: &Dataset) -> Self {
+        let views: Vec<_> = dataset.views.iter().filter(|view| view.is_for_training()).collect();
+        let line =
+            |view: &&View| format!("{} {}x{}\n", view.name, view.camera.width, view.camera.height);
+        let lines: String = views.iter().map(line).collect();
+        let hash = fnv1a(lines.bytes().map(u64::from));
+        let size = views.first().map_or([0; 2], |view| [view.camera.width, view.camera.height]);
+        Self { views: views.len(), size, fingerprint: format!("{hash:016x}") }
+    }
+
+    fn described(&self) -> String {
+        let [width, height] = self.size;
+        format!("{} training views of {width}x{height}", self.views)
+    }
+}
+
+/// What the model of a capture has, and why.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Plan {
+    /// Training views that are left out, by name.
+    #[serde(default)]
+    pub left_out: Vec<String>,
+    /// Which dataset it is for.
+    pub dataset: PlannedViews,
+    /// A tone curve makes the targets; else the photographs are.
+    pub curve: Switch,
+    /// Each view's exposure is learned.
+    pub exposure: Switch,
+    /// [`Part::Denoiser`].
+    pub denoiser: Switch,
+    /// [`Part::Tonemapper`].
+    pub tonemapper: Switch,
+    /// [`Part::Structure`].
+    pub structure: Switch,
+    /// [`Part::Depth`].
+    pub depth: Switch,
+    /// Highest degree of the spherical harmonics.
+    pub sh_degree: Number,
+    /// Density control stops growing here.
+    pub max_gaussians: Number,
+}
+
+impl Plan {
+    /// The plan for a capture under a configuration, whose steps, schedule and limits it keeps to, on a device with so many
+    /// bytes of memory.
+    pub fn new(diagnosis: &Diagnosis, config: &TrainConfig, memory: u64) -> Self {
+        let scene = &diagnosis.scene;
+        let sh_degree = sh_degree(scene, config);
+        let curve = curve(scene);
+        let follows_views = curve.on && !config.tone.scene_statistics;
+        let spread = Spread::of(scene, follows_views, diagnosis.views.len());
+        Self {
+            left_out: diagnosis.black_views(),
+            dataset: diagnosis.fingerprint.clone(),
+            curve,
+            exposure: spread.exposure(),
+            denoiser: denoiser(scene),
+            tonemapper: tonemapper(scene, spread.is_wide),
+            structure: spread.structure(scene),
+            depth: depth(diagnosis),
+            max_gaussians: max_gaussians(diagnosis, config, sh_degree.value, memory),
+            sh_degree,
+        }
+    }
+
+    /// Sets what the plan decides.
+    pub fn apply(&self, config: &mut TrainConfig) {
+        if !self.curve.on {
+            config.tone = config.tone.with_curve(ToneCurve::None);
+        }
+        config.exposure.learn = if self.exposure.on { Learning::On } else { Learning::Off };
+        let parts = [
+            (Part::Denoiser, &self.denoiser),
+            (Part::Tonemapper, &self.tonemapper),
+            (Part::Structure, &self.structure),
+            (Part::Depth, &self.depth),
+        ];
+        let on = parts.iter().filter(|(_, switch)| switch.on).map(|(part, _)| *part);
+        config.model.set_parts(&on.collect::<Vec<_>>());
+        config.sh_degree = u32::try_from(self.sh_degree.value).unwrap_or(u32::MAX);
+        config.max_gaussians = usize::try_from(self.max_gaussians.value).unwrap_or(usize::MAX);
+    }
+
+    /// Every decision: its name, what was decided, and why.
+    pub fn decisions(&self) -> Vec<(&'static str, String, &str)> {
+        let switch = |name, switch: &'_ Switch| {
+            let on = if switch.on { "on" } else { "off" };
+            (name, on.to_owned())
+        };
+        let number = |name, number: &'_ Number| (name, number.value.to_string());
+        let named = [
+            (switch("curve", &self.curve), &self.curve.why),
+            (switch("exposure", &self.exposure), &self.exposure.why),
+            (switch("denoiser", &self.denoiser), &self.denoiser.why),
+            (switch("tonemapper", &self.tonemapper), &self.tonemapper.why),
+            (switch("structure", &self.structure), &self.structure.why),
+            (switch("depth", &self.depth), &self.depth.why),
+            (number("sh_degree", &self.sh_degree), &self.sh_degree.why),
+            (number("max_gaussians", &self.max_gaussians), &self.max_gaussians.why),
+        ];
+        named.into_iter().map(|((name, value), why)| (name, value, why.as_str())).collect()
+    }
+
+    /// The plan as TOML.
+    ///
+    /// # Errors
+    /// None for a plan that was made or read.
+    pub fn to_toml(&self) -> Result<String> {
+        const HEAD: &str = "# What this capture needs, and why. Change what you know better and pass it to \
+                            `nightsplat train --plan FILE`.\n\n";
+        let text = toml::to_string(self).map_err(|error| Error::Usage(error.to_string()))?;
+        Ok(HEAD.to_owned() + &text)
+    }
+
+    /// Reads the plan of a dataset.
+    ///
+    /// # Errors
+    /// [`Error::Input`]: the file cannot be read, holds no plan, or that of another dataset.
+    pub fn load(path: &Path, dataset: &Dataset) -> Result<Self> {
+        let text = input::text(path)?;
+        let plan: Self = toml::from_str(&text).map_err(|error| {
+            let line = error.span().map(|span| text[..span.start].matches('\n').count() + 1);
+            let place = line.map(|line| format!(" (line {line})")).unwrap_or_default();
+            let message = error.message().lines().next().unwrap_or_default();
+            Error::input(
+                path,
+                format!("is no plan: {message}{place}; make one with `nightsplat diagnose`"),
+            )
+        })?;
+        let own = PlannedViews::of(dataset);
+        if plan.dataset != own {
+            let (of, is) = (plan.dataset.described(), own.described());
+            let problem = format!(
+                "is the plan of another dataset ({of}; {} has {is}, by other names or sizes); diagnose this one",
+                dataset.root.display()
+            );
+            return Err(Error::input(path, problem));
+        }
+        Ok(plan)
+    }
+}
+
+fn curve(scene: &SceneDiagnosis) -> Switch {
+    let SceneDiagnosis { lift, mean_luminance, .. } = scene;
+    let on = *lift >= LEAST_LIFT;
+    let verdict = if on { "dark" } else { "well lit" };
+    let why = format!(
+        "{verdict}: a target is {lift:.1} times as bright as its photograph (mean luminance {mean_luminance:.3}, a curve from {LEAST_LIFT})"
+    );
+    Switch { on, why }
+}
+
+/// How far the exposures of the targets lie apart.
+struct Spread {
+    /// Enough to be worth learning them.
+    is_wide: bool,
+    found: String,
+}
+
+impl Spread {
+    /// A curve that follows each view takes most of the photographs' spread away.
+    fn of(scene: &SceneDiagnosis, follows_views: bool, views: usize) -> Self {
+        let SceneDiagnosis { exposure_spread: spread, exposure_share: share, .. } = *scene;
+        let left = if follows_views { (1.0 - share) * spread } else { spread };
+        let by = if scene.spread_is_measured {
+            "at shared points"
+        } else {
+            "of the gain each view asks for"
+        };
+        Self {
+            is_wide: left >= LEAST_SPREAD && views > 2,
+            found: format!(
+                "exposures are spread by {spread:.2} stops {by}, of which the targets keep {left:.2}"
+            ),
+        }
+    }
+
+    fn exposure(&self) -> Switch {
+        Switch { on: self.is_wide, why: format!("{} (learned from {LEAST_SPREAD})", self.found) }
+    }
+
+    fn structure(&self, scene: &SceneDiagnosis) -> Switch {
+        let on = self.is_wide && scene.target_noise < LEAST_NOISE;
+        Switch { on, why: format!("{}: edges are the same in all of them", self.found) }
+    }
+}
+
+fn denoiser(scene: &SceneDiagnosis) -> Switch {
+    let SceneDiagnosis { target_noise, views_per_point, .. } = scene;
+    let on = *target_noise >= LEAST_NOISE;
+    let why = format!(
+        "the average of {views_per_point:.0} views leaves noise of {target_noise:.3} in the target (a network from {LEAST_NOISE})"
+    );
+    Switch { on, why }
+}
+
+fn tonemapper(scene: &SceneDiagnosis, learns_exposures: bool) -> Switch {
+    let unevenness = scene.unevenness;
+    // A learned exposure does not describe the dark photographs, to which the tonemapper holds the model.
+    let on = unevenness >= LEAST_UNEVENNESS && scene.lift >= LEAST_LIFT && !learns_exposures;
+    let why = format!(
+        "light varies by {unevenness:.1} stops between large regions (an illumination of its own from {LEAST_UNEVENNESS}, in dark sets)"
+    );
+    Switch { on, why }
+}
+
+fn depth(diagnosis: &Diagnosis) -> Switch {
+    let (maps, views) = (diagnosis.depth_maps, diagnosis.views.len());
+    Switch { on: maps > 0, why: format!("{maps} of {views} training views have a depth map") }
+}
+
+/// The highest degree whose coefficients are seen often enough and trained long enough.
+fn sh_degree(scene: &SceneDiagnosis, config: &TrainConfig) -> Number {
+    let seen = (scene.views_per_point / VIEWS_PER_COEFFICIENT).sqrt() - 1.0;
+    let seen = seen.max(0.0) as u32;
+    let last = (config.steps as f64 * LATEST_DEGREE) as u64;
+    let trained = config.schedule.sh_degree(last, u32::MAX);
+    let value = config.sh_degree.min(seen).min(trained);
+    let why = if config.sh_degree < seen.min(trained) {
+        "the preset's or the configuration's limit".to_owned()
+    } else if trained < seen.min(config.sh_degree) {
+        format!("{} steps are too few to train a higher one", config.steps)
+    } else {
+        let views = scene.views_per_point;
+        format!(
+            "a point is seen by {views:.0} views, {VIEWS_PER_COEFFICIENT} are wanted for each of the (degree + 1)^2 coefficients"
+        )
+    };
+    Number { value: value.into(), why }
+}
+
+fn max_gaussians(
+    diagnosis: &Diagnosis,
+    config: &TrainConfig,
+    sh_degree: u64,
+    memory: u64,
+) -> Number {
+    // Features are 8 floats at most, which the headroom covers.
+    let shape = Shape { sh_degree: sh_degree as u32, features: Features::NONE };
+    let pixels = diagnosis.pixels as f64;
+    let wanted = (pixels / PIXELS_PER_GAUSSIAN).max(diagnosis.scene.points as f64);
+    let bytes = width(shape) as f64 * size_of::<f32>() as f64 * COPIES;
+    let fitting = MEMORY_SHARE * memory as f64 / bytes;
+    let limit = config.max_gaussians as f64;
+    let why = if limit < wanted.min(fitting) {
+        "the preset's or the configuration's limit".to_owned()
+    } else if fitting < wanted {
+        let gib = memory as f64 / f64::from(1 << 30);
+        format!("half of the device's {gib:.1} GiB at {bytes:.0} bytes each")
+    } else {
+        format!("one for {PIXELS_PER_GAUSSIAN} of the {pixels:.0} pixels to train on")
+    };
+    Number { value: wanted.min(fitting).min(limit).round().max(1.0) as u64, why }
+}
+
+/// The hash FNV-1a, which plans hold: equal bytes have equal hashes, on every machine.
+fn fnv1a(bytes: impl Iterator<Item = u64>) -> u64 {
+    bytes.fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ byte).wrapping_mul(0x0100_0000_01b3))
+}

@@ -1,0 +1,77 @@
+//! `nightsplat curves`, in process.
+#![cfg(feature = "cli")]
+#![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
+
+use clap::Parser;
+use nightsplat::cli::curves::{CurvesArgs, text};
+use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
+use nightsplat::photographs::tone::FAMILIES;
+
+#[derive(Debug, Parser)]
+struct Command {
+    #[command(flatten)]
+    curves: CurvesArgs,
+}
+
+fn parse(arguments: &str) -> Result<CurvesArgs, clap::Error> {
+    let words = std::iter::once("curves").chain(arguments.split_whitespace());
+    Command::try_parse_from(words).map(|command| command.curves)
+}
+
+fn printed(arguments: &str) -> String {
+    text(&parse(arguments).unwrap()).unwrap()
+}
+
+#[test]
+fn every_curve_is_listed_with_its_formula_and_source() {
+    let listing = printed("");
+    for family in &FAMILIES {
+        assert!(listing.lines().any(|line| line.starts_with(family.name)), "{}", family.name);
+        assert!(listing.contains(family.formula) && listing.contains(family.source));
+    }
+    assert!(printed("gamma").contains("a = 0.7199, b = 0.5617"));
+}
+
+#[test]
+fn values_are_those_of_the_formula() {
+    let values = printed("gamma hable-2010 linear ap3 --table --at 0.25,1");
+    let row = |name: &str| {
+        let line = values.lines().find(|line| line.starts_with(name)).unwrap();
+        line.split_whitespace().skip(1).map(str::to_owned).collect::<Vec<_>>()
+    };
+    assert_eq!(row("t"), ["0.25", "1"]);
+    assert_eq!(row("gamma"), ["0.330", "0.720"]);
+    assert_eq!(row("linear"), ["0.250", "1.000"]);
+    assert_eq!(row("ap3"), ["0.222", "0.629"]);
+    assert!(text(&parse("gamma --table --at=-1").unwrap()).is_err());
+}
+
+#[test]
+fn curves_are_drawn_with_the_statistics_of_a_dataset() {
+    let folder = tempfile::tempdir().unwrap();
+    let set = folder.path().join("set");
+    synthetic::write(&set, &SyntheticOptions { width: 32, height: 24, ..Default::default() })
+        .unwrap();
+    let csv = folder.path().join("mine.csv");
+    std::fs::write(&csv, "0,0\n1,0.7\n2,1\n").unwrap();
+    let svg = folder.path().join("curves.svg");
+    printed(&format!(
+        "ap3 ase linear lum_preserve per_channel p80 {} --plot {} --dataset {}",
+        csv.display(),
+        svg.display(),
+        set.display()
+    ));
+    let svg = std::fs::read_to_string(svg).unwrap();
+    assert!(svg.starts_with("<svg xmlns=") && svg.matches("<polyline").count() == 7, "{svg}");
+    for part in [">p10<", ">p90<", ">mean Y<", ">mine<", "--series-0"] {
+        assert!(svg.contains(part), "{part} is not in {svg}");
+    }
+    assert!(!svg.contains("NaN"));
+}
+
+#[test]
+fn an_unknown_curve_is_misuse() {
+    let error = parse("gama").unwrap_err();
+    assert_eq!(error.exit_code(), 2);
+    assert!(error.to_string().contains("sinh_ratio"));
+}

@@ -1,0 +1,54 @@
+//! What `train` says while it trains, for people, logs and schedulers.
+#![cfg(feature = "cli")]
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
+use serde_json::Value;
+
+use crate::common::command::{command, refused, succeed};
+
+/// Standard output and error of a short run of six steps that is scored behind the third.
+fn trained(more: &str) -> (String, String) {
+    let folder = tempfile::tempdir().unwrap();
+    let (set, out) = (folder.path().join("set"), folder.path().join("run"));
+    let (set, out) = (set.display(), out.display());
+    succeed(&format!("synth {set} --views 9 --width 32 --height 24"));
+    let train = format!("train {set} --out {out} --steps 6 --sh-degree 0 --eval-every 3 {more}");
+    let output = command(&train).output().unwrap();
+    let [stdout, stderr] =
+        [output.stdout, output.stderr].map(|text| String::from_utf8(text).unwrap());
+    assert!(output.status.success(), "{stderr}");
+    (stdout, stderr)
+}
+
+#[test]
+fn without_a_terminal_scores_on_the_way_are_lines() {
+    for form in ["", "--progress plain"] {
+        let (stdout, stderr) = trained(form);
+        assert!(stderr.contains("step 3: ") && stderr.contains("PSNR"), "{stderr}");
+        assert!(stdout.contains("6 steps"), "{stdout}");
+    }
+    let (stdout, stderr) = trained("--progress none");
+    assert!(!stderr.contains("step 3") && stdout.contains("6 steps"), "{stderr}");
+}
+
+#[test]
+fn json_is_a_line_for_each_event_and_nothing_else() {
+    let (stdout, _) = trained("--progress json --checkpoint-every 3");
+    let lines: Vec<Value> =
+        stdout.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let events: Vec<&str> = lines.iter().map(|line| line["event"].as_str().unwrap()).collect();
+    assert_eq!((events[0], events[events.len() - 1]), ("started", "finished"));
+    for event in ["step", "checkpointed", "evaluated"] {
+        assert!(events.contains(&event), "{event} is not in {events:?}");
+    }
+    let of = |event: &str| lines.iter().rfind(|line| line["event"] == event).unwrap();
+    assert_eq!((&of("step")["step"], &of("step")["steps"]), (&6.into(), &6.into()));
+    assert_eq!(of("step")["seconds_left"], 0.0);
+    assert!(of("finished")["mean"]["psnr"].as_f64().unwrap() > 5.0, "{stdout}");
+    assert!(of("finished")["gaussians"].as_u64().unwrap() > 0);
+}
+
+#[test]
+fn an_unknown_form_is_refused_with_those_that_there_are() {
+    refused("train photos --out run --progress loud", 2, &["bar", "plain", "json", "none"]);
+}

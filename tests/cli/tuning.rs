@@ -1,0 +1,185 @@
+//! `bench --tune`, the file it leaves, and the tiles that training takes from there; `bench --growth`.
+
+#![cfg(feature = "cli")]
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use crate::common::command::{command, refused, succeed};
+use nightsplat::gpu::Tile;
+use nightsplat::gpu::testing::gpu;
+use nightsplat::results::run;
+use nightsplat::splats::render::RenderSettings;
+use serde_json::{Value, json};
+
+/// A folder with a set of dark photographs, whose runs look for the fastest tiles in a file beside it.
+struct Place(tempfile::TempDir);
+
+impl Place {
+    fn new() -> Self {
+        let place = Self(tempfile::tempdir().unwrap());
+        succeed(&format!("synth {} --views 3 --width 32 --height 24", place.path("set").display()));
+        place
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.0.path().join(name)
+    }
+
+    /// Standard output and error of a command that must succeed with the file.
+    fn run(&self, arguments: &str) -> (String, String) {
+        let output =
+            command(arguments).env("NIGHTSPLAT_TUNE", self.path("tiles.json")).output().unwrap();
+        let [stdout, stderr] =
+            [output.stdout, output.stderr].map(|text| String::from_utf8(text).unwrap());
+        assert!(output.status.success(), "{arguments}: {stderr}");
+        (stdout, stderr)
+    }
+
+    /// What a new run says on standard error, and the tile it records.
+    fn train(&self, run: &str, more: &str) -> (String, Tile) {
+        let (set, out) = (self.path("set"), self.path(run));
+        let (set, out) = (set.display(), out.display());
+        let (_, stderr) = self.run(&format!("train {set} --out {out} --sh-degree 0 {more}"));
+        (stderr, self.recorded(run))
+    }
+
+    fn recorded(&self, run: &str) -> Tile {
+        run::load_config(&self.path(run)).unwrap().tile.unwrap()
+    }
+
+    fn write(&self, tuning: &Value) {
+        fs::write(self.path("tiles.json"), tuning.to_string()).unwrap();
+    }
+}
+
+/// A file of this device that names one tile for everything.
+fn tuning(tile: Tile) -> Value {
+    let properties = gpu().properties().clone();
+    let tiles = json!([{ "channels": 3, "tile": tile }]);
+    json!({ "device": properties.name, "driver": properties.driver, "tiles": tiles })
+}
+
+/// What is taken where nothing was measured.
+fn built_in() -> Tile {
+    RenderSettings::default().tile_on(&gpu()).unwrap()
+}
+
+/// A tile that suits the device and is not the built-in one.
+fn unusual() -> Tile {
+    Tile { size: [16, 16], subgroups: 2 }
+}
+
+#[test]
+fn tuning_times_every_tile_that_suits_the_device_and_keeps_the_fastest() {
+    let place = Place::new();
+    let arguments = "bench --tune --json --width 64 --height 48 --gaussians 300 --repeats 1";
+    let printed: Value = serde_json::from_str(&place.run(arguments).0).unwrap();
+    let cases = printed["cases"].as_array().unwrap();
+    assert_eq!(cases.iter().map(|case| &case["channels"]).collect::<Vec<_>>(), [3, 11]);
+    for tile in cases.iter().flat_map(|case| case["tiles"].as_array().unwrap()) {
+        let own: Tile = serde_json::from_value(tile["tile"].clone()).unwrap();
+        assert!(gpu().properties().suits_tile(own), "{tile}");
+        assert_eq!(tile["agrees"], true, "{tile}");
+        assert!(tile["rasteriser_ms"].as_f64().unwrap() > 0.0, "{tile}");
+    }
+    let kept: Value = serde_json::from_slice(&fs::read(place.path("tiles.json")).unwrap()).unwrap();
+    assert_eq!(kept["tiles"], printed["tiles"]);
+    assert_eq!(kept["driver"], gpu().properties().driver.as_str());
+    let chosen: Tile = serde_json::from_value(kept["tiles"][0]["tile"].clone()).unwrap();
+    assert_eq!(place.train("run", "--steps 1").1, chosen);
+}
+
+#[test]
+fn the_kept_tile_is_taken_unless_another_is_asked_for_and_a_resumed_run_stays_with_its_own() {
+    let place = Place::new();
+    assert_ne!(unusual(), built_in());
+    assert_eq!(place.train("none", "--steps 1").1, built_in());
+    place.write(&tuning(unusual()));
+    assert_eq!(place.train("kept", "--steps 2 --checkpoint-every 2").1, unusual());
+    let [width, height] = built_in().size;
+    let asked = format!("--steps 1 --set tile=[{width},{height}]");
+    assert_eq!(place.train("asked", &asked).1, built_in());
+    place.write(&tuning(built_in()));
+    assert_eq!(place.train("kept", "--steps 3 --resume --checkpoint-every 2").1, unusual());
+    place.run(&format!("eval {}", place.path("kept").display()));
+    // The command of every other test has the file switched off.
+    let (set, out) = (place.path("set"), place.path("off"));
+    place.write(&tuning(unusual()));
+    succeed(&format!("train {} --out {} --steps 1", set.display(), out.display()));
+    assert_eq!(place.recorded("off"), built_in());
+}
+
+#[test]
+fn the_tile_is_recorded_so_that_the_same_file_gives_the_same_bits() {
+    let place = Place::new();
+    place.write(&tuning(unusual()));
+    place.train("first", "--steps 20");
+    place.write(&tuning(built_in()));
+    let config = place.path("first").join("config.toml");
+    place.train("again", &format!("--steps 20 --config {}", config.display()));
+    let model = |run: &str| fs::read(place.path(run).join("model.ply")).unwrap();
+    assert_eq!(model("first"), model("again"));
+}
+
+#[test]
+fn a_file_of_another_driver_and_a_damaged_one_are_ignored_with_one_line() {
+    let place = Place::new();
+    let mut other = tuning(unusual());
+    other["driver"] = json!("of another year");
+    place.write(&other);
+    let said = |run: &str, part: &str| {
+        let (stderr, tile) = place.train(run, "--steps 1");
+        assert_eq!(tile, built_in(), "{stderr}");
+        let lines: Vec<&str> = stderr.lines().filter(|line| line.contains("tiles.json")).collect();
+        assert!(lines.len() == 1 && lines[0].contains(part), "{stderr}");
+        assert!(lines[0].contains("bench --tune"), "{stderr}");
+    };
+    said("driver", "of another year");
+    fs::write(place.path("tiles.json"), "{\"device\": ").unwrap();
+    said("damaged", "is damaged");
+    place.write(&tuning([3, 3].into()));
+    said("unsuitable", "3x3 tiles do not suit");
+}
+
+#[test]
+fn a_tile_that_does_not_suit_the_device_is_refused_with_the_remedy() {
+    let place = Place::new();
+    let (set, out) = (place.path("set"), place.path("run"));
+    for tile in ["[3,3]", "[0,8]", "[4096,4096]", "[4294967295,4294967295]", "[16,16,3]"] {
+        let arguments =
+            format!("train {} --out {} --set tile={tile}", set.display(), out.display());
+        refused(&arguments, 2, &["tiles do not suit", "lanes", "take a tile of"]);
+        assert!(!Path::new(&out).exists());
+    }
+}
+
+#[test]
+fn growth_has_its_axes_exponents_and_memory_and_says_what_does_not_fit() {
+    let arguments = "bench --growth --json --width 64 --height 48 --gaussians 300 --repeats 1";
+    let printed: Value = serde_json::from_str(&Place::new().run(arguments).0).unwrap();
+    let axes = printed["axes"].as_array().unwrap();
+    let quantities: Vec<_> = axes.iter().map(|axis| axis["quantity"].as_str().unwrap()).collect();
+    assert_eq!(quantities, ["Gaussians", "pixels", "channels"]);
+    for axis in axes {
+        for point in axis["points"].as_array().unwrap() {
+            assert!(point["ms"].as_f64().unwrap() > 0.0, "{point}");
+            assert!(point["bytes"].as_u64().unwrap() > 0, "{point}");
+        }
+        assert!(axis["time_exponent"].is_f64() && axis["memory_exponent"].is_f64(), "{axis}");
+    }
+    // Each scene is gone before the next is measured.
+    let bytes = |axis: usize, point: usize| axes[axis]["points"][point]["bytes"].as_u64().unwrap();
+    assert!(2 * bytes(1, 0) < bytes(0, 4) && bytes(2, 0) < bytes(2, 4), "{printed:#}");
+    let values = |axis: usize| -> Vec<f64> {
+        axes[axis]["points"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .map(|p| p["value"].as_f64().unwrap())
+            .collect()
+    };
+    assert_eq!(values(0), [150.0, 450.0, 1500.0, 3750.0, 7500.0]);
+    assert_eq!((values(2)[0], values(2)[4]), (3.0, 11.0));
+}

@@ -1,0 +1,11 @@
+//! Device, buffers and passes: what they promise, on devices of their own and borrowed ones, and where they fail.
+
+#![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
+
+#[path = "../common/mod.rs"]
+mod common;
+
+mod descriptors;
+mod embedding;
+mod faults;
+mod gpu;

@@ -1,0 +1,237 @@
+//! The house rules that the compiler does not check, read off the sources.
+
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+const ROOT: &str = env!("CARGO_MANIFEST_DIR");
+
+/// The longest file that is still read once from top to bottom, in lines.
+const MAX_LINES: usize = 600;
+
+/// Every file below `folder` with the extension, as paths relative to the repository, with their text.
+pub(crate) fn files(folder: &str, extension: &str) -> Vec<(PathBuf, String)> {
+    let mut folders = vec![Path::new(ROOT).join(folder)];
+    let mut found = vec![];
+    while let Some(folder) = folders.pop() {
+        for entry in fs::read_dir(&folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                folders.push(path);
+            } else if path.extension().is_some_and(|found| found == extension) {
+                let text = fs::read_to_string(&path).unwrap();
+                found.push((path.strip_prefix(ROOT).unwrap().to_owned(), text));
+            }
+        }
+    }
+    found.sort();
+    assert!(!found.is_empty(), "no {folder}/**/*.{extension}");
+    found
+}
+
+fn stem(path: &Path) -> &str {
+    path.file_stem().unwrap().to_str().unwrap()
+}
+
+/// The module a file of `src` belongs to: `render` for `src/splats/render.rs` and `src/splats/render/frame.rs`.
+fn module(path: &Path) -> &str {
+    Path::new(path.iter().nth(1).unwrap()).file_stem().unwrap().to_str().unwrap()
+}
+
+/// The modules in the order of the crate's documentation.
+fn layers(lib: &str) -> Vec<&str> {
+    let entry = |line| {
+        let name = str::strip_prefix(line, "//! - ")?.split('`').nth(1)?;
+        Some(name)
+    };
+    lib.lines().filter_map(entry).collect()
+}
+
+/// The parts of the line that are code: no comment. Strings may remain; they name no modules.
+pub(crate) fn code(line: &str) -> &str {
+    line.split("//").next().unwrap()
+}
+
+/// The names that follow `crate::` in the text: `a` of `crate::a::B`, `a` and `B` of `crate::{a, B}`.
+fn crate_paths(text: &str) -> BTreeSet<String> {
+    let code: Vec<&str> = text.lines().map(code).collect();
+    let code = code.join("\n");
+    let mut names = BTreeSet::new();
+    for (_, path) in
+        code.match_indices("crate::").map(|(at, found)| (at, &code[at + found.len()..]))
+    {
+        if let Some(group) = path.strip_prefix('{') {
+            // Of each entry of the group, at any depth, the first segment at depth one.
+            let mut depth = 1;
+            let mut entry = String::new();
+            for character in group.chars() {
+                match character {
+                    '{' => depth += 1,
+                    '}' => depth -= 1,
+                    _ if depth == 1 => entry.push(character),
+                    _ => {}
+                }
+                if depth == 0 {
+                    break;
+                }
+            }
+            names.extend(entry.split(',').map(first_segment));
+        } else {
+            names.insert(first_segment(path));
+        }
+    }
+    names
+}
+
+fn first_segment(path: &str) -> String {
+    path.trim_start().chars().take_while(|c| c.is_alphanumeric() || *c == '_').collect()
+}
+
+#[test]
+fn paths_into_the_crate_are_found_however_they_are_written() {
+    let text =
+        "use crate::a::B;\nuse crate::{c, d::{E, f}, G}; // crate::comment\nlet x = crate::h::i();";
+    let names: Vec<String> = crate_paths(text).into_iter().collect();
+    assert_eq!(names, ["G", "a", "c", "d", "h"]);
+}
+
+#[test]
+fn the_list_of_layers_names_every_module_once() {
+    let lib = fs::read_to_string(Path::new(ROOT).join("src/lib.rs")).unwrap();
+    let declared: BTreeSet<&str> =
+        lib.lines().filter_map(|line| line.strip_prefix("pub mod ")?.strip_suffix(';')).collect();
+    let layers = layers(&lib);
+    assert_eq!(layers.iter().copied().collect::<BTreeSet<_>>(), declared);
+    assert_eq!(layers.len(), declared.len(), "a module is listed twice");
+}
+
+#[test]
+fn a_folder_of_modules_lists_each_on_its_page() {
+    for folder in ["base", "photographs", "splats", "results"] {
+        let page = fs::read_to_string(Path::new(ROOT).join(format!("src/{folder}.rs"))).unwrap();
+        let declared =
+            page.lines().filter_map(|line| line.strip_prefix("pub mod ")?.strip_suffix(';'));
+        let listed: BTreeSet<&str> = layers(&page).into_iter().collect();
+        assert_eq!(listed, declared.collect(), "{folder}");
+    }
+}
+
+#[test]
+fn a_module_uses_only_modules_above_it() {
+    let lib = fs::read_to_string(Path::new(ROOT).join("src/lib.rs")).unwrap();
+    let layers = layers(&lib);
+    let layer = |name: &str| layers.iter().position(|layer| *layer == name);
+    let mut broken = vec![];
+    for (path, text) in files("src", "rs") {
+        // `main` stands above all modules, `lib` only lists them.
+        let Some(own) = layer(module(&path)) else { continue };
+        for used in crate_paths(&text) {
+            if layer(&used).is_some_and(|used| used > own) {
+                broken.push(format!("{} uses {used}", path.display()));
+            }
+        }
+    }
+    assert!(broken.is_empty(), "{broken:#?}");
+}
+
+#[test]
+fn every_kernel_has_a_reference_of_its_name() {
+    for (path, _) in files("shaders-glsl", "comp") {
+        let reference = Path::new("src/reference").join(stem(&path)).with_extension("rs");
+        assert!(Path::new(ROOT).join(&reference).exists(), "{} is missing", reference.display());
+    }
+}
+
+#[test]
+fn every_kernel_is_named_in_a_test() {
+    let tests = files("tests", "rs");
+    for (path, _) in files("shaders-glsl", "comp") {
+        let words = |text: &str| -> bool {
+            text.split(|c: char| !c.is_alphanumeric() && c != '_').any(|word| word == stem(&path))
+        };
+        assert!(tests.iter().any(|(_, text)| words(text)), "no test names {}", path.display());
+    }
+}
+
+/// How often the text wires the kernel by hand: names its `Buffers`, or the test macro that does.
+fn wirings(text: &str, kernel: &str) -> usize {
+    let code: String = text.lines().map(code).flat_map(|line| [line.trim(), " "]).collect();
+    let words = |pattern: String| {
+        let begins = |at: usize| !code[..at].ends_with(|c: char| c.is_alphanumeric() || c == '_');
+        code.match_indices(&pattern).filter(|&(at, _)| begins(at)).count()
+    };
+    let [buffers, run] = [format!("{kernel}::Buffers {{"), format!("run_kernel!( {kernel},")];
+    words(buffers) + words(run) + words(format!("run_kernel!({kernel},"))
+}
+
+#[test]
+fn the_library_wires_each_kernel_in_one_place_and_no_command_wires_any() {
+    let sources = files("src", "rs");
+    for (shader, _) in files("shaders-glsl", "comp") {
+        let count = |(_, text): &(PathBuf, String)| wirings(text, stem(&shader));
+        let wired = sources.iter().filter(|(path, _)| module(path) != "reference");
+        let places: usize = wired.map(count).sum();
+        assert_eq!(places, 1, "{} is wired in {places} places", stem(&shader));
+        let commands = sources.iter().filter(|(path, _)| module(path) == "cli");
+        assert_eq!(commands.map(count).sum::<usize>(), 0, "a command wires {}", stem(&shader));
+    }
+}
+
+#[test]
+fn a_test_wires_a_kernel_by_hand_only_where_it_tests_that_kernel() {
+    // What the recorder does is shown with kernels of the rasteriser, and each curve with the kernel that maps images.
+    const EXEMPT: [&str; 2] = ["tests/gpu/gpu.rs", "tests/photographs/curves.rs"];
+    let mut tests = files("tests", "rs");
+    tests.retain(|(path, _)| !EXEMPT.iter().any(|exempt| path == Path::new(exempt)));
+    for (shader, _) in files("shaders-glsl", "comp") {
+        let wiring = tests.iter().filter(|(_, text)| wirings(text, stem(&shader)) > 0);
+        let places: Vec<_> = wiring.map(|(path, _)| path.display().to_string()).collect();
+        assert!(places.len() <= 1, "{} is wired by hand in {places:?}", stem(&shader));
+    }
+}
+
+#[test]
+fn unsafe_code_is_in_the_gpu_layer_alone() {
+    for (path, text) in files("src", "rs") {
+        if module(&path) == "gpu" {
+            continue;
+        }
+        for (number, line) in text.lines().enumerate() {
+            let is_unsafe = code(line).split(|c: char| !c.is_alphanumeric() && c != '_');
+            let is_unsafe = is_unsafe.filter(|word| *word == "unsafe").count() > 0;
+            assert!(!is_unsafe, "{}:{}: {line}", path.display(), number + 1);
+        }
+    }
+}
+
+#[test]
+fn tests_start_the_command_and_look_for_captures_in_one_place() {
+    // There validation is made to fail the command, and what is absent is said.
+    for (what, place) in [("CARGO_BIN_", "common/command.rs"), ("/../shar", "common/mod.rs")] {
+        for (path, text) in files("tests", "rs") {
+            let allowed = path.ends_with(place) || path.ends_with("architecture.rs");
+            assert!(allowed || !text.contains(what), "{}: see tests/{place}", path.display());
+        }
+    }
+}
+
+#[test]
+fn a_file_can_be_read_in_one_sitting() {
+    let all = [("src", "rs"), ("tests", "rs"), ("shaders-glsl", "comp"), ("shaders-glsl", "glsl")];
+    for (path, text) in all.into_iter().flat_map(|(folder, extension)| files(folder, extension)) {
+        let lines = text.lines().count();
+        assert!(lines <= MAX_LINES, "{} has {lines} lines", path.display());
+    }
+}
+
+#[test]
+fn a_clock_that_jumps_changes_nothing_but_the_dates_of_event_files() {
+    let clocks = ["SystemTime", "UNIX_EPOCH", ".modified()"];
+    for (path, text) in files("src", "rs") {
+        let asks =
+            text.lines().map(code).any(|line| clocks.iter().any(|clock| line.contains(clock)));
+        assert_eq!(asks, path.ends_with("src/results/run/tensorboard.rs"), "{}", path.display());
+    }
+}

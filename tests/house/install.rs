@@ -1,0 +1,75 @@
+//! What is installed beside the program: completions, man pages, and the package itself.
+#![cfg(feature = "cli")]
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
+use std::process::Command;
+use std::{fs, str};
+
+use crate::common::command::{refused, succeed};
+
+#[test]
+fn every_shell_completes_every_subcommand() {
+    for shell in ["bash", "elvish", "fish", "powershell", "zsh"] {
+        let script = succeed(&format!("completions {shell}"));
+        for word in ["train", "export", "doctor", "device", "max-gaussians"] {
+            assert!(script.contains(word), "{shell} does not complete {word}");
+        }
+    }
+    refused("completions tcsh", 2, &["tcsh", "zsh"]);
+}
+
+#[test]
+fn bash_takes_its_completions_and_completes_with_them() {
+    let Ok(version) = Command::new("bash").arg("--version").output() else {
+        return crate::common::not_run("there is no bash");
+    };
+    assert!(version.status.success());
+    let script = succeed("completions bash")
+        + "COMP_WORDS=(nightsplat exp); COMP_CWORD=1; _nightsplat nightsplat exp nightsplat; echo ${COMPREPLY[*]}";
+    let output = Command::new("bash").args(["-c", &script]).output().unwrap();
+    assert_eq!(str::from_utf8(&output.stdout).unwrap().trim(), "export");
+}
+
+#[test]
+fn every_subcommand_has_a_man_page() {
+    let folder = tempfile::tempdir().unwrap();
+    let dir = folder.path().join("man/man1");
+    succeed(&format!("man {}", dir.display()));
+    let page = |name: &str| fs::read_to_string(dir.join(name)).unwrap();
+    let main = page("nightsplat.1");
+    for command in succeed("--help").lines().skip_while(|line| *line != "Commands:").skip(1) {
+        // The first two columns; what a long help line continues with is deeper.
+        let Some(name) = command.strip_prefix("  ").filter(|text| !text.starts_with(' ')) else {
+            break;
+        };
+        let name = name.split(' ').next().unwrap();
+        if name == "help" {
+            continue;
+        }
+        assert!(main.contains(&format!("nightsplat\\-{name}(1)")), "nightsplat.1 lacks {name}");
+        assert!(page(&format!("nightsplat-{name}.1")).contains(".SH OPTIONS"), "{name}");
+    }
+    assert!(page("nightsplat-train.1").contains("\\-\\-max\\-gaussians"));
+    // A file is no folder.
+    refused(&format!("man {}/nightsplat.1", dir.display()), 1, &["nightsplat.1"]);
+}
+
+#[test]
+fn the_package_has_what_it_is_built_from_and_little_else() {
+    let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
+    let mut list = Command::new(cargo);
+    list.args(["package", "--list", "--allow-dirty", "--offline"]);
+    let output = list.current_dir(env!("CARGO_MANIFEST_DIR")).output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let files = String::from_utf8(output.stdout).unwrap();
+    let has = |name: &str| files.lines().any(|file| file == name);
+    for name in
+        ["build.rs", "build/rust.rs", "src/main.rs", "README.md", "LICENSE-MIT", "Cargo.lock"]
+    {
+        assert!(has(name), "{name} is not packaged");
+    }
+    assert!(files.contains("shaders-glsl/splats/render/blend_forward.comp"), "no shaders");
+    for folder in ["tests/", "scripts/", ".ci/", "target/"] {
+        assert!(!files.lines().any(|file| file.starts_with(folder)), "{folder} is packaged");
+    }
+}

@@ -1,0 +1,9 @@
+//! The house: what the compiler does not check, and what is installed.
+
+#![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
+
+#[path = "../common/mod.rs"]
+mod common;
+
+mod architecture;
+mod install;

@@ -1,0 +1,449 @@
+//! Exposures: kernels against their references, gradients against central differences, the mean that stays the identity,
+//! and trainings on photographs that are not equally bright.
+
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
+use std::path::Path;
+
+use glam::{UVec2, Vec2};
+use nightsplat::gpu::Threads;
+use nightsplat::gpu::testing::gpu;
+use nightsplat::kernels::exposure::{BIAS_SCALE, EXPOSURE_WIDTH};
+use nightsplat::kernels::{expose, expose_backward, exposure_center, exposure_gradient};
+use nightsplat::loss::exposure::{Affine, ExposureRates, Exposures, table};
+use nightsplat::photographs::dataset::Dataset;
+use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
+use nightsplat::photographs::image::{linear_from_srgb, srgb_from_linear};
+use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
+use nightsplat::results::run::{self, HeldRun};
+use nightsplat::splats::optimizer::{Adam, Learnable};
+use nightsplat::train::{Learning, Part, TrainConfig, Trainer};
+
+use crate::common::Random;
+use crate::common::chain::Chain;
+use crate::common::setup::Setup;
+use crate::common::train::advance;
+
+const WIDTH: usize = EXPOSURE_WIDTH as usize;
+
+fn noise(seed: u64, count: usize, low: f64, high: f64) -> Vec<f32> {
+    let mut random = Random::new(seed);
+    (0..count).map(|_| random.between(low, high) as f32).collect()
+}
+
+#[test]
+fn every_kernel_agrees_with_its_reference_at_every_size() {
+    for pixels in [1, 7, 1023, 1024, 1025, 131 * 97] {
+        for (view, view_count) in [(0, 1), (2, 3), (17, 40)] {
+            let (pixel_count, chunk_count) = (pixels as u32, (pixels as u32).div_ceil(1024));
+            // A plane more than colours has, which stays as it is.
+            let render = noise(1, 4 * pixels, -0.2, 1.3);
+            let d_render = noise(2, 4 * pixels, -1e-3, 1e-3);
+            let exposures = noise(3, view_count * WIDTH, -0.5, 0.5);
+            for inverse in [false, true] {
+                let exposed = vec![7.0f32; 4 * pixels];
+                let exposed = run_kernel!(
+                    expose,
+                    expose::Constants { inverse },
+                    expose::Params { pixel_count, view },
+                    Threads::Exactly([3 * pixel_count, 1, 1]),
+                    [exposures, render],
+                    [exposed]
+                );
+                assert!(exposed[3 * pixels..].iter().all(|&value| value == 7.0));
+            }
+            let partials = vec![Vec2::NAN; 3 * chunk_count as usize];
+            let expected = d_render[3 * pixels..].to_vec();
+            let (d_render, partials) = run_kernel!(
+                expose_backward,
+                expose_backward::Constants::default(),
+                expose_backward::Params { pixel_count, view },
+                Threads::Workgroups([chunk_count, 3, 1]),
+                [exposures, render],
+                [d_render, partials]
+            );
+            assert_eq!(d_render[3 * pixels..], expected);
+            let gradients = vec![f32::NAN; view_count * WIDTH];
+            let gradients = run_kernel!(
+                exposure_gradient,
+                exposure_gradient::Constants::default(),
+                exposure_gradient::Params { chunk_count, view, view_count: view_count as u32 },
+                Threads::Workgroups([1, 1, 1]),
+                [partials],
+                [gradients]
+            );
+            let own = view as usize * WIDTH..(view as usize + 1) * WIDTH;
+            let others = gradients.iter().enumerate().filter(|(at, _)| !own.contains(at));
+            assert!(others.into_iter().all(|(_, &gradient)| gradient == 0.0));
+        }
+    }
+}
+
+fn centred(exposures: &[f32], status: u32) -> Vec<f32> {
+    let (exposures, status) = (exposures.to_vec(), vec![status]);
+    run_kernel!(
+        exposure_center,
+        exposure_center::Constants::default(),
+        exposure_center::Params { view_count: (exposures.len() / WIDTH) as u32 },
+        Threads::Workgroups([EXPOSURE_WIDTH, 1, 1]),
+        [status],
+        [exposures]
+    )
+}
+
+/// Each number of all views.
+fn columns(exposures: &[f32]) -> impl Iterator<Item = Vec<f32>> + '_ {
+    (0..WIDTH).map(|number| exposures.iter().skip(number).step_by(WIDTH).copied().collect())
+}
+
+#[test]
+fn the_mean_of_centred_exposures_is_the_identity_in_every_order_of_summation() {
+    for views in [1, 2, 3, 7, 8, 9, 43, 300, 1025] {
+        for (low, high) in [(-0.5, 0.5), (0.3, 0.4), (-3.9, -3.8), (-90.0, 90.0)] {
+            let before = noise(5 + views as u64, views * WIDTH, low, high);
+            let after = centred(&before, 0);
+            for (column, before) in columns(&after).zip(columns(&before)) {
+                let exact: f64 = column.iter().copied().map(f64::from).sum();
+                assert_eq!(exact, 0.0, "{views} views from {low} to {high}");
+                // Single precision has room for the sum of fewer than eight whole bounds.
+                if high <= 0.5 && views < 30 {
+                    let [forth, back] = [column.iter().sum::<f32>(), column.iter().rev().sum()];
+                    assert_eq!([forth, back], [0.0; 2]);
+                }
+                // Differences between views stay, but for a rounding.
+                let difference =
+                    |values: &[f32]| f64::from(values[0]) - f64::from(values[views - 1]);
+                let is_cut = high > 4.0;
+                assert!(is_cut || (difference(&column) - difference(&before)).abs() < 2e-6);
+            }
+            assert!(high > 4.0 || centred(&after, 0) == after, "what is centred moved");
+            assert_eq!(centred(&before, 1), before, "a step that failed changed exposures");
+        }
+    }
+}
+
+#[test]
+fn numbers_that_are_not_finite_leave_finite_ones() {
+    let mut exposures = noise(1, 5 * WIDTH, -0.1, 0.1);
+    (exposures[0], exposures[7]) = (f32::INFINITY, f32::NEG_INFINITY);
+    for column in columns(&centred(&exposures, 0)) {
+        assert_eq!(column.iter().copied().map(f64::from).sum::<f64>(), 0.0);
+    }
+}
+
+/// Three exposures, of which the middle one is looked at.
+fn three() -> [Affine; 3] {
+    let second = Affine { gain: [0.7, 1.2, 0.9], bias: [0.05, -0.02, 0.01] };
+    [Affine { gain: [1.3, 0.9, 1.0], bias: [-0.1, 0.0, 0.03] }, second, Affine::IDENTITY]
+}
+
+/// L = sum of w e over all values, e what the exposure makes of the render of Gaussians.
+#[test]
+fn the_gradient_through_exposure_and_renderer_is_its_central_difference() {
+    let gpu = gpu();
+    let setup = Setup::new(7, [26, 19], 1, 33);
+    let chain = Chain::new(&setup);
+    let (parameters, background) = (chain.parameters(), chain.background());
+    let weights = chain.d_render.clone();
+    let (pixels, size) = (setup.pixels(), UVec2::new(26, 19));
+    let render = crate::common::narrow(&chain.run(&parameters).render);
+
+    let mut exposures = Exposures::new(&gpu, ExposureRates::default(), &three()).unwrap();
+    exposures.reserve(size).unwrap();
+    let own = exposures.affines().unwrap()[1];
+    let render_on_device = gpu.buffer("render", &render).unwrap();
+    let mut d_render = gpu.buffer("d_render", &crate::common::narrow(&weights)).unwrap();
+    gpu.run("exposures", |pass| {
+        exposures.expose(pass, 1, size, &render_on_device)?;
+        exposures.backward(pass, 1, size, &render_on_device, &mut d_render)
+    })
+    .unwrap();
+    let d_render = crate::common::widen(&gpu.read(&d_render).unwrap());
+    let gradients = gpu.read(exposures.buffers().gradients).unwrap();
+
+    // Of the exposure: L is linear in each of its numbers.
+    let loss = |affine: &Affine| -> f64 {
+        let exposed = |(i, &c): (usize, &f32)| {
+            weights[i] * (affine.gain[i / pixels] * f64::from(c) + affine.bias[i / pixels])
+        };
+        render.iter().enumerate().map(exposed).sum()
+    };
+    for number in 0..WIDTH {
+        let moved = |by: f64| {
+            let mut affine = own;
+            match number {
+                0..3 => affine.gain[number] += by,
+                _ => affine.bias[number - 3] += BIAS_SCALE * by,
+            }
+            loss(&affine)
+        };
+        let expected = (moved(1e-3) - moved(-1e-3)) / 2e-3;
+        let actual = f64::from(gradients[WIDTH + number]);
+        assert!((actual - expected).abs() < 1e-4 * (1.0 + expected.abs()), "{actual} {expected}");
+    }
+    assert!(gradients[..WIDTH].iter().chain(&gradients[2 * WIDTH..]).all(|&d| d == 0.0));
+
+    // Of the Gaussians: the chain behind the gradient that the exposure passes on, against differences of all of it.
+    let mut behind = Chain::new(&setup);
+    behind.d_render = d_render;
+    let gradient = behind.run(&parameters).gradient;
+    let mut exposed = Chain::new(&setup);
+    for (i, weight) in exposed.d_render.iter_mut().enumerate() {
+        *weight *= own.gain[i / pixels];
+    }
+    let largest = gradient.iter().fold(0.0f64, |largest, d| largest.max(d.abs()));
+    for at in 0..parameters.len() {
+        let moved = |by: f64| {
+            let mut parameters = parameters.clone();
+            parameters[at] += by;
+            exposed.loss(&parameters, &background)
+        };
+        let expected = (moved(1e-5) - moved(-1e-5)) / 2e-5;
+        let error = (gradient[at] - expected).abs();
+        assert!(error < 1e-5 * largest, "[{at}] {} is not {expected}", gradient[at]);
+    }
+}
+
+#[test]
+fn adam_finds_the_exposures_of_views_that_differ_by_nothing_else() {
+    let (gpu, size) = (gpu(), UVec2::new(20, 15));
+    let truth = Affine::about_their_mean(&three());
+    let render = noise(8, 3 * 300, 0.0, 1.0);
+    let render_on_device = gpu.buffer("render", &render).unwrap();
+    let rates = ExposureRates { initial: 0.02, last: 0.002, steps: 600 };
+    let mut exposures = Exposures::new(&gpu, rates, &[Affine::IDENTITY; 3]).unwrap();
+    exposures.reserve(size).unwrap();
+    let (adam, status) = (Adam::new(&gpu).unwrap(), gpu.zeros("status", 1).unwrap());
+    for step in 1..=900 {
+        let view = step as usize % 3;
+        // The gradient of half the mean squared difference.
+        gpu.run("expose", |pass| exposures.expose(pass, view, size, &render_on_device)).unwrap();
+        let exposed = gpu.read(exposures.exposed()).unwrap();
+        let target =
+            |i: usize| truth[view].gain[i / 300] * f64::from(render[i]) + truth[view].bias[i / 300];
+        let d: Vec<f32> =
+            (0..900).map(|i| ((f64::from(exposed[i]) - target(i)) / 900.0) as f32).collect();
+        let mut d_render = gpu.buffer("d_render", &d).unwrap();
+        gpu.run("learn", |pass| {
+            exposures.backward(pass, view, size, &render_on_device, &mut d_render)?;
+            adam.update(pass, step, 1.0, &mut exposures, &status)?;
+            exposures.center(pass, &status)
+        })
+        .unwrap();
+    }
+    for (found, truth) in exposures.affines().unwrap().iter().zip(&truth) {
+        for c in 0..3 {
+            assert!((found.gain[c] - truth.gain[c]).abs() < 0.02, "{found} is not {truth}");
+            assert!((found.bias[c] - truth.bias[c]).abs() < 0.02, "{found} is not {truth}");
+        }
+    }
+}
+
+#[test]
+fn what_does_not_fit_is_refused() {
+    let gpu = gpu();
+    let new = |start: &[Affine]| Exposures::new(&gpu, ExposureRates::default(), start);
+    assert!(new(&[]).is_err());
+    assert!(new(&[Affine { gain: [1.0, 0.0, 1.0], bias: [0.0; 3] }]).is_err());
+    assert!(new(&[Affine { gain: [1.0; 3], bias: [f64::NAN, 0.0, 0.0] }]).is_err());
+    let mut exposures = new(&three()).unwrap();
+    exposures.reserve(UVec2::splat(8)).unwrap();
+    let [mut d_render, render] = [(); 2].map(|()| gpu.zeros("render", 3 * 64).unwrap());
+    for (view, size) in [(3, [8, 8]), (0, [0, 8]), (0, [9, 8]), (0, [64, 64])] {
+        let exposed = gpu.run("e", |pass| exposures.expose(pass, view, size.into(), &render));
+        let backward = gpu
+            .run("b", |pass| exposures.backward(pass, view, size.into(), &render, &mut d_render));
+        assert!(exposed.is_err() && backward.is_err(), "{view} {size:?}");
+    }
+    let short = gpu.zeros("render", 100).unwrap();
+    assert!(gpu.run("e", |pass| exposures.expose(pass, 0, UVec2::splat(8), &short)).is_err());
+}
+
+/// The exposures of the four views in turn, in linear light.
+const FACTORS: [f32; 4] = [1.0, 0.5, 0.25, 2.0];
+
+/// Synthetic views of which each is darkened or brightened, under one curve.
+fn varied(folder: &Path) -> (TrainConfig, Dataset) {
+    let options = SyntheticOptions {
+        views: 14,
+        width: 40,
+        height: 30,
+        seed: 3,
+        ..SyntheticOptions::default()
+    };
+    synthetic::write(folder, &options).unwrap();
+    let mut tone = ToneSettings::new(ToneCurve::Ase);
+    tone.scene_statistics = true;
+    let mut config = TrainConfig { steps: 300, sh_degree: 0, tone, ..Default::default() };
+    config.schedule.densify_before = 0;
+    config.schedule.resolution_steps = [0, 40];
+    config.exposure.learn = Learning::On;
+    let mut dataset = Dataset::load(folder, &config.load_options()).unwrap();
+    for (at, view) in dataset.views.iter_mut().filter(|view| view.is_train()).enumerate() {
+        let image = view.image.as_mut().unwrap();
+        for x in &mut image.data {
+            *x = srgb_from_linear(FACTORS[at % 4] * linear_from_srgb(*x));
+        }
+    }
+    (config, dataset)
+}
+
+fn l1_of_last_steps(config: &TrainConfig, dataset: &Dataset) -> f64 {
+    let mut trainer = Trainer::new(&gpu(), config.clone(), dataset).unwrap();
+    let reports = advance(&mut trainer, config.steps);
+    let last = &reports[reports.len() - 24..];
+    last.iter().map(|report| report.term(nightsplat::loss::Term::L1)).sum::<f64>() / 24.0
+}
+
+#[test]
+fn exposures_explain_photographs_that_differ_in_brightness_and_their_mean_is_exact_after_every_step()
+ {
+    let folder = tempfile::tempdir().unwrap();
+    let (config, dataset) = varied(folder.path());
+    let mut trainer = Trainer::new(&gpu(), config.clone(), &dataset).unwrap();
+    for step in [1, 2, 3, 50, 300] {
+        advance(&mut trainer, step);
+        let exposures = trainer.exposures().unwrap().unwrap();
+        assert_eq!(exposures.len(), dataset.train_views().count());
+        for c in 0..3 {
+            let sum = |of: fn(&Affine, usize) -> f64| {
+                exposures.iter().map(|(_, exposure)| of(exposure, c)).sum::<f64>()
+            };
+            assert_eq!(sum(|e, c| e.gain[c] - 1.0), 0.0, "step {step}");
+            assert_eq!(sum(|e, c| e.bias[c]), 0.0, "step {step}");
+        }
+    }
+    let stops = |at: usize| trainer.exposures().unwrap().unwrap()[at].1.stops();
+    let (quarter, half, one, two) = (stops(2), stops(1), stops(0), stops(3));
+    assert!(quarter < half && half < one && one < two, "{quarter} {half} {one} {two}");
+    let with = l1_of_last_steps(&config, &dataset);
+    let mut config = config;
+    config.exposure.learn = Learning::Off;
+    let without = l1_of_last_steps(&config, &dataset);
+    assert!(with < 0.6 * without, "L1 is {with} with exposures and {without} without");
+}
+
+#[test]
+fn exposures_that_are_off_leave_no_kernel_and_no_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let (mut config, dataset) = varied(&folder.path().join("set"));
+    config.steps = 2;
+    let out = folder.path().join("run");
+    for learn in [Learning::On, Learning::Off] {
+        config.exposure.learn = learn;
+        let gpu = gpu();
+        let mut trainer = Trainer::new(&gpu, config.clone(), &dataset).unwrap();
+        let (reports, checked) = trainer.check_step();
+        reports.unwrap();
+        checked.agree().unwrap();
+        let own = checked.passes.iter().filter(|pass| pass.kernel.starts_with("expos")).count();
+        assert_eq!(own, if learn == Learning::On { 4 } else { 0 });
+        run::train(&gpu, &config, &dataset, &out, HeldRun::Replace, |_| {}).unwrap();
+        let exposures = run::load_exposures(&out).unwrap();
+        let metrics = std::fs::read_to_string(out.join("metrics.json")).unwrap();
+        let metrics: serde_json::Value = serde_json::from_str(&metrics).unwrap();
+        if learn == Learning::On {
+            let learned = trainer.exposures().unwrap().unwrap();
+            assert_eq!(exposures.len(), learned.len());
+            assert!(metrics["exposure"].as_str().unwrap().starts_with("neutral"));
+            let aligned = metrics["aligned_with_reference"]["mean"]["psnr"].as_f64().unwrap();
+            assert!(aligned >= metrics["mean"]["psnr"].as_f64().unwrap() - 0.01);
+        } else {
+            assert!(exposures.is_empty() && !out.join("exposures.csv").exists());
+            assert_eq!(
+                (&metrics["exposure"], &metrics["aligned_with_reference"]),
+                (&().into(), &().into())
+            );
+        }
+    }
+}
+
+#[test]
+fn a_run_with_exposures_goes_on_bit_for_bit() {
+    let folder = tempfile::tempdir().unwrap();
+    let (mut config, dataset) = varied(folder.path());
+    config.steps = 30;
+    let gpu = gpu();
+    let new = || Trainer::new(&gpu, config.clone(), &dataset).unwrap();
+    let state = |trainer: &mut Trainer, name: &str| {
+        let path = folder.path().join(name);
+        trainer.save_checkpoint(&path).unwrap();
+        std::fs::read(path).unwrap()
+    };
+    let mut whole = new();
+    advance(&mut whole, 30);
+    let mut interrupted = new();
+    advance(&mut interrupted, 17);
+    state(&mut interrupted, "checkpoint");
+    let mut resumed = new();
+    resumed.restore(&folder.path().join("checkpoint")).unwrap();
+    advance(&mut resumed, 30);
+    assert!(state(&mut whole, "whole") == state(&mut resumed, "resumed"));
+    assert_eq!(whole.exposures().unwrap(), resumed.exposures().unwrap());
+    let mut off = config.clone();
+    off.exposure.learn = Learning::Off;
+    let mut off = Trainer::new(&gpu, off, &dataset).unwrap();
+    let error = off.restore(&folder.path().join("checkpoint")).unwrap_err().to_string();
+    assert!(error.contains("exposure.learn"), "{error}");
+}
+
+#[test]
+fn a_denoiser_on_crops_sees_the_neutral_exposure_and_a_tonemapper_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let (mut config, dataset) = varied(folder.path());
+    config.model.set_parts(&[Part::Denoiser, Part::Structure]);
+    config.model.network.channels = 4;
+    config.model.network.stages = 2;
+    config.model.network.repeats = 2;
+    config.model.denoiser_crop = 16;
+    let gpu = gpu();
+    let mut trainer = Trainer::new(&gpu, config.clone(), &dataset).unwrap();
+    let (reports, checked) = trainer.check_step();
+    reports.unwrap();
+    checked.agree().unwrap();
+    config.model.set_parts(&Part::ALL);
+    let error = Trainer::new(&gpu, config, &dataset).unwrap_err().to_string();
+    assert!(error.contains("tonemapper") && error.contains("ExposureConfig::learn"), "{error}");
+}
+
+#[test]
+fn a_table_says_where_exposures_begin() {
+    let folder = tempfile::tempdir().unwrap();
+    let (mut config, dataset) = varied(folder.path());
+    let names: Vec<&str> = dataset.train_views().map(|view| view.name.as_str()).collect();
+    let path = folder.path().join("known.csv");
+    let begin = |config: &TrainConfig| {
+        let trainer = Trainer::new(&gpu(), config.clone(), &dataset).unwrap();
+        let exposures = trainer.exposures().unwrap().unwrap();
+        exposures.into_iter().map(|(_, exposure)| exposure).collect::<Vec<Affine>>()
+    };
+    assert!(begin(&config).iter().all(|exposure| *exposure == Affine::IDENTITY));
+
+    // Stops of the photographs: under one curve the targets differ as they do.
+    let lines = names.iter().zip(FACTORS.iter().cycle());
+    let lines: String = lines.map(|(name, factor)| format!("{name},{}\n", factor.log2())).collect();
+    std::fs::write(&path, format!("name,ev\n{lines}")).unwrap();
+    config.exposure.start = Some(path.clone());
+    let of_stops = begin(&config);
+    assert!(of_stops[2].stops() < of_stops[1].stops() && of_stops[1].stops() < of_stops[0].stops());
+    // Beside the photographs it is found.
+    std::fs::copy(&path, folder.path().join("exposures.csv")).unwrap();
+    config.exposure.start = None;
+    assert_eq!(begin(&config), of_stops);
+
+    // What a run learned begins where it ended.
+    let exposures: Vec<(String, Affine)> =
+        names.iter().map(|&name| name.to_owned()).zip(of_stops.iter().copied()).collect();
+    table::save(&path, &exposures).unwrap();
+    config.exposure.start = Some(path.clone());
+    for (again, first) in begin(&config).iter().zip(&of_stops) {
+        let gap = |c: usize| {
+            (again.gain[c] - first.gain[c]).abs() + (again.bias[c] - first.bias[c]).abs()
+        };
+        assert!((0..3).all(|c| gap(c) < 4e-6), "{again} is not {first}");
+    }
+
+    std::fs::write(&path, "name,ev\nnobody,1\nelsewhere,2\n").unwrap();
+    let error = Trainer::new(&gpu(), config, &dataset).unwrap_err().to_string();
+    assert!(error.contains("nobody, elsewhere") && error.contains("known.csv"), "{error}");
+}

@@ -1,0 +1,188 @@
+//! Curves from files: TOML settings, CSV and .cube tables, and what is wrong with them.
+
+#![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
+
+use std::path::PathBuf;
+
+use nightsplat::Error;
+use nightsplat::photographs::tone::{
+    CurveChoice, Family, Table, TableInput, ToneCurve, ToneSettings,
+};
+use nightsplat::train::TrainConfig;
+
+/// A curve read from a file of that name and text.
+fn load(name: &str, text: &str) -> Result<ToneSettings, Error> {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join(name);
+    std::fs::write(&path, text).unwrap();
+    path.to_str().unwrap().parse::<CurveChoice>().unwrap().settings()
+}
+
+#[test]
+fn a_family_with_its_own_constants_is_read_from_toml() {
+    let settings = load("my.toml", "curve = \"gamma\"\n[constants]\na = 0.9\nb = 0.4\n").unwrap();
+    assert_eq!(
+        (settings.curve, settings.constants.as_slice()),
+        (ToneCurve::Gamma, &[0.9, 0.4][..])
+    );
+    assert_eq!([settings.alpha, settings.gain_c], [0.0, 0.0]);
+    let cubic = "curve = \"cubic\"\nalpha = 0.1\nconstants = { a = 0.1, b = -0.5, c = 1, d = 0.0 }";
+    let settings = load("c.toml", cubic).unwrap();
+    assert_eq!(settings.curve, ToneCurve::FittedCubic);
+    assert_eq!(settings.constants, [0.1, -0.5, 1.0, 0.0]);
+    assert_eq!(settings.alpha, 0.1);
+    let plain = load("p.toml", "curve = \"hybrid\"").unwrap();
+    assert_eq!(plain, ToneSettings::new(ToneCurve::Hybrid));
+}
+
+#[test]
+fn tables_are_read_from_csv_and_cube() {
+    let settings = load("a.csv", "# made by hand\nt,y\n0,0\n0.5, 0.4\n1;0.8\n\n2,1\n").unwrap();
+    let table = settings.table.unwrap();
+    assert_eq!((table.input, table.x.as_slice()), (TableInput::T, &[0.0, 0.5, 1.0, 2.0][..]));
+    assert_eq!(table.y, [[0.0, 0.4, 0.8, 1.0]]);
+    let of_x = load("b.csv", "x,r,g,b\n0,0,0,0\n1,1,0.5,0.2\n").unwrap().table.unwrap();
+    assert_eq!((of_x.input, of_x.y.len()), (TableInput::X, 3));
+    let cube = "TITLE \"lift\"\nLUT_1D_SIZE 3\nDOMAIN_MIN 0 0 0\nDOMAIN_MAX 2 2 2\n0 0 0\n0.5 0.6 0.7\n1 1 1\n";
+    let settings = load("c.cube", cube).unwrap();
+    assert!(settings.needs_baking());
+    let table = settings.table.unwrap();
+    assert_eq!((table.input, table.x.as_slice()), (TableInput::X, &[0.0, 1.0, 2.0][..]));
+    assert_eq!(table.y[2], [0.0, 0.7, 1.0]);
+}
+
+#[test]
+fn a_configuration_holds_the_whole_curve() {
+    let csv = load("a.csv", "0,0.1\n0.30000000000000004,0.7\n1,1\n").unwrap();
+    let constants = vec![0.1 + 0.2, -1.0 / 3.0, 1.0, 1e-3];
+    let cubic = ToneSettings { constants, ..ToneSettings::new(ToneCurve::FittedCubic) };
+    for tone in [csv, cubic, ToneSettings::new(ToneCurve::PerChannel)] {
+        let config = TrainConfig { tone, ..TrainConfig::default() };
+        let text = config.to_toml().unwrap();
+        assert_eq!(toml::from_str::<TrainConfig>(&text).unwrap(), config, "{text}");
+        // A run's configuration is a file with a curve, too.
+        assert_eq!(load("config.toml", &text).unwrap(), config.tone);
+    }
+}
+
+#[test]
+fn configurations_of_earlier_versions_load() {
+    let text = "steps = 7\n[tone]\ncurve = \"ase\"\ngain_c = 3.0\ntheta = 0.49\nalpha = 0.12\nbeta = 2.5\nbase_gain = 1.0\n";
+    let config: TrainConfig = toml::from_str(text).unwrap();
+    assert_eq!(config.tone, ToneSettings::new(ToneCurve::Ase));
+}
+
+#[test]
+fn what_is_wrong_with_a_file_is_named() {
+    let wrong = [
+        ("a.toml", "curve = \"gama\"", "unknown curve `gama`"),
+        ("a.toml", "curve = \"gamma\"\nconstants = { a = 1.0 }", "needs the constant `b`"),
+        (
+            "a.toml",
+            "curve = \"gamma\"\nconstants = { a = 1.0, b = 1.0, q = 1.0 }",
+            "no constant `q`",
+        ),
+        ("a.toml", "curve = \"gamma\"\nconstants = { a = inf, b = 1.0 }", "constant a of `gamma`"),
+        (
+            "a.toml",
+            "curve = \"reinhard\"\nconstants = { a = 1.0, b = -0.5 }",
+            "undefined at t = 0.5",
+        ),
+        ("a.toml", "gain_c = 1.0", "names no curve"),
+        ("a.toml", "curve = \"ap3\"\ngain = 1.0", "unknown field `gain`"),
+        ("a.toml", "curve = \"table\"", "needs a file of values"),
+        ("a.toml", "curve = ", "is no tone curve"),
+        ("a.csv", "0,0\n0.5,0.2\n0.4,0.3\n", "line 3: the first column must ascend"),
+        ("a.csv", "0,0\n0,1\n", "must ascend"),
+        ("a.csv", "0,0\n1,nan\n", "line 2: `nan` is no number"),
+        ("a.csv", "0,0\n", "at least two"),
+        ("a.csv", "", "at least two"),
+        ("a.csv", "luma,y\n0,0\n", "`luma`"),
+        ("a.csv", "0,0,1\n1,1,1\n", "line 1: 2 values"),
+        ("a.cube", "LUT_3D_SIZE 2\n0 0 0\n", "3D"),
+        ("a.cube", "LUT_1D_SIZE 3\n0 0 0\n1 1 1\n", "LUT_1D_SIZE is 3 but there are 2"),
+    ];
+    for (name, text, part) in wrong {
+        let error = load(name, text).unwrap_err();
+        let message = error.to_string();
+        assert!(message.contains(part) && message.contains(name), "{message}");
+        assert!(!message.contains('\n'), "{message}");
+        assert_eq!(error.exit_code(), 3, "{message}");
+    }
+    let absent = CurveChoice::File(PathBuf::from("absent.toml")).settings().unwrap_err();
+    assert!(absent.to_string().contains("absent.toml"));
+    for name in ["gama", "table", ""] {
+        assert!(matches!(name.parse::<CurveChoice>(), Err(Error::Usage(_))), "{name}");
+    }
+}
+
+#[test]
+fn another_curve_brings_its_own_constants_and_the_same_keeps_them() {
+    let mine = ToneSettings { gain_c: 2.0, theta: 0.4, ..ToneSettings::new(ToneCurve::Ap3) };
+    assert_eq!(mine.with_curve(ToneCurve::Ap3), mine);
+    let ase = mine.with_curve(ToneCurve::Ase);
+    assert_eq!([ase.gain_c, ase.theta, ase.alpha], [3.0, 0.4, 0.12]);
+    let gamma = mine.with_curve(ToneCurve::Gamma);
+    assert_eq!(gamma.constants, Family::find("gamma").unwrap().defaults());
+}
+
+#[test]
+fn the_family_of_a_curve_has_one_key_and_its_old_name_is_read() {
+    let settings = load("my.toml", "family = \"AP3\"\ngain_c = 2.0\n").unwrap();
+    assert_eq!((settings.curve, settings.gain_c), (ToneCurve::Ap3, 2.0));
+    let twice = load("my.toml", "family = \"ap3\"\ncurve = \"ase\"\n").unwrap_err().to_string();
+    assert!(twice.contains("twice"), "{twice}");
+    let tone = ToneSettings::new(ToneCurve::Ap3);
+    let text = TrainConfig { tone, ..TrainConfig::default() }.to_toml().unwrap();
+    assert!(text.contains("curve = \"ap3\"") && !text.contains("family"), "{text}");
+    for name in ["AP3", "Ap3", "ap3"] {
+        assert_eq!(name.parse::<CurveChoice>().unwrap(), ToneCurve::Ap3.into());
+    }
+}
+
+#[test]
+fn a_rounded_curve_is_the_same_to_the_kernels_and_short() {
+    let long = ToneSettings {
+        gain_c: 1.234_567_890_123e-250,
+        alpha: 0.1 + 0.2,
+        constants: vec![1.0 / 3.0, -2.0 / 7.0, 1e-7, 3.0],
+        ..ToneSettings::new(ToneCurve::FittedCubic)
+    };
+    let short = long.clone().rounded();
+    assert_eq!((short.gain_c, short.alpha), (0.0, 0.3));
+    for (long, short) in long.constants.iter().zip(&short.constants) {
+        assert_eq!((*long as f32).to_bits(), (*short as f32).to_bits());
+        assert!(short.to_string().len() <= 12, "{short}");
+    }
+    assert_eq!(short.clone().rounded(), short);
+}
+
+#[test]
+fn a_cube_begins_where_its_domain_does() {
+    let table = Table::from_cube(
+        "LUT_1D_SIZE 3\nDOMAIN_MIN 0.2 0.2 0.2\nDOMAIN_MAX 0.6 0.6 0.6\n0 0 0\n0.5 0.5 0.5\n1 1 1\n",
+    );
+    let x = table.unwrap().x;
+    assert!(
+        x.iter().zip([0.2, 0.4, 0.6]).all(|(x, expected)| (x - expected).abs() < 1e-12),
+        "{x:?}"
+    );
+}
+
+/// Between knots 0.1 and 0.4 the slopes are weighted harmonic means of the secants 3, 2/3 and 1/6: 1.2203390 and 2/7.
+#[test]
+fn between_its_knots_a_table_is_the_monotone_cubic() {
+    let table = |y: [f64; 4]| Table {
+        input: TableInput::T,
+        x: vec![0.0, 0.1, 0.4, 1.0],
+        y: vec![y.to_vec()],
+    };
+    let is_near =
+        |actual: f64, expected: f64| assert!((actual - expected).abs() < 1e-8, "{actual}");
+    is_near(table([0.0, 0.3, 0.5, 0.6]).value(0.25, 0), 0.435_048_426_150);
+    for x in [0.03, 0.2, 0.25, 0.9] {
+        is_near(table([0.0, 0.1, 0.4, 1.0]).value(x, 0), x);
+    }
+    // Level at a peak, and half way between two levels half way up.
+    is_near(table([0.0, 0.6, 0.4, 0.5]).value(0.25, 0), 0.5);
+}

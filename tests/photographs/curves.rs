@@ -1,0 +1,411 @@
+//! The table of curves: the method's values, the properties each row claims, and the device against the host.
+
+#![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
+
+use nightsplat::gpu::testing::gpu;
+use nightsplat::gpu::{Gpu, Reference, Threads};
+use nightsplat::kernels::{ToneParameters, tone_map, tone_mix, tone_profile, tone_table};
+use nightsplat::photographs::tone::{
+    FAMILIES, Family, Table, TableInput, ToneCurve, ToneSettings, White,
+};
+
+/// The method's values after the clamp, as printed.
+const T: [f64; 8] = [0.05, 0.10, 0.25, 0.50, 1.00, 1.50, 2.00, 3.00];
+const VALUES: [(&str, [f64; 8]); 23] = [
+    ("fitted_cubic", [0.152, 0.198, 0.326, 0.500, 0.732, 0.854, 0.918, 1.00]),
+    ("exp_plateau", [0.102, 0.172, 0.329, 0.509, 0.726, 0.850, 0.927, 1.00]),
+    ("power_softexp", [0.102, 0.171, 0.329, 0.510, 0.728, 0.845, 0.911, 0.970]),
+    ("log_curve", [0.094, 0.169, 0.333, 0.509, 0.719, 0.854, 0.953, 1.00]),
+    ("aces_filmic", [0.111, 0.174, 0.328, 0.509, 0.725, 0.849, 0.929, 1.00]),
+    ("reinhard", [0.084, 0.157, 0.329, 0.518, 0.727, 0.839, 0.910, 0.994]),
+    ("softexp_gamma", [0.105, 0.174, 0.329, 0.508, 0.728, 0.851, 0.924, 0.994]),
+    ("rational", [0.104, 0.173, 0.329, 0.509, 0.724, 0.849, 0.931, 1.00]),
+    ("poly5_origin", [0.087, 0.163, 0.334, 0.510, 0.726, 0.853, 0.940, 1.00]),
+    ("double_exp", [0.074, 0.142, 0.315, 0.522, 0.747, 0.843, 0.884, 0.910]),
+    ("gamma", [0.134, 0.198, 0.330, 0.488, 0.720, 0.904, 1.00, 1.00]),
+    ("sinh_ratio", [0.088, 0.163, 0.331, 0.513, 0.725, 0.849, 0.921, 0.984]),
+    ("hybrid", [0.108, 0.174, 0.328, 0.508, 0.727, 0.849, 0.924, 1.00]),
+    ("poly3_origin", [0.075, 0.145, 0.321, 0.526, 0.716, 0.833, 1.00, 1.00]),
+    ("softexp_mod", [0.085, 0.159, 0.333, 0.516, 0.715, 0.847, 0.965, 1.00]),
+    ("sqrt_blend", [0.143, 0.205, 0.334, 0.486, 0.716, 0.903, 1.00, 1.00]),
+    ("tanh_curve", [0.062, 0.124, 0.299, 0.532, 0.763, 0.827, 0.843, 0.847]),
+    ("arctan_curve", [0.044, 0.087, 0.202, 0.338, 0.469, 0.526, 0.556, 0.588]),
+    ("bezier3", [0.004, 0.016, 0.096, 0.344, 1.00, 1.00, 1.00, 1.00]),
+    ("piecewise3", [0.027, 0.055, 0.137, 0.190, 0.438, 1.00, 1.00, 1.00]),
+    ("hable", [1.00, 0.909, 0.593, 0.375, 0.216, 0.152, 0.117, 0.080]),
+    ("richards", [1.00; 8]),
+    ("softexp", [0.077, 0.149, 0.331, 0.553, 0.800, 0.911, 0.960, 0.992]),
+];
+
+/// The values the task names among them, and a dense grid.
+fn grid() -> Vec<f64> {
+    let mut grid: Vec<f64> = (0..=20_000).map(|i| f64::from(i) / 4000.0).collect();
+    grid.extend((-60..=32).map(|power| 10f64.powf(f64::from(power) / 4.0)));
+    grid.extend([1e-12, 0.009_999, 0.01, 0.010_001, 65.0, 1e6, f64::INFINITY]);
+    grid.sort_by(f64::total_cmp);
+    grid
+}
+
+fn value(family: &Family, t: f64) -> f64 {
+    family.curve.value(t, 0.0, 1.0, &family.defaults())
+}
+
+#[test]
+fn every_family_has_the_method_s_values_to_their_last_digit() {
+    for (name, expected) in VALUES {
+        let family = Family::find(name).unwrap();
+        for (t, expected) in T.into_iter().zip(expected) {
+            let found = value(family, t);
+            assert!((found - expected).abs() <= 5.0001e-4, "{name}({t}) = {found}, not {expected}");
+        }
+    }
+}
+
+#[test]
+fn the_table_is_in_order_and_its_names_are_unique() {
+    let mut names = std::collections::BTreeSet::new();
+    for (number, family) in FAMILIES.iter().enumerate() {
+        assert_eq!(family.curve as usize, number, "{}", family.name);
+        for name in std::iter::once(&family.name).chain(family.aliases) {
+            assert!(names.insert(name), "{name} is there twice");
+            assert_eq!(name.parse::<ToneCurve>().unwrap(), family.curve);
+        }
+        assert!(!family.formula.is_empty() && !family.source.is_empty());
+        for constant in family.constants {
+            let [low, high] = constant.bounds;
+            for value in [constant.default, constant.start] {
+                assert!((low..=high).contains(&value), "{} of {}", constant.name, family.name);
+            }
+            let names = family.formula.split(|c: char| !c.is_alphanumeric());
+            assert!(
+                names.clone().any(|name| name == constant.name),
+                "{} of {}",
+                constant.name,
+                family.name
+            );
+        }
+    }
+    assert_eq!(VALUES.len(), 23);
+}
+
+#[test]
+fn every_value_is_a_number_in_the_range_at_every_extreme() {
+    for family in &FAMILIES {
+        for t in grid().into_iter().chain([f64::NAN, f64::NEG_INFINITY, -1.0]) {
+            let y = value(family, t);
+            assert!((0.0..=1.0).contains(&y), "{}({t}) = {y}", family.name);
+            let shape = family.shape(t, &family.defaults());
+            assert!(shape.is_finite(), "{}({t}) = {shape}", family.name);
+            assert!(family.derivative(t, &family.defaults()).is_finite(), "{}({t})", family.name);
+        }
+    }
+    let sinh_ratio = Family::find("sinh_ratio").unwrap();
+    for t in [65.0, 1e6, f64::INFINITY] {
+        assert!((sinh_ratio.shape(t, &sinh_ratio.defaults()) - 1.0067).abs() < 1e-12);
+    }
+}
+
+#[test]
+fn every_row_says_rightly_whether_it_rises_and_whether_it_clips() {
+    for family in &FAMILIES {
+        let name = family.name;
+        let values: Vec<f64> = grid().into_iter().map(|t| value(family, t)).collect();
+        let rises = values.windows(2).all(|pair| pair[1] >= pair[0] - 1e-15);
+        assert_eq!(rises, family.monotone, "{name}");
+        let constants = family.defaults();
+        let highest = grid().into_iter().map(|t| family.shape(t, &constants)).fold(0.0, f64::max);
+        let unbounded_law = matches!(family.curve, ToneCurve::AseFloor);
+        assert_eq!(highest <= 1.0 && !unbounded_law, family.bounded, "{name} reaches {highest}");
+    }
+}
+
+/// By central differences, away from knees.
+#[test]
+fn derivatives_are_those_of_central_differences() {
+    for family in &FAMILIES {
+        let constants = family.defaults();
+        for i in 0..400 {
+            let t = 0.0037 + f64::from(i) * 0.0113;
+            let h = 1e-5 * t.max(0.1);
+            let knees = [0.2513, 0.8845, 0.3, 1.2, 2.7, 3.0, 1.0];
+            if knees.iter().any(|knee: &f64| (knee - t).abs() <= h) {
+                continue;
+            }
+            let close = |exact: f64, difference: f64, what: &str| {
+                assert!(
+                    (exact - difference).abs() <= 1e-6 * (1.0 + exact.abs()),
+                    "{}({t}), d{what}: {exact}, not {difference}",
+                    family.name
+                );
+            };
+            let difference = family.shape(t + h, &constants) - family.shape(t - h, &constants);
+            close(family.derivative(t, &constants), difference / (2.0 * h), "t");
+            for (index, exact) in family.gradient(t, &constants).into_iter().enumerate() {
+                let h = 1e-6 * constants[index].abs().max(1e-3);
+                let at = |shift: f64| {
+                    let mut constants = constants.clone();
+                    constants[index] += shift;
+                    family.shape(t, &constants)
+                };
+                close(exact, (at(h) - at(-h)) / (2.0 * h), family.constants[index].name);
+            }
+        }
+    }
+}
+
+/// The device's values of a curve on a grid of t, with the reference's.
+fn on_device(gpu: &Gpu, curve: ToneCurve, grid: &[f32], tone: ToneParameters) -> [Vec<f32>; 2] {
+    let constants = tone_map::Constants { tone_curve: curve.constant(), ..Default::default() };
+    let params = tone_map::Params { value_count: grid.len() as u32, view: 0 };
+    let mut expected = vec![0.0; grid.len()];
+    let slices = tone_map::Slices { image: grid, parameters: &[tone], target: &mut expected };
+    tone_map::Kernel::run(&params, &constants, slices);
+    let pipeline = gpu.pipeline::<tone_map::Kernel>(&constants).unwrap();
+    let mut target = gpu.zeros("target", grid.len()).unwrap();
+    let device_image = gpu.buffer("image", grid).unwrap();
+    let device_parameters = gpu.buffer("parameters", &[tone]).unwrap();
+    let buffers = tone_map::Buffers {
+        image: device_image.slice(),
+        parameters: device_parameters.slice(),
+        target: target.slice_mut(),
+    };
+    let threads =
+        Threads::Exactly([params.value_count.div_ceil(4 * constants.quads_per_thread), 1, 1]);
+    gpu.run("tone_map", |pass| pass.dispatch(&pipeline, &params, buffers, threads)).unwrap();
+    [gpu.read(&target).unwrap(), expected]
+}
+
+/// An exact value's f32 neighbours are 2^-24 of it apart at least.
+fn ulps(found: f32, exact: f64) -> f64 {
+    let ulp = f64::from((exact as f32).next_up()) - f64::from(exact as f32);
+    (f64::from(found) - exact).abs() / ulp
+}
+
+/// What exp, pow and cancellation may cost beyond 4 ulp: 4 ulp of one, and of tiny values, which the series keep,
+/// a few parts in a million. The terms of the polynomial of degree 5 reach 30 where their sum is 1.
+fn bound(family: &Family, t: f32, exact: f64) -> f64 {
+    match family.curve {
+        ToneCurve::Poly5Origin => 4e-6,
+        _ if t < 0.001 => 4e-6 * exact,
+        _ => 4.8e-7,
+    }
+}
+
+#[test]
+fn the_device_follows_every_family_in_double_precision() {
+    let gpu = gpu();
+    let grid: Vec<f32> = grid().into_iter().map(|t| t as f32).collect();
+    for family in FAMILIES.iter().filter(|family| family.white != White::ChannelMeans) {
+        let constants = ToneSettings::new(family.curve).constants;
+        let mut padded = [0.0; 8];
+        for (padded, constant) in padded.iter_mut().zip(&constants) {
+            *padded = *constant as f32;
+        }
+        let rounded: Vec<f64> = padded.iter().map(|&constant| constant.into()).collect();
+        for (offset, gain) in [(0.0, 1.0), (0.0754, 1.16)] {
+            let tone = ToneParameters { white: 1.0, offset, gain, constants: padded };
+            let [found, host] = on_device(&gpu, family.curve, &grid, tone);
+            let mut worst = 0.0_f64;
+            for ((&t, found), host) in grid.iter().zip(found).zip(host) {
+                let exact = family.curve.value(t.into(), offset.into(), gain.into(), &rounded);
+                for found in [found, host] {
+                    let error = (f64::from(found) - exact).abs();
+                    worst = worst.max(error);
+                    assert!(
+                        ulps(found, exact) <= 4.0 || error <= bound(family, t, exact),
+                        "{}({t}) = {found}, not {exact}",
+                        family.name
+                    );
+                }
+            }
+            println!("{}: off by {worst:.1e} at most", family.name);
+        }
+    }
+}
+
+/// A photograph of 8-bit noise that crowds near black.
+fn photograph(pixels: usize) -> Vec<f32> {
+    let mut state = 5_u64;
+    let mut noise = move || {
+        state =
+            state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (state >> 40) as f32 / (1_u64 << 24) as f32
+    };
+    (0..3 * pixels).map(|_| (noise().powi(3) * 255.0).round() / 255.0).collect()
+}
+
+#[test]
+fn tone_mix_matches_its_reference() {
+    let gpu = gpu();
+    for pixels in [1, 255, 1001] {
+        let mut image = photograph(pixels);
+        image[0] = f32::NAN;
+        image[pixels - 1] = 0.0;
+        let whites = [0.2, 0.3, 0.4, 0.0, 0.0, 0.0, 0.0, 0.0];
+        let plain = ToneParameters { white: 1.0, offset: 0.0, gain: 3.0, constants: whites };
+        let automatic = ToneParameters { white: 0.07, offset: 0.075, gain: 1.0, ..plain };
+        for (curve, tone) in [
+            (ToneCurve::LumPreserve, plain),
+            (ToneCurve::PerChannel, plain),
+            (ToneCurve::Auto, automatic),
+            (ToneCurve::Auto, ToneParameters { white: 1.0 / 128.0, ..automatic }),
+        ] {
+            let constants = tone_mix::Constants { tone_curve: curve.constant() };
+            let params = tone_mix::Params { pixel_count: pixels as u32, view: 0 };
+            let mut expected = vec![0.0; 3 * pixels];
+            let slices =
+                tone_mix::Slices { image: &image, parameters: &[tone], target: &mut expected };
+            tone_mix::Kernel::run(&params, &constants, slices);
+            let mut target = gpu.zeros("target", expected.len()).unwrap();
+            let device_image = gpu.buffer("image", &image).unwrap();
+            let device_parameters = gpu.buffer("parameters", &[tone]).unwrap();
+            let buffers = tone_mix::Buffers {
+                image: device_image.slice(),
+                parameters: device_parameters.slice(),
+                target: target.slice_mut(),
+            };
+            let pipeline = gpu.pipeline::<tone_mix::Kernel>(&constants).unwrap();
+            let threads = Threads::Exactly([pixels as u32, 1, 1]);
+            gpu.run("tone_mix", |pass| pass.dispatch(&pipeline, &params, buffers, threads))
+                .unwrap();
+            for (found, expected) in gpu.read(&target).unwrap().into_iter().zip(expected) {
+                assert!((found - expected).abs() <= 1e-6, "{curve}: {found}, not {expected}");
+            }
+        }
+    }
+}
+
+fn table() -> Table {
+    Table {
+        input: TableInput::T,
+        x: vec![0.0, 0.1, 0.5, 0.6, 1.0, 2.5],
+        y: vec![
+            vec![0.0, 0.3, 0.5, 0.5, 0.8, 1.0],
+            vec![0.1; 6],
+            vec![1.0, 0.9, 0.3, 0.2, 0.1, 0.0],
+        ],
+    }
+}
+
+#[test]
+fn tone_table_matches_its_reference_and_double_precision() {
+    let gpu = gpu();
+    let (table, pixels) = (table(), 1003);
+    let mut image = photograph(pixels);
+    image[..6].copy_from_slice(&[f32::NAN, -1.0, 0.0, 0.4, f32::INFINITY, 0.04]);
+    let tone = ToneParameters { white: 0.4, offset: 0.0, gain: 1.0, constants: [0.0; 8] };
+    let knots: Vec<glam::Vec3> = table.knots();
+    let params = tone_table::Params { pixel_count: pixels as u32, view: 0, knot_count: 6 };
+    let mut expected = vec![0.0; 3 * pixels];
+    let slices = tone_table::Slices {
+        image: &image,
+        parameters: &[tone],
+        knots: &knots,
+        target: &mut expected,
+    };
+    tone_table::Kernel::run(&params, &tone_table::Constants::default(), slices);
+    let mut target = gpu.zeros("target", expected.len()).unwrap();
+    let device_image = gpu.buffer("image", &image).unwrap();
+    let device_parameters = gpu.buffer("parameters", &[tone]).unwrap();
+    let device_knots = gpu.buffer("knots", &knots).unwrap();
+    let buffers = tone_table::Buffers {
+        image: device_image.slice(),
+        parameters: device_parameters.slice(),
+        knots: device_knots.slice(),
+        target: target.slice_mut(),
+    };
+    let pipeline = gpu.pipeline::<tone_table::Kernel>(&tone_table::Constants::default()).unwrap();
+    let threads = Threads::Exactly([3 * pixels as u32, 1, 1]);
+    gpu.run("tone_table", |pass| pass.dispatch(&pipeline, &params, buffers, threads)).unwrap();
+    for (i, found) in gpu.read(&target).unwrap().into_iter().enumerate() {
+        let exact = table.value(f64::from(image[i]) / 0.4, i / pixels);
+        assert!((found - expected[i]).abs() <= 1e-6, "{i}: {found}, not {}", expected[i]);
+        assert!((f64::from(found) - exact).abs() <= 1e-6, "{i}: {found}, not {exact}");
+    }
+}
+
+#[test]
+fn tone_profile_matches_its_reference_and_double_precision() {
+    let made = crate::common::setup::profile();
+    made.check().unwrap();
+    for pixels in [1, 255, 256, 257, 1001] {
+        let mut photograph = photograph(pixels);
+        photograph[0] = f32::NAN;
+        photograph[pixels] = f32::INFINITY;
+        photograph[2 * pixels] = -1.0;
+        let white = 0.07;
+        let tone = ToneParameters { white, offset: 0.0, gain: 1.0, constants: [0.0; 8] };
+        let (image, parameters, profile) = (photograph.clone(), vec![tone], made.rows());
+        let target = vec![0.0_f32; 3 * pixels];
+        let found = run_kernel!(
+            tone_profile,
+            tone_profile::Constants::default(),
+            tone_profile::Params { pixel_count: pixels as u32, view: 0 },
+            Threads::Exactly([pixels as u32, 1, 1]),
+            [image, parameters, profile],
+            [target]
+        );
+        for (i, found) in found.into_iter().enumerate() {
+            let t = [0, 1, 2].map(|channel| match photograph[channel * pixels + i % pixels] {
+                x if x > 0.0 => f64::from(x.min(65504.0)) / f64::from(white),
+                _ => 0.0,
+            });
+            let exact = made.value(t)[i / pixels];
+            assert!((f64::from(found) - exact).abs() <= 3e-6, "{i}: {found}, not {exact}");
+        }
+    }
+}
+
+#[test]
+fn a_table_goes_through_its_knots_and_rises_where_they_do() {
+    let table = table();
+    for channel in 0..3 {
+        for (x, y) in table.x.iter().zip(&table.y[channel]) {
+            assert!((table.value(*x, channel) - y).abs() < 1e-12);
+        }
+    }
+    let values: Vec<f64> = (0..=2600).map(|i| table.value(f64::from(i) / 1000.0, 0)).collect();
+    assert!(values.windows(2).all(|pair| pair[1] >= pair[0] - 1e-12), "it overshoots");
+    assert_eq!(table.value(9.0, 0), 1.0);
+    assert_eq!(table.value(f64::NAN, 0), 0.0);
+}
+
+/// Grey keeps to the curve of one value whatever lambda is, and colours keep their ratios where it is 1.
+#[test]
+fn the_automatic_curve_is_one_on_grey_and_keeps_the_ratios_of_colours() {
+    let gpu = gpu();
+    for share in [0.0, 1.0 / 3.0, 1.0] {
+        let mut constants = [0.0; 8];
+        constants[0] = share;
+        let tone = ToneParameters { white: 0.1, offset: 0.075, gain: 1.0, constants };
+        let grey: Vec<f32> = (0..600).map(|i| i as f32 / 600.0).collect();
+        let colour = [0.01, 0.02, 0.005];
+        let image: Vec<f32> =
+            colour.iter().flat_map(|&c| [grey.as_slice(), &[c]].concat()).collect();
+        let curve = tone_mix::Constants { tone_curve: ToneCurve::Auto.constant() };
+        let pipeline = gpu.pipeline::<tone_mix::Kernel>(&curve).unwrap();
+        let mut target = gpu.zeros("target", image.len()).unwrap();
+        let device_image = gpu.buffer("image", &image).unwrap();
+        let device_parameters = gpu.buffer("parameters", &[tone]).unwrap();
+        let buffers = tone_mix::Buffers {
+            image: device_image.slice(),
+            parameters: device_parameters.slice(),
+            target: target.slice_mut(),
+        };
+        let params = tone_mix::Params { pixel_count: 601, view: 0 };
+        let threads = Threads::Exactly([601, 1, 1]);
+        gpu.run("tone_mix", |pass| pass.dispatch(&pipeline, &params, buffers, threads)).unwrap();
+        let target = gpu.read(&target).unwrap();
+        for (i, &x) in grey.iter().enumerate() {
+            let exact = ToneCurve::Auto.value(f64::from(x) / 0.1, 0.075, 1.0, &[]);
+            for channel in 0..3 {
+                let found = f64::from(target[601 * channel + i]);
+                assert!((found - exact).abs() < 1e-6, "{x}: {found}, not {exact}");
+            }
+        }
+        let above_black = |channel: usize| f64::from(target[601 * channel + 600]) - 0.075;
+        let ratio = above_black(1) / above_black(0);
+        let kept = (ratio - 2.0).abs() < 1e-4;
+        assert_eq!(kept, share == 1.0, "lambda {share}: a ratio of 2 became {ratio}");
+    }
+}

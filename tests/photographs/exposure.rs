@@ -1,0 +1,250 @@
+//! How bright the automatic target is: the rule against a slow one over pixels, and what comes of odd sets.
+
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
+use glam::{DAffine3, DVec2, DVec3};
+use nightsplat::camera::{Camera, CameraModel};
+use nightsplat::photographs::tone::{Exposure, LuminanceHistogram, Statistics, exposed_anew, soft};
+
+/// A reproducible photograph whose luminance crowds near black, planar; `contrast` is the power that crowds it.
+fn photograph(pixels: usize, brightness: f32, contrast: i32, seed: u64) -> Vec<f32> {
+    let mut state = seed;
+    let mut noise = move || {
+        state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+        (state >> 40) as f32 / (1u64 << 24) as f32
+    };
+    (0..3 * pixels).map(|_| (brightness * noise().powi(contrast)).min(1.0)).collect()
+}
+
+fn scaled(planes: &[f32], factor: f32) -> Vec<f32> {
+    planes.iter().map(|x| (x * factor).min(1.0)).collect()
+}
+
+fn luminances(planes: &[f32]) -> Vec<f64> {
+    let n = planes.len() / 3;
+    let of = |i| {
+        [0.299, 0.587, 0.114]
+            .iter()
+            .zip([i, n + i, 2 * n + i])
+            .map(|(w, at)| w * f64::from(planes[at]))
+    };
+    (0..n).map(|i| of(i).sum()).collect()
+}
+
+/// The rule by trying gains, a thousandth apart, on every pixel.
+fn slow_gain(luminances: &[f64]) -> f64 {
+    let mut sorted = luminances.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    let limit = sorted[(0.999 * (sorted.len() - 1) as f64) as usize];
+    let n = sorted.len() as f64;
+    let cubes: f64 = sorted.iter().map(|y| y.min(limit).powf(3.0)).sum();
+    let mut gain = 0.9 / (cubes / n).powf(1.0 / 3.0);
+    let mean =
+        |k: f64| sorted.iter().map(|y| 0.075 + 0.925 * (1.0 - (-k * y).exp())).sum::<f64>() / n;
+    while mean(gain) < 0.44 {
+        gain *= 1.001;
+    }
+    while mean(gain) > 0.54 {
+        gain /= 1.001;
+    }
+    gain.min(128.0)
+}
+
+fn exposure(views: &[Vec<f32>]) -> Option<Exposure> {
+    let views: Vec<_> = views.iter().map(|view| LuminanceHistogram::of(view)).collect();
+    Exposure::of(&views, None)
+}
+
+#[test]
+fn the_gain_is_that_of_a_search_over_all_pixels() {
+    let mut bounded = [0; 3];
+    for (seed, brightness) in [(1, 0.05), (2, 0.1), (3, 0.3), (4, 1.0)] {
+        for contrast in [1, 2, 4, 12] {
+            let planes = photograph(20_000, brightness, contrast, seed);
+            let luminances = luminances(&planes);
+            let Some(exposure) = exposure(&[planes]) else { continue };
+            let slow = slow_gain(&luminances);
+            assert!((exposure.gain / slow - 1.0).abs() < 3e-3, "{}, not {slow}", exposure.gain);
+            bounded
+                [usize::from(exposure.target > 0.4401) + usize::from(exposure.target > 0.5399)] +=
+                1;
+        }
+    }
+    assert!(bounded.iter().all(|&count| count > 0), "bounds were not met: {bounded:?}");
+}
+
+#[test]
+fn the_mean_rises_with_the_gain_and_with_the_brightness_asked_for() {
+    let views = [1, 2, 3].map(|seed| LuminanceHistogram::of(&photograph(5000, 0.2, 3, seed)));
+    let mut last = 0.0;
+    for gain in (-20..=20).map(|step| f64::from(step).exp2().powf(0.35)) {
+        let mean = views[0].mean_of(|y| soft(y, gain));
+        assert!(mean > last, "{gain}");
+        last = mean;
+    }
+    let mut last = 0.0;
+    for brightness in [0.2, 0.4, 0.5, 0.7, 0.9] {
+        let exposure = Exposure::of(&views, Some(brightness)).unwrap();
+        assert!((exposure.target - brightness).abs() < 1e-9);
+        assert_eq!(exposure.weight(), 1.0);
+        assert!(exposure.gain > last);
+        last = exposure.gain;
+    }
+}
+
+#[test]
+fn darker_views_have_a_higher_gain_and_equal_ones_the_scene_s() {
+    let view = photograph(20_000, 0.1, 2, 7);
+    let histogram = LuminanceHistogram::of(&view);
+    let equal = exposure(&vec![view.clone(); 3]).unwrap();
+    assert_eq!(equal.spread, 0.0);
+    assert!((equal.gain_of(&histogram, None) / equal.gain - 1.0).abs() < 1e-9);
+    let single = exposure(std::slice::from_ref(&view)).unwrap();
+    assert!((single.gain / equal.gain - 1.0).abs() < 1e-12);
+
+    let factors = [1.0, 0.5, 0.25, 2.0];
+    let views = factors.map(|factor| scaled(&view, factor));
+    let varied = exposure(&views).unwrap();
+    assert!((varied.spread / 2f64.ln() - 1.118).abs() < 0.02, "{}", varied.spread);
+    assert!(varied.share > 0.95 && varied.share < 1.0);
+    // Nearly all of the difference is taken back: the targets are as bright as one another.
+    let means = views.each_ref().map(|view| {
+        let histogram = LuminanceHistogram::of(view);
+        histogram.mean_of(|y| soft(y, varied.gain_of(&histogram, None)))
+    });
+    let [low, high] = [f64::min, f64::max].map(|of| means.into_iter().reduce(of).unwrap());
+    assert!(high - low < 0.03, "{means:?}");
+    let shared = varied.clone().shared();
+    assert_eq!(shared.gain_of(&histogram, None), varied.gain);
+}
+
+/// Cameras along a path, a step apart each, that look ahead.
+fn camera(step: usize) -> Camera {
+    Camera {
+        width: 8,
+        height: 8,
+        focal: DVec2::splat(8.0),
+        principal_point: DVec2::splat(4.0),
+        model: CameraModel::Pinhole,
+        view_from_world: DAffine3::from_translation(-(step as f64) * DVec3::X),
+    }
+}
+
+/// The gains of views along a path that are scaled by factors, and how much of their differences they keep.
+fn gains_along(factors: &[f32]) -> (Vec<f64>, f64) {
+    let view = photograph(20_000, 0.1, 2, 7);
+    let views: Vec<_> =
+        factors.iter().map(|&factor| LuminanceHistogram::of(&scaled(&view, factor))).collect();
+    let seen = views.iter().enumerate().map(|(i, view)| (view, camera(i)));
+    let exposure = Exposure::of(&views, None).unwrap().seen_by(seen);
+    let gain = |(i, view)| exposure.gain_of(view, Some(&camera(i)));
+    (views.iter().enumerate().map(gain).collect(), exposure.share)
+}
+
+#[test]
+fn views_that_are_near_each_other_have_about_one_gain_unless_their_exposures_differ() {
+    let spread = |gains: &[f64]| {
+        let [low, high] = [f64::min, f64::max].map(|of| gains.iter().copied().reduce(of).unwrap());
+        (high / low).log2()
+    };
+    // What differs by little from view to view is taken for what they show: the targets agree.
+    let flicker: Vec<f32> = (0..40).map(|i| if i % 2 == 0 { 1.0 } else { 1.1 }).collect();
+    let (gains, share) = gains_along(&flicker);
+    assert!(spread(&gains[5..35]) < 0.3 * 1.1_f64.log2(), "{}", spread(&gains[5..35]));
+    assert!(share < 0.3, "{share}");
+    // What changes along the path is followed.
+    let drift: Vec<f32> = (0..40).map(|i| 1.02_f32.powi(i)).collect();
+    let (gains, share) = gains_along(&drift);
+    assert!(share > 0.8 && spread(&gains) > 0.8 * 39.0 * 1.02_f64.log2(), "{share}");
+    // Photographs a stop apart are exposed anew, each by itself.
+    let stops: Vec<f32> = (0..40).map(|i| if i % 2 == 0 { 1.0 } else { 0.5 }).collect();
+    let (gains, share) = gains_along(&stops);
+    assert!(share > 0.9 && spread(&gains) > 0.9, "{share}");
+}
+
+#[test]
+fn a_view_beyond_all_others_has_the_gain_of_the_nearest() {
+    let views: Vec<_> = [1.0, 0.8]
+        .map(|factor| LuminanceHistogram::of(&scaled(&photograph(20_000, 0.1, 2, 7), factor)))
+        .into();
+    let seen = views.iter().enumerate().map(|(i, view)| (view, camera(100 * i)));
+    let exposure = Exposure::of(&views, None).unwrap().seen_by(seen);
+    let [near, far] = [0, 1].map(|i| exposure.gain_of(&views[i], Some(&camera(100 * i))));
+    let beyond = exposure.gain_of(&views[1], Some(&camera(100_000)));
+    assert!(far > near && (beyond / far - 1.0).abs() < 1e-9, "{beyond}, not {far}");
+    assert_eq!(exposure.clone().shared().gain_of(&views[1], Some(&camera(0))), exposure.gain);
+}
+
+#[test]
+fn a_picture_at_one_gain_is_known_at_another() {
+    for gains in [[10.0, 14.0], [14.0, 10.0], [3.0, 60.0], [8.0, 8.0]] {
+        for weight in [1.0, 0.4] {
+            let knots = exposed_anew(gains, weight);
+            assert!(knots.is_sorted_by(|a, b| a[0] <= b[0] && a[1] <= b[1]), "{gains:?}");
+            for x in [0.0, 0.001, 0.02, 0.1, 0.3] {
+                let [from, to] =
+                    gains.map(|gain| ((1.0 - weight) * x + weight * soft(x, gain)) as f32);
+                let above = knots.partition_point(|knot| knot[0] <= from).clamp(1, knots.len() - 1);
+                let [[x0, y0], [x1, y1]] = [knots[above - 1], knots[above]];
+                let found = y0 + (from - x0) / (x1 - x0).max(f32::MIN_POSITIVE) * (y1 - y0);
+                assert!((found - to).abs() < 2e-3, "{gains:?} at {x}: {found}, not {to}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_thousandth_of_hot_pixels_moves_the_gain_by_little() {
+    let clean = photograph(40_000, 0.08, 2, 5);
+    let mut hot = clean.clone();
+    for plane in hot.chunks_mut(40_000) {
+        plane.iter_mut().step_by(1250).for_each(|x| *x = 1.0);
+    }
+    let [clean, hot] = [clean, hot].map(|planes| exposure(&[planes]).unwrap().gain);
+    assert!((hot / clean - 1.0).abs() < 0.02, "{hot}, not {clean}");
+}
+
+#[test]
+fn black_views_are_left_out_and_a_black_set_has_no_exposure() {
+    let good = photograph(20_000, 0.1, 2, 7);
+    let black = scaled(&good, 0.05);
+    let with = exposure(&[good.clone(), black.clone(), vec![0.0; 3000]]).unwrap();
+    let without = exposure(&[good]).unwrap();
+    assert_eq!((with.gain, with.black), (without.gain, 2));
+    assert_eq!(with.gain_of(&LuminanceHistogram::of(&black), None), with.gain);
+    assert!(with.reason().contains("2 as good as black"), "{}", with.reason());
+    assert_eq!(exposure(&[black, vec![0.0; 3000]]), None);
+    assert_eq!(exposure(&[]), None);
+}
+
+#[test]
+fn a_well_lit_set_has_no_curve_and_one_between_a_blend() {
+    let bright = photograph(20_000, 0.8, 1, 3);
+    let [well_lit, between, dark] =
+        [1.0, 0.77, 0.2].map(|factor| exposure(&[scaled(&bright, factor)]).unwrap());
+    assert_eq!(well_lit.weight(), 0.0, "{well_lit:?}");
+    assert!(between.weight() > 0.0 && between.weight() < 1.0, "{between:?}");
+    assert_eq!(dark.weight(), 1.0, "{dark:?}");
+    for (exposure, part) in [(well_lit, "no curve"), (between, "% of a curve"), (dark, "gain")] {
+        assert!(exposure.reason().contains(part), "{}", exposure.reason());
+    }
+    // One view has no spread; of two, one a half as bright as the other, each is half a stop from their mean.
+    let stops = |views: &[Vec<f32>]| exposure(views).unwrap().reason();
+    let view = scaled(&bright, 0.2);
+    assert!(!stops(std::slice::from_ref(&view)).contains("give or take"));
+    let two = stops(&[view.clone(), scaled(&view, 0.5)]);
+    assert!(two.contains("give or take 0.5 stops between the views"), "{two}");
+    // Half the views well lit: the set is dark on the mean, and every view is brought to the same brightness.
+    let half = exposure(&[bright.clone(), scaled(&bright, 0.05)]).unwrap();
+    assert!(half.weight() > 0.0 && half.share > 0.95, "{half:?}");
+}
+
+#[test]
+fn the_histogram_has_the_mean_of_the_statistics() {
+    for (brightness, contrast) in [(0.05, 2), (0.3, 4), (1.0, 1)] {
+        let planes = photograph(30_000, brightness, contrast, 11);
+        let mean = f64::from(Statistics::of(&planes).mean_luminance);
+        let found = LuminanceHistogram::of(&planes).mean();
+        assert!((found / mean - 1.0).abs() < 3e-4, "{found}, not {mean}");
+    }
+}

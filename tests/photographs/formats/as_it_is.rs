@@ -1,0 +1,238 @@
+//! What COLMAP and its users leave: several models, photographs without a pose, rigs, marks of editors, real lenses.
+
+use std::fs;
+use std::path::Path;
+
+use glam::DVec2;
+use nightsplat::camera::{Camera, CameraModel, KannalaBrandt};
+use nightsplat::photographs::dataset::{Dataset, LoadOptions, Split};
+use serde_json::json;
+
+use super::synthetic::*;
+use super::{load, names, view};
+use crate::common::command::run;
+
+/// What `tone` says on standard error of a dataset; one line for each remark.
+fn said_of(root: &Path) -> String {
+    run(&format!("tone {} --json", root.display()), 0).1
+}
+
+#[test]
+fn of_several_models_the_one_that_places_the_most_photographs_is_taken_and_said() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    photographs(root, "images", 0..9, 1.0);
+    model(2).write_binary(&root.join("sparse/0"));
+    model(9).write_binary(&root.join("sparse/1"));
+    // More poses, of photographs that are not there.
+    let mut absent = model(20);
+    absent.images.iter_mut().for_each(|image| image.3 = format!("absent/{}", image.3));
+    absent.write_text(&root.join("sparse/2"));
+    let dataset = load(root);
+    assert_eq!(dataset.views.len(), 9);
+    assert_eq!(dataset.points.len(), 20);
+    assert!(dataset.points[0].views.len() > 2);
+    let said = said_of(root);
+    assert!(said.contains("3 models, of 2, 9, 0 photographs; sparse/1, the largest"), "{said}");
+}
+
+#[test]
+fn photographs_without_a_pose_and_pictures_that_are_not_read_are_counted() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    photographs(root, "images", 0..9, 1.0);
+    model(3).write_text(&root.join("sparse/0"));
+    fs::write(root.join("images/IMG_1.HEIC"), "").unwrap();
+    fs::write(root.join("images/clip.mp4"), "").unwrap();
+    fs::write(root.join("images/notes.txt"), "").unwrap();
+    let said = said_of(root);
+    let parts = [
+        "6 of 9 photographs have no pose",
+        "v03.png the first",
+        "`nightsplat pose`",
+        "1 .heic, 1 .mp4",
+        "heif-convert",
+    ];
+    assert!(parts.iter().all(|part| said.contains(part)) && !said.contains("txt"), "{said}");
+    // Where all have one, there is nothing to say.
+    model(9).write_text(&root.join("sparse/0"));
+    fs::remove_file(root.join("images/IMG_1.HEIC")).unwrap();
+    fs::remove_file(root.join("images/clip.mp4")).unwrap();
+    assert_eq!(said_of(root), "");
+}
+
+#[test]
+fn the_cameras_of_a_rig_may_have_photographs_of_one_name() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    let mut rig = model(8);
+    for (index, image) in rig.images.iter_mut().rev().enumerate() {
+        image.3 = format!("{}/{:03}.png", ["a", "b"][index % 2], index / 2);
+        photograph(&root.join("images").join(&image.3), SIZE, dark(index));
+    }
+    rig.write_binary(&root.join("sparse/0"));
+    fs::write(root.join("test.txt"), "a/001.png\nb_003\n").unwrap();
+    let dataset = load(root);
+    let all: Vec<&str> = dataset.views.iter().map(|view| view.name.as_str()).collect();
+    assert_eq!(all, ["a_000", "a_001", "a_002", "a_003", "b_000", "b_001", "b_002", "b_003"]);
+    assert_eq!(names(&dataset, Split::Test), ["a_001", "b_003"]);
+    let level = |name: &str| super::level(view(&dataset, name).image.as_ref()).unwrap();
+    assert_eq!([level("a_000"), level("b_000"), level("a_001")], [10.0, 11.0, 12.0]);
+    assert!(dataset.points.iter().any(|point| point.views.len() > 2));
+    // The same names in one listing of a transforms file.
+    fs::remove_dir_all(root.join("sparse")).unwrap();
+    let listed = |index: usize| format!("images/{}/{:03}", ["a", "b"][index % 2], index / 2);
+    let frames = (0..8).map(|index| frame(index, &listed(index))).collect();
+    write_json(root.join("transforms.json"), &transforms(frames));
+    assert_eq!(load(root).views[5].name, "b_001");
+}
+
+#[test]
+fn a_byte_order_mark_changes_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    photographs(root, "images", 0..9, 1.0);
+    model(9).write_text(&root.join("sparse/0"));
+    fs::write(root.join("test.txt"), "v03\n").unwrap();
+    let plain = load(root);
+    let files =
+        ["sparse/0/cameras.txt", "sparse/0/images.txt", "sparse/0/points3D.txt", "test.txt"];
+    let texts = files.map(|file| fs::read_to_string(root.join(file)).unwrap());
+    let utf8 = |text: &str| [b"\xEF\xBB\xBF", text.as_bytes()].concat();
+    let little = |text: &str| {
+        format!("\u{feff}{text}").encode_utf16().flat_map(u16::to_le_bytes).collect::<Vec<u8>>()
+    };
+    let big = |text: &str| {
+        format!("\u{feff}{text}").encode_utf16().flat_map(u16::to_be_bytes).collect::<Vec<u8>>()
+    };
+    for encoding in 0..3 {
+        let encode = |text: &str| match encoding {
+            0 => utf8(text),
+            1 => little(text),
+            _ => big(text),
+        };
+        for (file, text) in files.iter().zip(&texts) {
+            fs::write(root.join(file), encode(text)).unwrap();
+        }
+        let marked = load(root);
+        assert_eq!(names(&marked, Split::Test), ["v03"]);
+        assert_eq!(marked.points, plain.points);
+        assert!(marked.views.iter().zip(&plain.views).all(|(a, b)| a.camera == b.camera));
+    }
+}
+
+#[test]
+fn a_rational_lens_is_undistorted_on_load_and_so_is_a_fisheye_where_that_is_asked_for() {
+    let center = [20.0, 15.0];
+    let lenses = [
+        ("FULL_OPENCV", 6, vec![0.1, 0.01, 0.001, 0.0, 0.003, 0.02, 0.0, 0.0]),
+        ("OPENCV_FISHEYE", 5, vec![0.03, -0.01, 0.002, 0.0]),
+        ("SIMPLE_RADIAL_FISHEYE", 8, vec![0.02]),
+        ("RADIAL_FISHEYE", 9, vec![0.02, -0.01]),
+    ];
+    for (name, number, coefficients) in lenses {
+        let focal = if name.contains("OPENCV") { vec![22.0, 22.0] } else { vec![22.0] };
+        let parameters = [focal, center.to_vec(), coefficients.clone()].concat();
+        let folder = tempfile::tempdir().unwrap();
+        photographs(folder.path(), "images", 0..9, 1.0);
+        let lens = Model { cameras: vec![(3, name, number, parameters)], ..model(9) };
+        lens.write_binary(&folder.path().join("sparse/0"));
+        let binary = undistorted(folder.path());
+        let camera = binary.views[0].camera;
+        assert_eq!(camera.model, CameraModel::Pinhole, "{name}");
+        assert!(camera.focal.is_finite() && camera.focal.x != 22.0, "{name}: {camera:?}");
+        // No blank pixel: every photograph is of one colour.
+        assert_eq!(super::level(view(&binary, "v04").image.as_ref()), Some(14.0), "{name}");
+        fs::remove_dir_all(folder.path().join("sparse")).unwrap();
+        lens.write_text(&folder.path().join("sparse/0"));
+        assert_eq!(undistorted(folder.path()).views[0].camera, camera, "{name}");
+    }
+}
+
+fn undistorted(root: &Path) -> Dataset {
+    Dataset::load(root, &LoadOptions { undistort: true, ..LoadOptions::default() }).unwrap()
+}
+
+#[test]
+fn a_fisheye_is_loaded_as_it_is_from_every_listing_and_what_lies_outside_its_circle_is_hidden() {
+    let [fx, fy, cx, cy, k1, k2, k3, k4] = [15.0, 15.5, 21.0, 14.0, 0.03, -0.01, 0.002, -0.0005];
+    let coefficients = [k1, k2, k3, k4];
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    photographs(root, "images", 0..9, 1.0);
+    let parameters = vec![fx, fy, cx, cy, k1, k2, k3, k4];
+    let model = Model { cameras: vec![(3, "OPENCV_FISHEYE", 5, parameters)], ..model(9) };
+    let sparse = root.join("sparse");
+    model.write_binary(&sparse.join("0"));
+    let binary = load(root);
+    fs::remove_dir_all(&sparse).unwrap();
+    model.write_text(&sparse.join("0"));
+    let text = load(root);
+    fs::remove_dir_all(&sparse).unwrap();
+    let frames = (0..9).map(|index| frame(index, &format!("images/{}.png", name(index)))).collect();
+    let mut listing = transforms(frames);
+    for (key, value) in [("fl_x", fx), ("fl_y", fy), ("cx", cx), ("cy", cy)].into_iter().chain([
+        ("k1", k1),
+        ("k2", k2),
+        ("k3", k3),
+        ("k4", k4),
+    ]) {
+        listing[key] = json!(value);
+    }
+    listing["camera_model"] = json!("OPENCV_FISHEYE");
+    write_json(root.join("transforms.json"), &listing);
+    let lens = KannalaBrandt { coefficients };
+    let reach = lens.radius(lens.largest_angle());
+    for dataset in [binary, text, load(root)] {
+        let view = view(&dataset, "v04");
+        let Camera { focal, principal_point, model, .. } = view.camera;
+        assert_eq!(model, CameraModel::Fisheye(lens));
+        assert_eq!((focal, principal_point), (DVec2::new(fx, fy), DVec2::new(cx, cy)));
+        let mask = view.mask.as_ref().unwrap();
+        for (at, &weight) in mask.weights.iter().enumerate() {
+            let corner = DVec2::new((at % 40) as f64, (at / 40) as f64);
+            let corners = [DVec2::ZERO, DVec2::X, DVec2::Y, DVec2::ONE].map(|by| corner + by);
+            let is_seen =
+                corners.iter().all(|at| ((at - principal_point) / focal).length() < reach);
+            assert_eq!(weight, f32::from(is_seen), "pixel {corner}");
+        }
+    }
+    // Of photographs that shrink the mask is that of the pixels there.
+    let shrunk = LoadOptions { downscale: 1.25, ..LoadOptions::default() };
+    let shrunk = Dataset::load(root, &shrunk).unwrap();
+    let (camera, mask) = (shrunk.views[0].camera, shrunk.views[0].mask.as_ref().unwrap());
+    assert_eq!((camera.focal.x, mask.width, mask.height), (0.8 * fx, 32, 24));
+    assert_eq!(mask.hidden(), camera.unseen());
+    // A polynomial that falls from 5 degrees on is no lens.
+    listing["k1"] = json!(-40.0);
+    write_json(root.join("transforms.json"), &listing);
+    let refused = Dataset::load(root, &LoadOptions::default()).unwrap_err().to_string();
+    assert!(refused.contains("describe no lens"), "{refused}");
+}
+
+#[test]
+fn what_a_pinhole_cannot_show_of_a_fisheye_is_cropped_and_said() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    photographs(root, "images", 0..9, 1.0);
+    let frames = (0..9).map(|index| frame(index, &format!("images/{}.png", name(index)))).collect();
+    let mut listing = transforms(frames);
+    for (key, value) in [
+        ("camera_model", json!("OPENCV_FISHEYE")),
+        ("fl_x", json!(16.0)),
+        ("fl_y", json!(16.0)),
+        ("cx", json!(20.0)),
+        ("cy", json!(15.0)),
+        ("k1", json!(0.01)),
+    ] {
+        listing[key] = value;
+    }
+    write_json(root.join("transforms.json"), &listing);
+    let camera = undistorted(root).views[0].camera;
+    let corner = (DVec2::new(0.5, 0.5) - camera.principal_point) / camera.focal;
+    assert!((corner.length().atan().to_degrees() - 60.0).abs() < 0.01, "{camera:?}");
+    let (shown, out) = (root.display(), root.join("run"));
+    let train = format!("train {shown} --steps 1 --undistort --out {}", out.display());
+    let said = run(&train, 0).1;
+    assert!(said.contains("fisheye") && said.contains("60 degrees"), "{said}");
+}

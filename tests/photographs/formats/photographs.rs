@@ -1,0 +1,269 @@
+//! Photographs as they come: formats, orientation, alpha and masks.
+
+use std::fs;
+use std::path::Path;
+
+use image::{ImageBuffer, Luma, Rgb, Rgba};
+use nightsplat::photographs::dataset::{Dataset, LoadOptions, Split};
+use nightsplat::photographs::image::{Image, Mask, Orientation};
+use serde_json::json;
+
+use super::synthetic::*;
+use super::{load, names, view};
+use crate::common::command::{refused, run};
+
+/// The values of one row of pixels.
+fn row(image: &Image) -> Vec<f32> {
+    image.data[..image.width as usize].to_vec()
+}
+
+fn close(values: &[f32], expected: &[f32]) {
+    let off = values.iter().zip(expected).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    assert!(values.len() == expected.len() && off < 1e-6, "{values:?}, not {expected:?}");
+}
+
+#[test]
+fn tiff_and_webp_are_read_in_the_bits_that_they_have() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    let grey = [0_u8, 7, 100, 255];
+    let expected = grey.map(|value| f32::from(value) / 255.0);
+    let eight = ImageBuffer::from_fn(4, 1, |x, _| Rgb([grey[x as usize]; 3]));
+    eight.save(path("8.tif")).unwrap();
+    eight.save(path("8.webp")).unwrap();
+    let alpha = ImageBuffer::from_fn(4, 1, |x, _| {
+        let value = grey[x as usize];
+        Rgba([value, value, value, 255])
+    });
+    alpha.save(path("alpha.webp")).unwrap();
+    ImageBuffer::from_fn(4, 1, |x, _| Luma([grey[x as usize]])).save(path("grey.tiff")).unwrap();
+    for name in ["8.tif", "8.webp", "alpha.webp", "grey.tiff"] {
+        let image = Image::load(path(name)).unwrap();
+        close(&row(&image), &expected);
+        assert_eq!(Image::size_of(path(name)).unwrap(), (4, 1), "{name}");
+    }
+    let deep = [0_u16, 1, 700, 65_535];
+    ImageBuffer::from_fn(4, 1, |x, _| Rgb([deep[x as usize]; 3])).save(path("16.tif")).unwrap();
+    close(
+        &row(&Image::load(path("16.tif")).unwrap()),
+        &deep.map(|value| f32::from(value) / 65_535.0),
+    );
+    // Of floats, EXR is what is read.
+    fs::write(path("float.tif"), float_tiff(&[[0.0; 3], [0.5; 3]])).unwrap();
+    let error = Image::load(path("float.tif")).unwrap_err().to_string();
+    assert!(error.contains("float.tif: is not read") && error.contains("EXR"), "{error}");
+}
+
+/// A TIFF of one row of colours in 32-bit floats.
+fn float_tiff(pixels: &[[f32; 3]]) -> Vec<u8> {
+    let bytes: Vec<u8> = pixels.iter().flatten().flat_map(|value| value.to_le_bytes()).collect();
+    let (count, length) = (pixels.len() as u32, bytes.len() as u32);
+    // Behind the pixels, for each of the three samples: 32 bits, and that they are floats.
+    let of_samples = [32_u16, 32, 32, 3, 3, 3];
+    let (bits, formats) = (8 + length, 8 + length + 6);
+    // Tag, number, value: size, bits, no compression, RGB, offset, samples, rows, bytes, float.
+    let entries: [(u16, u16, u32); 10] = [
+        (256, 1, count),
+        (257, 1, 1),
+        (258, 3, bits),
+        (259, 1, 1),
+        (262, 1, 2),
+        (273, 1, 8),
+        (277, 1, 3),
+        (278, 1, 1),
+        (279, 1, length),
+        (339, 3, formats),
+    ];
+    let mut file = [b"II*\0".as_slice(), &(8 + length + 12).to_le_bytes(), &bytes].concat();
+    file.extend(of_samples.iter().flat_map(|value| value.to_le_bytes()));
+    file.extend((entries.len() as u16).to_le_bytes());
+    for (tag, number, value) in entries {
+        // Several values are shorts; one is a long.
+        let kind: u16 = if number > 1 { 3 } else { 4 };
+        file.extend([tag, kind, number, 0].iter().flat_map(|half| half.to_le_bytes()));
+        file.extend(value.to_le_bytes());
+    }
+    file.extend([0; 4]);
+    file
+}
+
+#[test]
+fn pixels_of_an_exr_that_are_no_numbers_are_hidden() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    fs::create_dir(root.join("images")).unwrap();
+    let (columns, rows) = (SIZE.0 as usize, SIZE.1 as usize);
+    let green = |x, y| match (x, y) {
+        (7, 4) => f32::NAN,
+        (20, 9) => f32::NEG_INFINITY,
+        _ => 0.01,
+    };
+    for index in 0..9 {
+        let path = root.join("images").join(name(index)).with_extension("exr");
+        let pixel = |x, y| (0.02, if index == 3 { green(x, y) } else { 0.01 }, 0.03);
+        exr::prelude::write_rgb_file(path, columns, rows, pixel).unwrap();
+    }
+    model(9).write_text(&root.join("sparse/0"));
+    let dataset = load(root);
+    let hidden = |name: &str| view(&dataset, name).mask.as_ref().map(Mask::hidden);
+    assert_eq!(hidden("v03"), Some(vec![4 * columns + 7, 9 * columns + 20]));
+    assert_eq!(hidden("v02"), None);
+}
+
+#[test]
+fn heic_is_refused_with_what_converts_it_and_listed_where_it_is_not_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    fs::write(root.join("a.heic"), b"\0\0\0\x18ftypheic\0\0\0\0mif1heic").unwrap();
+    photograph(&root.join("b.png"), SIZE, 0.1);
+    refused(
+        &format!("tone {}/a.heic", root.display()),
+        3,
+        &["a.heic", "HEIC", "heif-convert", "sips"],
+    );
+    let (_, said) = run(&format!("tone {}", root.display()), 0);
+    assert!(said.contains("not read: 1 .heic") && said.contains("heif-convert"), "{said}");
+}
+
+/// A JPEG of one grey with an orientation in its Exif.
+fn jpeg(path: &Path, (width, height): (u32, u32), orientation: u8) {
+    fs::create_dir_all(path.parent().unwrap()).unwrap();
+    let plain = path.with_extension("plain.jpg");
+    ImageBuffer::from_fn(width, height, |x, _| Luma([20 + (x > width / 2) as u8 * 20]))
+        .save(&plain)
+        .unwrap();
+    let bytes = fs::read(&plain).unwrap();
+    fs::remove_file(&plain).unwrap();
+    let exif = [
+        b"Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0".as_slice(),
+        &[orientation, 0, 0, 0],
+        &[0; 4],
+    ];
+    let exif = exif.concat();
+    let segment = [&[0xFF, 0xE1][..], &(exif.len() as u16 + 2).to_be_bytes(), &exif].concat();
+    fs::write(path, [&bytes[..2], &segment, &bytes[2..]].concat()).unwrap();
+}
+
+#[test]
+fn a_photograph_is_turned_where_its_camera_saw_it_upright_and_stays_where_it_did_not() {
+    // Of each way of holding a camera: the size as stored where the cameras' is 40 x 30.
+    for orientation in 1..=8 {
+        let folder = tempfile::tempdir().unwrap();
+        let root = folder.path();
+        let frames =
+            (0..9).map(|index| frame(index, &format!("images/{}.jpg", name(index)))).collect();
+        write_json(root.join("transforms.json"), &transforms(frames));
+        let seen = if orientation >= 5 { (30, 40) } else { SIZE };
+        for (stored, is_turned) in [(SIZE, false), (seen, orientation >= 5)] {
+            for index in 0..9 {
+                jpeg(
+                    &root.join("images").join(name(index)).with_extension("jpg"),
+                    stored,
+                    orientation,
+                );
+            }
+            let dataset = load(root);
+            let image = view(&dataset, "v03").image.as_ref().unwrap();
+            assert_eq!((image.width, image.height), SIZE);
+            // The bright half is that of the columns as they are stored.
+            let is_bright = |x: u32, y: u32| image.pixel(x, y)[0] > 0.12;
+            let (columns, rows) =
+                ([5, 35].map(|x| is_bright(x, 15)), [5, 25].map(|y| is_bright(20, y)));
+            if is_turned {
+                assert!(rows[0] != rows[1], "orientation {orientation} is not turned");
+            } else {
+                assert_eq!(columns, [false, true], "orientation {orientation} is turned");
+            }
+            let lone = root.join("images/v03.jpg");
+            let upright = Image::load_upright(&lone).unwrap();
+            assert_eq!((upright.width, upright.height), Orientation::of(&lone).size(stored));
+        }
+        jpeg(&root.join("images/v03.jpg"), (36, 40), orientation);
+        let error = Dataset::load(root, &LoadOptions::default()).unwrap_err().to_string();
+        let upright = if orientation >= 5 { " (upright 40x36)" } else { "" };
+        let expected = format!("v03.jpg: is 36x40{upright} but its camera is 40x30");
+        assert!(error.contains(&expected), "{error}");
+    }
+}
+
+/// Half of a picture is white, the left one.
+fn half_mask(path: &Path, size: (u32, u32)) {
+    fs::create_dir_all(path.parent().unwrap()).unwrap();
+    let half = |x: u32, _| [f32::from(2 * x < size.0); 3];
+    Image::from_fn(size.0, size.1, half).save_png8(path).unwrap();
+}
+
+fn hides_the_right(mask: &Mask) {
+    assert_eq!((mask.width, mask.height), SIZE);
+    let columns = mask.weights[..40].iter().map(|&weight| weight as u32).sum::<u32>();
+    assert_eq!((columns, mask.weights[0], mask.weights[39]), (20, 1.0, 0.0));
+}
+
+#[test]
+fn masks_are_found_by_both_names_may_be_inverted_and_alpha_is_one() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    lom(root, 10, &[2, 5]);
+    assert!(load(root).views.iter().all(|view| view.mask.is_none()));
+    half_mask(&root.join("masks/v00.png"), SIZE);
+    half_mask(&root.join("masks/v01.png.png"), SIZE);
+    half_mask(&root.join("masks/v02.png"), (80, 60));
+    let alpha = |x: u32, y: u32| Rgba([20_u8, 20, 20, if x < 20 && y < 40 { 255 } else { 0 }]);
+    ImageBuffer::from_fn(40, 30, alpha).save(root.join("low/v03.png")).unwrap();
+    let dataset = load(root);
+    for index in 0..4 {
+        hides_the_right(view(&dataset, &name(index)).mask.as_ref().unwrap());
+    }
+    assert!(view(&dataset, "v04").mask.is_none());
+    let image = view(&dataset, "v00").image.as_ref().unwrap();
+    assert_eq!(view(&dataset, "v00").counted(image).len(), 3 * 20 * 30);
+    let inverted = LoadOptions { invert_masks: true, ..LoadOptions::default() };
+    let dataset = Dataset::load(root, &inverted).unwrap();
+    let mask = view(&dataset, "v00").mask.as_ref().unwrap();
+    assert_eq!((mask.weights[0], mask.weights[39]), (0.0, 1.0));
+    // Alpha says what is there, and is not inverted.
+    hides_the_right(view(&dataset, "v03").mask.as_ref().unwrap());
+
+    // Shrunk with the photograph.
+    let shrunk = LoadOptions { downscale: 1.6, ..LoadOptions::default() };
+    let mask = view(&Dataset::load(root, &shrunk).unwrap(), "v00").mask.clone().unwrap();
+    // The thirteenth column shows half a column of what is hidden.
+    assert_eq!((mask.width, mask.weights[11], mask.weights[12]), (25, 1.0, 0.0));
+}
+
+#[test]
+fn a_mask_of_another_shape_is_refused_and_one_that_hides_all_leaves_the_view_out() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    lom(root, 10, &[2, 5]);
+    photograph(&root.join("masks/v00.png"), SIZE, 0.0);
+    let dataset = load(root);
+    assert!(!names(&dataset, Split::Train).contains(&"v00"));
+    assert!(
+        dataset.skipped.join("\n").contains("v00: no pixel is a number that its mask shows"),
+        "{:?}",
+        dataset.skipped
+    );
+    half_mask(&root.join("masks/v01.png"), (30, 30));
+    let error = Dataset::load(root, &LoadOptions::default()).unwrap_err().to_string();
+    assert!(error.contains("masks/v01.png: is 30x30, its photograph 40x30"), "{error}");
+    refused(&format!("diagnose {}", root.display()), 3, &["masks/v01.png"]);
+}
+
+#[test]
+fn what_is_hidden_is_in_no_measure_of_tone() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    let measured = |more: &str| -> serde_json::Value {
+        let (stdout, _) = run(&format!("tone {} --json{more}", root.display()), 0);
+        serde_json::from_str(&stdout).unwrap()
+    };
+    let halves = |x: u32, _| [if 2 * x < SIZE.0 { 0.1 } else { 0.9 }; 3];
+    Image::from_fn(SIZE.0, SIZE.1, halves).save_png8(root.join("a.png")).unwrap();
+    let mean = |json: &serde_json::Value| (json["scene"]["mean"].as_f64().unwrap() * 100.0).round();
+    assert_eq!(mean(&measured("")), 50.0);
+    half_mask(&root.join("masks/a.png"), SIZE);
+    assert_eq!(mean(&measured("")), 10.0);
+    assert_eq!(measured("")["scene"]["unusable_pixels"], json!(600));
+    assert_eq!(mean(&measured(" --invert-masks")), 90.0);
+}

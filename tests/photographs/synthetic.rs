@@ -1,0 +1,280 @@
+//! The synthetic set has the layout it claims, loads as a dataset, and is what its options say, byte for byte.
+
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use glam::{DVec2, DVec3};
+use nightsplat::camera::CameraModel;
+use nightsplat::photographs::dataset::synthetic::{self, DARKENING, SyntheticOptions};
+use nightsplat::photographs::dataset::{Dataset, LoadOptions, Split};
+use nightsplat::photographs::image::{Image, linear_from_srgb};
+
+use crate::common::command::run;
+
+const SMALL: SyntheticOptions =
+    SyntheticOptions { views: 10, width: 48, height: 36, seed: 5, fisheye: false };
+
+/// Every file below a folder by its path there.
+fn files(root: &Path) -> BTreeMap<String, Vec<u8>> {
+    let mut files = BTreeMap::new();
+    let mut folders = vec![root.to_owned()];
+    while let Some(folder) = folders.pop() {
+        for entry in std::fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                folders.push(path);
+            } else {
+                let name = path.strip_prefix(root).unwrap().to_string_lossy().replace('\\', "/");
+                files.insert(name, std::fs::read(path).unwrap());
+            }
+        }
+    }
+    files
+}
+
+fn written(options: &SyntheticOptions) -> tempfile::TempDir {
+    let dir = tempfile::tempdir().unwrap();
+    synthetic::write(dir.path(), options).unwrap();
+    dir
+}
+
+#[test]
+fn equal_options_give_equal_bytes_and_another_seed_gives_others() {
+    let first = files(written(&SMALL).path());
+    assert_eq!(first, files(written(&SMALL).path()));
+    let other = files(written(&SyntheticOptions { seed: 6, ..SMALL }).path());
+    for changed in ["low/003.png", "high/003.png", "colmap_sparse/0/points3D.txt"] {
+        assert_ne!(first[changed], other[changed], "{changed}");
+    }
+}
+
+#[test]
+fn the_layout_is_that_of_lom() {
+    let dir = written(&SMALL);
+    let files = files(dir.path());
+    let mut expected: Vec<String> = ["low", "high"]
+        .iter()
+        .flat_map(|folder| (0..10).map(move |view| format!("{folder}/{view:03}.png")))
+        .collect();
+    expected.extend(["train", "test", "val"].map(|split| format!("transforms_{split}.json")));
+    expected.extend(
+        ["cameras", "images", "points3D"].map(|list| format!("colmap_sparse/0/{list}.txt")),
+    );
+    expected.sort();
+    assert_eq!(files.keys().cloned().collect::<Vec<_>>(), expected);
+
+    let list = |split: &str| -> serde_json::Value {
+        serde_json::from_slice(&files[&format!("transforms_{split}.json")]).unwrap()
+    };
+    let names = |split: &str| -> Vec<String> {
+        let list = list(split);
+        let frames = list["frames"].as_array().unwrap().iter();
+        frames.map(|frame| frame["file_path"].as_str().unwrap().to_owned()).collect()
+    };
+    assert_eq!(names("test"), ["high/000.png", "high/008.png"]);
+    assert_eq!(names("val"), ["high/000.png"]);
+    assert_eq!(names("train").len(), 8);
+    assert_eq!(names("train")[0], "low/001.png");
+    let train = list("train");
+    assert_ne!(train["cx"], 24.0, "the principal point is to be off centre");
+    assert_eq!(train["k1"], 0.0);
+}
+
+#[test]
+fn the_set_loads_as_a_dataset_whose_points_project_into_their_views() {
+    let dir = written(&SMALL);
+    let dataset = Dataset::load(dir.path(), &LoadOptions::default()).unwrap();
+    assert_eq!(dataset.skipped, Vec::<String>::new());
+    assert_eq!(dataset.views.len(), 10);
+    assert_eq!(
+        dataset.test_views().map(|view| view.name.as_str()).collect::<Vec<_>>(),
+        ["000", "008"]
+    );
+    assert!(dataset.test_views().all(|view| view.reference.is_some()));
+    assert!(dataset.points.len() > 1000, "{}", dataset.points.len());
+    for point in &dataset.points {
+        assert!(point.views.len() >= 2);
+        for &view in &point.views {
+            let camera = &dataset.views[view as usize].camera;
+            let pixel = camera.project(point.position).unwrap();
+            // The positions carry the error of a reconstruction.
+            let (width, height) = (f64::from(camera.width) + 1.0, f64::from(camera.height) + 1.0);
+            assert!(
+                (-1.0..width).contains(&pixel.x) && (-1.0..height).contains(&pixel.y),
+                "{pixel}"
+            );
+        }
+    }
+}
+
+#[test]
+fn a_points_views_agree_on_its_color() {
+    let dir = written(&SyntheticOptions { width: 96, height: 72, ..SMALL });
+    let dataset = Dataset::load(dir.path(), &LoadOptions::default()).unwrap();
+    let references: Vec<Image> = dataset
+        .views
+        .iter()
+        .map(|view| Image::load(dir.path().join(format!("high/{}.png", view.name))).unwrap())
+        .collect();
+    let spread = |point: &nightsplat::photographs::dataset::Point| {
+        let green = point.views.iter().map(|&view| {
+            let pixel = dataset.views[view as usize].camera.project(point.position).unwrap();
+            references[view as usize]
+                .pixel((pixel.x.max(0.0) as u32).min(95), (pixel.y.max(0.0) as u32).min(71))[1]
+        });
+        let (low, high) =
+            green.fold((1.0f32, 0.0f32), |(low, high), value| (low.min(value), high.max(value)));
+        high - low
+    };
+    let mut spreads: Vec<f32> = dataset.points.iter().map(spread).collect();
+    spreads.sort_by(f32::total_cmp);
+    // Half of the points lie away from the edges of textures and objects.
+    assert!(spreads[spreads.len() / 2] < 0.15, "{}", spreads[spreads.len() / 2]);
+}
+
+#[test]
+fn the_dark_photograph_is_the_reference_darkened_in_linear_light() {
+    let dir = written(&SMALL);
+    let load = |folder: &str| Image::load(dir.path().join(folder).join("004.png")).unwrap();
+    let mean = |image: &Image| {
+        image.data.iter().map(|&value| f64::from(linear_from_srgb(value))).sum::<f64>()
+            / image.data.len() as f64
+    };
+    let (low, high) = (load("low"), load("high"));
+    let factor = mean(&high) / mean(&low);
+    assert!((factor / DARKENING - 1.0).abs() < 0.05, "{factor}");
+    let encoded_mean = |image: &Image| image.data.iter().sum::<f32>() / image.data.len() as f32;
+    assert!((0.4..0.6).contains(&encoded_mean(&high)), "{}", encoded_mean(&high));
+    // The noise is there: neighbours on plain surfaces differ in the dark by more than the light allows.
+    let roughness = |image: &Image| {
+        let pairs = image.data.windows(2).map(|pair| (pair[1] - pair[0]).abs());
+        let mut steps: Vec<f32> = pairs.collect();
+        steps.sort_by(f32::total_cmp);
+        steps[steps.len() / 4] / encoded_mean(image)
+    };
+    assert!(roughness(&low) > 1.3 * roughness(&high), "{} {}", roughness(&low), roughness(&high));
+}
+
+#[test]
+fn options_that_make_no_sense_are_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    for options in [
+        SyntheticOptions { views: 1, ..SMALL },
+        SyntheticOptions { views: 1000, ..SMALL },
+        SyntheticOptions { width: 15, ..SMALL },
+        SyntheticOptions { height: 100_000, ..SMALL },
+    ] {
+        assert!(synthetic::write(dir.path(), &options).is_err(), "{options:?}");
+    }
+    assert!(files(dir.path()).is_empty());
+}
+
+#[test]
+fn a_folder_that_cannot_be_made_is_named() {
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::write(dir.path().join("taken"), "").unwrap();
+    let problem = synthetic::write(dir.path().join("taken"), &SMALL).unwrap_err().to_string();
+    assert!(problem.contains("taken"), "{problem}");
+}
+
+#[test]
+fn every_eighth_view_is_for_testing() {
+    let dir = written(&SyntheticOptions {
+        views: 17,
+        width: 16,
+        height: 16,
+        seed: 0,
+        ..SyntheticOptions::default()
+    });
+    let dataset = Dataset::load(dir.path(), &LoadOptions::default()).unwrap();
+    let is_test = |(index, view): (usize, &nightsplat::photographs::dataset::View)| {
+        (view.split == Split::Test) == (index % 8 == 0)
+    };
+    assert!(dataset.views.iter().enumerate().all(is_test));
+}
+
+#[cfg(feature = "cli")]
+mod command {
+    use super::*;
+    use nightsplat::cli::synth::{SynthArgs, run};
+
+    fn args(dir: &Path, overwrite: bool) -> SynthArgs {
+        let SyntheticOptions { views, width, height, seed, fisheye } =
+            SyntheticOptions { width: 16, height: 16, ..SMALL };
+        SynthArgs { dir: dir.to_owned(), views, width, height, seed, fisheye, overwrite }
+    }
+
+    #[test]
+    fn a_folder_that_is_not_empty_is_kept_unless_told_otherwise() {
+        let dir = tempfile::tempdir().unwrap();
+        std::fs::write(dir.path().join("letter.txt"), "mine").unwrap();
+        let problem = run(args(dir.path(), false)).unwrap_err().to_string();
+        assert!(problem.contains("--overwrite"), "{problem}");
+        assert_eq!(files(dir.path()).len(), 1);
+        run(args(dir.path(), true)).unwrap();
+        assert_eq!(files(dir.path())["letter.txt"], b"mine");
+    }
+
+    #[test]
+    fn a_folder_that_does_not_exist_is_made() {
+        let dir = tempfile::tempdir().unwrap();
+        run(args(&dir.path().join("new"), false)).unwrap();
+        assert!(dir.path().join("new/transforms_train.json").is_file());
+    }
+}
+
+#[test]
+fn a_fisheye_set_has_one_lens_in_both_listings_and_its_points_where_its_photographs_show_them() {
+    let dir = written(&SyntheticOptions { fisheye: true, ..SMALL });
+    let root = dir.path();
+    let listed = Dataset::load(root, &LoadOptions::default()).unwrap();
+    let camera = listed.views[0].camera;
+    assert!(matches!(camera.model, CameraModel::Fisheye(_)), "{camera:?}");
+    // The middle of the longer side is 65 degrees off the picture's middle; nothing lies outside the circle.
+    let reach = camera.focal.x / 48.0;
+    let CameraModel::Fisheye(lens) = camera.model else { panic!() };
+    assert!((lens.angle(0.5 / reach).unwrap().to_degrees() - 65.0).abs() < 1e-9);
+    assert!(listed.views.iter().all(|view| view.mask.is_none()));
+    let model = std::fs::read_to_string(root.join("colmap_sparse/0/cameras.txt")).unwrap();
+    assert!(model.contains("OPENCV_FISHEYE"), "{model}");
+    let points = std::fs::read_to_string(root.join("colmap_sparse/0/points3D.txt")).unwrap();
+    let images = std::fs::read_to_string(root.join("colmap_sparse/0/images.txt")).unwrap();
+    // Observations of the first view, and the positions of their points.
+    let seen: Vec<f64> =
+        images.lines().nth(3).unwrap().split(' ').map(|n| n.parse().unwrap()).collect();
+    assert!(seen.len() > 300);
+    let view = listed.views.iter().find(|view| view.name == "000").unwrap();
+    for observation in seen.chunks(3) {
+        let id = format!("{} ", observation[2]);
+        let point = points.lines().find(|line| line.starts_with(&id)).unwrap();
+        let xyz: Vec<f64> = point.split(' ').skip(1).take(3).map(|n| n.parse().unwrap()).collect();
+        let pixel = view.camera.project(DVec3::from_slice(&xyz)).unwrap();
+        let off = pixel.distance(DVec2::new(observation[0], observation[1]));
+        // Positions are off by a reconstruction's noise.
+        assert!(off < 0.3, "point {id}: off by {off}");
+    }
+}
+
+#[test]
+fn a_fisheye_set_trains_renders_scores_and_exports() {
+    let dir = tempfile::tempdir().unwrap();
+    let [set, native, undistorted] =
+        ["set", "native", "undistorted"].map(|name| dir.path().join(name).display().to_string());
+    run(&format!("synth {set} --fisheye --views 10 --width 48 --height 36"), 0);
+    let said = run(&format!("train {set} --out {native} --steps 200 --seed 1"), 0).1;
+    assert!(!said.contains("cropped"), "{said}");
+    run(&format!("train {set} --out {undistorted} --steps 1 --undistort"), 0);
+    let scores = run(&format!("eval {native} --json"), 0).0;
+    let scores: serde_json::Value = serde_json::from_str(&scores).unwrap();
+    let psnr = scores["mean"]["psnr"].as_f64().unwrap_or_else(|| panic!("{scores}"));
+    assert!(psnr > 15.0, "{psnr}");
+    let frames = dir.path().join("frames");
+    run(&format!("render {native} --path interpolate --frames 2 --out {}", frames.display()), 0);
+    for (to, name) in [("ply", "model.ply"), ("html", "page.html")] {
+        let out = dir.path().join(name);
+        run(&format!("export {native} --to {to} --out {}", out.display()), 0);
+        assert!(out.exists());
+    }
+}

@@ -1,0 +1,73 @@
+//! `nightsplat export`, as a shell runs it. The formats themselves are tested beside their encoders.
+
+use std::path::Path;
+
+use nightsplat::splats::scene::ply;
+
+use crate::common::command::{refused, succeed};
+
+/// A short run on a small synthetic set.
+fn trained(folder: &Path) -> String {
+    let root = folder.display();
+    succeed(&format!("synth {root}/set --views 9 --width 40 --height 32"));
+    succeed(&format!(
+        "train {root}/set --out {root}/run --plan none --curve ase --steps 12 --progress none"
+    ));
+    format!("{root}/run")
+}
+
+#[test]
+fn every_format_is_one_file_of_the_run_and_begins_as_its_readers_expect() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = trained(folder.path());
+    for (format, magic) in [
+        ("spz", &b"NGSP"[..]),
+        ("glb", b"glTF"),
+        ("sog", b"PK\x03\x04"),
+        ("html", b"<!DOCTYPE html>"),
+    ] {
+        let said = succeed(&format!("export {run} --to {format}"));
+        let path = Path::new(&run).join(format!("model.{format}"));
+        assert!(said.contains("Gaussians in"), "{said}");
+        assert!(std::fs::read(&path).unwrap().starts_with(magic), "{format}");
+    }
+    let html = std::fs::read_to_string(Path::new(&run).join("model.html")).unwrap();
+    for part in
+        ["curve: ase", "dataset: set", "\"label\":\"photograph\"", "\"label\":\"reference\""]
+    {
+        assert!(html.contains(part), "{part}");
+    }
+
+    let copy = folder.path().join("copy.ply");
+    succeed(&format!("export {run} --to ply --out {}", copy.display()));
+    let header = String::from_utf8_lossy(&std::fs::read(&copy).unwrap()[..300]).into_owned();
+    assert!(header.contains("comment curve: ase"), "{header}");
+    assert_eq!(ply::load(&copy).unwrap(), ply::load(Path::new(&run).join("model.ply")).unwrap());
+
+    let v3 = folder.path().join("v3.spz");
+    succeed(&format!("export {run} --to spz --spz 3 --out {}", v3.display()));
+    assert!(std::fs::read(v3).unwrap().starts_with(&[0x1f, 0x8b]));
+}
+
+#[test]
+fn what_cannot_be_exported_is_one_line_and_leaves_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path().display();
+    refused(&format!("export {root} --to glb"), 3, &["config.toml"]);
+    let run = trained(folder.path());
+    refused(&format!("export {run} --to ply"), 1, &["is the model itself", "--out"]);
+    refused(
+        &format!("export {run} --to glb --out {root}/none/a.glb"),
+        1,
+        &["a.glb", "cannot be written"],
+    );
+    // A disk without room, where there is a device that plays one.
+    if Path::new("/dev/full").exists() {
+        let full = folder.path().join("full.glb.partial");
+        std::os::unix::fs::symlink("/dev/full", &full).unwrap();
+        refused(&format!("export {run} --to glb --out {root}/full.glb"), 1, &["full.glb", "disk"]);
+        assert!(!folder.path().join("full.glb").exists());
+    }
+    std::fs::remove_file(Path::new(&run).join("model.ply")).unwrap();
+    refused(&format!("export {run} --to spz"), 3, &["no model.ply"]);
+}

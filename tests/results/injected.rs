@@ -1,0 +1,150 @@
+//! What goes wrong around a run on its way: devices that are lost, disks that are full, folders that go. Each has one outcome.
+#![cfg(all(unix, feature = "cli"))]
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
+use std::fs;
+use std::io::{BufRead, BufReader};
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use crate::common::command::{command, refused_with, run, succeed};
+use crate::common::place::Place;
+
+/// A command that is at work, in a group of its own as a shell would start it.
+fn begun(arguments: &str) -> Child {
+    command(arguments).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
+}
+
+/// Waits for the first line of JSON, which says that a training has begun.
+fn wait_for_start(child: &mut Child) {
+    let mut line = String::new();
+    BufReader::new(child.stdout.as_mut().unwrap()).read_line(&mut line).unwrap();
+    assert!(line.contains("started") && line.contains("most_device"), "{line}");
+}
+
+fn terminate(child: &Child) {
+    let pid = child.id().to_string();
+    assert!(Command::new("kill").args(["-TERM", &pid]).status().unwrap().success());
+}
+
+/// Exit code and standard error.
+fn ended(child: Child) -> (i32, String) {
+    let output = child.wait_with_output().unwrap();
+    (output.status.code().unwrap_or(-1), String::from_utf8(output.stderr).unwrap())
+}
+
+#[test]
+fn a_lost_device_and_memory_that_is_out_end_with_4_and_the_run_goes_on() {
+    let place = Place::new();
+    let options = "--steps 40 --checkpoint-every 10";
+    succeed(&place.train("straight", options));
+    for (fault, said) in
+        [("submission:60", "was lost while"), ("allocation:100", "out of device memory")]
+    {
+        let name = fault.replace(':', "-");
+        let train = place.train(&name, &format!("{options} --progress none"));
+        let output = command(&train).env("NIGHTSPLAT_FAULT", fault).output().unwrap();
+        let stderr = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(4), "{fault}: {stderr}");
+        assert!(stderr.lines().last().is_some_and(|line| line.contains(said)), "{stderr}");
+        assert!(!place.path(&name).join("done.json").exists());
+        succeed(&place.train(&name, &format!("{options} --resume")));
+        assert!(place.model(&name) == place.model("straight"), "{fault}");
+    }
+    let nonsense = [("NIGHTSPLAT_FAULT", "flood:1")];
+    refused_with(&place.train("new", options), &nonsense, 2, &["NIGHTSPLAT_FAULT=flood:1"]);
+}
+
+#[test]
+fn a_full_disk_is_said_and_what_was_there_stays_whole() {
+    let place = Place::new();
+    let options = "--steps 40 --checkpoint-every 10";
+    succeed(&place.train("run", "--steps 10 --checkpoint-every 10"));
+    let before = place.model("run");
+    // No file may grow beyond so many blocks, as on a disk with no more left; the checkpoint needs more.
+    let program = command("").get_program().to_str().unwrap().to_owned();
+    let train = place.train("run", &format!("{options} --resume --progress none"));
+    let line = format!("trap '' XFSZ; ulimit -f 40; exec {program} {train}");
+    let output =
+        Command::new("sh").args(["-c", &line]).env("NIGHTSPLAT_TUNE", "off").output().unwrap();
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{stderr}");
+    assert!(stderr.contains("cannot be written") && stderr.contains("disk"), "{stderr}");
+    let is_half = |name: &str| name.ends_with(".partial") || name.starts_with(".tmp");
+    let files: Vec<_> = fs::read_dir(place.path("run")).unwrap().flatten().collect();
+    let names = files.iter().map(|file| file.file_name().to_string_lossy().into_owned());
+    assert!(!names.into_iter().any(|name| is_half(&name)), "{files:?}");
+    if let Ok(model) = fs::read(place.path("run/model.ply")) {
+        assert!(model == before, "half a model");
+    }
+    succeed(&place.train("run", &format!("{options} --resume")));
+    succeed(&place.train("straight", options));
+    assert!(place.model("run") == place.model("straight"));
+}
+
+#[test]
+fn a_place_that_cannot_be_written_is_said_before_anything_is_trained() {
+    let place = Place::new();
+    let read_only = place
+        .train("run", "--steps 1")
+        .replace(&place.path("run").display().to_string(), "/proc/nightsplat");
+    let begin = Instant::now();
+    let (_, stderr) = run(&read_only, 1);
+    assert!(stderr.contains("/proc/nightsplat"), "{stderr}");
+    assert!(begin.elapsed() < Duration::from_secs(60));
+}
+
+#[test]
+fn a_run_whose_folder_goes_says_so_and_one_whose_photographs_go_is_saved() {
+    let place = Place::new();
+    let endless = "--steps 1000000 --checkpoint-every 0 --progress json";
+    let mut child = begun(&place.train("gone", endless));
+    wait_for_start(&mut child);
+    fs::remove_dir_all(place.path("gone")).unwrap();
+    terminate(&child);
+    let (code, stderr) = ended(child);
+    assert!(code == 1 && stderr.contains("gone"), "{code}: {stderr}");
+
+    // A cache that holds nothing: every photograph waits on disk, as it was when the run began.
+    let options = "--steps 300 --cache 1K --checkpoint-every 0";
+    succeed(&place.train("straight", options));
+    let mut child = begun(&place.train("run", &format!("{options} --progress json")));
+    wait_for_start(&mut child);
+    fs::rename(place.path("set"), place.path("elsewhere")).unwrap();
+    let _ = child.stdout.take();
+    let (code, stderr) = ended(child);
+    if code != 0 {
+        assert!(code == 3 && stderr.contains("set"), "{code}: {stderr}");
+        assert!(place.path("run/checkpoint.safetensors").exists(), "{stderr}");
+        fs::rename(place.path("elsewhere"), place.path("set")).unwrap();
+        succeed(&place.train("run", &format!("{options} --resume")));
+    }
+    assert!(place.model("run") == place.model("straight"));
+}
+
+#[test]
+fn a_batch_that_is_told_to_end_saves_what_is_under_way_and_goes_on_to_the_same_leaderboard() {
+    let place = Place::new();
+    let sweep = |name: &str| {
+        let (set, out) = (place.path("set"), place.path(name));
+        let (set, out) = (set.display(), out.display());
+        format!("sweep {set} --out {out} --curves linear,ase --steps 400 --sh-degree 1")
+    };
+    let child = begun(&sweep("sweep"));
+    let first = place.path("sweep/curve=linear/train.csv");
+    let begin = Instant::now();
+    while fs::read_to_string(&first).map_or(0, |log| log.lines().count()) < 3 {
+        assert!(begin.elapsed() < Duration::from_secs(120));
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    terminate(&child);
+    let (code, stderr) = ended(child);
+    assert_eq!(code, 143, "{stderr}");
+    assert!(stderr.contains("told to end with 0 of 2 runs done"), "{stderr}");
+    assert!(place.path("sweep/curve=linear/checkpoint.safetensors").exists());
+    assert!(!place.path("sweep/curve=ase/config.toml").exists());
+    succeed(&sweep("sweep"));
+    succeed(&sweep("straight"));
+    let leaderboard = |name: &str| fs::read(place.path(name).join("leaderboard.csv")).unwrap();
+    assert!(leaderboard("sweep") == leaderboard("straight"));
+}

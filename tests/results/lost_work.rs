@@ -1,0 +1,312 @@
+//! Runs that are interrupted, doubled, damaged or given another dataset: nothing is lost, nothing is mixed.
+#![cfg(all(unix, feature = "cli"))]
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
+use std::fs;
+use std::io::{BufRead, BufReader};
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use crate::common::command::{command, refused, run, succeed};
+use crate::common::place::Place;
+
+/// A training of its own that has begun and has thousands of steps to go.
+fn begun(arguments: &str) -> Child {
+    let mut child = command(&format!("{arguments} --progress json"))
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut line = String::new();
+    BufReader::new(child.stdout.as_mut().unwrap()).read_line(&mut line).unwrap();
+    assert!(line.contains("started"), "{line}");
+    child
+}
+
+fn send(signal: &str, child: &Child) {
+    let pid = child.id().to_string();
+    assert!(Command::new("kill").args([signal, &pid]).status().unwrap().success());
+}
+
+/// Exit code and standard error.
+fn ended(child: Child) -> (i32, String) {
+    let output = child.wait_with_output().unwrap();
+    (output.status.code().unwrap_or(-1), String::from_utf8(output.stderr).unwrap())
+}
+
+fn wait_for(path: &Path) {
+    let begin = Instant::now();
+    while !path.exists() {
+        assert!(begin.elapsed() < Duration::from_secs(120), "{} does not come", path.display());
+        std::thread::sleep(Duration::from_millis(10));
+    }
+}
+
+/// The log without the column of times.
+fn log(run: &Path) -> Vec<String> {
+    let text = fs::read_to_string(run.join("train.csv")).unwrap();
+    text.lines().map(|line| line.rsplit_once(',').unwrap().0.to_owned()).collect()
+}
+
+#[test]
+fn a_signal_saves_and_stops_and_the_run_goes_on_to_the_same_bits() {
+    let place = Place::new();
+    succeed(&place.train("straight", "--steps 400"));
+    for (signal, code, said) in [("-INT", 130, "interrupted"), ("-TERM", 143, "told to end")] {
+        let name = format!("stopped{signal}");
+        let mut child = begun(&place.train(&name, "--steps 400"));
+        send(signal, &child);
+        let _ = child.stdout.take();
+        let (status, stderr) = ended(child);
+        assert_eq!(status, code, "{stderr}");
+        assert!(stderr.contains(said) && stderr.contains("--resume"), "{stderr}");
+        assert!(
+            !place.path(&name).join("metrics.json").exists(),
+            "the run ended before the signal"
+        );
+        assert!(!place.path(&name).join(".lock").exists());
+        succeed(&place.train(&name, "--steps 400 --resume"));
+        assert!(place.read(&format!("{name}/model.ply")) == place.read("straight/model.ply"));
+        assert_eq!(log(&place.path(&name)), log(&place.path("straight")));
+    }
+}
+
+#[test]
+fn a_run_saves_when_asked_and_when_its_checkpoint_is_old_and_goes_on() {
+    let place = Place::new();
+    let child =
+        begun(&place.train("asked", "--steps 1000000 --checkpoint-every 0 --checkpoint-minutes 0"));
+    let checkpoint = place.path("asked/checkpoint.safetensors");
+    assert!(!checkpoint.exists());
+    send("-USR1", &child);
+    wait_for(&checkpoint);
+    // A second run in the directory is refused with the process that has it.
+    let holder = format!("process {}", child.id());
+    for held in ["", "--resume", "--overwrite"] {
+        refused(&place.train("asked", held), 1, &["asked", &holder]);
+    }
+    send("-KILL", &child);
+    ended(child);
+
+    let child = begun(
+        &place.train("old", "--steps 1000000 --checkpoint-every 0 --checkpoint-minutes 0.01"),
+    );
+    wait_for(&place.path("old/checkpoint.before.safetensors"));
+    send("-INT", &child);
+    send("-INT", &child);
+    let (code, stderr) = ended(child);
+    assert_eq!(code, 130, "{stderr}");
+}
+
+#[test]
+fn a_run_whose_time_is_up_is_to_be_run_again_and_a_finished_one_is_not() {
+    let place = Place::new();
+    // The clock is looked at where the ledger is written: however fast the device, that is before the last step. A slow one
+    // looks more often.
+    let stops = "--resume --hash-every 40 --max-minutes 0.000001";
+    let train = place.train("run", &format!("--steps 120 {stops}"));
+    let mut rounds = 0;
+    loop {
+        let output = command(&train).output().unwrap();
+        match output.status.code() {
+            Some(75) => rounds += 1,
+            code => {
+                assert_eq!(code, Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+                break;
+            }
+        }
+        assert!(!place.path("run/done.json").exists() && rounds < 300);
+    }
+    assert!(rounds >= 2, "{rounds}");
+    succeed(&place.train("straight", "--steps 120"));
+    assert!(place.read("run/model.ply") == place.read("straight/model.ply"));
+    // Again: nothing is done, and nothing is touched.
+    let modified = || fs::metadata(place.path("run/model.ply")).unwrap().modified().unwrap();
+    let before = modified();
+    assert!(succeed(&train).contains("is done"));
+    assert_eq!(modified(), before);
+    succeed(&place.train("run", "--steps 130 --resume"));
+    assert!(modified() > before, "a longer run is another");
+}
+
+#[test]
+fn a_finished_run_stays_until_the_one_that_replaces_it_has_done_a_step() {
+    let place = Place::new();
+    succeed(&place.train("run", "--steps 3"));
+    let before = place.read("run/model.ply");
+    // A network too large for any device: the run fails behind everything that is checked first.
+    let hopeless = "--overwrite --steps 3 --parts denoiser --denoiser-channels 16384";
+    let output = command(&place.train("run", hopeless)).output().unwrap();
+    assert_ne!(output.status.code(), Some(0));
+    assert!(place.read("run/model.ply") == before && !place.path("run/.replaced").exists());
+    // Killed before the first step: the next start finds it.
+    fs::create_dir(place.path("run/.replaced")).unwrap();
+    for name in ["model.ply", "config.toml", "metrics.json", "train.csv"] {
+        fs::rename(place.path("run").join(name), place.path("run/.replaced").join(name)).unwrap();
+    }
+    fs::write(place.path("run/.tmpA1b2C3"), "half a checkpoint").unwrap();
+    fs::write(place.path("run/config.toml"), place.read("run/.replaced/config.toml")).unwrap();
+    refused(&place.train("run", "--steps 3 --resume"), 1, &["already holds a run", "--overwrite"]);
+    assert!(place.read("run/model.ply") == before && !place.path("run/.tmpA1b2C3").exists());
+    succeed(&place.train("run", "--steps 4 --overwrite"));
+    assert!(place.read("run/model.ply") != before && !place.path("run/.replaced").exists());
+}
+
+#[test]
+fn files_of_somebody_else_are_neither_replaced_nor_resumed() {
+    let place = Place::new();
+    fs::create_dir(place.path("theirs")).unwrap();
+    for (file, content) in [("config.toml", "title = \"my app\"\n"), ("train.csv", "a,b\n")] {
+        fs::write(place.path("theirs").join(file), content).unwrap();
+        for held in ["--resume", "--overwrite"] {
+            refused(&place.train("theirs", held), 1, &["theirs", "somebody else's"]);
+        }
+    }
+    assert_eq!(place.read("theirs/config.toml"), b"title = \"my app\"\n");
+    assert_eq!(place.read("theirs/train.csv"), b"a,b\n");
+}
+
+#[test]
+fn a_damaged_checkpoint_is_said_and_the_one_before_goes_on_to_the_same_bits() {
+    let place = Place::new();
+    let options = "--steps 50 --checkpoint-every 20";
+    succeed(&place.train("run", options));
+    let expected = place.read("run/model.ply");
+    let checkpoint = place.path("run/checkpoint.safetensors");
+    let whole = fs::read(&checkpoint).unwrap();
+    fs::remove_file(place.path("run/done.json")).unwrap();
+    // A bit of a number, which no format notices.
+    let mut flipped = whole.clone();
+    let at = flipped.len() - 9;
+    flipped[at] ^= 1;
+    for damaged in [&flipped[..], &whole[..whole.len() - 7], b""] {
+        fs::write(&checkpoint, damaged).unwrap();
+        let (_, stderr) = run(&place.train("run", &format!("{options} --resume")), 0);
+        assert!(stderr.contains("checkpoint.safetensors") && stderr.contains("before"), "{stderr}");
+        assert!(place.read("run/model.ply") == expected);
+        fs::remove_file(place.path("run/done.json")).unwrap();
+    }
+    fs::write(&checkpoint, &flipped).unwrap();
+    fs::write(place.path("run/checkpoint.before.safetensors"), &flipped).unwrap();
+    refused(&place.train("run", &format!("{options} --resume")), 3, &["checksum"]);
+}
+
+#[test]
+fn a_run_goes_on_with_its_own_dataset_alone() {
+    let place = Place::new();
+    succeed(&place.train("run", "--steps 12 --checkpoint-every 10"));
+    let resumed = place.train("run", "--steps 14 --resume");
+    let (photograph, other) = (place.path("set/low/003.png"), place.path("set/low/004.png"));
+    let before = fs::read(&photograph).unwrap();
+    fs::copy(&other, &photograph).unwrap();
+    refused(&resumed, 3, &["another dataset", "view 003 shows other pixels"]);
+    fs::remove_file(&photograph).unwrap();
+    let (_, stderr) = run(&resumed, 3);
+    assert!(stderr.contains("another dataset (view 003 is gone)"), "{stderr}");
+    fs::write(&photograph, before).unwrap();
+    let listing = place.path("set/transforms_train.json");
+    let text = fs::read_to_string(&listing).unwrap();
+    fs::write(&listing, text.replace("\"fl_x\": ", "\"fl_x\": 1")).unwrap();
+    refused(&resumed, 3, &["another dataset", "another camera or pose"]);
+    // Elsewhere, it is the same one.
+    fs::write(&listing, text).unwrap();
+    fs::rename(place.path("set"), place.path("moved")).unwrap();
+    succeed(&resumed.replace("/set ", "/moved "));
+}
+
+#[test]
+fn a_relative_dataset_means_the_same_from_everywhere() {
+    let place = Place::new();
+    let train = "train set --out run --steps 2 --curve ap3 --plan none";
+    let output = command(train).current_dir(place.0.path()).output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let eval = |config: &str| {
+        fs::write(place.path("run/config.toml"), config).unwrap();
+        succeed(&format!("eval {} --json", place.path("run").display()))
+    };
+    let config = fs::read_to_string(place.path("run/config.toml")).unwrap();
+    let absolute = place.path("set").display().to_string();
+    assert!(config.contains(&absolute), "{config}");
+    let expected = eval(&config);
+    assert_eq!(eval(&config.replace(&absolute, "../set")), expected, "from the run's folder");
+}
+
+#[test]
+fn two_runs_have_one_ledger_and_a_resumed_one_has_it_too() {
+    let place = Place::new();
+    let options = "--steps 40 --hash-every 10 --checkpoint-every 25";
+    for name in ["a", "b"] {
+        succeed(&place.train(name, options));
+    }
+    let ledger = place.read("a/hashes.csv");
+    assert_eq!(ledger.iter().filter(|&&byte| byte == b'\n').count(), 5);
+    assert!(place.read("b/hashes.csv") == ledger);
+    fs::remove_file(place.path("b/done.json")).unwrap();
+    succeed(&place.train("b", &format!("{options} --resume")));
+    assert!(place.read("b/hashes.csv") == ledger);
+    succeed(&place.train("c", &format!("{options} --seed 11")));
+    assert!(place.read("c/hashes.csv") != ledger);
+}
+
+#[test]
+fn names_from_elsewhere_break_no_table_and_reach_no_terminal() {
+    let place = Place::new();
+    let wild = "a,\u{1b}[31mb";
+    for (folder, stem) in [("low", "003"), ("high", "003")] {
+        let folder = place.path("set").join(folder);
+        if folder.join(format!("{stem}.png")).exists() {
+            fs::rename(folder.join(format!("{stem}.png")), folder.join(format!("{wild}.png")))
+                .unwrap();
+        }
+    }
+    let listing = place.path("set/transforms_train.json");
+    let text = fs::read_to_string(&listing).unwrap();
+    let text = text.replace("low/003.png", "low/a,\\u001b[31mb.png");
+    fs::write(&listing, text.replace("low/005.png", "low/gone\\u001b]0;x\\u0007.png")).unwrap();
+    let (stdout, stderr) = run(&place.train("run", "--steps 9"), 0);
+    assert!(
+        stderr.contains("gone") && !(stdout + &stderr).contains(['\u{1b}', '\u{7}']),
+        "{stderr:?}"
+    );
+    let log = fs::read_to_string(place.path("run/train.csv")).unwrap();
+    assert_eq!(log.lines().count(), 10);
+    assert!(log.contains("\"a,_[31mb\""), "{log}");
+    refused("eval /nowhere\u{1b}[2J", 3, &[r"/nowhere\u{1b}[2J"]);
+}
+
+#[test]
+fn who_has_read_enough_ends_a_command_quietly() {
+    for arguments in ["curves --table", "curves"] {
+        let mut child =
+            command(arguments).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+        drop(child.stdout.take());
+        let (code, stderr) = ended(child);
+        assert_eq!((code, stderr.as_str()), (0, ""), "{arguments}");
+    }
+}
+
+#[test]
+fn the_exit_code_says_who_can_do_something_about_it() {
+    let place = Place::new();
+    succeed(&place.train("done", "--steps 1"));
+    refused(&place.train("done", "--steps 1"), 1, &["already holds a run"]);
+    refused(&place.train("new", "--steps 0"), 2, &["--steps"]);
+    refused(&format!("eval {}", place.0.path().display()), 3, &["no config.toml"]);
+    refused(&place.train("new", "--steps 1 --device voodoo"), 4, &["voodoo"]);
+    assert!(!place.path("new").exists());
+}
+
+#[test]
+fn too_little_address_space_is_said_before_a_driver_faults() {
+    let place = Place::new();
+    let program = command("").get_program().to_str().unwrap().to_owned();
+    for kilobytes in [300_000, 600_000] {
+        let line =
+            format!("ulimit -v {kilobytes}; exec {program} {}", place.train("run", "--steps 1"));
+        let output = Command::new("sh").args(["-c", &line]).output().unwrap();
+        let stderr = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(4), "{stderr}");
+        assert!(stderr.contains("`ulimit -v`") && stderr.lines().count() == 1, "{stderr}");
+    }
+}

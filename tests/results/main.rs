@@ -1,0 +1,14 @@
+//! Runs, scores, reports and exports.
+
+#![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
+
+#[path = "../common/mod.rs"]
+mod common;
+
+mod determinism;
+mod export;
+mod injected;
+mod lost_work;
+mod profile;
+mod report;
+mod run;

@@ -1,0 +1,327 @@
+//! The page stands alone, escapes what it is given and marks what is best.
+
+use nightsplat::photographs::image::Image;
+use nightsplat::results::report::{
+    Bar, Best, Column, Comparison, Distribution, Facts, Mark, Picture, Report, Series, Table,
+    Trace, bars, distributions, plot, plot_in_groups, plot_points, svg_file, traces,
+};
+
+fn column(name: &str, digits: usize, best: Best) -> Column {
+    Column { name: name.into(), digits, best }
+}
+
+fn table() -> Table {
+    Table {
+        title: "Scores <test>".into(),
+        label: "curve".into(),
+        columns: vec![
+            column("PSNR", 2, Best::Greatest),
+            column("seconds", 0, Best::Least),
+            column("steps", 0, Best::Unmarked),
+        ],
+        rows: vec![
+            ("linear".into(), vec![Some(20.111), Some(31.0), Some(100.0)]),
+            ("a|b".into(), vec![Some(25.004), None, Some(200.0)]),
+            ("ap3".into(), vec![Some(25.001), Some(29.6), Some(f64::NAN)]),
+        ],
+    }
+}
+
+#[test]
+fn a_table_in_markdown_marks_the_best_of_each_column() {
+    let expected = "\
+| curve | PSNR | seconds | steps |
+| --- | ---: | ---: | ---: |
+| linear | 20.11 | 31 | 100 |
+| a\\|b | **25.00** | – | 200 |
+| ap3 | **25.00** | **30** | – |
+";
+    assert_eq!(table().markdown(), expected);
+}
+
+#[test]
+fn a_table_in_html_marks_the_same_values() {
+    let html = table().html();
+    assert_eq!(html.matches("class=\"best\"").count(), 3);
+    assert!(
+        html.contains(
+            "<td>ap3</td><td class=\"best\">25.00</td><td class=\"best\">30</td><td>–</td>"
+        ),
+        "{html}"
+    );
+    assert!(html.contains("Scores &lt;test&gt;"));
+}
+
+#[test]
+fn a_lone_value_and_a_short_row_are_not_marked() {
+    let mut table = table();
+    table.rows.truncate(1);
+    table.rows.push(("short".into(), vec![]));
+    assert!(!table.markdown().contains("**"));
+    assert!(table.markdown().contains("| short | – | – | – |"));
+}
+
+#[test]
+fn infinity_is_a_value() {
+    let mut table = table();
+    table.rows[0].1[0] = Some(f64::INFINITY);
+    assert!(table.markdown().contains("| linear | **∞** |"), "{}", table.markdown());
+}
+
+fn page(text: &str) -> String {
+    let picture = |scores: &str| Picture {
+        caption: text.into(),
+        scores: scores.into(),
+        image: Image::filled(4, 3, [0.5, 2.0, -1.0]),
+    };
+    let series =
+        [Series { name: text.into(), points: vec![(0.0, 1.0), (10.0, 0.2)], ..Series::default() }];
+    Report {
+        title: text.into(),
+        intro: vec![text.into()],
+        facts: vec![Facts { title: text.into(), rows: vec![[text.into(), text.into()]] }],
+        tables: vec![table()],
+        plots: vec![plot(text, text, &series)],
+        comparisons: vec![Comparison {
+            title: text.into(),
+            pictures: vec![picture("20 dB"), picture("")],
+        }],
+    }
+    .html()
+}
+
+#[test]
+fn the_page_refers_to_nothing_outside_itself() {
+    let html = page("chair");
+    for outside in ["http:", "https:", "<script", "<link", "@import", "url("] {
+        assert!(!html.contains(outside), "{outside}");
+    }
+    assert_eq!(html.matches("src=\"data:image/png;base64,iVBORw0KGgo").count(), 2);
+    assert_eq!(html.matches("<figcaption>").count(), 2);
+    assert!(html.contains("prefers-color-scheme: dark"));
+}
+
+#[test]
+fn every_text_is_escaped() {
+    let html = page("<b onload=\"x('&')\">");
+    assert!(!html.contains("<b onload"));
+    // Title, heading, paragraph, a fact with its caption, two captions with alternative texts, row title, plot label, axes, legend
+    // and its title.
+    assert_eq!(html.matches("&lt;b onload=&quot;x(&#39;&amp;&#39;)&quot;&gt;").count(), 17);
+}
+
+#[test]
+fn a_plot_draws_each_series_within_its_frame() {
+    let series = |name: &str, points: &[(f64, f64)]| Series {
+        name: name.into(),
+        points: points.to_vec(),
+        ..Series::default()
+    };
+    let svg = plot(
+        "step",
+        "loss",
+        &[
+            series("linear", &[(0.0, 0.31), (50.0, f64::NAN), (100.0, 0.1)]),
+            series("ap3", &[(0.0, 0.2), (100.0, 0.05)]),
+        ],
+    );
+    assert_eq!(svg.matches("<polyline").count(), 2);
+    let lines = svg.split(" points=\"").skip(1).map(|rest| rest.split('"').next().unwrap());
+    let points: Vec<Vec<(f64, f64)>> = lines
+        .map(|line| {
+            let point = |pair: &str| {
+                pair.split_once(',').map(|(x, y)| (x.parse().unwrap(), y.parse().unwrap()))
+            };
+            line.split_whitespace().map(|pair| point(pair).unwrap()).collect()
+        })
+        .collect();
+    assert_eq!(points.iter().map(Vec::len).collect::<Vec<_>>(), [2, 2], "a NaN is drawn");
+    assert!(
+        points
+            .iter()
+            .flatten()
+            .all(|(x, y)| (56.0..=704.0).contains(x) && (34.0..=266.0).contains(y))
+    );
+    // A greater value is higher up.
+    assert!(points[0][0].1 < points[0][1].1);
+    for label in [">0.3<", ">100<", ">step<", ">loss<", ">linear<"] {
+        assert!(svg.contains(label), "{label} is missing in {svg}");
+    }
+}
+
+#[test]
+fn plots_of_nothing_of_one_value_and_of_extremes_stay_well_formed() {
+    let extremes = [f64::MAX, f64::MIN, 1e30, -1e30, 0.0, 1e-300];
+    let plots = [vec![], vec![(1.0, 2.0)], extremes.iter().map(|&value| (value, value)).collect()];
+    for points in plots {
+        let svg = plot("step", "PSNR", &[Series { name: "a".into(), points, ..Series::default() }]);
+        assert!(!svg.contains("NaN") && !svg.contains("inf"), "{svg}");
+    }
+}
+
+#[test]
+fn a_distribution_has_the_skewness_of_its_luminances_and_draws_its_density() {
+    let of = |values: &[f32]| {
+        let mut distribution = Distribution::new("grey");
+        distribution.add(&[values, values, values].concat());
+        distribution
+    };
+    // Three at 0 and one at 1: mean 1/4, variance 3/16, third moment 3/32.
+    let skewness = of(&[0.0, 0.0, 0.0, 1.0]).skewness();
+    assert!((skewness - 3.0 / 32.0 / (3.0_f64 / 16.0).powf(1.5)).abs() < 1e-6, "{skewness}");
+    assert!((of(&[0.2, 0.3, 0.7, 0.8]).skewness()).abs() < 1e-5);
+    for constant in [&[][..], &[0.3], &[0.0; 9], &[1.0; 9]] {
+        assert_eq!(of(constant).skewness(), 0.0, "{constant:?}");
+    }
+    let svg = distributions(&[of(&[0.0, 0.1, 0.1, 0.9]), Distribution::new("nothing")]);
+    assert!(svg.contains("grey (skewness") && svg.matches("<polyline").count() == 2, "{svg}");
+    assert!(!svg.contains("NaN"));
+}
+
+#[test]
+fn a_legend_of_many_names_takes_rows_and_a_plot_can_be_a_file() {
+    let series = |index: usize| Series {
+        name: format!("a curve with number {index}"),
+        points: vec![(0.0, 0.0), (1.0, 1.0)],
+        ..Series::default()
+    };
+    let svg = svg_file(&plot("t", "y", &(0..12).map(series).collect::<Vec<_>>()));
+    assert!(
+        svg.starts_with("<svg xmlns=\"http://www.w3.org/2000/svg\"") && svg.contains("<style>")
+    );
+    assert!(svg.contains("--series-0") && !svg.contains("viewBox=\"0 0 "), "{svg}");
+    assert!(svg.contains("stroke-dasharray"));
+}
+
+#[test]
+fn a_line_looks_alike_in_every_plot_of_a_page_and_its_legend_shows_how() {
+    let series = |line: Option<usize>| Series {
+        name: "ap3".into(),
+        points: vec![(0.0, 0.0), (1.0, 1.0)],
+        line,
+        ..Series::default()
+    };
+    let look = |svg: &str, element: &str| {
+        let rest = svg.split(element).nth(1).unwrap();
+        let stroke = rest.split("stroke=\"").nth(1).unwrap().split('"').next().unwrap().to_owned();
+        let dashes = rest.split("/>").next().unwrap().contains("stroke-dasharray=\"7 3\"");
+        (stroke, dashes)
+    };
+    // The seventh line of the page, alone in one plot and behind another in the next.
+    for svg in
+        [plot("t", "y", &[series(Some(6))]), plot("t", "y", &[series(Some(6)), series(None)])]
+    {
+        for element in ["<polyline", "class=\"sample\""] {
+            assert_eq!(
+                look(&svg, element),
+                ("var(--series-1)".to_owned(), true),
+                "{element}: {svg}"
+            );
+        }
+        assert_eq!(svg.matches("class=\"sample\"").count(), svg.matches("<polyline").count());
+        assert!(svg.contains("<title>ap3</title>"), "nothing is said where the pointer rests");
+    }
+}
+
+#[test]
+fn many_series_are_drawn_a_few_at_a_time_with_the_same_axes() {
+    let series = |index: usize| Series {
+        name: format!("curve {index}"),
+        points: vec![(0.0, 0.0), (3.0, index as f64)],
+        line: Some(index),
+        ..Series::default()
+    };
+    let svg = svg_file(&plot_in_groups("t", "y", &(0..37).map(series).collect::<Vec<_>>(), &[]));
+    let plots: Vec<&str> = svg.split("<svg y=").skip(1).collect();
+    assert_eq!((plots.len(), svg.matches("<polyline").count()), (7, 37));
+    for plot in plots {
+        assert!(plot.matches("<polyline").count() <= 6 && plot.contains(">30<"), "{plot}");
+    }
+    assert!(svg.contains(":hover"), "a line cannot be told from the others");
+}
+
+#[test]
+fn what_a_mean_is_of_is_drawn_as_a_line_from_least_to_greatest() {
+    let series = Series {
+        name: "ap3".into(),
+        points: vec![(0.0, 20.0), (1.0, 21.0)],
+        spreads: vec![(0.0, 18.0, 30.0)],
+        ..Series::default()
+    };
+    let svg = plot_points("gain", "PSNR", &[series], &[]);
+    assert_eq!(svg.matches("class=\"spread\"").count(), 1);
+    assert!(svg.contains(">30<"), "the axis does not reach the greatest: {svg}");
+    let bar = Bar { name: "a".into(), value: 20.0, spread: Some([19.0, 22.0]) };
+    assert_eq!(bars("PSNR", 2, &[bar]).matches("class=\"spread\"").count(), 1);
+}
+
+#[test]
+fn pictures_come_first_on_a_page() {
+    let html = page("chair");
+    let at = |part: &str| html.find(part).unwrap();
+    assert!(at("<img") < at("<table") && at("<table") < at("<polyline"));
+}
+
+#[test]
+fn few_points_have_dots_and_the_special_one_a_star() {
+    let series = [Series {
+        name: "ap3".into(),
+        points: vec![(0.0, 20.0), (0.1, 24.0)],
+        ..Series::default()
+    }];
+    let mark = |name: &str, point| Mark { name: name.into(), point };
+    let marks = [mark("adaptive <0.2>", (0.2, 30.0)), mark("nowhere", (f64::NAN, 1.0))];
+    let svg = plot_points("delta0", "PSNR", &series, &marks);
+    assert_eq!((svg.matches("<circle").count(), svg.matches("<path").count()), (2, 1));
+    assert!(svg.contains("adaptive &lt;0.2&gt;") && !svg.contains("NaN"), "{svg}");
+    // The axes reach to the mark.
+    assert!(svg.contains(">0.20<") && svg.contains(">30<"), "{svg}");
+    assert_eq!(plot("delta0", "PSNR", &series).matches("<circle").count(), 0);
+}
+
+#[test]
+fn bars_begin_at_zero_and_are_as_long_as_their_values() {
+    let bar = |name: &str, value| Bar { name: name.into(), value, spread: None };
+    let rows = [bar("a", 20.0), bar("b & c", 5.0), bar("d", -5.0), bar("failed", f64::NAN)];
+    let svg = bars("PSNR, dB", 2, &rows);
+    let widths = svg.split(" width=\"").skip(1).map(|rest| rest.split('"').next().unwrap());
+    let widths: Vec<f64> = widths.map(|width| width.parse().unwrap()).collect();
+    assert_eq!(widths.len(), 3);
+    assert!((widths[0] - 4.0 * widths[1]).abs() < 0.3 && widths[1] == widths[2], "{widths:?}");
+    for text in [">20.00<", ">b &amp; c<", ">failed<", ">-5.00<"] {
+        assert!(svg.contains(text), "{text} is missing in {svg}");
+    }
+    assert!(!bars("PSNR", 2, &[]).contains("NaN"));
+}
+
+#[test]
+fn a_run_has_one_colour_in_every_drawing_and_its_name_beside_its_last_point() {
+    let trace = |name: &str, color, points: &[(f64, f64)]| Trace {
+        name: name.into(),
+        title: format!("the run <{name}>"),
+        color,
+        is_minor: color > 0,
+        points: points.to_vec(),
+    };
+    let of = [
+        trace("fast", 0, &[(10.0, 24.0)]),
+        trace("2", 1, &[(10.0, 24.0)]),
+        trace("lost", 2, &[(f64::NAN, 1.0)]),
+    ];
+    let svg = traces("time, s", "PSNR, dB", &of, &[(10.0, 24.0)]);
+    assert_eq!((svg.matches("<circle").count(), svg.matches("<path").count()), (2, 1));
+    assert!(svg.contains("--series-0") && svg.contains("--series-1") && !svg.contains("lost"));
+    assert!(svg.contains("the run &lt;fast&gt;") && !svg.contains("NaN"), "{svg}");
+    // Two names of one place do not stand on each other.
+    let place = |name: &str| {
+        let before = svg.split(&format!(">{name}</text>")).next().unwrap();
+        before.rsplit("<text ").next().unwrap().to_owned()
+    };
+    assert_ne!(place("fast").split(" fill").next(), place("2").split(" fill").next());
+    let curve = traces("s", "dB", &[trace("a", 0, &[(1.0, 20.0), (9.0, 25.0)])], &[]);
+    assert_eq!((curve.matches("<polyline").count(), curve.matches("<path").count()), (1, 0));
+    for points in [&[][..], &[(0.0, 1.0)], &[(-1.0, 2.0)], &[(1e-300, 1e300)]] {
+        let svg = traces("s", "dB", &[trace("a", 0, points)], points);
+        assert!(!svg.contains("NaN") && !svg.contains("inf"), "{svg}");
+    }
+}

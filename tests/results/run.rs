@@ -1,0 +1,422 @@
+//! Runs as their users meet them: without references, with another split, stopped on the way, opened elsewhere, seen from a
+//! path, watched by `TensorBoard`.
+#![cfg(feature = "cli")]
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use nightsplat::photographs::image::Image;
+use nightsplat::results::run::{load_progress, stopped_at};
+use serde_json::Value;
+
+use crate::common::command::{command, refused, refused_with, run, succeed};
+
+/// A folder with a small set below `set`.
+fn folder() -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    let set = folder.path().join("set").display().to_string();
+    succeed(&format!("synth {set} --views 10 --width 48 --height 32"));
+    folder
+}
+
+fn json(path: impl AsRef<Path>) -> Value {
+    serde_json::from_slice(&fs::read(path).unwrap()).unwrap()
+}
+
+fn train(folder: &Path, out: &str, options: &str) -> String {
+    let (set, out) = (folder.join("set"), folder.join(out));
+    format!("train {} --out {} --sh-degree 0 {options}", set.display(), out.display())
+}
+
+fn file_count(folder: impl AsRef<Path>) -> usize {
+    fs::read_dir(folder).unwrap().count()
+}
+
+#[test]
+fn without_references_test_views_are_scored_against_what_they_would_be_trained_on_and_it_is_said() {
+    let folder = folder();
+    let path = |name: &str| folder.path().join(name);
+    succeed(&train(folder.path(), "with", "--steps 4 --curve ap3"));
+    assert_eq!(json(path("with/metrics.json")).get("against"), None);
+    fs::remove_dir_all(path("set/high")).unwrap();
+    for (out, curve, label) in [
+        ("lifted", "--curve ap3", "against their own pseudo-GT"),
+        ("plain", "--curve none", "against the photographs themselves"),
+    ] {
+        let options = format!("--steps 4 --eval-every 2 --progress plain {curve}");
+        let (said, on_the_way) = run(&train(folder.path(), out, &options), 0);
+        assert!(said.contains(label), "{said}");
+        assert!(on_the_way.contains("test views against their"), "{on_the_way}");
+        let metrics = json(path(out).join("metrics.json"));
+        assert!(metrics["against"].as_str().unwrap().starts_with(label), "{metrics}");
+        assert!(metrics["mean"]["psnr"].as_f64().unwrap() > 5.0);
+        let printed: Value =
+            serde_json::from_str(&succeed(&format!("eval {} --json", path(out).display())))
+                .unwrap();
+        assert_eq!(printed, metrics);
+        let table = succeed(&format!("eval {} --save-images", path(out).display()));
+        assert!(table.contains(label), "{table}");
+        assert_eq!(file_count(path(out).join("eval/targets")), 2);
+    }
+    // What a photograph is compared with under `none` is that photograph.
+    let [low, target] = ["set/low/000.png", "plain/eval/targets/000.png"].map(path);
+    assert_eq!(Image::load(low).unwrap().data, Image::load(target).unwrap().data);
+    // A page says it, too.
+    let sweep = path("sweep").display().to_string();
+    let set = path("set").display().to_string();
+    succeed(&format!("sweep {set} --out {sweep} --curves ap3,none --steps 2 --sh-degree 0"));
+    for file in ["leaderboard.csv", "leaderboard.md", "index.html"] {
+        let text = fs::read_to_string(path("sweep").join(file)).unwrap();
+        assert!(text.contains("against their own pseudo-GT"), "{file}: {text}");
+    }
+}
+
+#[test]
+fn scores_on_the_way_are_rows_and_a_resumed_run_has_each_once() {
+    let folder = folder();
+    let path = |name: &str| folder.path().join(name);
+    let options = "--eval-every 3 --checkpoint-every 4 --progress none";
+    succeed(&train(folder.path(), "run", &format!("--steps 6 {options}")));
+    let steps =
+        |run: &Path| -> Vec<u64> { load_progress(run).iter().map(|row| row.step).collect() };
+    assert_eq!(steps(&path("run")), [3, 6]);
+    succeed(&train(folder.path(), "run", &format!("--steps 9 --resume {options}")));
+    assert_eq!(steps(&path("run")), [3, 6, 9]);
+    let text = fs::read_to_string(path("run/evals.csv")).unwrap();
+    let header = "step,views,psnr,psnr_channel_mean,ssim,seconds,";
+    assert!(text.starts_with(header) && text.lines().count() == 4, "{text}");
+    let last = load_progress(&path("run"))[2];
+    let metrics = json(path("run/metrics.json"));
+    assert_eq!(last.views, 2);
+    for (name, value) in
+        [("psnr", last.psnr), ("psnr_channel_mean", last.psnr_channel_mean), ("ssim", last.ssim)]
+    {
+        assert_eq!(metrics["mean"][name].as_f64().unwrap(), value, "{name}");
+    }
+}
+
+#[test]
+fn a_run_says_at_its_start_what_it_trains_and_why() {
+    let folder = folder();
+    let start = |out: &str, options: &str| succeed(&train(folder.path(), out, options));
+    let said = start("a", "--steps 1 --progress none");
+    for part in [
+        "8 views of 48x32 to train on",
+        "2 test views (as the transforms files say) scored against reference images",
+        "points; on ",
+        "curve auto: as bright as",
+    ] {
+        assert!(said.contains(part), "no `{part}` in: {said}");
+    }
+    // Nothing is held out of eight views but one, and nothing of seven.
+    let said = start("d", "--progress none --preset balanced --set steps=30");
+    for part in [
+        "30 steps at most: the run settles for 10 and ends once 1 held-out view has converged",
+        "30 steps are too few to settle for 250 (a third of them at most)",
+    ] {
+        assert!(said.contains(part), "no `{part}` in: {said}");
+    }
+    assert!(said.contains("ended at step 30: all steps are done"), "{said}");
+    let said = start("e", "--progress none --preset balanced --set steps=3 --test-every 3");
+    assert!(said.contains("no early end: 6 training views are too few to hold one out"), "{said}");
+    let said = start("b", "--steps 1 --progress none --plan none --curve AP3 --test-every 5");
+    assert!(said.contains("curve ap3: as asked for"), "{said}");
+    assert!(said.contains("2 test views (every 5th by name, as asked for)"), "{said}");
+    let said = start("c", "--steps 1 --progress json --curve none");
+    let first: Value = serde_json::from_str(said.lines().next().unwrap()).unwrap();
+    assert_eq!(first["event"], "started");
+    assert_eq!((&first["train_views"], &first["curve"]), (&8.into(), &"none".into()));
+    assert!(!first["device"].as_str().unwrap().is_empty());
+}
+
+#[test]
+fn another_split_is_asked_for_said_and_kept() {
+    let folder = folder();
+    let path = |name: &str| folder.path().join(name);
+    let (_, said) = run(&train(folder.path(), "run", "--steps 2 --test-every 3"), 0);
+    assert!(said.contains("its transforms files split the views") && said.contains("3"), "{said}");
+    let views = |run: &str| -> Vec<String> {
+        let metrics = json(path(run).join("metrics.json"));
+        metrics["views"].as_object().unwrap().keys().cloned().collect()
+    };
+    assert_eq!(views("run"), ["000", "003", "006", "009"]);
+    let table = succeed(&format!("eval {}", path("run").display()));
+    assert!(table.contains("\n006") && table.contains("\n009"), "{table}");
+    succeed(&train(folder.path(), "all", "--steps 2 --test-every 0"));
+    assert!(views("all").is_empty());
+    let listed = fs::read_to_string(path("all/views.csv")).unwrap();
+    assert_eq!(listed.lines().filter(|line| line.contains(",train,48,32")).count(), 10, "{listed}");
+    refused(&train(folder.path(), "one", "--test-every 1"), 2, &["--test-every is 1"]);
+    // A test view whose dark photograph is gone stays a pose: its bright twin is nothing to train on.
+    fs::remove_file(path("set/low/000.png")).unwrap();
+    succeed(&train(folder.path(), "pose", "--steps 2 --test-every 0"));
+    let listed = fs::read_to_string(path("pose/views.csv")).unwrap();
+    assert!(listed.contains("000,test,"), "{listed}");
+}
+
+#[test]
+fn a_run_that_was_stopped_is_rendered_scored_and_made_longer_with_a_lower_cap() {
+    let folder = folder();
+    let path = |name: &str| folder.path().join(name);
+    let options = "--checkpoint-every 5 --curve ap3 --model plain --max-gaussians 4000";
+    succeed(&train(folder.path(), "run", &format!("--steps 12 {options}")));
+    succeed(&train(folder.path(), "ten", &format!("--steps 10 {options}")));
+    let model = |run: &str| fs::read(path(run).join("model.ply")).unwrap();
+    let whole = model("run");
+    // As it would be had it been killed behind its last checkpoint.
+    for file in ["metrics.json", "done.json"] {
+        fs::remove_file(path("run").join(file)).unwrap();
+    }
+    fs::copy(path("ten/model.ply"), path("run/model.ply")).unwrap();
+    let checkpoint = path("run/checkpoint.safetensors");
+    fs::copy(path("run/checkpoint.before.safetensors"), checkpoint).unwrap();
+    assert_eq!(stopped_at(&path("run")), Some(10));
+    let run_folder = path("run").display().to_string();
+    let (printed, said) = run(&format!("eval {run_folder} --json"), 0);
+    assert!(said.contains("stopped at step 10 of 12"), "{said}");
+    let printed: Value = serde_json::from_str(&printed).unwrap();
+    assert_eq!(printed["steps"], 10);
+    assert_eq!(printed["mean"], json(path("ten/metrics.json"))["mean"]);
+    let shown = path("shown").display().to_string();
+    let (_, said) = run(&format!("render {run_folder} --split test --out {shown}"), 0);
+    assert!(said.contains("stopped at step 10 of 12") && file_count(&shown) == 2, "{said}");
+
+    succeed(&train(folder.path(), "run", &format!("--steps 12 --resume {options}")));
+    assert!(model("run") == whole);
+    assert_eq!(stopped_at(&path("run")), None);
+    let lower = options.replace("4000", "3000");
+    let logged = "--eval-every 7 --tensorboard --cache 1M --progress json";
+    succeed(&train(folder.path(), "run", &format!("--steps 14 --resume {lower} {logged}")));
+    assert_eq!(json(path("run/metrics.json"))["steps"], 14);
+    let higher = options.replace("4000", "5000");
+    let arguments = train(folder.path(), "run", &format!("--steps 15 --resume {higher}"));
+    refused(&arguments, 3, &["max_gaussians"]);
+}
+
+#[test]
+fn a_planned_run_is_made_longer_on_the_views_that_it_began_with() {
+    let folder = tempfile::tempdir().unwrap();
+    let set = folder.path().join("set").display().to_string();
+    succeed(&format!("synth {set} --views 20 --width 32 --height 24"));
+    let short = "--set steps=6 --checkpoint-every 3 --progress none";
+    let said = succeed(&train(folder.path(), "run", short));
+    assert!(said.contains("held-out view"), "{said}");
+    let said = succeed(&train(folder.path(), "run", "--steps 9 --resume --progress none"));
+    assert!(said.contains("9 steps"), "{said}");
+}
+
+#[test]
+fn a_model_is_written_with_every_checkpoint() {
+    let folder = folder();
+    let out = folder.path().join("run");
+    let options = "--steps 100000 --checkpoint-every 5 --curve ap3 --model plain --progress none";
+    let mut child = command(&train(folder.path(), "run", options));
+    let mut child = child.stdout(std::process::Stdio::null()).spawn().unwrap();
+    while !out.join("model.ply").exists() && child.try_wait().unwrap().is_none() {
+        std::thread::sleep(std::time::Duration::from_millis(5));
+    }
+    child.kill().unwrap();
+    child.wait().unwrap();
+    assert!(stopped_at(&out).unwrap() >= 5);
+    let (_, said) = run(&format!("eval {}", out.display()), 0);
+    assert!(said.contains("stopped at step"), "{said}");
+}
+
+fn copy(from: &Path, to: &Path) {
+    fs::create_dir_all(to).unwrap();
+    for entry in fs::read_dir(from).unwrap() {
+        let (path, target) = entry.map(|e| (e.path(), to.join(e.file_name()))).unwrap();
+        if path.is_dir() {
+            copy(&path, &target);
+        } else {
+            fs::copy(path, target).unwrap();
+        }
+    }
+}
+
+#[test]
+fn a_run_is_opened_with_another_copy_of_its_dataset_and_what_differs_is_said() {
+    let folder = folder();
+    let path = |name: &str| folder.path().join(name);
+    succeed(&train(folder.path(), "run", "--steps 2"));
+    copy(&path("set"), &path("copy"));
+    fs::remove_dir_all(path("set")).unwrap();
+    let [run_folder, copied, shown] =
+        ["run", "copy", "shown"].map(|name| path(name).display().to_string());
+    refused(&format!("eval {run_folder}"), 3, &["set", "--dataset"]);
+    let (printed, said) = run(&format!("eval {run_folder} --json --dataset {copied}"), 0);
+    let printed: Value = serde_json::from_str(&printed).unwrap();
+    assert_eq!(printed, json(path("run/metrics.json")));
+    assert!(!said.contains("is not what"), "{said}");
+    fs::remove_file(path("copy/low/004.png")).unwrap();
+    let arguments = format!("render {run_folder} --split test --out {shown} --dataset {copied}");
+    let (_, said) = run(&arguments, 0);
+    assert!(said.contains("is not what") && said.contains("004,train,48,32"), "{said}");
+}
+
+/// The pictures of a path, as files.
+fn flight(run: &Path, out: &Path, options: &str) -> Vec<PathBuf> {
+    succeed(&format!("render {} --out {} {options}", run.display(), out.display()));
+    let mut files: Vec<PathBuf> =
+        fs::read_dir(out).unwrap().map(|entry| entry.unwrap().path()).collect();
+    files.sort();
+    files
+}
+
+#[test]
+fn a_camera_flies_and_the_pictures_become_a_video() {
+    let folder = folder();
+    let path = |name: &str| folder.path().join(name);
+    succeed(&train(folder.path(), "run", "--steps 30"));
+    for way in ["orbit", "spiral", "interpolate"] {
+        let video = path(way).with_extension("png");
+        let options = format!("--path {way} --frames 4 --fps 12 --video {}", video.display());
+        let files = flight(&path("run"), &path(way), &options);
+        assert_eq!(files.len(), 4, "{way}");
+        assert!(files[0].ends_with("00000.png") && files[3].ends_with("00003.png"));
+        let [first, last] = [&files[0], &files[3]].map(|file| Image::load(file).unwrap());
+        assert_eq!((first.width, first.height), (48, 32));
+        assert!(first.data != last.data && first.data.iter().any(|&value| value > 0.1), "{way}");
+        // Whatever cannot show a moving PNG shows its first picture.
+        assert_eq!(Image::load(&video).unwrap(), first);
+        let bytes = fs::read(&video).unwrap();
+        let chunks = |name: &[u8]| bytes.windows(4).filter(|window| *window == name).count();
+        assert_eq!((chunks(b"acTL"), chunks(b"fcTL")), (1, 4));
+    }
+    // The way begins at the first training camera.
+    let first = flight(&path("run"), &path("test"), "--split train").swap_remove(0);
+    let frame = path("interpolate/00000.png");
+    assert_eq!(Image::load(first).unwrap(), Image::load(frame).unwrap());
+
+    let [run_folder, out] = ["run", "frames"].map(|name| path(name).display().to_string());
+    let render = format!("render {run_folder} --out {out}");
+    let video =
+        format!("{render} --path orbit --frames 2 --video {}/orbit.mp4", folder.path().display());
+    let nowhere = [("PATH", "/nonexistent")];
+    let parts = ["orbit.mp4", "there is no ffmpeg", "ffmpeg -y", "-framerate 30", "%05d.png"];
+    refused_with(&video, &nowhere, 1, &parts);
+    assert_eq!(file_count(&out), 2);
+    if crate::common::command::exists("ffmpeg") {
+        succeed(&video);
+        assert!(fs::metadata(path("orbit.mp4")).unwrap().len() > 100);
+    }
+    refused(&render, 2, &["--split"]);
+    refused(&format!("{render} --split all --path orbit"), 2, &["--path"]);
+    refused(&format!("{render} --path orbit --format exr --video a.mp4"), 2, &["--video", "exr"]);
+}
+
+#[test]
+fn tensorboard_gets_its_events_and_changes_no_bit() {
+    let folder = folder();
+    let path = |name: &str| folder.path().join(name);
+    let options = "--steps 20 --curve ap3 --model plain --eval-every 10";
+    succeed(&train(folder.path(), "plain", options));
+    succeed(&train(folder.path(), "watched", &format!("{options} --tensorboard")));
+    let model = |run: &str| fs::read(path(run).join("model.ply")).unwrap();
+    assert!(model("plain") == model("watched"));
+    let events: Vec<PathBuf> = fs::read_dir(path("watched/tensorboard"))
+        .unwrap()
+        .map(|entry| entry.unwrap().path())
+        .collect();
+    assert_eq!(events.len(), 1);
+    let bytes = fs::read(&events[0]).unwrap();
+    let has = |text: &str| bytes.windows(text.len()).any(|window| window == text.as_bytes());
+    for tag in [
+        "loss/all",
+        "model/Gaussians",
+        "rates/means",
+        "/PSNR",
+        "view 000/render",
+        "all steps are done",
+    ] {
+        assert!(has(tag), "{tag}");
+    }
+    assert!(!path("plain/tensorboard").exists());
+}
+
+#[test]
+fn options_of_what_a_run_has_not_are_said_with_what_switches_it_on() {
+    let folder = folder();
+    let said = |out: &str, options: &str| run(&train(folder.path(), out, options), 0).1;
+    let plain = said("a", "--steps 1 --model plain --denoiser-channels 8 --depth-is-disparity");
+    for part in [
+        "--denoiser-channels",
+        "no denoiser",
+        "--parts denoiser",
+        "--depth-is-disparity",
+        "no depth",
+    ] {
+        assert!(plain.contains(part), "no `{part}` in: {plain}");
+    }
+    let with = said("b", "--steps 1 --parts denoiser --denoiser-channels 4 --denoiser-crop 16");
+    assert!(!with.contains("no effect"), "{with}");
+    let gains = "--steps 1 --set stop.growth_gain=0.3 --set stop.degree_gain=0.02";
+    let without = said("c", gains);
+    for gain in ["stop.growth_gain has no effect", "stop.degree_gain has no effect", "stop.views=N"]
+    {
+        assert!(without.contains(gain), "no `{gain}` in: {without}");
+    }
+    let with = said("d", &format!("{gains} --set stop.views=1"));
+    assert!(!with.contains("no effect"), "{with}");
+}
+
+#[test]
+fn large_photographs_shrink_to_a_limit_that_is_said_and_recorded() {
+    let folder = folder();
+    let path = |name: &str| folder.path().join(name);
+    let views = |out: &str| fs::read_to_string(path(out).join("views.csv")).unwrap();
+    let (_, said) = run(&train(folder.path(), "run", "--steps 2 --max-resolution 24"), 0);
+    assert!(said.contains("48x32 are trained on at 24x16"), "{said}");
+    assert!(views("run").contains("001,train,24,16"), "{}", views("run"));
+    // Behind another factor, which does more by itself.
+    let (_, said) =
+        run(&train(folder.path(), "both", "--steps 2 --max-resolution 40 --downscale 2"), 0);
+    assert!(!said.contains("trained on at") && views("both").contains("001,train,24,16"), "{said}");
+    succeed(&train(folder.path(), "none", "--steps 2 --max-resolution none"));
+    assert!(views("none").contains("001,train,48,32"));
+    let config = fs::read_to_string(path("none/config.toml")).unwrap();
+    assert!(config.contains("max_resolution = 0"), "{config}");
+}
+
+#[test]
+fn whatever_the_cache_leaves_on_disk_the_model_has_the_same_bits() {
+    let folder = folder();
+    let model = |out: &str, options: &str| {
+        succeed(&train(folder.path(), out, &format!("--steps 30 --progress none {options}")));
+        fs::read(folder.path().join(out).join("model.ply")).unwrap()
+    };
+    for options in ["--model plain", "--curve ase --parts tonemapper --plan none"] {
+        let all = model("all", &format!("{options} --overwrite"));
+        for size in ["0", "20K"] {
+            let some = model("some", &format!("{options} --overwrite --cache {size}"));
+            assert!(all == some, "{options} --cache {size}");
+        }
+    }
+    refused(&train(folder.path(), "no", "--cache much"), 2, &["much", "4G"]);
+}
+
+/// Reference images, and the targets where there are none, are read and made anew for every score.
+#[test]
+fn whatever_the_cache_leaves_on_disk_views_score_the_same() {
+    let folder = folder();
+    let path = |name: &str| folder.path().join(name);
+    let scores = |out: &str, cache: &str| {
+        let options = "--steps 6 --eval-every 3 --progress none --model plain --overwrite";
+        succeed(&train(folder.path(), out, &format!("{options} --cache {cache}")));
+        let trained = json(path(out).join("metrics.json"))["views"].clone();
+        let printed = succeed(&format!("eval {} --json --save-images", path(out).display()));
+        let scored: Value = serde_json::from_str(&printed).unwrap();
+        assert_eq!(scored["views"], trained);
+        let on_the_way = load_progress(&path(out));
+        (trained, on_the_way.iter().map(|at| (at.step, at.psnr, at.ssim)).collect::<Vec<_>>())
+    };
+    let against_references = scores("all", "1G");
+    assert_eq!(against_references, scores("none", "0"));
+    assert_eq!(file_count(path("none/eval/references")), 2);
+    fs::remove_dir_all(path("set/high")).unwrap();
+    let against_targets = scores("all", "1G");
+    assert_eq!(against_targets, scores("none", "0"));
+    assert!(against_targets != against_references);
+    assert_eq!(file_count(path("none/eval/targets")), 2);
+}

@@ -1,0 +1,198 @@
+//! More Gaussians than one binding holds the planes of: in batches, to the same bits.
+
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
+use glam::{DVec3, Vec3};
+
+use nightsplat::gpu::Gpu;
+use nightsplat::gpu::testing::{gpu, gpu_that_binds};
+use nightsplat::photographs::dataset::Dataset;
+use nightsplat::splats::batches::Batches;
+use nightsplat::splats::render::{RenderOptions, RenderSettings, Renderer};
+use nightsplat::splats::scene::{Gaussians, Shape, width};
+use nightsplat::train::{TrainConfig, Trainer};
+
+use crate::common::setup::{Setup, features};
+use crate::common::train::{advance, dataset};
+
+/// Planes of 2176 Gaussians of SH degree 3, splats of 16384.
+const LITTLE: u64 = 1 << 19;
+const BATCH: usize = 2176;
+
+#[test]
+fn planes_go_there_in_batches_and_come_back_whole() {
+    let gpu = gpu_that_binds(LITTLE);
+    let shape = Shape { sh_degree: 2, features: features(5) };
+    let columns = width(shape);
+    for (count, batches) in [(0, vec![0]), (3000, vec![3000]), (7000, vec![3264, 3264, 472])] {
+        let all = Batches::new(&gpu, count, [columns, shape.features.width()]);
+        assert_eq!(all.iter().map(|batch| batch.count).collect::<Vec<_>>(), batches);
+        let planes: Vec<f32> = (0..count * columns).map(|i| i as f32).collect();
+        let buffer = all.upload(&gpu, "planes", &planes).unwrap();
+        assert_eq!(all.read(&gpu, &buffer).unwrap(), planes);
+        for (float, value) in gpu.read(&buffer).unwrap().into_iter().enumerate() {
+            assert_eq!(all.place_of(float) as f32, value);
+        }
+        // The scales of a batch's last Gaussian are where its kernels look.
+        if let Some(batch) = all.iter().filter(|batch| batch.count > 0).last() {
+            let own = gpu.read(batch.planes(&buffer).unwrap()).unwrap();
+            let last = Gaussians { count: batch.count, shape, parameters: own }.log_scales()
+                [batch.count - 1];
+            let whole = Gaussians { count, shape, parameters: planes };
+            assert_eq!(last, whole.log_scales()[count - 1]);
+        }
+    }
+}
+
+/// Views of a set without points.
+fn views() -> Dataset {
+    Dataset { points: vec![], ..dataset(8, [40, 30]) }
+}
+
+/// Density control and a growing SH degree among its steps.
+fn config() -> TrainConfig {
+    let mut config = TrainConfig {
+        steps: 30,
+        max_gaussians: 5200,
+        random_points: 4200,
+        ..TrainConfig::default()
+    };
+    (config.schedule.densify_after, config.schedule.densify_interval) = (4, 5);
+    config.schedule.densify_before = 25;
+    config.schedule.sh_degree_interval = 7;
+    config.density.gradient_threshold = 1e-6;
+    // Small ones, which meet few tiles: as many as there are, a binding holds on each of the devices.
+    config.start.scale = 0.2;
+    config
+}
+
+#[test]
+fn batches_train_to_the_bits_of_one() {
+    let (dataset, folder) = (views(), tempfile::tempdir().unwrap());
+    let new = |gpu: &Gpu| Trainer::new(gpu, config(), &dataset).unwrap();
+    let (whole, little) = (gpu(), gpu_that_binds(LITTLE));
+    let (mut expected, mut batched) = (new(&whole), new(&little));
+    let [whole_reports, batched_reports] =
+        [&mut expected, &mut batched].map(|trainer| advance(trainer, 30));
+    assert!(
+        batched.gaussian_count() > 2 * BATCH,
+        "{} make no three batches",
+        batched.gaussian_count()
+    );
+    assert_eq!(batched.gaussian_count(), expected.gaussian_count());
+    for (batched, whole) in batched_reports.iter().zip(&whole_reports) {
+        let (count, terms) = (batched.gaussians, &batched.terms);
+        assert_eq!((batched.step, count, terms), (whole.step, whole.gaussians, &whole.terms));
+    }
+    let end = |trainer: &mut Trainer| {
+        let path = folder.path().join("end.safetensors");
+        trainer.save_checkpoint(&path).unwrap();
+        std::fs::read(path).unwrap()
+    };
+    assert!(end(&mut batched) == end(&mut expected), "another state");
+
+    // A run goes on where a binding holds more, and where it holds less.
+    let checkpoint = folder.path().join("checkpoint.safetensors");
+    for [from, to] in [[&whole, &little], [&little, &whole]] {
+        let (mut first, mut second) = (new(from), new(to));
+        advance(&mut first, 22);
+        first.save_checkpoint(&checkpoint).unwrap();
+        second.restore(&checkpoint).unwrap();
+        advance(&mut second, 30);
+        assert!(second.gaussians().unwrap() == expected.gaussians().unwrap());
+    }
+}
+
+#[test]
+fn the_passes_of_batches_match_their_references() {
+    let dataset = views();
+    let mut trainer = Trainer::new(&gpu_that_binds(LITTLE), config(), &dataset).unwrap();
+    advance(&mut trainer, 22);
+    let batches = trainer.gaussian_count().div_ceil(BATCH);
+    assert!(batches > 1);
+    let (done, report) = trainer.check_step();
+    done.unwrap();
+    assert!(report.first_difference().is_none(), "{report:?}");
+    for kernel in ["project", "project_backward", "adam"] {
+        let passes = report.passes.iter().filter(|pass| pass.kernel == kernel).count();
+        assert_eq!(passes, batches, "{kernel}");
+    }
+}
+
+#[test]
+fn growth_in_batches_matches_its_references() {
+    let gpu = gpu_that_binds(LITTLE);
+    let dataset = views();
+    let mut trainer = Trainer::new(&gpu, config(), &dataset).unwrap();
+    let before = trainer.gaussian_count();
+    let (_, report) = gpu.checked(|| advance(&mut trainer, 20));
+    assert!(trainer.gaussian_count() > before.max(BATCH));
+    assert!(report.first_difference().is_none(), "{report:?}");
+    let passes = |kernel| report.passes.iter().filter(|pass| pass.kernel == kernel).count();
+    // From one batch or two to two.
+    assert!(passes("densify_scatter") > 3 && passes("densify_moments") > 6);
+}
+
+/// Half of them lie behind the camera, in the first batch; those that are seen are in the second.
+#[test]
+fn what_lies_beyond_a_binding_is_rendered() {
+    let gpu = gpu();
+    let shape = Shape::from(3);
+    let binding = gpu.properties().max_storage_buffer_range as usize;
+    let hidden = binding / (width(shape) * size_of::<f32>());
+    if hidden > 1_000_000 {
+        eprintln!("not run: this device binds {binding} bytes");
+        return;
+    }
+    let seen = Setup::new(500, [64, 48], shape, 5);
+    let own = Gaussians { count: seen.count, shape, parameters: seen.parameters.clone() };
+    let mut all = Gaussians::zeros(hidden + seen.count, shape);
+    let behind = seen.camera.view_from_world.inverse().transform_point3(DVec3::NEG_Z).as_vec3();
+    all.means_mut()[..hidden].fill(behind);
+    let copies: [fn(&mut Gaussians, &Gaussians, usize); 6] = [
+        |all, own, at| all.means_mut()[at..].copy_from_slice(own.means()),
+        |all, own, at| all.quats_mut()[at..].copy_from_slice(own.quats()),
+        |all, own, at| all.log_scales_mut()[at..].copy_from_slice(own.log_scales()),
+        |all, own, at| all.raw_opacities_mut()[at..].copy_from_slice(own.raw_opacities()),
+        |all, own, at| all.dc_mut()[at..].copy_from_slice(own.dc()),
+        |all, own, at| all.rest_mut()[15 * at..].copy_from_slice(own.rest()),
+    ];
+    copies.iter().for_each(|copy| copy(&mut all, &own, hidden));
+    let [alone, among] = [&own, &all].map(|gaussians| {
+        let settings = RenderSettings { shape, ..RenderSettings::default() };
+        let mut renderer = Renderer::new(&gpu, settings).unwrap();
+        renderer.reserve(gaussians.count, [&seen.camera]).unwrap();
+        let options = RenderOptions { sh_degree: 3, background: Vec3::ZERO.to_array() };
+        let parameters = gaussians.upload(&gpu).unwrap();
+        renderer.render_image(&parameters, &seen.camera, &options).unwrap()
+    });
+    assert!(alone == among);
+}
+
+#[test]
+fn what_a_device_cannot_bind_is_refused_and_growth_ends_before_it() {
+    let gpu = gpu_that_binds(LITTLE);
+    let settings = RenderSettings::default();
+    assert_eq!(settings.most_gaussians(&gpu), 16_384);
+    let mut renderer = Renderer::new(&gpu, settings).unwrap();
+    let camera = Setup::new(1, [32, 24], 0, 1).camera;
+    let refused = renderer.reserve(16_385, [&camera]).unwrap_err().to_string();
+    assert!(refused.contains("`splats`"), "{refused}");
+    // Fewer parameters than Gaussians are expected.
+    renderer.reserve(3000, [&camera]).unwrap();
+    let short = Gaussians::zeros(2999, settings.shape).upload(&gpu).unwrap();
+    let options = RenderOptions { sh_degree: 0, background: [0.0; 3] };
+    let refused = renderer.render_image(&short, &camera, &options).unwrap_err().to_string();
+    assert!(refused.contains("buffer `parameters` holds"), "{refused}");
+}
+
+#[test]
+fn of_more_points_than_a_device_can_render_the_first_begin() {
+    let mut config = config();
+    (config.random_points, config.max_gaussians) = (17_000, 20_000);
+    config.start.scale = 1e-3;
+    let mut trainer = Trainer::new(&gpu_that_binds(LITTLE), config, &views()).unwrap();
+    assert_eq!(trainer.gaussian_count(), 16_384);
+    advance(&mut trainer, 6);
+    assert!(trainer.gaussian_count() <= 16_384);
+}

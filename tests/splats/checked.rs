@@ -1,0 +1,322 @@
+//! What ships is what is checked: every pass of rendering, training, density control and pseudo-GT, as the library
+//! records it, against its CPU reference.
+
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use nightsplat::Error;
+use nightsplat::base::random::Stream;
+use nightsplat::gpu::testing::{Defect, gpu, is_checked, with_defect};
+use nightsplat::gpu::{CheckReport, Gpu};
+use nightsplat::networks::Form;
+use nightsplat::photographs::dataset::Dataset;
+use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
+use nightsplat::photographs::image::Image;
+use nightsplat::photographs::pseudo_gt::PseudoGt;
+use nightsplat::photographs::tone::{Statistics, ToneCurve, ToneSettings};
+use nightsplat::splats::sort::{Count, RadixSort, Scan};
+use nightsplat::train::{Background, Part, TrainConfig, Trainer};
+
+use crate::common::Random;
+use crate::common::setup::variants;
+
+/// Six views of 40 x 30 pixels with depth maps, as the model wants them.
+fn dataset(config: &TrainConfig) -> Dataset {
+    let folder = tempfile::tempdir().unwrap();
+    let options = SyntheticOptions {
+        views: 6,
+        width: 40,
+        height: 30,
+        seed: 1,
+        ..SyntheticOptions::default()
+    };
+    synthetic::write(folder.path(), &options).unwrap();
+    let depth = folder.path().join("depth");
+    std::fs::create_dir(&depth).unwrap();
+    let map = Image::from_fn(20, 15, |x, y| [1.0 - (y as f32 + 0.1 * x as f32) / 20.0; 3]);
+    for file in std::fs::read_dir(folder.path().join("low")).unwrap() {
+        let name = file.unwrap().path().file_stem().unwrap().to_str().unwrap().to_owned();
+        map.save_png16(depth.join(format!("depth_{name}.png"))).unwrap();
+    }
+    Dataset::load(folder.path(), &config.load_options()).unwrap()
+}
+
+/// Density control acts after the second step.
+fn config(parts: &[Part]) -> TrainConfig {
+    let tone = ToneSettings::new(ToneCurve::Ap3);
+    let mut config =
+        TrainConfig { steps: 40, background: Background::Random, tone, ..Default::default() };
+    config.schedule.densify_after = 1;
+    config.schedule.densify_interval = 2;
+    config.schedule.sh_degree_interval = 1;
+    config.density.gradient_threshold = 1e-6;
+    config.model.set_parts(parts);
+    config.model.network.channels = 4;
+    config.model.network.stages = 2;
+    config.model.network.repeats = 2;
+    config
+}
+
+fn kernels(report: &CheckReport) -> BTreeSet<&str> {
+    report.passes.iter().map(|pass| pass.kernel).collect()
+}
+
+/// Every pass was compared, and no number differs by more than its roundings explain.
+fn assert_agrees(what: &str, report: &CheckReport) {
+    let shown: Vec<String> = report
+        .passes
+        .iter()
+        .filter_map(|pass| pass.difference.as_ref())
+        .map(ToString::to_string)
+        .collect();
+    assert!(
+        shown.is_empty(),
+        "{what}: {} differences: {:#?}",
+        shown.len(),
+        &shown[..shown.len().min(20)]
+    );
+    assert!(
+        report.passes.iter().all(|pass| pass.error.is_some_and(|error| error <= 1.0)),
+        "{what}"
+    );
+}
+
+/// Three checked steps, density control included; the kernels that took part.
+fn assert_steps_agree(name: &str, config: &TrainConfig) -> BTreeSet<String> {
+    let (gpu, dataset) = (gpu(), dataset(config));
+    let (trainer, mut all) = gpu.checked(|| Trainer::new(&gpu, config.clone(), &dataset));
+    let mut trainer = trainer.unwrap();
+    while trainer.steps_done() < 3 {
+        let (reports, report) = trainer.check_step();
+        reports.unwrap();
+        all.extend(report);
+    }
+    assert_agrees(name, &all);
+    kernels(&all).into_iter().map(str::to_owned).collect()
+}
+
+#[test]
+fn every_pass_of_a_step_agrees_with_its_reference_whatever_the_model_is_made_of() {
+    let plain = assert_steps_agree("plain", &config(&[]));
+    for kernel in ["project", "sort_downsweep", "blend_backward", "ssim", "densify_scatter"] {
+        assert!(plain.contains(kernel), "{kernel} is not in {plain:?}");
+    }
+    let raw = TrainConfig { ssim_weight: 0.0, sh_degree: 2, ..config(&[]) };
+    assert!(assert_steps_agree("L1 alone", &raw).contains("l1"));
+    for (part, kernel) in [
+        (Part::Structure, "structure_l1"),
+        (Part::Depth, "depth_correlation"),
+        (Part::Tonemapper, "product_backward"),
+        (Part::Denoiser, "norm_backward"),
+    ] {
+        assert!(assert_steps_agree(part.name(), &config(&[part])).contains(kernel));
+    }
+}
+
+#[test]
+fn every_pass_of_the_whole_model_agrees_with_its_reference_on_a_crop() {
+    let mut config = config(&Part::ALL);
+    config.model.denoiser_crop = 9;
+    config.model.raw_colors = true;
+    config.ssim_weight = 0.0;
+    for form in [Form::Identity, Form::Paper] {
+        config.model.network.form = form;
+        let kernels = assert_steps_agree("the whole model", &config);
+        assert!(kernels.contains("window_scatter") && kernels.contains("denoising"), "{kernels:?}");
+    }
+}
+
+#[test]
+fn a_checked_step_leaves_the_bits_that_an_unchecked_one_leaves() {
+    let (gpu, config) = (gpu(), config(&Part::ALL));
+    let dataset = dataset(&config);
+    let [mut checked, mut unchecked] =
+        [(); 2].map(|()| Trainer::new(&gpu, config.clone(), &dataset).unwrap());
+    while checked.steps_done() < 4 {
+        let reports = checked.check_step().0.unwrap();
+        let same = unchecked.advance(unchecked.steps_done() + 1).unwrap();
+        let terms = |reports: &[nightsplat::train::StepReport]| {
+            reports.iter().map(|report| (report.step, report.terms.clone())).collect::<Vec<_>>()
+        };
+        assert_eq!(terms(&reports), terms(&same));
+    }
+    assert!(checked.gaussians().unwrap() == unchecked.gaussians().unwrap());
+    let folder = tempfile::tempdir().unwrap();
+    let bytes = |trainer: &mut Trainer, name: &str| {
+        let path = folder.path().join(name);
+        trainer.save_checkpoint(&path).unwrap();
+        std::fs::read(path).unwrap()
+    };
+    assert!(bytes(&mut checked, "a") == bytes(&mut unchecked, "b"), "moments or networks differ");
+}
+
+/// Values that crowd near black, as dark photographs do, and some that are none.
+fn dark(pixels: u64) -> Vec<f32> {
+    let stream = Stream::new(3, 1);
+    let mut image: Vec<f32> =
+        (0..3 * pixels).map(|i| 0.4 * stream.uniform(i).powi(4) as f32).collect();
+    (image[0], image[1], image[2]) = (f32::NAN, -0.5, f32::INFINITY);
+    image
+}
+
+#[test]
+fn every_pass_of_the_pseudo_gt_agrees_with_its_reference_for_every_curve() {
+    let gpu = gpu();
+    let profile = ToneSettings::of_profile(crate::common::setup::profile());
+    let named = ToneCurve::ALL.into_iter().chain([ToneCurve::Auto]).map(ToneSettings::new);
+    for settings in named.chain([profile]) {
+        let curve = settings.curve;
+        if settings.check().is_err() {
+            continue;
+        }
+        let (done, report) = gpu.checked(|| -> nightsplat::Result<()> {
+            let mut pseudo_gt = PseudoGt::new(&gpu, &settings)?;
+            let image = gpu.buffer("image", &dark(47 * 33))?;
+            // Longer than the image: what lies beyond is nobody's.
+            let curve = settings.parameters(&Statistics::of(&dark(47 * 33)));
+            let parameters = gpu.buffer("tone", &[curve; 3])?;
+            let mut target = gpu.zeros("target", image.len())?;
+            gpu.run("pseudo-GT", |pass| {
+                pseudo_gt.statistics(pass, &image, [47, 33])?;
+                pseudo_gt.map(pass, &image, &parameters, 1, &mut target)
+            })
+        });
+        done.unwrap();
+        assert!(report.passes.len() >= 6, "{curve}: {:?}", kernels(&report));
+        assert_agrees(&curve.to_string(), &report);
+    }
+}
+
+#[test]
+fn every_pass_of_the_rasteriser_agrees_with_its_reference_whatever_its_sizes() {
+    for setup in variants() {
+        let mut random = Random::new(3);
+        let (_, report) = gpu().checked(|| {
+            let mut rendered = setup.render();
+            let d_render: Vec<f32> =
+                rendered.render.iter().map(|_| random.between(-1.0, 1.0) as f32).collect();
+            rendered.backward(&d_render)
+        });
+        assert_agrees(&format!("{} Gaussians, {:?}", setup.count, setup.settings), &report);
+        assert!(kernels(&report).is_superset(&BTreeSet::from(["project", "project_backward"])));
+    }
+}
+
+#[test]
+fn every_pass_of_scan_and_sort_agrees_with_its_reference_at_every_size() {
+    let gpu = gpu();
+    let stream = Stream::new(5, 0);
+    for (count, capacity) in [(0, 1), (1, 1), (5, 1024), (1023, 1024), (1025, 1025), (3000, 5001)] {
+        let data: Vec<u32> = (0..capacity).map(|i| stream.bits(i) as u32).collect();
+        let (done, report) = gpu.checked(|| -> nightsplat::Result<()> {
+            let counts = gpu.buffer("counts", &[7, count])?;
+            let (mut keys, mut values) = (gpu.buffer("keys", &data)?, gpu.buffer("values", &data)?);
+            let mut offsets = gpu.uninit("offsets", data.len())?;
+            let mut total = gpu.uninit("total", 1)?;
+            let mut sort = RadixSort::new(&gpu, capacity as u32)?;
+            let mut scan = Scan::new(&gpu, capacity as u32)?;
+            gpu.run("sort", |pass| {
+                let count = Count { counts: &counts, index: 1 };
+                scan.record(pass, count, &values, &mut offsets, &mut total)?;
+                sort.record(pass, count, &mut keys, &mut values, 13)
+            })
+        });
+        done.unwrap();
+        assert_agrees(&format!("{count} of {capacity}"), &report);
+    }
+}
+
+/// A step of `plain` on a device whose `kernel` gets one parameter with its lowest bits flipped.
+fn with_wrong_param(gpu: &Gpu, kernel: &'static str, word: usize, bits: u32) -> CheckReport {
+    let mut trainer = Trainer::new(gpu, config(&[]), &dataset(&config(&[]))).unwrap();
+    let (step, report) = with_defect(Defect { kernel, word, bits }, || trainer.check_step());
+    assert!(step.is_ok() || matches!(step, Err(Error::NotFinite { .. })), "{step:?}");
+    report
+}
+
+#[test]
+fn a_wrong_wiring_is_named_where_it_arises() {
+    let gpu = gpu();
+    // Focal length along x, the tile's columns, the scale of L1, Adam's rate of the means.
+    for (kernel, word, bits, buffer) in [
+        ("project", 12, 0x0040_0000, "splats"),
+        ("blend_forward", 2, 1, "render"),
+        ("ssim", 6, 0x0080_0000, "d_render"),
+        ("adam", 5, 0x0080_0000, "parameters"),
+        ("sort_upsweep", 2, 1, "table"),
+    ] {
+        let report = with_wrong_param(&gpu, kernel, word, bits);
+        let first = report.first_difference().unwrap_or_else(|| panic!("{kernel} went unnoticed"));
+        assert_eq!((first.kernel, first.buffer), (kernel, buffer), "{first}");
+        assert!((first.device - first.reference).abs() > first.bound && first.count > 0, "{first}");
+        assert_eq!(report.passes[first.pass].difference.as_ref(), Some(first));
+        let message = first.to_string();
+        assert!(message.contains(kernel) && message.contains(buffer), "{message}");
+        // What works on wrong counts or indices is not compared: a reference could not follow it.
+        let is_index = matches!(kernel, "project" | "blend_forward" | "sort_upsweep");
+        assert_eq!(report.passes.iter().any(|pass| pass.error.is_none()), is_index, "{kernel}");
+    }
+}
+
+#[test]
+fn a_panic_ends_what_is_checked_and_takes_the_defect_along() {
+    let gpu = gpu();
+    let defect = Defect { kernel: "project", word: 12, bits: 0x0040_0000 };
+    let work = || gpu.checked(|| with_defect(defect, || panic!("on purpose")));
+    assert!(std::panic::catch_unwind(std::panic::AssertUnwindSafe(work)).is_err());
+    assert!(!is_checked(&gpu));
+    assert_steps_agree("behind a panic", &config(&[]));
+    assert!(!is_checked(&gpu));
+}
+
+#[test]
+fn data_that_is_not_finite_is_no_difference_and_no_panic() {
+    let gpu = gpu();
+    let mut dataset = dataset(&config(&[]));
+    for view in &mut dataset.views {
+        if let Some(image) = &mut view.image {
+            for (i, value) in image.data.iter_mut().enumerate() {
+                *value = [f32::NAN, f32::INFINITY, *value][i % 3];
+            }
+        }
+    }
+    let mut trainer = Trainer::new(&gpu, config(&[]), &dataset).unwrap();
+    let (_, report) = trainer.check_step();
+    assert_agrees("a photograph of NaN", &report);
+
+    let mut parameters = trainer.gaussians().unwrap();
+    let stream = Stream::new(1, 1);
+    for (i, value) in parameters.parameters.iter_mut().enumerate() {
+        if stream.uniform(i as u64) < 0.02 {
+            *value = [f32::NAN, f32::INFINITY, -f32::INFINITY][i % 3];
+        }
+    }
+    let config = config(&[]);
+    let mut trainer = Trainer::from_gaussians(&gpu, config, &dataset, &parameters).unwrap();
+    let (_, report) = trainer.check_step();
+    assert!(report.passes.iter().any(|pass| pass.kernel == "adam"), "{:?}", kernels(&report));
+}
+
+#[test]
+fn the_command_checks_a_dataset_and_names_what_differs() {
+    use clap::Parser as _;
+    let folder = tempfile::tempdir().unwrap();
+    let options = SyntheticOptions {
+        views: 3,
+        width: 24,
+        height: 18,
+        seed: 1,
+        ..SyntheticOptions::default()
+    };
+    synthetic::write(folder.path(), &options).unwrap();
+    let check = |path: &Path| {
+        let arguments = ["nightsplat", "check", path.to_str().unwrap(), "--steps", "1", "--json"];
+        nightsplat::cli::Cli::try_parse_from(arguments).unwrap().run()
+    };
+    check(folder.path()).unwrap();
+    let defect = Defect { kernel: "blend_forward", word: 2, bits: 1 };
+    let error = with_defect(defect, || check(folder.path())).unwrap_err().to_string();
+    assert!(error.contains("`blend_forward`") && error.contains("render["), "{error}");
+}

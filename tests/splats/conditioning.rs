@@ -1,0 +1,276 @@
+//! How errors grow: blending with its layers, Adam with its steps, percentiles and means with their pixels; each against
+//! f64, with the bound that is promised.
+
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
+use std::ops::Range;
+
+use glam::{DVec2, DVec3, Vec3};
+use nightsplat::base::random::Stream;
+use nightsplat::gpu::testing::gpu;
+use nightsplat::kernels::adam::{LOG_SCALE_MAX, LOG_SCALE_MIN};
+use nightsplat::photographs::pseudo_gt::PseudoGt;
+use nightsplat::photographs::tone::{Statistics, ToneCurve, ToneSettings};
+use nightsplat::reference::blend_backward::blend_pixel_backward;
+use nightsplat::reference::blend_forward::blend_pixel;
+use nightsplat::reference::gaussian::Gaussian;
+use nightsplat::reference::rounding::UNIT;
+use nightsplat::reference::splat::Splat;
+use nightsplat::splats::attributes::planes;
+use nightsplat::splats::optimizer::{Adam, AdamBuffers, LearningRates, Moments};
+
+use crate::common::setup::Setup;
+use crate::common::{Random, widen};
+
+/// Numbers of a record of three channels: mean2d, conic, opacity, colour.
+const RECORD: usize = 9;
+
+/// Of so many layers that together leave a fiftieth of the light; no fainter than 1/255 anywhere in the view.
+fn opacity_of(count: usize) -> f64 {
+    (1.0 - (-4.0 / count as f64).exp()).max(0.0055)
+}
+
+/// So many layers over a view of one tile, front to back.
+fn layers(count: usize) -> Setup {
+    let mut setup = Setup::new(count, [16, 8], 0, 7);
+    let mut random = Random::new(count as u64);
+    let opacity = opacity_of(count);
+    for i in 0..count {
+        let depth = 1.0 + 4.0 * (i as f64 + 1.0) / count as f64;
+        let pixel = DVec2::new(random.between(4.0, 12.0), random.between(2.0, 6.0));
+        let gaussian = Gaussian {
+            mean: setup.at_pixel(pixel, depth),
+            log_scale: DVec3::splat((random.between(14.0, 30.0) * depth / 14.4).ln()),
+            raw_opacity: (opacity / (1.0 - opacity)).ln(),
+            ..setup.get(i)
+        };
+        setup.set(i, &gaussian);
+    }
+    setup
+}
+
+/// The largest error of the render over the largest colour, and that of the records over the largest of each number, in
+/// roundings.
+fn errors_of(count: usize) -> [f64; 2] {
+    let setup = layers(count);
+    let mut rendered = setup.render();
+    let mut random = Random::new(9);
+    let d_render: Vec<f32> =
+        rendered.render.iter().map(|_| random.between(-1.0, 1.0) as f32).collect();
+    rendered.backward(&d_render);
+    let frame = rendered.renderer.frame();
+    let splats = gpu().read(&frame.splats).unwrap();
+    let splats: Vec<Splat> = splats[..count].iter().map(Splat::from).collect();
+    let colors = widen(bytemuck::cast_slice(&gpu().read(&frame.colors).unwrap()[..count]));
+    // The view is one tile, so that every layer has one slot.
+    let slots = gpu().read(&frame.emitted).unwrap();
+    let stored = gpu().read(&frame.records).unwrap();
+    let sums: Vec<f32> = slots[..count]
+        .iter()
+        .flat_map(|slot| {
+            stored[3 * slot.x as usize..3 * slot.y as usize].iter().flat_map(Vec3::to_array)
+        })
+        .collect();
+    let (pixels, alpha_max) = (setup.pixels(), f64::from(setup.settings.max_alpha));
+    let background: Vec<f64> = widen(&setup.background());
+    let largest_color = colors.iter().chain(&background).fold(1.0f64, |most, c| most.max(c.abs()));
+    let (mut records, mut forward) = (vec![0.0; RECORD * count], 0.0f64);
+    for at in 0..pixels {
+        let width = setup.camera.width as usize;
+        let center = DVec2::new((at % width) as f64, (at / width) as f64) + 0.5;
+        let (values, _) = blend_pixel(&splats, &colors, &background, center, alpha_max);
+        let d: Vec<f64> = (0..3).map(|c| d_render[c * pixels + at].into()).collect();
+        for (c, value) in values.iter().enumerate() {
+            let error = (f64::from(rendered.render[c * pixels + at]) - value).abs();
+            forward = forward.max(error / largest_color);
+        }
+        blend_pixel_backward(&splats, &colors, &values, &d, center, alpha_max, 3, &mut records);
+    }
+    let backward = (0..RECORD).map(|k| {
+        let own = |values: &dyn Fn(usize) -> f64| {
+            (0..count).map(|i| values(RECORD * i + k).abs()).fold(0.0, f64::max)
+        };
+        own(&|at| f64::from(sums[at]) - records[at]) / own(&|at| records[at])
+    });
+    [forward / UNIT, backward.fold(0.0, f64::max) / UNIT]
+}
+
+#[test]
+fn the_error_of_blending_and_its_backward_grows_no_faster_than_the_layers() {
+    for count in [1, 4, 16, 64, 256, 1024, 4096] {
+        let [forward, backward] = errors_of(count);
+        println!("{count} layers: render {forward:.1}, gradients {backward:.1} roundings");
+        let bound = 32.0 + 6.0 * count as f64;
+        assert!(forward <= bound, "{count} layers: the render is off by {forward} roundings");
+        // What a pixel still sees is divided by what the layer lets through.
+        let bound = 4.0 * bound / (1.0 - opacity_of(count));
+        assert!(backward <= bound, "{count} layers: gradients by {backward} roundings");
+    }
+}
+
+/// As training has them behind its schedules; of means, quats, log scales, raw opacities, dc, features, rest.
+const RATES: LearningRates = LearningRates([1.6e-6, 1e-3, 5e-4, 2.5e-3, 2.5e-3, 1e-3, 1.25e-4]);
+const LOG_SCALES: usize = 2;
+const COLUMNS: usize = 23;
+const GAUSSIANS: usize = 4;
+/// Gradients that come in turn: noise about a mean.
+const TURNS: u64 = 16;
+
+fn gradient(turn: u64, at: usize) -> f32 {
+    let stream = Stream::new(5, turn);
+    (0.02 + stream.normal(at as u64)) as f32 * 1e-4
+}
+
+/// Adam as it is written, in f64.
+fn adam_in_f64(steps: u64, start: &[f32]) -> Vec<f64> {
+    let gradients: Vec<Vec<f64>> = (0..TURNS)
+        .map(|turn| (0..start.len()).map(|at| gradient(turn, at).into()).collect())
+        .collect();
+    let planes = planes(0, COLUMNS);
+    let plane_of = |at: usize| {
+        let column = at / GAUSSIANS;
+        let own = |&(begin, width): &(usize, usize)| (begin..begin + width).contains(&column);
+        planes.iter().position(own).unwrap()
+    };
+    let in_f64 = |at: usize| {
+        let (mut value, mut m, mut v) = (f64::from(start[at]), 0.0, 0.0);
+        let plane = plane_of(at);
+        let rate = RATES.0[plane];
+        for step in 1..=steps {
+            let g = gradients[(step % TURNS) as usize][at];
+            m = 0.9 * m + 0.1 * g;
+            v = 0.999 * v + 0.001 * g * g;
+            let power = step.min(100_000) as i32;
+            let corrected = (v / (1.0 - 0.999f64.powi(power))).sqrt();
+            value -= rate * m / (1.0 - 0.9f64.powi(power)) / (corrected + 1e-15);
+            if plane == LOG_SCALES {
+                value = value.clamp(LOG_SCALE_MIN, LOG_SCALE_MAX);
+            }
+        }
+        value
+    };
+    (0..start.len()).map(in_f64).collect()
+}
+
+/// The same on the device.
+fn adam_on_device(steps: u64, start: &[f32]) -> Vec<f32> {
+    let gpu = gpu();
+    let gradients: Vec<_> = (0..TURNS)
+        .map(|turn| {
+            let values: Vec<f32> = (0..start.len()).map(|at| gradient(turn, at)).collect();
+            gpu.buffer("gradients", &values).unwrap()
+        })
+        .collect();
+    let mut parameters = gpu.buffer("parameters", start).unwrap();
+    let mut moments = Moments::zeros(&gpu, start.len()).unwrap();
+    let (status, adam) = (gpu.buffer("status", &[0u32]).unwrap(), Adam::new(&gpu).unwrap());
+    let mut record = |steps: Range<u64>| {
+        gpu.run("adam", |pass| {
+            for step in steps.clone() {
+                let buffers = AdamBuffers {
+                    parameters: parameters.slice_mut(),
+                    gradients: gradients[(step % TURNS) as usize].slice(),
+                    moments: moments.slice_mut(),
+                };
+                let counts = [GAUSSIANS as u32, COLUMNS as u32, 0];
+                adam.record(pass, step, &RATES, counts, buffers, &status)?;
+            }
+            Ok(())
+        })
+        .unwrap();
+    };
+    for begin in (1..=steps).step_by(1000) {
+        record(begin..(begin + 1000).min(steps + 1));
+    }
+    gpu.read(&parameters).unwrap()
+}
+
+/// Of each plane, what `assert_adam_stays_with_f64` holds it to.
+struct PlaneError {
+    /// The largest error.
+    error: f64,
+    /// How far it moved.
+    moved: f64,
+    /// The largest unit in the last place of what it was on the way, which is between where it begins and where it ends.
+    unit: f64,
+}
+
+fn adam_errors(steps: u64) -> Vec<PlaneError> {
+    let start: Vec<f32> =
+        (0..GAUSSIANS * COLUMNS).map(|at| 1.5 * (at as f32 * 0.7).sin()).collect();
+    let (actual, expected) = (adam_on_device(steps, &start), adam_in_f64(steps, &start));
+    let of_plane = |(begin, width): (usize, usize)| {
+        let own = GAUSSIANS * begin..GAUSSIANS * (begin + width);
+        let most = |of: &dyn Fn(usize) -> f64| own.clone().map(of).fold(0.0, f64::max);
+        let largest = most(&|at| expected[at].abs().max(f64::from(start[at]).abs()));
+        PlaneError {
+            error: most(&|at| (f64::from(actual[at]) - expected[at]).abs()),
+            moved: most(&|at| (expected[at] - f64::from(start[at])).abs()),
+            unit: largest.log2().floor().exp2() * f64::from(f32::EPSILON),
+        }
+    };
+    planes(0, COLUMNS).map(of_plane).into()
+}
+
+/// A step rounds the parameter once, which is half a unit in its last place; beside, the step itself is off by some
+/// roundings. Of the first the signs differ.
+fn assert_adam_stays_with_f64(steps: u64) {
+    for (plane, PlaneError { error, moved, unit }) in adam_errors(steps).into_iter().enumerate() {
+        if moved == 0.0 {
+            continue;
+        }
+        eprintln!(
+            "plane {plane}: moved by {moved:.2e}, off by {:.3} units a step",
+            error / unit / steps as f64
+        );
+        let bound = unit * steps as f64 / 2.0 + 1e-4 * moved;
+        assert!(error <= bound, "plane {plane}: off by {error:e} of {moved:e}");
+    }
+}
+
+#[test]
+fn adam_stays_with_f64_over_thousands_of_steps() {
+    assert_adam_stays_with_f64(10_000);
+}
+
+#[test]
+#[ignore = "a minute: of `make stress`"]
+fn adam_stays_with_f64_over_a_hundred_thousand_steps() {
+    assert_adam_stays_with_f64(100_000);
+}
+
+/// Percentiles to the bit, means to roundings.
+fn assert_statistics_are_exact(pixels: usize) {
+    let mut state = 14u64;
+    let mut noise = || {
+        state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+        (state >> 40) as f32 / (1u64 << 24) as f32
+    };
+    let image: Vec<f32> = (0..3 * pixels).map(|_| 0.4 * noise() * noise()).collect();
+    let mut pseudo_gt = PseudoGt::new(&gpu(), &ToneSettings::new(ToneCurve::Ap3)).unwrap();
+    let device = pseudo_gt.measure(&image).unwrap().statistics;
+    let host = Statistics::of(&image);
+    assert_eq!(
+        (device.p10.to_bits(), device.p90.to_bits()),
+        (host.p10.to_bits(), host.p90.to_bits())
+    );
+    let means = |of: &Statistics| {
+        let [red, green, blue] = of.channel_means;
+        [of.mean_luminance, of.mean, red, green, blue]
+    };
+    for (device, host) in means(&device).into_iter().zip(means(&host)) {
+        assert!((device - host).abs() <= 4.0 * f32::EPSILON * host, "{device} is not {host}");
+    }
+}
+
+/// Ranks beyond 2^24 are whole numbers that f32 does not have.
+#[test]
+fn percentiles_and_means_of_more_than_sixteen_million_pixels_are_exact() {
+    assert_statistics_are_exact((1 << 24) + 12_345);
+}
+
+#[test]
+#[ignore = "a gigabyte: of `make stress`"]
+fn percentiles_and_means_of_33_megapixels_are_exact() {
+    assert_statistics_are_exact(7680 * 4320);
+}

@@ -1,0 +1,299 @@
+//! Gaussians in host memory, and what density control makes of them on the device and by its references.
+
+use glam::{DAffine3, DVec2, DVec3, Vec3};
+use nightsplat::camera::{Camera, CameraModel, Patch};
+use nightsplat::gpu::{Buffer, Gpu, Reference};
+use nightsplat::kernels::fate::{KEY_KEEP, KEY_PRUNE};
+use nightsplat::kernels::{self, densify_decide, densify_moments, densify_scatter, densify_score};
+use nightsplat::splats::densify::{
+    Densifier, DensifyInputs, DensifyReport, DensifySettings, DensityControl, DeviceGaussians,
+    LARGEST_CHANGE, Round,
+};
+use nightsplat::splats::halves::Bits;
+use nightsplat::splats::optimizer::Moments;
+
+/// Four features and SH of degree 1.
+pub(super) const COLUMNS: usize = 27;
+pub(super) const FEATURES: usize = 4;
+pub(super) const REST: usize = 14 + FEATURES;
+pub(super) const SETTINGS: DensifySettings = DensifySettings {
+    control: DensityControl::Paper,
+    gradient_threshold: 2e-4,
+    split_scale: 0.05,
+    min_opacity: 0.005,
+    max_gaussians: usize::MAX,
+    near: 0.01,
+    seed: 10,
+};
+pub(super) const CONSERVING: DensifySettings =
+    DensifySettings { control: DensityControl::Conserving, ..SETTINGS };
+pub(super) const STEP: u64 = 600;
+pub(super) const LAST: Round = Round { step: STEP, rounds_left: 1, most: usize::MAX };
+
+pub(super) fn room_for(gpu: &Gpu, count: usize) -> DeviceGaussians {
+    DeviceGaussians::new(gpu, count, [COLUMNS, FEATURES], [Bits::Single; 2]).unwrap()
+}
+
+/// Of 64 x 48 pixels, at a position, looking along +z.
+pub(super) fn camera_at(position: DVec3) -> Camera {
+    Camera {
+        width: 64,
+        height: 48,
+        focal: DVec2::splat(60.0),
+        principal_point: DVec2::new(32.0, 24.0),
+        model: CameraModel::Pinhole,
+        view_from_world: DAffine3::from_translation(-position),
+    }
+}
+
+/// Gaussians, their moments and their statistics in host memory.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Host {
+    pub(super) count: usize,
+    pub(super) parameters: Vec<f32>,
+    pub(super) first: Vec<f32>,
+    pub(super) second: Vec<f32>,
+    pub(super) grad_norm_sums: Vec<f32>,
+    pub(super) visit_counts: Vec<u32>,
+}
+
+impl Host {
+    /// Opaque Gaussians of scale 0.01 that nothing pulls at.
+    pub(super) fn calm(count: usize) -> Self {
+        let wave = |phase: f32| -> Vec<f32> {
+            (0..count * COLUMNS).map(|i| (i as f32 * 0.7 + phase).sin()).collect()
+        };
+        let mut parameters = wave(0.0);
+        parameters[7 * count..10 * count].fill(0.01f32.ln());
+        parameters[10 * count..11 * count].fill(2.0);
+        let (first, second) = (wave(1.0), wave(2.0));
+        Self {
+            count,
+            parameters,
+            first,
+            second,
+            grad_norm_sums: vec![0.0; count],
+            visit_counts: vec![4; count],
+        }
+    }
+
+    /// Large and small, faint and opaque ones under gradients of all sizes, some never seen.
+    pub(super) fn mixed(count: usize) -> Self {
+        let mut host = Self::calm(count);
+        for i in 0..count {
+            host.parameters[7 * count + 3 * i] =
+                if i % 3 == 0 { 0.2f32.ln() } else { 0.01f32.ln() };
+            host.parameters[10 * count + i] = if i % 7 == 0 { -6.0 } else { 1.0 };
+            host.visit_counts[i] = i as u32 % 5;
+            host.grad_norm_sums[i] = (i * 37 % 101) as f32 * 2e-5;
+        }
+        host
+    }
+
+    pub(super) fn pull_at(&mut self, i: usize) {
+        self.grad_norm_sums[i] = 1.0;
+    }
+
+    pub(super) fn quat_mut(&mut self, i: usize) -> &mut [f32] {
+        let first = 3 * self.count + 4 * i;
+        &mut self.parameters[first..first + 4]
+    }
+
+    pub(super) fn log_scales_mut(&mut self, i: usize) -> &mut [f32] {
+        let first = 7 * self.count + 3 * i;
+        &mut self.parameters[first..first + 3]
+    }
+
+    pub(super) fn mean(&self, i: usize) -> Vec3 {
+        Vec3::from_slice(&self.parameters[3 * i..])
+    }
+
+    /// All floats of one Gaussian, column by column.
+    pub(super) fn row(&self, planes: &[f32], i: usize) -> Vec<f32> {
+        [(0, 3), (3, 4), (7, 3), (10, 1), (11, 3), (14, FEATURES), (REST, COLUMNS - REST)]
+            .into_iter()
+            .flat_map(|(column, width)| {
+                let first = column * self.count + width * i;
+                planes[first..first + width].to_vec()
+            })
+            .collect()
+    }
+
+    pub(super) fn densify(
+        &self,
+        gpu: &Gpu,
+        settings: DensifySettings,
+        round: Round,
+    ) -> (Self, DensifyReport) {
+        self.densify_seen_from(&[], gpu, settings, round)
+    }
+
+    pub(super) fn densify_seen_from(
+        &self,
+        cameras: &[Camera],
+        gpu: &Gpu,
+        settings: DensifySettings,
+        round: Round,
+    ) -> (Self, DensifyReport) {
+        self.densify_as_kept(cameras, gpu, settings, round, |_| 1.0)
+    }
+
+    /// The same where `keeps` says of a number of Gaussians which share of the splits stays.
+    pub(super) fn densify_as_kept(
+        &self,
+        cameras: &[Camera],
+        gpu: &Gpu,
+        settings: DensifySettings,
+        round: Round,
+        mut keeps: impl FnMut(usize) -> f64,
+    ) -> (Self, DensifyReport) {
+        let planes = |data: &[f32]| gpu.buffer("planes", data).unwrap();
+        let mut gaussians = room_for(gpu, self.count);
+        gaussians.parameters = planes(&self.parameters);
+        gaussians.moments =
+            Moments::Single { first: planes(&self.first), second: planes(&self.second) };
+        let inputs = DensifyInputs {
+            grad_norm_sums: &mut planes(&self.grad_norm_sums),
+            visit_counts: &mut gpu.buffer("visit_counts", &self.visit_counts).unwrap(),
+            gradients: &mut planes(&vec![f32::NAN; self.count * COLUMNS]),
+        };
+        let mut densifier = Densifier::new(gpu, settings, cameras).unwrap();
+        let keeps = |new: &Buffer<f32>, count: usize| {
+            assert!(new.len() >= count * COLUMNS);
+            Ok(keeps(count))
+        };
+        let report = densifier.densify(&mut gaussians, inputs, round, keeps).unwrap();
+        assert_eq!(report.count, gaussians.count as usize);
+        let Moments::Single { first, second } = &gaussians.moments else { panic!() };
+        let read = |buffer| {
+            let mut planes = gpu.read(buffer).unwrap();
+            planes.truncate(report.count * COLUMNS);
+            assert_eq!(planes.len(), report.count * COLUMNS);
+            planes
+        };
+        let host = Self {
+            count: report.count,
+            parameters: read(&gaussians.parameters),
+            first: read(first),
+            second: read(second),
+            grad_norm_sums: vec![0.0; report.count],
+            visit_counts: vec![0; report.count],
+        };
+        (host, report)
+    }
+
+    /// The same by the references, with sort and prefix sums on the host.
+    pub(super) fn reference(
+        &self,
+        cameras: &[Camera],
+        settings: DensifySettings,
+        round: Round,
+    ) -> Self {
+        let conserving = settings.control == DensityControl::Conserving;
+        let cameras = if conserving { cameras } else { &[] };
+        let cameras: Vec<kernels::Camera> =
+            cameras.iter().map(|camera| (&Patch::from(camera)).into()).collect();
+        let n = self.count;
+        let (gaussian_count, column_count, feature_count) =
+            (n as u32, COLUMNS as u32, FEATURES as u32);
+        let (mut keys, mut ids, mut tally) = (vec![0; n], vec![0; n], vec![0; 4]);
+        let params = densify_score::Params {
+            gaussian_count,
+            column_count,
+            feature_count,
+            gradient_threshold: settings.gradient_threshold as f32,
+            min_raw_opacity: (settings.min_opacity / (1.0 - settings.min_opacity)).ln() as f32,
+            first_gaussian: 0,
+            camera_count: cameras.len() as u32,
+            near: settings.near as f32,
+            largest_change: LARGEST_CHANGE,
+        };
+        let slices = densify_score::Slices {
+            parameters: &self.parameters,
+            grad_norm_sums: &self.grad_norm_sums,
+            visit_counts: &self.visit_counts,
+            keys: &mut keys,
+            ids: &mut ids,
+            tally: &mut tally,
+            cameras: &cameras,
+        };
+        densify_score::Kernel::run(&params, &densify_score::Constants::default(), slices);
+        assert_eq!(tally[0] as usize, keys.iter().filter(|&&key| key < KEY_KEEP).count());
+        assert_eq!(tally[1] as usize, keys.iter().filter(|&&key| key == KEY_PRUNE).count());
+        ids.sort_by_key(|&id| keys[id as usize]);
+        keys.sort_unstable();
+        let (mut fates, mut offspring_counts) = (vec![0; n], vec![0; n]);
+        let params = densify_decide::Params {
+            gaussian_count,
+            first_gaussian: 0,
+            batch_count: gaussian_count,
+            max_gaussians: settings.max_gaussians.min(u32::MAX as usize) as u32,
+            rounds_left: round.rounds_left as u32,
+            split_log_scale: settings.split_scale.ln() as f32,
+            most_added: u32::MAX,
+        };
+        let slices = densify_decide::Slices {
+            parameters: &self.parameters,
+            sorted_keys: &keys,
+            sorted_ids: &ids,
+            tally: &mut tally,
+            fates: &mut fates,
+            offspring_counts: &mut offspring_counts,
+        };
+        densify_decide::Kernel::run(&params, &densify_decide::Constants { conserving }, slices);
+        let mut count = 0;
+        let offsets: Vec<u32> = offspring_counts
+            .iter()
+            .map(|offspring| {
+                count += offspring;
+                count - offspring
+            })
+            .collect();
+        let new_gaussian_count = count;
+        let count = count as usize;
+        let mut new_parameters = vec![0.0; count * COLUMNS];
+        let params = densify_scatter::Params {
+            gaussian_count,
+            new_gaussian_count,
+            column_count,
+            feature_count,
+            seed: settings.seed as u32,
+            step: round.step as u32,
+            first_gaussian: 0,
+            first_new_gaussian: 0,
+        };
+        let slices = densify_scatter::Slices {
+            parameters: &self.parameters,
+            fates: &fates,
+            offsets: &offsets,
+            new_parameters: &mut new_parameters,
+        };
+        densify_scatter::Kernel::run(&params, &densify_scatter::Constants { conserving }, slices);
+        let carry = |moments: &[f32]| {
+            let mut new_moments = vec![0.0_f32; count * COLUMNS];
+            let params = densify_moments::Params {
+                gaussian_count,
+                new_gaussian_count,
+                column_count,
+                feature_count,
+                first_new_gaussian: 0,
+            };
+            let slices = densify_moments::Slices {
+                moments: bytemuck::cast_slice(moments),
+                fates: &fates,
+                offsets: &offsets,
+                new_moments: bytemuck::cast_slice_mut(&mut new_moments),
+            };
+            densify_moments::Kernel::run(&params, &densify_moments::Constants::default(), slices);
+            new_moments
+        };
+        Self {
+            count,
+            parameters: new_parameters,
+            first: carry(&self.first),
+            second: carry(&self.second),
+            grad_norm_sums: vec![0.0; count],
+            visit_counts: vec![0; count],
+        }
+    }
+}

@@ -1,0 +1,188 @@
+//! The backward pass: central differences of the f64 chain, the renderer against the chain, the same bits always.
+
+use glam::{DVec2, DVec3, DVec4};
+use nightsplat::gpu::testing::gpu;
+use nightsplat::reference::camera::Model;
+use nightsplat::reference::gaussian::Gaussian;
+use nightsplat::splats::scene::Shape;
+
+use crate::common::chain::Chain;
+use crate::common::setup::{Gradients, Rendered, Setup, features, fisheye, tile_of, variants};
+
+const SIZE: [u32; 2] = [26, 19];
+
+/// Compares central differences with the chain's gradient, relative to the largest of each attribute, and the chain with
+/// the renderer.
+fn check(setup: &Setup, name: &str) {
+    let chain = Chain::new(setup);
+    let (parameters, background) = (chain.parameters(), chain.background());
+    let results = chain.run(&parameters);
+    let gradient = &results.gradient;
+    let difference = |values: &[f64], at: usize, loss: &dyn Fn(&[f64]) -> f64| {
+        let step = 1e-5;
+        let moved = |by: f64| {
+            let mut values = values.to_vec();
+            values[at] += by;
+            loss(&values)
+        };
+        (moved(step) - moved(-step)) / (2.0 * step)
+    };
+    let (count, rest) = (setup.count, 14 + setup.planes().feature_count);
+    for (attribute, first, end) in [
+        ("means", 0, 3),
+        ("quats", 3, 7),
+        ("log_scales", 7, 10),
+        ("raw_opacities", 10, 11),
+        ("dc", 11, 14),
+        ("features", 14, rest),
+        ("rest", rest, gradient.len() / count),
+    ] {
+        let range = first * count..end * count;
+        let largest = gradient[range.clone()].iter().fold(0.0f64, |a, g| a.max(g.abs()));
+        assert!(largest > 1e-3 || range.is_empty(), "{name}: no gradient of {attribute}");
+        for at in range {
+            let expected = difference(&parameters, at, &|p| chain.loss(p, &background));
+            let actual = gradient[at];
+            // The second term is the rounding of the loss, over the step.
+            let bound = 1e-6 * largest + 1e-9;
+            let error = (actual - expected).abs();
+            assert!(error < bound, "{name}: {attribute} [{at}] {actual} is not {expected}");
+        }
+    }
+    for (c, &actual) in results.d_background.iter().enumerate() {
+        let expected = difference(&background, c, &|b| chain.loss(&parameters, b));
+        assert!((actual - expected).abs() < 1e-6 * expected.abs(), "{name}: background");
+    }
+    chain.assert_agrees_with_the_device(name);
+}
+
+#[test]
+fn the_chain_s_gradients_are_its_central_differences() {
+    for degree in 0..=3 {
+        check(&Setup::new(7, SIZE, degree, 21 + u64::from(degree)), &format!("degree {degree}"));
+    }
+}
+
+#[test]
+fn the_chain_s_gradients_are_its_central_differences_through_a_fisheye_too() {
+    for degree in [0, 2] {
+        let setup = Setup::seen_by(fisheye(), 7, SIZE, degree, 21 + u64::from(degree));
+        check(&setup, &format!("fisheye, degree {degree}"));
+    }
+}
+
+#[test]
+fn every_feature_and_every_raw_color_has_its_central_difference() {
+    for (channels, raw_colors) in [(5, false), (11, true)] {
+        let shape = Shape { sh_degree: 1, features: features(channels) };
+        let mut setup = Setup::new(7, SIZE, shape, 61);
+        setup.settings.raw_colors = raw_colors;
+        check(&setup, &format!("{channels} channels"));
+    }
+}
+
+#[test]
+fn coefficients_above_the_degree_in_use_have_no_gradient() {
+    let mut setup = Setup::new(7, SIZE, 3, 31);
+    setup.options.sh_degree = 1;
+    check(&setup, "SH degree 1 of 3");
+    let gradients = setup.render().backward(&vec![1.0; 3 * setup.pixels()]);
+    let above = (0..7).flat_map(|i| setup.planes().load(&gradients.parameters, i).sh.split_off(4));
+    assert!(above.into_iter().all(|coefficient| coefficient == DVec3::ZERO));
+}
+
+#[test]
+fn the_gradient_holds_where_the_slope_is_clamped() {
+    let mut setup = Setup::new(5, SIZE, 1, 41);
+    let camera = setup.camera();
+    let Model::Pinhole(pinhole) = &camera.model else { panic!("{camera:?}") };
+    for (i, x, y) in [(0, 1.3, 0.5), (1, -0.4, 0.4), (2, 0.5, 1.5), (3, 1.3, -0.3)] {
+        let depth = 2.0 + 0.3 * i as f64;
+        let mean = setup.at_pixel(DVec2::new(x, y) * camera.size, depth);
+        let slope = camera.view(mean).truncate() / depth;
+        let clamped = pinhole.clamped_slope(camera.view(mean));
+        assert!((clamped - slope).length() > 1e-3, "not clamped");
+        let log_scale = DVec3::new(-0.3, -0.6, -0.1);
+        setup.set(i, &Gaussian { mean, log_scale, raw_opacity: 1.0, ..setup.get(i) });
+    }
+    check(&setup, "clamped slope");
+}
+
+#[test]
+fn the_gradient_holds_through_capped_alphas_and_done_pixels() {
+    let mut setup = Setup::new(12, [16, 12], 1, 51);
+    for i in 0..12 {
+        let gaussian = setup.get(i);
+        let log_scale = gaussian.log_scale + 1.2;
+        setup.set(i, &Gaussian { raw_opacity: 2.0 + 0.5 * i as f64, log_scale, ..gaussian });
+    }
+    let chain = Chain::new(&setup);
+    let transmittances = chain.run(&chain.parameters()).transmittances;
+    assert!(transmittances.into_iter().any(|t| t < 5e-4), "nothing is opaque");
+    check(&setup, "opaque");
+}
+
+#[test]
+fn the_gradient_holds_where_one_part_of_a_tile_is_done_before_another() {
+    for (channels, subgroups) in [(3, 2), (3, 4), (11, 4)] {
+        let shape = Shape { sh_degree: 0, features: features(channels) };
+        let mut setup = Setup::new(90, [32, 35], shape, 52);
+        // Of the uppermost part nothing is left behind the first ones; what lies below goes on for several batches.
+        for i in 0..12 {
+            let mean = setup.at_pixel(DVec2::new(16.0, 2.0), 0.8 + 0.01 * i as f64);
+            let log_scale = DVec3::new(0.5, 0.03, 0.03).map(f64::ln);
+            let quat = DVec4::new(1.0, 0.0, 0.0, 0.0);
+            setup.set(i, &Gaussian { mean, quat, log_scale, raw_opacity: 6.0, ..setup.get(i) });
+        }
+        let tile = tile_of(([16, 16], subgroups));
+        setup.settings.tile = Some(tile).filter(|&tile| gpu().properties().suits_tile(tile));
+        let chain = Chain::new(&setup);
+        let transmittances = chain.run(&chain.parameters()).transmittances;
+        assert!(transmittances[2 * 32 + 16] < 5e-4 && transmittances[14 * 32 + 16] > 5e-4);
+        chain.assert_agrees_with_the_device(&format!("{channels} channels, {tile}"));
+    }
+}
+
+#[test]
+fn the_renderer_gives_what_the_chain_gives() {
+    for setup in variants() {
+        let name = format!("{} Gaussians, {:?}", setup.count, setup.settings);
+        Chain::new(&setup).assert_agrees_with_the_device(&name);
+    }
+}
+
+#[test]
+fn an_overflow_leaves_no_gradient_and_no_statistics() {
+    let setup = Setup::new(65, [50, 40], 1, 5);
+    let (mut rendered, status) = setup.render_within(3);
+    assert!(status.overflowed);
+    let gradients = rendered.backward(&vec![1.0; rendered.render.len()]);
+    assert!(gradients.parameters.iter().all(|&d| d == 0.0));
+    let Gradients { grad_norm_sums, visit_counts, .. } = gradients;
+    let untouched = (vec![Rendered::NORM_BEFORE; 65], vec![Rendered::VISITS_BEFORE; 65]);
+    assert_eq!((grad_norm_sums, visit_counts), untouched);
+}
+
+/// Sums have one order, in the subgroups of `blend_backward` and over the slots in `project_backward`.
+#[test]
+fn the_same_frame_gives_the_same_bits_every_time() {
+    let shape = Shape { sh_degree: 2, features: features(4) };
+    let mut setup = Setup::new(777, [131, 77], shape, 8);
+    let mut d_render = vec![0.0; 4 * setup.pixels()];
+    (0..).zip(&mut d_render).for_each(|(i, d)| *d = ((i % 17) as f32 - 8.0) / 8.0);
+    let bits = |setup: &Setup| -> Vec<u32> {
+        let mut rendered = setup.render();
+        let Gradients { parameters, grad_norm_sums, visit_counts } = rendered.backward(&d_render);
+        let Rendered { render, transmittances, .. } = rendered;
+        let floats = [render, transmittances, parameters, grad_norm_sums].concat();
+        floats.into_iter().map(f32::to_bits).chain(visit_counts).collect()
+    };
+    let tiles = [([16, 8], 1), ([16, 16], 4)].map(tile_of);
+    for tile in tiles.into_iter().filter(|&tile| gpu().properties().suits_tile(tile)) {
+        setup.settings.tile = Some(tile);
+        let first = bits(&setup);
+        for repetition in 1..25 {
+            assert!(bits(&setup) == first, "{tile}: repetition {repetition}");
+        }
+    }
+}

@@ -1,0 +1,360 @@
+//! The passes of the renderer at what they can hold: counts that wrap around, slots without a tile, Gaussians that cover
+//! everything, crowds on one pixel, and tiles that suit no device.
+
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
+use std::array;
+use std::collections::HashSet;
+
+use glam::{DVec2, DVec3, UVec2, Vec2, Vec3};
+use nightsplat::camera::Patch;
+use nightsplat::gpu::testing::gpu;
+use nightsplat::gpu::{Threads, Tile};
+use nightsplat::kernels::status::STATUS_CROWDED;
+use nightsplat::kernels::{
+    self, ProjectedSplat, blend_forward, emit, order_counts, project_backward,
+};
+use nightsplat::reference::gaussian::Gaussian;
+use nightsplat::splats::render::{RenderSettings, Renderer, Status};
+use nightsplat::splats::scene::Shape;
+
+use crate::common::Random;
+use crate::common::setup::{Setup, features};
+
+#[test]
+fn the_most_intersections_that_can_be_counted_are_an_overflow() {
+    // The last wraps around.
+    for (tile_counts, before, flag) in [
+        (vec![], [0, 9], 0),
+        (vec![2, 3], [0, 9], 0),
+        (vec![6], [2, 1], 1),
+        (vec![u32::MAX], [0, 0], 1),
+        (vec![1 << 31, 0, 1 << 31, 3], [0, 0], 1),
+    ] {
+        let total: u64 = tile_counts.iter().map(|&count| u64::from(count)).sum();
+        let total = u32::try_from(total).unwrap_or(u32::MAX);
+        let gaussian_count = tile_counts.len() as u32;
+        let constants = order_counts::Constants { partition_size: 2 };
+        let sorted_ids: Vec<u32> = (0..gaussian_count).rev().collect();
+        let (slots_before, sums, arrivals) = (vec![7; 5], vec![7; 3], vec![0]);
+        let (counts, status) = (vec![7], vec![before[0], before[1], 0]);
+        let (_, _, counts, after, arrivals) = run_kernel!(
+            order_counts,
+            constants,
+            order_counts::Params { gaussian_count, capacity: 5 },
+            Threads::Workgroups([3, 1, 1]),
+            [sorted_ids, tile_counts],
+            [slots_before, sums, counts, status, arrivals]
+        );
+        assert_eq!(counts[0], if flag == 0 { total } else { 0 });
+        assert_eq!(after, [before[0] | flag, before[1].max(total), 0]);
+        assert_eq!(arrivals, [0]);
+    }
+}
+
+#[test]
+fn memory_for_intersections_grows_to_what_the_device_can_bind_and_no_further() {
+    let mut renderer = Setup::new(1, [32, 32], 0, 1).render().renderer;
+    let most = renderer.most_intersections();
+    // Where a device binds gigabytes, allocating them is no test.
+    if most > 1 << 23 {
+        eprintln!("not run: this device binds {most} intersections at once");
+        return;
+    }
+    renderer.grow(most - most / 4).unwrap();
+    renderer.grow(most).unwrap();
+    let message = renderer.grow(most + 1).unwrap_err().to_string();
+    assert!(message.contains("records"), "{message}");
+}
+
+/// What `blend_forward` finds of the runs of `sorted_tiles` in a view of 5 x 24 tiles, and the status.
+fn tile_runs(sorted_tiles: Vec<u32>, longest_run: u32) -> (Vec<UVec2>, Vec<u32>) {
+    let setup = Setup::new(1, [32, 32], 0, 1);
+    let splats = gpu().read(&setup.render().renderer.frame().splats).unwrap();
+    let (count, size) = (sorted_tiles.len() as u32, UVec2::new(5 * 16, 24 * 16));
+    let (counts, sorted_slots, owners) =
+        (vec![count], (0..count).collect::<Vec<_>>(), vec![0; count as usize]);
+    let (colors, pixels) = (vec![Vec3::splat(0.5)], size.element_product() as usize);
+    let (render, transmittances) = (vec![0.0; 3 * pixels], vec![0.0; pixels]);
+    let (tile_ranges, status) = (vec![UVec2::ONE; 120], vec![0; 3]);
+    let params =
+        blend_forward::Params { size, tile_columns: 5, longest_run, background: [0.0; 11] };
+    let (_, _, ranges, status) = run_kernel!(
+        blend_forward,
+        blend_forward::Constants::default(),
+        params,
+        Threads::Workgroups([120, 1, 1]),
+        [counts, sorted_slots, owners, splats, colors, sorted_tiles],
+        [render, transmittances, tile_ranges, status]
+    );
+    (ranges, status)
+}
+
+#[test]
+fn padding_belongs_to_no_tile() {
+    let (ranges, status) = tile_runs(vec![0, 0, 2, 120, u32::MAX], 2);
+    assert_eq!(ranges[..3], [UVec2::new(0, 2), UVec2::splat(2), UVec2::new(2, 3)]);
+    assert!(ranges[3..].iter().all(|range| range.x == range.y));
+    assert_eq!(status, [0; 3]);
+}
+
+#[test]
+fn every_tile_finds_its_run_among_any_number_of_intersections() {
+    let mut random = Random::new(8);
+    for count in [0, 1, 7, 8, 9, 63, 64, 65, 513, 5000] {
+        let mut tiles: Vec<u32> = (0..count).map(|_| random.between(0.0, 122.0) as u32).collect();
+        tiles.sort_unstable();
+        let (ranges, _) = tile_runs(tiles.clone(), u32::MAX);
+        for (tile, range) in (0..120).zip(ranges) {
+            let own = &tiles[range.x as usize..range.y as usize];
+            let all = tiles.iter().filter(|&&other| other == tile).count();
+            assert!(own.len() == all && own.iter().all(|&other| other == tile), "{count}: {tile}");
+        }
+    }
+}
+
+#[test]
+fn a_count_that_wrapped_around_writes_no_slot_beyond_the_counted() {
+    let setup = Setup::new(3, [32, 32], 0, 1);
+    let splats = gpu().read(&setup.render().renderer.frame().splats).unwrap();
+    // As if the offsets of later ranks had run past the total.
+    let (counts, sorted_ids, tile_counts) = (vec![2], vec![0, 1, 2], vec![4, 4, u32::MAX - 5]);
+    let (sums, slots_before) = (vec![0], vec![0, 4, 8]);
+    let [tiles, slots, owners] = [0; 3].map(|_| vec![7u32; 16]);
+    let emitted = vec![UVec2::splat(7); 3];
+    let (tiles, slots, owners, emitted) = run_kernel!(
+        emit,
+        emit::Constants { partition_size: 256, ..Default::default() },
+        emit::Params { size: UVec2::new(32, 32), gaussian_count: 3, tile_columns: 2 },
+        Threads::Exactly([3, 1, 1]),
+        [counts, sorted_ids, slots_before, sums, splats, tile_counts],
+        [tiles, slots, owners, emitted]
+    );
+    let untouched = |slots: &[u32]| slots[2..].iter().all(|&slot| slot == 7);
+    assert!(untouched(&tiles) && untouched(&slots) && untouched(&owners));
+    assert!(emitted.iter().all(|range| range.x == range.y));
+}
+
+/// Splats that cover an image whole, `extra` slots more reserved than they need, and what `emit` makes of them.
+fn emit_wide(count: u32, size: UVec2, extra: u32) -> (Vec<u32>, Vec<UVec2>, u32) {
+    let constants = emit::Constants { partition_size: 256, ..Default::default() };
+    let tile = UVec2::new(constants.tile_width, constants.tile_height);
+    let tiles = (size + tile - 1) / tile;
+    let splat = ProjectedSplat {
+        mean2d: size.as_vec2() / 2.0,
+        conic: Vec3::new(1e-9, 0.0, 1e-9),
+        opacity: 0.5,
+        half_extent: Vec2::splat(1e5),
+    };
+    let per_splat = tiles.element_product() + extra;
+    let (splats, sorted_ids) = (vec![splat; count as usize], (0..count).rev().collect::<Vec<_>>());
+    let (counts, sums) = (vec![count * per_splat], vec![0; 1 + count as usize / 256]);
+    let tile_counts = vec![per_splat; count as usize];
+    let slots_before: Vec<u32> = (0..count).map(|rank| rank * per_splat).collect();
+    let [tiles_, slots, owners] = [0; 3].map(|_| vec![7u32; counts[0] as usize]);
+    let (tiles, emitted) = (tiles_, vec![UVec2::ZERO; count as usize]);
+    let (tiles, _, _, emitted) = run_kernel!(
+        emit,
+        constants,
+        emit::Params { size, gaussian_count: count, tile_columns: size.x.div_ceil(tile.x) },
+        Threads::Exactly([count, 1, 1]),
+        [counts, sorted_ids, slots_before, sums, splats, tile_counts],
+        [tiles, slots, owners, emitted]
+    );
+    (tiles, emitted, per_splat)
+}
+
+/// A record of four channels.
+type Record = [Vec3; 4];
+
+/// Sums the records of Gaussians with one feature, all in one place, whose slots are these: the gradients of the features
+/// are the sums of the last channel.
+fn sums(emitted: Vec<UVec2>, records: &[Record]) -> Vec<f32> {
+    let (count, shape) = (emitted.len(), Shape { sh_degree: 3, features: features(4) });
+    let mut setup = Setup::new(count, [32, 32], shape, 1);
+    for i in 0..count {
+        setup.set(i, &Gaussian { mean: setup.at_pixel(DVec2::splat(16.0), 2.0), ..setup.get(0) });
+    }
+    let rendered = setup.render();
+    let frame = rendered.renderer.frame();
+    let (splats, colors) = (gpu().read(&frame.splats).unwrap(), gpu().read(&frame.colors).unwrap());
+    let (parameters, tile_counts, status) = (setup.parameters.clone(), vec![1; count], vec![0; 3]);
+    let records: Vec<Vec3> = records.concat();
+    let gradients = vec![f32::NAN; parameters.len()];
+    let (grad_norm_sums, visit_counts) = (vec![0.0f32; count], vec![0; count]);
+    let cameras = vec![kernels::Camera::from(&Patch::from(&setup.camera))];
+    let (_, gradients, _, _) = run_kernel!(
+        project_backward,
+        project_backward::Constants { channels: 4, ..Default::default() },
+        project_backward::Params {
+            camera_index: 0,
+            half_view: Vec2::splat(16.0),
+            gaussian_count: count as u32,
+            sh_degree: 3,
+            damping_weight: 0.0,
+            damping_depth: 1.0,
+        },
+        Threads::Exactly([count as u32, 1, 1]),
+        [parameters, splats, colors, tile_counts, emitted, records, cameras],
+        [status, gradients, grad_norm_sums, visit_counts]
+    );
+    (0..count).map(|i| setup.planes().load(&gradients, i).features[0] as f32).collect()
+}
+
+#[test]
+fn gaussians_that_cover_the_whole_of_a_large_image_fill_their_slots_and_are_summed() {
+    // More tiles than a loop of some devices has turns, for every lane of a subgroup.
+    let size = UVec2::new(4096, 2176);
+    let (tiles, emitted, per_splat) = emit_wide(9, size, 0);
+    assert!(per_splat > 32_000 && tiles.len() == 9 * per_splat as usize);
+    assert!(tiles.chunks(per_splat as usize).all(|own| (0..per_splat).eq(own.iter().copied())));
+    let mut random = Random::new(3);
+    let mut number = || random.between(-1.0, 1.0) as f32;
+    let mut record = || array::from_fn(|_| Vec3::new(number(), number(), number()));
+    let records: Vec<Record> = tiles.iter().map(|_| record()).collect();
+    sums(emitted, &records);
+}
+
+#[test]
+fn slots_that_no_tile_fills_are_padding_and_leave_no_trace_in_the_sums() {
+    // Few slots, which their lane walks alone, and many, which all lanes share.
+    for size in [UVec2::new(40, 20), UVec2::new(400, 200)] {
+        let (tiles, emitted, per_splat) = emit_wide(11, size, 5);
+        let is_padding = |slot: usize| slot as u32 % per_splat >= per_splat - 5;
+        assert!((0..tiles.len()).all(|slot| (tiles[slot] == emit::NO_TILE) == is_padding(slot)));
+        // No tile has written the records of padding.
+        let record = |slot: usize| [if is_padding(slot) { Vec3::NAN } else { Vec3::ONE }; 4];
+        let records: Vec<Record> = (0..tiles.len()).map(record).collect();
+        assert_eq!(sums(emitted, &records), [(per_splat - 5) as f32; 11]);
+    }
+}
+
+#[test]
+fn a_view_has_at_most_the_tiles_that_a_subgroup_of_gaussians_that_cover_them_all_gets_through() {
+    let most = gpu().properties().max_loop_iterations;
+    if most == u32::MAX {
+        eprintln!("not run: loops of this device do not end");
+        return;
+    }
+    let mut renderer = Renderer::new(&gpu(), Setup::new(1, [32, 32], 0, 1).settings).unwrap();
+    let view = |size| Setup::new(1, size, 0, 1).camera;
+    renderer.reserve(1, [&view([8192, 16])]).unwrap();
+    renderer.reserve(1, [&view([3840, 2160])]).unwrap();
+    // The host's renders are put together from patches; one pass takes no such view.
+    renderer.reserve(1, [&view([8192, 8192])]).unwrap();
+    let refused = renderer.reserve_with_headroom([1; 2], [UVec2::splat(8192)]).unwrap_err();
+    let message = refused.to_string();
+    assert!(message.starts_with("a 8192x8192 view has 524288 tiles of 16x8 pixels"), "{message}");
+    assert!(!message.contains('\n'), "{message}");
+
+    // A tile grows with the view, but for one that is named.
+    let tile_for = |tile: Option<Tile>| {
+        let settings = RenderSettings { tile, ..RenderSettings::default() };
+        settings.tile_for(&gpu(), [[8192, 4096]].into_iter()).unwrap()
+    };
+    let named = Tile::from([16, 8]);
+    assert_eq!(tile_for(Some(named)), named);
+    assert!(tile_for(None).size[1] > 8, "{:?}", tile_for(None));
+
+    let lanes = gpu().properties().subgroup_size;
+    let tiles = most - 64 - 2 * lanes;
+    let slots = (tiles * lanes) as usize;
+    let emitted: Vec<_> = (0..lanes).map(|i| UVec2::new(i, i + 1) * tiles).collect();
+    assert_eq!(sums(emitted, &vec![[Vec3::ONE; 4]; slots]), vec![tiles as f32; lanes as usize]);
+}
+
+/// What the refusal of a view names as the longest side is one that fits, and not much less than could.
+#[test]
+fn a_refused_view_names_a_longest_side_that_fits() {
+    let gpu = gpu();
+    let settings = RenderSettings::default();
+    for size in [[1 << 16, 1 << 15], [1 << 15, 1 << 17], [1 << 18, 1 << 18]] {
+        let refused = settings.check_size(&gpu, "night.png", size).unwrap_err().to_string();
+        let view = format!("view night.png is {}x{}: it", size[0], size[1]);
+        assert!(refused.starts_with(&view), "{refused}");
+        let longest: f64 = refused.rsplit(' ').next().unwrap().parse().unwrap();
+        let shrunk = |longest: f64| {
+            let share = longest / f64::from(size[0].max(size[1]));
+            size.map(|side| (f64::from(side) * share).round() as u32)
+        };
+        settings.check_size(&gpu, "", shrunk(longest)).unwrap();
+        assert!(settings.check_size(&gpu, "", shrunk(1.05 * longest)).is_err(), "{refused}");
+    }
+}
+
+/// So many faint splats, one behind the other, on one pixel.
+fn crowd(count: usize) -> Setup {
+    let mut setup = Setup::new(count, [16, 8], 0, 5);
+    let size = setup.camera().size;
+    for i in 0..count {
+        let depth = 1.0 + 4.0 * i as f64 / count as f64;
+        let gaussian = Gaussian {
+            mean: setup.at_pixel((size / 2.0).floor() + 0.5, depth),
+            log_scale: DVec3::splat((0.1 * depth / setup.camera().focal.x).ln()),
+            raw_opacity: -4.5,
+            ..setup.get(i)
+        };
+        setup.set(i, &gaussian);
+    }
+    setup
+}
+
+#[test]
+fn a_hundred_thousand_splats_on_one_pixel_are_blended_as_the_references_say() {
+    let mut setup = crowd(100_000);
+    // Where four subgroups share a tile, each turns over its parts as well.
+    let shared = Tile { size: [16, 16], subgroups: 4 };
+    for tile in [None, Some(shared).filter(|&tile| gpu().properties().suits_tile(tile))] {
+        setup.settings.tile = tile;
+        let (_, report) = gpu().checked(|| {
+            let mut rendered = setup.render();
+            rendered.backward(&vec![1.0; 3 * setup.pixels()])
+        });
+        report.agree().unwrap();
+        let passed: HashSet<_> = report.passes.iter().map(|pass| pass.kernel).collect();
+        for kernel in ["emit", "blend_forward", "blend_backward", "project_backward"] {
+            assert!(passed.contains(kernel), "{kernel} of {tile:?}");
+        }
+    }
+}
+
+#[test]
+fn more_splats_on_a_tile_than_the_device_follows_are_an_error_that_says_so() {
+    let (ranges, status) = tile_runs(vec![0, 0, 0, 0, 2, 2, 2], 3);
+    assert_eq!(ranges[..3], [UVec2::ZERO, UVec2::splat(4), UVec2::new(4, 7)]);
+    assert_eq!(status, [STATUS_CROWDED, 0, 4]);
+    assert_eq!(Status::from_words(&status).crowd, 4);
+    if gpu().properties().max_loop_iterations == u32::MAX {
+        return;
+    }
+    let setup = crowd(300_000);
+    let gaussians = gpu().buffer("parameters", &setup.parameters).unwrap();
+    let mut renderer = Renderer::new(&gpu(), setup.settings).unwrap();
+    renderer.reserve(setup.count, [&setup.camera]).unwrap();
+    let refused = renderer.render_image(&gaussians, &setup.camera, &setup.options);
+    let message = refused.unwrap_err().to_string();
+    assert!(message.starts_with("a 16x8 render: 300000 splats on one tile of 16x8"), "{message}");
+    assert!(!message.contains('\n'), "{message}");
+}
+
+#[test]
+fn a_tile_that_does_not_suit_the_device_is_refused_in_one_line_and_others_render() {
+    let lanes = gpu().properties().subgroup_size;
+    let mut setup = Setup::new(5, [50, 40], 1, 5);
+    for tile in [[0, 8], [1, 1], [lanes + 1, 1], [lanes, 33], [64 * lanes, 1], [1 << 20, 1 << 20]] {
+        setup.settings.tile = Some(tile.into());
+        let message = Renderer::new(&gpu(), setup.settings).unwrap_err().to_string();
+        let [width, height] = tile;
+        assert!(message.starts_with(&format!("{width}x{height} tiles do not suit")), "{message}");
+        assert!(message.contains("take a tile") && !message.contains('\n'), "{message}");
+    }
+    for subgroups in [0, 3, 8] {
+        setup.settings.tile = Some(Tile { size: [lanes, 24], subgroups });
+        let message = Renderer::new(&gpu(), setup.settings).unwrap_err().to_string();
+        assert!(message.contains("1, 2 or 4 subgroups") && !message.contains('\n'), "{message}");
+    }
+    for tile in [[lanes, 1], [1, lanes], [lanes, 32]] {
+        setup.settings.tile = Some(tile.into());
+        setup.render();
+    }
+}

@@ -1,0 +1,22 @@
+//! Gaussians: sorting, rendering, gradients, Adam and density control.
+
+#![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
+
+#[macro_use]
+#[path = "../common/mod.rs"]
+mod common;
+
+mod batches;
+mod checked;
+mod conditioning;
+mod coverage;
+mod densify;
+mod fisheye;
+mod gradients;
+mod halves;
+mod limits;
+mod not_finite;
+mod optimizer;
+mod render;
+mod scene;
+mod sort;

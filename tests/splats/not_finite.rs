@@ -1,0 +1,106 @@
+//! NaN where none may be: it is caught in the step in which it arises, named, and changes nothing.
+
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
+use nightsplat::Error;
+use nightsplat::gpu::testing::{Defect, gpu, with_defect};
+use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
+use nightsplat::train::{NotFinite, TrainConfig, Trainer};
+
+use crate::common::setup::Setup;
+use crate::common::train::{advance, dataset};
+
+/// The background of a render is NaN, and so is the loss.
+const BAD_LOSS: Defect = Defect { kernel: "blend_forward", word: 4, bits: 0x7fc0_0000 };
+
+/// The scale of the loss's gradient is NaN, the loss is not.
+fn bad_gradient() -> Defect {
+    let scale = (1.0 / (3.0 * 40.0 * 30.0)) as f32;
+    Defect { kernel: "l1", word: 1, bits: scale.to_bits() ^ 0x7fc0_0000 }
+}
+
+fn config(not_finite: NotFinite) -> TrainConfig {
+    let tone = ToneSettings::new(ToneCurve::Ap3);
+    let mut config = TrainConfig { steps: 60, ssim_weight: 0.0, tone, ..TrainConfig::default() };
+    config.schedule.resolution_steps = [0, 0];
+    config.schedule.densify_after = u64::MAX / 2;
+    config.stop.not_finite = not_finite;
+    config
+}
+
+#[test]
+fn what_is_not_finite_ends_the_run_at_its_own_step_with_view_and_place_and_changes_nothing() {
+    let dataset = dataset(6, [40, 30]);
+    for (defect, place) in [(BAD_LOSS, "L1"), (bad_gradient(), "a gradient")] {
+        let mut trainer = Trainer::new(&gpu(), config(NotFinite::Stop), &dataset).unwrap();
+        advance(&mut trainer, 3);
+        let before = trainer.gaussians().unwrap();
+        let (done, _) = with_defect(defect, || trainer.check_step());
+        let Err(Error::NotFinite { step, view, what }) = done else {
+            panic!("{place}: {done:?}");
+        };
+        assert_eq!((step, what.to_lowercase().as_str()), (4, place.to_lowercase().as_str()));
+        assert!(dataset.views.iter().any(|own| own.name == view), "{view}");
+        assert!(trainer.gaussians().unwrap() == before && trainer.steps_done() == 3, "{place}");
+    }
+}
+
+#[test]
+fn a_view_whose_numbers_are_not_finite_is_left_out_and_the_run_goes_on_to_the_same_bits() {
+    let dataset = dataset(6, [40, 30]);
+    let folder = tempfile::tempdir().unwrap();
+    for defect in [BAD_LOSS, bad_gradient()] {
+        let new = || Trainer::new(&gpu(), config(NotFinite::SkipView), &dataset).unwrap();
+        let mut trainer = new();
+        advance(&mut trainer, 3);
+        let before = trainer.gaussians().unwrap();
+        let (done, _) = with_defect(defect, || trainer.check_step());
+        assert!(done.unwrap().is_empty() && trainer.steps_done() == 3);
+        assert!(
+            trainer.gaussians().unwrap() == before,
+            "the state before the step is the good one"
+        );
+        let checkpoint = folder.path().join("checkpoint.safetensors");
+        trainer.save_checkpoint(&checkpoint).unwrap();
+        let reports = advance(&mut trainer, 30);
+        let views: std::collections::BTreeSet<&str> =
+            reports.iter().map(|report| report.view.as_str()).collect();
+        let all = dataset.train_views().count();
+        assert_eq!(views.len(), all - 1, "{views:?}");
+        let mut resumed = new();
+        resumed.restore(&checkpoint).unwrap();
+        let again = advance(&mut resumed, 30);
+        let names = |reports: &[nightsplat::train::StepReport]| {
+            reports.iter().map(|report| report.view.clone()).collect::<Vec<_>>()
+        };
+        assert_eq!(names(&again), names(&reports));
+        assert!(resumed.gaussians().unwrap() == trainer.gaussians().unwrap());
+    }
+}
+
+#[test]
+fn the_last_view_is_never_left_out() {
+    let dataset = dataset(6, [40, 30]);
+    let mut trainer = Trainer::new(&gpu(), config(NotFinite::SkipView), &dataset).unwrap();
+    let others = dataset.train_views().count() - 1;
+    for _ in 0..others {
+        let (done, _) = with_defect(BAD_LOSS, || trainer.check_step());
+        assert!(done.unwrap().is_empty());
+    }
+    let (done, _) = with_defect(BAD_LOSS, || trainer.check_step());
+    assert!(matches!(done, Err(Error::NotFinite { step: 1, .. })), "{done:?}");
+}
+
+#[test]
+fn a_gradient_that_is_not_finite_raises_a_flag_and_leaves_no_trace_in_the_statistics() {
+    let setup = Setup::new(20, [33, 17], 3, 6);
+    let mut rendered = setup.render();
+    let mut d_render = vec![0.1; rendered.render.len()];
+    d_render[40] = f32::NAN;
+    let gradients = rendered.backward(&d_render);
+    let status = gpu().read(rendered.renderer.status()).unwrap();
+    let status = nightsplat::splats::render::Status::from_words(&status);
+    assert!(status.gradient_not_finite && !status.not_finite);
+    assert!(gradients.parameters.iter().any(|gradient| !gradient.is_finite()));
+    assert!(gradients.grad_norm_sums.iter().all(|sum| sum.is_finite()));
+}

@@ -1,0 +1,329 @@
+//! Adam: the kernel against its reference, its guards, and a problem it has to solve.
+
+#![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
+
+use nightsplat::gpu::testing::gpu;
+use nightsplat::gpu::{Gpu, Reference};
+use nightsplat::kernels::adam;
+use nightsplat::splats::attributes::Attribute;
+use nightsplat::splats::optimizer::{
+    Adam, AdamBuffers, FiniteCheck, LearningRates, Moments, Schedule,
+};
+
+/// Two features and SH of degree 1.
+const COLUMNS: u32 = 25;
+const FEATURES: u32 = 2;
+/// Of means, quats, log scales, raw opacities, dc, features, rest.
+const RATES: LearningRates = LearningRates([0.01, 0.02, 0.03, 0.04, 0.05, 0.015, 0.06]);
+
+/// Parameters, gradients and both moments of one step, in host memory.
+#[derive(Clone)]
+struct Planes {
+    parameters: Vec<f32>,
+    gradients: Vec<f32>,
+    first: Vec<f32>,
+    second: Vec<f32>,
+}
+
+impl Planes {
+    fn new(gaussian_count: u32) -> Self {
+        let wave = |scale: f32, phase: f32| {
+            (0..gaussian_count * COLUMNS)
+                .map(|i| scale * (i as f32 * 0.7 + phase).sin())
+                .collect::<Vec<_>>()
+        };
+        let second = wave(1e-3, 0.5).iter().map(|m| m * m).collect();
+        Self {
+            parameters: wave(2.0, 0.0),
+            gradients: wave(1e-3, 1.0),
+            first: wave(1e-4, 2.0),
+            second,
+        }
+    }
+
+    /// One step on the device.
+    fn step(
+        &mut self,
+        gpu: &Gpu,
+        step: u64,
+        [gaussian_count, column_count]: [u32; 2],
+        status: u32,
+    ) {
+        let upload = |name: &str, data: &[f32]| gpu.buffer(name, data).unwrap();
+        let mut parameters = upload("parameters", &self.parameters);
+        let gradients = upload("gradients", &self.gradients);
+        let mut moments = Moments::Single {
+            first: upload("first", &self.first),
+            second: upload("second", &self.second),
+        };
+        let status = gpu.buffer("status", &[status]).unwrap();
+        let adam = Adam::new(gpu).unwrap();
+        gpu.run("adam", |pass| {
+            let buffers = AdamBuffers {
+                parameters: parameters.slice_mut(),
+                gradients: gradients.slice(),
+                moments: moments.slice_mut(),
+            };
+            adam.record(
+                pass,
+                step,
+                &RATES,
+                [gaussian_count, column_count, FEATURES],
+                buffers,
+                &status,
+            )
+        })
+        .unwrap();
+        self.parameters = gpu.read(&parameters).unwrap();
+        let Moments::Single { first, second } = &moments else { panic!("{moments:?}") };
+        self.first = gpu.read(first).unwrap();
+        self.second = gpu.read(second).unwrap();
+    }
+
+    /// The same step by the reference.
+    fn reference_step(&mut self, step: i32, [gaussian_count, column_count]: [u32; 2]) {
+        let first_correction = 1.0 / (1.0 - 0.9f64.powi(step));
+        let rate = |rate: f64| (rate * first_correction) as f32;
+        let params = adam::Params {
+            gaussian_count,
+            column_count,
+            feature_count: FEATURES,
+            second_correction: (1.0 / (1.0 - 0.999f64.powi(step)).sqrt()) as f32,
+            step: step as u32,
+            rates: RATES.0.map(rate),
+        };
+        let slices = adam::Slices {
+            parameters: &mut self.parameters,
+            gradients: &self.gradients,
+            first_moments: &mut self.first,
+            second_moments: &mut self.second,
+            both_moments: &mut [],
+            status: &[0],
+        };
+        adam::Kernel::run(&params, &adam::Constants::default(), slices);
+    }
+
+    fn bits(&self) -> Vec<u32> {
+        [&self.parameters, &self.first, &self.second]
+            .into_iter()
+            .flatten()
+            .map(|x| x.to_bits())
+            .collect()
+    }
+}
+
+#[test]
+fn adam_matches_its_reference() {
+    let gpu = gpu();
+    for gaussian_count in [0, 1, 255, 1024, 1025, 3001] {
+        for (step, column_count) in [(1, COLUMNS), (7, COLUMNS), (1000, 14)] {
+            let mut expected = Planes::new(gaussian_count);
+            let mut actual = expected.clone();
+            expected.reference_step(step, [gaussian_count, column_count]);
+            actual.step(&gpu, step as u64, [gaussian_count, column_count], 0);
+            // Division and square root are within a few ulp of steps of up to a unit.
+            let pairs = [
+                (&actual.parameters, &expected.parameters, 4e-6),
+                (&actual.first, &expected.first, 1e-9),
+                (&actual.second, &expected.second, 1e-12),
+            ];
+            for (actual, expected, tolerance) in pairs {
+                for (i, (a, b)) in actual.iter().zip(expected).enumerate() {
+                    assert!(
+                        (a - b).abs() <= tolerance,
+                        "{gaussian_count} Gaussians, float {i}: {a} {b}"
+                    );
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn the_first_step_moves_every_attribute_by_its_own_rate() {
+    let gpu = gpu();
+    let count = 5;
+    let mut planes = Planes::new(count);
+    planes.first.fill(0.0);
+    planes.second.fill(0.0);
+    let before = planes.clone();
+    planes.step(&gpu, 1, [count, COLUMNS], 0);
+    let rates = [
+        (0, RATES[Attribute::Means]),
+        (2, RATES[Attribute::Means]),
+        (3, RATES[Attribute::Quats]),
+        (6, RATES[Attribute::Quats]),
+        (7, RATES[Attribute::LogScales]),
+    ]
+    .into_iter()
+    .chain([
+        (9, RATES[Attribute::LogScales]),
+        (10, RATES[Attribute::RawOpacities]),
+        (11, RATES[Attribute::Dc]),
+        (13, RATES[Attribute::Dc]),
+    ])
+    .chain([(14, RATES[Attribute::Features]), (13 + FEATURES, RATES[Attribute::Features])])
+    .chain([(14 + FEATURES, RATES[Attribute::Rest]), (COLUMNS - 1, RATES[Attribute::Rest])]);
+    for (column, rate) in rates {
+        for i in (column * count) as usize..((column + 1) * count) as usize {
+            let expected = before.parameters[i] - rate as f32 * before.gradients[i].signum();
+            assert!((planes.parameters[i] - expected).abs() < 1e-5, "column {column}");
+        }
+    }
+}
+
+#[test]
+fn columns_beyond_the_count_do_not_change() {
+    let gpu = gpu();
+    let mut planes = Planes::new(10);
+    let before = planes.clone();
+    planes.step(&gpu, 3, [10, 14], 0);
+    assert_eq!(planes.parameters[140..], before.parameters[140..]);
+    assert_eq!(planes.first[140..], before.first[140..]);
+    assert_ne!(planes.parameters[139], before.parameters[139]);
+}
+
+#[test]
+fn nothing_changes_while_the_status_is_set() {
+    let gpu = gpu();
+    let mut planes = Planes::new(300);
+    let before = planes.bits();
+    planes.step(&gpu, 3, [300, COLUMNS], 4);
+    assert!(planes.bits() == before);
+}
+
+/// Without the guard a NaN stays in the moments for good, and an infinite second moment freezes its parameter.
+#[test]
+fn a_gradient_that_is_not_finite_counts_as_zero() {
+    let gpu = gpu();
+    let mut expected = Planes::new(64);
+    for i in [0, 200, 700, 1000] {
+        expected.gradients[i] = 0.0;
+    }
+    let mut actual = expected.clone();
+    for (i, value) in
+        [(0, f32::NAN), (200, f32::INFINITY), (700, f32::NEG_INFINITY), (1000, -f32::NAN)]
+    {
+        actual.gradients[i] = value;
+    }
+    expected.step(&gpu, 5, [64, COLUMNS], 0);
+    actual.step(&gpu, 5, [64, COLUMNS], 0);
+    assert!(actual.bits() == expected.bits());
+}
+
+#[test]
+fn a_huge_gradient_leaves_finite_moments() {
+    let gpu = gpu();
+    let mut planes = Planes::new(4);
+    planes.gradients.fill(3e30);
+    planes.step(&gpu, 2, [4, COLUMNS], 0);
+    assert!(planes.second.iter().chain(&planes.parameters).all(|x| x.is_finite()));
+}
+
+#[test]
+fn log_scales_stay_where_exp_is_finite() {
+    let gpu = gpu();
+    let mut planes = Planes::new(2);
+    planes.parameters.fill(100.0);
+    planes.parameters[7 * 2] = -100.0;
+    planes.step(&gpu, 1, [2, COLUMNS], 0);
+    assert_eq!(planes.parameters[7 * 2..10 * 2], [-30.0, 13.0, 13.0, 13.0, 13.0, 13.0]);
+    assert!(
+        planes.parameters[..7 * 2].iter().chain(&planes.parameters[10 * 2..]).all(|x| *x > 99.0)
+    );
+}
+
+#[test]
+fn adam_finds_the_minimum_of_a_parabola() {
+    let gpu = gpu();
+    let mut planes = Planes::new(3);
+    planes.first.fill(0.0);
+    planes.second.fill(0.0);
+    planes.parameters.iter_mut().for_each(|p| *p *= 0.2);
+    for step in 1..=250 {
+        planes.gradients = planes.parameters.iter().map(|p| 2.0 * (p - 0.5)).collect();
+        planes.step(&gpu, step, [3, COLUMNS], 0);
+    }
+    assert!(planes.parameters.iter().all(|p| (p - 0.5).abs() < 0.05), "{:?}", planes.parameters);
+}
+
+/// A kernel that ran on would write beyond its buffers.
+#[test]
+fn a_buffer_that_is_too_short_is_refused() {
+    let gpu = gpu();
+    let adam = Adam::new(&gpu).unwrap();
+    for (lengths, status_len, step) in [
+        ([27, 28, 28], 1, 1),
+        ([28, 27, 28], 1, 1),
+        ([28, 28, 27], 1, 1),
+        ([28; 3], 0, 1),
+        ([28; 3], 1, 0),
+    ] {
+        let mut parameters = gpu.zeros("parameters", lengths[0]).unwrap();
+        let gradients = gpu.zeros("gradients", lengths[1]).unwrap();
+        let mut moments = Moments::zeros(&gpu, lengths[2]).unwrap();
+        let status = gpu.zeros("status", status_len).unwrap();
+        let rates = Schedule::default().learning_rates(step, 1.0);
+        let result = gpu.run("adam", |pass| {
+            let buffers = AdamBuffers {
+                parameters: parameters.slice_mut(),
+                gradients: gradients.slice(),
+                moments: moments.slice_mut(),
+            };
+            adam.record(pass, step, &rates, [2, 14, 0], buffers, &status)
+        });
+        assert!(result.is_err(), "{lengths:?} {status_len} {step}");
+    }
+}
+
+#[test]
+fn coefficients_in_halves_are_refused_where_a_buffer_is_too_short() {
+    let gpu = gpu();
+    let adam = Adam::new(&gpu).unwrap();
+    // Two Gaussians of 14 columns, and 9 coefficients behind them in 5 words.
+    let fitting = [2 * (14 + 5), 2 * (14 + 9), 2 * (14 + 9)];
+    for (short, fits) in
+        [([0, 0, 0], true), ([1, 0, 0], false), ([0, 1, 0], false), ([0, 0, 1], false)]
+    {
+        let [words, floats, of_moments] = [0, 1, 2].map(|i| fitting[i] - short[i]);
+        let mut parameters = gpu.zeros("parameters", words).unwrap();
+        let gradients = gpu.zeros("gradients", floats).unwrap();
+        let mut moments = Moments::zeros(&gpu, of_moments).unwrap();
+        let status = gpu.zeros("status", 1).unwrap();
+        let result = gpu.run("adam", |pass| {
+            let buffers = AdamBuffers {
+                parameters: parameters.slice_mut(),
+                gradients: gradients.slice(),
+                moments: moments.slice_mut(),
+            };
+            adam.record_halves(pass, 1, 1e-3, [2, 14, 9], buffers, &status)
+        });
+        assert_eq!(result.is_ok(), fits, "{short:?}");
+    }
+}
+
+#[test]
+fn the_first_value_that_is_not_finite_is_found_wherever_it_stands_and_none_where_there_is_none() {
+    let gpu = gpu();
+    let mut check = FiniteCheck::new(&gpu).unwrap();
+    for count in [1, 3, 4, 255, 1024, 1025, 4097] {
+        // Extremes are finite; what lies behind the last value does not count.
+        let mut values: Vec<f32> =
+            (0..count + 4).map(|i| [f32::MAX, -f32::MAX, 1e-45, -0.0][i % 4]).collect();
+        values[count] = f32::NAN;
+        let buffer = gpu.buffer("values", &values).unwrap();
+        assert_eq!(check.first(&gpu, &buffer, count).unwrap(), None, "{count}");
+        for wrong in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, -f32::NAN] {
+            for at in [0, count / 2, count - 1] {
+                let mut values = values.clone();
+                values[at] = wrong;
+                values[count - 1] = wrong;
+                let buffer = gpu.buffer("values", &values).unwrap();
+                let found = gpu.checked(|| check.first(&gpu, &buffer, count));
+                found.1.agree().unwrap();
+                assert_eq!(found.0.unwrap(), Some(at), "{wrong} at {at} of {count}");
+            }
+        }
+        assert!(check.first(&gpu, &buffer, count + 5).is_err());
+    }
+}

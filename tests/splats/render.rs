@@ -1,0 +1,376 @@
+//! The forward pass of the renderer: at its limits, the same whatever must not matter, and against golden renders.
+
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
+use std::collections::HashSet;
+use std::path::Path;
+
+use glam::{DAffine3, DMat3, DVec2, DVec3, DVec4, Vec2, Vec3};
+use nightsplat::camera::Camera;
+use nightsplat::gpu::Tile;
+use nightsplat::gpu::testing::gpu;
+use nightsplat::kernels::ProjectedSplat;
+use nightsplat::kernels::splat::ALPHA_MIN;
+use nightsplat::kernels::status::{STATUS_NOT_FINITE, STATUS_OVERFLOWED};
+use nightsplat::reference::gaussian::Gaussian;
+use nightsplat::reference::splat::{Splat, splat_columns};
+use nightsplat::splats::render::Status;
+use nightsplat::splats::scene::{Features, Shape};
+
+use crate::common::chain::Chain;
+use crate::common::setup::{Rendered, Setup, tile_of};
+use crate::common::{Random, assert_close, fixture, safetensors, shared};
+
+const SIZE: [u32; 2] = [50, 40];
+
+/// The render is the background, and nothing hides it.
+fn assert_shows_nothing(rendered: &Rendered<'_>, setup: &Setup) {
+    assert!(rendered.transmittances.iter().all(|&transmittance| transmittance == 1.0));
+    for (plane, value) in rendered.render.chunks(setup.pixels()).zip(setup.background()) {
+        assert!(plane.iter().all(|&shown| shown == value));
+    }
+}
+
+// ---------------------------------------------------------------------------
+// Limits
+
+#[test]
+fn an_overflow_renders_nothing_and_keeps_its_flag() {
+    let setup = Setup::new(65, SIZE, 1, 5);
+    let (_, Status { intersections: total, .. }) = setup.render_within(0);
+    let (exact, status) = setup.render_within(total);
+    assert!(!status.overflowed && status.intersections == total);
+    assert_eq!(exact.render, setup.render().render);
+    let (mut rendered, status) = setup.render_within(total - 1);
+    assert!(status.overflowed && status.intersections == total);
+    assert_shows_nothing(&rendered, &setup);
+    // A render that fits does not lower it, nor any other.
+    let flags = STATUS_OVERFLOWED | STATUS_NOT_FINITE;
+    gpu().write(rendered.renderer.render_and_status().1, &[flags, 7]).unwrap();
+    rendered.renderer.set_intersection_capacity(total).unwrap();
+    rendered.forward();
+    assert_eq!(gpu().read(rendered.renderer.status()).unwrap(), [flags, total, 0]);
+}
+
+/// A Gaussian in the middle of the view of [`Setup::new`], a few pixels wide.
+fn plain(setup: &Setup, depth: f64) -> Gaussian {
+    let camera = setup.camera();
+    Gaussian {
+        mean: setup.at_pixel(camera.size / 2.0, depth),
+        quat: DVec4::new(1.0, 0.2, -0.3, 0.1),
+        log_scale: DVec3::splat((4.0 * depth / camera.focal.x).ln()),
+        raw_opacity: 1.0,
+        ..setup.get(0)
+    }
+}
+
+#[test]
+fn gaussians_out_of_range_leave_no_trace() {
+    let mut setup = Setup::new(17, SIZE, 1, 5);
+    let (base, nan, infinity) = (plain(&setup, 3.0), f64::NAN, f64::INFINITY);
+    let scale = |s| Gaussian { log_scale: DVec3::splat(s), ..base.clone() };
+    let at = |mean| Gaussian { mean, ..base.clone() };
+    let opacity = |raw_opacity| Gaussian { raw_opacity, ..base.clone() };
+    let right = setup.camera().rotation.transpose() * DVec3::X;
+    let cases = [
+        plain(&setup, -3.0),
+        plain(&setup, 0.19),
+        at(DVec3::new(nan, 0.0, 3.0)),
+        at(DVec3::new(0.0, nan, 3.0)),
+        at(DVec3::new(0.0, 0.0, nan)),
+        at(DVec3::splat(infinity)),
+        at(DVec3::new(0.0, 0.0, infinity)),
+        at(DVec3::new(1e30, -1e30, 3.0)),
+        at(base.mean + 100.0 * right),
+        // 1 / (1 + 254.5) is below 1/255, by less than any rounding may cover.
+        opacity(-(254.5f64.ln())),
+        opacity(-1000.0),
+        opacity(-infinity),
+        opacity(nan),
+        scale(nan),
+        // A determinant of 1e35: finite, and its square is not.
+        scale(18.0),
+        scale(40.0),
+        scale(1000.0),
+    ];
+    for (i, gaussian) in cases.iter().enumerate() {
+        setup.set(i, gaussian);
+    }
+    let mut rendered = setup.render();
+    assert_shows_nothing(&rendered, &setup);
+    assert_eq!(gpu().read(&rendered.renderer.frame().counts).unwrap(), [0]);
+    let gradients = rendered.backward(&vec![1.0; rendered.render.len()]);
+    assert!(gradients.parameters.iter().all(|&g| g == 0.0));
+    assert_eq!(gradients.visit_counts, [Rendered::VISITS_BEFORE; 17]);
+}
+
+#[test]
+fn extreme_gaussians_stay_finite() {
+    let mut setup = Setup::new(9, SIZE, 1, 5);
+    let (base, nan) = (plain(&setup, 3.0), f64::NAN);
+    let scale = |s| Gaussian { log_scale: s, ..base.clone() };
+    let quat = |quat| Gaussian { quat, ..base.clone() };
+    let cases = [
+        scale(DVec3::splat(-40.0)),
+        scale(DVec3::new(-1000.0, -2.0, -2.0)),
+        scale(DVec3::splat(8.0)),
+        scale(DVec3::new(11.0, -40.0, -40.0)),
+        scale(DVec3::new(40.0, -40.0, -1.0)),
+        quat(DVec4::ZERO),
+        quat(DVec4::new(nan, 0.0, 0.0, 1.0)),
+        quat(DVec4::splat(1e30)),
+        Gaussian { raw_opacity: 1000.0, ..base.clone() },
+    ];
+    for (i, gaussian) in cases.iter().enumerate() {
+        setup.set(i, gaussian);
+    }
+    let mut rendered = setup.render();
+    let gradients = rendered.backward(&vec![1.0; rendered.render.len()]);
+    let seen = gradients.visit_counts.iter().filter(|&&visits| visits > Rendered::VISITS_BEFORE);
+    assert!(seen.count() >= 7);
+    let Rendered { render, transmittances, .. } = rendered;
+    let all = [render, transmittances, gradients.parameters, gradients.grad_norm_sums].concat();
+    assert!(all.iter().all(|value| value.is_finite()));
+}
+
+#[test]
+fn a_pixel_is_done_before_its_transmittance_falls_below_the_limit() {
+    let mut setup = Setup::new(9, [16, 16], 0, 5);
+    for i in 0..9 {
+        let log_scale = DVec3::splat(6.0);
+        // Transmittances 0.2, 0.04, 0.008, 0.0016, 0.00032, and 0.000064 would be too little.
+        let raw_opacity = 4.0f64.ln();
+        setup.set(i, &Gaussian { log_scale, raw_opacity, ..plain(&setup, 2.0 + i as f64) });
+    }
+    let mut rendered = setup.render();
+    let expected = [0.2f32.powi(5); 256];
+    assert_close("transmittances", &rendered.transmittances, &expected, |_, t| 0.02 * t);
+    let gradients = rendered.backward(&vec![1.0; rendered.render.len()]);
+    for i in 0..9 {
+        let gradient = setup.planes().load(&gradients.parameters, i);
+        assert_eq!(gradient.sh[0] == DVec3::ZERO, i >= 5, "{i}: {gradient:?}");
+        assert_eq!(gradient.raw_opacity == 0.0, i >= 5, "{i}: {gradient:?}");
+    }
+}
+
+// ---------------------------------------------------------------------------
+// Tiles
+
+/// Thousands of Gaussians, from dots to needles that cross the image many times over.
+fn needles(count: usize) -> Setup {
+    let mut setup = Setup::new(count, [123, 85], 0, 77);
+    let mut random = Random::new(78);
+    for i in 0..count {
+        let log_scale = DVec3::from_array([0; 3].map(|_| random.between(-10.0, 3.0)));
+        let gaussian = Gaussian { log_scale, ..setup.get(i) };
+        setup.set(i, &gaussian);
+    }
+    setup
+}
+
+/// Every intersection of a render: the tile and the Gaussian.
+fn intersections(rendered: &Rendered<'_>) -> Vec<(u32, u32)> {
+    let frame = rendered.renderer.frame();
+    let [tiles, slots, owners, counts] = [&frame.tiles, &frame.slots, &frame.owners, &frame.counts]
+        .map(|buffer| gpu().read(buffer).unwrap());
+    let owners = slots[..counts[0] as usize].iter().map(|&slot| owners[slot as usize]);
+    tiles.into_iter().zip(owners).collect()
+}
+
+/// Those of the tiles that subgroups of this device can own.
+fn suited<const N: usize>(tiles: [([u32; 2], u32); N]) -> impl Iterator<Item = Tile> {
+    tiles.into_iter().map(tile_of).filter(|&tile| gpu().properties().suits_tile(tile))
+}
+
+#[test]
+fn counting_and_emitting_agree() {
+    for tile in suited([([16, 16], 1), ([16, 8], 1), ([8, 8], 1)]) {
+        let mut setup = needles(5000);
+        setup.settings.tile = Some(tile);
+        let [width, height] = tile.size;
+        let all = intersections(&setup.render());
+        assert!(all.len() > 20_000, "{}", all.len());
+        let tile_count = setup.camera.width.div_ceil(width) * setup.camera.height.div_ceil(height);
+        assert!(all.iter().all(|&(tile, _)| tile < tile_count), "a slot is padding");
+        assert_eq!(all.iter().collect::<HashSet<_>>().len(), all.len(), "one is there twice");
+    }
+}
+
+#[test]
+fn no_visible_pixel_is_missed() {
+    let mut setup = needles(2000);
+    setup.settings.tile = Some([16, 8].into());
+    let rendered = setup.render();
+    let seen: HashSet<_> = intersections(&rendered).into_iter().collect();
+    let splats = gpu().read(&rendered.renderer.frame().splats).unwrap();
+    let (width, height) = (setup.camera.width, setup.camera.height);
+    let (mut visible, mut missed) = (0, vec![]);
+    for (id, projected) in (0..).zip(&splats) {
+        let splat = Splat::from(projected);
+        for y in 0..height {
+            let [first, last] = splat_columns(projected, y as f32, y as f32);
+            for x in 0..width {
+                let sigma = splat.sigma(splat.mean2d - DVec2::new(x.into(), y.into()) - 0.5);
+                let alpha = splat.opacity * (-sigma).exp();
+                if !(sigma >= 0.0 && alpha >= ALPHA_MIN) {
+                    continue;
+                }
+                visible += 1;
+                let tile = y / 8 * width.div_ceil(16) + x / 16;
+                let is_in_row = (first..=last).contains(&(x as i32));
+                if !is_in_row || !seen.contains(&(tile, id)) {
+                    let ProjectedSplat { mean2d, conic, .. } = projected;
+                    missed.push(format!("({x}, {y}) of {id}, {mean2d} {conic}: alpha = {alpha}"));
+                }
+            }
+        }
+    }
+    assert!(visible > 100_000, "{visible}");
+    let shown = &missed[..missed.len().min(10)];
+    assert!(missed.is_empty(), "{} of {visible}: {shown:#?}", missed.len());
+}
+
+#[test]
+fn neither_tiles_nor_the_order_of_gaussians_change_a_bit() {
+    // Faint, so that nothing hides what another tile may have missed; no two at one depth, which their order decides.
+    let mut setup = needles(1000);
+    let camera = setup.camera();
+    for i in 0..setup.count {
+        let gaussian = setup.get(i);
+        let nearer = (1.0 + 0.004 * i as f64) / camera.view(gaussian.mean).z;
+        let mean = camera.center() + (gaussian.mean - camera.center()) * nearer;
+        setup.set(i, &Gaussian { mean, raw_opacity: -4.0, ..gaussian });
+    }
+    let mut reversed = setup.clone();
+    (0..setup.count).for_each(|i| reversed.set(i, &setup.get(setup.count - 1 - i)));
+    let mut first: Option<(Vec<f32>, Vec<f32>)> = None;
+    for setup in [&mut setup, &mut reversed] {
+        let alone = [[16, 16], [16, 8], [8, 8], [32, 4], [64, 4]].map(|size| (size, 1));
+        let shares = [([16, 16], 2), ([16, 16], 4), ([32, 16], 4), ([8, 8], 2)];
+        for tile in suited(alone).chain(suited(shares)) {
+            setup.settings.tile = Some(tile);
+            let Rendered { render, transmittances, .. } = setup.render();
+            let (first_render, first_transmittances) =
+                first.get_or_insert_with(|| (render.clone(), transmittances.clone()));
+            assert!(render == *first_render, "{tile:?}");
+            assert!(transmittances == *first_transmittances, "{tile:?}");
+        }
+    }
+}
+
+// ---------------------------------------------------------------------------
+// Golden renders
+
+/// A render, or its golden twin: (channels + 1, H, W), the last plane being the transmittances.
+fn planes(render: Vec<f32>, transmittances: Vec<f32>) -> Vec<f32> {
+    [render, transmittances].concat()
+}
+
+/// Panics with the largest difference and where it is.
+fn assert_golden(name: &str, setup: &Setup, golden: &[f32], tolerance: f32) {
+    let Rendered { render, transmittances, .. } = setup.render();
+    let actual = planes(render, transmittances);
+    assert_eq!(actual.len(), golden.len(), "{name}");
+    let difference = |&at: &usize| (actual[at] - golden[at]).abs();
+    // A NaN is the largest.
+    let by = |a: &usize, b: &usize| difference(a).total_cmp(&difference(b));
+    let at = (0..golden.len()).max_by(by).unwrap();
+    let (pixel, width) = (at % setup.pixels(), setup.camera.width as usize);
+    let (x, y, channel) = (pixel % width, pixel / width, at / setup.pixels());
+    let (largest, actual, golden) = (difference(&at), actual[at], golden[at]);
+    assert!(
+        largest <= tolerance,
+        "{name}: off by {largest:e} at most, at pixel ({x}, {y}) of channel {channel}: {actual}, golden {golden}"
+    );
+}
+
+/// The scenes of `tests/fixtures/golden`; its README says what is in a file.
+fn golden_setups() -> [(&'static str, Setup); 2] {
+    let plain = Setup::new(16, [24, 16], 2, 90);
+    let shape = Shape { sh_degree: 0, features: Features::ALL };
+    let mut features = Setup::new(12, [16, 12], shape, 91);
+    features.settings.raw_colors = true;
+    [("plain", plain), ("features", features)]
+}
+
+/// A render's rounding: of some dozens of operations on values of a few units.
+const GOLDEN_TOLERANCE: f32 = 1e-5;
+
+#[test]
+fn golden_renders_of_the_f64_chain_are_met() {
+    for (name, mut setup) in golden_setups() {
+        let path = fixture("golden").join(name).with_extension("safetensors");
+        if std::env::var_os("NIGHTSPLAT_WRITE_GOLDEN").is_some() {
+            write_golden(&path, &setup);
+        }
+        let golden = safetensors::read(path);
+        setup.parameters.clone_from(&golden["parameters"]);
+        let [x, y, z, translation] =
+            [0, 3, 6, 9].map(|at| Vec3::from_slice(&golden["view_from_world"][at..]).as_dvec3());
+        setup.camera.view_from_world = DAffine3 { matrix3: DMat3::from_cols(x, y, z), translation };
+        setup.camera.focal = Vec2::from_slice(&golden["focal"]).as_dvec2();
+        setup.camera.principal_point = Vec2::from_slice(&golden["principal_point"]).as_dvec2();
+        let golden = planes(golden["render"].clone(), golden["transmittances"].clone());
+        assert_golden(name, &setup, &golden, GOLDEN_TOLERANCE);
+    }
+}
+
+/// Renders on the CPU, in f64; refuses a scene in which a rounding decides what is seen.
+fn write_golden(path: &Path, setup: &Setup) {
+    let chain = Chain::new(setup);
+    let results = chain.run(&chain.parameters());
+    for seed in 0..20 {
+        let jittered = chain.run(&chain.jitter(seed));
+        let moved = results.render.iter().zip(&jittered.render).map(|(a, b)| (a - b).abs());
+        let most = moved.fold(0.0, f64::max);
+        assert!(most < 10.0 * f64::from(GOLDEN_TOLERANCE), "{path:?} hangs on a rounding: {most}");
+    }
+    let narrow = |values: &[f64]| values.iter().map(|&v| v as f32).collect::<Vec<_>>();
+    let Camera { width, height, focal, principal_point, view_from_world, .. } = setup.camera;
+    let (width, height) = (width as usize, height as usize);
+    safetensors::write(
+        path,
+        &[
+            ("parameters", &[setup.parameters.len()], &setup.parameters),
+            ("view_from_world", &[4, 3], &narrow(&view_from_world.to_cols_array())),
+            ("focal", &[2], &narrow(&focal.to_array())),
+            ("principal_point", &[2], &narrow(&principal_point.to_array())),
+            ("render", &[setup.channels(), height, width], &narrow(&results.render)),
+            ("transmittances", &[height, width], &narrow(&results.transmittances)),
+        ],
+    );
+}
+
+#[test]
+fn golden_renders_of_another_renderer_are_met() {
+    let Some(folder) = shared("data/fixtures/golden_render") else { return };
+    for case in ["tiny_case", "basic_case"] {
+        let golden = safetensors::read(folder.join(case).with_extension("safetensors"));
+        let row = |name: &str, width: usize, i: usize| -> Vec<f64> {
+            golden[name][width * i..][..width].iter().map(|&v| v.into()).collect()
+        };
+        let mut setup = Setup::new(golden["opacities"].len(), [123, 82], 3, 0);
+        setup.camera.view_from_world =
+            DAffine3::from_translation(Vec3::new(-0.123, -0.456, 8.0).as_dvec3());
+        setup.camera.focal = DVec2::splat(0.5 * 123.0);
+        setup.camera.principal_point = DVec2::new(61.5, 41.0);
+        (setup.settings.near, setup.settings.max_alpha) = (0.01, 0.999);
+        setup.options.background = [0.0; 3];
+        for i in 0..setup.count {
+            let gaussian = Gaussian {
+                mean: DVec3::from_slice(&row("means", 3, i)),
+                quat: DVec4::from_slice(&row("quats", 4, i)),
+                log_scale: DVec3::from_slice(&row("scales", 3, i)),
+                raw_opacity: row("opacities", 1, i)[0],
+                features: vec![],
+                sh: row("coeffs", 48, i).chunks(3).map(DVec3::from_slice).collect(),
+            };
+            setup.set(i, &gaussian);
+        }
+        // (H, W, RGBA), of which the last is what the transmittance leaves.
+        let plane = |c: usize| golden["out_img"].iter().skip(c).step_by(4).copied();
+        let transmittances = plane(3).map(|alpha| 1.0 - alpha).collect();
+        let golden = planes((0..3).flat_map(plane).collect(), transmittances);
+        assert_golden(case, &setup, &golden, 1e-4);
+    }
+}

@@ -1,0 +1,544 @@
+//! Gaussians on the host: their table, their beginning, their file.
+
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
+use glam::{DAffine3, DVec2, DVec3, Quat, Vec3};
+use nightsplat::camera::{Camera, CameraModel};
+use nightsplat::photographs::dataset::{Point, Split, View};
+use nightsplat::photographs::image::Image;
+use nightsplat::splats::attributes::planes;
+use nightsplat::splats::scene::init::Start;
+use nightsplat::splats::scene::{
+    ATTRIBUTES, Features, Gaussians, SH_C0, Shape, init, ply, rest_coefficients, width,
+};
+
+/// A camera at `position` that looks along +z.
+fn camera(position: DVec3) -> Camera {
+    Camera {
+        width: 8,
+        height: 6,
+        focal: DVec2::splat(10.0),
+        principal_point: DVec2::new(4.0, 3.0),
+        model: CameraModel::Pinhole,
+        view_from_world: DAffine3::from_translation(-position),
+    }
+}
+
+/// Gaussians whose every parameter is another number.
+fn distinct(count: usize, shape: impl Into<Shape>) -> Gaussians {
+    let mut gaussians = Gaussians::zeros(count, shape);
+    for (index, parameter) in gaussians.parameters.iter_mut().enumerate() {
+        *parameter = (index as f32 * 0.37).sin() * 1e3 + 1e-7 * index as f32;
+    }
+    gaussians
+}
+
+mod table {
+    use super::*;
+
+    #[test]
+    fn the_rows_stand_in_the_order_of_the_planes() {
+        for (index, spec) in ATTRIBUTES.iter().enumerate() {
+            assert_eq!(spec.attribute as usize, index, "{}", spec.name);
+        }
+    }
+
+    /// Files and shaders have relied on these from the first version on.
+    #[test]
+    fn the_columns_stay_where_they_are() {
+        let columns = ATTRIBUTES.map(|spec| spec.attribute.column(2));
+        assert_eq!(columns, [0, 3, 7, 10, 11, 14, 16]);
+    }
+
+    #[test]
+    fn the_accessors_cover_every_parameter_once() {
+        let shapes = [
+            Features::NONE,
+            Features { structure: true, noise: true, ..Features::NONE },
+            Features::ALL,
+        ]
+        .into_iter()
+        .flat_map(|features| (0..=3).map(move |sh_degree| Shape { sh_degree, features }));
+        for shape in shapes {
+            let Shape { sh_degree, features } = shape;
+            let mut gaussians = Gaussians::zeros(5, shape);
+            assert_eq!(
+                gaussians.parameters.len(),
+                5 * (14 + features.width() + 3 * ((sh_degree as usize + 1).pow(2) - 1))
+            );
+            gaussians.means_mut().fill(Vec3::splat(1.0));
+            gaussians.quats_mut().fill([2.0; 4]);
+            gaussians.log_scales_mut().fill(Vec3::splat(3.0));
+            gaussians.raw_opacities_mut().fill(4.0);
+            gaussians.dc_mut().fill(Vec3::splat(5.0));
+            gaussians.features_mut().fill(6.0);
+            gaussians.rest_mut().fill(Vec3::splat(7.0));
+            let widths = planes(features.width(), width(shape)).map(|(_, width)| 5 * width);
+            let expected = (1..=7).zip(widths).flat_map(|(value, len)| vec![value as f32; len]);
+            assert_eq!(gaussians.parameters, expected.collect::<Vec<_>>());
+            assert_eq!(
+                (gaussians.means().len(), gaussians.quats().len(), gaussians.log_scales().len()),
+                (5, 5, 5)
+            );
+            assert_eq!((gaussians.raw_opacities().len(), gaussians.dc().len()), (5, 5));
+            assert_eq!(gaussians.rest().len(), 5 * rest_coefficients(sh_degree));
+        }
+    }
+
+    #[test]
+    fn no_gaussians_are_gaussians_too() {
+        let none = Gaussians::zeros(0, 3);
+        assert!(none.means().is_empty() && none.rest().is_empty());
+    }
+}
+
+mod from_points {
+    use super::*;
+
+    fn scales(positions: &[DVec3]) -> Vec<f32> {
+        let colors = vec![Vec3::ZERO; positions.len()];
+        let gaussians = init::from_points(positions, &colors, 0, &Start::PAPER, 0).unwrap();
+        gaussians.log_scales().iter().map(|log_scale| log_scale.x.exp()).collect()
+    }
+
+    #[test]
+    fn every_attribute_begins_as_in_3dgs() {
+        let positions = [DVec3::ZERO, DVec3::X, DVec3::Y * 2.0, DVec3::Z * 3.0];
+        let colors = [Vec3::new(0.1, 0.5, 0.9); 4];
+        let gaussians = init::from_points(&positions, &colors, 2, &Start::PAPER, 0).unwrap();
+        assert_eq!((gaussians.count, gaussians.shape), (4, 2.into()));
+        assert_eq!(gaussians.means()[2], Vec3::new(0.0, 2.0, 0.0));
+        assert_eq!(gaussians.quats(), [[1.0, 0.0, 0.0, 0.0]; 4]);
+        let opacity = 1.0 / (1.0 + (-gaussians.raw_opacities()[3]).exp());
+        assert!((opacity - 0.1).abs() < 1e-6);
+        let color = gaussians.dc()[0] * SH_C0 + 0.5;
+        assert!(color.abs_diff_eq(colors[0], 1e-6), "{color}");
+        assert!(gaussians.rest().iter().all(|&coefficient| coefficient == Vec3::ZERO));
+        // The mean squared distance from the origin is (1 + 4 + 9) / 3.
+        assert!((gaussians.log_scales()[0].y.exp() - (14.0f32 / 3.0).sqrt()).abs() < 1e-6);
+    }
+
+    #[test]
+    fn neighbours_on_a_plane_make_discs_along_it() {
+        let normal = DVec3::new(1.0, 2.0, -2.0) / 3.0;
+        let (right, up) =
+            (normal.any_orthonormal_vector(), normal.cross(normal.any_orthonormal_vector()));
+        let place = |i: i32| DVec3::ONE + right * f64::from(i % 9) + up * f64::from(i / 9);
+        let positions: Vec<DVec3> = (0..81).map(place).collect();
+        let colors = vec![Vec3::ONE; positions.len()];
+        let start = Start { opacity: 0.3, scale: 0.5, thinnest: 0.2 };
+        let gaussians = init::from_points(&positions, &colors, 0, &start, 0).unwrap();
+        // In the middle of the grid, where neighbours lie on all sides.
+        let middle = 40;
+        let [w, x, y, z] = gaussians.quats()[middle];
+        let scales = gaussians.log_scales()[middle].exp();
+        let thin = scales.min_position();
+        let axis = Quat::from_xyzw(x, y, z, w) * Vec3::AXES[thin];
+        assert!(axis.as_dvec3().dot(normal).abs() > 1.0 - 1e-6, "{axis}");
+        assert!((scales[thin] - 0.2 * scales.max_element()).abs() < 1e-6, "{scales}");
+        // The disc has the area of the round Gaussian at half the distance of the grid.
+        let area = scales.element_product() / scales.min_element();
+        assert!((area - 0.25).abs() < 1e-6, "{scales}");
+        let opacity = 1.0 / (1.0 + (-gaussians.raw_opacities()[middle]).exp());
+        assert!((opacity - 0.3).abs() < 1e-6);
+    }
+
+    #[test]
+    fn points_in_one_line_and_pairs_make_finite_gaussians() {
+        for count in [2, 3, 20] {
+            let positions: Vec<DVec3> = (0..count).map(|i| DVec3::X * f64::from(i)).collect();
+            let colors = vec![Vec3::ONE; positions.len()];
+            let start = Start::default();
+            let gaussians = init::from_points(&positions, &colors, 0, &start, 0).unwrap();
+            assert!(gaussians.parameters.iter().all(|value| value.is_finite()), "{count}");
+            for quat in gaussians.quats() {
+                let norm: f32 = quat.iter().map(|part| part * part).sum();
+                assert!((norm - 1.0).abs() < 1e-6, "{quat:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_start_that_makes_no_gaussian_is_refused_by_name() {
+        for (start, name) in [
+            (Start { opacity: 1.0, ..Start::PAPER }, "start.opacity"),
+            (Start { scale: 0.0, ..Start::PAPER }, "start.scale"),
+            (Start { thinnest: f64::NAN, ..Start::PAPER }, "start.thinnest"),
+        ] {
+            let message = init::from_points(&[], &[], 0, &start, 0).unwrap_err().to_string();
+            assert!(message.contains(name), "{message}");
+        }
+    }
+
+    #[test]
+    fn the_scales_are_those_of_a_search_through_all_pairs() {
+        let coordinate = |i: usize| ((i as f64 * 12.9898).sin() * 43_758.545_3).fract();
+        let positions: Vec<_> = (0..500)
+            .map(|i| DVec3::new(coordinate(3 * i), coordinate(3 * i + 1), coordinate(3 * i + 2)))
+            .collect();
+        for (position, scale) in positions.iter().zip(scales(&positions)) {
+            let mut squared: Vec<f64> =
+                positions.iter().map(|other| other.distance_squared(*position)).collect();
+            squared.sort_by(f64::total_cmp);
+            let expected = (squared[1..4].iter().sum::<f64>() / 3.0).sqrt();
+            assert!((f64::from(scale) - expected).abs() < 1e-6 * expected, "{scale} {expected}");
+        }
+    }
+
+    #[test]
+    fn coincident_points_do_not_shrink_each_other() {
+        let corners = [DVec3::ZERO, DVec3::X, DVec3::Y, DVec3::Z];
+        let doubled: Vec<_> = corners.iter().chain(&corners).copied().collect();
+        assert_eq!(scales(&doubled)[..4], scales(&corners)[..]);
+        assert_eq!(scales(&doubled)[4..], scales(&corners)[..]);
+    }
+
+    #[test]
+    fn thousands_of_coincident_points_and_flat_grids_are_no_trouble() {
+        assert_eq!(scales(&vec![DVec3::ONE; 5000]), vec![0.01; 5000]);
+        let grid: Vec<_> =
+            (0..4096).map(|i| DVec3::new((i % 64) as f64, (i / 64) as f64, 0.0)).collect();
+        let mut grid_twice = grid.clone();
+        grid_twice.extend(&grid);
+        assert!(scales(&grid_twice).iter().all(|&scale| (1.0..1.5).contains(&scale)));
+    }
+
+    #[test]
+    fn fewer_than_four_positions_use_the_neighbours_there_are() {
+        assert!(scales(&[]).is_empty());
+        assert_eq!(scales(&[DVec3::ONE]), [0.01]);
+        assert!(
+            scales(&[DVec3::ZERO, DVec3::X * 2.0]).iter().all(|scale| (scale - 2.0).abs() < 1e-6)
+        );
+        let three = scales(&[DVec3::ZERO, DVec3::X, DVec3::X * 2.0]);
+        assert!(
+            (three[1] - 1.0).abs() < 1e-6 && (three[0] - 2.5f32.sqrt()).abs() < 1e-6,
+            "{three:?}"
+        );
+    }
+
+    #[test]
+    fn the_closest_points_keep_a_scale_above_zero() {
+        let scales = scales(&[DVec3::ZERO, DVec3::X * 1e-12, DVec3::Y * 1e-12, DVec3::Z * 1e-12]);
+        assert!(scales.iter().all(|scale| (scale - 1e-7f32.sqrt()).abs() < 1e-9), "{scales:?}");
+    }
+
+    #[test]
+    fn points_that_are_not_finite_or_lack_a_color_are_refused() {
+        let refused = |positions: &[DVec3], colors: &[Vec3]| {
+            init::from_points(positions, colors, 0, &Start::PAPER, 0).is_err()
+        };
+        assert!(refused(&[DVec3::new(0.0, f64::NAN, 0.0)], &[Vec3::ZERO]));
+        assert!(refused(&[DVec3::ZERO], &[Vec3::splat(f32::INFINITY)]));
+        assert!(refused(&[DVec3::ZERO, DVec3::ONE], &[Vec3::ZERO]));
+    }
+}
+
+mod random {
+    use super::*;
+
+    fn sees(camera: &Camera, position: DVec3) -> bool {
+        let Some(pixel) = camera.project(position) else { return false };
+        // A hundredth of a pixel for the rounding of a position on the border.
+        pixel.cmpge(DVec2::splat(-0.01)).all() && pixel.cmple(DVec2::new(8.01, 6.01)).all()
+    }
+
+    #[test]
+    fn every_position_is_seen_and_most_are_seen_twice() {
+        let cameras = [DVec3::ZERO, DVec3::X * 0.5, DVec3::Y * 0.5].map(camera);
+        let positions = init::random(&cameras, 1000, 7);
+        assert_eq!(positions.len(), 1000);
+        let seen_by =
+            |position: &DVec3| cameras.iter().filter(|camera| sees(camera, *position)).count();
+        assert!(positions.iter().all(|position| seen_by(position) >= 1));
+        assert!(positions.iter().filter(|position| seen_by(position) >= 2).count() > 900);
+    }
+
+    #[test]
+    fn the_seed_decides_everything() {
+        let cameras = [DVec3::ZERO, DVec3::X].map(camera);
+        assert_eq!(init::random(&cameras, 100, 1), init::random(&cameras, 100, 1));
+        assert_ne!(init::random(&cameras, 100, 1), init::random(&cameras, 100, 2));
+    }
+
+    #[test]
+    fn cameras_in_one_place_see_depths_around_one() {
+        let one = [camera(DVec3::splat(1e3))];
+        for cameras in [&one[..], &[one[0]; 5]] {
+            let depths = init::random(cameras, 200, 0).into_iter().map(|position| position.z - 1e3);
+            assert!(depths.clone().all(|depth| (0.49..5.01).contains(&depth)));
+            assert!(
+                depths.clone().any(|depth| depth < 0.8) && depths.clone().any(|depth| depth > 2.0)
+            );
+        }
+    }
+
+    #[test]
+    fn no_cameras_see_nothing() {
+        assert!(init::random(&[], 10, 0).is_empty());
+    }
+}
+
+mod colors {
+    use super::*;
+
+    fn view(split: Split, position: DVec3) -> View {
+        View::new("", split, camera(position), None)
+    }
+
+    fn point(position: DVec3, views: &[u32]) -> Point {
+        Point { position, views: views.to_vec() }
+    }
+
+    fn colors(points: &[Point], views: &[View], targets: &[Image]) -> Vec<Vec3> {
+        init::colors_from_views(points, views, |view| Ok(targets.get(view))).unwrap()
+    }
+
+    #[test]
+    fn a_color_is_the_mean_over_the_training_views_of_the_track() {
+        let views = [Split::Train, Split::Train, Split::Train, Split::Test]
+            .map(|split| view(split, DVec3::ZERO));
+        let targets = [0.1, 0.3, 0.9, 0.9].map(|grey| Image::filled(8, 6, [grey, 0.0, 0.0]));
+        let points = [point(DVec3::Z, &[0, 1, 3]), point(DVec3::Z, &[]), point(DVec3::Z, &[3])];
+        let [tracked, untracked, tested] = colors(&points, &views, &targets)[..] else { panic!() };
+        assert!((tracked.x - 0.2).abs() < 1e-6, "{tracked}");
+        let everywhere = (0.1 + 0.3 + 0.9) / 3.0;
+        assert!(
+            (untracked.x - everywhere).abs() < 1e-6 && (tested.x - everywhere).abs() < 1e-6,
+            "{untracked}"
+        );
+    }
+
+    #[test]
+    fn an_unseen_point_gets_the_mean_grey() {
+        let views = [view(Split::Train, DVec3::ZERO)];
+        let targets = [Image::filled(8, 6, [0.1, 0.2, 0.6])];
+        for position in [DVec3::NEG_Z, DVec3::new(100.0, 0.0, 1.0), DVec3::ZERO] {
+            let color = colors(&[point(position, &[0])], &views, &targets)[0];
+            assert!(color.abs_diff_eq(Vec3::splat(0.3), 1e-6), "{color}");
+        }
+    }
+
+    #[test]
+    fn without_targets_everything_is_grey() {
+        let color = colors(&[point(DVec3::Z, &[0])], &[view(Split::Train, DVec3::ZERO)], &[])[0];
+        assert_eq!(color, Vec3::splat(0.5));
+    }
+
+    #[test]
+    fn sampling_is_bilinear_between_pixel_centers_and_goes_on_at_the_edge() {
+        let ramp = [Image::from_fn(8, 6, |x, y| [x as f32, y as f32, 1.0])];
+        let views = [view(Split::Train, DVec3::ZERO)];
+        let at = |x: f64, y: f64| {
+            let position = DVec3::new((x - 4.0) / 10.0, (y - 3.0) / 10.0, 1.0);
+            colors(&[point(position, &[0])], &views, &ramp)[0]
+        };
+        for (x, y) in [(2.5, 3.5), (2.75, 3.1), (4.0, 3.0), (7.5, 5.5)] {
+            let expected = Vec3::new(x as f32 - 0.5, y as f32 - 0.5, 1.0);
+            assert!(at(x, y).abs_diff_eq(expected, 1e-5), "{x} {y}: {}", at(x, y));
+        }
+        assert!(at(0.1, 5.9).abs_diff_eq(Vec3::new(0.0, 5.0, 1.0), 1e-5));
+    }
+
+    #[test]
+    fn a_target_that_fails_is_reported() {
+        let views = [view(Split::Train, DVec3::ZERO)];
+        let failing = |_| Err::<Option<Image>, _>(nightsplat::Error::Usage("no target".into()));
+        assert!(init::colors_from_views(&[], &views, failing).is_err());
+    }
+}
+
+mod ply_file {
+    use super::*;
+
+    /// The problem that loading these bytes meets.
+    fn problem(bytes: &[u8]) -> String {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("model.ply");
+        std::fs::write(&path, bytes).unwrap();
+        ply::load(&path).unwrap_err().to_string()
+    }
+
+    fn bytes(gaussians: &Gaussians) -> Vec<u8> {
+        let dir = tempfile::tempdir().unwrap();
+        ply::save(gaussians, dir.path().join("model.ply")).unwrap();
+        std::fs::read(dir.path().join("model.ply")).unwrap()
+    }
+
+    #[test]
+    fn features_come_back_and_stand_behind_the_harmonics() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("model.ply");
+        for features in [Features::ALL, Features { noise: true, ..Features::NONE }] {
+            let gaussians = distinct(5, Shape { sh_degree: 1, features });
+            ply::save(&gaussians, &path).unwrap();
+            assert_eq!(ply::load(&path).unwrap(), gaussians);
+        }
+        let header = bytes(&distinct(1, Shape { sh_degree: 0, features: Features::ALL }));
+        let header = String::from_utf8_lossy(&header).into_owned();
+        let names = "f_dc_2 f_depth_0 f_prior_0 f_noise_0 f_noise_1 f_noise_2 f_illu_0 f_illu_1 f_illu_2 opacity";
+        let lines = names.replace(' ', "\nproperty float ");
+        assert!(header.contains(&lines), "{header}");
+    }
+
+    /// The file with its header's text changed.
+    fn with_header(bytes: &[u8], from: &str, to: &str) -> Vec<u8> {
+        let body = bytes.windows(11).position(|window| window == b"end_header\n").unwrap() + 11;
+        let header = std::str::from_utf8(&bytes[..body]).unwrap();
+        assert!(header.contains(from));
+        [header.replacen(from, to, 1).as_bytes(), &bytes[body..]].concat()
+    }
+
+    #[test]
+    fn saving_and_loading_changes_no_bit() {
+        let dir = tempfile::tempdir().unwrap();
+        for sh_degree in 0..=3 {
+            for count in [0, 1, 37] {
+                let gaussians = distinct(count, sh_degree);
+                let path = dir.path().join("model.ply");
+                ply::save(&gaussians, &path).unwrap();
+                assert_eq!(ply::load(&path).unwrap(), gaussians, "degree {sh_degree}, {count}");
+            }
+        }
+        assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1, "a temporary file is left");
+    }
+
+    #[test]
+    fn the_layout_is_that_of_the_inria_viewer() {
+        let gaussians = distinct(2, 1);
+        let bytes = bytes(&gaussians);
+        let names: Vec<_> = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 f_rest_0 f_rest_1 f_rest_2 f_rest_3 f_rest_4 f_rest_5 \
+            f_rest_6 f_rest_7 f_rest_8 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
+            .split_whitespace()
+            .collect();
+        let properties: String =
+            names.iter().map(|name| format!("property float {name}\n")).collect();
+        let header = format!(
+            "ply\nformat binary_little_endian 1.0\nelement vertex 2\n{properties}end_header\n"
+        );
+        assert!(bytes.starts_with(header.as_bytes()), "{}", String::from_utf8_lossy(&bytes));
+        let values: Vec<f32> = bytemuck::pod_collect_to_vec(&bytes[header.len()..]);
+        assert_eq!(values.len(), 2 * names.len());
+        let second = |name: &str| {
+            values[names.len() + names.iter().position(|other| *other == name).unwrap()]
+        };
+        assert_eq!(Vec3::new(second("x"), second("y"), second("z")), gaussians.means()[1]);
+        assert_eq!(Vec3::new(second("nx"), second("ny"), second("nz")), Vec3::ZERO);
+        // Channel-major: green begins after the three red coefficients.
+        let coefficient = gaussians.rest()[3 + 2];
+        assert_eq!(
+            Vec3::new(second("f_rest_2"), second("f_rest_5"), second("f_rest_8")),
+            coefficient
+        );
+        assert_eq!(second("opacity"), gaussians.raw_opacities()[1]);
+        assert_eq!(second("rot_0"), gaussians.quats()[1][0]);
+    }
+
+    #[test]
+    fn unknown_properties_and_later_elements_are_skipped() {
+        let gaussians = distinct(3, 0);
+        let plain = bytes(&gaussians);
+        let body = plain.windows(11).position(|window| window == b"end_header\n").unwrap() + 11;
+        let header = std::str::from_utf8(&plain[..body]).unwrap();
+        let header = header
+            .replace("property float opacity", "property uchar tag\nproperty double weight\nproperty float opacity")
+            .replace("end_header", "comment by hand\nelement face 1\nproperty list uchar int vertex_indices\nend_header");
+        let mut extended = header.into_bytes();
+        for vertex in plain[body..].chunks_exact(17 * 4) {
+            extended.extend([&vertex[..9 * 4], &[9; 9], &vertex[9 * 4..]].concat());
+        }
+        extended.extend([3, 0, 0, 0, 0]);
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("model.ply");
+        std::fs::write(&path, extended).unwrap();
+        assert_eq!(ply::load(&path).unwrap(), gaussians);
+    }
+
+    #[test]
+    fn other_formats_are_refused_by_name() {
+        let plain = bytes(&distinct(1, 0));
+        for format in ["ascii", "binary_big_endian"] {
+            let problem = problem(&with_header(&plain, "binary_little_endian", format));
+            assert!(
+                problem.contains(format) && problem.contains("binary_little_endian"),
+                "{problem}"
+            );
+        }
+        assert!(problem(b"\x89PNG and so on end_header\n").contains("not a PLY"));
+        assert!(problem(b"").contains("not a PLY"));
+        assert!(
+            problem(&with_header(&plain, "format binary_little_endian 1.0\n", ""))
+                .contains("format")
+        );
+    }
+
+    #[test]
+    fn a_file_cut_short_anywhere_is_refused() {
+        let plain = bytes(&distinct(2, 1));
+        for length in [2, 3, 40, 300, plain.len() - 100, plain.len() - 1] {
+            let problem = problem(&plain[..length]);
+            assert!(problem.contains("model.ply"), "{length}: {problem}");
+        }
+        assert!(problem(&plain[..plain.len() - 1]).contains("cut short"));
+    }
+
+    #[test]
+    fn counts_that_disagree_with_the_file_are_refused() {
+        let plain = bytes(&distinct(2, 1));
+        for (count, words) in [
+            ("1", "more than"),
+            ("3", "cut short"),
+            ("-1", "vertex count"),
+            ("many", "vertex count"),
+        ] {
+            let problem = problem(&with_header(&plain, "vertex 2", &format!("vertex {count}")));
+            assert!(problem.contains(words), "{problem}");
+        }
+        let huge = format!("vertex {}", usize::MAX);
+        assert!(problem(&with_header(&plain, "vertex 2", &huge)).contains("absurd"));
+        assert!(problem(&with_header(&plain, "vertex 2", "face 2")).contains("face"));
+    }
+
+    #[test]
+    fn properties_that_are_missing_or_of_another_type_are_named() {
+        let plain = bytes(&distinct(2, 1));
+        let changed = |from, to| problem(&with_header(&plain, from, to));
+        assert!(changed("float opacity", "float opaqueness").contains("opacity"));
+        assert!(changed("float opacity", "int opacity").contains("int"));
+        assert!(changed("float opacity", "quad opacity").contains("quad"));
+        assert!(changed("float opacity", "float x").contains("twice"));
+        assert!(changed("float f_rest_8", "float other").contains("8 f_rest"));
+        assert!(
+            changed("property float opacity", "property list uchar int opacity").contains("list")
+        );
+    }
+
+    #[test]
+    fn a_value_that_is_not_finite_is_refused_with_its_place() {
+        let mut gaussians = distinct(4, 0);
+        gaussians.log_scales_mut()[2].y = f32::NAN;
+        let problem = problem(&bytes(&gaussians));
+        assert!(problem.contains("vertex 2") && problem.contains("scale_1"), "{problem}");
+    }
+
+    #[test]
+    fn a_folder_that_is_missing_is_named_and_nothing_is_left() {
+        let dir = tempfile::tempdir().unwrap();
+        let problem = ply::save(&distinct(1, 0), dir.path().join("missing/model.ply"))
+            .unwrap_err()
+            .to_string();
+        assert!(problem.contains("missing"), "{problem}");
+        assert!(
+            ply::load(dir.path().join("model.ply")).unwrap_err().to_string().contains("model.ply")
+        );
+        std::fs::create_dir(dir.path().join("taken")).unwrap();
+        assert!(ply::save(&distinct(1, 0), dir.path().join("taken")).is_err());
+        assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1, "a temporary file is left");
+    }
+
+    #[test]
+    fn a_vertex_holds_what_the_table_says() {
+        let header_and = |count| bytes(&distinct(count, 3)).len();
+        assert_eq!(header_and(3) - header_and(2), 4 * (width(3) + 3));
+    }
+}

@@ -1,0 +1,304 @@
+//! Scan and radix sort: each kernel against its reference, the whole against the standard library.
+
+#![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
+
+use nightsplat::gpu::testing::gpu;
+use nightsplat::gpu::{Buffer, Gpu, Threads};
+use nightsplat::kernels::{scan_downsweep, scan_upsweep, sort_downsweep, sort_spine, sort_upsweep};
+use nightsplat::splats::sort::{Count, RadixSort, Scan};
+
+const PARTITION: u32 = 1024;
+const SIZES: [u32; 8] =
+    [0, 1, PARTITION - 1, PARTITION, PARTITION + 1, 3 * PARTITION + 17, 65_000, 300_000];
+
+/// Numbers without a pattern (xorshift64*), the same every time.
+fn noise(len: u32) -> Vec<u32> {
+    let mut state = 88_172_645_463_325_252_u64;
+    let mut next = || {
+        state ^= state << 13;
+        state ^= state >> 7;
+        state ^= state << 17;
+        (state.wrapping_mul(0x2545_f491_4f6c_dd1d) >> 32) as u32
+    };
+    (0..len).map(|_| next()).collect()
+}
+
+fn first(counts: &Buffer<u32>) -> Count<'_> {
+    Count { counts, index: 0 }
+}
+
+fn assert_same(what: &str, actual: &[u32], expected: &[u32]) {
+    assert_eq!(actual.len(), expected.len(), "{what}: lengths");
+    let pairs = actual.iter().zip(expected).enumerate();
+    let wrong: Vec<_> = pairs.filter(|(_, (a, b))| a != b).take(10).collect();
+    assert!(wrong.is_empty(), "{what}: (index, (actual, expected)) {wrong:?}");
+}
+
+/// The pairs (keys[i], i) for i below `count`, as [`RadixSort`] leaves them.
+fn sorted(
+    gpu: &Gpu,
+    sort: &mut RadixSort,
+    keys: &[u32],
+    count: u32,
+    bits: u32,
+) -> (Vec<u32>, Vec<u32>) {
+    let counts = gpu.buffer("counts", &[u32::MAX, count]).unwrap();
+    let mut values = gpu.buffer("values", &(0..keys.len() as u32).collect::<Vec<_>>()).unwrap();
+    let mut keys = gpu.buffer("keys", keys).unwrap();
+    let count = Count { counts: &counts, index: 1 };
+    gpu.run("sort", |pass| sort.record(pass, count, &mut keys, &mut values, bits)).unwrap();
+    (gpu.read(&keys).unwrap(), gpu.read(&values).unwrap())
+}
+
+/// Sorts on the device and with the standard library, and compares the first `count` pairs.
+fn assert_sorts(gpu: &Gpu, sort: &mut RadixSort, what: &str, keys: &[u32], count: u32, bits: u32) {
+    let what = format!("{what}, {count} of {} keys, {bits} bits", keys.len());
+    let mask = if bits == 0 { 0 } else { u32::MAX >> (32 - bits) };
+    let count_in_range = (count as usize).min(keys.len());
+    let mut order: Vec<u32> = (0..count_in_range as u32).collect();
+    order.sort_by_key(|&i| keys[i as usize] & mask);
+    let expected: Vec<u32> = order.iter().map(|&i| keys[i as usize]).collect();
+    let (sorted_keys, sorted_values) = sorted(gpu, sort, keys, count, bits);
+    assert_same(&format!("{what}: keys"), &sorted_keys[..count_in_range], &expected);
+    assert_same(&format!("{what}: values"), &sorted_values[..count_in_range], &order);
+}
+
+#[test]
+fn sorts_of_all_sizes_are_right_and_stable() {
+    let gpu = gpu();
+    let mut sort = RadixSort::new(&gpu, 0).unwrap();
+    for size in SIZES {
+        let keys = noise(size);
+        for bits in [10, 32] {
+            assert_sorts(&gpu, &mut sort, "noise", &keys, size, bits);
+        }
+    }
+}
+
+#[test]
+fn any_number_of_bits_sorts_by_those_bits_alone() {
+    let gpu = gpu();
+    let mut sort = RadixSort::new(&gpu, 3000).unwrap();
+    let keys = noise(3000);
+    for bits in [0, 1, 7, 8, 9, 13, 16, 17, 24, 31] {
+        assert_sorts(&gpu, &mut sort, "noise", &keys, 3000, bits);
+    }
+}
+
+#[test]
+fn equal_and_extreme_keys_keep_their_order() {
+    let gpu = gpu();
+    let mut sort = RadixSort::new(&gpu, 5000).unwrap();
+    for key in [0, 1, 0x0102_0408, u32::MAX] {
+        assert_sorts(&gpu, &mut sort, "equal keys", &[key; 5000], 5000, 32);
+    }
+    let extremes: Vec<u32> = noise(5000).iter().map(|n| 0_u32.wrapping_sub(n & 1)).collect();
+    assert_sorts(&gpu, &mut sort, "0 and the maximum", &extremes, 5000, 32);
+    let descending: Vec<u32> = (0..5000).rev().collect();
+    assert_sorts(&gpu, &mut sort, "descending", &descending, 5000, 32);
+}
+
+#[test]
+fn a_sort_takes_its_count_from_the_device_and_stays_within_the_buffers() {
+    let gpu = gpu();
+    let mut sort = RadixSort::new(&gpu, 4000).unwrap();
+    let keys = noise(4000);
+    for count in [0, 1, 1023, 2049, 3999, 4000, 4001, u32::MAX] {
+        assert_sorts(&gpu, &mut sort, "count", &keys, count, 32);
+    }
+}
+
+#[test]
+fn twenty_five_sorts_are_identical() {
+    let gpu = gpu();
+    let mut sort = RadixSort::new(&gpu, 20_000).unwrap();
+    // Few distinct keys: any race between equal ones would show in the values.
+    let keys: Vec<u32> = noise(20_000).iter().map(|n| n % 37).collect();
+    let first = sorted(&gpu, &mut sort, &keys, 20_000, 8);
+    for _ in 1..25 {
+        assert!(sorted(&gpu, &mut sort, &keys, 20_000, 8) == first);
+    }
+}
+
+#[test]
+fn two_sorts_in_one_recording_do_not_disturb_each_other() {
+    let gpu = gpu();
+    let (keys, ids) = (noise(2500), (0..2500).collect::<Vec<u32>>());
+    let mut sort = RadixSort::new(&gpu, 2500).unwrap();
+    let counts = gpu.buffer("counts", &[2500]).unwrap();
+    let mut low = gpu.buffer("low", &keys).unwrap();
+    let mut order = gpu.buffer("order", &ids).unwrap();
+    let mut high = gpu.buffer("high", &keys.iter().map(|k| k >> 24).collect::<Vec<_>>()).unwrap();
+    let mut high_order = gpu.buffer("high_order", &ids).unwrap();
+    gpu.run("sort", |pass| {
+        sort.record(pass, first(&counts), &mut low, &mut order, 24)?;
+        sort.record(pass, first(&counts), &mut high, &mut high_order, 8)
+    })
+    .unwrap();
+    let (mut by_low, mut by_high) = (ids.clone(), ids);
+    by_low.sort_by_key(|&i| keys[i as usize] & 0xff_ffff);
+    by_high.sort_by_key(|&i| keys[i as usize] >> 24);
+    assert_same("low", &gpu.read(&order).unwrap(), &by_low);
+    assert_same("high", &gpu.read(&high_order).unwrap(), &by_high);
+}
+
+#[test]
+fn scans_of_all_sizes_are_right_and_leave_the_rest_alone() {
+    let gpu = gpu();
+    let mut scan = Scan::new(&gpu, 0).unwrap();
+    for size in SIZES {
+        // Large enough to wrap around.
+        let values = noise(size + 5);
+        let mut running = 0_u32;
+        let mut expected = vec![7; values.len()];
+        for i in 0..size as usize {
+            expected[i] = running;
+            running = running.wrapping_add(values[i]);
+        }
+        let counts = gpu.buffer("counts", &[size]).unwrap();
+        let values = gpu.buffer("values", &values).unwrap();
+        let mut offsets = gpu.buffer("offsets", &vec![7; values.len()]).unwrap();
+        let mut total = gpu.buffer("total", &[7]).unwrap();
+        gpu.run("scan", |pass| {
+            scan.record(pass, first(&counts), &values, &mut offsets, &mut total)
+        })
+        .unwrap();
+        assert_same(&format!("{size} offsets"), &gpu.read(&offsets).unwrap(), &expected);
+        assert_eq!(gpu.read(&total).unwrap(), [running], "total of {size}");
+    }
+}
+
+#[test]
+fn a_count_beyond_the_buffers_scans_what_they_hold() {
+    let gpu = gpu();
+    let mut scan = Scan::new(&gpu, 3).unwrap();
+    let counts = gpu.buffer("counts", &[u32::MAX]).unwrap();
+    let values = gpu.buffer("values", &[5, 6, 7]).unwrap();
+    let mut offsets = gpu.zeros("offsets", 3).unwrap();
+    let mut total = gpu.zeros("total", 1).unwrap();
+    gpu.run("scan", |pass| scan.record(pass, first(&counts), &values, &mut offsets, &mut total))
+        .unwrap();
+    assert_eq!(gpu.read(&offsets).unwrap(), [0, 5, 11]);
+    assert_eq!(gpu.read(&total).unwrap(), [18]);
+}
+
+#[test]
+fn buffers_that_do_not_fit_together_are_an_error() {
+    let gpu = gpu();
+    let (mut sort, mut scan) = (RadixSort::new(&gpu, 4).unwrap(), Scan::new(&gpu, 4).unwrap());
+    let counts = gpu.zeros::<u32>("counts", 1).unwrap();
+    let [mut a, mut b] = ["a", "b"].map(|name| gpu.zeros(name, 4).unwrap());
+    let (mut five, mut none) = (gpu.zeros("five", 5).unwrap(), gpu.zeros("none", 0).unwrap());
+    let outside = Count { counts: &counts, index: 1 };
+    let lengths = gpu.run("sort", |pass| sort.record(pass, first(&counts), &mut a, &mut five, 8));
+    let index = gpu.run("sort", |pass| sort.record(pass, outside, &mut a, &mut b, 8));
+    let scan_lengths =
+        gpu.run("scan", |pass| scan.record(pass, first(&counts), &a, &mut five, &mut b));
+    let no_total = gpu.run("scan", |pass| scan.record(pass, first(&counts), &a, &mut b, &mut none));
+    for (result, expected) in [
+        (lengths, "sort: buffers of lengths [4, 5]; give them one length"),
+        (index, "buffer `counts` holds 1 counts, none at 1"),
+        (scan_lengths, "scan: buffers of lengths [4, 5]; give them one length"),
+        (no_total, "scan: buffer `none` is empty; give the total one element"),
+    ] {
+        assert_eq!(result.unwrap_err().to_string(), expected);
+    }
+}
+
+#[test]
+fn more_workgroups_than_fit_along_x_are_folded() {
+    // Two values a partition make 70 001 workgroups, in two rows: the last is idle in part.
+    compare_scan_kernels(140_001, 2);
+}
+
+#[test]
+fn scan_kernels_match_their_references() {
+    for size in SIZES {
+        compare_scan_kernels(size, PARTITION);
+    }
+}
+
+fn compare_scan_kernels(size: u32, partition_size: u32) {
+    let partitions = size.div_ceil(partition_size).max(1);
+    // One workgroup more than there are partitions: it must leave no trace.
+    let groups = Threads::Workgroups([partitions + 1, 1, 1]);
+    // A count beyond the capacity is clamped to it.
+    let (counts, values, capacity) = (vec![size + 5], noise(size), size);
+    let (sums, total) = (vec![9; partitions as usize + 1], vec![7]);
+    let arrivals = vec![0];
+    let (sums, total, arrivals) = run_kernel!(
+        scan_upsweep,
+        scan_upsweep::Constants { partition_size },
+        scan_upsweep::Params { count_index: 0, capacity },
+        groups,
+        [counts, values],
+        [sums, total, arrivals]
+    );
+    assert_eq!((sums[0], sums[partitions as usize], &arrivals[..]), (0, 9, &[0][..]));
+    assert_eq!(total, [values.iter().fold(0u32, |sum, &value| sum.wrapping_add(value))]);
+    let offsets = vec![7; values.len() + PARTITION as usize];
+    run_kernel!(
+        scan_downsweep,
+        scan_downsweep::Constants { partition_size },
+        scan_downsweep::Params { count_index: 0, capacity },
+        groups,
+        [counts, values, sums],
+        [offsets]
+    );
+}
+
+#[test]
+fn sort_kernels_match_their_references() {
+    for rank_by_ballot in [false, true] {
+        if rank_by_ballot || gpu().properties().subgroup_size <= 32 {
+            compare_sort_kernels(rank_by_ballot);
+        }
+    }
+}
+
+fn compare_sort_kernels(rank_by_ballot: bool) {
+    let ranked = sort_downsweep::Constants { rank_by_ballot, ..Default::default() };
+    // A digit narrower than any subgroup, and the widest.
+    for (size, (shift, digit_bits)) in SIZES.into_iter().flat_map(|s| [(s, (31, 1)), (s, (5, 8))]) {
+        let (capacity, count_index, digits) = (size, 0, 1_u32 << digit_bits);
+        let partitions = size.div_ceil(PARTITION);
+        // One workgroup more than there are partitions: it must leave no trace.
+        let groups = Threads::Workgroups([partitions + 1, 1, 1]);
+        // A count beyond the capacity is clamped to it.
+        let (counts, keys) = (vec![size + 5], noise(size));
+        let values: Vec<u32> = (0..size).map(|i| 3 * i).collect();
+        let empty_table = vec![0; (digits * partitions) as usize];
+        let no_totals = vec![0; digits as usize];
+        let upsweep = |folds_spine: u32| {
+            let (table, digit_totals, arrivals) = (empty_table.clone(), no_totals.clone(), vec![0]);
+            run_kernel!(
+                sort_upsweep,
+                sort_upsweep::Constants::default(),
+                sort_upsweep::Params { count_index, capacity, shift, digit_bits, folds_spine },
+                groups,
+                [counts, keys],
+                [table, digit_totals, arrivals]
+            )
+        };
+        let (table, digit_totals, _) = upsweep(0);
+        let (table, digit_totals) = run_kernel!(
+            sort_spine,
+            sort_spine::Constants::default(),
+            sort_spine::Params { count_index, capacity, digit_bits },
+            Threads::Workgroups([digits, 1, 1]),
+            [counts],
+            [table, digit_totals]
+        );
+        let folded = upsweep(1);
+        assert_eq!((&folded.0, &folded.1, folded.2), (&table, &digit_totals, vec![0]));
+        let (sorted_keys, sorted_values) = (vec![0; keys.len()], vec![0; keys.len()]);
+        run_kernel!(
+            sort_downsweep,
+            ranked,
+            sort_downsweep::Params { count_index, capacity, shift, digit_bits },
+            groups,
+            [counts, table, digit_totals, keys, values],
+            [sorted_keys, sorted_values]
+        );
+    }
+}

@@ -1,0 +1,185 @@
+//! Training with every kind of curve: evaluated in the loss, baked at upload, of the scene; and from what a run records.
+
+#![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
+
+use nightsplat::gpu::testing::gpu;
+use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
+use nightsplat::photographs::dataset::{Dataset, LoadOptions};
+use nightsplat::photographs::image::Image;
+use nightsplat::photographs::pseudo_gt::PseudoGt;
+use nightsplat::photographs::tone::{GainChoice, Table, ToneCurve, ToneSettings};
+use nightsplat::train::{TargetExposure, TrainConfig, Trainer};
+
+/// The losses of the first steps, and the parameters after them.
+fn train(config: &TrainConfig, dataset: &Dataset) -> (Vec<f64>, Vec<f32>) {
+    let (reports, gaussians) = crate::common::train::train(config, dataset);
+    (reports.into_iter().map(|report| report.loss).collect(), gaussians.parameters)
+}
+
+fn config(tone: ToneSettings) -> TrainConfig {
+    TrainConfig { steps: 5, sh_degree: 0, tone, ..TrainConfig::default() }
+}
+
+/// Points so close that the cubics between them are the curve's to 1e-4.
+fn dense_table(curve: ToneCurve) -> Table {
+    let settings = ToneSettings::new(curve);
+    let plain = settings.plain_statistics();
+    let x: Vec<f64> = (0..=2000).map(|i| f64::from(i) / 400.0).collect();
+    Table { y: vec![x.iter().map(|&t| settings.value(t, &plain)).collect()], x, ..Table::default() }
+}
+
+#[test]
+fn every_kind_of_curve_trains_and_a_recorded_configuration_repeats_it() {
+    let dataset = crate::common::train::dataset(5, [32, 24]);
+    let kinds = [
+        ToneSettings::new(ToneCurve::Hybrid),
+        ToneSettings { constants: vec![0.9, 0.4], ..ToneSettings::new(ToneCurve::Gamma) },
+        ToneSettings::new(ToneCurve::P80),
+        ToneSettings::new(ToneCurve::LumPreserve),
+        ToneSettings::new(ToneCurve::PerChannel),
+        ToneSettings { scene_statistics: true, ..ToneSettings::new(ToneCurve::Ase) },
+        ToneSettings::default(),
+        ToneSettings { colour: 0.0, brightness: Some(0.4), ..ToneSettings::default() },
+        ToneSettings::new(ToneCurve::Ap3).with_gain(GainChoice::Auto),
+        ToneSettings { lift_first: true, ..ToneSettings::new(ToneCurve::Ap3) },
+        ToneSettings::of_table(dense_table(ToneCurve::Rational)),
+        ToneSettings::of_profile(crate::common::setup::profile()),
+    ];
+    for tone in kinds {
+        let config = config(tone);
+        let (losses, parameters) = train(&config, &dataset);
+        assert!(losses.iter().all(|loss| loss.is_finite() && *loss > 0.0), "{losses:?}");
+        let recorded: TrainConfig = toml::from_str(&config.to_toml().unwrap()).unwrap();
+        assert_eq!(train(&recorded, &dataset), (losses, parameters), "{}", config.tone.curve);
+    }
+}
+
+#[test]
+fn a_baked_target_trains_as_the_curve_in_the_loss() {
+    let dataset = crate::common::train::dataset(5, [32, 24]);
+    let in_loss = train(&config(ToneSettings::new(ToneCurve::PowerSoftexp)), &dataset).0;
+    let table = ToneSettings::of_table(dense_table(ToneCurve::PowerSoftexp));
+    let baked = train(&config(table), &dataset).0;
+    for (a, b) in in_loss.iter().zip(&baked) {
+        assert!((a - b).abs() < 2e-3, "{in_loss:?} and {baked:?}");
+    }
+}
+
+#[test]
+fn the_statistics_of_the_scene_are_not_those_of_a_view() {
+    let dataset = crate::common::train::dataset(5, [32, 24]);
+    let settings = ToneSettings::new(ToneCurve::Ap3);
+    let scene = ToneSettings { scene_statistics: true, ..settings.clone() };
+    assert_ne!(train(&config(settings), &dataset).0, train(&config(scene), &dataset).0);
+}
+
+/// What training finds of the brightness of a set whose training photographs were scaled, one by one.
+fn exposure(
+    dataset: &Dataset,
+    factors: impl Fn(usize) -> f32,
+) -> nightsplat::Result<TargetExposure> {
+    let mut dataset = dataset.clone();
+    let training = dataset.views.iter_mut().filter(|view| view.is_train());
+    for (place, image) in training.filter_map(|view| view.image.as_mut()).enumerate() {
+        image.data.iter_mut().for_each(|x| *x = (*x * factors(place)).min(1.0));
+    }
+    let trainer = Trainer::new(&gpu(), config(ToneSettings::default()), &dataset)?;
+    Ok(trainer.target_exposure().unwrap().clone())
+}
+
+#[test]
+fn darker_views_get_more_gain_and_the_model_the_mean_of_them() {
+    let dataset = crate::common::train::dataset(6, [32, 24]);
+    let uniform = exposure(&dataset, |_| 1.0).unwrap();
+    assert_eq!(uniform.gains.len(), 5);
+    let varied = exposure(&dataset, |place| [1.0, 0.5, 0.25, 2.0, 1.0][place]).unwrap();
+    for ((name, gain), factor) in varied.gains.iter().zip([1.0, 0.5, 0.25, 2.0, 1.0]) {
+        // The scene's gain moves with its brightest views, and each view has a little of it.
+        let ratio = gain * factor / uniform.gains[name];
+        assert!((0.75..1.35).contains(&ratio), "{name}: {gain}, {}", uniform.gains[name]);
+    }
+    let product: f64 = varied.gains.values().product();
+    assert!((varied.model_gain / product.powf(0.2) - 1.0).abs() < 1e-9);
+    let shared = ToneSettings { scene_statistics: true, ..ToneSettings::default() };
+    let trainer = Trainer::new(&gpu(), config(shared), &dataset).unwrap();
+    let TargetExposure { scene, gains, .. } = trainer.target_exposure().unwrap();
+    assert!(gains.values().all(|&gain| gain == scene.gain));
+}
+
+#[test]
+fn odd_sets_have_a_defined_brightness_or_say_why_not() {
+    let dataset = crate::common::train::dataset(6, [32, 24]);
+    let mut single = dataset.clone();
+    let first = single.views.iter().position(|view| view.is_train()).unwrap();
+    single.views.retain({
+        let name = single.views[first].name.clone();
+        move |view| view.name == name
+    });
+    let one = exposure(&single, |_| 1.0).unwrap();
+    assert!((one.model_gain / one.scene.gain - 1.0).abs() < 1e-9 && one.scene.spread == 0.0);
+    // Black views among good ones: left out of the measurement, and trained on at the scene's gain.
+    let with_black = exposure(&dataset, |place| if place < 2 { 0.0 } else { 1.0 }).unwrap();
+    assert_eq!(with_black.scene.black, 2);
+    assert_eq!(with_black.gains.values().next(), Some(&with_black.scene.gain));
+    let error = exposure(&dataset, |_| 0.0).unwrap_err().to_string();
+    assert!(error.contains("as good as black") && !error.contains('\n'), "{error}");
+    // Half of them well lit, and all.
+    let half = exposure(&dataset, |place| if place % 2 == 0 { 8.0 } else { 1.0 }).unwrap();
+    assert!(half.scene.share > 0.9, "{half:?}");
+    let well_lit = exposure(&dataset, |_| 9.0).unwrap();
+    assert_eq!(well_lit.scene.weight(), 0.0, "{}", well_lit.scene.reason());
+}
+
+/// The means of areas of lifted photographs, not lifted means.
+#[test]
+fn photographs_are_lifted_before_they_are_shrunk() {
+    let folder = tempfile::tempdir().unwrap();
+    let options = SyntheticOptions {
+        views: 5,
+        width: 96,
+        height: 72,
+        seed: 1,
+        ..SyntheticOptions::default()
+    };
+    synthetic::write(folder.path(), &options).unwrap();
+    let load = || {
+        let options = LoadOptions { downscale: 3.0, ..LoadOptions::default() };
+        Dataset::load(folder.path(), &options).unwrap()
+    };
+    let shrunk = load();
+    let view = &shrunk.views[1];
+    let original = view.photograph().unwrap().unwrap();
+    assert_eq!([original.width, original.height], [96, 72]);
+    assert_eq!(view.image.as_ref(), Some(&original.resized(32, 24)));
+
+    let settings = ToneSettings::default();
+    let own = train(&config(settings.clone()), &shrunk).0;
+    let mut pseudo_gt = PseudoGt::new(&gpu(), &settings).unwrap();
+    let photographs = shrunk
+        .train_views()
+        .map(|view| (view.name.clone(), view.photograph().unwrap().unwrap().into_owned()));
+    let photographs: Vec<(String, Image)> = photographs.collect();
+    let seen = photographs.iter().zip(shrunk.train_views());
+    let measured: Vec<_> = seen
+        .map(|((_, image), view)| pseudo_gt.measure(&image.data).unwrap().seen_by(&view.camera))
+        .collect();
+    let scene = settings.scene(&measured).unwrap();
+    for ((name, photograph), measured) in photographs.iter().zip(&measured) {
+        let lifted = pseudo_gt.lifted(photograph, &settings.lift(&scene, measured)).unwrap();
+        lifted.save_png16(folder.path().join("low").join(format!("{name}.png"))).unwrap();
+    }
+    let elsewhere = train(&config(ToneSettings::new(ToneCurve::None)), &load()).0;
+    for (a, b) in own.iter().zip(&elsewhere) {
+        assert!((a - b).abs() < 1e-4, "{own:?} and {elsewhere:?}");
+    }
+    let late =
+        train(&config(ToneSettings { lift_first: false, ..settings }), &load_dark(&options)).0;
+    assert_ne!(own, late);
+}
+
+/// The same set, as it was written.
+fn load_dark(options: &SyntheticOptions) -> Dataset {
+    let folder = tempfile::tempdir().unwrap();
+    synthetic::write(folder.path(), options).unwrap();
+    Dataset::load(folder.path(), &LoadOptions { downscale: 3.0, ..Default::default() }).unwrap()
+}

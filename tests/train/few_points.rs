@@ -1,0 +1,181 @@
+//! Datasets with few points: random ones beside them, and Gaussians at the depths that the first steps have found.
+
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
+use std::fs;
+
+use glam::DVec3;
+use nightsplat::gpu::testing::gpu;
+use nightsplat::photographs::dataset::Dataset;
+use nightsplat::photographs::image::{Image, Mask};
+use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
+use nightsplat::splats::scene::Gaussians;
+use nightsplat::train::{DensityConfig, Learning, Part, TrainConfig, Trainer};
+
+use crate::common::train::{advance, train};
+
+/// All the points, which lie on the surfaces, and the set with so many of them.
+fn dataset(points: usize) -> (Vec<DVec3>, Dataset) {
+    let mut dataset = crate::common::train::dataset(9, [64, 48]);
+    let all = dataset.points.iter().map(|point| point.position).collect();
+    let apart = dataset.points.len() / points.max(1);
+    dataset.points = dataset.points.into_iter().step_by(apart.max(1)).take(points).collect();
+    (all, dataset)
+}
+
+/// The first of two rounds fills.
+fn config() -> TrainConfig {
+    let mut config = TrainConfig { steps: 60, ..TrainConfig::default() };
+    config.schedule.densify_after = 8;
+    config.schedule.densify_interval = 20;
+    config.density.fill = 300;
+    config
+}
+
+/// How far a Gaussian is from the nearest of `points`, in the mean.
+fn distance(gaussians: impl Iterator<Item = DVec3>, points: &[DVec3]) -> f64 {
+    let nearest =
+        |mean: DVec3| points.iter().map(|point| point.distance(mean)).fold(f64::INFINITY, f64::min);
+    let distances: Vec<f64> = gaussians.map(nearest).collect();
+    distances.iter().sum::<f64>() / distances.len() as f64
+}
+
+fn means(gaussians: &Gaussians) -> impl Iterator<Item = DVec3> {
+    gaussians.means().iter().map(|mean| mean.as_dvec3())
+}
+
+#[test]
+fn few_points_become_as_many_gaussians_as_asked_for_nearer_to_the_surfaces_than_random_ones() {
+    let (surface, dataset) = dataset(20);
+    let mut trainer = Trainer::new(&gpu(), config(), &dataset).unwrap();
+    // A tenth, with random ones beside the twenty.
+    assert_eq!(trainer.gaussian_count(), 30);
+    let first = trainer.gaussians().unwrap();
+    let estimate = trainer.memory_estimate().unwrap();
+    assert!(estimate.most_gaussians >= 300, "{estimate:?}");
+    advance(&mut trainer, 19);
+    assert_eq!(trainer.gaussian_count(), 30);
+    advance(&mut trainer, 20);
+    assert_eq!(trainer.gaussian_count(), 300);
+    let filled = trainer.gaussians().unwrap();
+    let [random, added] =
+        [distance(means(&first).skip(20), &surface), distance(means(&filled).skip(30), &surface)];
+    assert!(added < 0.5 * random, "{added} {random}");
+    advance(&mut trainer, 60);
+    assert!(trainer.gaussian_count() >= 300);
+}
+
+#[test]
+fn the_views_are_shown_better_after_as_many_steps() {
+    let (_, dataset) = dataset(20);
+    let loss = |fill| {
+        let mut config = config();
+        config.density.fill = fill;
+        let (reports, _) = train(&config, &dataset);
+        reports[45..].iter().map(|report| report.loss).sum::<f64>() / 15.0
+    };
+    let [with, without] = [loss(300), loss(0)];
+    assert!(with < 0.9 * without, "{with} {without}");
+}
+
+#[test]
+fn many_points_the_papers_control_and_a_setting_of_zero_change_nothing() {
+    let with = |fill: usize, density: DensityConfig, points: usize| {
+        let config =
+            TrainConfig { steps: 40, density: DensityConfig { fill, ..density }, ..config() };
+        train(&config, &dataset(points).1).1
+    };
+    let default = DensityConfig::default();
+    assert!(with(300, default.clone(), 31) == with(0, default.clone(), 31));
+    assert!(with(300, default.clone(), 30) != with(0, default, 30));
+    let paper = with(300, DensityConfig::paper(), 20);
+    assert!(paper == with(0, DensityConfig::paper(), 20) && paper.count < 200);
+}
+
+#[test]
+fn small_views_have_a_gaussian_for_eight_of_their_pixels_at_most() {
+    let mut config = TrainConfig { steps: 40, ..config() };
+    config.density.fill = 5_000;
+    let mut trainer = Trainer::new(&gpu(), config, &dataset(20).1).unwrap();
+    assert_eq!(trainer.gaussian_count(), 500);
+    advance(&mut trainer, 20);
+    // There are more already: the round is one like others.
+    assert!(trainer.gaussian_count() < 1000);
+    let config = TrainConfig {
+        density: DensityConfig { fill: 1000, ..DensityConfig::default() },
+        steps: 40,
+        ..self::config()
+    };
+    let mut trainer = Trainer::new(&gpu(), config, &dataset(20).1).unwrap();
+    advance(&mut trainer, 20);
+    assert_eq!(trainer.gaussian_count(), 64 * 48 / 8);
+}
+
+#[test]
+fn growth_stops_at_the_most_gaussians_there_as_everywhere() {
+    for (most, expected) in [(150, 150), (50, 50), (1, 1)] {
+        let config = TrainConfig { max_gaussians: most, steps: 40, ..config() };
+        let mut trainer = Trainer::new(&gpu(), config, &dataset(20).1).unwrap();
+        advance(&mut trainer, 20);
+        assert_eq!(trainer.gaussian_count(), expected);
+    }
+}
+
+#[test]
+fn a_training_of_every_part_fills_to_the_same_bits_however_it_is_submitted_and_interrupted() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = dataset(12).1;
+    for parts in [&[][..], &[Part::Structure, Part::Denoiser]] {
+        let mut config = TrainConfig { steps: 44, ..config() };
+        config.model.set_parts(parts);
+        config.model.network.channels = 4;
+        config.model.network.stages = 2;
+        config.model.network.repeats = 2;
+        config.model.denoiser_crop = 16;
+        config.exposure.learn = if parts.is_empty() { Learning::On } else { Learning::Off };
+        let gpu = gpu();
+        let new = || Trainer::new(&gpu, config.clone(), &dataset).unwrap();
+        let end = |mut trainer: Trainer| {
+            advance(&mut trainer, 44);
+            let path = folder.path().join("end.safetensors");
+            trainer.save_checkpoint(&path).unwrap();
+            fs::read(path).unwrap()
+        };
+        let expected = end(new());
+        let mut one_by_one = new();
+        one_by_one.set_pace(1, Some(1));
+        assert!(end(one_by_one) == expected, "{parts:?}: one by one");
+        for step in [7, 20, 33] {
+            let checkpoint = folder.path().join("checkpoint.safetensors");
+            let mut interrupted = new();
+            advance(&mut interrupted, step);
+            interrupted.save_checkpoint(&checkpoint).unwrap();
+            let mut restored = new();
+            restored.restore(&checkpoint).unwrap();
+            assert!(end(restored) == expected, "{parts:?}: from step {step}");
+        }
+    }
+}
+
+#[test]
+fn what_a_mask_hides_fills_nothing() {
+    let hidden = |color: [f32; 3]| {
+        let mut dataset = dataset(20).1;
+        for view in &mut dataset.views {
+            let (width, height) = (view.camera.width, view.camera.height);
+            let is_hidden = |x: u32| x > width / 2;
+            let weights = (0..width * height).map(|pixel| f32::from(!is_hidden(pixel % width)));
+            view.mask = Some(Mask { width, height, weights: weights.collect() });
+            view.image = view.image.as_ref().map(|image| {
+                let paint = |x, y| if is_hidden(x) { color } else { image.pixel(x, y) };
+                Image::from_fn(width, height, paint)
+            });
+            view.original = None;
+        }
+        let tone = ToneSettings::new(ToneCurve::Ap3);
+        train(&TrainConfig { steps: 40, tone, ..config() }, &dataset).1
+    };
+    let [dark, bright] = [hidden([0.0; 3]), hidden([1.0, 0.5, 0.9])];
+    assert_eq!(dark.count, 300);
+    assert!(dark == bright);
+}

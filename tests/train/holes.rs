@@ -1,0 +1,192 @@
+//! Holes that black hides: a dark object before a dark room needs no Gaussians before a black background.
+
+#![cfg(feature = "cli")]
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
+use std::fs;
+use std::path::Path;
+
+use glam::DVec3;
+use nightsplat::gpu::testing::gpu;
+use nightsplat::photographs::dataset::synthetic::{self, Capture, SyntheticOptions};
+use nightsplat::photographs::dataset::{Dataset, View};
+use nightsplat::photographs::image::{Image, Mask};
+use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
+use nightsplat::results::eval::{self, Leftover, MOST_LEFTOVER, Player};
+use nightsplat::train::{Background, Part, TrainConfig, Trainer};
+
+use serde_json::Value;
+
+use crate::common::command::{self, succeed};
+use crate::common::train::{advance, train};
+
+const SET: SyntheticOptions =
+    SyntheticOptions { views: 12, width: 64, height: 48, seed: 1, fisheye: false };
+
+/// What a lamp lights of the room stays; the rest, objects before walls, is black, and no point is found there.
+fn dark_room() -> tempfile::TempDir {
+    /// Where the mean of the channels is less, nothing is left.
+    const DARK: f32 = 0.5;
+    let folder = tempfile::tempdir().unwrap();
+    synthetic::write_captured(folder.path(), &SET, &Capture::clean()).unwrap();
+    for part in ["low", "high"] {
+        for file in fs::read_dir(folder.path().join(part)).unwrap() {
+            let path = file.unwrap().path();
+            let image = Image::load(&path).unwrap();
+            let shown = |x, y| {
+                let pixel = image.pixel(x, y);
+                if pixel.iter().sum::<f32>() < 3.0 * DARK { [0.0; 3] } else { pixel }
+            };
+            Image::from_fn(image.width, image.height, shown).save_png8(&path).unwrap();
+        }
+    }
+    let dataset = load(folder.path());
+    let (camera, image) = (dataset.views[1].camera, dataset.views[1].image.as_ref().unwrap());
+    rewrite_points(folder.path(), |position| {
+        let pixel = camera.sees(position).map(|pixel| pixel.as_uvec2());
+        pixel.is_some_and(|pixel| image.pixel(pixel.x, pixel.y) != [0.0; 3])
+    });
+    folder
+}
+
+/// Makes the points of the COLMAP model black, and leaves those out that are not kept.
+fn rewrite_points(folder: &Path, keeps: impl Fn(DVec3) -> bool) {
+    let file = folder.join("colmap_sparse/0/points3D.txt");
+    let mut text = String::new();
+    for line in fs::read_to_string(&file).unwrap().lines().filter(|line| !line.starts_with('#')) {
+        // Number, position, colour, error, track.
+        let mut fields: Vec<&str> = line.split(' ').collect();
+        let position: [f64; 3] = std::array::from_fn(|axis| fields[1 + axis].parse().unwrap());
+        if keeps(position.into()) {
+            fields[4..7].fill("0");
+            text += &(fields.join(" ") + "\n");
+        }
+    }
+    fs::write(file, text).unwrap();
+}
+
+fn load(folder: &Path) -> Dataset {
+    Dataset::load(folder, &TrainConfig::default().load_options()).unwrap()
+}
+
+/// What a dark room is trained with: no curve lifts its black.
+fn config(background: Background) -> TrainConfig {
+    let tone = ToneSettings::new(ToneCurve::None);
+    TrainConfig { steps: 200, background, tone, ..TrainConfig::default() }
+}
+
+/// The mean leftover transmittances of the test views, and what is said of them.
+fn left_over(background: Background, dataset: &Dataset) -> (Vec<f64>, Option<String>) {
+    let config = config(background);
+    let mut trainer = Trainer::new(&gpu(), config.clone(), dataset).unwrap();
+    advance(&mut trainer, config.steps);
+    let scored = eval::score(dataset, |view| trainer.render(&view.camera)).unwrap();
+    let views = scored.iter().map(|view| (view.name.as_str(), view.leftover.unwrap()));
+    let warning = eval::hole_warning(views.clone(), background);
+    (views.map(|(_, leftover)| leftover.mean).collect(), warning)
+}
+
+#[test]
+fn a_dark_room_is_hollow_before_black_which_is_said_and_whole_before_random_colours() {
+    let folder = dark_room();
+    let dataset = load(folder.path());
+    let (hollow, warning) = left_over(Background::Black, &dataset);
+    assert!(hollow.iter().all(|&mean| mean > 1.5 * MOST_LEFTOVER), "{hollow:?}");
+    let warning = warning.unwrap();
+    assert!(warning.contains("in 2 of 2 views") && warning.contains("--background random"));
+    let (whole, warning) = left_over(Background::Random, &dataset);
+    assert!(whole.iter().all(|&mean| mean < 0.2 * MOST_LEFTOVER), "{whole:?}");
+    assert_eq!(warning, None);
+}
+
+#[test]
+fn a_black_point_cloud_trains_to_what_a_grey_one_does() {
+    let folder = tempfile::tempdir().unwrap();
+    synthetic::write(folder.path(), &SET).unwrap();
+    let config = TrainConfig { steps: 30, ..TrainConfig::default() };
+    let grey = train(&config, &load(folder.path())).1;
+    rewrite_points(folder.path(), |_| true);
+    let black = train(&config, &load(folder.path())).1;
+    assert!(black.count > 100 && black.parameters == grey.parameters, "{}", black.count);
+}
+
+#[test]
+fn what_a_mask_hides_is_no_hole() {
+    let folder = dark_room();
+    let dataset = load(folder.path());
+    let mut trainer = Trainer::new(&gpu(), config(Background::Black), &dataset).unwrap();
+    let view = dataset.test_views().next().unwrap();
+    let rendered = trainer.render(&view.camera).unwrap();
+    let open = rendered.transmittances.as_ref().unwrap();
+    let (empty, covered): (Vec<usize>, Vec<usize>) =
+        (0..open.len()).partition(|&pixel| open[pixel] > 0.5);
+    assert!(!empty.is_empty() && !covered.is_empty());
+    let masked = |hidden: &[usize]| {
+        let mask = Mask::hiding(&rendered.colors, hidden);
+        Leftover::of(&rendered, &View { mask, ..view.clone() })
+    };
+    assert!(masked(&[]).unwrap().q99 > 0.9, "{:?}", masked(&[]));
+    assert!(masked(&empty).unwrap().q99 <= 0.5 && masked(&covered).unwrap().mean > 0.5);
+    assert_eq!(masked(&[empty, covered].concat()), None);
+    // A picture that no Gaussian made has none.
+    assert_eq!(Leftover::of(&rendered.colors.clone().into(), view), None);
+}
+
+#[test]
+fn a_denoiser_and_patches_leave_the_transmittances_as_they_are() {
+    let dataset = crate::common::train::dataset(8, [64, 48]);
+    let mut config = TrainConfig { patch_pixels: Some(1000), ..TrainConfig::default() };
+    config.model.set_parts(&[Part::Denoiser]);
+    let mut trainer = Trainer::new(&gpu(), config, &dataset).unwrap();
+    let view = dataset.test_views().next().unwrap();
+    let rendered = trainer.render(&view.camera).unwrap();
+    assert!(rendered.denoised.is_some());
+    let (gaussians, plain) = (trainer.gaussians().unwrap(), TrainConfig::default());
+    let mut player = Player::new(&gpu(), &gaussians, &plain, None).unwrap();
+    let whole = player.render(view).unwrap();
+    let [in_parts, whole] = [rendered, whole].map(|own| own.transmittances.unwrap());
+    assert_eq!(in_parts.len(), 64 * 48);
+    let far = in_parts.iter().zip(&whole).filter(|(own, whole)| (*own - *whole).abs() > 1e-3);
+    assert!(far.count() < 10 && whole.iter().any(|&open| open < 0.5));
+}
+
+#[test]
+fn holes_are_said_by_train_eval_and_diagnose() {
+    let folder = dark_room();
+    let set = folder.path().display();
+    let run = format!("{set}/run");
+    let short = "--curve none --steps 60 --background black --progress none";
+    let (_, warned) = command::run(&format!("train {set} --out {run} {short}"), 0);
+    let warning =
+        |text: &str| text.lines().filter(|line| line.contains("of the background")).count();
+    assert!(warning(&warned) == 1 && warned.contains("--background random"), "{warned}");
+    let trained: Value =
+        serde_json::from_slice(&fs::read(format!("{run}/metrics.json")).unwrap()).unwrap();
+    let (scored, warned) = command::run(&format!("eval {run} --json"), 0);
+    assert_eq!(warning(&warned), 1, "{warned}");
+    let scored: Value = serde_json::from_str(&scored).unwrap();
+    let leftover = &scored["leftover_transmittance"];
+    assert_eq!(*leftover, trained["leftover_transmittance"]);
+    let of = |what: &Value| [&what["mean"], &what["q99"]].map(|value| value.as_f64().unwrap());
+    let [mean, q99] = of(&leftover["mean"]);
+    assert!(mean > MOST_LEFTOVER && q99 > mean, "{leftover}");
+    assert_eq!(leftover["views"].as_object().unwrap().len(), 2);
+    let table = succeed(&format!("eval {run}"));
+    for part in ["leftover", "99 %", &format!("{mean:.4}"), &format!("{q99:.4}")] {
+        assert!(table.contains(part), "no {part} in {table}");
+    }
+
+    // Where no view is held out, training views are looked at.
+    let all = format!("train {set} --out {set}/all --test-every 0 {short}");
+    let (_, warned) = command::run(&all, 0);
+    assert!(warning(&warned) == 1 && warned.contains("of 6 views"), "{warned}");
+
+    let (said, _) = command::run(&format!("diagnose {set} --run {run}"), 0);
+    assert!(said.contains("note: view ") && warning(&said) == 1, "{said}");
+    let json: Value =
+        serde_json::from_str(&succeed(&format!("diagnose {set} --run {run} --json"))).unwrap();
+    let views = json["leftover_transmittance"].as_object().unwrap();
+    assert_eq!(views.len(), SET.views);
+    assert_eq!(of(&views["000"]), of(&leftover["views"]["000"]));
+    assert!(!succeed(&format!("diagnose {set} --json")).contains("leftover"));
+}

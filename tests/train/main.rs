@@ -1,0 +1,18 @@
+//! Training: one step after another, resumed, masked, patched, in fewer bits.
+
+#![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
+
+#[path = "../common/mod.rs"]
+mod common;
+
+mod bad_data;
+mod curve_training;
+mod diagnose;
+mod few_points;
+mod holes;
+mod parts;
+mod patches;
+mod precision;
+mod resume;
+mod training;
+mod world;

@@ -1,0 +1,427 @@
+//! The parts of LITA-GS: each alone and all together, trained, saved, and shown.
+
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
+use std::path::Path;
+
+use nightsplat::gpu::testing::gpu;
+use nightsplat::loss::Term;
+use nightsplat::networks::{DenoiserSettings, Form};
+use nightsplat::photographs::dataset::Dataset;
+use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
+use nightsplat::photographs::image::Image;
+use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
+use nightsplat::splats::attributes::{ATTRIBUTES, Attribute, AttributeSpec};
+use nightsplat::train::{Part, Rendered, StepReport, TrainConfig, Trainer};
+
+use crate::common::command::{refused, succeed};
+use crate::common::train::train;
+
+/// Six views of 40 x 30 pixels, with depth maps where asked.
+fn make_set(folder: &Path, with_depth: bool) {
+    let options = SyntheticOptions {
+        views: 6,
+        width: 40,
+        height: 30,
+        seed: 1,
+        ..SyntheticOptions::default()
+    };
+    synthetic::write(folder, &options).unwrap();
+    if with_depth {
+        let depth = folder.join("depth");
+        std::fs::create_dir(&depth).unwrap();
+        // Of half the size, as estimators give it; a plane that recedes upwards.
+        let map = Image::from_fn(20, 15, |x, y| [1.0 - (y as f32 + 0.1 * x as f32) / 20.0; 3]);
+        for file in std::fs::read_dir(folder.join("low")).unwrap() {
+            let name = file.unwrap().path().file_stem().unwrap().to_str().unwrap().to_owned();
+            map.save_png16(depth.join(format!("depth_{name}.png"))).unwrap();
+        }
+    }
+}
+
+fn config(parts: &[Part]) -> TrainConfig {
+    let tone = ToneSettings::new(ToneCurve::Ap3);
+    let mut config = TrainConfig { steps: 40, sh_degree: 0, tone, ..Default::default() };
+    config.schedule.densify_after = 10;
+    config.schedule.densify_interval = 15;
+    config.model.set_parts(parts);
+    config.model.network.channels = 4;
+    config.model.network.stages = 2;
+    config.model.network.repeats = 2;
+    config.model.rates.denoiser = 1e-2;
+    config.model.rates.tonemapper = 1e-2;
+    config.schedule.initial_rates[Attribute::Features] = 5e-2;
+    config
+}
+
+fn load(folder: &Path, config: &TrainConfig) -> Dataset {
+    Dataset::load(folder, &config.load_options()).unwrap()
+}
+
+/// The mean of a term over the first and over the last epoch.
+fn fall(reports: &[StepReport], term: Term) -> [f64; 2] {
+    let mean = |reports: &[StepReport]| {
+        reports.iter().map(|report| report.term(term)).sum::<f64>() / reports.len() as f64
+    };
+    [mean(&reports[..5]), mean(&reports[reports.len() - 5..])]
+}
+
+#[test]
+fn each_part_alone_has_its_channels_and_its_terms_fall() {
+    let folder = tempfile::tempdir().unwrap();
+    make_set(folder.path(), true);
+    for (part, channels, terms) in [
+        (Part::Structure, 4, &[Term::STRUCTURE][..]),
+        (Part::Depth, 4, &[Term::DEPTH, Term::DEPTH_LOCAL]),
+        (Part::Tonemapper, 6, &[Term::LOW_L1]),
+        (Part::Denoiser, 3, &[Term::DENOISING]),
+    ] {
+        let config = config(&[part]);
+        let (reports, gaussians) = train(&config, &load(folder.path(), &config));
+        assert_eq!(gaussians.shape.features.channels(), channels);
+        for &term in terms {
+            let [begin, end] = fall(&reports, term);
+            assert!(end < begin, "{}: {term:?} went from {begin} to {end}", part.name());
+        }
+        let [begin, end] = fall(&reports, Term::L1);
+        assert!(end < begin, "{}: L1 went from {begin} to {end}", part.name());
+    }
+}
+
+/// As the paper has it, but for the size of the networks and how fast they learn.
+fn paper(parts: &[Part]) -> TrainConfig {
+    let mut config = config(parts);
+    let (network, rates) = (config.model.network, config.model.rates);
+    config.model.follow_paper();
+    config.model.rates = rates;
+    config.model.network = DenoiserSettings { form: Form::Paper, ..network };
+    config
+}
+
+#[test]
+fn the_paper_s_denoiser_has_a_noise_map_and_its_terms_fall() {
+    let folder = tempfile::tempdir().unwrap();
+    make_set(folder.path(), false);
+    let config = paper(&[Part::Denoiser]);
+    let (reports, gaussians) = train(&config, &load(folder.path(), &config));
+    assert_eq!(gaussians.shape.features.channels(), 6);
+    for term in [Term::DENOISING, Term::L1] {
+        let [begin, end] = fall(&reports, term);
+        assert!(end < begin, "{term:?} went from {begin} to {end}");
+    }
+}
+
+/// What a model shows of the first test view before it has trained.
+fn first_render(config: &TrainConfig, dataset: &Dataset) -> Rendered {
+    // Tiles of another size add up in another order.
+    let config = TrainConfig { tile: Some([8, 8].into()), ..config.clone() };
+    let camera = dataset.test_views().next().unwrap().camera;
+    Trainer::new(&gpu(), config, dataset).unwrap().render(&camera).unwrap()
+}
+
+#[test]
+fn with_every_part_a_model_begins_as_the_plain_one_bit_for_bit() {
+    let folder = tempfile::tempdir().unwrap();
+    make_set(folder.path(), true);
+    let dataset = load(folder.path(), &config(&Part::ALL));
+    let plain = first_render(&config(&[]), &dataset).colors;
+    for parts in Part::ALL.iter().map(std::slice::from_ref).chain([&Part::ALL[..]]) {
+        let begun = first_render(&config(parts), &dataset);
+        assert!(begun.colors == plain && *begun.output() == plain, "{parts:?}");
+    }
+    let of_paper = first_render(&paper(&Part::ALL), &dataset);
+    assert!(of_paper.colors == plain && *of_paper.output() != plain);
+}
+
+#[test]
+fn what_a_denoiser_learns_leaves_every_gaussian_as_it_would_be_without_one() {
+    let folder = tempfile::tempdir().unwrap();
+    make_set(folder.path(), false);
+    let plain = config(&[]);
+    let dataset = load(folder.path(), &plain);
+    let expected = train(&plain, &dataset).1;
+    for crop in [0, 12] {
+        let mut config = config(&[Part::Denoiser]);
+        config.model.denoiser_crop = crop;
+        let (reports, gaussians) = train(&config, &dataset);
+        assert_eq!(gaussians, expected, "crop {crop}");
+        assert!(reports.iter().all(|report| report.terms.len() == 4));
+    }
+}
+
+/// The light that the dark photographs show is where the tonemapper begins: it has little to pull at.
+#[test]
+fn the_illumination_begins_as_what_the_photographs_make_of_their_targets() {
+    let folder = tempfile::tempdir().unwrap();
+    make_set(folder.path(), false);
+    let first = |config: &TrainConfig| {
+        let config = TrainConfig { steps: 1, ..config.clone() };
+        train(&config, &load(folder.path(), &config)).0[0].term(Term::LOW_L1)
+    };
+    let parts = [Part::Tonemapper];
+    let (own, of_paper) = (first(&config(&parts)), first(&paper(&parts)));
+    assert!(own < of_paper, "{own} against {of_paper}");
+}
+
+#[test]
+fn the_whole_model_gives_the_same_bits_every_time_on_crops_too() {
+    let folder = tempfile::tempdir().unwrap();
+    make_set(folder.path(), true);
+    let mut config = TrainConfig { steps: 20, ..paper(&Part::ALL) };
+    config.model.denoiser_crop = 12;
+    let dataset = load(folder.path(), &config);
+    let (reports, gaussians) = train(&config, &dataset);
+    assert_eq!(gaussians.shape.features.channels(), 11);
+    assert!(reports.iter().all(|report| report.loss.is_finite() && report.terms.len() == 9));
+    let (again, same) = train(&config, &dataset);
+    assert_eq!(gaussians, same);
+    assert!(reports.iter().zip(again).all(|(a, b)| a.terms == b.terms));
+}
+
+/// A crop that covers the view is the view: the estimate becomes the mean itself.
+#[test]
+fn a_crop_of_everything_is_no_crop() {
+    let folder = tempfile::tempdir().unwrap();
+    make_set(folder.path(), false);
+    let parts = [Part::Denoiser, Part::Tonemapper];
+    let whole = TrainConfig { steps: 6, ..config(&parts) };
+    let mut cropped = whole.clone();
+    cropped.model.denoiser_crop = 40;
+    let dataset = load(folder.path(), &whole);
+    assert_eq!(train(&whole, &dataset).1, train(&cropped, &dataset).1);
+}
+
+/// The terms are means over pixels, so crops come to the whole view's on average. Nothing is learned: each step is compared
+/// with the same step of the same weights.
+#[test]
+fn crops_estimate_the_losses_of_the_whole_view() {
+    const NO_RATE: f64 = 1e-12;
+    let folder = tempfile::tempdir().unwrap();
+    make_set(folder.path(), false);
+    let losses = |crop: u32| -> Vec<f64> {
+        let mut config = TrainConfig { steps: 48, ..config(&[Part::Tonemapper]) };
+        config.schedule.densify_after = config.steps;
+        for AttributeSpec { attribute, .. } in &ATTRIBUTES {
+            config.schedule.initial_rates[*attribute] = NO_RATE;
+        }
+        config.schedule.final_means_rate = NO_RATE;
+        config.model.rates.tonemapper = NO_RATE;
+        config.model.denoiser_crop = crop;
+        let (reports, _) = train(&config, &load(folder.path(), &config));
+        reports.iter().map(|report| report.term(Term::LOW_L1)).collect()
+    };
+    let (cropped, whole) = (losses(16), losses(0));
+    let differences: Vec<f64> = cropped.iter().zip(&whole).map(|(a, b)| a - b).collect();
+    let count = differences.len() as f64;
+    let mean = differences.iter().sum::<f64>() / count;
+    let variance = differences.iter().map(|d| (d - mean).powi(2)).sum::<f64>() / (count - 1.0);
+    let error = (variance / count).sqrt();
+    assert!(mean.abs() < 4.0 * error, "off by {mean}, four standard errors are {}", 4.0 * error);
+}
+
+#[test]
+fn depth_maps_are_found_resized_negated_and_left_out_where_they_say_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    make_set(folder.path(), true);
+    let mut config = config(&[Part::Depth]);
+    let dataset = load(folder.path(), &config);
+    let views: Vec<_> = dataset.train_views().collect();
+    assert!(dataset.test_views().all(|view| view.depth.is_none()));
+    let depth = views[0].depth.as_ref().unwrap();
+    assert_eq!(depth.len(), 40 * 30);
+    assert!(depth[0] > depth[39 + 40 * 29], "larger is farther");
+
+    config.model.depth_is_disparity = true;
+    let negated = load(folder.path(), &config);
+    let negated = negated.train_views().next().unwrap().depth.clone().unwrap();
+    assert!(depth.iter().zip(&negated).all(|(a, b)| *a == -b));
+    config.model.depth_is_disparity = false;
+
+    let name = &views[0].name;
+    let constant = Image::filled(40, 30, [0.5; 3]);
+    constant.save_png8(folder.path().join(format!("depth/depth_{name}.png"))).unwrap();
+    let dataset = load(folder.path(), &config);
+    let with_depth = dataset.train_views().filter(|view| view.depth.is_some()).count();
+    assert_eq!(with_depth, views.len() - 1);
+    // Trains on: the view without depth leaves the term out.
+    let (reports, _) = train(&TrainConfig { steps: 10, ..config.clone() }, &dataset);
+    for report in &reports {
+        assert_eq!((report.term(Term::DEPTH) == 0.0), report.view == *name, "{report:?}");
+    }
+
+    config.model.depth_folder = Some(folder.path().join("nowhere"));
+    let error = Dataset::load(folder.path(), &config.load_options()).unwrap_err().to_string();
+    assert!(error.contains("nowhere") && error.contains("depth"), "{error}");
+}
+
+#[test]
+fn float_depth_keeps_its_values_and_its_sign() {
+    let folder = tempfile::tempdir().unwrap();
+    make_set(folder.path(), false);
+    let maps = folder.path().join("estimates");
+    std::fs::create_dir(&maps).unwrap();
+    let map = Image::from_fn(40, 30, |x, _| [x as f32 - 20.0; 3]);
+    for file in std::fs::read_dir(folder.path().join("low")).unwrap() {
+        let name = file.unwrap().path().file_stem().unwrap().to_str().unwrap().to_owned();
+        map.save_exr_as_stored(maps.join(format!("{name}.exr"))).unwrap();
+    }
+    let mut config = config(&[Part::Depth]);
+    config.model.depth_folder = Some(maps);
+    let dataset = load(folder.path(), &config);
+    let depth = dataset.train_views().next().unwrap().depth.clone().unwrap();
+    assert_eq!((depth[0], depth[39]), (-20.0, 19.0));
+}
+
+#[test]
+fn without_depth_maps_there_is_no_depth_part() {
+    let folder = tempfile::tempdir().unwrap();
+    make_set(folder.path(), false);
+    let config = TrainConfig { steps: 2, ..config(&[Part::Depth, Part::Structure]) };
+    let (reports, gaussians) = train(&config, &load(folder.path(), &config));
+    assert_eq!(gaussians.shape.features.channels(), 4);
+    assert_eq!(reports[0].terms.len(), 3);
+}
+
+#[test]
+fn raw_colors_train_and_are_saved_as_viewers_show_them() {
+    let folder = tempfile::tempdir().unwrap();
+    make_set(folder.path(), false);
+    let mut config = TrainConfig { steps: 20, ..config(&[]) };
+    config.model.raw_colors = true;
+    let (reports, mut gaussians) = train(&config, &load(folder.path(), &config));
+    let [begin, end] = fall(&reports, Term::L1);
+    assert!(end < begin, "L1 went from {begin} to {end}");
+    let before = gaussians.dc()[0].x;
+    gaussians.shift_colors(-0.5);
+    assert!((gaussians.dc()[0].x - (before - 0.5 / 0.282_094_8)).abs() < 1e-5);
+}
+
+// ---------------------------------------------------------------------------
+// The command line
+
+const SMALL: &str =
+    "--steps 12 --sh-degree 0 --denoiser-channels 4 --denoiser-stages 1 --denoiser-repeats 2";
+
+#[test]
+fn a_run_with_networks_is_saved_scored_and_shown_layer_by_layer() {
+    let folder = tempfile::tempdir().unwrap();
+    let set = folder.path().join("set");
+    make_set(&set, true);
+    let (set, run) = (set.display(), folder.path().join("run"));
+    let at = run.display();
+    let paper = "--preset lom --model lita --denoiser-crop 16";
+    succeed(&format!("train {set} --out {at} {paper} {SMALL}"));
+    let header = std::fs::read_to_string(run.join("train.csv")).unwrap();
+    let columns = "step,view,loss,l1,ssim,low_l1,low_ssim,structure,depth,depth_local,denoising,\
+                   total_variation,gaussians,milliseconds";
+    assert_eq!(header.lines().next().unwrap(), columns);
+    let read = |path: &Path| -> serde_json::Value {
+        serde_json::from_str(&std::fs::read_to_string(path).unwrap()).unwrap()
+    };
+    let trained = read(&run.join("metrics.json"));
+    assert!(trained["mean"]["r0"]["psnr"].as_f64().unwrap() > 0.0, "{trained}");
+    let scored: serde_json::Value =
+        serde_json::from_str(&succeed(&format!("eval {at} --json"))).unwrap();
+    assert_eq!(scored["views"], trained["views"], "the saved networks are those that were trained");
+
+    for (layer, format) in [
+        ("rgb", "png"),
+        ("denoised", "png"),
+        ("depth", "png"),
+        ("structure", "exr"),
+        ("illumination", "png"),
+        ("noise", "exr"),
+    ] {
+        let out = folder.path().join(layer);
+        let to = out.display();
+        succeed(&format!("render {at} --split test --out {to} --layer {layer} --format {format}"));
+        let file = std::fs::read_dir(&out).unwrap().next().unwrap().unwrap().path();
+        assert_eq!(Image::size_of(file).unwrap(), (40, 30), "{layer}");
+    }
+
+    // Networks of another configuration.
+    let config = std::fs::read_to_string(run.join("config.toml")).unwrap();
+    std::fs::write(run.join("config.toml"), config.replace("channels = 4", "channels = 5"))
+        .unwrap();
+    refused(&format!("eval {at}"), 3, &["networks.safetensors", "\"channels\":4"]);
+}
+
+#[test]
+fn a_layer_that_the_model_lacks_is_named_with_those_it_has() {
+    let folder = tempfile::tempdir().unwrap();
+    let set = folder.path().join("set");
+    make_set(&set, false);
+    let (set, run) = (set.display(), folder.path().join("run"));
+    let at = run.display();
+    succeed(&format!("train {set} --out {at} --parts structure {SMALL}"));
+    let render = format!("render {at} --split test --out {at}/out --layer denoised");
+    refused(&render, 2, &["no denoised", "rgb, structure"]);
+
+    let config = run.join("config.toml");
+    let text = std::fs::read_to_string(&config).unwrap();
+    let with_denoiser = text.replace("denoiser = false", "denoiser = true");
+    std::fs::write(&config, &with_denoiser).unwrap();
+    refused(&format!("eval {at}"), 3, &["networks.safetensors"]);
+    let of_paper = with_denoiser.replace("form = \"identity\"", "form = \"paper\"");
+    std::fs::write(&config, of_paper).unwrap();
+    refused(&format!("eval {at}"), 2, &["no noise, which the denoiser takes"]);
+}
+
+/// Without depth maps there is no depth channel, so that the others lie elsewhere than the configuration would have them.
+#[test]
+fn a_model_without_the_depth_it_asked_for_scores_the_same_afterwards() {
+    let folder = tempfile::tempdir().unwrap();
+    let (set, run) = (folder.path().join("set"), folder.path().join("run"));
+    make_set(&set, false);
+    let (set, at) = (set.display(), run.display());
+    succeed(&format!("train {set} --out {at} --model lita {SMALL}"));
+    let trained = std::fs::read_to_string(run.join("metrics.json")).unwrap();
+    let [trained, scored] = [trained, succeed(&format!("eval {at} --json"))]
+        .map(|text| serde_json::from_str::<serde_json::Value>(&text).unwrap()["mean"].clone());
+    assert!(trained["r0"]["psnr"].is_f64());
+    assert_eq!(trained, scored);
+}
+
+#[test]
+fn ablate_trains_every_model_and_leaves_a_page() {
+    let folder = tempfile::tempdir().unwrap();
+    let set = folder.path().join("set");
+    make_set(&set, true);
+    let (set, out) = (set.display(), folder.path().join("ablation"));
+    let at = out.display();
+    let table = succeed(&format!("ablate {set} --out {at} {SMALL}"));
+    for (name, title) in [
+        ("plain", "plain"),
+        ("denoiser", "+ denoiser"),
+        ("tonemapper", "+ tonemapper"),
+        ("structure", "+ structure"),
+        ("depth", "+ depth"),
+        ("lita", "all parts"),
+    ] {
+        assert!(out.join(name).join("metrics.json").is_file(), "{name}");
+        assert!(table.contains(title), "{table}");
+    }
+    let markdown = std::fs::read_to_string(out.join("table.md")).unwrap();
+    assert!(markdown.contains("peak, MiB") && markdown.contains("Gaussians"), "{markdown}");
+    let page = std::fs::read_to_string(out.join("index.html")).unwrap();
+    assert!(page.contains("all parts") && page.contains("data:image/png"));
+    refused(&format!("ablate {set} --out {at} {SMALL}"), 1, &["--overwrite"]);
+    let picked = format!("ablate {set} --out {at} --overwrite --model lita");
+    refused(&picked, 2, &["leave out --model"]);
+}
+
+#[test]
+fn a_preset_sets_what_the_paper_states_and_options_win() {
+    let folder = tempfile::tempdir().unwrap();
+    let set = folder.path().join("shrub");
+    make_set(&set, false);
+    let run = folder.path().join("run");
+    let (set, at) = (set.display(), run.display());
+    succeed(&format!("train {set} --out {at} --preset lom --model plain {SMALL}"));
+    let config = std::fs::read_to_string(run.join("config.toml")).unwrap();
+    for line in
+        ["steps = 12", "ssim_weight = 0.4", "seed = 10", "means_rate_steps = 20000", "stages = 1"]
+    {
+        assert!(config.contains(line), "no `{line}` in {config}");
+    }
+}

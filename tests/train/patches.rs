@@ -1,0 +1,313 @@
+//! Views that are too large to be taken at once are rendered and trained on patch by patch, and show the same.
+
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
+use std::fs;
+
+use glam::DVec3;
+
+use nightsplat::camera::Frame;
+use nightsplat::gpu::testing::gpu;
+use nightsplat::photographs::dataset::{Dataset, Split, View};
+use nightsplat::photographs::image::{Image, Mask};
+use nightsplat::photographs::metrics::Scores;
+use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
+use nightsplat::splats::render::{self, Damping, RenderOptions, RenderSettings, Renderer};
+use nightsplat::splats::scene::Gaussians;
+use nightsplat::train::{Learning, Part, Rendered, TrainConfig, Trainer};
+
+use crate::common::Random;
+use crate::common::command::{command, refused, succeed};
+use crate::common::place::Place;
+use crate::common::setup::{Setup, features};
+use crate::common::train::advance;
+
+/// Gaussians of every kind in a view that parts into patches; some are far beside it.
+fn setup(patch_pixels: Option<u64>) -> Setup {
+    let shape = nightsplat::splats::scene::Shape { sh_degree: 2, features: features(5) };
+    let mut setup = Setup::new(400, [83, 57], shape, 3);
+    setup.settings.patch_pixels = patch_pixels;
+    setup
+}
+
+fn renderer(setup: &Setup) -> Renderer {
+    let mut renderer = Renderer::new(&gpu(), setup.settings).unwrap();
+    renderer.reserve(setup.count, [&setup.camera]).unwrap();
+    renderer
+}
+
+#[test]
+fn patches_show_what_the_whole_view_shows() {
+    let whole = setup(None);
+    let rendered = whole.render();
+    let expected = [&rendered.render[..], &rendered.transmittances].concat();
+    let gaussians = gpu().buffer("parameters", &whole.parameters).unwrap();
+    for (patch_pixels, count) in [(2500, 2), (1000, 6), (300, 20)] {
+        let setup = setup(Some(patch_pixels));
+        let mut renderer = renderer(&setup);
+        assert_eq!(renderer.patches(&setup.camera).len(), count);
+        let shown = renderer.render_planes(&gaussians, &setup.camera, &setup.options).unwrap();
+        assert_eq!(shown.len(), (setup.channels() + 1) * setup.pixels());
+        let errors = shown.iter().zip(&expected).map(|(shown, whole)| (shown - whole).abs());
+        // A splat may be just above the least alpha in one, and just below in the other.
+        let far = errors.clone().filter(|&error| error > 1e-4).count();
+        assert!(far * 1000 <= shown.len(), "{far} of {}", shown.len());
+        assert!(errors.fold(0.0, f32::max) < 0.02);
+    }
+}
+
+/// The gradients of the parameters, and what density control is told, of a loss per pixel of each patch.
+fn gradients(setup: &Setup, weights: &[f32]) -> [Vec<f32>; 3] {
+    let (gpu, mut renderer) = (gpu(), renderer(setup));
+    let gaussians = gpu.buffer("parameters", &setup.parameters).unwrap();
+    let mut sums = vec![0.0; setup.parameters.len()];
+    let mut grad_norm_sums = gpu.zeros("grad_norm_sums", setup.count).unwrap();
+    let mut visit_counts = gpu.zeros("visit_counts", setup.count).unwrap();
+    let mut parameters = gpu.buffer("gradients", &sums).unwrap();
+    for patch in renderer.patches(&setup.camera) {
+        let share = patch.pixel_count() as f32 / setup.pixels() as f32;
+        let d_render: Vec<f32> = patch.cut(weights).iter().map(|weight| weight / share).collect();
+        let d_render = gpu.buffer("d_render", &d_render).unwrap();
+        gpu.run("patch", |pass| {
+            renderer.forward(pass, &gaussians, patch, &setup.options)?;
+            let gradients = render::Gradients {
+                parameters: &mut parameters,
+                grad_norm_sums: &mut grad_norm_sums,
+                visit_counts: &mut visit_counts,
+            };
+            let damping = Damping { weight: 0.7, depth: 3.0 };
+            renderer.backward(
+                pass,
+                &gaussians,
+                patch,
+                &setup.options,
+                damping,
+                &d_render,
+                gradients,
+            )
+        })
+        .unwrap();
+        for (sum, own) in sums.iter_mut().zip(gpu.read(&parameters).unwrap()) {
+            *sum += share * own;
+        }
+    }
+    let visits: Vec<u32> = gpu.read(&visit_counts).unwrap();
+    let visits = visits.into_iter().map(|visits| visits as f32).collect();
+    [sums, gpu.read(&grad_norm_sums).unwrap(), visits]
+}
+
+#[test]
+fn the_gradients_of_the_patches_add_up_to_that_of_the_view() {
+    let whole = setup(None);
+    let mut random = Random::new(9);
+    let len = whole.channels() * whole.pixels();
+    let weights: Vec<f32> = (0..len).map(|_| random.between(-1.0, 1.0) as f32).collect();
+    let [expected, norms, visits] = gradients(&whole, &weights);
+    let [sums, own_norms, own_visits] = gradients(&setup(Some(2500)), &weights);
+    let planes = whole.planes();
+    for column in 0..planes.len() / planes.count {
+        let plane = column * planes.count..(column + 1) * planes.count;
+        let largest = expected[plane.clone()].iter().fold(0.0, |a: f32, b| a.max(b.abs()));
+        for i in plane {
+            let error = (sums[i] - expected[i]).abs();
+            assert!(error <= 2e-3 * largest, "{i}: {} instead of {}", sums[i], expected[i]);
+        }
+    }
+    // What is seen in one patch alone counts for density control as in the whole view.
+    let alone = (0..whole.count).filter(|&i| own_visits[i] == 1.0 && visits[i] == 1.0);
+    let alone: Vec<usize> = alone.collect();
+    assert!(alone.len() > whole.count / 4);
+    for i in alone {
+        let (own, norm) = (own_norms[i], norms[i]);
+        assert!((own - norm).abs() <= 1e-2 * norm + 1e-3, "{i}: {own} instead of {norm}");
+    }
+}
+
+/// Eight views of 64 x 48 pixels.
+fn dataset() -> Dataset {
+    crate::common::train::dataset(8, [64, 48])
+}
+
+fn config(patch_pixels: Option<u64>) -> TrainConfig {
+    let tone = ToneSettings::new(ToneCurve::Ap3);
+    let mut config = TrainConfig { steps: 60, tone, patch_pixels, ..Default::default() };
+    config.schedule.densify_after = 10;
+    config.schedule.densify_interval = 20;
+    config
+}
+
+#[test]
+fn training_begins_alike_and_sees_every_patch_of_every_photograph_in_turn() {
+    let dataset = dataset();
+    let whole = Trainer::new(&gpu(), config(None), &dataset).unwrap();
+    let mut trainer = Trainer::new(&gpu(), config(Some(800)), &dataset).unwrap();
+    assert_eq!(
+        whole.gaussians().unwrap().parameters,
+        trainer.gaussians().unwrap().parameters,
+        "colours come from whole photographs"
+    );
+    let photographs = dataset.train_views().count();
+    let reports = advance(&mut trainer, 4 * photographs as u64);
+    for view in dataset.train_views() {
+        assert_eq!(reports.iter().filter(|report| report.view == view.name).count(), 4);
+    }
+    // As good as the whole views make it, behind as many pixels.
+    let psnr = |config: TrainConfig| {
+        let mut trainer = Trainer::new(&gpu(), config.clone(), &dataset).unwrap();
+        advance(&mut trainer, config.steps);
+        let view = dataset.test_views().next().unwrap();
+        let shown = trainer.render(&view.camera).unwrap().colors;
+        Scores::of(&shown, view.reference.as_ref().unwrap()).unwrap().psnr
+    };
+    let expected = psnr(TrainConfig { steps: 60, ..config(None) });
+    let own = psnr(TrainConfig { steps: 240, ..config(Some(800)) });
+    assert!(own > expected - 0.5, "{own} dB, whole views {expected} dB");
+}
+
+#[test]
+fn every_part_of_the_model_trains_on_patches_and_two_runs_have_the_same_bits() {
+    let mut dataset = dataset();
+    for view in &mut dataset.views {
+        let (width, height) = (view.camera.width, view.camera.height);
+        let weights = (0..width * height).map(|i| f32::from(u8::from(i % width > 9))).collect();
+        view.mask = Some(Mask { width, height, weights });
+        view.depth = Some((0..width * height).map(|i| (i / width) as f32 / 48.0).collect());
+    }
+    let mut config = TrainConfig { steps: 12, ..config(Some(800)) };
+    config.schedule.resolution_steps = [0, 5];
+    let mut exposed = config.clone();
+    exposed.exposure.learn = Learning::On;
+    config.model.set_parts(&Part::ALL);
+    config.model.network.channels = 4;
+    config.model.network.stages = 2;
+    let mut cropped = config.clone();
+    cropped.model.denoiser_crop = 20;
+    for config in [config, cropped, exposed] {
+        let run = || {
+            let mut trainer = Trainer::new(&gpu(), config.clone(), &dataset).unwrap();
+            let reports = advance(&mut trainer, config.steps);
+            assert!(reports.iter().all(|report| report.loss.is_finite()));
+            let shown = trainer.render(&dataset.views[0].camera).unwrap();
+            assert_eq!([shown.colors.width, shown.colors.height], [64, 48]);
+            (trainer.gaussians().unwrap().parameters, shown.output().data.clone())
+        };
+        assert!(run() == run());
+    }
+}
+
+#[test]
+fn a_denoiser_sees_around_each_patch() {
+    let dataset = dataset();
+    let mut config = TrainConfig { steps: 20, ..config(None) };
+    config.model.set_parts(&[Part::Denoiser]);
+    config.model.network.channels = 4;
+    config.model.rates.denoiser = 1e-2;
+    let mut trainer = Trainer::new(&gpu(), config.clone(), &dataset).unwrap();
+    advance(&mut trainer, config.steps);
+    let sh_degree = config.render_settings().shape.sh_degree;
+    let gaussians = trainer.gaussians_in_frame().unwrap().with_sh_degree(sh_degree);
+    let camera = trainer.frame().camera(&dataset.views[0].camera);
+    let parameters = gpu().buffer("parameters", &gaussians.parameters).unwrap();
+    let options = RenderOptions { sh_degree: 0, background: [0.0; 3] };
+    let [whole, patches] = [None, Some(800)].map(|patch_pixels| {
+        let settings = RenderSettings { patch_pixels, ..config.render_settings() };
+        let mut renderer = Renderer::new(&gpu(), settings).unwrap();
+        let model = (&parameters, gaussians.count);
+        Rendered::new(&mut renderer, model, &camera, &options, trainer.networks()).unwrap()
+    });
+    let largest = |one: &Image, other: &Image| {
+        let errors = one.data.iter().zip(&other.data).map(|(one, other)| (one - other).abs());
+        errors.fold(0.0, f32::max)
+    };
+    assert!(largest(&whole.colors, &patches.colors) < 1e-3);
+    let [whole, patches] = [&whole, &patches].map(|shown| shown.denoised.as_ref().unwrap());
+    assert!(largest(whole, &dataset.views[0].image.clone().unwrap()) > 0.1);
+    // The norms look at each patch.
+    let error = largest(whole, patches);
+    assert!(error < 0.1, "{error}");
+}
+
+#[test]
+fn a_run_on_patches_says_so_is_resumed_to_the_same_bits_and_scored() {
+    let place = Place::new();
+    let output =
+        command(&place.train("straight", "--steps 30 --patch-pixels 600")).output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(said.contains("40x30, in 2 of about 20x30"), "{said}");
+    let config = String::from_utf8(place.read("straight/config.toml")).unwrap();
+    assert!(config.contains("patch_pixels = 600"));
+    let stopped = "--steps 30 --patch-pixels 600 --hash-every 7 --max-minutes 1e-7";
+    let output = command(&place.train("run", stopped)).output().unwrap();
+    assert_eq!(output.status.code(), Some(75));
+    succeed(&place.train("run", "--steps 30 --patch-pixels 600 --resume"));
+    assert!(place.model("run") == place.model("straight"));
+    assert!(
+        place.model("straight") != {
+            succeed(&place.train("whole", "--steps 30"));
+            place.model("whole")
+        }
+    );
+    refused(&place.train("few", "--patch-pixels 255"), 2, &["--patch-pixels is 255", "256"]);
+    assert!(!fs::exists(place.path("few")).unwrap());
+}
+
+/// So many Gaussians that each cover a view of this size.
+fn covering(count: usize, size: [u32; 2]) -> Setup {
+    let mut setup = Setup::new(count, size, 0, 4);
+    for i in 0..count {
+        let mut gaussian = setup.get(i);
+        gaussian.mean = setup.at_pixel(0.5 * setup.camera().size, 2.0 + i as f64 / 100.0);
+        gaussian.log_scale = DVec3::splat(1.0);
+        gaussian.raw_opacity = -4.0;
+        setup.set(i, &gaussian);
+    }
+    setup
+}
+
+#[test]
+fn more_intersections_than_the_device_binds_are_rendered_in_halves() {
+    let own = covering(300, [1440, 1280]);
+    let mut renderer = renderer(&own);
+    let most = renderer.most_intersections();
+    if most > 1 << 22 {
+        eprintln!("not run: this device binds {most} intersections at once");
+        return;
+    }
+    let gaussians = gpu().buffer("parameters", &own.parameters).unwrap();
+    let shown = renderer.render_channels(&gaussians, &own.camera, &own.options).unwrap();
+    assert!(renderer.intersections().unwrap() > most / 3, "the last was no half");
+    let mut parted = own.clone();
+    parted.settings.patch_pixels = Some(1 << 18);
+    let mut renderer = self::renderer(&parted);
+    let expected = renderer.render_channels(&gaussians, &own.camera, &own.options).unwrap();
+    let errors = shown.iter().zip(&expected).map(|(shown, expected)| (shown - expected).abs());
+    assert!(errors.fold(0.0, f32::max) < 1e-3);
+}
+
+#[test]
+fn training_takes_patches_of_which_the_device_follows_every_intersection() {
+    let own = covering(300, [1440, 1280]);
+    if renderer(&own).most_intersections() > 1 << 22 {
+        eprintln!("not run: this device binds more intersections at once");
+        return;
+    }
+    let dark = Image::filled(1440, 1280, [0.1; 3]);
+    let view = |name| View::new(name, Split::Train, own.camera, Some(dark.clone()));
+    let dataset = Dataset {
+        root: ".".into(),
+        views: vec![view("a"), view("b")],
+        points: vec![],
+        skipped: vec![],
+    };
+    let gaussians =
+        Gaussians { count: own.count, shape: own.settings.shape, parameters: own.parameters };
+    let mut config = TrainConfig { steps: 8, sh_degree: 0, ..config(None) };
+    config.frame = Some(Frame::WORLD);
+    config.schedule.resolution_steps = [0, 0];
+    let mut trainer = Trainer::from_gaussians(&gpu(), config, &dataset, &gaussians).unwrap();
+    // Four quarters of each, with room for twice the intersections.
+    let reports = advance(&mut trainer, 8);
+    for name in ["a", "b"] {
+        assert_eq!(reports.iter().filter(|report| report.view == name).count(), 4);
+    }
+}

@@ -1,0 +1,351 @@
+//! Runs that are interrupted and go on.
+
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Stdio;
+use std::time::Duration;
+
+use glam::Vec3;
+use nightsplat::gpu::testing::gpu;
+use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
+use nightsplat::photographs::dataset::{Dataset, Split, View};
+use nightsplat::photographs::image::Image;
+use nightsplat::results::run::{self, Event, HeldRun};
+use nightsplat::splats::scene::Attribute;
+use nightsplat::train::{Background, EndReason, Part, StepReport, TrainConfig, Trainer};
+use safetensors::SafeTensors;
+
+use crate::common::command::{command, refused, succeed};
+use crate::common::train::advance;
+
+/// A set of nine small views.
+fn make_set(folder: &Path) {
+    let options = SyntheticOptions {
+        views: 9,
+        width: 40,
+        height: 30,
+        seed: 2,
+        ..SyntheticOptions::default()
+    };
+    synthetic::write(folder, &options).unwrap();
+}
+
+/// Density control acts after steps 10 and 20 of thirty.
+fn config(parts: &[Part]) -> TrainConfig {
+    let mut config =
+        TrainConfig { steps: 30, background: Background::Random, ..TrainConfig::default() };
+    config.schedule.densify_after = 5;
+    config.schedule.densify_interval = 10;
+    config.schedule.sh_degree_interval = 8;
+    config.model.set_parts(parts);
+    config.model.network.channels = 4;
+    config.model.network.stages = 2;
+    config.model.network.repeats = 2;
+    config.model.denoiser_crop = 16;
+    config
+}
+
+/// The whole state at the end, and what every step said.
+fn finished(trainer: &mut Trainer, folder: &Path) -> (Vec<u8>, Vec<StepReport>) {
+    let reports = advance(trainer, 30);
+    let path = folder.join("end.safetensors");
+    trainer.save_checkpoint(&path).unwrap();
+    (fs::read(path).unwrap(), reports)
+}
+
+#[test]
+fn a_restored_run_goes_on_bit_for_bit() {
+    let folder = tempfile::tempdir().unwrap();
+    make_set(folder.path());
+    let gpu = gpu();
+    for parts in [&[][..], &[Part::Denoiser, Part::Tonemapper, Part::Structure]] {
+        let config = config(parts);
+        let dataset = Dataset::load(folder.path(), &config.load_options()).unwrap();
+        let new = || Trainer::new(&gpu, config.clone(), &dataset).unwrap();
+        let (expected, all) = finished(&mut new(), folder.path());
+        // Between passes of density control, right behind one, and before the first.
+        for step in [17, 20, 3] {
+            let checkpoint = folder.path().join("checkpoint.safetensors");
+            let mut interrupted = new();
+            advance(&mut interrupted, step);
+            interrupted.save_checkpoint(&checkpoint).unwrap();
+            let mut restored = new();
+            // Whatever the trainer did before is gone.
+            advance(&mut restored, 12);
+            restored.restore(&checkpoint).unwrap();
+            assert_eq!(restored.steps_done(), step);
+            let (end, reports) = finished(&mut restored, folder.path());
+            assert!(end == expected, "{parts:?} from step {step}: another end");
+            let same = reports.iter().zip(&all[step as usize..]);
+            assert!(same.clone().all(|(a, b)| a.terms == b.terms && a.view == b.view));
+            assert_eq!(same.len() as u64, 30 - step);
+        }
+    }
+}
+
+/// What can never be gained ends both as soon as it is asked for.
+#[test]
+fn growth_and_the_sh_degree_end_where_held_out_views_gain_too_little_and_a_resumed_run_knows_it() {
+    let folder = tempfile::tempdir().unwrap();
+    // So many that one can be held out.
+    let options = SyntheticOptions {
+        views: 12,
+        width: 40,
+        height: 30,
+        seed: 2,
+        ..SyntheticOptions::default()
+    };
+    synthetic::write(folder.path(), &options).unwrap();
+    let gpu = gpu();
+    let mut free = config(&[]);
+    free.schedule.densify_interval = 3;
+    free.schedule.resolution_steps = [0, 0];
+    free.stop.views = 1;
+    let mut ending = free.clone();
+    (ending.stop.growth_gain, ending.stop.degree_gain) = (1e3, 1e3);
+    let dataset = Dataset::load(folder.path(), &free.load_options()).unwrap();
+    let new = |config: &TrainConfig| Trainer::new(&gpu, config.clone(), &dataset).unwrap();
+    let [mut freely, mut ended] = [new(&free), new(&ending)];
+    finished(&mut freely, folder.path());
+    // Rounds after steps 6, 9, 12, 15 and 18; the first degree has been in use from step 8 to 15.
+    advance(&mut ended, 18);
+    let count = ended.gaussian_count();
+    let (expected, _) = finished(&mut ended, folder.path());
+    assert!(ended.held_out_psnr().unwrap().is_some());
+    let colors = |trainer: &Trainer| trainer.gaussians().unwrap().rest().to_vec();
+    assert!(ended.gaussian_count() <= count && freely.gaussian_count() > count);
+    assert!(colors(&ended).iter().all(|rest| *rest == Vec3::ZERO));
+    assert!(colors(&freely).iter().any(|rest| *rest != Vec3::ZERO));
+    for step in [13, 16, 20] {
+        let checkpoint = folder.path().join("checkpoint.safetensors");
+        let mut interrupted = new(&ending);
+        advance(&mut interrupted, step);
+        interrupted.save_checkpoint(&checkpoint).unwrap();
+        let mut restored = new(&ending);
+        restored.restore(&checkpoint).unwrap();
+        assert!(finished(&mut restored, folder.path()).0 == expected, "from step {step}");
+    }
+}
+
+/// A set of which one view is held out, and a run on it that converges as soon as it can: what is gained is never enough.
+fn early(folder: &Path) -> (Dataset, TrainConfig) {
+    let options = SyntheticOptions {
+        views: 12,
+        width: 40,
+        height: 30,
+        seed: 2,
+        ..SyntheticOptions::default()
+    };
+    synthetic::write(folder, &options).unwrap();
+    let mut config = config(&[]);
+    config.steps = 60;
+    config.schedule.resolution_steps = [0, 0];
+    (config.stop.views, config.stop.every, config.stop.gain) = (1, 7, 90.0);
+    config.schedule.settle_steps = 9;
+    (Dataset::load(folder, &config.load_options()).unwrap(), config)
+}
+
+fn ended(trainer: &mut Trainer, folder: &Path) -> Vec<u8> {
+    while !trainer.has_ended() {
+        trainer.advance(u64::MAX).unwrap();
+    }
+    let path = folder.join("end.safetensors");
+    trainer.save_checkpoint(&path).unwrap();
+    fs::read(path).unwrap()
+}
+
+#[test]
+fn a_run_that_converges_settles_and_ends_and_so_does_one_that_was_killed() {
+    let folder = tempfile::tempdir().unwrap();
+    let (dataset, config) = early(folder.path());
+    let new = || Trainer::new(&gpu(), config.clone(), &dataset).unwrap();
+    let mut whole = new();
+    assert!(whole.may_end_early());
+    let expected = ended(&mut whole, folder.path());
+    // Rounds follow steps 10 and 20. Scores that fall in the ten steps after one wait for the end of these.
+    let steps: Vec<u64> = whole.held_out_scores().map(|(step, _)| step).collect();
+    assert_eq!(steps, [7, 20, 30, 39]);
+    assert_eq!((whole.settles_after(), whole.steps_done(), whole.may_end_early()), (30, 39, false));
+    let rate = |step| whole.learning_rates(step)[Attribute::Quats];
+    assert!(rate(30) > 0.99 * rate(29) && rate(39) < 0.06 * rate(30));
+    let refused = whole.advance(60).unwrap_err().to_string();
+    assert!(refused.contains("has ended at step 39, before step 60"), "{refused}");
+    let end = whole.end().unwrap();
+    assert_eq!((end.reason, end.step), (EndReason::Converged, 39));
+    // In growth, after a score, at the step that converges, and while it settles.
+    for step in [5, 20, 25, 30, 34] {
+        let checkpoint = folder.path().join("checkpoint.safetensors");
+        let mut interrupted = new();
+        advance(&mut interrupted, step);
+        interrupted.save_checkpoint(&checkpoint).unwrap();
+        let mut restored = new();
+        restored.restore(&checkpoint).unwrap();
+        assert!(ended(&mut restored, folder.path()) == expected, "from step {step}");
+        assert_eq!(restored.end().unwrap(), end);
+    }
+}
+
+#[test]
+fn a_run_that_is_resumed_with_other_steps_takes_them_all() {
+    let folder = tempfile::tempdir().unwrap();
+    let (dataset, config) = early(folder.path());
+    let checkpoint = folder.path().join("end.safetensors");
+    ended(&mut Trainer::new(&gpu(), config.clone(), &dataset).unwrap(), folder.path());
+    let longer = TrainConfig { steps: 48, ..config };
+    let mut restored = Trainer::new(&gpu(), longer, &dataset).unwrap();
+    restored.restore(&checkpoint).unwrap();
+    assert_eq!((restored.last_step(), restored.may_end_early()), (48, false));
+    ended(&mut restored, folder.path());
+    let end = restored.end().unwrap();
+    assert_eq!((end.reason, end.step), (EndReason::Steps, 48));
+}
+
+#[test]
+fn held_out_views_that_show_nothing_are_not_scored() {
+    let folder = tempfile::tempdir().unwrap();
+    let (mut dataset, config) = early(folder.path());
+    let held_out = |view: &&mut View| view.split == Split::HeldOut;
+    let view = dataset.views.iter_mut().find(held_out).unwrap();
+    (view.image, view.original) = (Some(Image::filled(40, 30, [0.0; 3])), None);
+    let mut trainer = Trainer::new(&gpu(), config, &dataset).unwrap();
+    assert!(!trainer.may_end_early());
+    assert_eq!((trainer.last_step(), trainer.held_out_psnr().unwrap()), (60, None));
+}
+
+#[test]
+fn a_checkpoint_that_does_not_fit_is_refused_and_changes_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    make_set(folder.path());
+    let (gpu, path) = (gpu(), folder.path().join("checkpoint.safetensors"));
+    let config = config(&[]);
+    let dataset = Dataset::load(folder.path(), &config.load_options()).unwrap();
+    let mut trainer = Trainer::new(&gpu, config.clone(), &dataset).unwrap();
+    advance(&mut trainer, 6);
+    trainer.save_checkpoint(&path).unwrap();
+    let whole = fs::read(&path).unwrap();
+    let (before, count) = (trainer.gaussians().unwrap(), trainer.gaussian_count());
+
+    let refuses = |trainer: &mut Trainer, bytes: &[u8], parts: &[&str]| {
+        fs::write(&path, bytes).unwrap();
+        let message = trainer.restore(&path).unwrap_err().to_string();
+        for part in parts.iter().chain(&["checkpoint.safetensors"]) {
+            assert!(message.contains(part), "`{part}` is not in: {message}");
+        }
+    };
+    let edited = |from: &str, to: &str| {
+        assert_eq!(from.len(), to.len());
+        let at = whole.windows(from.len()).position(|window| window == from.as_bytes()).unwrap();
+        [&whole[..at], to.as_bytes(), &whole[at + from.len()..]].concat()
+    };
+    refuses(&mut trainer, &whole[..whole.len() - 5], &["no whole checkpoint"]);
+    refuses(&mut trainer, b"", &["no whole checkpoint"]);
+    refuses(&mut trainer, &edited("checkpoint 1", "checkpoint 9"), &["is no `nightsplat"]);
+    refuses(&mut trainer, &edited("visit_counts", "visit_c0unts"), &["density.visit_counts"]);
+    refuses(&mut trainer, &edited("first_moments", "first_m0ments"), &["gaussians.first_moments"]);
+    refuses(
+        &mut trainer,
+        &edited("seed = 10", "seed = 11"),
+        &["seed = 11, not 10", "HeldRun::Replace"],
+    );
+    refuses(&mut trainer, &edited("steps = 30", "stepz = 30"), &["another version"]);
+    let file = SafeTensors::deserialize(&whole).unwrap();
+    let sums = file.tensor("density.grad_norm_sums").unwrap().data();
+    let at = sums.as_ptr() as usize - whole.as_ptr() as usize;
+    let mut spoiled = whole.clone();
+    spoiled[at..at + 4].copy_from_slice(&f32::NAN.to_le_bytes());
+    refuses(&mut trainer, &spoiled, &["not finite"]);
+    assert_eq!((trainer.gaussians().unwrap(), trainer.gaussian_count()), (before, count));
+
+    let shorter = TrainConfig { steps: 5, ..config };
+    let mut shorter = Trainer::new(&gpu, shorter, &dataset).unwrap();
+    refuses(&mut shorter, &whole, &["at step 6", "ends at 5", "TrainConfig::steps"]);
+}
+
+#[test]
+fn a_run_tells_its_observer_everything_in_order() {
+    let folder = tempfile::tempdir().unwrap();
+    make_set(&folder.path().join("set"));
+    let config = TrainConfig { eval_every: 12, checkpoint_every: 20, ..config(&[]) };
+    let dataset = Dataset::load(folder.path().join("set"), &config.load_options()).unwrap();
+    let train = |config: &TrainConfig, held| {
+        let mut told = vec![];
+        let out = folder.path().join("run");
+        let trained = run::train(&gpu(), config, &dataset, &out, held, |event| {
+            told.push(match event {
+                Event::Started { step, steps, .. } => format!("started {step} of {steps}"),
+                Event::Step(report) => format!("step {}", report.step),
+                Event::Checkpointed { step } => format!("checkpointed {step}"),
+                Event::Evaluated { step, scored } => format!("evaluated {step}: {}", scored.len()),
+                Event::Ended(ended) => format!("ended {}", ended.step),
+                Event::Finished(trained) => format!("finished {}", trained.scored.len()),
+                _ => String::new(),
+            });
+        });
+        (trained.map(|trained| trained.losses.len()), told)
+    };
+    let mut expected = vec!["started 0 of 30".to_owned()];
+    for step in 1..=30 {
+        expected.push(format!("step {step}"));
+        expected.extend((step == 20).then(|| "checkpointed 20".to_owned()));
+        expected.extend((step % 12 == 0).then(|| format!("evaluated {step}: 2")));
+    }
+    let end = ["checkpointed 30", "ended 30", "evaluated 30: 2", "finished 2"];
+    expected.extend(end.map(str::to_owned));
+    let (steps, told) = train(&config, HeldRun::Refuse);
+    assert_eq!((steps.unwrap(), told), (30, expected));
+
+    let (refused, told) = train(&config, HeldRun::Refuse);
+    assert!(refused.unwrap_err().to_string().contains("already holds a run") && told.is_empty());
+    let (steps, told) = train(&TrainConfig { steps: 33, ..config }, HeldRun::Resume);
+    assert_eq!((steps.unwrap(), told[0].as_str()), (3, "started 30 of 33"));
+}
+
+/// The log without the column of times.
+fn log(run: &Path) -> Vec<String> {
+    let text = fs::read_to_string(run.join("train.csv")).unwrap();
+    text.lines().map(|line| line.rsplit_once(',').unwrap().0.to_owned()).collect()
+}
+
+#[test]
+fn a_killed_run_is_resumed_to_the_same_model() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    make_set(&path("set"));
+    let set = path("set").display().to_string();
+    let train = |run: &PathBuf, options: &str| {
+        format!("train {set} --out {} --sh-degree 1 --checkpoint-every 10 {options}", run.display())
+    };
+    let (straight, killed) = (path("straight"), path("killed"));
+    succeed(&train(&straight, "--steps 200"));
+
+    // Without a checkpoint it begins; killed at some step behind one, it goes on.
+    let mut child = command(&train(&killed, "--steps 200 --resume"));
+    let mut child = child.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+    let checkpoint = killed.join("checkpoint.safetensors");
+    while !checkpoint.exists() && child.try_wait().unwrap().is_none() {
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    child.kill().unwrap();
+    child.wait().unwrap();
+    assert!(!killed.join("metrics.json").exists(), "the run ended before it was killed");
+    succeed(&train(&killed, "--steps 200 --resume"));
+    let model = |run: &Path| fs::read(run.join("model.ply")).unwrap();
+    assert!(model(&killed) == model(&straight));
+    assert_eq!(log(&killed), log(&straight));
+
+    // A finished run is made longer; what it had written of its end is replaced.
+    succeed(&train(&killed, "--steps 203 --resume"));
+    assert_eq!(log(&killed).len(), 204);
+    assert!(model(&killed) != model(&straight));
+
+    refused(&train(&killed, "--steps 203 --resume --overwrite"), 2, &["--overwrite"]);
+    refused(&train(&killed, "--steps 300 --resume --seed 4"), 3, &["seed = 10, not 4"]);
+    refused(&train(&killed, "--steps 199 --resume"), 3, &["at step 203", "--steps"]);
+    fs::write(killed.join("train.csv"), "step,view\n1,000,1\n").unwrap();
+    refused(&train(&killed, "--steps 300 --resume"), 3, &["train.csv", "step 203"]);
+    fs::remove_file(&checkpoint).unwrap();
+    fs::remove_file(killed.join("checkpoint.before.safetensors")).unwrap();
+    refused(&train(&killed, "--steps 300 --resume"), 1, &["already holds a run", "--overwrite"]);
+}

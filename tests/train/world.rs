@@ -1,0 +1,125 @@
+//! Where the world's origin lies and how large its unit is makes no difference to a model.
+
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
+use glam::{DAffine3, DVec3};
+use nightsplat::camera::Frame;
+use nightsplat::gpu::testing::gpu;
+use nightsplat::photographs::dataset::Dataset;
+use nightsplat::photographs::metrics::Scores;
+use nightsplat::results::eval::{self, Player, ViewScore};
+use nightsplat::results::run::{self, HeldRun};
+use nightsplat::train::{TrainConfig, Trainer};
+
+use crate::common::train::advance;
+
+fn config() -> TrainConfig {
+    let mut config = TrainConfig { steps: 150, ..TrainConfig::default() };
+    config.schedule.densify_after = 10;
+    config.schedule.densify_interval = 40;
+    config.schedule.resolution_steps = [0, 40];
+    config
+}
+
+/// The same scene, seen from the same cameras, in another world: scaled, then moved.
+fn moved(dataset: &Dataset, scale: f64, offset: DVec3) -> Dataset {
+    let mut moved = dataset.clone();
+    for view in &mut moved.views {
+        let DAffine3 { matrix3, translation } = view.camera.view_from_world;
+        let translation = scale * translation - matrix3 * offset;
+        view.camera.view_from_world = DAffine3 { matrix3, translation };
+    }
+    for point in &mut moved.points {
+        point.position = scale * point.position + offset;
+    }
+    moved
+}
+
+fn mean_psnr(scored: &[ViewScore]) -> f64 {
+    let scores: Vec<Scores> = scored.iter().map(|view| view.scores).collect();
+    Scores::mean(&scores).unwrap().psnr
+}
+
+const WORLDS: [(f64, f64); 7] =
+    [(1e-6, 0.0), (0.03, 0.0), (0.4, 1e4), (1e3, 0.0), (1e6, 0.0), (1.0, 1e7), (1e-3, -1e5)];
+
+#[test]
+fn a_scene_trains_alike_however_large_and_wherever_it_is() {
+    let dataset = crate::common::train::dataset(10, [64, 48]);
+    let psnr = |dataset: &Dataset| {
+        let mut trainer = Trainer::new(&gpu(), config(), dataset).unwrap();
+        advance(&mut trainer, config().steps);
+        mean_psnr(&eval::score(dataset, |view| trainer.render(&view.camera)).unwrap())
+    };
+    let expected = psnr(&dataset);
+    assert!(expected > 17.0, "{expected}");
+    for (scale, offset) in WORLDS {
+        let there = psnr(&moved(&dataset, scale, offset * DVec3::new(1.0, -0.7, 0.1)));
+        assert!((there - expected).abs() < 0.05, "{scale} at {offset}: {there}, not {expected}");
+    }
+}
+
+#[test]
+fn a_run_in_any_world_is_scored_as_it_was_trained_and_its_model_lies_in_that_world() {
+    let dataset = crate::common::train::dataset(10, [64, 48]);
+    let config = TrainConfig { steps: 40, ..config() };
+    for (scale, offset) in [(1e-6, 0.0), (1e6, 0.0), (3.0, 1e7)] {
+        let offset = offset * DVec3::new(1.0, -0.7, 0.1);
+        let there = moved(&dataset, scale, offset);
+        let folder = tempfile::tempdir().unwrap();
+        let out = folder.path().join("run");
+        let trained = run::train(&gpu(), &config, &there, &out, HeldRun::Refuse, |_| {}).unwrap();
+        let recorded = run::load_config(&out).unwrap();
+        let frame = recorded.frame.unwrap();
+        assert_ne!(frame, Frame::WORLD);
+        let gaussians = run::load_model(&out, false).unwrap();
+        let mut player = Player::new(&gpu(), &gaussians, &recorded, None).unwrap();
+        let scored = eval::score(&there, |view| player.render(view)).unwrap();
+        let (again, then) = (mean_psnr(&scored), mean_psnr(&trained.scored));
+        assert!((again - then).abs() < 0.01, "{scale} at {offset}: {again}, not {then}");
+
+        // What other programs see: positions in the world, behind the origin that the header names.
+        let header = std::fs::read(out.join("model.ply")).unwrap();
+        let header = String::from_utf8_lossy(&header[..400]).into_owned();
+        let origin = frame.file_origin();
+        assert_eq!(
+            header.contains("comment world = position + "),
+            origin != DVec3::ZERO,
+            "{header}"
+        );
+        let mean = |positions: &mut dyn Iterator<Item = DVec3>, count: usize| {
+            positions.sum::<DVec3>() / count as f64
+        };
+        let model = mean(
+            &mut gaussians.means().iter().map(|mean| mean.as_dvec3() + origin),
+            gaussians.count,
+        );
+        let points = mean(&mut there.points.iter().map(|point| point.position), there.points.len());
+        assert!(model.distance(points) < 0.5 * there.extent(), "{model} {points}");
+        let scales = gaussians.log_scales().iter().map(|scale| f64::from(scale.x)).sum::<f64>();
+        let typical = (scales / gaussians.count as f64).exp() / there.extent();
+        assert!((1e-3..1.0).contains(&typical), "{scale}: {typical} of the extent");
+    }
+}
+
+#[test]
+fn a_resumed_run_stays_in_its_frame_and_an_old_one_in_its_world() {
+    let dataset = moved(&crate::common::train::dataset(10, [64, 48]), 0.1, DVec3::ZERO);
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("run");
+    let config = TrainConfig { steps: 6, checkpoint_every: 5, ..config() };
+    run::train(&gpu(), &config, &dataset, &out, HeldRun::Refuse, |_| {}).unwrap();
+    let longer = TrainConfig { steps: 8, ..config };
+    let resumed = run::train(&gpu(), &longer, &dataset, &out, HeldRun::Resume, |_| {}).unwrap();
+    assert_eq!(*resumed.trainer.frame(), dataset.frame());
+    assert_ne!(dataset.frame(), Frame::WORLD);
+    // As a version wrote it that knew no frames.
+    let path = out.join("config.toml");
+    let text = std::fs::read_to_string(&path).unwrap();
+    let (before, behind) = text.split_once("[frame]\n").unwrap();
+    let behind = behind.split_once("\n[").map_or("", |(_, behind)| behind);
+    std::fs::write(&path, format!("{before}[{behind}")).unwrap();
+    let longer = TrainConfig { steps: 9, ..longer };
+    let old = run::train(&gpu(), &longer, &dataset, &out, HeldRun::Resume, |_| {}).unwrap();
+    assert_eq!(*old.trainer.frame(), Frame::WORLD);
+}
