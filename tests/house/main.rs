@@ -6,4 +6,5 @@
 mod common;
 
 mod architecture;
+mod circles;
 mod install;
