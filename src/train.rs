@@ -474,7 +474,8 @@ impl Trainer {
         let model = &mut self.model;
         let [decoded, decoded_photograph] = &mut self.decoded;
 
-        self.renderer.forward(pass, &model.gaussians, view.patch, &options)?;
+        let viewpoint = self.views.viewpoint(view);
+        self.renderer.forward(pass, &model.gaussians, viewpoint, &options)?;
         let (render, status) = self.renderer.render_and_status();
         let (d_render, size) = (&mut self.d_render, view.size());
         let input = view.input.decoded(pass, decoded)?;
@@ -528,7 +529,7 @@ impl Trainer {
         self.renderer.backward(
             pass,
             &model.gaussians,
-            view.patch,
+            viewpoint,
             &options,
             damping,
             &self.d_render,

@@ -133,6 +133,10 @@ pub(crate) struct TrainOptions {
     /// Masks (masks/NAME.png or masks/NAME.jpg.png of the dataset) hide what is white, not what is black
     #[arg(long)]
     invert_masks: bool,
+    /// Undistort the photographs of a fisheye to a pinhole's, cropped to 60 degrees off its axis, in place of training on
+    /// the fisheye as it is; those of other distorted lenses are always undistorted
+    #[arg(long)]
+    undistort: bool,
     #[command(flatten)]
     model: ModelOptions,
     /// Nothing nearer to a camera is seen, in units of the scene's extent: of how far the cameras stand from their middle [default: {near}]
@@ -395,6 +399,7 @@ impl TrainOptions {
         set(&mut config.check.every, &self.check_every);
         config.check.stops |= self.check_stops;
         config.invert_masks |= self.invert_masks;
+        config.undistort |= self.undistort;
         if self.exposures.is_some() {
             (config.exposure.learn, config.exposure.start) = (Learning::On, self.exposures.clone());
         }

@@ -71,6 +71,8 @@ pub struct TrainConfig {
     /// Masks hide what is white, not what is black.
     #[serde(skip_serializing_if = "is_off")]
     pub invert_masks: bool,
+    /// Photographs of a fisheye are undistorted to a pinhole's, cropped to 60 degrees off the axis.
+    pub undistort: bool,
     /// Steps; each renders one training view.
     pub steps: u64,
     /// Factor by which photographs shrink.
@@ -195,6 +197,7 @@ impl Default for TrainConfig {
             reference: None,
             init: None,
             invert_masks: false,
+            undistort: false,
             steps: 5000,
             downscale: 1.0,
             max_resolution: 1600,
@@ -301,6 +304,7 @@ impl TrainConfig {
             keep: CacheSize::on_host(self.cache, self.max_ram),
             reference: self.reference.clone(),
             invert_masks: self.invert_masks,
+            undistort: self.undistort,
             hold_out: self.stop.views,
             depth: DepthOptions {
                 load: self.model.depth,

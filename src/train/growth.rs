@@ -185,7 +185,13 @@ mod tests {
     fn no_round_costs_the_training_views_much() {
         for seed in 1..=3 {
             let folder = tempfile::tempdir().unwrap();
-            let options = SyntheticOptions { views: 12, width: 64, height: 48, seed };
+            let options = SyntheticOptions {
+                views: 12,
+                width: 64,
+                height: 48,
+                seed,
+                ..SyntheticOptions::default()
+            };
             synthetic::write(folder.path(), &options).unwrap();
             let mut config = of(Preset::Fast, folder.path(), seed);
             config.schedule.densify_interval = 50;

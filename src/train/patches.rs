@@ -99,6 +99,7 @@ mod tests {
     use glam::{DAffine3, DVec2};
 
     use super::*;
+    use crate::camera::CameraModel;
     use crate::gpu::testing::gpu;
     use crate::train::Part;
 
@@ -109,6 +110,7 @@ mod tests {
             height,
             focal: size,
             principal_point: 0.5 * size,
+            model: CameraModel::Pinhole,
             view_from_world: DAffine3::IDENTITY,
         }
     }
