@@ -34,7 +34,7 @@ use crate::{Error, Result};
 pub use fingerprint::Fingerprint;
 use listing::{ListedView, Listing, list, warn};
 use members::with_held_out;
-pub use options::{DepthOptions, LoadOptions};
+pub use options::{DOWNSCALE, DepthOptions, LoadOptions};
 pub use pixels::Original;
 use pixels::Source;
 use points::points;

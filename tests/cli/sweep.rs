@@ -271,12 +271,11 @@ fn train_sets_any_setting_by_its_path() {
     let train = format!("train {set} --out {}", out.display());
     let (_, said) = run(&format!("{train} --set density.grad=1"), 2);
     assert!(said.contains("density.grad") && said.contains("nearest"), "{said}");
-    run(
-        &format!("{train} --steps 9 --set steps=1 --set tone.alpha=0.2 --set background=random"),
-        0,
-    );
+    run(&format!("{train} --steps 9 --set steps=1 --set tone.alpha=0.2 --set background=black"), 0);
     let config = fs::read_to_string(out.join("config.toml")).unwrap();
-    for line in ["steps = 1\n", "alpha = 0.2\n", "background = \"random\"\n"] {
+    for line in
+        ["steps = 1  # --set\n", "alpha = 0.2  # --set\n", "background = \"black\"  # --set\n"]
+    {
         assert!(config.contains(line), "{config}");
     }
 }

@@ -10,7 +10,7 @@ use nightsplat::train::{StepReport, TrainConfig, Trainer};
 pub(crate) fn dataset(views: usize, [width, height]: [u32; 2]) -> Dataset {
     let folder = tempfile::tempdir().unwrap();
     synthetic::write(folder.path(), &SyntheticOptions { views, width, height, seed: 1 }).unwrap();
-    Dataset::load(folder.path(), &TrainConfig::default().load_options()).unwrap()
+    Dataset::load(folder.path(), &TrainConfig::bare().load_options()).unwrap()
 }
 
 /// Trains until a step; what the steps said.
