@@ -112,21 +112,23 @@ impl fmt::Display for Rule {
         use Bound::{Excluded, Included, Unbounded};
         match self {
             Self::Flag => out.write_str("true or false"),
-            Self::Whole(least, most) if *most >= i64::MAX as u64 => {
+            Self::Whole(least, most) if *most >= u32::MAX.into() => {
                 write!(out, "a whole number, at least {least}")
             }
             Self::Whole(least, most) => write!(out, "a whole number, {least} to {most}"),
-            Self::Number(Included(least), Included(most)) => write!(out, "{least} to {most}"),
+            Self::Number(Included(least), Included(most)) => {
+                write!(out, "{} to {}", short(*least), short(*most))
+            }
             Self::Number(Unbounded, Unbounded) => out.write_str("a finite number"),
             Self::Number(least, most) => {
                 let least = match least {
-                    Included(least) => Some(format!("at least {least}")),
-                    Excluded(least) => Some(format!("above {least}")),
+                    Included(least) => Some(format!("at least {}", short(*least))),
+                    Excluded(least) => Some(format!("above {}", short(*least))),
                     Unbounded => None,
                 };
                 let most = match most {
-                    Included(most) => Some(format!("at most {most}")),
-                    Excluded(most) => Some(format!("below {most}")),
+                    Included(most) => Some(format!("at most {}", short(*most))),
+                    Excluded(most) => Some(format!("below {}", short(*most))),
                     Unbounded => Some("finite".to_owned()),
                 };
                 let bounds: Vec<String> = least.into_iter().chain(most).collect();
@@ -141,13 +143,23 @@ impl fmt::Display for Rule {
     }
 }
 
+/// A number without a row of zeros.
+fn short(number: f64) -> String {
+    let is_plain = number == 0.0 || (1e-6..1e7).contains(&number.abs());
+    if is_plain { number.to_string() } else { format!("{number:e}") }
+}
+
 impl Setting {
-    /// What it does, in one line, with its unit.
+    /// What it does, in one line.
     pub fn help(&self) -> String {
         let lines: Vec<&str> = self.help.iter().map(|line| line.trim()).collect();
-        let text = lines.join(" ");
-        let text = text.trim_end_matches('.');
-        if self.unit.is_empty() { text.to_owned() } else { format!("{text} [{}]", self.unit) }
+        lines.join(" ").trim_end_matches('.').to_owned()
+    }
+
+    /// The values that it takes, with their unit.
+    pub fn takes(&self) -> String {
+        let Self { rule, unit, .. } = self;
+        if unit.is_empty() { rule.to_string() } else { format!("{rule}, in {unit}") }
     }
 
     /// The option's name without its dashes, and what its value is called; none is a flag's.
@@ -158,7 +170,7 @@ impl Setting {
 
     /// What is to be said of a value that it does not take.
     pub fn refused(&self, value: impl fmt::Display) -> Error {
-        let (key, rule) = (self.key.to_string(), self.rule.to_string());
+        let (key, rule) = (self.key.to_string(), self.takes());
         Error::Setting { key, value: value.to_string(), rule }
     }
 

@@ -21,11 +21,12 @@ settings! {
 /// A translation and a scaling of the world.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Frame {
-    /// The origin of the frame in which the model is trained, in the world. Without `frame` it is found from the cameras, and
-    /// recorded.
-    center: [f64; 3] = [0.0; 3] => Rule::List(3, 3, &Rule::Number(Bound::Unbounded, Bound::Unbounded)), in "world units";
+    /// The origin of the frame in which the model is trained, in the world.
+    center: [f64; 3] = [0.0; 3], "found from the cameras, and recorded"
+        => Rule::List(3, 3, &Rule::Number(Bound::Unbounded, Bound::Unbounded)), in "world units";
     /// Units of the frame in a unit of the world.
-    scale: f64 = 1.0 => Rule::Number(Bound::Included(f64::MIN_POSITIVE), Bound::Unbounded);
+    scale: f64 = 1.0, "found from the cameras, and recorded"
+        => Rule::Number(Bound::Included(f64::MIN_POSITIVE), Bound::Unbounded);
 }
 }
 

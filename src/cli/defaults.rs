@@ -3,8 +3,7 @@
 use clap::Command;
 use toml::Value;
 
-use crate::train::TrainConfig;
-use crate::train::settings::values;
+use crate::train::{TrainConfig, values};
 
 /// The command with `{tone.theta}` in an option's help replaced by the default of that setting, and `{tone.gain_c of
 /// ase}` by the one that comes with that curve. A negative number is a value, so that what refuses it names its option.
@@ -81,7 +80,7 @@ mod tests {
             assert_eq!(config, expected, "{option}");
             checked += 1;
         }
-        assert_eq!(checked, 25);
+        assert_eq!(checked, 26);
         assert_eq!(filled("c [{tone.gain_c of ase}, {tone.gain_c of ap3}]"), "c [3, 1]");
     }
 }

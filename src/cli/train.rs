@@ -17,8 +17,7 @@ use crate::base::output::printable;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::results::eval;
 use crate::results::run::{self, HeldRun, RunDirectory, Session, Trained};
-use crate::train::settings::Origin;
-use crate::train::{Planned, Planning};
+use crate::train::{Origin, Planned, Planning};
 
 /// Train a 3D Gaussian Splatting model from dark photographs.
 ///

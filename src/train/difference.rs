@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use toml::Value;
 
 use super::TrainConfig;
-use super::settings::values;
+use super::layers::values;
 use crate::Result;
 use crate::base::hash::{self, Hasher};
 

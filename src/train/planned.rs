@@ -5,7 +5,7 @@ use std::path::Path;
 use toml::Value;
 
 use super::diagnose::{Diagnosis, Plan};
-use super::settings::{Layer, Origin, Settings};
+use super::layers::{Layer, Origin, Settings};
 use super::{Preset, TrainConfig, Trainer};
 use crate::gpu::Gpu;
 use crate::photographs::dataset::{Dataset, LoadOptions};
@@ -109,7 +109,7 @@ impl Said {
 }
 
 /// As the configuration's, with depth maps wherever there are some: whether there are is part of the diagnosis.
-pub(crate) fn diagnosed(config: &TrainConfig) -> LoadOptions {
+pub fn diagnosed(config: &TrainConfig) -> LoadOptions {
     let mut options = config.load_options();
     options.depth.load = true;
     options

@@ -8,7 +8,7 @@ use std::str::FromStr;
 use toml::Value;
 
 use super::TrainConfig;
-use super::settings::{Layer, Origin};
+use super::layers::{Layer, Origin};
 use crate::photographs::tone::ToneCurve;
 use crate::{Error, Result};
 

@@ -4,7 +4,8 @@ use std::fmt::Write;
 
 use toml::Value;
 
-use super::settings::{SETTINGS, values};
+use super::layers::values;
+use super::settings::SETTINGS;
 use super::{Preset, TrainConfig};
 use crate::Result;
 use crate::base::settings::Setting;
@@ -38,7 +39,7 @@ pub fn reference() -> Result<String> {
             "| `{}` | {} | {} | {} |",
             row.key,
             default.map_or_else(|| row.absent.unwrap_or_default().to_owned(), cell),
-            escaped(&row.rule.to_string()),
+            escaped(&row.takes()),
             escaped(&told(row)),
         );
     }

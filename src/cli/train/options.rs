@@ -9,8 +9,8 @@ use toml::{Table, Value};
 use crate::base::settings::{Rule, Setting};
 use crate::photographs::tone::{CurveChoice, GainChoice, Profile, ToneSettings};
 use crate::train::diagnose::Plan;
-use crate::train::settings::{Layer, Origin, SETTINGS};
-use crate::train::{ModelName, Part, Preset, Said, TrainConfig};
+use crate::train::settings::SETTINGS;
+use crate::train::{Layer, ModelName, Origin, Part, Preset, Said, TrainConfig};
 use crate::{Error, Result};
 
 /// The options of a run; each wins over the configuration file.

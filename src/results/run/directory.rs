@@ -41,8 +41,7 @@ use crate::loss::exposure::{Affine, table};
 use crate::photographs::dataset::{Dataset, Split, View};
 use crate::splats::scene::{Gaussians, ply};
 use crate::train::diagnose::Plan;
-use crate::train::settings::Settings;
-use crate::train::{Networks, StepReport, TrainConfig, Trainer};
+use crate::train::{Networks, Settings, StepReport, TrainConfig, Trainer};
 use crate::{Error, Result};
 
 /// A run directory and the log that grows in it.

@@ -12,8 +12,7 @@ use crate::photographs::dataset::{Dataset, View};
 use crate::results::eval::{self, Compared, ViewScore, Yardstick};
 use crate::splats::attributes::{ATTRIBUTES, AttributeSpec};
 use crate::train::diagnose::Plan;
-use crate::train::settings::Settings;
-use crate::train::{Ended, Learning, MemoryEstimate, StepReport, TrainConfig, Trainer};
+use crate::train::{Ended, Learning, MemoryEstimate, Settings, StepReport, TrainConfig, Trainer};
 use crate::{Error, Result, Stop};
 
 /// What becomes of a run that the directory already holds.

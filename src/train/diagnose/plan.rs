@@ -11,7 +11,7 @@ use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::tone::ToneCurve;
 use crate::splats::scene::{Features, Shape, width};
 use crate::train::TrainConfig;
-use crate::train::settings::{Layer, Origin};
+use crate::train::layers::{Layer, Origin};
 use crate::{Error, Result};
 
 /// Targets less than this many times brighter than their photographs are the photographs: the rule of `--curve auto`.
