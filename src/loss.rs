@@ -38,7 +38,7 @@ settings! {
 /// which blurs what holds no noise.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Weights {
-    /// Of mean (R_K - target)^2, in the paper's form (R_K - R_0)^2.
+    /// Of mean `(R_K - target)^2`, in the paper's form `(R_K - R_0)^2`.
     denoising: f64 = 1.0 => Rule::POSITIVE_OR_0;
     /// Of the total variation of R_K.
     total_variation: f64 = 0.0 => Rule::POSITIVE_OR_0;

@@ -112,7 +112,7 @@ pub struct TrainConfig {
     device: String = String::new(), "the best" => Rule::Text("a device", |_| true), "--device DEVICE";
     /// The tile that a workgroup renders: width and height in pixels and, where more than one subgroup share it, their number.
     tile: Option<Tile> = None, "the fastest known on the device, and recorded"
-        => Rule::List(2, 3, &Rule::Whole(1, u32::MAX as u64));
+        => Rule::List(2, 3, &Rule::Whole(0, u32::MAX as u64));
     /// Nothing nearer to a camera is seen, in units of the scene's extent: of how far the cameras stand from their middle. The
     /// extent is taken as the power of two of which it is 0.75 to 1.5 times.
     near: f64 = 0.1 => Rule::from_to(1e-6, 1.0), "--near N";

@@ -53,7 +53,7 @@ impl TrainConfig {
         let is_free = |key: &str| FREE.contains(&key) || ALSO.contains(&key);
         let mut keys = keys.filter(|key| !is_free(key) && !is_lower_limit(key));
         keys.find(|&key| own.get(key) != others.get(key))
-            .map(|key| format!("{key} = {}, not {}", value(&own, key), value(&others, key)))
+            .map(|key| format!("{key} = {}, not {}", value(own, key), value(others, key)))
     }
 
     /// A checksum of every setting that a result depends on: all but where the dataset lies, when the run is saved and

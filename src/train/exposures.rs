@@ -47,7 +47,7 @@ settings! {
 pub struct ExposureConfig {
     /// on: learn gain and bias of each channel of each training view, where photographs are not equally bright; off.
     learn: Learning = Learning::Off => Rule::OneOf(&["on", "off"]), "--exposure on|off";
-    /// Learn exposures from where this table has them: name,ev or name,gain_r,gain_g,gain_b,bias_r,bias_g,bias_b.
+    /// Learn exposures from where this table has them: `name,ev` or `name,gain_r,gain_g,gain_b,bias_r,bias_g,bias_b`.
     start: Option<PathBuf> = None, "exposures.csv of the dataset" => Rule::PATH, "--exposures FILE";
 }
 sections {
