@@ -83,19 +83,24 @@ impl Kernel {
         let Self { name, docs, workgroup_size, params, constants, subgroup_size_id, buffers } =
             self;
         let docs: String = docs.iter().map(|line| format!("///{line}\n")).collect();
-        let list = |line: &dyn Fn(&Buffer, &str) -> String| -> String {
-            buffers.iter().map(|b| line(b, if b.writable { "mut " } else { "" })).collect()
-        };
-        let device = list(&|b, m| binding(text, b, &format!("&'a {m}gpu::Buffer<{}>", b.element)));
-        let host = list(&|b, m| binding(text, b, &format!("&'a {m}[{}]", b.element)));
-        let bindings = list(&|b, _| {
+        let list =
+            |line: &dyn Fn(&Buffer) -> String| -> String { buffers.iter().map(line).collect() };
+        let device = list(&|b| {
+            let slice = if b.writable { "SliceMut" } else { "Slice" };
+            binding(text, b, &format!("gpu::{slice}<'a, {}>", b.element))
+        });
+        let host = list(&|b| {
+            let mutable = if b.writable { "mut " } else { "" };
+            binding(text, b, &format!("&'a {mutable}[{}]", b.element))
+        });
+        let bindings = list(&|b| {
             format!(
                 "gpu::Binding {{ name: {:?}, index: {}, writable: {}, is_float: {} }}, ",
                 b.name, b.binding, b.writable, b.is_float
             )
         });
-        let bound = list(&|b, _| format!("buffers.{}.bound(), ", b.name));
-        let slices = list(&|b, _| {
+        let bound = list(&|b| format!("buffers.{}.bound(), ", b.name));
+        let slices = list(&|b| {
             let cast = if b.writable { "cast_slice_mut" } else { "cast_slice" };
             format!("{}: bytemuck::{cast}(words.next().unwrap_or_default()), ", b.name)
         });
@@ -133,21 +138,24 @@ impl Default for Constants {{
     fn default() -> Self {{ Self {{ {defaults}}} }}
 }}
 
-/// What a dispatch binds: `&` where the shader says `readonly`, else `&mut`.
+/// What a dispatch binds: a `Slice` where the shader says `readonly`, else a `SliceMut`.
 #[derive(Debug)]
 pub struct Buffers<'a> {{
 {device}}}
 
 /// The same buffers in host memory, for the CPU reference.
+#[cfg(feature = "check")]
 #[derive(Debug)]
 pub struct Slices<'a> {{
 {host}}}
 
 /// How far each buffer that it writes may be from the reference's.
+#[cfg(feature = "check")]
 #[derive(Clone, Debug, Default)]
 pub struct Tolerances {{
 {tolerances}}}
 
+#[cfg(feature = "check")]
 impl From<Tolerances> for Vec<gpu::Tolerance> {{
     fn from(tolerances: Tolerances) -> Self {{ vec![{listed}] }}
 }}
@@ -164,10 +172,14 @@ impl gpu::Kernel for Kernel {{
     type Params = Params;
     type Constants = Constants;
     type Buffers<'a> = Buffers<'a>;
-    type Slices<'a> = Slices<'a>;
     fn constants(constants: &Constants) -> Vec<(u32, u32)> {{ let _ = constants; vec![{values}] }}
-    type Tolerances = Tolerances;
     fn bound(buffers: &Buffers<'_>) -> Vec<gpu::Bound> {{ vec![{bound}] }}
+}}
+
+#[cfg(feature = "check")]
+impl gpu::OnHost for Kernel {{
+    type Slices<'a> = Slices<'a>;
+    type Tolerances = Tolerances;
     fn slices(words: &mut [Vec<u32>]) -> Slices<'_> {{
         let mut words = words.iter_mut().map(Vec::as_mut_slice);
         Slices {{ {slices}}}

@@ -37,7 +37,9 @@ use std::thread::{self, ScopedJoinHandle};
 use glam::DVec3;
 
 use crate::camera::{Camera, Frame};
-use crate::gpu::{Buffer, CheckReport, Gpu, PassTime, Recorder};
+#[cfg(feature = "check")]
+use crate::gpu::CheckReport;
+use crate::gpu::{Buffer, Gpu, PassTime, Recorder};
 use crate::loss::exposure::Exposures;
 use crate::loss::{LogSlot, LossLog, Losses, StepLosses, Term, TermInputs};
 use crate::networks::Form;
@@ -419,23 +421,33 @@ impl Trainer {
         match (self.step + 1).checked_next_multiple_of(self.config.check.every) {
             Some(checked) if checked > until => self.submit_steps(until),
             Some(checked) if checked > self.step + 1 => self.submit_steps(checked - 1),
-            Some(_) if self.step < until.min(self.last_step()) => {
-                let (reports, checks) = self.check_step();
-                let stops = self.config.check.stops;
-                match checks.agree() {
-                    Err(difference) if stops => return Err(difference),
-                    Err(difference) => tracing::warn!("step {}: {difference}", self.step),
-                    Ok(()) => {}
-                }
-                reports
-            }
+            Some(_) if self.step < until.min(self.last_step()) => self.agreeing_step(),
             _ => self.submit_steps(until),
         }
+    }
+
+    /// One step with every pass checked; a difference ends the run or is a warning, as the configuration says.
+    #[cfg(feature = "check")]
+    fn agreeing_step(&mut self) -> Result<Vec<StepReport>> {
+        let (reports, checks) = self.check_step();
+        match checks.agree() {
+            Err(difference) if self.config.check.stops => return Err(difference),
+            Err(difference) => tracing::warn!("step {}: {difference}", self.step),
+            Ok(()) => {}
+        }
+        reports
+    }
+
+    #[cfg(not(feature = "check"))]
+    fn agreeing_step(&mut self) -> Result<Vec<StepReport>> {
+        let problem = "`check.every` compares steps with the references, which this build lacks";
+        Err(Error::Usage(format!("{problem}: build with feature `check`, or set it to 0")))
     }
 
     /// Trains one step with every pass checked ([`Gpu::checked`]), density control included, and reports on them. The
     /// model is what [`Trainer::advance`] would have made of it, bit for bit; no step is reported where it has to be done
     /// again with more memory.
+    #[cfg(feature = "check")]
     pub fn check_step(&mut self) -> (Result<Vec<StepReport>>, CheckReport) {
         let next = self.step + 1;
         self.gpu.clone().checked(|| self.submit_steps(next))

@@ -8,38 +8,27 @@ use ash::vk;
 use gpu_allocator::vulkan::{Allocation, AllocationCreateDesc, AllocationScheme};
 use gpu_allocator::{AllocationError, MemoryLocation};
 
-use super::recorder::HOST_SUBMITS;
-use super::{Bound, Gpu, Properties, Recorder, Retired, Shared, lock};
+use super::limits::whole_quads;
+use super::{Bound, Gpu, Properties, Retired, Shared, SliceMut, lock};
 use crate::{Error, Result};
 
-/// An array of `T` in device memory, or a window of one. Dropping the last of them frees the memory once no submission uses
-/// it.
+/// An array of `T` in device memory, and its only owner: passes bind [`Slice`](super::Slice)s and
+/// [`SliceMut`](super::SliceMut)s that borrow it. Dropping it frees the memory once no submission uses it.
 #[derive(Debug)]
 pub struct Buffer<T> {
-    memory: Arc<Memory>,
-    /// Where it begins in the memory, in elements.
-    first: usize,
+    memory: Memory,
     len: usize,
     element: PhantomData<T>,
 }
 
 /// A Vulkan buffer and the memory behind it.
 #[derive(Debug)]
-struct Memory {
-    shared: Arc<Shared>,
+pub(super) struct Memory {
+    pub(super) shared: Arc<Shared>,
     raw: vk::Buffer,
     /// Taken when the buffer retires.
-    allocation: Option<Allocation>,
+    pub(super) allocation: Option<Allocation>,
     name: String,
-}
-
-/// A copy of a buffer that a submission brings to the host.
-#[derive(Debug)]
-pub struct Download<T> {
-    host: Memory,
-    len: usize,
-    value: u64,
-    element: PhantomData<T>,
 }
 
 impl<T: bytemuck::Pod> Buffer<T> {
@@ -55,52 +44,24 @@ impl<T: bytemuck::Pod> Buffer<T> {
 
     /// The name it was created with.
     pub fn name(&self) -> &str {
-        &self.memory.name
+        self.memory.name()
     }
 
     /// The Vulkan buffer, for a host application that binds it itself.
     pub fn handle(&self) -> vk::Buffer {
-        self.memory.raw
+        self.memory.handle()
     }
 
-    /// What a dispatch binds.
-    pub(crate) fn bound(&self) -> Bound {
-        let [offset, size] = [self.first, self.len].map(|n| (n * size_of::<T>()) as u64);
-        Bound { raw: self.handle(), offset, size }
+    /// What its slices borrow.
+    pub(super) fn memory(&self) -> &Memory {
+        &self.memory
     }
 
-    /// Some of its elements: the same memory, so that what is done to the one is done to the other.
-    ///
-    /// # Errors
-    /// The buffer does not hold them, or no binding can begin there: at multiples of 256 bytes every device's can.
-    pub(crate) fn window(&self, first: usize, len: usize) -> Result<Self> {
-        let holds = first.checked_add(len).is_some_and(|end| end <= self.len);
-        if !holds || !(first * size_of::<T>()).is_multiple_of(WINDOW_ALIGNMENT) {
-            let (name, own) = (self.name(), self.len);
-            let what = format!("buffer `{name}` holds {own} elements, not {len} from {first} on");
-            return Err(Error::Usage(what));
-        }
-        let memory = Arc::clone(&self.memory);
-        Ok(Self { memory, first: self.first + first, len, element: PhantomData })
+    /// All of it, for copies.
+    pub(super) fn bound(&self) -> Bound {
+        Bound { raw: self.handle(), offset: 0, size: (self.len * size_of::<T>()) as u64 }
     }
 }
-
-impl Buffer<f32> {
-    /// The same memory as words: for what keeps bits, and for what keeps other numbers than floats in the place of some.
-    pub(crate) fn words(&self) -> Buffer<u32> {
-        let memory = Arc::clone(&self.memory);
-        Buffer { memory, first: self.first, len: self.len, element: PhantomData }
-    }
-}
-
-/// What is made and bound for so many bytes: Vulkan has no empty buffers, an empty array still binds; and whole quads, for
-/// kernels that read four values at a time.
-pub(super) fn whole_quads(bytes: u64) -> u64 {
-    bytes.max(1).next_multiple_of(16)
-}
-
-/// Vulkan lets no device ask for more of where a binding begins, in bytes.
-const WINDOW_ALIGNMENT: usize = 256;
 
 impl Gpu {
     /// A buffer of `len` elements whose contents are undefined.
@@ -128,7 +89,7 @@ impl Gpu {
     ) -> Result<Buffer<T>> {
         let bytes = (len as u64).saturating_mul(size_of::<T>() as u64);
         let memory = Memory::new(&self.shared, name, bytes, MemoryLocation::GpuOnly)?;
-        Ok(Buffer { memory: Arc::new(memory), first: 0, len, element: PhantomData })
+        Ok(Buffer { memory, len, element: PhantomData })
     }
 
     /// A buffer of `len` elements of zero bits.
@@ -162,13 +123,18 @@ impl Gpu {
         Ok(buffer)
     }
 
-    /// Overwrites the first elements of `buffer` with `data` and waits until that is done.
+    /// Overwrites the first elements of a buffer, or of a slice of one, with `data` and waits until that is done.
     ///
     /// # Errors
     /// `data` is longer than the buffer, or the device is out of memory or lost.
-    pub fn write<T: bytemuck::Pod>(&self, buffer: &mut Buffer<T>, data: &[T]) -> Result<()> {
-        if data.len() > buffer.len {
-            let (name, len) = (buffer.name(), buffer.len);
+    pub fn write<'a, T: bytemuck::Pod>(
+        &self,
+        buffer: impl Into<SliceMut<'a, T>>,
+        data: &[T],
+    ) -> Result<()> {
+        let buffer = buffer.into();
+        if data.len() > buffer.len() {
+            let (name, len) = (buffer.name(), buffer.len());
             let n = data.len();
             return Err(Error::Usage(format!("buffer `{name}` holds {len} elements, not {n}")));
         }
@@ -187,68 +153,15 @@ impl Gpu {
         })?;
         Ok(())
     }
-
-    /// A copy of `buffer` on the host, after everything submitted before.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
-    pub fn read<T: bytemuck::Pod>(&self, buffer: &Buffer<T>) -> Result<Vec<T>> {
-        let mut download = None;
-        self.run("read", |pass| {
-            download = Some(pass.download(buffer)?);
-            Ok(())
-        })?;
-        download.map_or_else(|| Ok(vec![]), Download::wait)
-    }
-}
-
-impl Recorder<'_> {
-    /// Copies `buffer` as it is at this point of the recording to the host.
-    ///
-    /// # Errors
-    /// The device is out of memory, or the recording is [`Gpu::record_into`]'s: only the host knows when the copy is there.
-    pub fn download<T: bytemuck::Pod>(&mut self, buffer: &Buffer<T>) -> Result<Download<T>> {
-        self.download_bound(buffer.name(), buffer.bound())
-    }
-
-    /// The same for a buffer of which only that is at hand what a pass binds.
-    pub(super) fn download_bound<T: bytemuck::Pod>(
-        &mut self,
-        name: &str,
-        bound: Bound,
-    ) -> Result<Download<T>> {
-        if self.value() == HOST_SUBMITS {
-            return Err(Error::Usage(format!(
-                "`{name}` cannot be downloaded where the host submits; once that is done, `Gpu::read` it"
-            )));
-        }
-        let host = Memory::new(self.shared(), name, bound.size, MemoryLocation::GpuToCpu)?;
-        if bound.size > 0 {
-            self.copy_raw(bound, host.bound(), bound.size);
-        }
-        let len = bound.size as usize / size_of::<T>();
-        Ok(Download { host, len, value: self.value(), element: PhantomData })
-    }
-}
-
-impl<T: bytemuck::Pod> Download<T> {
-    /// Waits for the submission that the copy is part of.
-    ///
-    /// # Errors
-    /// The device was lost.
-    pub fn wait(self) -> Result<Vec<T>> {
-        self.host.shared.wait(self.value)?;
-        let bytes = self.len * size_of::<T>();
-        let mut data = vec![T::zeroed(); self.len];
-        if let Some(mapped) = self.host.allocation.as_ref().and_then(Allocation::mapped_slice) {
-            bytemuck::cast_slice_mut(&mut data).copy_from_slice(&mapped[..bytes]);
-        }
-        Ok(data)
-    }
 }
 
 impl Memory {
-    fn new(shared: &Arc<Shared>, name: &str, bytes: u64, location: MemoryLocation) -> Result<Self> {
+    pub(super) fn new(
+        shared: &Arc<Shared>,
+        name: &str,
+        bytes: u64,
+        location: MemoryLocation,
+    ) -> Result<Self> {
         let usage = vk::BufferUsageFlags::STORAGE_BUFFER
             | vk::BufferUsageFlags::INDIRECT_BUFFER
             | vk::BufferUsageFlags::TRANSFER_SRC
@@ -266,6 +179,7 @@ impl Memory {
             let raw =
                 shared.device.create_buffer(&info, None).map_err(out_of_memory(name, size))?;
             let requirements = shared.device.get_buffer_memory_requirements(raw);
+            #[cfg(feature = "testing")]
             if shared.faults.fails_allocation(name) {
                 shared.device.destroy_buffer(raw, None);
                 return Err(out_of_memory(name, size)(AllocationError::OutOfMemory));
@@ -303,8 +217,16 @@ impl Memory {
         }
     }
 
+    pub(super) fn name(&self) -> &str {
+        &self.name
+    }
+
+    pub(super) fn handle(&self) -> vk::Buffer {
+        self.raw
+    }
+
     /// From its begin.
-    fn bound(&self) -> Bound {
+    pub(super) fn bound(&self) -> Bound {
         Bound { raw: self.raw, offset: 0, size: vk::WHOLE_SIZE }
     }
 }

@@ -3,15 +3,16 @@
 use std::collections::HashMap;
 use std::ffi::CString;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::Ordering;
 
 use ash::vk;
 use ash::vk::Handle as _;
 
-use super::checked::Checked;
+#[cfg(feature = "check")]
+use super::Tolerance;
 use super::descriptors::Sets;
 use super::pipeline::Objects;
-use super::{Binding, Bound, Buffer, Gpu, Interface, Pipeline, Properties, Reference, Shared};
+use super::{Binding, Bound, Buffer, Gpu, Interface, Pipeline, Properties, Recordable, Shared};
 use crate::{Error, Result};
 
 /// How many invocations a dispatch needs; the kernel knows its workgroup size.
@@ -30,7 +31,7 @@ pub enum Threads<'a> {
 pub struct Recorder<'g> {
     shared: &'g Arc<Shared>,
     /// What its passes bind.
-    pub(super) sets: Sets,
+    sets: Sets,
     pub(super) commands: vk::CommandBuffer,
     /// The timeline value that signals the end of this recording.
     pub(super) value: u64,
@@ -38,8 +39,9 @@ pub struct Recorder<'g> {
     pub(super) labels: Vec<&'static str>,
     /// Buffers touched since the last barrier; true when written.
     pending: HashMap<vk::Buffer, bool>,
-    /// Where every pass is run alone and compared with its reference.
-    pub(super) checked: Option<Checked<'g>>,
+    /// Runs every pass alone and compares it with its reference, in place of its being recorded.
+    #[cfg(feature = "check")]
+    pub(super) observer: Option<&'g mut (dyn PassObserver + 'g)>,
 }
 
 /// What a recording of the host application's binds; nothing on a device with `VK_KHR_push_descriptor`.
@@ -49,12 +51,35 @@ pub struct HostRecording {
     _sets: Sets,
 }
 
-/// What was recorded since the device was opened.
-#[derive(Debug, Default)]
-pub(super) struct Recorded {
-    pub(super) dispatches: AtomicU64,
-    pub(super) barriers: AtomicU64,
+/// Runs passes in a way of its own in place of their being recorded.
+#[cfg(feature = "check")]
+pub(super) trait PassObserver: std::fmt::Debug {
+    /// Does what recording and submitting the pass would do.
+    ///
+    /// # Errors
+    /// The extent exceeds what the device can launch, or the device was lost.
+    fn pass(&mut self, recorder: &mut Recorder<'_>, pass: &ObservedPass<'_>) -> Result<()>;
+
+    /// Submits what is recorded, waits for it, and begins anew.
+    ///
+    /// # Errors
+    /// The device was lost.
+    fn run_recorded(&mut self, recorder: &mut Recorder<'_>, label: &str) -> Result<()>;
 }
+
+/// A pass whose types are left behind.
+#[cfg(feature = "check")]
+pub(super) struct ObservedPass<'a> {
+    pub(super) objects: &'a Objects,
+    pub(super) params: &'a [u8],
+    pub(super) bound: &'a [Bound],
+    pub(super) threads: Threads<'a>,
+    pub(super) reference: &'a ReferenceOf<'a>,
+}
+
+/// Makes of the words of a pass's buffers what its reference does, and gives the tolerances from other such words.
+#[cfg(feature = "check")]
+pub(super) type ReferenceOf<'a> = dyn Fn(&mut [Vec<u32>], &mut [Vec<u32>]) -> Vec<Tolerance> + 'a;
 
 /// The timeline value of a recording that the host application submits: none of ours.
 pub(super) const HOST_SUBMITS: u64 = 0;
@@ -78,7 +103,8 @@ impl<'g> Recorder<'g> {
             queries,
             labels: vec![],
             pending: HashMap::new(),
-            checked: None,
+            #[cfg(feature = "check")]
+            observer: None,
         };
         recorder.barrier();
         recorder.timestamp();
@@ -97,7 +123,7 @@ impl<'g> Recorder<'g> {
     ///
     /// # Errors
     /// The extent exceeds what the device can launch.
-    pub fn dispatch<K: Reference>(
+    pub fn dispatch<K: Recordable>(
         &mut self,
         pipeline: &Pipeline<K>,
         params: &K::Params,
@@ -105,10 +131,26 @@ impl<'g> Recorder<'g> {
         threads: Threads<'_>,
     ) -> Result<()> {
         let bound = K::bound(&buffers);
-        if self.checked.is_some() {
-            return self.dispatch_checked(pipeline, params, &bound, threads);
+        let words = bytemuck::bytes_of(params);
+        #[cfg(feature = "check")]
+        if let Some(observer) = self.observer.take() {
+            let reference = |reference: &mut [Vec<u32>], before: &mut [Vec<u32>]| {
+                K::run(params, &pipeline.constants, K::slices(reference));
+                K::tolerances(params, &pipeline.constants, K::slices(before)).into()
+            };
+            let objects = &pipeline.objects;
+            let pass = ObservedPass {
+                objects,
+                params: words,
+                bound: &bound,
+                threads,
+                reference: &reference,
+            };
+            let done = observer.pass(self, &pass);
+            self.observer = Some(observer);
+            return done;
         }
-        self.record_dispatch(&pipeline.objects, bytemuck::bytes_of(params), &bound, threads)
+        self.record_dispatch(&pipeline.objects, words, &bound, threads)
     }
 
     pub(super) fn record_dispatch(
@@ -131,7 +173,7 @@ impl<'g> Recorder<'g> {
             _ => self.fold(name, self.workgroups(pipeline.interface, threads))?,
         };
         self.begin_label(name);
-        self.bind(pipeline, params, bound)?;
+        self.sets.bind(self.commands, pipeline, params, bound)?;
         let device = &self.shared.device;
         // SAFETY: recording; a retired buffer outlives this submission.
         unsafe {

@@ -149,12 +149,12 @@ impl DenoisingLoss {
                 y_scale: pair_scale(columns * (rows - 1)),
             },
             denoising::Buffers {
-                denoised,
-                render,
-                d_denoised,
-                d_render,
-                mse_partials: &mut self.mse_partials,
-                tv_partials: &mut self.tv_partials,
+                denoised: denoised.slice(),
+                render: render.slice(),
+                d_denoised: d_denoised.slice_mut(),
+                d_render: d_render.slice_mut(),
+                mse_partials: self.mse_partials.slice_mut(),
+                tv_partials: self.tv_partials.slice_mut(),
             },
             Threads::Workgroups([workgroups, 1, 1]),
         )?;

@@ -246,7 +246,7 @@ impl DepthLoss {
                 box_count: chunks.boxes.count,
                 key: (stream.bits(step) >> 32) as u32,
             },
-            depth_boxes::Buffers { regions: &mut self.regions },
+            depth_boxes::Buffers { regions: self.regions.slice_mut() },
             Threads::Exactly([region_count, 1, 1]),
         )?;
         self.correlate(pass, inputs, chunks)?;
@@ -254,11 +254,11 @@ impl DepthLoss {
             &self.gradient,
             &depth_gradient::Params { size, first: plane * pixels, region_count },
             depth_gradient::Buffers {
-                render,
-                depth,
-                regions: &self.regions,
-                gradients: &self.gradients,
-                d_render,
+                render: render.slice(),
+                depth: depth.slice(),
+                regions: self.regions.slice(),
+                gradients: self.gradients.slice(),
+                d_render: d_render.slice_mut(),
             },
             Threads::Exactly([pixels, 1, 1]),
         )?;
@@ -296,10 +296,10 @@ impl DepthLoss {
                 chunk_size: self.chunk_size,
             },
             depth_moments::Buffers {
-                render,
-                depth,
-                regions: &self.regions,
-                moments: &mut self.chunk_moments,
+                render: render.slice(),
+                depth: depth.slice(),
+                regions: self.regions.slice(),
+                moments: self.chunk_moments.slice_mut(),
             },
             Threads::Workgroups([chunks.total(), 1, 1]),
         )?;
@@ -317,13 +317,13 @@ impl DepthLoss {
                 box_weight: (weight / f64::from(boxes.max(1))) as f32,
             },
             depth_correlation::Buffers {
-                render,
-                depth,
-                regions: &self.regions,
-                moments: &self.chunk_moments,
-                gradients: &mut self.gradients,
-                view_values: &mut self.view_value,
-                box_values: &mut self.box_values,
+                render: render.slice(),
+                depth: depth.slice(),
+                regions: self.regions.slice(),
+                moments: self.chunk_moments.slice(),
+                gradients: self.gradients.slice_mut(),
+                view_values: self.view_value.slice_mut(),
+                box_values: self.box_values.slice_mut(),
             },
             Threads::Workgroups([boxes + 1, 1, 1]),
         )

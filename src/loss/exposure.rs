@@ -157,7 +157,11 @@ impl Exposures {
         pass.dispatch(
             if inverse { &self.neutralize } else { &self.expose },
             &expose::Params { pixel_count: pixels(size), view: view as u32 },
-            expose::Buffers { exposures: &self.parameters, render, exposed: &mut self.exposed },
+            expose::Buffers {
+                exposures: self.parameters.slice(),
+                render: render.slice(),
+                exposed: self.exposed.slice_mut(),
+            },
             Threads::Exactly([COLOR_CHANNELS as u32 * pixels(size), 1, 1]),
         )
     }
@@ -186,17 +190,20 @@ impl Exposures {
             &self.backward,
             &expose_backward::Params { pixel_count, view },
             expose_backward::Buffers {
-                exposures: &self.parameters,
-                render,
-                d_render,
-                partials: &mut self.partials,
+                exposures: self.parameters.slice(),
+                render: render.slice(),
+                d_render: d_render.slice_mut(),
+                partials: self.partials.slice_mut(),
             },
             Threads::Workgroups([chunk_count, COLOR_CHANNELS as u32, 1]),
         )?;
         pass.dispatch(
             &self.gradient,
             &exposure_gradient::Params { chunk_count, view, view_count: self.view_count },
-            exposure_gradient::Buffers { partials: &self.partials, gradients: &mut self.gradients },
+            exposure_gradient::Buffers {
+                partials: self.partials.slice(),
+                gradients: self.gradients.slice_mut(),
+            },
             Threads::Workgroups([1, 1, 1]),
         )
     }
@@ -212,7 +219,10 @@ impl Exposures {
         pass.dispatch(
             &self.center,
             &exposure_center::Params { view_count: self.view_count },
-            exposure_center::Buffers { exposures: &mut self.parameters, status },
+            exposure_center::Buffers {
+                exposures: self.parameters.slice_mut(),
+                status: status.slice(),
+            },
             Threads::Workgroups([EXPOSURE_WIDTH, 1, 1]),
         )
     }
@@ -264,7 +274,11 @@ impl Learnable for Exposures {
 
     fn buffers(&mut self) -> AdamBuffers<'_> {
         let Self { parameters, gradients, moments, .. } = self;
-        AdamBuffers { parameters, gradients, moments }
+        AdamBuffers {
+            parameters: parameters.slice_mut(),
+            gradients: gradients.slice(),
+            moments: moments.slice_mut(),
+        }
     }
 }
 

@@ -256,7 +256,13 @@ impl Loss {
                         interior_begin: inputs.interior.origin,
                         interior_end: inputs.interior.end(),
                     },
-                    l1::Buffers { render, low, tone, d_render, partials: l1_partials },
+                    l1::Buffers {
+                        render: render.slice(),
+                        low: low.slice(),
+                        tone: tone.slice(),
+                        d_render: d_render.slice_mut(),
+                        partials: l1_partials.slice_mut(),
+                    },
                     threads,
                 )?;
             }
@@ -339,7 +345,14 @@ impl Ssim {
                 l1_scale: ((1.0 - self.weight) * mean_scale) as f32,
                 ssim_scale: (self.weight * mean_scale) as f32,
             },
-            ssim::Buffers { render, low, tone, d_render, l1_partials, ssim_partials },
+            ssim::Buffers {
+                render: render.slice(),
+                low: low.slice(),
+                tone: tone.slice(),
+                d_render: d_render.slice_mut(),
+                l1_partials: l1_partials.slice_mut(),
+                ssim_partials: ssim_partials.slice_mut(),
+            },
             threads,
         )
     }

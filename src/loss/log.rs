@@ -132,11 +132,11 @@ impl LogSlot<'_> {
                 mean_scales: [first.scale, second.scale].into(),
             },
             loss_log::Buffers {
-                first_partials: first.partials,
-                second_partials: second.partials,
-                log: &mut self.log.values,
-                statuses: &mut self.log.statuses,
-                status: self.status,
+                first_partials: first.partials.slice(),
+                second_partials: second.partials.slice(),
+                log: self.log.values.slice_mut(),
+                statuses: self.log.statuses.slice_mut(),
+                status: self.status.slice_mut(),
             },
             Threads::Workgroups([1, 1, 1]),
         )

@@ -150,7 +150,12 @@ impl StructureLoss {
                 first: plane * pixels,
                 scale: (self.weight / f64::from(pixels)) as f32,
             },
-            structure_l1::Buffers { render, structure, d_render, partials: &mut self.partials },
+            structure_l1::Buffers {
+                render: render.slice(),
+                structure: structure.slice(),
+                d_render: d_render.slice_mut(),
+                partials: self.partials.slice_mut(),
+            },
             Threads::Workgroups([workgroups, 1, 1]),
         )?;
         let sums = |count| PartialSums {

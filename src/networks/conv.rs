@@ -207,7 +207,11 @@ impl Product {
         pass.dispatch(
             &self.kernel,
             &conv3x3::Params { size, in_channels, out_channels, offset },
-            conv3x3::Buffers { values, source, target },
+            conv3x3::Buffers {
+                values: values.slice(),
+                source: source.slice(),
+                target: target.slice_mut(),
+            },
             Threads::Workgroups([
                 out_channels.div_ceil(self.channels),
                 size.x.div_ceil(self.columns),
@@ -242,7 +246,11 @@ impl WeightGradient {
         pass.dispatch(
             &self.kernel,
             &conv3x3_weight_gradient::Params { size, in_channels, out_channels },
-            conv3x3_weight_gradient::Buffers { source, d_target, partials },
+            conv3x3_weight_gradient::Buffers {
+                source: source.slice(),
+                d_target: d_target.slice(),
+                partials: partials.slice_mut(),
+            },
             Threads::Workgroups([
                 in_channels,
                 out_channels.div_ceil(self.outputs),
@@ -281,7 +289,7 @@ impl Reduce {
         pass.dispatch(
             &self.0,
             &reduce_strips::Params { parameter_count, strip_count, offset },
-            reduce_strips::Buffers { partials, gradients },
+            reduce_strips::Buffers { partials: partials.slice(), gradients: gradients.slice_mut() },
             Threads::Exactly([parameter_count, 1, 1]),
         )
     }

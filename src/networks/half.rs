@@ -148,7 +148,11 @@ impl HalfConv {
         pass.dispatch(
             &self.pack_weights[way as usize],
             &pack_weights::Params { in_channels, out_channels, offset },
-            pack_weights::Buffers { largest, values, packed: &mut halves[way as usize] },
+            pack_weights::Buffers {
+                largest: largest.slice(),
+                values: values.slice(),
+                packed: halves[way as usize].slice_mut(),
+            },
             Threads::Exactly([self.weight_eights(), 1, 1]),
         )
     }
@@ -167,7 +171,11 @@ impl HalfConv {
         pass.dispatch(
             &self.pack_map,
             &pack_map::Params { size, channels },
-            pack_map::Buffers { largest, source, packed: halves },
+            pack_map::Buffers {
+                largest: largest.slice(),
+                source: source.slice(),
+                packed: halves.slice_mut(),
+            },
             Threads::Exactly([eights / (PACKED_CHANNELS / 8), 1, 1]),
         )
     }
@@ -183,7 +191,7 @@ impl HalfConv {
         pass.dispatch(
             &self.largest,
             &largest_magnitude::Params { offset, value_count },
-            largest_magnitude::Buffers { values, largest },
+            largest_magnitude::Buffers { values: values.slice(), largest: largest.slice_mut() },
             Threads::Workgroups([value_count.div_ceil(CHUNK), 1, 1]),
         )
     }
@@ -207,12 +215,12 @@ impl HalfConv {
             &self.products[way as usize],
             &conv3x3_half::Params { size, in_channels, out_channels, biases },
             conv3x3_half::Buffers {
-                largest_weight: &weights.largest,
-                largest_source: &source.largest,
-                values,
-                weights: &weights.halves[way as usize],
-                source: &source.halves,
-                target,
+                largest_weight: weights.largest.slice(),
+                largest_source: source.largest.slice(),
+                values: values.slice(),
+                weights: weights.halves[way as usize].slice(),
+                source: source.halves.slice(),
+                target: target.slice_mut(),
             },
             Threads::Workgroups([
                 out_channels.div_ceil(self.blocks * m),
@@ -239,12 +247,12 @@ impl HalfConv {
             &self.weight_gradient,
             &conv3x3_weight_gradient_half::Params { size, in_channels, out_channels },
             conv3x3_weight_gradient_half::Buffers {
-                largest_source: &source.largest,
-                largest_d_target: &d_target.largest,
-                source: &source.halves,
-                d_target: &d_target.halves,
-                d_target_single,
-                partials: &mut *partials,
+                largest_source: source.largest.slice(),
+                largest_d_target: d_target.largest.slice(),
+                source: source.halves.slice(),
+                d_target: d_target.halves.slice(),
+                d_target_single: d_target_single.slice(),
+                partials: partials.slice_mut(),
             },
             Threads::Workgroups([
                 in_channels.div_ceil(n),

@@ -107,19 +107,25 @@ impl Norm {
         pass.dispatch(
             &self.statistics,
             &params!(self, of, norm_statistics),
-            norm_statistics::Buffers { source, partials: &mut *partials },
+            norm_statistics::Buffers { source: source.slice(), partials: partials.slice_mut() },
             per_chunk,
         )?;
         pass.dispatch(
             &self.merge,
             &params!(self, of, norm_merge),
-            norm_merge::Buffers { partials, statistics: &mut *statistics },
+            norm_merge::Buffers { partials: partials.slice(), statistics: statistics.slice_mut() },
             per_channel,
         )?;
         pass.dispatch(
             &self.forward,
             &params!(self, of, norm_forward),
-            norm_forward::Buffers { values, statistics, source, shortcut, target },
+            norm_forward::Buffers {
+                values: values.slice(),
+                statistics: statistics.slice(),
+                source: source.slice(),
+                shortcut: shortcut.slice(),
+                target: target.slice_mut(),
+            },
             per_chunk,
         )
     }
@@ -140,24 +146,35 @@ impl Norm {
             &self.backward_sums,
             &params!(self, of, norm_backward_sums),
             norm_backward_sums::Buffers {
-                values,
-                statistics,
-                source,
-                d_target,
-                partials: &mut *partials,
+                values: values.slice(),
+                statistics: statistics.slice(),
+                source: source.slice(),
+                d_target: d_target.slice(),
+                partials: partials.slice_mut(),
             },
             per_chunk,
         )?;
         pass.dispatch(
             &self.backward_merge,
             &params!(self, of, norm_backward_merge),
-            norm_backward_merge::Buffers { partials, sums: &mut *sums, gradients },
+            norm_backward_merge::Buffers {
+                partials: partials.slice(),
+                sums: sums.slice_mut(),
+                gradients: gradients.slice_mut(),
+            },
             per_channel,
         )?;
         pass.dispatch(
             &self.backward,
             &params!(self, of, norm_backward),
-            norm_backward::Buffers { values, statistics, sums, source, d_target, d_source },
+            norm_backward::Buffers {
+                values: values.slice(),
+                statistics: statistics.slice(),
+                sums: sums.slice(),
+                source: source.slice(),
+                d_target: d_target.slice(),
+                d_source: d_source.slice_mut(),
+            },
             per_chunk,
         )
     }

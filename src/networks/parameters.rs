@@ -68,7 +68,11 @@ impl Learnable for Parameters {
 
     fn buffers(&mut self) -> AdamBuffers<'_> {
         let Self { values, gradients, moments, .. } = self;
-        AdamBuffers { parameters: values, gradients, moments }
+        AdamBuffers {
+            parameters: values.slice_mut(),
+            gradients: gradients.slice(),
+            moments: moments.slice_mut(),
+        }
     }
 }
 

@@ -26,7 +26,10 @@ impl ReluBackward {
         pass.dispatch(
             &self.0,
             &relu_backward::Params { value_count },
-            relu_backward::Buffers { activations, gradient },
+            relu_backward::Buffers {
+                activations: activations.slice(),
+                gradient: gradient.slice_mut(),
+            },
             Threads::Exactly([value_count, 1, 1]),
         )
     }

@@ -163,7 +163,11 @@ impl Tonemapper {
         pass.dispatch(
             &self.product,
             &product::Params { value_count },
-            product::Buffers { illumination, denoised, target: &mut *product },
+            product::Buffers {
+                illumination: illumination.slice(),
+                denoised: denoised.slice(),
+                target: product.slice_mut(),
+            },
             Threads::Exactly([value_count, 1, 1]),
         )?;
         let ([conv_in, conv, conv_out], [at_in, at, at_out]) = (&self.convs, self.offsets);
@@ -227,11 +231,11 @@ impl Tonemapper {
             &self.product_backward,
             &product_backward::Params { value_count },
             product_backward::Buffers {
-                illumination,
-                denoised,
-                d_target: d_product,
-                d_illumination,
-                d_denoised,
+                illumination: illumination.slice(),
+                denoised: denoised.slice(),
+                d_target: d_product.slice(),
+                d_illumination: d_illumination.slice_mut(),
+                d_denoised: d_denoised.slice_mut(),
             },
             threads(value_count),
         )

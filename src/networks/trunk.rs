@@ -263,7 +263,7 @@ impl Trunk {
         pass.dispatch(
             &self.pool,
             &max_pool::Params { size, target_size, channels, window, stride: POOL_STRIDE },
-            max_pool::Buffers { source, target },
+            max_pool::Buffers { source: source.slice(), target: target.slice_mut() },
             Threads::Exactly([channels * target_size.element_product(), 1, 1]),
         )
     }
@@ -296,7 +296,11 @@ impl Trunk {
                 padding,
                 offset,
             },
-            conv_strided::Buffers { values, source, target },
+            conv_strided::Buffers {
+                values: values.slice(),
+                source: source.slice(),
+                target: target.slice_mut(),
+            },
             Threads::Exactly([blocks * target_size.element_product(), 1, 1]),
         )
     }

@@ -95,7 +95,7 @@ impl Windows {
         pass.dispatch(
             &self.gather,
             &window_gather::Params { size, origin, window, first_plane, plane_count },
-            window_gather::Buffers { image, content },
+            window_gather::Buffers { image: image.slice(), content: content.slice_mut() },
             Threads::Exactly([plane_count * window.element_product(), 1, 1]),
         )
     }
@@ -120,7 +120,7 @@ impl Windows {
         pass.dispatch(
             &self.scatter,
             &window_scatter::Params { size, origin, window, first_plane, plane_count },
-            window_scatter::Buffers { content, image },
+            window_scatter::Buffers { content: content.slice(), image: image.slice_mut() },
             Threads::Exactly([plane_count * window.element_product(), 1, 1]),
         )
     }

@@ -6,6 +6,7 @@
 
 mod colmap;
 mod fingerprint;
+mod listed;
 mod listing;
 mod masks;
 mod members;
@@ -32,7 +33,8 @@ use crate::photographs::image::files::Files;
 use crate::photographs::image::{Image, Mask};
 use crate::{Error, Result};
 pub use fingerprint::Fingerprint;
-use listing::{ListedView, Listing, list, warn};
+use listed::{ListedView, Listing};
+use listing::{list, warn};
 use members::with_held_out;
 pub use options::{DOWNSCALE, DepthOptions, LoadOptions};
 pub use pixels::Original;

@@ -21,6 +21,8 @@ mod mask;
 mod orientation;
 #[cfg(feature = "raw")]
 mod raw;
+#[cfg(feature = "io")]
+mod source;
 
 #[cfg(feature = "io")]
 pub use exif::exposure_value;

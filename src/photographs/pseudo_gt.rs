@@ -180,9 +180,9 @@ impl PseudoGt {
                 sum_count: THREADS * tiles.len() as u32,
             },
             kernels::tone_statistics::Buffers {
-                searches: &self.searches,
-                sums: &self.sums,
-                statistics: &mut self.measured,
+                searches: self.searches.slice(),
+                sums: self.sums.slice(),
+                statistics: self.measured.slice_mut(),
             },
             Threads::Workgroups([1, 1, 1]),
         )
@@ -225,11 +225,11 @@ impl PseudoGt {
                     first_sum: THREADS * index as u32,
                 },
                 kernels::luminance::Buffers {
-                    image,
-                    luminances: &mut self.luminances[index],
-                    sums: &mut self.sums,
-                    searches: &mut self.searches,
-                    histograms: &mut self.histograms,
+                    image: image.slice(),
+                    luminances: self.luminances[index].slice_mut(),
+                    sums: self.sums.slice_mut(),
+                    searches: self.searches.slice_mut(),
+                    histograms: self.histograms.slice_mut(),
                 },
                 Threads::Exactly([THREADS, 1, 1]),
             )?;
@@ -255,8 +255,8 @@ impl PseudoGt {
             &self.select,
             &kernels::percentile_select::Params { digit_bits, first_search },
             kernels::percentile_select::Buffers {
-                searches: &mut self.searches,
-                histograms: &mut self.histograms,
+                searches: self.searches.slice_mut(),
+                histograms: self.histograms.slice_mut(),
             },
             Threads::Workgroups([1, 1, 1]),
         )
@@ -288,19 +288,32 @@ impl PseudoGt {
             Map::Formula { pipeline, quads_per_thread } => pass.dispatch(
                 pipeline,
                 &kernels::tone_map::Params { value_count, view },
-                kernels::tone_map::Buffers { image, parameters, target },
+                kernels::tone_map::Buffers {
+                    image: image.slice(),
+                    parameters: parameters.slice(),
+                    target: target.slice_mut(),
+                },
                 Threads::Exactly([value_count.div_ceil(4 * quads_per_thread), 1, 1]),
             ),
             Map::Mix(pipeline) => pass.dispatch(
                 pipeline,
                 &kernels::tone_mix::Params { pixel_count, view },
-                kernels::tone_mix::Buffers { image, parameters, target },
+                kernels::tone_mix::Buffers {
+                    image: image.slice(),
+                    parameters: parameters.slice(),
+                    target: target.slice_mut(),
+                },
                 Threads::Exactly([pixel_count, 1, 1]),
             ),
             Map::Profile(pipeline, profile) => pass.dispatch(
                 pipeline,
                 &kernels::tone_profile::Params { pixel_count, view },
-                kernels::tone_profile::Buffers { image, parameters, profile, target },
+                kernels::tone_profile::Buffers {
+                    image: image.slice(),
+                    parameters: parameters.slice(),
+                    profile: profile.slice(),
+                    target: target.slice_mut(),
+                },
                 Threads::Exactly([pixel_count, 1, 1]),
             ),
             Map::Table(pipeline, knots) => pass.dispatch(
@@ -310,7 +323,12 @@ impl PseudoGt {
                     view,
                     knot_count: (knots.len() / 3) as u32,
                 },
-                kernels::tone_table::Buffers { image, parameters, knots, target },
+                kernels::tone_table::Buffers {
+                    image: image.slice(),
+                    parameters: parameters.slice(),
+                    knots: knots.slice(),
+                    target: target.slice_mut(),
+                },
                 Threads::Exactly([value_count, 1, 1]),
             ),
         }
@@ -355,7 +373,11 @@ fn count_luminances(
                 shift,
                 first_search,
             },
-            kernels::luminance_histogram::Buffers { luminances, searches, histograms },
+            kernels::luminance_histogram::Buffers {
+                luminances: luminances.slice(),
+                searches: searches.slice(),
+                histograms: histograms.slice_mut(),
+            },
             Threads::Exactly([THREADS, 1, 1]),
         )?;
     }

@@ -82,9 +82,9 @@ impl StructureTarget {
             &self.rows,
             &ciconv_rows::Params { width, height },
             ciconv_rows::Buffers {
-                image: target,
-                smooth_rows: &mut self.smooth_rows,
-                slope_rows: &mut self.slope_rows,
+                image: target.slice(),
+                smooth_rows: self.smooth_rows.slice_mut(),
+                slope_rows: self.slope_rows.slice_mut(),
             },
             per_pixel,
         )?;
@@ -92,23 +92,30 @@ impl StructureTarget {
             &self.columns,
             &ciconv_columns::Params { width, height, pixels_per_moment: self.subgroup_size },
             ciconv_columns::Buffers {
-                smooth_rows: &self.smooth_rows,
-                slope_rows: &self.slope_rows,
-                logs: &mut self.logs,
-                moments: &mut self.partial_moments,
+                smooth_rows: self.smooth_rows.slice(),
+                slope_rows: self.slope_rows.slice(),
+                logs: self.logs.slice_mut(),
+                moments: self.partial_moments.slice_mut(),
             },
             per_pixel,
         )?;
         pass.dispatch(
             &self.moments,
             &ciconv_moments::Params { pixel_count, pixels_per_moment: self.subgroup_size },
-            ciconv_moments::Buffers { moments: &self.partial_moments, norm: &mut self.norm },
+            ciconv_moments::Buffers {
+                moments: self.partial_moments.slice(),
+                norm: self.norm.slice_mut(),
+            },
             Threads::Workgroups([1, 1, 1]),
         )?;
         pass.dispatch(
             &self.normalize,
             &ciconv_normalize::Params { pixel_count },
-            ciconv_normalize::Buffers { logs: &self.logs, norm: &self.norm, structure },
+            ciconv_normalize::Buffers {
+                logs: self.logs.slice(),
+                norm: self.norm.slice(),
+                structure: structure.slice_mut(),
+            },
             per_pixel,
         )
     }

@@ -17,7 +17,6 @@
 //! follows from the luminance of all photographs, see [`Exposure`]; so may that of every other curve. [`FAMILIES`] is the table of all curves; a [`Table`]
 //! of values from a file is a curve too, and so is a camera's [`Profile`].
 
-mod catalogue;
 mod exposure;
 mod families;
 #[cfg(feature = "io")]
@@ -34,11 +33,10 @@ mod table;
 use std::fmt;
 use std::str::FromStr;
 
-pub use self::catalogue::{FAMILIES, ToneCurve};
 #[cfg(feature = "io")]
 pub(crate) use self::exposure::all_black;
 pub use self::exposure::{Exposure, exposed_anew, is_black, soft};
-pub use self::families::{Constant, Family, Law, White};
+pub use self::families::{Constant, FAMILIES, Family, Law, ToneCurve, White};
 #[cfg(feature = "io")]
 pub use self::file::CurveChoice;
 pub use self::histogram::LuminanceHistogram;
@@ -48,6 +46,7 @@ pub(crate) use self::law::{Numbers, PhotographCurve, law};
 pub(crate) use self::law::{clamped, curve_at, tone_curve};
 pub use self::lift::{Lift, Measured, Scene};
 pub use self::profile::Profile;
+#[cfg(feature = "check")]
 pub(crate) use self::profile::profiled;
 #[cfg(feature = "fit")]
 pub(crate) use self::real::Dual;
@@ -55,8 +54,11 @@ pub use self::real::Real;
 #[cfg(feature = "io")]
 pub(crate) use self::settings::OF_CURVE;
 pub use self::settings::{GainChoice, ToneSettings};
-pub(crate) use self::statistics::{Rank, luminance, measurable};
+pub(crate) use self::statistics::Rank;
 pub use self::statistics::{Statistics, percentile};
+#[cfg(any(feature = "io", feature = "check"))]
+pub(crate) use self::statistics::{luminance, measurable};
+#[cfg(feature = "check")]
 pub(crate) use self::table::interpolate;
 pub use self::table::{Table, TableInput};
 pub use crate::kernels::ToneParameters;

@@ -4,6 +4,7 @@ mod aside;
 mod directory;
 mod done;
 mod events;
+mod files;
 mod generations;
 mod ledger;
 mod load;
@@ -14,15 +15,15 @@ mod requests;
 mod tensorboard;
 mod train;
 
-#[cfg(feature = "cli")]
-pub(crate) use directory::{ENDED, HELD_OUT_COURSE, SPENT, TARGET_EXPOSURE};
 pub use directory::{Progress, RunDirectory, load_progress};
 pub use done::done_steps;
-pub use events::Event;
+pub use events::{Event, Trained};
+#[cfg(feature = "cli")]
+pub(crate) use files::{ENDED, HELD_OUT_COURSE, SPENT, TARGET_EXPOSURE};
 pub use load::{
     is_finished, load_config, load_exposures, load_metrics, load_model, load_networks, other_views,
     plan_of, stopped_at,
 };
 pub use meter::{Spent, energy_counters};
 pub use requests::Requests;
-pub use train::{HeldRun, Session, Trained, train, train_in};
+pub use train::{HeldRun, Session, train, train_in};

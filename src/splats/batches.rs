@@ -1,12 +1,12 @@
 //! Gaussians in batches: planes of more of them than one binding spans lie batch behind batch.
 //!
-//! A pass over Gaussians is dispatched for one batch after the other, and bound to the windows that hold it. Most devices
+//! A pass over Gaussians is dispatched for one batch after the other, and bound to the slices that hold it. Most devices
 //! bind gigabytes, and there is one batch; some bind 128 MiB, the planes of half a million Gaussians of SH degree 3.
 
 use std::ops::Range;
 
 use crate::Result;
-use crate::gpu::{Buffer, Gpu};
+use crate::gpu::{Buffer, Gpu, Slice, SliceMut};
 use crate::splats::attributes::planes;
 
 /// How the planes of so many Gaussians lie in a buffer.
@@ -84,7 +84,12 @@ impl Batches {
     ///
     /// # Errors
     /// The buffer is shorter, or the device is out of memory or lost.
-    pub fn write(&self, gpu: &Gpu, buffer: &mut Buffer<f32>, planes: &[f32]) -> Result<()> {
+    pub fn write<'a>(
+        &self,
+        gpu: &Gpu,
+        buffer: impl Into<SliceMut<'a, f32>>,
+        planes: &[f32],
+    ) -> Result<()> {
         if self.count <= self.size {
             return gpu.write(buffer, planes);
         }
@@ -96,7 +101,7 @@ impl Batches {
     ///
     /// # Errors
     /// The device was lost.
-    pub fn read(&self, gpu: &Gpu, buffer: &Buffer<f32>) -> Result<Vec<f32>> {
+    pub fn read<'a>(&self, gpu: &Gpu, buffer: impl Into<Slice<'a, f32>>) -> Result<Vec<f32>> {
         let mut batched = gpu.read(buffer)?;
         batched.truncate(self.count * self.columns);
         if self.count <= self.size {
@@ -137,20 +142,51 @@ impl Batches {
 }
 
 impl Batch {
-    /// The window of a buffer of planes in batches.
+    /// What a buffer of planes in batches holds of it.
     ///
     /// # Errors
     /// The buffer is shorter.
-    pub fn of_planes(&self, planes: &Buffer<f32>) -> Result<Buffer<f32>> {
-        planes.window(self.first * self.columns, self.count * self.columns)
+    pub fn planes<'a>(&self, planes: impl Into<Slice<'a, f32>>) -> Result<Slice<'a, f32>> {
+        self.rows(planes, self.columns)
     }
 
-    /// The window of a buffer that holds `each` elements of a Gaussian behind those of the one before.
+    /// The same to write.
     ///
     /// # Errors
     /// The buffer is shorter.
-    pub fn of_rows<T: bytemuck::Pod>(&self, rows: &Buffer<T>, each: usize) -> Result<Buffer<T>> {
-        rows.window(self.first * each, self.count * each)
+    pub fn planes_mut<'a>(
+        &self,
+        planes: impl Into<SliceMut<'a, f32>>,
+    ) -> Result<SliceMut<'a, f32>> {
+        self.rows_mut(planes, self.columns)
+    }
+
+    /// What a buffer of `each` elements per Gaussian, those of one after those of another, holds of it.
+    ///
+    /// # Errors
+    /// The buffer is shorter.
+    pub fn rows<'a, T: bytemuck::Pod>(
+        &self,
+        rows: impl Into<Slice<'a, T>>,
+        each: usize,
+    ) -> Result<Slice<'a, T>> {
+        rows.into().range(self.range(each))
+    }
+
+    /// The same to write.
+    ///
+    /// # Errors
+    /// The buffer is shorter.
+    pub fn rows_mut<'a, T: bytemuck::Pod>(
+        &self,
+        rows: impl Into<SliceMut<'a, T>>,
+        each: usize,
+    ) -> Result<SliceMut<'a, T>> {
+        rows.into().range(self.range(each))
+    }
+
+    fn range(&self, each: usize) -> Range<usize> {
+        self.first * each..(self.first + self.count) * each
     }
 
     /// How many Gaussians it is of, as kernels count.

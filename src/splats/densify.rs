@@ -293,13 +293,13 @@ impl Densifier {
             pass.fill(&mut scratch.tally, 0);
             for batch in batches.iter() {
                 let buffers = densify_score::Buffers {
-                    parameters: &batch.of_rows(parameters, columns)?,
-                    grad_norm_sums: &batch.of_rows(grad_norm_sums, 1)?,
-                    visit_counts: &batch.of_rows(visit_counts, 1)?,
-                    keys: &mut batch.of_rows(&scratch.keys, 1)?,
-                    ids: &mut batch.of_rows(&scratch.ids, 1)?,
-                    tally: &mut scratch.tally,
-                    cameras,
+                    parameters: batch.rows(parameters, columns)?,
+                    grad_norm_sums: batch.rows(&**grad_norm_sums, 1)?,
+                    visit_counts: batch.rows(&**visit_counts, 1)?,
+                    keys: batch.rows_mut(&mut scratch.keys, 1)?,
+                    ids: batch.rows_mut(&mut scratch.ids, 1)?,
+                    tally: scratch.tally.slice_mut(),
+                    cameras: cameras.slice(),
                 };
                 let threads = Threads::Exactly([batch.gaussian_count(), 1, 1]);
                 pass.dispatch(&self.score, &score(batch), buffers, threads)?;
@@ -308,12 +308,12 @@ impl Densifier {
             sort.record(pass, counted, &mut scratch.keys, &mut scratch.ids, u32::BITS)?;
             for batch in batches.iter() {
                 let buffers = densify_decide::Buffers {
-                    parameters: &batch.of_rows(parameters, columns)?,
-                    sorted_keys: &scratch.keys,
-                    sorted_ids: &scratch.ids,
-                    tally: &mut scratch.tally,
-                    fates: &mut scratch.fates,
-                    offspring_counts: &mut scratch.offspring_counts,
+                    parameters: batch.rows(parameters, columns)?,
+                    sorted_keys: scratch.keys.slice(),
+                    sorted_ids: scratch.ids.slice(),
+                    tally: scratch.tally.slice_mut(),
+                    fates: scratch.fates.slice_mut(),
+                    offspring_counts: scratch.offspring_counts.slice_mut(),
                 };
                 let threads = Threads::Exactly([count, 1, 1]);
                 pass.dispatch(&self.decide, &decide(batch), buffers, threads)?;
@@ -360,10 +360,10 @@ impl Densifier {
         self.gpu.run("densify_scatter", |pass| {
             for &(from, to) in &pairs {
                 let buffers = densify_scatter::Buffers {
-                    parameters: &from.of_rows(parameters, columns)?,
-                    fates: &from.of_rows(fates, 1)?,
-                    offsets: &from.of_rows(offsets, 1)?,
-                    new_parameters: &mut to.of_rows(target, columns)?,
+                    parameters: from.rows(parameters, columns)?,
+                    fates: from.rows(fates, 1)?,
+                    offsets: from.rows(offsets, 1)?,
+                    new_parameters: to.rows_mut(&mut *target, columns)?,
                 };
                 let threads = Threads::Exactly([from.gaussian_count(), 1, 1]);
                 pass.dispatch(&self.scatter, &params(from, to), buffers, threads)?;
@@ -399,10 +399,10 @@ impl Densifier {
                 take(&mut planes, spare);
                 for &(from, to) in &pairs {
                     let buffers = densify_moments::Buffers {
-                        moments: &from.of_planes(moments)?.words(),
-                        fates: &from.of_rows(fates, 1)?,
-                        offsets: &from.of_rows(offsets, 1)?,
-                        new_moments: &mut to.of_planes(spare)?.words(),
+                        moments: from.planes(&*moments)?.words(),
+                        fates: from.rows(fates, 1)?,
+                        offsets: from.rows(offsets, 1)?,
+                        new_moments: to.planes_mut(&mut *spare)?.words(),
                     };
                     let threads = Threads::Exactly([from.gaussian_count(), 1, 1]);
                     pass.dispatch(&self.moments, &params(from, to), buffers, threads)?;

@@ -10,24 +10,25 @@ pub use schedule::{LearningRates, Schedule};
 
 use std::sync::OnceLock;
 
-use crate::gpu::{Buffer, Gpu, Kernel, Pipeline, Recorder, Threads};
+use crate::gpu::{Buffer, Gpu, Kernel, Pipeline, Recorder, Slice, SliceMut, Threads};
 use crate::kernels::{adam, adam_rest};
 use crate::splats::batches::Batch;
 use crate::splats::halves::Bits;
 use crate::{Error, Result};
 
-/// The exponential means of the gradients and of their squares: planes, as the parameters are.
+/// The exponential means of the gradients and of their squares: planes, as the parameters are, in buffers or in slices of
+/// buffers.
 #[derive(Debug)]
-pub enum Moments {
+pub enum Moments<P = Buffer<f32>> {
     /// Both in 32 bits.
     Single {
         /// Of the gradients.
-        first: Buffer<f32>,
+        first: P,
         /// Of their squares.
-        second: Buffer<f32>,
+        second: P,
     },
     /// Both in the bits of one float: the upper half of the first's bits above that of the second's.
-    Half(Buffer<f32>),
+    Half(P),
 }
 
 impl Moments {
@@ -52,23 +53,13 @@ impl Moments {
         })
     }
 
-    /// Their planes, by name.
-    pub(crate) fn planes(&self) -> Vec<(&'static str, &Buffer<f32>)> {
+    /// All of them, for a step of Adam.
+    pub fn slice_mut(&mut self) -> Moments<SliceMut<'_, f32>> {
         match self {
             Self::Single { first, second } => {
-                vec![("first_moments", first), ("second_moments", second)]
+                Moments::Single { first: first.slice_mut(), second: second.slice_mut() }
             }
-            Self::Half(both) => vec![("moments", both)],
-        }
-    }
-
-    /// Their planes, by name.
-    pub(crate) fn planes_mut(&mut self) -> Vec<(&'static str, &mut Buffer<f32>)> {
-        match self {
-            Self::Single { first, second } => {
-                vec![("first_moments", first), ("second_moments", second)]
-            }
-            Self::Half(both) => vec![("moments", both)],
+            Self::Half(both) => Moments::Half(both.slice_mut()),
         }
     }
 
@@ -76,13 +67,47 @@ impl Moments {
     ///
     /// # Errors
     /// The planes are shorter.
-    pub fn of_batch(&self, batch: &Batch) -> Result<Self> {
+    pub fn of_batch(&mut self, batch: &Batch) -> Result<Moments<SliceMut<'_, f32>>> {
         Ok(match self {
-            Self::Single { first, second } => {
-                Self::Single { first: batch.of_planes(first)?, second: batch.of_planes(second)? }
-            }
-            Self::Half(both) => Self::Half(batch.of_planes(both)?),
+            Self::Single { first, second } => Moments::Single {
+                first: batch.planes_mut(first)?,
+                second: batch.planes_mut(second)?,
+            },
+            Self::Half(both) => Moments::Half(batch.planes_mut(both)?),
         })
+    }
+}
+
+impl<P> Moments<P> {
+    /// Their planes, by name.
+    pub(crate) fn planes(&self) -> Vec<(&'static str, &P)> {
+        match self {
+            Self::Single { first, second } => {
+                vec![("first_moments", first), ("second_moments", second)]
+            }
+            Self::Half(both) => vec![("moments", both)],
+        }
+    }
+
+    /// Their planes, by name.
+    pub(crate) fn planes_mut(&mut self) -> Vec<(&'static str, &mut P)> {
+        match self {
+            Self::Single { first, second } => {
+                vec![("first_moments", first), ("second_moments", second)]
+            }
+            Self::Half(both) => vec![("moments", both)],
+        }
+    }
+
+    /// Their planes, by name.
+    #[cfg(feature = "io")]
+    pub(crate) fn into_planes(self) -> Vec<(&'static str, P)> {
+        match self {
+            Self::Single { first, second } => {
+                vec![("first_moments", first), ("second_moments", second)]
+            }
+            Self::Half(both) => vec![("moments", both)],
+        }
     }
 
     /// In how many bits they are.
@@ -92,15 +117,32 @@ impl Moments {
             Self::Half(_) => Bits::Half,
         }
     }
+}
 
-    /// What a kernel binds: either both, or what holds both; of what there is not, nothing.
-    fn bound(&self) -> Result<([Buffer<f32>; 2], Buffer<f32>)> {
-        let all = |plane: &Buffer<f32>| plane.window(0, plane.len());
-        let none = |plane: &Buffer<f32>| plane.window(0, 0);
-        Ok(match self {
-            Self::Single { first, second } => ([all(first)?, all(second)?], none(first)?),
-            Self::Half(both) => ([none(both)?, none(both)?], all(both)?),
-        })
+impl<'a> Moments<SliceMut<'a, f32>> {
+    /// The same for one use.
+    fn reborrow(&mut self) -> Moments<SliceMut<'_, f32>> {
+        match self {
+            Self::Single { first, second } => {
+                Moments::Single { first: first.reborrow(), second: second.reborrow() }
+            }
+            Self::Half(both) => Moments::Half(both.reborrow()),
+        }
+    }
+
+    /// What a kernel binds: the first, the second, and what holds both; those there are not are empty.
+    fn bindings(self) -> Result<[SliceMut<'a, f32>; 3]> {
+        match self {
+            Self::Single { first, second } => {
+                let len = first.len();
+                let [first, both] = first.split([0..len, 0..0])?;
+                Ok([first, second, both])
+            }
+            Self::Half(both) => {
+                let len = both.len();
+                both.split([0..0, 0..0, 0..len])
+            }
+        }
     }
 }
 
@@ -108,11 +150,23 @@ impl Moments {
 #[derive(Debug)]
 pub struct AdamBuffers<'a> {
     /// What is optimised.
-    pub parameters: &'a mut Buffer<f32>,
+    pub parameters: SliceMut<'a, f32>,
     /// dL/d parameters; one that is not finite counts as zero.
-    pub gradients: &'a Buffer<f32>,
+    pub gradients: Slice<'a, f32>,
     /// The moments, updated.
-    pub moments: &'a mut Moments,
+    pub moments: Moments<SliceMut<'a, f32>>,
+}
+
+impl AdamBuffers<'_> {
+    /// The same for one step of two.
+    pub(crate) fn reborrow(&mut self) -> AdamBuffers<'_> {
+        let Self { parameters, gradients, moments } = self;
+        AdamBuffers {
+            parameters: parameters.reborrow(),
+            gradients: *gradients,
+            moments: moments.reborrow(),
+        }
+    }
 }
 
 /// Adam with beta 0.9 and 0.999, epsilon 1e-15 (Kingma and Ba 2015; the constants of 3DGS).
@@ -152,11 +206,11 @@ impl Adam {
         status: &Buffer<u32>,
     ) -> Result<()> {
         let len = gaussian_count as usize * column_count as usize;
-        check(step, status, [(&*parameters, len), (gradients, len)], (moments, len))?;
+        check(step, status, [(parameters.as_slice(), len), (gradients, len)], (&moments, len))?;
         let half_moments = moments.bits() == Bits::Half;
         let constants = adam::Constants { half_moments };
         let pipeline = self.pipeline(&self.floats, half_moments, &constants)?;
-        let ([mut first, mut second], mut both) = moments.bound()?;
+        let [first_moments, second_moments, both_moments] = moments.bindings()?;
         let (uncorrected, second_correction) = corrections(step);
         pass.dispatch(
             pipeline,
@@ -171,10 +225,10 @@ impl Adam {
             adam::Buffers {
                 parameters,
                 gradients,
-                first_moments: &mut first,
-                second_moments: &mut second,
-                both_moments: &mut both,
-                status,
+                first_moments,
+                second_moments,
+                both_moments,
+                status: status.slice(),
             },
             Threads::Exactly([(len as u32).div_ceil(4), 1, 1]),
         )
@@ -195,11 +249,12 @@ impl Adam {
     ) -> Result<()> {
         let len = |own: u32| gaussian_count as usize * (first_column + own) as usize;
         let (words, floats) = (len(coefficient_count.div_ceil(2)), len(coefficient_count));
-        check(step, status, [(&*parameters, words), (gradients, floats)], (moments, floats))?;
+        let planes = [(parameters.as_slice(), words), (gradients, floats)];
+        check(step, status, planes, (&moments, floats))?;
         let half_moments = moments.bits() == Bits::Half;
         let constants = adam_rest::Constants { half_moments };
         let pipeline = self.pipeline(&self.halves, half_moments, &constants)?;
-        let ([mut first, mut second], both) = moments.bound()?;
+        let [first_moments, second_moments, both_moments] = moments.bindings()?;
         let (uncorrected, second_correction) = corrections(step);
         pass.dispatch(
             pipeline,
@@ -212,12 +267,12 @@ impl Adam {
                 step: step as u32,
             },
             adam_rest::Buffers {
-                parameters: &mut parameters.words(),
+                parameters: parameters.words(),
                 gradients,
-                first_moments: &mut first,
-                second_moments: &mut second,
-                both_moments: &mut both.words(),
-                status,
+                first_moments,
+                second_moments,
+                both_moments: both_moments.words(),
+                status: status.slice(),
             },
             Threads::Exactly([gaussian_count * coefficient_count.div_ceil(4), 1, 1]),
         )
@@ -242,10 +297,10 @@ impl Adam {
 fn check(
     step: u64,
     status: &Buffer<u32>,
-    planes: [(&Buffer<f32>, usize); 2],
-    (moments, len): (&Moments, usize),
+    planes: [(Slice<'_, f32>, usize); 2],
+    (moments, len): (&Moments<SliceMut<'_, f32>>, usize),
 ) -> Result<()> {
-    let moments = moments.planes().into_iter().map(|(_, plane)| (plane, len));
+    let moments = moments.planes().into_iter().map(|(_, plane)| (plane.as_slice(), len));
     if let Some((short, needed)) = planes.into_iter().chain(moments).find(|(b, n)| b.len() < *n) {
         let (name, has) = (short.name(), short.len());
         let what = format!("buffer `{name}` holds {has} floats, Adam needs {needed}");

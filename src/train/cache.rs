@@ -268,7 +268,7 @@ impl InFile {
     fn save(gpu: &Gpu, photograph: &Photograph, spool: &Arc<Spool>) -> Result<Self> {
         let (name, words, palette, decoder) = match photograph {
             Photograph::Plain(buffer) => {
-                let words = gpu.read(buffer)?.into_iter().map(f32::to_bits).collect();
+                let words = gpu.read(&**buffer)?.into_iter().map(f32::to_bits).collect();
                 (buffer.name(), words, vec![], None)
             }
             Photograph::Coded(coded) => {

@@ -18,7 +18,7 @@ use super::{TrainConfig, Trainer, learnables};
 use crate::base::hash::{self, Hasher};
 use crate::base::input;
 use crate::base::output::write_whole_with;
-use crate::gpu::{Buffer, Gpu};
+use crate::gpu::{Gpu, SliceMut};
 use crate::networks::TensorFile;
 use crate::photographs::dataset::Fingerprint;
 use crate::splats::batches::Batches;
@@ -104,7 +104,7 @@ pub fn check_checkpoint(path: &Path) -> Result<()> {
 pub(super) struct State<'a> {
     pub(super) name: String,
     pub(super) shape: Vec<usize>,
-    buffer: &'a mut Buffer<f32>,
+    buffer: SliceMut<'a, f32>,
     /// How it lies in the buffer, where that is not as in the file.
     batches: Option<Batches>,
 }
@@ -112,9 +112,9 @@ pub(super) struct State<'a> {
 impl State<'_> {
     fn read(&self, gpu: &Gpu) -> Result<Vec<f32>> {
         if let Some(batches) = self.batches {
-            return batches.read(gpu, self.buffer);
+            return batches.read(gpu, self.buffer.as_slice());
         }
-        let mut values = gpu.read(self.buffer)?;
+        let mut values = gpu.read(self.buffer.as_slice())?;
         values.truncate(self.shape.iter().product());
         Ok(values)
     }
@@ -350,8 +350,10 @@ impl Trainer {
             });
         let name = "density.grad_norm_sums".to_owned();
         let shape = vec![gaussians.count as usize];
-        let mut state = vec![State { name, shape, buffer: grad_norm_sums, batches: None }];
+        let buffer = grad_norm_sums.slice_mut();
+        let mut state = vec![State { name, shape, buffer, batches: None }];
         let DeviceGaussians { parameters, moments, .. } = gaussians;
+        let (parameters, moments) = (parameters.slice_mut(), moments.slice_mut());
         state.extend(optimized("gaussians", parameters, moments).enumerate().map(
             |(place, (name, buffer))| {
                 let (shape, batches) = if place == 0 { &of_parameters } else { &of_moments };
@@ -391,10 +393,10 @@ fn best_of(file: &TensorFile<'_>) -> std::result::Result<Snapshot, String> {
 /// What Adam works on, by the names of the tensors: the parameters, and then their moments.
 fn optimized<'a>(
     owner: &str,
-    parameters: &'a mut Buffer<f32>,
-    moments: &'a mut Moments,
-) -> impl Iterator<Item = (String, &'a mut Buffer<f32>)> {
-    let all = std::iter::once(("parameters", parameters)).chain(moments.planes_mut());
+    parameters: SliceMut<'a, f32>,
+    moments: Moments<SliceMut<'a, f32>>,
+) -> impl Iterator<Item = (String, SliceMut<'a, f32>)> {
+    let all = std::iter::once(("parameters", parameters)).chain(moments.into_planes());
     all.map(move |(name, buffer)| (format!("{owner}.{name}"), buffer))
 }
 

@@ -265,6 +265,13 @@ mod tests {
         }
     }
 
+    /// A call returns early where the machine is slow, so that progress can be shown.
+    fn train_until(trainer: &mut Trainer, step: u64) {
+        while trainer.step < step {
+            trainer.train_steps(step, &mut vec![]).unwrap();
+        }
+    }
+
     /// A trainer on a small set with a held-out view, after some steps and a score.
     fn scored(margin: f64) -> Trainer {
         let folder = tempfile::tempdir().unwrap();
@@ -275,7 +282,7 @@ mod tests {
         config.schedule.resolution_steps = [0, 0];
         let dataset = Dataset::load(folder.path(), &config.load_options()).unwrap();
         let mut trainer = Trainer::new(&gpu(), config, &dataset).unwrap();
-        trainer.train_steps(12, &mut vec![]).unwrap();
+        train_until(&mut trainer, 12);
         trainer.score_held_out().unwrap();
         trainer
     }
@@ -285,7 +292,7 @@ mod tests {
         for (margin, best_step) in [(0.25, 12), (90.0, 20)] {
             let mut trainer = scored(margin);
             let best = trainer.gaussians().unwrap();
-            trainer.train_steps(20, &mut vec![]).unwrap();
+            train_until(&mut trainer, 20);
             // Damage: nothing is seen any more.
             let gpu = trainer.gpu.clone();
             let parameters = &mut trainer.model.gaussians.parameters;
@@ -304,7 +311,7 @@ mod tests {
         let mut trainer = scored(0.25);
         let file = tempfile::NamedTempFile::new().unwrap();
         let best = trainer.gaussians().unwrap();
-        trainer.train_steps(16, &mut vec![]).unwrap();
+        train_until(&mut trainer, 16);
         trainer.save_checkpoint(file.path()).unwrap();
         let mut restored = scored(0.25);
         restored.best.clear();

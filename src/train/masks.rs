@@ -130,7 +130,13 @@ impl Masking {
         pass.dispatch(
             &self.render,
             &mask_render::Params { value_count, pixel_count: size.x * size.y },
-            mask_render::Buffers { weights, render, low, tone, shown: &mut self.shown },
+            mask_render::Buffers {
+                weights: weights.slice(),
+                render: render.slice(),
+                low: low.slice(),
+                tone: tone.slice(),
+                shown: self.shown.slice_mut(),
+            },
             Threads::Exactly([value_count, 1, 1]),
         )?;
         Ok(&self.shown)
@@ -152,7 +158,7 @@ impl Masking {
         pass.dispatch(
             &self.gradient,
             &mask_gradient::Params { value_count, pixel_count },
-            mask_gradient::Buffers { weights, d_render },
+            mask_gradient::Buffers { weights: weights.slice(), d_render: d_render.slice_mut() },
             Threads::Exactly([value_count, 1, 1]),
         )
     }

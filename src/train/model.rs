@@ -117,7 +117,7 @@ impl Model {
         self.planes_mut().try_for_each(|plane| lengthen(gpu, plane, room * columns))?;
         let parameters = self.gaussians.read(gpu)?;
         let batches = self.gaussians.batches(gpu);
-        let planes = self.planes_mut().map(|plane| batches.read(gpu, plane));
+        let planes = self.planes_mut().map(|plane| batches.read(gpu, &*plane));
         let planes = planes.collect::<Result<Vec<_>>>()?;
 
         (self.shape, self.gaussians.column_count) = (new, columns as u32);
@@ -163,22 +163,23 @@ impl Model {
         sh_degree: u32,
         status: &Buffer<u32>,
     ) -> Result<()> {
-        let gaussians = &self.gaussians;
+        let gaussians = &mut self.gaussians;
         let DeviceGaussians { column_count, feature_count, rest, .. } = *gaussians;
         let first = width(0) as u32 + feature_count;
         let of_floats = if sh_degree == 0 || rest == Bits::Half { first } else { column_count };
         gaussians.batches(gpu).iter().try_for_each(|batch| {
             let words = gaussians.parameter_columns();
-            let parameters = &mut batch.of_rows(&gaussians.parameters, words)?;
-            let gradients = &batch.of_planes(&self.gradients)?;
-            let moments = &mut gaussians.moments.of_batch(&batch)?;
+            let mut buffers = AdamBuffers {
+                parameters: batch.rows_mut(&mut gaussians.parameters, words)?,
+                gradients: batch.planes(&self.gradients)?,
+                moments: gaussians.moments.of_batch(&batch)?,
+            };
             let count = batch.gaussian_count();
-            let buffers = AdamBuffers { parameters, gradients, moments };
-            adam.record(pass, step, rates, [count, of_floats, feature_count], buffers, status)?;
+            let floats = [count, of_floats, feature_count];
+            adam.record(pass, step, rates, floats, buffers.reborrow(), status)?;
             if sh_degree == 0 || rest == Bits::Single {
                 return Ok(());
             }
-            let buffers = AdamBuffers { parameters, gradients, moments };
             let rate = rates[Attribute::Rest];
             let halves = [count, first, column_count - first];
             adam.record_halves(pass, step, rate, halves, buffers, status)
@@ -224,8 +225,8 @@ impl Model {
             (self.gaussians.parameter_batches(gpu), self.gaussians.parameter_columns());
         let mut before = 0;
         for batch in batches.iter() {
-            let planes = batch.of_rows(&self.gaussians.parameters, words)?;
-            if let Some(at) = finite.first(gpu, &planes, planes.len())? {
+            let planes = batch.rows(&self.gaussians.parameters, words)?;
+            if let Some(at) = finite.first(gpu, planes, planes.len())? {
                 return Ok(Some(batches.place_of(before + at)));
             }
             before += planes.len();
@@ -257,7 +258,7 @@ impl Model {
 fn lengthen(gpu: &Gpu, buffer: &mut Buffer<f32>, len: usize) -> Result<()> {
     if buffer.len() < len {
         let mut longer = gpu.uninit_in_windows(buffer.name(), len)?;
-        gpu.write(&mut longer, &gpu.read(buffer)?)?;
+        gpu.write(&mut longer, &gpu.read(&*buffer)?)?;
         *buffer = longer;
     }
     Ok(())

@@ -235,7 +235,11 @@ impl Photograph {
         pass.dispatch(
             &coded.decoder,
             &decode::Params { value_count: coded.value_count as u32 },
-            decode::Buffers { codes: &coded.codes, values: &coded.values, decoded: scratch },
+            decode::Buffers {
+                codes: coded.codes.slice(),
+                values: coded.values.slice(),
+                decoded: scratch.slice_mut(),
+            },
             Threads::Exactly([coded.codes.len() as u32, 1, 1]),
         )?;
         Ok(scratch)

@@ -31,7 +31,10 @@ macro_rules! run_kernel {
         $(let mut $output = gpu.buffer(stringify!($output), &$output).unwrap();)+
         let (done, report) = gpu.checked(|| {
             gpu.run(stringify!($kernel), |pass| {
-                let buffers = $kernel::Buffers { $($input: &$input,)* $($output: &mut $output,)+ };
+                let buffers = $kernel::Buffers {
+                    $($input: $input.slice(),)*
+                    $($output: $output.slice_mut(),)+
+                };
                 pass.dispatch(&pipeline, params, buffers, threads)
             })
         });

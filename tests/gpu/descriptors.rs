@@ -39,7 +39,10 @@ fn a_recording_of_many_passes_binds_each_its_own_buffers_in_sets() {
         gpu.run("many passes", |pass| {
             for gradient in &mut gradients {
                 let params = relu_backward::Params { value_count: 2 };
-                let buffers = relu_backward::Buffers { activations: &activations, gradient };
+                let buffers = relu_backward::Buffers {
+                    activations: activations.slice(),
+                    gradient: gradient.slice_mut(),
+                };
                 pass.dispatch(&pipeline, &params, buffers, Threads::Exactly([2, 1, 1]))?;
             }
             Ok(())

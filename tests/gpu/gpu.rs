@@ -25,7 +25,10 @@ fn ones_and_zeros(count: usize, threads: Threads<'_>) -> Vec<f32> {
     let mut gradient = gpu.buffer("gradient", &vec![1.0; count]).unwrap();
     gpu.run("ones and zeros", |pass| {
         let params = relu_backward::Params { value_count: count as u32 };
-        let buffers = relu_backward::Buffers { activations: &activations, gradient: &mut gradient };
+        let buffers = relu_backward::Buffers {
+            activations: activations.slice(),
+            gradient: gradient.slice_mut(),
+        };
         pass.dispatch(&pipeline, &params, buffers, threads)
     })
     .unwrap();
@@ -295,16 +298,16 @@ fn more_workgroups_than_fit_along_x_are_folded_and_none_is_lost() {
     let mut transmittances = gpu.zeros("transmittances", pixels).unwrap();
     gpu.run("fold", |pass| {
         let buffers = blend_forward::Buffers {
-            counts: &counts,
-            sorted_tiles: &sorted_tiles,
-            tile_ranges: &mut tile_ranges,
-            status: &mut status,
-            sorted_slots: &sorted_slots,
-            owners: &owners,
-            splats: &splats,
-            colors: &colors,
-            render: &mut render,
-            transmittances: &mut transmittances,
+            counts: counts.slice(),
+            sorted_tiles: sorted_tiles.slice(),
+            tile_ranges: tile_ranges.slice_mut(),
+            status: status.slice_mut(),
+            sorted_slots: sorted_slots.slice(),
+            owners: owners.slice(),
+            splats: splats.slice(),
+            colors: colors.slice(),
+            render: render.slice_mut(),
+            transmittances: transmittances.slice_mut(),
         };
         pass.dispatch(&pipeline, &params, buffers, Threads::Workgroups([rows * COLUMNS, 1, 1]))
     })
@@ -323,7 +326,10 @@ fn workgroups_that_cannot_be_folded_are_refused_by_the_name_of_the_pass() {
     let activations = gpu.zeros("activations", 1).unwrap();
     let pipeline = relu_pipeline();
     let refused = gpu.run("refused", |pass| {
-        let buffers = relu_backward::Buffers { activations: &activations, gradient: &mut gradient };
+        let buffers = relu_backward::Buffers {
+            activations: activations.slice(),
+            gradient: gradient.slice_mut(),
+        };
         let params = relu_backward::Params { value_count: 1 };
         pass.dispatch(&pipeline, &params, buffers, Threads::Workgroups([too_many, 2, 1]))
     });
@@ -340,9 +346,11 @@ fn a_profile_names_each_pass_and_its_time_in_order() {
     let threads = Threads::Exactly([5000, 1, 1]);
     let times = gpu
         .profile("two passes", |pass| {
-            let buffers = relu_backward::Buffers { activations: &a, gradient: &mut b };
+            let buffers =
+                relu_backward::Buffers { activations: a.slice(), gradient: b.slice_mut() };
             pass.dispatch(&pipeline, &params, buffers, threads)?;
-            let buffers = relu_backward::Buffers { activations: &b, gradient: &mut a };
+            let buffers =
+                relu_backward::Buffers { activations: b.slice(), gradient: a.slice_mut() };
             pass.dispatch(&pipeline, &params, buffers, threads)
         })
         .unwrap();

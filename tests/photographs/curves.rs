@@ -162,10 +162,12 @@ fn on_device(gpu: &Gpu, curve: ToneCurve, grid: &[f32], tone: ToneParameters) ->
     tone_map::Kernel::run(&params, &constants, slices);
     let pipeline = gpu.pipeline::<tone_map::Kernel>(&constants).unwrap();
     let mut target = gpu.zeros("target", grid.len()).unwrap();
+    let device_image = gpu.buffer("image", grid).unwrap();
+    let device_parameters = gpu.buffer("parameters", &[tone]).unwrap();
     let buffers = tone_map::Buffers {
-        image: &gpu.buffer("image", grid).unwrap(),
-        parameters: &gpu.buffer("parameters", &[tone]).unwrap(),
-        target: &mut target,
+        image: device_image.slice(),
+        parameters: device_parameters.slice(),
+        target: target.slice_mut(),
     };
     let threads =
         Threads::Exactly([params.value_count.div_ceil(4 * constants.quads_per_thread), 1, 1]);
@@ -255,10 +257,12 @@ fn tone_mix_matches_its_reference() {
                 tone_mix::Slices { image: &image, parameters: &[tone], target: &mut expected };
             tone_mix::Kernel::run(&params, &constants, slices);
             let mut target = gpu.zeros("target", expected.len()).unwrap();
+            let device_image = gpu.buffer("image", &image).unwrap();
+            let device_parameters = gpu.buffer("parameters", &[tone]).unwrap();
             let buffers = tone_mix::Buffers {
-                image: &gpu.buffer("image", &image).unwrap(),
-                parameters: &gpu.buffer("parameters", &[tone]).unwrap(),
-                target: &mut target,
+                image: device_image.slice(),
+                parameters: device_parameters.slice(),
+                target: target.slice_mut(),
             };
             let pipeline = gpu.pipeline::<tone_mix::Kernel>(&constants).unwrap();
             let threads = Threads::Exactly([pixels as u32, 1, 1]);
@@ -301,11 +305,14 @@ fn tone_table_matches_its_reference_and_double_precision() {
     };
     tone_table::Kernel::run(&params, &tone_table::Constants::default(), slices);
     let mut target = gpu.zeros("target", expected.len()).unwrap();
+    let device_image = gpu.buffer("image", &image).unwrap();
+    let device_parameters = gpu.buffer("parameters", &[tone]).unwrap();
+    let device_knots = gpu.buffer("knots", &knots).unwrap();
     let buffers = tone_table::Buffers {
-        image: &gpu.buffer("image", &image).unwrap(),
-        parameters: &gpu.buffer("parameters", &[tone]).unwrap(),
-        knots: &gpu.buffer("knots", &knots).unwrap(),
-        target: &mut target,
+        image: device_image.slice(),
+        parameters: device_parameters.slice(),
+        knots: device_knots.slice(),
+        target: target.slice_mut(),
     };
     let pipeline = gpu.pipeline::<tone_table::Kernel>(&tone_table::Constants::default()).unwrap();
     let threads = Threads::Exactly([3 * pixels as u32, 1, 1]);
@@ -378,10 +385,12 @@ fn the_automatic_curve_is_one_on_grey_and_keeps_the_ratios_of_colours() {
         let curve = tone_mix::Constants { tone_curve: ToneCurve::Auto.constant() };
         let pipeline = gpu.pipeline::<tone_mix::Kernel>(&curve).unwrap();
         let mut target = gpu.zeros("target", image.len()).unwrap();
+        let device_image = gpu.buffer("image", &image).unwrap();
+        let device_parameters = gpu.buffer("parameters", &[tone]).unwrap();
         let buffers = tone_mix::Buffers {
-            image: &gpu.buffer("image", &image).unwrap(),
-            parameters: &gpu.buffer("parameters", &[tone]).unwrap(),
-            target: &mut target,
+            image: device_image.slice(),
+            parameters: device_parameters.slice(),
+            target: target.slice_mut(),
         };
         let params = tone_mix::Params { pixel_count: 601, view: 0 };
         let threads = Threads::Exactly([601, 1, 1]);

@@ -193,10 +193,12 @@ fn tone_statistics_matches_the_reference() {
             };
             tone_statistics::Kernel::run(&params, &constants, slices);
             let mut device_statistics = gpu.zeros("statistics", 1).unwrap();
+            let device_searches = gpu.buffer("searches", &searches).unwrap();
+            let device_sums = gpu.buffer("sums", &sums).unwrap();
             let bound = tone_statistics::Buffers {
-                searches: &gpu.buffer("searches", &searches).unwrap(),
-                sums: &gpu.buffer("sums", &sums).unwrap(),
-                statistics: &mut device_statistics,
+                searches: device_searches.slice(),
+                sums: device_sums.slice(),
+                statistics: device_statistics.slice_mut(),
             };
             gpu.run("tone_statistics", |pass| {
                 pass.dispatch(&pipeline, &params, bound, Threads::Workgroups([1, 1, 1]))
@@ -248,10 +250,12 @@ fn tone_map_follows_the_reference_from_tiny_to_huge_values() {
                 tone_map::Slices { image: &grid, parameters: &parameters, target: &mut expected };
             tone_map::Kernel::run(&params, &constants, slices);
             let mut target = gpu.zeros("target", grid.len()).unwrap();
+            let device_image = gpu.buffer("image", &grid).unwrap();
+            let device_parameters = gpu.buffer("parameters", &parameters).unwrap();
             let bound = tone_map::Buffers {
-                image: &gpu.buffer("image", &grid).unwrap(),
-                parameters: &gpu.buffer("parameters", &parameters).unwrap(),
-                target: &mut target,
+                image: device_image.slice(),
+                parameters: device_parameters.slice(),
+                target: target.slice_mut(),
             };
             gpu.run("tone_map", |pass| {
                 pass.dispatch(

@@ -35,7 +35,7 @@ fn planes_go_there_in_batches_and_come_back_whole() {
         }
         // The scales of a batch's last Gaussian are where its kernels look.
         if let Some(batch) = all.iter().filter(|batch| batch.count > 0).last() {
-            let own = gpu.read(&batch.of_planes(&buffer).unwrap()).unwrap();
+            let own = gpu.read(batch.planes(&buffer).unwrap()).unwrap();
             let last = Gaussians { count: batch.count, shape, parameters: own }.log_scales()
                 [batch.count - 1];
             let whole = Gaussians { count, shape, parameters: planes };

@@ -167,9 +167,11 @@ fn adam_on_device(steps: u64, start: &[f32]) -> Vec<f32> {
     let mut record = |steps: Range<u64>| {
         gpu.run("adam", |pass| {
             for step in steps.clone() {
-                let gradients = &gradients[(step % TURNS) as usize];
-                let buffers =
-                    AdamBuffers { parameters: &mut parameters, gradients, moments: &mut moments };
+                let buffers = AdamBuffers {
+                    parameters: parameters.slice_mut(),
+                    gradients: gradients[(step % TURNS) as usize].slice(),
+                    moments: moments.slice_mut(),
+                };
                 let counts = [GAUSSIANS as u32, COLUMNS as u32, 0];
                 adam.record(pass, step, &RATES, counts, buffers, &status)?;
             }

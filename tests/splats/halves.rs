@@ -54,14 +54,20 @@ impl Learned {
         let rates = LearningRates::uniform(rate);
         gpu.run("adam", |pass| {
             let Self { gaussians, gradients, adam, status, .. } = self;
-            let DeviceGaussians { parameters, moments, .. } = gaussians;
-            let buffers = AdamBuffers { parameters, gradients, moments };
+            let buffers = AdamBuffers {
+                parameters: gaussians.parameters.slice_mut(),
+                gradients: gradients.slice(),
+                moments: gaussians.moments.slice_mut(),
+            };
             adam.record(pass, step, &rates, [count, floats, feature_count], buffers, status)?;
             if rest == Bits::Single {
                 return Ok(());
             }
-            let DeviceGaussians { parameters, moments, .. } = gaussians;
-            let buffers = AdamBuffers { parameters, gradients, moments };
+            let buffers = AdamBuffers {
+                parameters: gaussians.parameters.slice_mut(),
+                gradients: gradients.slice(),
+                moments: gaussians.moments.slice_mut(),
+            };
             let halves = [count, first, column_count - first];
             adam.record_halves(pass, step, rate, halves, buffers, status)
         })

@@ -60,9 +60,9 @@ impl Planes {
         let adam = Adam::new(gpu).unwrap();
         gpu.run("adam", |pass| {
             let buffers = AdamBuffers {
-                parameters: &mut parameters,
-                gradients: &gradients,
-                moments: &mut moments,
+                parameters: parameters.slice_mut(),
+                gradients: gradients.slice(),
+                moments: moments.slice_mut(),
             };
             adam.record(
                 pass,
@@ -266,9 +266,9 @@ fn a_buffer_that_is_too_short_is_refused() {
         let rates = Schedule::default().learning_rates(step, 1.0);
         let result = gpu.run("adam", |pass| {
             let buffers = AdamBuffers {
-                parameters: &mut parameters,
-                gradients: &gradients,
-                moments: &mut moments,
+                parameters: parameters.slice_mut(),
+                gradients: gradients.slice(),
+                moments: moments.slice_mut(),
             };
             adam.record(pass, step, &rates, [2, 14, 0], buffers, &status)
         });
@@ -292,9 +292,9 @@ fn coefficients_in_halves_are_refused_where_a_buffer_is_too_short() {
         let status = gpu.zeros("status", 1).unwrap();
         let result = gpu.run("adam", |pass| {
             let buffers = AdamBuffers {
-                parameters: &mut parameters,
-                gradients: &gradients,
-                moments: &mut moments,
+                parameters: parameters.slice_mut(),
+                gradients: gradients.slice(),
+                moments: moments.slice_mut(),
             };
             adam.record_halves(pass, 1, 1e-3, [2, 14, 9], buffers, &status)
         });

@@ -1,39 +1,12 @@
 //! What a dataset lists: photographs with their cameras, before any pixel is read.
 
 use std::collections::HashMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use glam::DAffine3;
-
-use super::{Split, colmap, names, transforms, unused};
-use crate::camera::Lens;
+use super::listed::{ListedView, Listing};
+use super::{colmap, names, transforms, unused};
 use crate::photographs::image::files::{self, Files};
 use crate::{Error, Result};
-
-/// One view as a listing describes it, before any pixel is read.
-#[derive(Clone, Debug)]
-pub(super) struct ListedView {
-    pub(super) name: String,
-    /// Path as listed, relative to the root.
-    pub(super) listed: String,
-    /// Path below the folder of all photographs.
-    pub(super) below: String,
-    /// `None`: the split rule decides.
-    pub(super) split: Option<Split>,
-    /// The listed file, where it exists.
-    pub(super) file: Option<PathBuf>,
-    pub(super) lens: Lens,
-    /// Rigid; the world is the listing's.
-    pub(super) view_from_world: DAffine3,
-}
-
-#[derive(Debug, Default)]
-pub(super) struct Listing {
-    pub(super) frames: Vec<ListedView>,
-    pub(super) skipped: Vec<String>,
-    /// What was chosen, and what lies there unused; a line each.
-    pub(super) remarks: Vec<String>,
-}
 
 /// The views by name, all different.
 pub(super) fn list(root: &Path, files: &Files) -> Result<Listing> {

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use super::listing::ListedView;
+use super::listed::ListedView;
 use super::pixels::{prepared, turn};
 use super::undistort::Undistortion;
 use crate::Result;

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use super::listing::ListedView;
+use super::listed::ListedView;
 use crate::photographs::image::files::stem;
 
 /// A path as one file name, so that what is written of a view needs no folders: `a_001` of `a/001.png`.

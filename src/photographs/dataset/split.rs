@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 
-use super::listing::ListedView;
+use super::listed::ListedView;
 use super::{LoadOptions, Split, names};
 use crate::Result;
 use crate::base::input;

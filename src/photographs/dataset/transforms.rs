@@ -10,7 +10,7 @@ use serde::Deserialize;
 
 use super::Split;
 use super::colmap::SUPPORTED;
-use super::listing::{ListedView, Listing};
+use super::listed::{ListedView, Listing};
 use super::names::below_first;
 use crate::base::input;
 use crate::camera::{Distortion, Lens};

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use super::listing::ListedView;
+use super::listed::ListedView;
 use crate::photographs::image::files::{photographs_in, unread_in};
 
 /// A line where most photographs have no pose, and one for each folder with pictures that are not read.

@@ -3,8 +3,8 @@
 use std::io::Cursor;
 use std::path::Path;
 
-use super::codec::{Source, reader};
 use super::exr_file;
+use super::source::{Source, reader};
 use crate::{Error, Result};
 
 /// More than any camera takes: 16 384 x 16 384.

@@ -1,7 +1,7 @@
 //! Photographs from and to files: PNG, JPEG, WebP, TIFF and EXR in, PNG and EXR out.
 
 use std::fs::File;
-use std::io::{BufRead, BufReader, Cursor, Seek};
+use std::io::{BufReader, Cursor};
 use std::path::Path;
 
 use ::image::{
@@ -14,23 +14,11 @@ use ::image::{
 #[cfg(not(feature = "raw"))]
 use super::files::RAW_REMEDY;
 use super::files::{HEIC_REMEDY, is_raw};
+use super::source::{Source, not_an_image, reader};
 use super::{Image, budget, exr_file, from_interleaved, jpeg, linear_from_srgb, srgb_from_linear};
 use crate::base::input;
 use crate::base::output::write_whole;
 use crate::{Error, Result};
-
-/// A file or memory, behind one type: every decoder is compiled anew for each that it reads from.
-pub(super) trait Source: BufRead + Seek {}
-
-impl<T: BufRead + Seek> Source for T {}
-
-/// The reader of a picture, of the format that its content is of.
-pub(super) fn reader<'a>(
-    source: impl Source + 'a,
-) -> std::io::Result<ImageReader<Box<dyn Source + 'a>>> {
-    let source: Box<dyn Source> = Box::new(source);
-    ImageReader::new(source).with_guessed_format()
-}
 
 fn bytes_of(path: &Path) -> Result<Vec<u8>> {
     input::bytes(path)
@@ -224,15 +212,6 @@ impl Image {
             .map_err(|error| Error::output(path, format!("cannot be encoded: {error}")))?;
         write_whole(path, &file)
     }
-}
-
-pub(super) fn not_an_image(path: &Path, error: &dyn std::error::Error) -> Error {
-    Error::input(
-        path,
-        format!(
-            "is not a readable PNG, JPEG, WebP, TIFF or EXR image ({error}); replace or remove it"
-        ),
-    )
 }
 
 /// What phones write has no free decoder: the message says what converts it.

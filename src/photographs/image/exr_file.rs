@@ -6,7 +6,7 @@ use std::path::Path;
 use exr::prelude::{ReadChannels, ReadLayers, SpecificChannels, Vec2, WritableImage};
 
 use super::Image;
-use super::codec::{Source, not_an_image};
+use super::source::{Source, not_an_image};
 use crate::base::output::write_whole;
 use crate::{Error, Result};
 

@@ -1,8 +1,11 @@
 //! What a row of the table of curves holds, and the values, derivatives and gradients it gives.
 
-use super::catalogue::{Constants, ToneCurve, curve_shape};
-use super::law::within;
-use super::real::{Dual, Real};
+mod catalogue;
+
+use super::real::{Dual, Real, within};
+
+pub(crate) use catalogue::{Constants, curve_shape};
+pub use catalogue::{FAMILIES, ToneCurve};
 
 /// How black level and gain join a curve's shape f.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -105,7 +108,7 @@ impl Family {
 
     /// The family of that name or alias.
     pub fn find(name: &str) -> Option<&'static Self> {
-        super::FAMILIES.iter().find(|family| {
+        FAMILIES.iter().find(|family| {
             family.name.eq_ignore_ascii_case(name)
                 || family.aliases.iter().any(|alias| alias.eq_ignore_ascii_case(name))
         })

@@ -2,10 +2,9 @@
 //! arithmetic: f64 for the parameters that the kernels get, dual numbers for the derivatives of a fit, f32 for the
 //! kernels' references.
 
-use super::catalogue::{Constants, curve_shape};
-use super::families::{Family, Law, White, padded};
-use super::real::Real;
-use super::{Statistics, ToneSettings};
+use super::Statistics;
+use super::families::{Constants, Family, Law, White, curve_shape};
+use super::real::{Real, within};
 use crate::kernels::ToneParameters;
 use crate::kernels::curves::*;
 
@@ -27,19 +26,6 @@ pub(crate) struct Numbers<T> {
     pub(crate) gain_c: T,
     pub(crate) base_gain: T,
     pub(crate) constants: Constants<T>,
-}
-
-impl<T: Real> From<&ToneSettings> for Numbers<T> {
-    fn from(settings: &ToneSettings) -> Self {
-        Self {
-            theta: T::of(settings.theta),
-            alpha: T::of(settings.alpha),
-            beta: settings.beta,
-            gain_c: T::of(settings.gain_c),
-            base_gain: T::of(settings.base_gain),
-            constants: padded(&settings.constants).map(T::of),
-        }
-    }
 }
 
 /// The curve of one photograph: [`ToneParameters`] in any arithmetic.
@@ -121,11 +107,6 @@ pub(crate) fn curve_at<T: Real>(curve: u32, t: T, [offset, gain]: [T; 2], c: &Co
         }
         _ => offset + gain * curve_shape(curve, within(t), c),
     }
-}
-
-/// What lies outside (0, [`LARGEST_T`]), or is no number, counts as the end it is at, a NaN as black.
-pub(super) fn within<T: Real>(t: T) -> T {
-    if t > T::of(0.0) { t.at_most(T::of(LARGEST_T)) } else { T::of(0.0) }
 }
 
 /// Within [0, 1]; a NaN becomes black.

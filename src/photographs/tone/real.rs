@@ -3,6 +3,8 @@
 
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
+use crate::kernels::curves::LARGEST_T;
+
 /// What the formulas of the curves need of a number.
 pub trait Real:
     Copy
@@ -190,6 +192,11 @@ impl Real for Dual {
     fn atan(self) -> Self {
         self.chain(self.value.atan(), 1.0 / (1.0 + self.value * self.value))
     }
+}
+
+/// What lies outside (0, [`LARGEST_T`]), or is no number, counts as the end it is at, a NaN as black.
+pub(crate) fn within<T: Real>(t: T) -> T {
+    if t > T::of(0.0) { t.at_most(T::of(LARGEST_T)) } else { T::of(0.0) }
 }
 
 #[cfg(test)]

@@ -7,8 +7,9 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 
 use super::exposure::BLACK_LEVEL;
-use super::families::White;
+use super::families::{White, padded};
 use super::law::{Numbers, black_level, law};
+use super::real::Real;
 use super::{Profile, Statistics, Table, ToneCurve, ToneParameters};
 use crate::base::settings::{self, Rule, Setting};
 use crate::{Error, Result};
@@ -64,6 +65,19 @@ const MOST: f64 = 1e30;
 /// Settings that belong to a curve: they do not outlast the choice of another one.
 pub(crate) const OF_CURVE: [&str; 8] =
     ["gain_c", "alpha", "auto_gain", "colour", "lift_first", "constants", "table", "profile"];
+
+impl<T: Real> From<&ToneSettings> for Numbers<T> {
+    fn from(settings: &ToneSettings) -> Self {
+        Self {
+            theta: T::of(settings.theta),
+            alpha: T::of(settings.alpha),
+            beta: settings.beta,
+            gain_c: T::of(settings.gain_c),
+            base_gain: T::of(settings.base_gain),
+            constants: padded(&settings.constants).map(T::of),
+        }
+    }
+}
 
 impl ToneSettings {
     /// A row for each setting.

@@ -2,8 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
-use super::directory::FILES;
-use crate::{Error, Result};
+use super::files::{FILES, unwritable};
+use crate::Result;
 
 /// Where the files of a run wait that is being replaced.
 const ASIDE: &str = ".replaced";
@@ -92,10 +92,6 @@ fn is_half_written(name: &str) -> bool {
         || drawn.is_some_and(|drawn| {
             drawn.len() == 6 && drawn.bytes().all(|b| b.is_ascii_alphanumeric())
         })
-}
-
-pub(super) fn unwritable(path: &Path, error: &std::io::Error) -> Error {
-    Error::output(path, format!("cannot be written ({error}); check the folder and the disk"))
 }
 
 #[cfg(test)]

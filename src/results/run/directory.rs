@@ -28,8 +28,9 @@ use std::path::{Path, PathBuf};
 
 use glam::DVec3;
 
-use super::aside::{self, Aside, unwritable};
-use super::generations::{self, CHECKPOINT, CHECKPOINT_BEFORE};
+use super::aside::{self, Aside};
+use super::files::*;
+use super::generations;
 use super::ledger;
 use super::lock::RunLock;
 pub use super::progress::Progress;
@@ -61,66 +62,6 @@ pub struct RunDirectory {
     /// Behind `aside`: nobody else begins before that is in order.
     _lock: RunLock,
 }
-
-/// The files of a run that a new run replaces; nothing else in the directory is touched.
-pub(super) const FILES: [&str; 14] = [
-    DONE,
-    "metrics.json",
-    "model.ply",
-    NETWORKS,
-    EXPOSURES,
-    CHECKPOINT,
-    CHECKPOINT_BEFORE,
-    LOG,
-    HELD_OUT,
-    PROGRESS,
-    HASHES,
-    VIEWS,
-    PLAN,
-    "config.toml",
-];
-
-/// A line per step.
-const LOG: &str = "train.csv";
-
-/// PSNR of the views that were kept from training, against their targets.
-const HELD_OUT: &str = "held_out.csv";
-
-/// Scores of the test views on the way, and what it took.
-const PROGRESS: &str = "evals.csv";
-
-/// Name, split and size of every view.
-pub(super) const VIEWS: &str = "views.csv";
-
-/// The folder of event files.
-const TENSORBOARD: &str = "tensorboard";
-
-/// Checksums of the parameters on the way.
-const HASHES: &str = "hashes.csv";
-
-/// What was decided for the photographs, and why.
-pub(super) const PLAN: &str = "plan.toml";
-
-/// Where `metrics.json` holds the [`crate::train::TargetExposure`].
-pub(crate) const TARGET_EXPOSURE: &str = "target_exposure";
-
-/// Where `metrics.json` holds what the steps took beside seconds.
-pub(crate) const SPENT: &str = "spent";
-
-/// How the run ended, in `metrics.json`.
-pub(crate) const ENDED: &str = "ended";
-
-/// The last scores of the held-out views and their spread, in `metrics.json`.
-pub(crate) const HELD_OUT_COURSE: &str = "held_out";
-
-/// Gain and bias of the training views.
-pub(super) const EXPOSURES: &str = "exposures.csv";
-
-/// The weights of the networks.
-pub(super) const NETWORKS: &str = "networks.safetensors";
-
-/// The sign that the run is whole, and what it is of.
-pub(super) const DONE: &str = "done.json";
 
 impl RunDirectory {
     /// Refuses a place where no run can begin, before anything is loaded or written.

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use super::directory::DONE;
+use super::files::DONE;
 use crate::base::output::write_whole;
 use crate::photographs::dataset::{Dataset, Fingerprint};
 use crate::train::{Ended, TrainConfig};

@@ -1,8 +1,8 @@
 //! What a run tells its observer.
 
-use super::Trained;
+use super::meter::Spent;
 use crate::results::eval::ViewScore;
-use crate::train::{Ended, MemoryEstimate, StepReport};
+use crate::train::{Ended, MemoryEstimate, StepReport, Trainer};
 
 /// A moment of a run, in the order in which they come.
 #[derive(Clone, Copy, Debug)]
@@ -51,4 +51,19 @@ pub enum Event<'a> {
     },
     /// The run directory is whole.
     Finished(&'a Trained),
+}
+
+/// What a run made.
+#[derive(Debug)]
+pub struct Trained {
+    /// The model and its networks, on the device.
+    pub trainer: Trainer,
+    /// How it ended.
+    pub ended: Ended,
+    /// The test views that have a reference image.
+    pub scored: Vec<ViewScore>,
+    /// The loss of every step of this call.
+    pub losses: Vec<f64>,
+    /// What the steps took, without loading and scoring; the seconds before a resumed run included.
+    pub spent: Spent,
 }

@@ -2,15 +2,9 @@
 
 use std::path::{Path, PathBuf};
 
-use super::aside::unwritable;
+use super::files::{CHECKPOINT, CHECKPOINT_BEFORE, unwritable};
 use crate::Result;
 use crate::train::check_checkpoint;
-
-/// The state of an unfinished run, or of a finished one that may be made longer.
-pub(super) const CHECKPOINT: &str = "checkpoint.safetensors";
-
-/// The one before.
-pub(super) const CHECKPOINT_BEFORE: &str = "checkpoint.before.safetensors";
 
 fn both(run: &Path) -> [PathBuf; 2] {
     [CHECKPOINT, CHECKPOINT_BEFORE].map(|file| run.join(file))

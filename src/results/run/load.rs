@@ -5,7 +5,8 @@ use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-use super::directory::{EXPOSURES, NETWORKS, PLAN, VIEWS, view_lines};
+use super::directory::view_lines;
+use super::files::{EXPOSURES, NETWORKS, PLAN, VIEWS};
 use super::generations;
 use crate::gpu::Gpu;
 use crate::loss::exposure::{Affine, table};

@@ -3,10 +3,11 @@
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use super::directory::{ENDED, HELD_OUT_COURSE, Progress, SPENT, TARGET_EXPOSURE};
+use super::directory::Progress;
+use super::files::{ENDED, HELD_OUT_COURSE, SPENT, TARGET_EXPOSURE};
 use super::meter::{Meter, Spent};
 use super::tensorboard::EventFile;
-use super::{Event, Requests, RunDirectory, done, generations, load};
+use super::{Event, Requests, RunDirectory, Trained, done, generations, load};
 use crate::gpu::Gpu;
 use crate::photographs::dataset::{Dataset, View};
 use crate::results::eval::{self, Compared, ViewScore, Yardstick};
@@ -38,21 +39,6 @@ pub struct Session<'a> {
     pub held: HeldRun,
     /// What is asked of it on the way.
     pub requests: Requests,
-}
-
-/// What a run made.
-#[derive(Debug)]
-pub struct Trained {
-    /// The model and its networks, on the device.
-    pub trainer: Trainer,
-    /// How it ended.
-    pub ended: Ended,
-    /// The test views that have a reference image.
-    pub scored: Vec<ViewScore>,
-    /// The loss of every step of this call.
-    pub losses: Vec<f64>,
-    /// What the steps took, without loading and scoring; the seconds before a resumed run included.
-    pub spent: Spent,
 }
 
 /// Trains `config` on `dataset`, scores the test views and writes the run directory `out`.

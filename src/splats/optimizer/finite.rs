@@ -1,6 +1,6 @@
 //! Whether what is learned is still numbers.
 
-use crate::gpu::{Buffer, Gpu, Pipeline, Threads};
+use crate::gpu::{Buffer, Gpu, Pipeline, Slice, Threads};
 use crate::kernels::first_not_finite;
 use crate::{Error, Result};
 
@@ -28,12 +28,13 @@ impl FiniteCheck {
     ///
     /// # Errors
     /// The buffer holds fewer, or the device was lost.
-    pub fn first(
+    pub fn first<'a>(
         &mut self,
         gpu: &Gpu,
-        values: &Buffer<f32>,
+        values: impl Into<Slice<'a, f32>>,
         count: usize,
     ) -> Result<Option<usize>> {
+        let values = values.into();
         if values.len() < count {
             let (name, has) = (values.name(), values.len());
             return Err(Error::Usage(format!("buffer `{name}` holds {has} values, not {count}")));
@@ -41,7 +42,7 @@ impl FiniteCheck {
         gpu.run("first_not_finite", |pass| {
             pass.fill(&mut self.first, NONE);
             let params = first_not_finite::Params { value_count: count as u32 };
-            let buffers = first_not_finite::Buffers { values, first: &mut self.first };
+            let buffers = first_not_finite::Buffers { values, first: self.first.slice_mut() };
             let threads = Threads::Exactly([(count as u32).div_ceil(4), 1, 1]);
             pass.dispatch(&self.pipeline, &params, buffers, threads)
         })?;

@@ -4,7 +4,7 @@ use glam::{UVec2, Vec3};
 
 use super::RenderSettings;
 use super::frame::color_vectors;
-use crate::gpu::{Gpu, Properties};
+use crate::gpu::{Gpu, Properties, Tile};
 use crate::kernels::ProjectedSplat;
 use crate::{Error, Result};
 
@@ -27,6 +27,31 @@ impl RenderSettings {
         let color = color_vectors(self.channels()) * size_of::<Vec3>();
         let bytes = size_of::<ProjectedSplat>().max(color) as u64;
         (gpu.properties().max_storage_buffer_range / bytes).min(u32::MAX.into()) as usize
+    }
+
+    /// The tile for views of these sizes: that of [`RenderSettings::tile_on`], twice and more as high where nothing names a
+    /// tile and the device could not follow so many of them.
+    ///
+    /// # Errors
+    /// As there.
+    pub fn tile_for(
+        &self,
+        gpu: &Gpu,
+        sizes: impl Iterator<Item = [u32; 2]> + Clone,
+    ) -> Result<Tile> {
+        let mut tile = self.tile_on(gpu)?;
+        let count = |[width, height]: [u32; 2], tile: Tile| {
+            width.div_ceil(tile.size[0]) as usize * height.div_ceil(tile.size[1]) as usize
+        };
+        let most = most_tiles(gpu);
+        while self.tile.is_none() && sizes.clone().any(|size| count(size, tile) > most) {
+            let higher = Tile { size: [tile.size[0], 2 * tile.size[1]], ..tile };
+            if !gpu.properties().suits_tile(higher) {
+                break;
+            }
+            tile = higher;
+        }
+        Ok(tile)
     }
 
     /// Whether this device can render and train on a view of this size.

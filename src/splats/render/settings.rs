@@ -1,6 +1,5 @@
 //! What a renderer is made for, and the tile that suits a device.
 
-use super::limits::most_tiles;
 use crate::gpu::{Gpu, Tile};
 use crate::splats::halves::Bits;
 use crate::splats::scene::{Features, Shape};
@@ -75,31 +74,6 @@ impl RenderSettings {
         let remedy = format!("1 to 32 times {lanes} pixels{of}; without `tile` the device chooses");
         let problem = format!("{tile} tiles do not suit {lanes} lanes");
         Err(Error::Usage(format!("{problem}; take a tile of {remedy}")))
-    }
-
-    /// The tile for views of these sizes: that of [`RenderSettings::tile_on`], twice and more as high where nothing names a
-    /// tile and the device could not follow so many of them.
-    ///
-    /// # Errors
-    /// As there.
-    pub fn tile_for(
-        &self,
-        gpu: &Gpu,
-        sizes: impl Iterator<Item = [u32; 2]> + Clone,
-    ) -> Result<Tile> {
-        let mut tile = self.tile_on(gpu)?;
-        let count = |[width, height]: [u32; 2], tile: Tile| {
-            width.div_ceil(tile.size[0]) as usize * height.div_ceil(tile.size[1]) as usize
-        };
-        let most = most_tiles(gpu);
-        while self.tile.is_none() && sizes.clone().any(|size| count(size, tile) > most) {
-            let higher = Tile { size: [tile.size[0], 2 * tile.size[1]], ..tile };
-            if !gpu.properties().suits_tile(higher) {
-                break;
-            }
-            tile = higher;
-        }
-        Ok(tile)
     }
 
     /// Values per pixel of a render: RGB and the features.

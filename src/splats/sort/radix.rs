@@ -122,14 +122,24 @@ impl RadixSort {
                 digit_bits,
                 folds_spine: folds_spine.into(),
             },
-            sort_upsweep::Buffers { counts, keys, table, digit_totals, arrivals },
+            sort_upsweep::Buffers {
+                counts: counts.slice(),
+                keys: keys.slice(),
+                table: table.slice_mut(),
+                digit_totals: digit_totals.slice_mut(),
+                arrivals: arrivals.slice_mut(),
+            },
             Threads::Workgroups([partitions, 1, 1]),
         )?;
         if !folds_spine {
             pass.dispatch(
                 &self.spine,
                 &sort_spine::Params { count_index, capacity, digit_bits },
-                sort_spine::Buffers { counts, table, digit_totals },
+                sort_spine::Buffers {
+                    counts: counts.slice(),
+                    table: table.slice_mut(),
+                    digit_totals: digit_totals.slice_mut(),
+                },
                 Threads::Workgroups([1 << digit_bits, 1, 1]),
             )?;
         }
@@ -137,13 +147,13 @@ impl RadixSort {
             &self.downsweep,
             &sort_downsweep::Params { count_index, capacity, shift, digit_bits },
             sort_downsweep::Buffers {
-                counts,
-                table,
-                digit_totals,
-                keys,
-                values,
-                sorted_keys,
-                sorted_values,
+                counts: counts.slice(),
+                table: table.slice(),
+                digit_totals: digit_totals.slice(),
+                keys: keys.slice(),
+                values: values.slice(),
+                sorted_keys: sorted_keys.slice_mut(),
+                sorted_values: sorted_values.slice_mut(),
             },
             Threads::Workgroups([partitions, 1, 1]),
         )

@@ -65,13 +65,24 @@ impl Scan {
         pass.dispatch(
             &self.upsweep,
             &scan_upsweep::Params { count_index, capacity },
-            scan_upsweep::Buffers { counts, values, sums, total, arrivals },
+            scan_upsweep::Buffers {
+                counts: counts.slice(),
+                values: values.slice(),
+                sums: sums.slice_mut(),
+                total: total.slice_mut(),
+                arrivals: arrivals.slice_mut(),
+            },
             Threads::Workgroups([partitions, 1, 1]),
         )?;
         pass.dispatch(
             &self.downsweep,
             &scan_downsweep::Params { count_index, capacity },
-            scan_downsweep::Buffers { counts, values, sums: &self.sums, offsets },
+            scan_downsweep::Buffers {
+                counts: counts.slice(),
+                values: values.slice(),
+                sums: self.sums.slice(),
+                offsets: offsets.slice_mut(),
+            },
             Threads::Workgroups([partitions, 1, 1]),
         )
     }

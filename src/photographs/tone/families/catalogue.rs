@@ -5,8 +5,8 @@
 
 use std::f64::consts::FRAC_PI_2;
 
-use super::families::{Constant, Family, Law, White};
-use super::real::Real;
+use super::super::real::Real;
+use super::{Constant, Family, Law, White};
 use crate::kernels::curves::*;
 
 const CODE: &str =
@@ -64,11 +64,11 @@ macro_rules! families {
         #[repr(u32)]
         pub enum ToneCurve {
             $(#[doc = $formula] $variant = $number,)*
-            /// What a [`super::Table`] makes.
+            /// What a [`crate::photographs::tone::Table`] makes.
             Table = CURVE_TABLE,
-            /// The curve whose gain [`super::Exposure`] finds: (1 - lambda) soft(x) + lambda x soft(Y) / Y.
+            /// The curve whose gain [`crate::photographs::tone::Exposure`] finds: (1 - lambda) soft(x) + lambda x soft(Y) / Y.
             Auto = CURVE_AUTO,
-            /// What a [`super::Profile`] makes.
+            /// What a [`crate::photographs::tone::Profile`] makes.
             Profile = CURVE_PROFILE,
         }
 
@@ -94,7 +94,7 @@ macro_rules! families {
 
         /// The shape of the curve `curve` (a `CURVE_*`) at t >= 0, before black level, gain and clamp.
         #[allow(unused_variables, reason = "not every shape takes every constant")]
-        pub(super) fn curve_shape<T: Real>(curve: u32, t: T, constants: &Constants<T>) -> T {
+        pub(crate) fn curve_shape<T: Real>(curve: u32, t: T, constants: &Constants<T>) -> T {
             match curve {
                 $($number => {
                     let [$($constant,)* ..] = *constants;

@@ -1,0 +1,270 @@
+//! Borrowed views of buffers: what passes bind. They follow the rules of `&` and `&mut`, which is why `build.rs` may tell the
+//! driver that no two buffers of a pass overlap where one is written.
+
+use std::marker::PhantomData;
+use std::ops::Range;
+
+use super::buffer::Memory;
+use super::{Bound, Buffer};
+use crate::{Error, Result};
+
+/// Elements of a buffer to read. While it lives, no [`SliceMut`] of them can be made:
+///
+/// ```compile_fail,E0502
+/// # use nightsplat::gpu::{Buffer, Gpu};
+/// # use nightsplat::kernels::window_gather;
+/// fn copied_onto_itself(buffer: &mut Buffer<f32>) -> window_gather::Buffers<'_> {
+///     window_gather::Buffers { image: buffer.slice().slice(), content: buffer.slice_mut().slice_mut() }
+/// }
+/// ```
+///
+/// and none at all of a buffer that is only shared:
+///
+/// ```compile_fail,E0596
+/// # use nightsplat::gpu::{Buffer, Gpu};
+/// # use nightsplat::kernels::window_gather;
+/// fn written_through_a_shared_reference<'a>(
+///     image: &'a Buffer<f32>,
+///     content: &'a Buffer<f32>,
+/// ) -> window_gather::Buffers<'a> {
+///     window_gather::Buffers { image: image.slice().slice(), content: content.slice_mut().slice_mut() }
+/// }
+/// ```
+///
+/// Two buffers, of which one may be written, are what a pass takes:
+///
+/// ```
+/// # use nightsplat::gpu::{Buffer, Gpu};
+/// # use nightsplat::kernels::window_gather;
+/// fn copied_to_another<'a>(
+///     image: &'a Buffer<f32>,
+///     content: &'a mut Buffer<f32>,
+/// ) -> window_gather::Buffers<'a> {
+///     window_gather::Buffers { image: image.slice().slice(), content: content.slice_mut().slice_mut() }
+/// }
+/// ```
+#[derive(Clone, Copy, Debug)]
+pub struct Slice<'a, T> {
+    memory: &'a Memory,
+    /// Where it begins in the memory, in elements.
+    first: usize,
+    len: usize,
+    element: PhantomData<&'a T>,
+}
+
+/// Elements of a buffer to read and write; while it lives, nothing else reads or writes them.
+#[derive(Debug)]
+pub struct SliceMut<'a, T> {
+    memory: &'a Memory,
+    first: usize,
+    len: usize,
+    element: PhantomData<&'a mut T>,
+}
+
+/// Vulkan lets no device ask for more of where a binding begins, in bytes.
+const ALIGNMENT: usize = 256;
+
+impl<T: bytemuck::Pod> Buffer<T> {
+    /// All of it, to read.
+    pub fn slice(&self) -> Slice<'_, T> {
+        Slice { memory: self.memory(), first: 0, len: self.len(), element: PhantomData }
+    }
+
+    /// All of it, to read and write.
+    pub fn slice_mut(&mut self) -> SliceMut<'_, T> {
+        SliceMut { len: self.len(), memory: self.memory(), first: 0, element: PhantomData }
+    }
+}
+
+impl<'a, T: bytemuck::Pod> From<&'a Buffer<T>> for Slice<'a, T> {
+    fn from(buffer: &'a Buffer<T>) -> Self {
+        buffer.slice()
+    }
+}
+
+impl<'a, T: bytemuck::Pod> From<&'a mut Buffer<T>> for SliceMut<'a, T> {
+    fn from(buffer: &'a mut Buffer<T>) -> Self {
+        buffer.slice_mut()
+    }
+}
+
+impl<T: bytemuck::Pod> Slice<'_, T> {
+    /// The number of elements.
+    pub fn len(&self) -> usize {
+        self.len
+    }
+
+    /// True for a slice of no elements.
+    pub fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+
+    /// The name of the buffer.
+    pub fn name(&self) -> &str {
+        self.memory.name()
+    }
+
+    /// Some of its elements.
+    ///
+    /// # Errors
+    /// They are out of range, or begin at no multiple of 256 bytes, where every device lets a binding begin.
+    pub fn range(self, range: Range<usize>) -> Result<Self> {
+        let first = self.first + offset_of::<T>(self.memory, self.len, &range)?;
+        Ok(Self { first, len: range.len(), ..self })
+    }
+
+    /// What a dispatch binds.
+    pub(crate) fn bound(&self) -> Bound {
+        bound::<T>(self.memory, self.first, self.len)
+    }
+}
+
+impl<'a, T: bytemuck::Pod> SliceMut<'a, T> {
+    /// The number of elements.
+    pub fn len(&self) -> usize {
+        self.len
+    }
+
+    /// True for a slice of no elements.
+    pub fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+
+    /// The name of the buffer.
+    pub fn name(&self) -> &str {
+        self.memory.name()
+    }
+
+    /// The same elements to read, while this is not used.
+    pub fn as_slice(&self) -> Slice<'_, T> {
+        let Self { memory, first, len, .. } = *self;
+        Slice { memory, first, len, element: PhantomData }
+    }
+
+    /// The same elements for one use; this can be used again behind it.
+    pub fn reborrow(&mut self) -> SliceMut<'_, T> {
+        let Self { memory, first, len, .. } = *self;
+        SliceMut { memory, first, len, element: PhantomData }
+    }
+
+    /// Some of its elements.
+    ///
+    /// # Errors
+    /// As [`Slice::range`].
+    pub fn range(self, range: Range<usize>) -> Result<Self> {
+        let first = self.first + offset_of::<T>(self.memory, self.len, &range)?;
+        Ok(Self { first, len: range.len(), ..self })
+    }
+
+    /// Several parts of it, for a pass that binds each on its own. Parts may be empty, in any order and with gaps between.
+    ///
+    /// # Errors
+    /// Two parts overlap, or as [`Slice::range`].
+    pub fn split<const N: usize>(self, ranges: [Range<usize>; N]) -> Result<[Self; N]> {
+        for (i, a) in ranges.iter().enumerate() {
+            offset_of::<T>(self.memory, self.len, a)?;
+            if let Some(b) = ranges[..i].iter().find(|b| a.start.max(b.start) < a.end.min(b.end)) {
+                let name = self.memory.name();
+                let what = format!("parts {b:?} and {a:?} of buffer `{name}` overlap");
+                return Err(Error::Usage(what));
+            }
+        }
+        let Self { memory, first, .. } = self;
+        Ok(ranges.map(|range| SliceMut {
+            memory,
+            first: first + range.start,
+            len: range.len(),
+            element: PhantomData,
+        }))
+    }
+
+    /// What a dispatch binds.
+    pub(crate) fn bound(&self) -> Bound {
+        bound::<T>(self.memory, self.first, self.len)
+    }
+}
+
+impl<'a> Slice<'a, f32> {
+    /// The bits of the same elements, for a kernel that stores other numbers than floats in them.
+    pub fn words(self) -> Slice<'a, u32> {
+        let Self { memory, first, len, .. } = self;
+        Slice { memory, first, len, element: PhantomData }
+    }
+}
+
+impl<'a> SliceMut<'a, f32> {
+    /// The bits of the same elements, for a kernel that stores other numbers than floats in them.
+    pub fn words(self) -> SliceMut<'a, u32> {
+        let Self { memory, first, len, .. } = self;
+        SliceMut { memory, first, len, element: PhantomData }
+    }
+}
+
+/// Where a range of `len` elements begins, checked.
+fn offset_of<T>(memory: &Memory, len: usize, range: &Range<usize>) -> Result<usize> {
+    let name = memory.name();
+    if range.start > range.end || range.end > len {
+        let what =
+            format!("elements {range:?} are out of range for buffer `{name}`, which has {len}");
+        return Err(Error::Usage(what));
+    }
+    if !(range.start * size_of::<T>()).is_multiple_of(ALIGNMENT) {
+        let what = format!(
+            "elements {range:?} of buffer `{name}` begin at no multiple of {ALIGNMENT} bytes, which a binding must"
+        );
+        return Err(Error::Usage(what));
+    }
+    Ok(range.start)
+}
+
+/// Vulkan has no empty bindings: what stands for one is at the begin, where every buffer has some bytes.
+fn bound<T>(memory: &Memory, first: usize, len: usize) -> Bound {
+    let first = if len == 0 { 0 } else { first };
+    let [offset, size] = [first, len].map(|n| (n * size_of::<T>()) as u64);
+    Bound { raw: memory.handle(), offset, size }
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::gpu::testing::gpu;
+
+    #[test]
+    fn a_range_is_within_the_slice_and_begins_where_a_binding_can() {
+        let gpu = gpu();
+        let buffer = gpu.zeros::<f32>("numbers", 200).unwrap();
+        let second = buffer.slice().range(64..200).unwrap();
+        assert_eq!((second.len(), second.bound().offset, second.bound().size), (136, 256, 544));
+        let third = second.range(64..136).unwrap();
+        assert_eq!((third.len(), third.bound().offset), (72, 512));
+        assert!(buffer.slice().range(0..0).unwrap().is_empty());
+        #[expect(clippy::reversed_empty_ranges, reason = "that is refused")]
+        for (range, problem) in [
+            (64..201, "out of range for buffer `numbers`, which has 200"),
+            (128..64, "out of range"),
+            (1..2, "begin at no multiple of 256 bytes"),
+        ] {
+            let error = buffer.slice().range(range.clone()).unwrap_err().to_string();
+            assert!(error.contains(problem), "{range:?}: {error}");
+        }
+        assert!(third.range(0..73).is_err(), "the buffer holds them, the slice does not");
+    }
+
+    #[test]
+    fn parts_of_a_split_are_disjoint_or_refused() {
+        let gpu = gpu();
+        let mut buffer = gpu.zeros::<f32>("numbers", 256).unwrap();
+        let parts = buffer.slice_mut().split([128..256, 0..64, 128..128, 0..0]).unwrap();
+        let bounds = parts.map(|part| (part.bound().offset, part.bound().size));
+        assert_eq!(bounds, [(512, 512), (0, 256), (0, 0), (0, 0)]);
+        for (ranges, problem) in [
+            ([0..65, 64..128], "parts 0..65 and 64..128 of buffer `numbers` overlap"),
+            ([64..128, 0..256], "overlap"),
+            ([0..64, 0..64], "overlap"),
+            ([0..64, 192..257], "out of range"),
+            ([0..64, 65..70], "begin at no multiple of 256 bytes"),
+        ] {
+            let error = buffer.slice_mut().split(ranges).unwrap_err().to_string();
+            assert!(error.contains(problem), "{error}");
+        }
+    }
+}

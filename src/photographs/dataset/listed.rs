@@ -1,0 +1,33 @@
+//! What a listing says of its views, before any pixel is read.
+
+use std::path::PathBuf;
+
+use glam::DAffine3;
+
+use super::Split;
+use crate::camera::Lens;
+
+/// One view as a listing describes it, before any pixel is read.
+#[derive(Clone, Debug)]
+pub(super) struct ListedView {
+    pub(super) name: String,
+    /// Path as listed, relative to the root.
+    pub(super) listed: String,
+    /// Path below the folder of all photographs.
+    pub(super) below: String,
+    /// `None`: the split rule decides.
+    pub(super) split: Option<Split>,
+    /// The listed file, where it exists.
+    pub(super) file: Option<PathBuf>,
+    pub(super) lens: Lens,
+    /// Rigid; the world is the listing's.
+    pub(super) view_from_world: DAffine3,
+}
+
+#[derive(Debug, Default)]
+pub(super) struct Listing {
+    pub(super) frames: Vec<ListedView>,
+    pub(super) skipped: Vec<String>,
+    /// What was chosen, and what lies there unused; a line each.
+    pub(super) remarks: Vec<String>,
+}
