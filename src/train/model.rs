@@ -273,7 +273,8 @@ mod tests {
         let gpu = gpu();
         let shape = Shape { sh_degree: 3, features: Features::NONE };
         for rest in [StorageFormat::Single, StorageFormat::Half] {
-            let precision = PrecisionConfig { rest, ..PrecisionConfig::default() };
+            let precision =
+                PrecisionConfig { rest, moments: StorageFormat::Single, ..Default::default() };
             let mut given = Gaussians::zeros(10, shape);
             // What is in use of the degree 3 is none, and room is for that.
             given.parameters[..140].fill(0.5);

@@ -122,7 +122,7 @@ mod tests {
             eprintln!("not run: this device binds {}", gpu.properties().max_storage_buffer_range);
             return;
         }
-        let mut config = TrainConfig::default();
+        let mut config = TrainConfig::bare();
         let count = |config: &TrainConfig, width, height| {
             let patches = config.patches(&gpu, &camera(width, height));
             patches.iter().for_each(|patch| assert!(patch.pixel_count() <= 1 << 24));

@@ -103,7 +103,7 @@ impl Renderer {
         let device = &self.gpu.properties().name;
         Error::Usage(format!(
             "a {width}x{height} view has {count} tiles of {tile_width}x{tile_height} pixels, {device} follows {most}; \
-             lower `TrainConfig::patch_pixels` or take a larger `tile`"
+             lower patch_pixels or take a larger tile"
         ))
     }
 }
