@@ -144,15 +144,18 @@ pub struct Buffers<'a> {{
 {device}}}
 
 /// The same buffers in host memory, for the CPU reference.
+#[cfg(feature = "check")]
 #[derive(Debug)]
 pub struct Slices<'a> {{
 {host}}}
 
 /// How far each buffer that it writes may be from the reference's.
+#[cfg(feature = "check")]
 #[derive(Clone, Debug, Default)]
 pub struct Tolerances {{
 {tolerances}}}
 
+#[cfg(feature = "check")]
 impl From<Tolerances> for Vec<gpu::Tolerance> {{
     fn from(tolerances: Tolerances) -> Self {{ vec![{listed}] }}
 }}
@@ -169,10 +172,14 @@ impl gpu::Kernel for Kernel {{
     type Params = Params;
     type Constants = Constants;
     type Buffers<'a> = Buffers<'a>;
-    type Slices<'a> = Slices<'a>;
     fn constants(constants: &Constants) -> Vec<(u32, u32)> {{ let _ = constants; vec![{values}] }}
-    type Tolerances = Tolerances;
     fn bound(buffers: &Buffers<'_>) -> Vec<gpu::Bound> {{ vec![{bound}] }}
+}}
+
+#[cfg(feature = "check")]
+impl gpu::OnHost for Kernel {{
+    type Slices<'a> = Slices<'a>;
+    type Tolerances = Tolerances;
     fn slices(words: &mut [Vec<u32>]) -> Slices<'_> {{
         let mut words = words.iter_mut().map(Vec::as_mut_slice);
         Slices {{ {slices}}}

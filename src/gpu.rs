@@ -9,16 +9,24 @@
 
 mod address_space;
 mod buffer;
+#[cfg(feature = "check")]
 mod check;
+#[cfg(feature = "check")]
 mod checked;
 mod choice;
 mod cooperative;
 mod descriptors;
 mod device;
 mod device_report;
+mod download;
+#[cfg(feature = "testing")]
 mod faults;
+mod instance;
 mod kernel;
+mod limits;
 mod memory;
+mod offered;
+mod pci;
 mod pipeline;
 mod reconvergence;
 mod recorder;
@@ -27,6 +35,7 @@ mod slice;
 mod statistics;
 mod subgroups;
 mod submission;
+#[cfg(feature = "testing")]
 #[doc(hidden)]
 pub mod testing;
 mod tuning;
@@ -39,16 +48,21 @@ use std::thread::{self, ThreadId};
 
 use ash::{ext, khr, vk};
 
-pub use buffer::{Buffer, Download};
+pub use buffer::Buffer;
+#[cfg(feature = "check")]
 pub use check::{CheckReport, CheckedPass, Difference, Tolerance};
+pub use choice::DeviceChoice;
 pub(crate) use choice::SchedulerVariables;
-pub use choice::{DeviceChoice, PciAddress};
 pub use cooperative::CooperativeMatrix;
-pub use descriptors::PUSH_VARIABLE;
 pub use device::HostDevice;
 pub use device_report::{DeviceLimits, DeviceReport, RequirementReport, devices};
-pub use kernel::{Binding, Bound, Interface, Kernel, Reference};
+pub use download::Download;
+pub use kernel::{Binding, Bound, Interface, Kernel, Recordable};
+#[cfg(feature = "check")]
+pub use kernel::{OnHost, Reference};
 pub use memory::MemoryBudget;
+pub use offered::PUSH_VARIABLE;
+pub use pci::PciAddress;
 pub use pipeline::Pipeline;
 pub use recorder::{HostRecording, Recorder, Threads};
 pub use requirements::{REQUIREMENTS, Requirement, required_device_features};
@@ -120,16 +134,25 @@ struct Shared {
     usage: memory::MemoryUsage,
     /// What else takes memory of the device; absent where the driver does not tell.
     budget: Option<memory::BudgetQuery>,
+    #[cfg(feature = "testing")]
     faults: faults::Faults,
     retired: Mutex<Vec<(u64, Retired)>>,
-    recorded: recorder::Recorded,
+    recorded: Recorded,
     /// The threads whose submissions are checked.
+    #[cfg(feature = "check")]
     checks: checked::Checks,
     pipeline_cache: vk::PipelineCache,
     /// What the file of the fastest tiles says; read when it is first asked.
     tuned_tiles: OnceLock<Vec<TunedTile>>,
     /// What we created around the device and destroy with it; nothing for a borrowed device.
-    owned: Option<device::Owned>,
+    owned: Option<instance::Owned>,
+}
+
+/// What was recorded since the device was opened.
+#[derive(Debug, Default)]
+struct Recorded {
+    dispatches: AtomicU64,
+    barriers: AtomicU64,
 }
 
 /// The queue is held while a submission is recorded, so that timeline values are known in advance.
@@ -231,6 +254,7 @@ impl Shared {
         // SAFETY: the semaphore lives as long as `self`.
         unsafe { self.device.wait_semaphores(&wait, u64::MAX) }
             .map_err(|result| self.error("vkWaitSemaphores", result))?;
+        #[cfg(feature = "testing")]
         if self.faults.is_lost() {
             return Err(self.error("vkWaitSemaphores", vk::Result::ERROR_DEVICE_LOST));
         }

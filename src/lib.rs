@@ -39,6 +39,7 @@ pub mod kernels;
 pub mod loss;
 pub mod networks;
 pub mod photographs;
+#[cfg(feature = "check")]
 pub mod reference;
 #[cfg(feature = "io")]
 pub mod results;

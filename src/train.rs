@@ -6,24 +6,29 @@ mod checkpoint;
 mod config;
 mod decisions;
 pub mod diagnose;
+mod difference;
 mod early_stopping;
 mod epochs;
 mod exposures;
 mod fill;
 mod growth;
+mod layers;
 mod masks;
 mod measuring;
 mod memory;
 mod model;
 mod networks;
-mod overrides;
 mod parts;
 mod passes;
 mod patches;
 mod paths;
+mod planned;
 mod precision;
 mod preset;
+mod reference;
 mod rendered;
+pub mod settings;
+mod start;
 mod submission;
 mod target_views;
 mod terms;
@@ -32,10 +37,10 @@ mod views;
 use std::panic::resume_unwind;
 use std::thread::{self, ScopedJoinHandle};
 
-use glam::DVec3;
-
 use crate::camera::{Camera, Frame};
-use crate::gpu::{Buffer, CheckReport, Gpu, PassTime, Recorder};
+#[cfg(feature = "check")]
+use crate::gpu::CheckReport;
+use crate::gpu::{Buffer, Gpu, PassTime, Recorder};
 use crate::loss::exposure::Exposures;
 use crate::loss::{LogSlot, LossLog, Losses, ParameterTerms, StepLosses, Term, TermInputs};
 use crate::photographs::dataset::{Dataset, Fingerprint, Original, Split};
@@ -54,6 +59,7 @@ pub use config::{Background, CheckConfig, DensityConfig, TrainConfig};
 use decisions::Decisions;
 pub use early_stopping::{EndReason, Ended, NotFinite, StopConfig};
 pub use exposures::{ExposureConfig, Learning};
+pub use layers::{Layer, Origin, Settings, values};
 use masks::Masks;
 pub use measuring::TargetExposure;
 pub use memory::MemoryEstimate;
@@ -61,8 +67,10 @@ use model::Model;
 pub use networks::Networks;
 pub use parts::{ModelConfig, ModelName, NetworkRates, Part};
 use passes::{Kernels, background, first_sh_degree, learnables};
+pub use planned::{Planned, Planning, Said, diagnosed};
 pub use precision::{PhotographBits, PrecisionConfig};
 pub use preset::Preset;
+pub use reference::reference;
 pub use rendered::Rendered;
 use submission::{MOST_STEPS, Pace};
 use target_views::TargetViews;
@@ -183,11 +191,20 @@ pub struct Trainer {
 }
 
 impl Trainer {
-    /// Uploads the training views, takes their statistics and places the first Gaussians.
+    /// Uploads the training views, takes their statistics and places the first Gaussians, or those of [`TrainConfig::init`].
     ///
     /// # Errors
-    /// The configuration makes no sense, or the device is out of memory or lost.
+    /// The configuration makes no sense, the model to begin with does not suit it, or the device is out of memory or lost.
     pub fn new(gpu: &Gpu, config: TrainConfig, dataset: &Dataset) -> Result<Self> {
+        let initial = config.initial_model()?;
+        Self::on_patches(gpu, config, dataset, initial.as_ref())
+    }
+
+    /// A trainer whose state a checkpoint is to replace: the model that its run began with need not be there any more.
+    ///
+    /// # Errors
+    /// As [`Trainer::new`].
+    pub(crate) fn to_restore(gpu: &Gpu, config: TrainConfig, dataset: &Dataset) -> Result<Self> {
         Self::on_patches(gpu, config, dataset, None)
     }
 
@@ -281,11 +298,7 @@ impl Trainer {
         let gaussians = match gaussians {
             // A run that ended before its highest SH degree was in use has a model without it.
             Some(gaussians) if settings.shape.holds(gaussians.shape) => {
-                let gaussians = gaussians.with_sh_degree(settings.shape.sh_degree);
-                match frame {
-                    Frame::WORLD => gaussians,
-                    _ => gaussians.from_world(&frame, DVec3::ZERO),
-                }
+                gaussians.with_sh_degree(settings.shape.sh_degree).from_world(&frame)
             }
             Some(Gaussians { shape: own, .. }) => {
                 let problem = format!("Gaussians of {own:?} make no model of {:?}", settings.shape);
@@ -371,11 +384,7 @@ impl Trainer {
     /// # Errors
     /// The device was lost.
     pub fn gaussians(&self) -> Result<Gaussians> {
-        let gaussians = self.gaussians_in_frame()?;
-        Ok(match self.frame {
-            Frame::WORLD => gaussians,
-            frame => gaussians.to_world(&frame, DVec3::ZERO),
-        })
+        Ok(self.gaussians_in_frame()?.to_world(&self.frame))
     }
 
     /// The same in [`Trainer::frame`], to the bit as they are trained.
@@ -421,23 +430,33 @@ impl Trainer {
         match (self.step + 1).checked_next_multiple_of(self.config.check.every) {
             Some(checked) if checked > until => self.submit_steps(until),
             Some(checked) if checked > self.step + 1 => self.submit_steps(checked - 1),
-            Some(_) if self.step < until.min(self.last_step()) => {
-                let (reports, checks) = self.check_step();
-                let stops = self.config.check.stops;
-                match checks.agree() {
-                    Err(difference) if stops => return Err(difference),
-                    Err(difference) => tracing::warn!("step {}: {difference}", self.step),
-                    Ok(()) => {}
-                }
-                reports
-            }
+            Some(_) if self.step < until.min(self.last_step()) => self.agreeing_step(),
             _ => self.submit_steps(until),
         }
+    }
+
+    /// One step with every pass checked; a difference ends the run or is a warning, as the configuration says.
+    #[cfg(feature = "check")]
+    fn agreeing_step(&mut self) -> Result<Vec<StepReport>> {
+        let (reports, checks) = self.check_step();
+        match checks.agree() {
+            Err(difference) if self.config.check.stops => return Err(difference),
+            Err(difference) => tracing::warn!("step {}: {difference}", self.step),
+            Ok(()) => {}
+        }
+        reports
+    }
+
+    #[cfg(not(feature = "check"))]
+    fn agreeing_step(&mut self) -> Result<Vec<StepReport>> {
+        let problem = "`check.every` compares steps with the references, which this build lacks";
+        Err(Error::Usage(format!("{problem}: build with feature `check`, or set it to 0")))
     }
 
     /// Trains one step with every pass checked ([`Gpu::checked`]), density control included, and reports on them. The
     /// model is what [`Trainer::advance`] would have made of it, bit for bit; no step is reported where it has to be done
     /// again with more memory.
+    #[cfg(feature = "check")]
     pub fn check_step(&mut self) -> (Result<Vec<StepReport>>, CheckReport) {
         let next = self.step + 1;
         self.gpu.clone().checked(|| self.submit_steps(next))
@@ -470,7 +489,8 @@ impl Trainer {
         let damping = Damping { weight: schedule.damping_weight(step), depth: self.extent as f32 };
         let model = &mut self.model;
 
-        self.renderer.forward(pass, &model.gaussians.parameters, view.patch, &options)?;
+        let viewpoint = self.views.viewpoint(view);
+        self.renderer.forward(pass, &model.gaussians, viewpoint, &options)?;
         let (render, status) = self.renderer.render_and_status();
         let (d_render, size) = (&mut self.d_render, view.size());
         let target = self.views.record_target(pass, &self.pseudo_gt, view, &mut self.target)?;
@@ -519,8 +539,8 @@ impl Trainer {
         }
         self.renderer.backward(
             pass,
-            &model.gaussians.parameters,
-            view.patch,
+            &model.gaussians,
+            viewpoint,
             &options,
             damping,
             &self.d_render,
@@ -570,7 +590,7 @@ impl Trainer {
     /// As [`Trainer::render`], of a camera in the frame.
     fn render_of_degree(&mut self, camera: &Camera, sh_degree: u32) -> Result<Rendered> {
         let options = RenderOptions { sh_degree, background: [0.0; 3] };
-        let gaussians = (&self.model.gaussians.parameters, self.model.count());
+        let gaussians = &self.model.gaussians;
         let networks = self.networks.as_mut().map(|terms| &mut terms.networks);
         Rendered::new(&mut self.renderer, gaussians, camera, &options, networks)
     }
@@ -582,7 +602,7 @@ impl Trainer {
     fn reserve(&mut self) -> Result<()> {
         let Self { model, views, renderer, .. } = self;
         let sizes = views.all().map(TrainView::size);
-        renderer.reserve_with_headroom([model.count(), model.capacity()], sizes)
+        renderer.reserve_sizes(model.count(), model.capacity(), sizes)
     }
 
     fn report(&self, step: u64, losses: &StepLosses, milliseconds: f64) -> StepReport {

@@ -8,8 +8,8 @@ use ash::vk;
 use gpu_allocator::vulkan::{Allocation, AllocationCreateDesc, AllocationScheme};
 use gpu_allocator::{AllocationError, MemoryLocation};
 
-use super::recorder::HOST_SUBMITS;
-use super::{Bound, Gpu, Properties, Recorder, Retired, Shared, Slice, SliceMut, lock};
+use super::limits::whole_quads;
+use super::{Bound, Gpu, Properties, Retired, Shared, SliceMut, lock};
 use crate::{Error, Result};
 
 /// An array of `T` in device memory, and its only owner: passes bind [`Slice`](super::Slice)s and
@@ -24,20 +24,11 @@ pub struct Buffer<T> {
 /// A Vulkan buffer and the memory behind it.
 #[derive(Debug)]
 pub(super) struct Memory {
-    shared: Arc<Shared>,
+    pub(super) shared: Arc<Shared>,
     raw: vk::Buffer,
     /// Taken when the buffer retires.
-    allocation: Option<Allocation>,
+    pub(super) allocation: Option<Allocation>,
     name: String,
-}
-
-/// A copy of a buffer that a submission brings to the host.
-#[derive(Debug)]
-pub struct Download<T> {
-    host: Memory,
-    len: usize,
-    value: u64,
-    element: PhantomData<T>,
 }
 
 impl<T: bytemuck::Pod> Buffer<T> {
@@ -70,12 +61,6 @@ impl<T: bytemuck::Pod> Buffer<T> {
     pub(super) fn bound(&self) -> Bound {
         Bound { raw: self.handle(), offset: 0, size: (self.len * size_of::<T>()) as u64 }
     }
-}
-
-/// What is made and bound for so many bytes: Vulkan has no empty buffers, an empty array still binds; and whole quads, for
-/// kernels that read four values at a time.
-pub(super) fn whole_quads(bytes: u64) -> u64 {
-    bytes.max(1).next_multiple_of(16)
 }
 
 impl Gpu {
@@ -168,73 +153,15 @@ impl Gpu {
         })?;
         Ok(())
     }
-
-    /// A copy of a buffer or a slice of one on the host, after everything submitted before.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
-    pub fn read<'a, T: bytemuck::Pod>(&self, buffer: impl Into<Slice<'a, T>>) -> Result<Vec<T>> {
-        let buffer = buffer.into();
-        let mut download = None;
-        self.run("read", |pass| {
-            download = Some(pass.download(buffer)?);
-            Ok(())
-        })?;
-        download.map_or_else(|| Ok(vec![]), Download::wait)
-    }
-}
-
-impl Recorder<'_> {
-    /// Copies a buffer, or a slice of one, as it is at this point of the recording to the host.
-    ///
-    /// # Errors
-    /// The device is out of memory, or the recording is [`Gpu::record_into`]'s: only the host knows when the copy is there.
-    pub fn download<'a, T: bytemuck::Pod>(
-        &mut self,
-        buffer: impl Into<Slice<'a, T>>,
-    ) -> Result<Download<T>> {
-        let buffer = buffer.into();
-        self.download_bound(buffer.name(), buffer.bound())
-    }
-
-    /// The same for a buffer of which only that is at hand what a pass binds.
-    pub(super) fn download_bound<T: bytemuck::Pod>(
-        &mut self,
-        name: &str,
-        bound: Bound,
-    ) -> Result<Download<T>> {
-        if self.value() == HOST_SUBMITS {
-            return Err(Error::Usage(format!(
-                "`{name}` cannot be downloaded where the host submits; once that is done, `Gpu::read` it"
-            )));
-        }
-        let host = Memory::new(self.shared(), name, bound.size, MemoryLocation::GpuToCpu)?;
-        if bound.size > 0 {
-            self.copy_raw(bound, host.bound(), bound.size);
-        }
-        let len = bound.size as usize / size_of::<T>();
-        Ok(Download { host, len, value: self.value(), element: PhantomData })
-    }
-}
-
-impl<T: bytemuck::Pod> Download<T> {
-    /// Waits for the submission that the copy is part of.
-    ///
-    /// # Errors
-    /// The device was lost.
-    pub fn wait(self) -> Result<Vec<T>> {
-        self.host.shared.wait(self.value)?;
-        let bytes = self.len * size_of::<T>();
-        let mut data = vec![T::zeroed(); self.len];
-        if let Some(mapped) = self.host.allocation.as_ref().and_then(Allocation::mapped_slice) {
-            bytemuck::cast_slice_mut(&mut data).copy_from_slice(&mapped[..bytes]);
-        }
-        Ok(data)
-    }
 }
 
 impl Memory {
-    fn new(shared: &Arc<Shared>, name: &str, bytes: u64, location: MemoryLocation) -> Result<Self> {
+    pub(super) fn new(
+        shared: &Arc<Shared>,
+        name: &str,
+        bytes: u64,
+        location: MemoryLocation,
+    ) -> Result<Self> {
         let usage = vk::BufferUsageFlags::STORAGE_BUFFER
             | vk::BufferUsageFlags::INDIRECT_BUFFER
             | vk::BufferUsageFlags::TRANSFER_SRC
@@ -252,6 +179,7 @@ impl Memory {
             let raw =
                 shared.device.create_buffer(&info, None).map_err(out_of_memory(name, size))?;
             let requirements = shared.device.get_buffer_memory_requirements(raw);
+            #[cfg(feature = "testing")]
             if shared.faults.fails_allocation(name) {
                 shared.device.destroy_buffer(raw, None);
                 return Err(out_of_memory(name, size)(AllocationError::OutOfMemory));
@@ -298,7 +226,7 @@ impl Memory {
     }
 
     /// From its begin.
-    fn bound(&self) -> Bound {
+    pub(super) fn bound(&self) -> Bound {
         Bound { raw: self.raw, offset: 0, size: vk::WHOLE_SIZE }
     }
 }

@@ -11,16 +11,15 @@ use std::thread::{self, ThreadId};
 use ash::vk;
 
 use super::check::Versions;
-use super::pipeline::Objects;
+use super::recorder::{ObservedPass, PassObserver};
 use super::submission::Record;
+#[cfg(feature = "testing")]
+use super::testing;
 use super::{
-    Binding, Bound, CheckReport, CheckedPass, Difference, Download, Gpu, Pipeline, Queue, Recorder,
-    Reference, Shared, Threads, Tolerance, lock, testing,
+    Binding, Bound, CheckReport, CheckedPass, Difference, Download, Gpu, Queue, Recorder, Shared,
+    lock,
 };
 use crate::Result;
-
-/// Makes of the words of a pass's buffers what its reference does, and gives the tolerances from other such words.
-type ReferenceOf<'a> = dyn Fn(&mut [Vec<u32>], &mut [Vec<u32>]) -> Vec<Tolerance> + 'a;
 
 /// The reports of the threads whose submissions are checked.
 #[derive(Debug, Default)]
@@ -103,57 +102,44 @@ impl Shared {
         recording: &str,
         record: Record<'_>,
     ) -> Result<u64> {
-        let mut recorder = Recorder::new(self, self.begin(pool)?, value, None);
         let report = self.checks.take().unwrap_or_default();
-        let has_wrong_integers = false;
-        recorder.checked = Some(Checked { queue, pool, recording, report, has_wrong_integers });
-        let done = record(&mut recorder).and_then(|()| recorder.run_what_is_recorded("copies"));
-        let value = recorder.value - 1;
-        if let Some(checked) = recorder.checked {
-            self.checks.put(checked.report);
-        }
-        done.map(|()| value)
+        let mut checked = Checked { queue, pool, recording, report, has_wrong_integers: false };
+        let done = checked.run(self, value, record);
+        self.checks.put(checked.report);
+        done
     }
 }
 
-impl Recorder<'_> {
-    /// Checks a pass, its kernel's types left behind.
-    pub(super) fn dispatch_checked<K: Reference>(
-        &mut self,
-        pipeline: &Pipeline<K>,
-        params: &K::Params,
-        bound: &[Bound],
-        threads: Threads<'_>,
-    ) -> Result<()> {
-        let mut on_device = *params;
-        testing::plant_defect(K::INTERFACE.name, bytemuck::bytes_of_mut(&mut on_device));
-        let on_device = bytemuck::bytes_of(&on_device);
-        self.run_checked(&pipeline.objects, on_device, bound, threads, &|reference, before| {
-            K::run(params, &pipeline.constants, K::slices(reference));
-            K::tolerances(params, &pipeline.constants, K::slices(before)).into()
-        })
+impl Checked<'_> {
+    /// Records and runs; gives the timeline value of the last submission.
+    fn run(&mut self, shared: &Arc<Shared>, value: u64, record: Record<'_>) -> Result<u64> {
+        let mut recorder = Recorder::new(shared, shared.begin(self.pool)?, value, None);
+        recorder.observer = Some(self);
+        record(&mut recorder)?;
+        if let Some(observer) = recorder.observer.take() {
+            observer.run_recorded(&mut recorder, "copies")?;
+        }
+        Ok(recorder.value - 1)
     }
+}
 
+impl PassObserver for Checked<'_> {
     /// Runs what was recorded before, then the pass alone, then its reference, and compares.
-    fn run_checked(
-        &mut self,
-        pipeline: &Objects,
-        params: &[u8],
-        bound: &[Bound],
-        threads: Threads<'_>,
-        reference_of: &ReferenceOf<'_>,
-    ) -> Result<()> {
-        let (interface, kernel) = (pipeline.interface, pipeline.interface.name);
-        let before = self.copies(interface.bindings, bound, |_| true)?;
-        self.record_dispatch(pipeline, params, bound, threads)?;
-        let device = self.copies(interface.bindings, bound, |binding| binding.writable)?;
-        self.run_what_is_recorded(kernel)?;
+    fn pass(&mut self, recorder: &mut Recorder<'_>, pass: &ObservedPass<'_>) -> Result<()> {
+        let ObservedPass { objects, params, bound, threads, reference: reference_of } = *pass;
+        let (interface, kernel) = (objects.interface, objects.interface.name);
+        let before = copies(recorder, interface.bindings, bound, |_| true)?;
+        #[cfg(feature = "testing")]
+        let params = &testing::with_defect_of(kernel, params);
+        recorder.record_dispatch(objects, params, bound, threads)?;
+        let device = copies(recorder, interface.bindings, bound, |binding| binding.writable)?;
+        self.run_recorded(recorder, kernel)?;
 
-        let workgroups = self.workgroups(interface, threads).iter().map(|&n| n as usize).product();
-        let Some(checked) = &mut self.checked else { return Ok(()) };
-        let recording = checked.recording.to_owned();
+        let workgroups =
+            recorder.workgroups(interface, threads).iter().map(|&n| n as usize).product();
+        let recording = self.recording.to_owned();
         let mut pass = CheckedPass { recording, kernel, error: None, difference: None };
-        if !checked.has_wrong_integers {
+        if !self.has_wrong_integers {
             let mut before = wait(before)?;
             let mut reference = before.clone();
             let tolerances = reference_of(&mut reference, &mut before);
@@ -168,9 +154,9 @@ impl Recorder<'_> {
                 let comparison = versions.compare(&tolerance, workgroups);
                 pass.error = pass.error.map(|error: f64| error.max(comparison.error));
                 let Some((index, [device, reference, bound])) = comparison.first else { continue };
-                checked.has_wrong_integers |= !binding.is_float;
+                self.has_wrong_integers |= !binding.is_float;
                 pass.difference.get_or_insert(Difference {
-                    pass: checked.report.passes.len(),
+                    pass: self.report.passes.len(),
                     kernel,
                     buffer: binding.name,
                     index,
@@ -181,35 +167,34 @@ impl Recorder<'_> {
                 });
             }
         }
-        checked.report.passes.push(pass);
+        self.report.passes.push(pass);
         Ok(())
     }
 
-    /// Records copies of what the pass binds.
-    fn copies(
-        &mut self,
-        bindings: &[Binding],
-        bound: &[Bound],
-        wanted: impl Fn(&Binding) -> bool,
-    ) -> Result<Vec<Download<u32>>> {
-        let wanted = bindings.iter().zip(bound).filter(|(binding, _)| wanted(binding));
-        wanted.map(|(binding, bound)| self.download_bound(binding.name, *bound)).collect()
-    }
-
-    /// Submits what is recorded, waits for it, and begins anew.
-    fn run_what_is_recorded(&mut self, pass: &str) -> Result<()> {
-        let shared = self.shared();
-        self.finish();
-        let Some(checked) = &mut self.checked else { return Ok(()) };
-        // Under the pass's name: should the device be lost, it is known where.
-        shared.submit(checked.queue, self.commands, self.value, pass)?;
-        shared.wait(self.value)?;
-        self.commands = shared.begin(checked.pool)?;
-        self.value += 1;
-        shared.last_use.store(self.value, Ordering::Release);
-        self.barrier();
+    /// Submits what is recorded, waits for it, and begins anew. Under the pass's name: should the device be lost, it is
+    /// known where.
+    fn run_recorded(&mut self, recorder: &mut Recorder<'_>, pass: &str) -> Result<()> {
+        let shared = recorder.shared();
+        recorder.finish();
+        shared.submit(self.queue, recorder.commands, recorder.value, pass)?;
+        shared.wait(recorder.value)?;
+        recorder.commands = shared.begin(self.pool)?;
+        recorder.value += 1;
+        shared.last_use.store(recorder.value, Ordering::Release);
+        recorder.barrier();
         Ok(())
     }
+}
+
+/// Records copies of what the pass binds.
+fn copies(
+    recorder: &mut Recorder<'_>,
+    bindings: &[Binding],
+    bound: &[Bound],
+    wanted: impl Fn(&Binding) -> bool,
+) -> Result<Vec<Download<u32>>> {
+    let wanted = bindings.iter().zip(bound).filter(|(binding, _)| wanted(binding));
+    wanted.map(|(binding, bound)| recorder.download_bound(binding.name, *bound)).collect()
 }
 
 fn wait(downloads: Vec<Download<u32>>) -> Result<Vec<Vec<u32>>> {

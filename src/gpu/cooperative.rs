@@ -2,7 +2,7 @@
 
 use ash::{khr, vk};
 
-use super::requirements::Offered;
+use super::offered::Offered;
 
 /// Rows of the first factor, columns of the second, and what both share, of the products that kernels build on:
 /// 16-bit factors, sums in single precision, a subgroup's work.

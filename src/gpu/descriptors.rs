@@ -4,16 +4,10 @@ use std::sync::Arc;
 
 use ash::{khr, vk};
 
-use super::buffer::whole_quads;
+use super::limits::{MAX_BUFFERS, whole_quads};
 use super::pipeline::Objects;
-use super::{Bound, Recorder, Retired, Shared};
+use super::{Bound, Retired, Shared};
 use crate::Result;
-
-/// `off` in this variable binds descriptor sets also where a device could be pushed to. It changes no bit.
-pub const PUSH_VARIABLE: &str = "NIGHTSPLAT_PUSH_DESCRIPTORS";
-
-/// The most buffers that one pass binds.
-pub(super) const MAX_BUFFERS: u32 = 16;
 
 /// What a device takes.
 pub(super) enum Descriptors {
@@ -58,6 +52,58 @@ impl Sets {
         Self { shared: Arc::clone(shared), pools: vec![], left: 0 }
     }
 
+    /// Records into `commands` what the next dispatch binds: pipeline, buffers and parameters.
+    pub(super) fn bind(
+        &mut self,
+        commands: vk::CommandBuffer,
+        pipeline: &Objects,
+        params: &[u8],
+        bound: &[Bound],
+    ) -> Result<()> {
+        let infos: Vec<_> = bound
+            .iter()
+            .map(|&Bound { raw, offset, size }| {
+                let info = vk::DescriptorBufferInfo::default().buffer(raw).offset(offset);
+                [info.range(whole_quads(size))]
+            })
+            .collect();
+        let mut writes: Vec<_> = pipeline
+            .interface
+            .bindings
+            .iter()
+            .zip(&infos)
+            .map(|(binding, info)| {
+                vk::WriteDescriptorSet::default()
+                    .dst_binding(binding.index)
+                    .descriptor_type(vk::DescriptorType::STORAGE_BUFFER)
+                    .buffer_info(info)
+            })
+            .collect();
+        let (point, layout) = (vk::PipelineBindPoint::COMPUTE, pipeline.layout);
+        let shared = Arc::clone(&self.shared);
+        let device = &shared.device;
+        // SAFETY: recording; pipeline and buffers are live and match the layout by construction.
+        unsafe {
+            device.cmd_bind_pipeline(commands, point, pipeline.raw);
+            match &shared.descriptors {
+                Descriptors::Pushed(functions) => {
+                    functions.cmd_push_descriptor_set(commands, point, layout, 0, &writes);
+                }
+                Descriptors::InSets => {
+                    let set = self.next(pipeline.set_layout)?;
+                    writes.iter_mut().for_each(|write| write.dst_set = set);
+                    device.update_descriptor_sets(&writes, &[]);
+                    device.cmd_bind_descriptor_sets(commands, point, layout, 0, &[set], &[]);
+                }
+            }
+            if !params.is_empty() {
+                let stage = vk::ShaderStageFlags::COMPUTE;
+                device.cmd_push_constants(commands, layout, stage, 0, params);
+            }
+        }
+        Ok(())
+    }
+
     /// A set that nothing was written to.
     fn next(&mut self, layout: vk::DescriptorSetLayout) -> Result<vk::DescriptorSet> {
         let shared = &self.shared;
@@ -90,59 +136,5 @@ impl Drop for Sets {
         for pool in self.pools.drain(..) {
             self.shared.retire(Retired::Descriptors(pool));
         }
-    }
-}
-
-impl Recorder<'_> {
-    /// Binds pipeline, buffers and parameters of the next dispatch.
-    pub(super) fn bind(
-        &mut self,
-        pipeline: &Objects,
-        params: &[u8],
-        bound: &[Bound],
-    ) -> Result<()> {
-        let infos: Vec<_> = bound
-            .iter()
-            .map(|&Bound { raw, offset, size }| {
-                let info = vk::DescriptorBufferInfo::default().buffer(raw).offset(offset);
-                [info.range(whole_quads(size))]
-            })
-            .collect();
-        let mut writes: Vec<_> = pipeline
-            .interface
-            .bindings
-            .iter()
-            .zip(&infos)
-            .map(|(binding, info)| {
-                vk::WriteDescriptorSet::default()
-                    .dst_binding(binding.index)
-                    .descriptor_type(vk::DescriptorType::STORAGE_BUFFER)
-                    .buffer_info(info)
-            })
-            .collect();
-        let (commands, point, layout) =
-            (self.commands, vk::PipelineBindPoint::COMPUTE, pipeline.layout);
-        let shared = self.shared();
-        let device = &shared.device;
-        // SAFETY: recording; pipeline and buffers are live and match the layout by construction.
-        unsafe {
-            device.cmd_bind_pipeline(commands, point, pipeline.raw);
-            match &shared.descriptors {
-                Descriptors::Pushed(functions) => {
-                    functions.cmd_push_descriptor_set(commands, point, layout, 0, &writes);
-                }
-                Descriptors::InSets => {
-                    let set = self.sets.next(pipeline.set_layout)?;
-                    writes.iter_mut().for_each(|write| write.dst_set = set);
-                    device.update_descriptor_sets(&writes, &[]);
-                    device.cmd_bind_descriptor_sets(commands, point, layout, 0, &[set], &[]);
-                }
-            }
-            if !params.is_empty() {
-                let stage = vk::ShaderStageFlags::COMPUTE;
-                device.cmd_push_constants(commands, layout, stage, 0, params);
-            }
-        }
-        Ok(())
     }
 }

@@ -3,10 +3,12 @@
 use ash::vk;
 
 use super::REQUIREMENTS;
-use super::choice::PciAddress;
+
 use super::cooperative::{self, CooperativeMatrix};
-use super::device::{Owned, instance, loader_error, physical_devices};
-use super::requirements::Offered;
+use super::instance::{Owned, instance, loader_error, physical_devices};
+use super::limits::max_workgroups;
+use super::offered::Offered;
+use super::pci::PciAddress;
 use crate::Result;
 
 /// One device and how it meets the requirements, for `doctor`.
@@ -134,11 +136,6 @@ pub(super) fn report(
             .map(|r| RequirementReport { name: r.name, why: r.why, met: r.met_by(&offered) })
             .collect(),
     })
-}
-
-/// Of a dispatch along either of its first two dimensions.
-pub(super) fn max_workgroups(limits: &vk::PhysicalDeviceLimits) -> u32 {
-    limits.max_compute_work_group_count[0].min(limits.max_compute_work_group_count[1])
 }
 
 /// Bytes of device-local memory.

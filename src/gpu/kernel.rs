@@ -4,6 +4,7 @@ use std::fmt::Debug;
 
 use ash::vk;
 
+#[cfg(feature = "check")]
 use super::Tolerance;
 
 /// One storage buffer of a kernel.
@@ -59,23 +60,41 @@ pub trait Kernel: 'static {
     type Constants: Copy + Debug;
     /// The buffers of a dispatch.
     type Buffers<'a>;
-    /// The buffers in host memory, for the reference.
-    type Slices<'a>;
-    /// How far each buffer that it writes may be from the reference's.
-    type Tolerances: Default + Into<Vec<Tolerance>>;
     /// The Vulkan buffers in binding order.
     fn bound(buffers: &Self::Buffers<'_>) -> Vec<Bound>;
-    /// The slices whose 32-bit numbers these are, in binding order.
-    fn slices(words: &mut [Vec<u32>]) -> Self::Slices<'_>;
     /// Specialization ids and the bits of their values.
     fn constants(constants: &Self::Constants) -> Vec<(u32, u32)>;
 }
+
+/// What a kernel's buffers are in host memory. Implemented by `build.rs`.
+#[cfg(feature = "check")]
+pub trait OnHost: Kernel {
+    /// The buffers in host memory.
+    type Slices<'a>;
+    /// How far each buffer that it writes may be from the reference's.
+    type Tolerances: Default + Into<Vec<Tolerance>>;
+    /// The slices whose 32-bit numbers these are, in binding order.
+    fn slices(words: &mut [Vec<u32>]) -> Self::Slices<'_>;
+}
+
+/// A kernel that passes can be recorded of: with feature `check` one that has a reference.
+#[cfg(feature = "check")]
+pub trait Recordable: Reference {}
+#[cfg(feature = "check")]
+impl<K: Reference> Recordable for K {}
+
+/// A kernel that passes can be recorded of.
+#[cfg(not(feature = "check"))]
+pub trait Recordable: Kernel {}
+#[cfg(not(feature = "check"))]
+impl<K: Kernel> Recordable for K {}
 
 /// The CPU reference of a kernel: same parameters, same buffers, plain loops.
 ///
 /// It takes from a slice what parameters and counts say and nothing else: a buffer may be longer than a view needs, and
 /// what lies beyond is anything.
-pub trait Reference: Kernel {
+#[cfg(feature = "check")]
+pub trait Reference: OnHost {
     /// Does to the slices what the kernel does to the buffers.
     fn run(params: &Self::Params, constants: &Self::Constants, slices: Self::Slices<'_>);
 

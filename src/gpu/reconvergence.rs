@@ -6,7 +6,7 @@
 
 use ash::{khr, vk};
 
-use super::requirements::Offered;
+use super::offered::Offered;
 
 /// The extension a device is created with to be asked.
 pub(super) const EXTENSION: &std::ffi::CStr = khr::shader_subgroup_uniform_control_flow::NAME;

@@ -3,15 +3,16 @@
 use std::collections::HashMap;
 use std::ffi::CString;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::Ordering;
 
 use ash::vk;
 use ash::vk::Handle as _;
 
-use super::checked::Checked;
+#[cfg(feature = "check")]
+use super::Tolerance;
 use super::descriptors::Sets;
 use super::pipeline::Objects;
-use super::{Binding, Bound, Buffer, Gpu, Interface, Pipeline, Properties, Reference, Shared};
+use super::{Binding, Bound, Buffer, Gpu, Interface, Pipeline, Properties, Recordable, Shared};
 use crate::{Error, Result};
 
 /// How many invocations a dispatch needs; the kernel knows its workgroup size.
@@ -30,7 +31,7 @@ pub enum Threads<'a> {
 pub struct Recorder<'g> {
     shared: &'g Arc<Shared>,
     /// What its passes bind.
-    pub(super) sets: Sets,
+    sets: Sets,
     pub(super) commands: vk::CommandBuffer,
     /// The timeline value that signals the end of this recording.
     pub(super) value: u64,
@@ -38,8 +39,9 @@ pub struct Recorder<'g> {
     pub(super) labels: Vec<&'static str>,
     /// Buffers touched since the last barrier; true when written.
     pending: HashMap<vk::Buffer, bool>,
-    /// Where every pass is run alone and compared with its reference.
-    pub(super) checked: Option<Checked<'g>>,
+    /// Runs every pass alone and compares it with its reference, in place of its being recorded.
+    #[cfg(feature = "check")]
+    pub(super) observer: Option<&'g mut (dyn PassObserver + 'g)>,
 }
 
 /// What a recording of the host application's binds; nothing on a device with `VK_KHR_push_descriptor`.
@@ -49,18 +51,44 @@ pub struct HostRecording {
     _sets: Sets,
 }
 
-/// What was recorded since the device was opened.
-#[derive(Debug, Default)]
-pub(super) struct Recorded {
-    pub(super) dispatches: AtomicU64,
-    pub(super) barriers: AtomicU64,
+/// Runs passes in a way of its own in place of their being recorded.
+#[cfg(feature = "check")]
+pub(super) trait PassObserver: std::fmt::Debug {
+    /// Does what recording and submitting the pass would do.
+    ///
+    /// # Errors
+    /// The extent exceeds what the device can launch, or the device was lost.
+    fn pass(&mut self, recorder: &mut Recorder<'_>, pass: &ObservedPass<'_>) -> Result<()>;
+
+    /// Submits what is recorded, waits for it, and begins anew.
+    ///
+    /// # Errors
+    /// The device was lost.
+    fn run_recorded(&mut self, recorder: &mut Recorder<'_>, label: &str) -> Result<()>;
 }
+
+/// A pass whose types are left behind.
+#[cfg(feature = "check")]
+pub(super) struct ObservedPass<'a> {
+    pub(super) objects: &'a Objects,
+    pub(super) params: &'a [u8],
+    pub(super) bound: &'a [Bound],
+    pub(super) threads: Threads<'a>,
+    pub(super) reference: &'a ReferenceOf<'a>,
+}
+
+/// Makes of the words of a pass's buffers what its reference does, and gives the tolerances from other such words.
+#[cfg(feature = "check")]
+pub(super) type ReferenceOf<'a> = dyn Fn(&mut [Vec<u32>], &mut [Vec<u32>]) -> Vec<Tolerance> + 'a;
 
 /// The timeline value of a recording that the host application submits: none of ours.
 pub(super) const HOST_SUBMITS: u64 = 0;
 
 /// Timestamps that fit one recording; passes beyond are not timed.
 pub(super) const MAX_TIMESTAMPS: u32 = 4096;
+
+/// What `vkCmdUpdateBuffer` takes at most, in bytes.
+const MAX_UPDATE: usize = 65_536;
 
 impl<'g> Recorder<'g> {
     /// Starts with a barrier behind everything submitted before.
@@ -78,7 +106,8 @@ impl<'g> Recorder<'g> {
             queries,
             labels: vec![],
             pending: HashMap::new(),
-            checked: None,
+            #[cfg(feature = "check")]
+            observer: None,
         };
         recorder.barrier();
         recorder.timestamp();
@@ -97,7 +126,7 @@ impl<'g> Recorder<'g> {
     ///
     /// # Errors
     /// The extent exceeds what the device can launch.
-    pub fn dispatch<K: Reference>(
+    pub fn dispatch<K: Recordable>(
         &mut self,
         pipeline: &Pipeline<K>,
         params: &K::Params,
@@ -105,10 +134,26 @@ impl<'g> Recorder<'g> {
         threads: Threads<'_>,
     ) -> Result<()> {
         let bound = K::bound(&buffers);
-        if self.checked.is_some() {
-            return self.dispatch_checked(pipeline, params, &bound, threads);
+        let words = bytemuck::bytes_of(params);
+        #[cfg(feature = "check")]
+        if let Some(observer) = self.observer.take() {
+            let reference = |reference: &mut [Vec<u32>], before: &mut [Vec<u32>]| {
+                K::run(params, &pipeline.constants, K::slices(reference));
+                K::tolerances(params, &pipeline.constants, K::slices(before)).into()
+            };
+            let objects = &pipeline.objects;
+            let pass = ObservedPass {
+                objects,
+                params: words,
+                bound: &bound,
+                threads,
+                reference: &reference,
+            };
+            let done = observer.pass(self, &pass);
+            self.observer = Some(observer);
+            return done;
         }
-        self.record_dispatch(&pipeline.objects, bytemuck::bytes_of(params), &bound, threads)
+        self.record_dispatch(&pipeline.objects, words, &bound, threads)
     }
 
     pub(super) fn record_dispatch(
@@ -131,7 +176,7 @@ impl<'g> Recorder<'g> {
             _ => self.fold(name, self.workgroups(pipeline.interface, threads))?,
         };
         self.begin_label(name);
-        self.bind(pipeline, params, bound)?;
+        self.sets.bind(self.commands, pipeline, params, bound)?;
         let device = &self.shared.device;
         // SAFETY: recording; a retired buffer outlives this submission.
         unsafe {
@@ -156,6 +201,26 @@ impl<'g> Recorder<'g> {
         unsafe {
             self.shared.device.cmd_fill_buffer(self.commands, raw, offset, size, word);
         }
+    }
+
+    /// Overwrites the first elements of `buffer` with `data`, which the command buffer itself holds: for a few numbers that the
+    /// host knows when it records.
+    ///
+    /// # Errors
+    /// `data` is longer than the buffer, or than the 64 KiB that Vulkan takes.
+    pub fn update<T: bytemuck::Pod>(&mut self, buffer: &mut Buffer<T>, data: &[T]) -> Result<()> {
+        let bytes: &[u8] = bytemuck::cast_slice(data);
+        let Bound { raw, offset, size } = buffer.bound();
+        if bytes.len() as u64 > size || bytes.len() > MAX_UPDATE {
+            let (name, count) = (buffer.name(), data.len());
+            return Err(Error::Usage(format!("{count} elements do not fit buffer `{name}`")));
+        }
+        if !bytes.is_empty() {
+            self.synchronize([(raw, true)].into_iter());
+            // SAFETY: recording; the buffer holds the bytes. Sizes of our element types are multiples of four.
+            unsafe { self.shared.device.cmd_update_buffer(self.commands, raw, offset, bytes) };
+        }
+        Ok(())
     }
 
     /// Copies the first elements of `source` to `target`, as many as both hold.

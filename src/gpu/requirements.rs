@@ -1,13 +1,9 @@
 //! What every device must offer: one table, read by device selection, `doctor` and the embedding check.
 
-use std::collections::BTreeSet;
-use std::ffi::CStr;
+use ash::vk;
 
-use ash::{ext, khr, vk};
-
-use super::choice::PciAddress;
-use super::descriptors::{MAX_BUFFERS, PUSH_VARIABLE};
-use super::subgroups::{SIZES, SubgroupSizes};
+use super::limits::{MAX_BUFFERS, SUBGROUP_SIZES};
+use super::offered::Offered;
 use crate::{Error, Result};
 
 /// The subgroup operations that our kernels use.
@@ -18,28 +14,6 @@ const SUBGROUP_OPERATIONS: vk::SubgroupFeatureFlags = vk::SubgroupFeatureFlags::
         | vk::SubgroupFeatureFlags::BALLOT.as_raw()
         | vk::SubgroupFeatureFlags::SHUFFLE.as_raw(),
 );
-
-/// The device extensions that a device of our own is created with where it has them.
-pub(super) const OPTIONAL_EXTENSIONS: &[&CStr] =
-    &[khr::push_descriptor::NAME, khr::portability_subset::NAME];
-
-/// What a physical device offers, gathered once.
-pub(super) struct Offered {
-    pub(super) properties: vk::PhysicalDeviceProperties,
-    pub(super) uuid: [u8; vk::UUID_SIZE],
-    pub(super) pci: Option<PciAddress>,
-    pub(super) max_allocation: u64,
-    pub(super) subgroups: SubgroupSizes,
-    pub(super) subgroup_operations: vk::SubgroupFeatureFlags,
-    pub(super) subgroup_stages: vk::ShaderStageFlags,
-    pub(super) max_push_descriptors: u32,
-    pub(super) extensions: BTreeSet<String>,
-    pub(super) vulkan12: vk::PhysicalDeviceVulkan12Features<'static>,
-    pub(super) vulkan13: vk::PhysicalDeviceVulkan13Features<'static>,
-    pub(super) compute_family: Option<u32>,
-    /// Of that family.
-    pub(super) timestamp_bits: u32,
-}
 
 /// One thing that every device must offer.
 #[derive(Clone, Copy)]
@@ -121,7 +95,7 @@ pub const REQUIREMENTS: &[Requirement] = &[
     Requirement {
         name: "subgroup size 4 to 128",
         why: "a ballot fits four words, a tile at most 32 rows of lanes",
-        offered: |o| SIZES.contains(&o.subgroups.own),
+        offered: |o| SUBGROUP_SIZES.contains(&o.subgroups.own),
     },
     Requirement {
         name: "maxComputeWorkGroupInvocations >= 256",
@@ -151,99 +125,6 @@ pub fn required_device_features()
 }
 
 impl Offered {
-    pub(super) fn gather(
-        instance: &ash::Instance,
-        physical: vk::PhysicalDevice,
-    ) -> Result<Self, vk::Result> {
-        // SAFETY: the handle is the instance's.
-        let extensions: BTreeSet<String> =
-            unsafe { instance.enumerate_device_extension_properties(physical)? }
-                .iter()
-                .filter_map(|e| Some(e.extension_name_as_c_str().ok()?.to_string_lossy().into()))
-                .collect();
-        let has = |name: &CStr| extensions.contains(name.to_string_lossy().as_ref());
-        let mut vulkan11 = vk::PhysicalDeviceVulkan11Properties::default();
-        let mut vulkan13_properties = vk::PhysicalDeviceVulkan13Properties::default();
-        let mut push = vk::PhysicalDevicePushDescriptorPropertiesKHR::default();
-        let mut pci = vk::PhysicalDevicePCIBusInfoPropertiesEXT::default();
-        let mut properties = vk::PhysicalDeviceProperties2::default()
-            .push_next(&mut vulkan11)
-            .push_next(&mut vulkan13_properties);
-        // Some drivers complain of what they do not know.
-        if has(khr::push_descriptor::NAME) {
-            properties = properties.push_next(&mut push);
-        }
-        let has_pci = has(ext::pci_bus_info::NAME);
-        if has_pci {
-            properties = properties.push_next(&mut pci);
-        }
-        let mut vulkan12 = vk::PhysicalDeviceVulkan12Features::default();
-        let mut vulkan13 = vk::PhysicalDeviceVulkan13Features::default();
-        let mut features = vk::PhysicalDeviceFeatures2::default()
-            .push_next(&mut vulkan12)
-            .push_next(&mut vulkan13);
-        // SAFETY: the chains point at live locals of the types that the structures name.
-        let families = unsafe {
-            instance.get_physical_device_properties2(physical, &mut properties);
-            instance.get_physical_device_features2(physical, &mut features);
-            instance.get_physical_device_queue_family_properties(physical)
-        };
-        let properties = properties.properties;
-        let compute =
-            families.iter().position(|family| family.queue_flags.contains(vk::QueueFlags::COMPUTE));
-        Ok(Self {
-            properties,
-            uuid: vulkan11.device_uuid,
-            pci: has_pci.then_some(PciAddress {
-                domain: pci.pci_domain,
-                bus: pci.pci_bus,
-                device: pci.pci_device,
-                function: pci.pci_function,
-            }),
-            max_allocation: vulkan11.max_memory_allocation_size,
-            subgroups: SubgroupSizes {
-                own: vulkan11.subgroup_size,
-                are_selectable: vulkan13_properties
-                    .required_subgroup_size_stages
-                    .contains(vk::ShaderStageFlags::COMPUTE),
-                least: vulkan13_properties.min_subgroup_size,
-                most: vulkan13_properties.max_subgroup_size,
-                most_in_workgroup: vulkan13_properties.max_compute_workgroup_subgroups,
-            },
-            subgroup_operations: vulkan11.subgroup_supported_operations,
-            subgroup_stages: vulkan11.subgroup_supported_stages,
-            max_push_descriptors: push.max_push_descriptors,
-            extensions,
-            // The chain pointers die with this function.
-            vulkan12: vk::PhysicalDeviceVulkan12Features {
-                p_next: std::ptr::null_mut(),
-                ..vulkan12
-            },
-            vulkan13: vk::PhysicalDeviceVulkan13Features {
-                p_next: std::ptr::null_mut(),
-                ..vulkan13
-            },
-            compute_family: compute.and_then(|index| u32::try_from(index).ok()),
-            timestamp_bits: compute.map_or(0, |index| families[index].timestamp_valid_bits),
-        })
-    }
-
-    /// The device's name, as the driver gives it.
-    pub(super) fn device_name(&self) -> String {
-        let name = self.properties.device_name_as_c_str();
-        name.map_or_else(|_| "unnamed device".to_owned(), |name| name.to_string_lossy().into())
-    }
-
-    pub(super) fn has(&self, extension: &CStr) -> bool {
-        self.extensions.contains(extension.to_string_lossy().as_ref())
-    }
-
-    /// Whether passes may push their descriptors, and the user does not forbid it.
-    pub(super) fn pushes_descriptors(&self) -> bool {
-        let is_forbidden = std::env::var_os(PUSH_VARIABLE).is_some_and(|value| value == "off");
-        self.max_push_descriptors >= MAX_BUFFERS && !is_forbidden
-    }
-
     /// # Errors
     /// The first requirement that is not met, by its name.
     pub(super) fn check(&self) -> Result<()> {
@@ -261,7 +142,10 @@ impl Offered {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeSet;
+
     use super::*;
+    use crate::gpu::subgroups::SubgroupSizes;
 
     /// A device that meets every requirement, just so.
     fn sufficient() -> Offered {

@@ -1,18 +1,10 @@
 //! How many lanes a subgroup of our kernels has, where the device leaves that open.
 
-use std::ops::RangeInclusive;
-
-use super::requirements::Offered;
-use crate::{Error, Result};
-
+use super::limits::{SUBGROUP_SIZES, WORKGROUP};
 /// Names another size than the built-in one of the device.
 pub const SUBGROUP_VARIABLE: &str = "NIGHTSPLAT_SUBGROUP";
 
 const AMD: u32 = 0x1002;
-/// What our kernels are written for.
-pub(super) const SIZES: RangeInclusive<u32> = 4..=128;
-/// Invocations of our largest workgroups.
-pub(super) const WORKGROUP: u32 = 256;
 
 /// What a device says of its subgroups.
 #[derive(Clone, Copy, Debug)]
@@ -35,7 +27,7 @@ impl SubgroupSizes {
         }
         let powers = (0..u32::BITS).map(|power| 1 << power);
         let fit = |&size: &u32| {
-            SIZES.contains(&size)
+            SUBGROUP_SIZES.contains(&size)
                 && (self.least..=self.most).contains(&size)
                 && WORKGROUP / size <= self.most_in_workgroup
         };
@@ -50,20 +42,15 @@ impl SubgroupSizes {
     }
 }
 
-impl Offered {
-    /// The lanes of our kernels: the built-in number, or that of the variable.
-    ///
-    /// # Errors
-    /// The variable names what the device does not have.
-    pub(super) fn lanes(&self) -> Result<u32> {
-        let wanted = std::env::var(SUBGROUP_VARIABLE).ok().filter(|value| !value.is_empty());
-        lanes(self.subgroups, self.properties.vendor_id, wanted.as_deref()).map_err(|problem| {
-            Error::Usage(format!("{SUBGROUP_VARIABLE} on {}: {problem}", self.device_name()))
-        })
-    }
-}
-
-fn lanes(sizes: SubgroupSizes, vendor: u32, wanted: Option<&str>) -> Result<u32, String> {
+/// The lanes of our kernels: the built-in number, or the one that is asked for.
+///
+/// # Errors
+/// The device does not have it; says what it has.
+pub(super) fn lanes(
+    sizes: SubgroupSizes,
+    vendor: u32,
+    wanted: Option<&str>,
+) -> Result<u32, String> {
     let Some(wanted) = wanted else { return Ok(sizes.built_in(vendor)) };
     let all = sizes.all();
     wanted.parse().ok().filter(|size| all.contains(size)).ok_or_else(|| {

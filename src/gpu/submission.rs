@@ -160,32 +160,34 @@ impl Gpu {
         // From here on, whatever is dropped may be in this recording.
         shared.last_use.store(value, Ordering::Release);
         let queue = &recording.queue;
-        let submitted = if queries.is_none() && shared.checks.are_on() {
-            shared.record_checked(queue, pool, value, label, record).map(|last| (last, vec![]))
-        } else {
-            self.record_commands(pool, value, queries, record).and_then(|(commands, labels)| {
-                shared.submit(queue, commands, value, label)?;
-                tracing::trace!(label, value, "submitted");
-                Ok((value, labels))
-            })
-        };
+        let submitted = self.record_with(queue, pool, value, label, queries, record);
         // Where nothing was submitted, what was dropped meanwhile waits for the next submission, of the same value.
         shared.retire(Retired::Commands(pool));
         submitted.map(|(value, labels)| (Submission { shared: Arc::clone(shared), value }, labels))
     }
 
-    fn record_commands(
+    /// Records and submits; gives the timeline value of the last submission and what was recorded.
+    fn record_with(
         &self,
+        queue: &Queue,
         pool: vk::CommandPool,
         value: u64,
+        label: &str,
         queries: Option<vk::QueryPool>,
         record: Record<'_>,
-    ) -> Result<(vk::CommandBuffer, Vec<&'static str>)> {
+    ) -> Result<(u64, Vec<&'static str>)> {
         let shared = &self.shared;
+        #[cfg(feature = "check")]
+        if queries.is_none() && shared.checks.are_on() {
+            let last = shared.record_checked(queue, pool, value, label, record)?;
+            return Ok((last, vec![]));
+        }
         let mut recorder = Recorder::new(shared, shared.begin(pool)?, value, queries);
         record(&mut recorder)?;
         recorder.finish();
-        Ok((recorder.commands, recorder.labels))
+        shared.submit(queue, recorder.commands, value, label)?;
+        tracing::trace!(label, value, "submitted");
+        Ok((value, recorder.labels))
     }
 }
 
@@ -219,6 +221,7 @@ impl Shared {
         label: &str,
     ) -> Result<()> {
         let fail = |call| move |result| self.error(call, result);
+        #[cfg(feature = "testing")]
         if self.faults.loses_submission() {
             return Err(self.error("vkQueueSubmit2", vk::Result::ERROR_DEVICE_LOST));
         }

@@ -61,7 +61,7 @@ pub fn misuse(gpu: &Gpu) {
 
 /// How many dispatches and barriers were recorded for the device since it was opened.
 pub fn recorded(gpu: &Gpu) -> [u64; 2] {
-    let super::recorder::Recorded { dispatches, barriers } = &gpu.shared.recorded;
+    let super::Recorded { dispatches, barriers } = &gpu.shared.recorded;
     [dispatches, barriers].map(|count| count.load(Ordering::Relaxed))
 }
 
@@ -114,9 +114,13 @@ pub fn with_defect<R>(defect: Defect, work: impl FnOnce() -> R) -> R {
     work()
 }
 
-/// Alters the parameters of the defective kernel.
-pub(super) fn plant_defect(kernel: &str, params: &mut [u8]) {
-    let Some(defect) = DEFECT.get().filter(|defect| defect.kernel == kernel) else { return };
-    let bytes = params.iter_mut().skip(4 * defect.word);
-    bytes.zip(defect.bits.to_le_bytes()).for_each(|(byte, bits)| *byte ^= bits);
+/// The parameters of a pass, altered where the kernel has the defect.
+#[cfg(feature = "check")]
+pub(super) fn with_defect_of(kernel: &str, params: &[u8]) -> Vec<u8> {
+    let mut params = params.to_vec();
+    if let Some(defect) = DEFECT.get().filter(|defect| defect.kernel == kernel) {
+        let bytes = params.iter_mut().skip(4 * defect.word);
+        bytes.zip(defect.bits.to_le_bytes()).for_each(|(byte, bits)| *byte ^= bits);
+    }
+    params
 }

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::subgroups::WORKGROUP;
+use super::limits::WORKGROUP;
 use super::{Gpu, Properties};
 use crate::base::output::write_whole;
 use crate::{Error, Result};

@@ -4,11 +4,10 @@
 //! deviations: the regularisers of 3DGS-MCMC (Kheradmand et al. 2024). They look at no view, so they are recorded after the render's gradient
 //! has become that of the parameters, and add to it.
 
-use serde::{Deserialize, Serialize};
-
 use super::log::{LogSlot, PartialSums};
 use super::{LossSpec, Term, TermOn};
 use crate::Result;
+use crate::base::settings::{Rule, settings};
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::parameter_terms;
 use crate::splats::batches::{Batch, Batches};
@@ -35,14 +34,16 @@ impl Term {
     };
 }
 
+settings! {
+"loss."
 /// What the terms on parameters weigh; 0: they are not there.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ParameterWeights {
-    /// Of the mean opacity; 3DGS-MCMC has 0.01.
-    pub opacity_weight: f64,
-    /// Of the mean standard deviation, in units of the frame; 3DGS-MCMC has 0.01.
-    pub scale_weight: f64,
+    /// Of the mean opacity, which it presses down; 3DGS-MCMC has 0.01.
+    opacity_weight: f64 = 0.0 => Rule::POSITIVE_OR_0;
+    /// Of the mean standard deviation, in units of the frame, which it presses down; 3DGS-MCMC has 0.01.
+    scale_weight: f64 = 0.0 => Rule::POSITIVE_OR_0;
+}
 }
 
 impl ParameterWeights {

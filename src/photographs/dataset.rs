@@ -38,7 +38,7 @@ pub use fingerprint::Fingerprint;
 use listed::{ListedView, Listing};
 use listing::{list, warn};
 use members::with_held_out;
-pub use options::{DepthOptions, LoadOptions, MeasuredSize};
+pub use options::{DOWNSCALE, DepthOptions, LoadOptions, MeasuredSize};
 pub(crate) use pixels::Look;
 pub use pixels::Original;
 use pixels::Source;

@@ -46,13 +46,19 @@ pub(crate) use self::law::{Numbers, PhotographCurve, law};
 pub(crate) use self::law::{clamped, curve_at, tone_curve};
 pub use self::lift::{Lift, Measured, Scene};
 pub use self::profile::Profile;
+#[cfg(feature = "check")]
 pub(crate) use self::profile::profiled;
 #[cfg(feature = "fit")]
 pub(crate) use self::real::Dual;
 pub use self::real::Real;
+#[cfg(feature = "io")]
+pub(crate) use self::settings::OF_CURVE;
 pub use self::settings::{GainChoice, ToneSettings};
-pub(crate) use self::statistics::{Rank, luminance, measurable};
+pub(crate) use self::statistics::Rank;
 pub use self::statistics::{Statistics, percentile};
+#[cfg(any(feature = "io", feature = "check"))]
+pub(crate) use self::statistics::{luminance, measurable};
+#[cfg(feature = "check")]
 pub(crate) use self::table::interpolate;
 pub use self::table::{Table, TableInput};
 pub use crate::kernels::ToneParameters;

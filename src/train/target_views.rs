@@ -261,7 +261,7 @@ impl Trainer {
             let target = self.views.read(&self.gpu, &self.pseudo_gt, views, Shown::Targets)?;
             let UVec2 { x: width, y: height } = view.size();
             let target = Image { width, height, data: target.concat() };
-            let (camera, place) = (view.patch.pinhole(), Some(view.place));
+            let (camera, place) = (view.patch.own_camera(), Some(view.place));
             Ok(TargetView { camera, target, mask: None, place })
         });
         Ok(TargetViews(some.collect::<Result<_>>()?))

@@ -23,6 +23,7 @@ use crate::photographs::dataset::{Dataset, Point};
 use crate::photographs::image::Image;
 use crate::photographs::pseudo_gt::PseudoGt;
 use crate::photographs::tone::Scene;
+use crate::splats::render::{Viewpoint, Viewpoints};
 use crate::splats::scene::{COLOR_CHANNELS, Feature, Gaussians, Shape, init};
 use crate::{Error, Result};
 
@@ -54,6 +55,8 @@ pub(super) struct TrainView {
 #[derive(Debug)]
 pub(super) struct Views {
     levels: Vec<Vec<TrainView>>,
+    /// By their numbers.
+    viewpoints: Viewpoints,
     /// The places of those that are trained on no more.
     left_out: BTreeSet<usize>,
     cache: Cache,
@@ -123,8 +126,11 @@ impl Views {
             }
         }
         views.iter_mut().flatten().enumerate().for_each(|(number, view)| view.number = number);
+        let patches = views.iter().flatten().map(|view| view.patch).collect();
+        let viewpoints = Viewpoints::new(gpu, patches)?;
         let views = Self {
             levels: views,
+            viewpoints,
             left_out: BTreeSet::new(),
             cache,
             epochs: Epochs::default(),
@@ -273,6 +279,11 @@ impl Views {
         let from_place = order.iter().cycle().skip(place).take(views.len());
         let own = from_place.copied().find(|at| !self.left_out.contains(&views[*at].place));
         &views[own.unwrap_or(order[place])]
+    }
+
+    /// A view as it is rendered.
+    pub(super) fn viewpoint(&self, view: &TrainView) -> Viewpoint<'_> {
+        self.viewpoints.get(view.number)
     }
 
     /// Trains on a view no more; false where there is no other.

@@ -6,4 +6,6 @@
 mod common;
 
 mod architecture;
+mod circles;
 mod install;
+mod settings;

@@ -6,7 +6,7 @@ use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::parameter_terms;
 use nightsplat::loss::{ParameterInputs, ParameterTerms, ParameterWeights, Term};
 use nightsplat::reference::parameter_terms::parameter_terms;
-use nightsplat::splats::attributes::{Attribute, column_count};
+use nightsplat::splats::attributes::{Attribute, PlaneCounts, column_count};
 use nightsplat::splats::batches::Batches;
 
 use super::{assert_close, central_differences, log_step};
@@ -72,7 +72,7 @@ fn the_means_over_the_gaussians_reach_the_log_and_their_gradients_the_planes() {
     let weights = ParameterWeights { opacity_weight: 0.3, scale_weight: 0.7 };
     let mut terms = ParameterTerms::new(&gpu, weights).unwrap().unwrap();
     let (planes, words) = (planes(count), column_count(0, 0));
-    let batches = Batches::new(&gpu, count, [words, 0]);
+    let batches = Batches::new(&gpu, PlaneCounts { gaussians: count, columns: words, features: 0 });
     let parameters = batches.upload(&gpu, "parameters", &planes).unwrap();
     let mut gradients = batches.zeros(&gpu, "gradients").unwrap();
     let logged = log_step(&gpu, |pass, log| {

@@ -12,7 +12,7 @@ use super::packed::Packed;
 use super::undistort::{Undistortion, WIDEST};
 use super::{LoadOptions, MeasuredSize, Split, View, masks};
 use crate::base::hash::Hasher;
-use crate::camera::{Camera, Lens};
+use crate::camera::{Camera, CameraModel, Lens};
 use crate::photographs::image::{Image, Mask, Orientation, PictureFile};
 use crate::photographs::tone::Measured;
 use crate::{Error, Result};
@@ -190,6 +190,8 @@ pub struct Original {
     path: PathBuf,
     /// Fitted to the photograph's size.
     lens: Lens,
+    /// As [`LoadOptions::undistort`].
+    undistort: bool,
     /// At which size, and what.
     measured: Option<(MeasuredSize, Measured)>,
     /// Of the pixels as they are loaded, where they are not kept.
@@ -199,8 +201,8 @@ pub struct Original {
 }
 
 impl Original {
-    fn of(path: PathBuf, lens: Lens) -> Self {
-        Self { path, lens, measured: None, checksum: None, stored: Arc::default() }
+    fn of(path: PathBuf, lens: Lens, undistort: bool) -> Self {
+        Self { path, lens, undistort, measured: None, checksum: None, stored: Arc::default() }
     }
 
     /// Width and height, undistorted.
@@ -219,8 +221,8 @@ impl Original {
 
     /// Read anew, undistorted and shrunk.
     pub(super) fn load_at(&self, size: (u32, u32)) -> Result<Image> {
-        let Self { path, lens, .. } = self;
-        let undistortion = undistortion(lens, &path.to_string_lossy())?;
+        let Self { path, lens, undistort, .. } = self;
+        let undistortion = undistortion(lens, *undistort, &path.to_string_lossy())?;
         let (image, _) = PictureFile::open(path)?.decode()?;
         let orientation = turn(path, (image.width, image.height), lens);
         prepared(image.turned(orientation), path, lens, undistortion.as_ref(), size)
@@ -343,10 +345,10 @@ fn load_group(lens: &Lens, mut group: Vec<Source>, loading: &Loading<'_>) -> Res
             options.downscale, size.0, size.1
         )));
     }
-    let undistortion = undistortion(lens, name)?;
+    let undistortion = undistortion(lens, options.undistort, name)?;
     if undistortion.as_ref().is_some_and(|undistortion| undistortion.is_cropped) {
         tracing::warn!(
-            "view {name} and {} more are of a fisheye that sees farther off its axis than the {WIDEST} degrees at the corners of what is trained on; the rest is cropped",
+            "view {name} and {} more are of a fisheye that sees farther off its axis than the {WIDEST} degrees at the corners of what is trained on; the rest is cropped, without `--undistort` it is not",
             group.len() - 1
         );
     }
@@ -360,15 +362,40 @@ fn load_group(lens: &Lens, mut group: Vec<Source>, loading: &Loading<'_>) -> Res
     Ok(loaded)
 }
 
-/// What makes a pinhole of the lens; none where it is one.
-fn undistortion(lens: &Lens, name: &str) -> Result<Option<Undistortion>> {
-    let undistortion = (!lens.is_pinhole()).then(|| {
-        Undistortion::new(lens).ok_or_else(|| {
-            let problem = "its distortion coefficients describe no lens; calibrate again or undistort with COLMAP";
-            Error::input(name, problem)
-        })
-    });
-    undistortion.transpose()
+/// What makes a pinhole of the lens; none where it is rendered as it is.
+///
+/// # Errors
+/// The distortion describes no lens: no pinhole sees inside the photograph only, or a fisheye shows too little of it.
+fn undistortion(lens: &Lens, undistort: bool, name: &str) -> Result<Option<Undistortion>> {
+    let native = lens.model().filter(|&model| model == CameraModel::Pinhole || !undistort);
+    let undistortion = match native {
+        Some(_) => shows_enough(lens).then_some(None),
+        None => Undistortion::new(lens).map(Some),
+    };
+    undistortion.ok_or_else(|| {
+        let problem = "its distortion coefficients describe no lens; calibrate again or undistort with COLMAP";
+        Error::input(name, problem)
+    })
+}
+
+/// Whether a lens that is rendered as it is shows something at a quarter of its pixels at least: the circle of a fisheye in a
+/// wide picture covers more.
+fn shows_enough(lens: &Lens) -> bool {
+    const LEAST: f64 = 0.25;
+    let unseen = native_camera(lens).unseen().len() as f64;
+    unseen <= (1.0 - LEAST) * pixels(lens.width, lens.height) as f64
+}
+
+/// A lens at the world's origin, as it is rendered where it is not undistorted.
+fn native_camera(lens: &Lens) -> Camera {
+    Camera {
+        width: lens.width,
+        height: lens.height,
+        focal: lens.focal,
+        principal_point: lens.principal_point,
+        model: lens.model().unwrap_or_default(),
+        view_from_world: DAffine3::IDENTITY,
+    }
 }
 
 /// How the photographs of a lens become those of a pinhole.
@@ -442,7 +469,7 @@ impl Prepared<'_> {
         if is_kept && !is_shrunk {
             return (Some(whole), None);
         }
-        let mut original = Original::of(path, *self.lens);
+        let mut original = Original::of(path, *self.lens, options.undistort);
         let measured = |image: &Image| match mask {
             Some(mask) => Measured::of(&mask.counted(image)),
             None => Measured::of(&image.data),
@@ -495,14 +522,23 @@ fn load_view(source: Source, lens: &Prepared<'_>, loading: &Loading<'_>) -> Resu
     let mask = stored_mask.map(|(stored, path, orientation)| {
         masks::seen(&stored, &path, (own, orientation), undistortion, size)
     });
-    let mask = mask.transpose()?.flatten();
+    let camera = Camera { view_from_world, ..native_camera(own) };
+    let camera = match undistortion {
+        Some(&Undistortion { focal, .. }) => {
+            Camera { focal, model: CameraModel::Pinhole, ..camera }
+        }
+        None => camera,
+    };
+    let camera = camera.resized(size.0, size.1);
+    let mask = Mask::hiding_too(mask.transpose()?.flatten(), size, &camera.unseen());
     let is_hidden = mask.as_ref().is_some_and(Mask::hides_all);
     if is_hidden {
         problems.push(format!("{name}: no pixel is a number that its mask shows"));
     }
     let is_kept = options.keep != Some(0);
     let of_reference = |reference: Decoded| {
-        let file = (!is_kept).then(|| Original::of(reference.path.clone(), *own));
+        let file =
+            (!is_kept).then(|| Original::of(reference.path.clone(), *own, options.undistort));
         let image = is_kept.then(|| lens.whole(reference).map(|image| lens.shrunk(image)));
         Ok((image.transpose()?, file))
     };
@@ -519,14 +555,7 @@ fn load_view(source: Source, lens: &Prepared<'_>, loading: &Loading<'_>) -> Resu
             .map_err(|problem| tracing::warn!("the depth of view {name} is not used: {problem}"))
             .ok()
     });
-    let camera = Camera {
-        width: own.width,
-        height: own.height,
-        focal: undistortion.map_or(own.focal, |undistortion| undistortion.focal),
-        principal_point: own.principal_point,
-        view_from_world,
-    };
-    let camera = camera.resized(size.0, size.1);
+
     let view = View::new(&name, split, camera, image);
     let view = View { original, reference, reference_file, mask, depth, ..view };
     let view = (split == Split::Test || view.has_photograph()).then_some(view);

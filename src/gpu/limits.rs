@@ -1,0 +1,25 @@
+//! Numbers that all our kernels keep to, and so every device must.
+
+use std::ops::RangeInclusive;
+
+use ash::vk;
+
+/// The most buffers that one pass binds.
+pub(super) const MAX_BUFFERS: u32 = 16;
+
+/// The subgroup sizes that our kernels are written for.
+pub(super) const SUBGROUP_SIZES: RangeInclusive<u32> = 4..=128;
+
+/// Invocations of our largest workgroups.
+pub(super) const WORKGROUP: u32 = 256;
+
+/// What is made and bound for so many bytes: Vulkan has no empty buffers, an empty array still binds; and whole quads, for
+/// kernels that read four values at a time.
+pub(super) fn whole_quads(bytes: u64) -> u64 {
+    bytes.max(1).next_multiple_of(16)
+}
+
+/// Workgroups of a dispatch along either of its first two dimensions.
+pub(super) fn max_workgroups(limits: &vk::PhysicalDeviceLimits) -> u32 {
+    limits.max_compute_work_group_count[0].min(limits.max_compute_work_group_count[1])
+}
