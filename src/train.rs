@@ -55,10 +55,12 @@ use crate::{Error, Result};
 use best::Snapshot;
 pub use cache::CacheSize;
 pub use checkpoint::check_checkpoint;
-pub use config::{Background, CheckConfig, DensityConfig, TrainConfig};
+pub use config::{
+    Background, CheckConfig, DensityConfig, ExposureConfig, Learning, NotFinite, StopConfig,
+    TrainConfig,
+};
 use decisions::Decisions;
-pub use early_stopping::{EndReason, Ended, NotFinite, StopConfig};
-pub use exposures::{ExposureConfig, Learning};
+pub use early_stopping::{EndReason, Ended};
 pub use layers::{Layer, Origin, Settings, values};
 use masks::Masks;
 pub use measuring::TargetExposure;

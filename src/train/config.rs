@@ -1,13 +1,14 @@
 //! Everything that a training run depends on: the command line, a TOML file and the run directory say it alike.
 
+mod exposure;
+mod stop;
+
 use std::ops::Bound;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
 use super::cache::CacheSize;
-use super::early_stopping::StopConfig;
-use super::exposures::{ExposureConfig, Learning};
 use super::parts::ModelConfig;
 use super::precision::PrecisionConfig;
 use super::streams;
@@ -26,6 +27,9 @@ use crate::splats::render::RenderSettings;
 use crate::splats::scene::init::Start;
 use crate::splats::scene::{MAX_SH_DEGREE, Shape};
 use crate::{Error, Result};
+
+pub use exposure::{ExposureConfig, Learning};
+pub use stop::{NotFinite, StopConfig};
 
 /// Pixels of a patch; smaller ones have more border than content.
 pub(super) const LEAST_PATCH: u64 = 256;
