@@ -12,7 +12,7 @@ use std::ffi::c_void;
 use ash::vk::Handle as _;
 use ash::{khr, vk};
 use glam::{DAffine3, DVec2, DVec3, Vec3};
-use nightsplat::camera::Camera;
+use nightsplat::camera::{Camera, CameraModel};
 use nightsplat::gpu::{Gpu, HostDevice, HostRecording, required_device_features};
 use nightsplat::photographs::image::Image;
 use nightsplat::splats::render::{RenderOptions, RenderSettings, Renderer, Status};
@@ -35,7 +35,7 @@ fn main() -> Result<(), Box<dyn Error>> {
 
 fn render(host: &Host, gpu: &Gpu) -> Result<Image, Box<dyn Error>> {
     let (camera, gaussians) = (camera(), ring()?);
-    let parameters = gaussians.upload(gpu)?;
+    let on_device = gaussians.upload(gpu)?;
     let settings = RenderSettings { shape: gaussians.shape, ..RenderSettings::default() };
     let mut renderer = Renderer::new(gpu, settings)?;
     // Memory is taken before anything is recorded.
@@ -46,7 +46,7 @@ fn render(host: &Host, gpu: &Gpu) -> Result<Image, Box<dyn Error>> {
             unsafe {
                 gpu.record_into(commands.as_raw(), |pass| {
                     renderer.clear_status(pass);
-                    renderer.forward(pass, &parameters, &camera, &OPTIONS)
+                    renderer.forward(pass, &on_device, &camera, &OPTIONS)
                 })
             }
             // The host goes on here: `renderer.render().handle()` is a buffer that its own shaders can bind.
@@ -85,6 +85,7 @@ fn camera() -> Camera {
         height: 240,
         focal: DVec2::splat(260.0),
         principal_point: DVec2::new(160.0, 120.0),
+        model: CameraModel::Pinhole,
         view_from_world: DAffine3::IDENTITY,
     }
 }

@@ -127,6 +127,7 @@ mod tests {
     use glam::{DQuat, DVec2};
 
     use super::*;
+    use crate::camera::CameraModel;
 
     fn camera(translation: DVec3) -> Camera {
         let rotation = DQuat::from_euler(glam::EulerRot::XYZ, 0.3, -0.7, 1.1);
@@ -135,6 +136,7 @@ mod tests {
             height: 60,
             focal: DVec2::new(80.0, 90.0),
             principal_point: DVec2::new(47.0, 33.0),
+            model: CameraModel::Pinhole,
             view_from_world: DAffine3::from_rotation_translation(rotation, translation),
         }
     }

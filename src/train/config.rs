@@ -20,7 +20,7 @@ use crate::networks::Form;
 use crate::photographs::dataset::{DOWNSCALE, Dataset, DepthOptions, LoadOptions};
 use crate::photographs::tone::ToneSettings;
 use crate::splats::densify::DensityControl;
-use crate::splats::halves::Bits;
+use crate::splats::halves::StorageFormat;
 use crate::splats::optimizer::Schedule;
 use crate::splats::render::RenderSettings;
 use crate::splats::scene::init::Start;
@@ -62,6 +62,12 @@ pub struct TrainConfig {
     dataset: PathBuf = PathBuf::new() => Rule::PATH;
     /// A folder of reference images by name, for scores only.
     reference: Option<PathBuf> = None, "what lies beside the photographs" => Rule::PATH, "--reference DIR";
+    /// Begin with the Gaussians of a PLY, of a run or of another program, in the dataset's world, in place of the dataset's
+    /// points; every SH degree is in use from the first step.
+    init: Option<PathBuf> = None, "the dataset's points" => Rule::PATH, "--init MODEL.ply";
+    /// Undistort the photographs of a fisheye to a pinhole's, cropped to 60 degrees off its axis, in place of training on the
+    /// fisheye as it is; those of other distorted lenses are always undistorted.
+    undistort: bool = false => Rule::Flag, "--undistort";
     /// Masks (masks/NAME.png or masks/NAME.jpg.png of the dataset) hide what is white, not what is black.
     invert_masks: bool = false => Rule::Flag, "--invert-masks";
     /// Training steps, one view each.
@@ -214,8 +220,8 @@ impl TrainConfig {
             density: DensityConfig { fill: 0, ..DensityConfig::default() },
             stop: StopConfig { views: 0, ..StopConfig::default() },
             precision: PrecisionConfig {
-                rest: Bits::Single,
-                moments: Bits::Single,
+                rest: StorageFormat::Single,
+                moments: StorageFormat::Single,
                 ..PrecisionConfig::default()
             },
             ..Self::default()
@@ -239,6 +245,7 @@ impl TrainConfig {
             keep: CacheSize::on_host(self.cache, self.max_ram),
             reference: self.reference.clone(),
             invert_masks: self.invert_masks,
+            undistort: self.undistort,
             hold_out: self.stop.views,
             depth: DepthOptions {
                 load: self.model.depth,

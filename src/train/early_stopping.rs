@@ -275,7 +275,13 @@ mod tests {
     /// A trainer on a small set with a held-out view, after some steps and a score.
     fn scored(margin: f64) -> Trainer {
         let folder = tempfile::tempdir().unwrap();
-        let options = SyntheticOptions { views: 10, width: 32, height: 24, seed: 3 };
+        let options = SyntheticOptions {
+            views: 10,
+            width: 32,
+            height: 24,
+            seed: 3,
+            ..SyntheticOptions::default()
+        };
         synthetic::write(folder.path(), &options).unwrap();
         let mut config = TrainConfig { steps: 20, ..TrainConfig::bare() };
         (config.stop.views, config.stop.margin) = (1, margin);

@@ -16,7 +16,7 @@ use crate::loss::exposure::{Affine, Exposures};
 use crate::photographs::image::Image;
 use crate::photographs::pseudo_gt::PseudoGt;
 use crate::splats::attributes::planes;
-use crate::splats::halves::Bits;
+use crate::splats::halves::StorageFormat;
 use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
 use crate::splats::scene::init::{self, Start};
 use crate::splats::scene::{Gaussians, SH_C0, width};
@@ -96,7 +96,7 @@ impl Trainer {
         let settings = RenderSettings {
             shape: 0.into(),
             raw_colors: true,
-            rest: Bits::Single,
+            rest: StorageFormat::Single,
             ..self.config.render_settings()
         };
         let mut renderer = Renderer::new(&self.gpu, settings)?;
@@ -134,7 +134,7 @@ impl Trainer {
         bare.log_scales_mut().copy_from_slice(gaussians.log_scales());
         bare.raw_opacities_mut().copy_from_slice(gaussians.raw_opacities());
         for (dc, mean) in bare.dc_mut().iter_mut().zip(gaussians.means()) {
-            let depth = camera.view_from_world.transform_point3(mean.as_dvec3()).z;
+            let depth = camera.depth(mean.as_dvec3()).unwrap_or_default();
             *dc = Vec3::new(depth as f32, 1.0, 0.0) / SH_C0;
         }
         renderer.reserve(bare.count, [camera])?;
@@ -172,8 +172,7 @@ fn seen(camera: &Camera, depths: &Image, target: &Image, mask: Option<&Image>) -
         let depth = f64::from(depths.data[at] / cover);
         let (column, row) = (at % camera.width as usize, at / camera.width as usize);
         let pixel = DVec2::new(column as f64 + 0.5, row as f64 + 0.5);
-        let in_view = ((pixel - camera.principal_point) / camera.focal).extend(1.0) * depth;
-        let position = world_from_view.transform_point3(in_view);
+        let position = world_from_view.transform_point3(camera.in_view(pixel, depth)?);
         let color = Vec3::from_array([0, 1, 2].map(|c| target.data[c * pixels + at]));
         let counts = mask.is_none_or(|mask| mask.data[at] >= 1.0);
         let is_sound = cover >= LEAST_COVER && position.is_finite() && color.is_finite();
@@ -215,12 +214,20 @@ mod tests {
     use glam::DAffine3;
 
     use super::*;
+    use crate::camera::CameraModel;
     use crate::splats::scene::{Features, Shape};
 
     fn camera(width: u32, height: u32) -> Camera {
         let (focal, principal_point) = (DVec2::splat(2.0), DVec2::new(1.0, 0.5));
         let view_from_world = DAffine3::from_translation(DVec3::new(0.0, 0.0, 1.0));
-        Camera { width, height, focal, principal_point, view_from_world }
+        Camera {
+            width,
+            height,
+            focal,
+            principal_point,
+            model: CameraModel::Pinhole,
+            view_from_world,
+        }
     }
 
     #[test]

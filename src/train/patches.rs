@@ -44,7 +44,7 @@ impl Trainer {
         let Some((largest, _)) = largest else { return Ok(None) };
         let patches: Vec<Patch> =
             patches().filter(|&(place, _)| place == largest).map(|(_, patch)| patch).collect();
-        let gaussians = &self.model.gaussians.parameters;
+        let gaussians = self.model.gaussians.slice();
         let mut met = 0;
         for patch in &patches {
             met = met.max(self.renderer.count_intersections(gaussians, patch)?);
@@ -99,6 +99,7 @@ mod tests {
     use glam::{DAffine3, DVec2};
 
     use super::*;
+    use crate::camera::CameraModel;
     use crate::gpu::testing::gpu;
     use crate::train::Part;
 
@@ -109,6 +110,7 @@ mod tests {
             height,
             focal: size,
             principal_point: 0.5 * size,
+            model: CameraModel::Pinhole,
             view_from_world: DAffine3::IDENTITY,
         }
     }

@@ -11,7 +11,7 @@ use crate::Result;
 use crate::base::settings::{Rule, settings};
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::decode;
-use crate::splats::halves::Bits;
+use crate::splats::halves::StorageFormat;
 
 settings! {
 "precision."
@@ -21,9 +21,9 @@ pub struct PrecisionConfig {
     /// Bits of the training photographs, or of the targets that are made of them once. exact: as few as give every value back.
     photographs: PhotographBits = PhotographBits::Exact => Rule::OneOf(&["exact", "32", "16", "8"]);
     /// Bits of the SH coefficients above degree 0.
-    rest: Bits = Bits::Half => Rule::OneOf(&["32", "16"]);
+    rest: StorageFormat = StorageFormat::Half => Rule::OneOf(&["32", "16"]);
     /// Bits of what Adam keeps of the gradients of every Gaussian.
-    moments: Bits = Bits::Half => Rule::OneOf(&["32", "16"]);
+    moments: StorageFormat = StorageFormat::Half => Rule::OneOf(&["32", "16"]);
 }
 }
 

@@ -154,8 +154,8 @@ mod tests {
 
     /// A configuration with every setting that may be left out.
     fn whole() -> TrainConfig {
-        let set =
-            ["reference", "exposure.start", "model.depth_folder"].map(|key| format!("{key}=a"));
+        let set = ["reference", "init", "exposure.start", "model.depth_folder"]
+            .map(|key| format!("{key}=a"));
         let mut set = set.to_vec();
         set.extend(["cache", "max_vram", "max_ram"].map(|key| format!("{key}=1G")));
         let rest = [

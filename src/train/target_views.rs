@@ -240,7 +240,7 @@ impl Trainer {
         let views = self.views.whole();
         let some = views.iter().step_by(views.len().div_ceil(MOST).max(1)).map(|view| {
             let target = view.image(&self.gpu, &*view.kept_target(&self.gpu)?)?;
-            let (camera, place) = (view.patch.pinhole(), Some(view.place));
+            let (camera, place) = (view.patch.own_camera(), Some(view.place));
             Ok(TargetView { camera, target, mask: None, place })
         });
         Ok(TargetViews(some.collect::<Result<_>>()?))

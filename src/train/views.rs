@@ -25,6 +25,7 @@ use crate::photographs::pseudo_gt::PseudoGt;
 use crate::photographs::tone::{
     Exposure, Measured, Scene, Statistics, ToneCurve, ToneSettings, all_black,
 };
+use crate::splats::render::{Viewpoint, Viewpoints};
 use crate::splats::scene::{COLOR_CHANNELS, Feature, Gaussians, Shape, init};
 
 /// One training view: a photograph, or a patch of one that is too large to be trained on at once.
@@ -78,6 +79,8 @@ impl TargetExposure {
 #[derive(Debug)]
 pub(super) struct Views {
     levels: Vec<Vec<TrainView>>,
+    /// By their numbers.
+    viewpoints: Viewpoints,
     /// The places of those that are trained on no more.
     left_out: BTreeSet<usize>,
     cache: Cache,
@@ -143,7 +146,9 @@ impl Views {
             }
         }
         views.iter_mut().flatten().enumerate().for_each(|(number, view)| view.number = number);
-        let views = Self { levels: views, left_out: BTreeSet::new(), cache };
+        let patches = views.iter().flatten().map(|view| view.patch).collect();
+        let viewpoints = Viewpoints::new(gpu, patches)?;
+        let views = Self { levels: views, viewpoints, left_out: BTreeSet::new(), cache };
         // The targets of a profile are as bright as its references.
         let exposure = scene.exposure.clone().filter(|_| settings.profile.is_none());
         let exposure = exposure.map(|scene| TargetExposure::new(scene, gains));
@@ -230,6 +235,11 @@ impl Views {
         let from_place = order.iter().cycle().skip(place as usize).take(views.len());
         let own = from_place.copied().find(|at| !self.left_out.contains(&views[*at].place));
         &views[own.unwrap_or(order[place as usize])]
+    }
+
+    /// A view as it is rendered.
+    pub(super) fn viewpoint(&self, view: &TrainView) -> Viewpoint<'_> {
+        self.viewpoints.get(view.number)
     }
 
     /// Trains on a view no more; false where there is no other.

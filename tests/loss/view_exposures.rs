@@ -264,7 +264,13 @@ const FACTORS: [f32; 4] = [1.0, 0.5, 0.25, 2.0];
 
 /// Synthetic views of which each is darkened or brightened, under one curve.
 fn varied(folder: &Path) -> (TrainConfig, Dataset) {
-    let options = SyntheticOptions { views: 14, width: 40, height: 30, seed: 3 };
+    let options = SyntheticOptions {
+        views: 14,
+        width: 40,
+        height: 30,
+        seed: 3,
+        ..SyntheticOptions::default()
+    };
     synthetic::write(folder, &options).unwrap();
     let mut tone = ToneSettings::new(ToneCurve::Ase);
     tone.scene_statistics = true;

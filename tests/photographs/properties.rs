@@ -6,7 +6,7 @@
 use std::path::Path;
 
 use glam::{DAffine3, DMat2, DQuat, DVec2, DVec3, EulerRot};
-use nightsplat::camera::{Camera, Distortion, Frame};
+use nightsplat::camera::{Camera, CameraModel, Distortion, Frame};
 use nightsplat::gpu::testing::gpu;
 use nightsplat::photographs::dataset::{Dataset, LoadOptions};
 use nightsplat::photographs::tone::{FAMILIES, Table, ToneSettings};
@@ -41,6 +41,7 @@ fn camera() -> impl Strategy<Value = Camera> {
             height,
             focal: DVec2::new(fx, fy),
             principal_point: DVec2::new(0.4 * f64::from(width), 0.6 * f64::from(height)),
+            model: CameraModel::Pinhole,
             view_from_world,
         },
     )

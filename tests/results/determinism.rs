@@ -124,7 +124,13 @@ fn file_name(device: &str, driver: &str) -> String {
 fn tiny_run() -> (tempfile::TempDir, PathBuf) {
     let folder = tempfile::tempdir().unwrap();
     let [set, run] = ["set", "run"].map(|name| folder.path().join(name));
-    let options = SyntheticOptions { views: 8, width: 32, height: 24, seed: 1 };
+    let options = SyntheticOptions {
+        views: 8,
+        width: 32,
+        height: 24,
+        seed: 1,
+        ..SyntheticOptions::default()
+    };
     synthetic::write(&set, &options).unwrap();
     succeed(&format!(
         "train {} --out {} --plan none --model plain --curve ap3 --steps 60 --hash-every 20 --set tile=[16,8] \

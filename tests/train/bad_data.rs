@@ -14,7 +14,13 @@ use crate::common::command::{refused, run};
 /// Nine small views, to spoil.
 fn small_set() -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
-    let options = SyntheticOptions { views: 9, width: 40, height: 30, seed: 2 };
+    let options = SyntheticOptions {
+        views: 9,
+        width: 40,
+        height: 30,
+        seed: 2,
+        ..SyntheticOptions::default()
+    };
     synthetic::write(folder.path(), &options).unwrap();
     folder
 }

@@ -134,7 +134,13 @@ fn odd_sets_have_a_defined_brightness_or_say_why_not() {
 #[test]
 fn photographs_are_lifted_before_they_are_shrunk() {
     let folder = tempfile::tempdir().unwrap();
-    let options = SyntheticOptions { views: 5, width: 96, height: 72, seed: 1 };
+    let options = SyntheticOptions {
+        views: 5,
+        width: 96,
+        height: 72,
+        seed: 1,
+        ..SyntheticOptions::default()
+    };
     synthetic::write(folder.path(), &options).unwrap();
     let load = || {
         let options = LoadOptions { downscale: 3.0, ..LoadOptions::default() };

@@ -19,7 +19,13 @@ use crate::common::train::train;
 
 /// Six views of 40 x 30 pixels, with depth maps where asked.
 fn make_set(folder: &Path, with_depth: bool) {
-    let options = SyntheticOptions { views: 6, width: 40, height: 30, seed: 1 };
+    let options = SyntheticOptions {
+        views: 6,
+        width: 40,
+        height: 30,
+        seed: 1,
+        ..SyntheticOptions::default()
+    };
     synthetic::write(folder, &options).unwrap();
     if with_depth {
         let depth = folder.join("depth");

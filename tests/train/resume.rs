@@ -22,7 +22,13 @@ use crate::common::train::advance;
 
 /// A set of nine small views.
 fn make_set(folder: &Path) {
-    let options = SyntheticOptions { views: 9, width: 40, height: 30, seed: 2 };
+    let options = SyntheticOptions {
+        views: 9,
+        width: 40,
+        height: 30,
+        seed: 2,
+        ..SyntheticOptions::default()
+    };
     synthetic::write(folder, &options).unwrap();
 }
 
@@ -84,7 +90,13 @@ fn a_restored_run_goes_on_bit_for_bit() {
 fn growth_and_the_sh_degree_end_where_held_out_views_gain_too_little_and_a_resumed_run_knows_it() {
     let folder = tempfile::tempdir().unwrap();
     // So many that one can be held out.
-    let options = SyntheticOptions { views: 12, width: 40, height: 30, seed: 2 };
+    let options = SyntheticOptions {
+        views: 12,
+        width: 40,
+        height: 30,
+        seed: 2,
+        ..SyntheticOptions::default()
+    };
     synthetic::write(folder.path(), &options).unwrap();
     let gpu = gpu();
     let mut free = config(&[]);
@@ -119,7 +131,13 @@ fn growth_and_the_sh_degree_end_where_held_out_views_gain_too_little_and_a_resum
 
 /// A set of which one view is held out, and a run on it that converges as soon as it can: what is gained is never enough.
 fn early(folder: &Path) -> (Dataset, TrainConfig) {
-    let options = SyntheticOptions { views: 12, width: 40, height: 30, seed: 2 };
+    let options = SyntheticOptions {
+        views: 12,
+        width: 40,
+        height: 30,
+        seed: 2,
+        ..SyntheticOptions::default()
+    };
     synthetic::write(folder, &options).unwrap();
     let mut config = config(&[]);
     config.steps = 60;

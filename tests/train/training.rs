@@ -13,7 +13,7 @@ use nightsplat::gpu::{DeviceChoice, Gpu};
 use nightsplat::photographs::image::Image;
 use nightsplat::photographs::metrics::Scores;
 use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
-use nightsplat::splats::halves::Bits;
+use nightsplat::splats::halves::StorageFormat;
 use nightsplat::splats::scene::{Gaussians, Shape};
 use nightsplat::train::{Background, StepReport, TrainConfig, Trainer};
 
@@ -176,7 +176,7 @@ fn a_plain_step_is_at_most_24_dispatches_and_20_barriers() {
         config.precision.rest = rest;
         config
     };
-    for bits in [Bits::Single, Bits::Half] {
+    for bits in [StorageFormat::Single, StorageFormat::Half] {
         let [dispatches, barriers] = recorded_for_a_step(with_all_coefficients(bits));
         let counted = format!("{bits:?}: {dispatches} dispatches, {barriers} barriers");
         println!("{counted}");

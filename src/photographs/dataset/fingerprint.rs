@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::{Dataset, View};
 use crate::Result;
 use crate::base::hash::{self, Hasher};
+use crate::camera::CameraModel;
 
 /// What distinguishes one dataset from another, as it was loaded.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -74,6 +75,9 @@ fn camera(View { camera, .. }: &View) -> u64 {
     hasher.write_numbers(&camera.focal.to_array());
     hasher.write_numbers(&camera.principal_point.to_array());
     hasher.write_numbers(&camera.view_from_world.to_cols_array());
+    if let CameraModel::Fisheye(lens) = camera.model {
+        hasher.write_numbers(&lens.coefficients);
+    }
     hasher.finish()
 }
 

@@ -30,6 +30,9 @@ pub struct LoadOptions {
     pub hold_out: usize,
     /// Masks hide what is white, not what is black.
     pub invert_masks: bool,
+    /// Photographs of a fisheye are undistorted to a pinhole's, too, as those of every other lens are; without it the
+    /// fisheye itself is trained on.
+    pub undistort: bool,
     /// What is looked for as the training views' depth.
     pub depth: DepthOptions,
 }
@@ -56,6 +59,7 @@ impl Default for LoadOptions {
             load_low_test: true,
             hold_out: 0,
             invert_masks: false,
+            undistort: false,
             depth: DepthOptions::default(),
         }
     }

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use super::undistort::{Undistortion, WIDEST};
 use super::{LoadOptions, Split, View, masks};
-use crate::camera::{Camera, Lens};
+use crate::camera::{Camera, CameraModel, Lens};
 use crate::photographs::image::{Image, Mask, Orientation};
 use crate::{Error, Result};
 
@@ -116,6 +116,8 @@ pub struct Original {
     path: PathBuf,
     /// Fitted to the photograph's size.
     lens: Lens,
+    /// As [`LoadOptions::undistort`].
+    undistort: bool,
 }
 
 impl Original {
@@ -126,8 +128,8 @@ impl Original {
 
     /// The same, shrunk.
     pub(super) fn load_at(&self, size: (u32, u32)) -> Result<Image> {
-        let Self { path, lens } = self;
-        let undistortion = undistortion(lens, &path.to_string_lossy())?;
+        let Self { path, lens, undistort } = self;
+        let undistortion = undistortion(lens, *undistort, &path.to_string_lossy())?;
         prepared(loaded(path, lens)?, path, lens, undistortion.as_ref(), size)
     }
 }
@@ -243,10 +245,10 @@ fn load_group(
             options.downscale, size.0, size.1
         )));
     }
-    let undistortion = undistortion(lens, name)?;
+    let undistortion = undistortion(lens, options.undistort, name)?;
     if undistortion.as_ref().is_some_and(|undistortion| undistortion.is_cropped) {
         tracing::warn!(
-            "view {name} and {} more are of a fisheye that sees farther off its axis than the {WIDEST} degrees at the corners of what is trained on; the rest is cropped",
+            "view {name} and {} more are of a fisheye that sees farther off its axis than the {WIDEST} degrees at the corners of what is trained on; the rest is cropped, without `--undistort` it is not",
             group.len() - 1
         );
     }
@@ -260,15 +262,40 @@ fn load_group(
     Ok(loaded)
 }
 
-/// What makes a pinhole of the lens; none where it is one.
-fn undistortion(lens: &Lens, name: &str) -> Result<Option<Undistortion>> {
-    let undistortion = (!lens.is_pinhole()).then(|| {
-        Undistortion::new(lens).ok_or_else(|| {
-            let problem = "its distortion coefficients describe no lens; calibrate again or undistort with COLMAP";
-            Error::input(name, problem)
-        })
-    });
-    undistortion.transpose()
+/// What makes a pinhole of the lens; none where it is rendered as it is.
+///
+/// # Errors
+/// The distortion describes no lens: no pinhole sees inside the photograph only, or a fisheye shows too little of it.
+fn undistortion(lens: &Lens, undistort: bool, name: &str) -> Result<Option<Undistortion>> {
+    let native = lens.model().filter(|&model| model == CameraModel::Pinhole || !undistort);
+    let undistortion = match native {
+        Some(_) => shows_enough(lens).then_some(None),
+        None => Undistortion::new(lens).map(Some),
+    };
+    undistortion.ok_or_else(|| {
+        let problem = "its distortion coefficients describe no lens; calibrate again or undistort with COLMAP";
+        Error::input(name, problem)
+    })
+}
+
+/// Whether a lens that is rendered as it is shows something at a quarter of its pixels at least: the circle of a fisheye in a
+/// wide picture covers more.
+fn shows_enough(lens: &Lens) -> bool {
+    const LEAST: f64 = 0.25;
+    let unseen = native_camera(lens).unseen().len() as f64;
+    unseen <= (1.0 - LEAST) * pixels(lens.width, lens.height) as f64
+}
+
+/// A lens at the world's origin, as it is rendered where it is not undistorted.
+fn native_camera(lens: &Lens) -> Camera {
+    Camera {
+        width: lens.width,
+        height: lens.height,
+        focal: lens.focal,
+        principal_point: lens.principal_point,
+        model: lens.model().unwrap_or_default(),
+        view_from_world: DAffine3::IDENTITY,
+    }
 }
 
 fn load_view(
@@ -294,8 +321,9 @@ fn load_view(
     let is_shrunk = size != (lens.width, lens.height);
     let is_kept = options.keep.is_none();
     let original = input.clone().filter(|_| is_shrunk || !is_kept);
-    let original = original.map(|path| Original { path, lens: *lens });
-    let file = |path| Original { path, lens: *lens };
+    let undistort = options.undistort;
+    let file = |path| Original { path, lens: *lens, undistort };
+    let original = original.map(file);
     let reference_file = reference.clone().filter(|_| !is_kept).map(file);
     let paths = [input.clone(), reference.clone()];
     let (mut image, mut reference) = (image(input)?, image(reference)?);
@@ -308,7 +336,15 @@ fn load_view(
             let files = (path.as_path(), mask.as_deref());
             masks::load(files, lens, undistortion, size, options.invert_masks)
         });
-    let mask = hidden.transpose()?.flatten();
+    let camera = Camera { view_from_world, ..native_camera(lens) };
+    let camera = match undistortion {
+        Some(&Undistortion { focal, .. }) => {
+            Camera { focal, model: CameraModel::Pinhole, ..camera }
+        }
+        None => camera,
+    };
+    let camera = camera.resized(size.0, size.1);
+    let mask = Mask::hiding_too(hidden.transpose()?.flatten(), size, &camera.unseen());
     if mask.as_ref().is_some_and(Mask::hides_all) {
         problems.push(format!("{name}: no pixel is a number that its mask shows"));
         (image, reference) = (None, None);
@@ -318,14 +354,6 @@ fn load_view(
             .map_err(|problem| tracing::warn!("the depth of view {name} is not used: {problem}"))
             .ok()
     });
-    let camera = Camera {
-        width: lens.width,
-        height: lens.height,
-        focal: undistortion.map_or(lens.focal, |undistortion| undistortion.focal),
-        principal_point: lens.principal_point,
-        view_from_world,
-    };
-    let camera = camera.resized(size.0, size.1);
     let original = original.filter(|_| image.is_some());
     let reference_file = reference_file.filter(|_| reference.is_some());
     let (image, reference) = (image.filter(|_| is_kept), reference.filter(|_| is_kept));

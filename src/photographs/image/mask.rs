@@ -83,6 +83,22 @@ impl Mask {
         (!pixels.is_empty()).then_some(Self { width, height, weights })
     }
 
+    #[cfg(feature = "io")]
+    /// A mask of an image of this size that hides these pixels beside those that `own` hides; none of none.
+    pub(crate) fn hiding_too(
+        own: Option<Self>,
+        (width, height): (u32, u32),
+        pixels: &[usize],
+    ) -> Option<Self> {
+        if pixels.is_empty() {
+            return own;
+        }
+        let all = || Self { width, height, weights: vec![1.0; width as usize * height as usize] };
+        let mut mask = own.unwrap_or_else(all);
+        pixels.iter().for_each(|&pixel| mask.weights[pixel] = 0.0);
+        Some(mask)
+    }
+
     /// The mask of an image of another size.
     pub fn resized(&self, width: u32, height: u32) -> Cow<'_, Self> {
         if (width, height) == (self.width, self.height) {

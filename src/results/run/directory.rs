@@ -26,8 +26,6 @@ use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
-use glam::DVec3;
-
 use super::aside::{self, Aside};
 use super::files::*;
 use super::generations;
@@ -36,7 +34,6 @@ use super::lock::RunLock;
 pub use super::progress::Progress;
 use super::tensorboard::EventFile;
 use crate::base::output::{csv_field, write_whole};
-use crate::camera::Frame;
 use crate::loss::Term;
 use crate::loss::exposure::{Affine, table};
 use crate::photographs::dataset::{Dataset, Split, View};
@@ -322,26 +319,19 @@ impl RunDirectory {
         self.log.flush().map_err(|error| unwritable(&self.path, &error))
     }
 
-    /// Writes `model.ply`, in the colours that viewers show and in the dataset's world: relative to
-    /// [`Frame::file_origin`], which a comment says where it is not the world's own.
+    /// Writes `model.ply`, in the colours that viewers show and in the dataset's world.
     ///
     /// # Errors
     /// The disk is full or gone, or a parameter is not finite.
     pub fn save_model(&mut self, trainer: &Trainer) -> Result<()> {
         self.flush_log()?;
-        let (mut gaussians, frame) = (trainer.gaussians_in_frame()?, trainer.frame());
-        trainer.refuse_not_finite(&gaussians)?;
-        let origin = frame.file_origin();
-        if *frame != Frame::WORLD {
-            gaussians = gaussians.to_world(frame, origin);
-        }
+        let in_frame = trainer.gaussians_in_frame()?;
+        trainer.refuse_not_finite(&in_frame)?;
+        let mut gaussians = in_frame.to_world(trainer.frame());
         if self.raw_colors {
             gaussians.shift_colors(-0.5);
         }
-        let [x, y, z] = origin.to_array();
-        let comment = format!("world = position + {x} {y} {z}");
-        let comments = if origin == DVec3::ZERO { &[][..] } else { &[comment.as_str()] };
-        ply::save_with_comments(&gaussians, self.path.join("model.ply"), comments)
+        ply::save(&gaussians, self.path.join("model.ply"))
     }
 
     /// Writes the weights of the networks.

@@ -176,7 +176,10 @@ fn begin(
         Some(settings) => directory.save_config(config, settings),
         None => Ok(()),
     };
-    let mut trainer = Trainer::new(gpu, config.clone(), dataset)?;
+    let mut trainer = match checkpoint {
+        Some(_) => Trainer::to_restore(gpu, config.clone(), dataset)?,
+        None => Trainer::new(gpu, config.clone(), dataset)?,
+    };
     if let Some(checkpoint) = checkpoint {
         trainer.restore(&checkpoint)?;
         let step = trainer.steps_done();

@@ -21,17 +21,17 @@ impl Renderer {
         for camera in cameras {
             sizes.extend(self.patches(camera).iter().map(|patch| patch.size));
         }
-        self.reserve_with_headroom([gaussian_count; 2], sizes)
+        self.reserve_sizes(gaussian_count, gaussian_count, sizes)
     }
 
-    /// The same for images of these sizes and a number of Gaussians, and where that needs more memory, for another number
-    /// that may follow.
+    /// The same for images of these sizes; where `gaussian_count` Gaussians need more memory, for `capacity` of them.
     ///
     /// # Errors
     /// The device is out of memory, or cannot follow so many tiles.
-    pub fn reserve_with_headroom(
+    pub fn reserve_sizes(
         &mut self,
-        [gaussian_count, capacity]: [usize; 2],
+        gaussian_count: usize,
+        capacity: usize,
         sizes: impl IntoIterator<Item = UVec2>,
     ) -> Result<()> {
         let (mut pixels, mut tiles) = (0, 0);
@@ -43,7 +43,7 @@ impl Renderer {
                 return Err(self.too_many_tiles(size));
             }
         }
-        self.frame.reserve(&self.gpu, [gaussian_count, capacity], pixels, tiles)
+        self.frame.reserve(&self.gpu, gaussian_count, capacity, pixels, tiles)
     }
 
     /// Makes room for `intersections`, and half as many again where the device can bind them; what room there is stays.
@@ -112,10 +112,10 @@ impl Renderer {
 mod tests {
     use glam::{DAffine3, DVec2};
 
-    use crate::camera::Camera;
+    use crate::camera::{Camera, CameraModel};
     use crate::gpu::{DeviceChoice, Gpu};
     use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
-    use crate::splats::scene::width;
+    use crate::splats::scene::Gaussians;
 
     /// With the sorts, whose memory comes with the first render.
     #[test]
@@ -124,15 +124,22 @@ mod tests {
         let (gaussians, intersections) = (200_000, 300_000);
         let (principal_point, view_from_world) = (DVec2::new(8.0, 4.0), DAffine3::IDENTITY);
         let focal = DVec2::splat(16.0);
-        let camera = Camera { width: 16, height: 8, focal, principal_point, view_from_world };
+        let camera = Camera {
+            width: 16,
+            height: 8,
+            focal,
+            principal_point,
+            model: CameraModel::Pinhole,
+            view_from_world,
+        };
         let settings = RenderSettings::default();
-        let parameters = gpu.zeros("parameters", gaussians * width(settings.shape)).unwrap();
+        let model = Gaussians::zeros(gaussians, settings.shape).upload(&gpu).unwrap();
         let mut renderer = Renderer::new(&gpu, settings).unwrap();
         let before = gpu.memory_in_use();
         renderer.reserve(gaussians, [&camera]).unwrap();
         renderer.set_intersection_capacity(intersections).unwrap();
         let options = RenderOptions { sh_degree: 3, background: [0.0; 3] };
-        renderer.render_image(&parameters, &camera, &options).unwrap();
+        renderer.render_image(&model, &camera, &options).unwrap();
         assert_eq!(renderer.intersection_capacity(), intersections);
         gpu.free_unused();
         let taken = (gpu.memory_in_use() - before) as f64;

@@ -192,7 +192,8 @@ pub fn random(cameras: &[Camera], count: usize, seed: u64) -> Vec<DVec3> {
                 uniform(2) * f64::from(camera.height),
             );
             let depth = near * (far / near).powf(uniform(3));
-            let in_view = ((pixel - camera.principal_point) / camera.focal).extend(1.0) * depth;
+            // Where a fisheye shows nothing, straight ahead.
+            let in_view = camera.in_view(pixel, depth).unwrap_or(DVec3::Z * depth);
             camera.view_from_world.inverse().transform_point3(in_view)
         };
         let seen_twice = |position: &DVec3| {

@@ -117,7 +117,13 @@ impl Hostile {
         let config = config();
         let files = tempfile::tempdir()
             .map_err(|error| Error::output(std::env::temp_dir(), error.to_string()))?;
-        let options = SyntheticOptions { views: 4, width: 32, height: 24, seed: 14 };
+        let options = SyntheticOptions {
+            views: 4,
+            width: 32,
+            height: 24,
+            seed: 14,
+            ..SyntheticOptions::default()
+        };
         synthetic::write(files.path(), &options)?;
         let low = files.path().join("low");
         for name in 0..options.views {
