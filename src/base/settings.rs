@@ -261,7 +261,7 @@ macro_rules! settings {
             ///
             /// # Errors
             /// [`Error::Setting`](crate::Error::Setting).
-            pub(crate) fn check_rows(&self) -> $crate::Result<()> {
+            pub fn check_rows(&self) -> $crate::Result<()> {
                 let values = [$(&self.$field as &dyn std::any::Any),*];
                 let mut rows = Self::SETTINGS.iter().zip(values);
                 rows.try_for_each(|(row, value)| row.check(value))

@@ -15,7 +15,7 @@ impl TrainConfig {
         let (Shape { sh_degree, features }, own) = (self.render_settings().shape, gaussians.shape);
         if own.sh_degree > sh_degree {
             let problem = format!(
-                "has SH degree {}, more than the {sh_degree} of `TrainConfig::sh_degree`",
+                "has SH degree {}, more than sh_degree, which is {sh_degree}",
                 own.sh_degree
             );
             return Err(Error::input(path, problem));

@@ -63,6 +63,7 @@ pub struct ToneSettings {
 const MOST: f64 = 1e30;
 
 /// Settings that belong to a curve: they do not outlast the choice of another one.
+#[cfg(feature = "io")]
 pub(crate) const OF_CURVE: [&str; 8] =
     ["gain_c", "alpha", "auto_gain", "colour", "lift_first", "constants", "table", "profile"];
 

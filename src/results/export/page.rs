@@ -49,7 +49,7 @@ impl Page<'_> {
         let other = bookmarks.iter().find(|own| own.camera.model != CameraModel::Pinhole);
         if let Some(Bookmark { name, .. }) = other {
             return Err(Error::Usage(format!(
-                "view {name} is of a fisheye, and the page shows pinholes; load its dataset with `LoadOptions::undistort`"
+                "view {name} is of a fisheye, and the page shows pinholes; load its dataset with --undistort"
             )));
         }
         let scene = json!({
