@@ -12,7 +12,7 @@ use std::ffi::c_void;
 use ash::vk::Handle as _;
 use ash::{khr, vk};
 use glam::{DAffine3, DVec2, DVec3, Vec3};
-use nightsplat::camera::Camera;
+use nightsplat::camera::{Camera, CameraModel};
 use nightsplat::gpu::{Gpu, HostDevice, HostRecording, required_device_features};
 use nightsplat::photographs::image::Image;
 use nightsplat::splats::render::{RenderOptions, RenderSettings, Renderer, Status};
@@ -85,6 +85,7 @@ fn camera() -> Camera {
         height: 240,
         focal: DVec2::splat(260.0),
         principal_point: DVec2::new(160.0, 120.0),
+        model: CameraModel::Pinhole,
         view_from_world: DAffine3::IDENTITY,
     }
 }

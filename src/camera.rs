@@ -1,8 +1,9 @@
-//! Cameras: the undistorted pinhole that everything renders with, and the calibrated lens that a dataset lists.
+//! Cameras: the pinhole or fisheye that everything renders with, and the calibrated lens that a dataset lists.
 //!
 //! Axes are those of `OpenCV` (x right, y down, z forward); pixel units, the image's corner at (0, 0), pixel centres at +0.5.
 
 pub mod frame;
+mod model;
 mod patch;
 mod path;
 mod places;
@@ -10,11 +11,12 @@ mod places;
 use glam::{DAffine3, DVec2, DVec3};
 
 pub use frame::Frame;
+pub use model::{CameraModel, KannalaBrandt};
 pub use patch::Patch;
 pub use path::CameraPath;
 pub(crate) use places::Places;
 
-/// An undistorted pinhole camera with its pose.
+/// A camera with its pose: a pinhole, or a fisheye as it is.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Camera {
     /// Pixels per row.
@@ -25,6 +27,8 @@ pub struct Camera {
     pub focal: DVec2,
     /// Where the optical axis meets the image, pixels; rarely the centre.
     pub principal_point: DVec2,
+    /// Which place of the picture shows which direction.
+    pub model: CameraModel,
     /// Rigid: world space to view space (`OpenCV` axes).
     pub view_from_world: DAffine3,
 }
@@ -35,11 +39,22 @@ impl Camera {
         self.view_from_world.inverse().translation
     }
 
-    /// Where a world-space point appears, pixels (possibly outside the image); `None` behind the camera.
+    /// Where a world-space point appears, pixels (possibly outside the image); `None` behind the camera, or beyond what a
+    /// fisheye sees.
     pub fn project(&self, point: DVec3) -> Option<DVec2> {
-        let in_view = self.view_from_world.transform_point3(point);
-        (in_view.z > 0.0)
-            .then(|| self.focal * in_view.truncate() / in_view.z + self.principal_point)
+        let place = self.model.place(self.view_from_world.transform_point3(point))?;
+        Some(self.focal * place + self.principal_point)
+    }
+
+    /// The point of the view (x right, y down, z forward) that is seen at a pixel and a depth, as
+    /// [`CameraModel::depth`] counts it; `None` where a fisheye sees nothing.
+    pub fn in_view(&self, pixel: DVec2, depth: f64) -> Option<DVec3> {
+        self.model.point((pixel - self.principal_point) / self.focal, depth)
+    }
+
+    /// The depth of a world-space point, as [`CameraModel::depth`].
+    pub fn depth(&self, point: DVec3) -> Option<f64> {
+        self.model.depth(self.view_from_world.transform_point3(point))
     }
 
     /// As [`Camera::project`], inside the image alone.
@@ -47,6 +62,30 @@ impl Camera {
         let size = DVec2::new(self.width.into(), self.height.into());
         self.project(point)
             .filter(|pixel| pixel.cmpge(DVec2::ZERO).all() && pixel.cmplt(size).all())
+    }
+
+    /// The pixels of which a part shows nothing, as indices into a plane, ascending: outside the circle of a fisheye.
+    pub fn unseen(&self) -> Vec<usize> {
+        let CameraModel::Fisheye(lens) = self.model else { return vec![] };
+        let reach = lens.radius(lens.largest_angle());
+        let size = DVec2::new(self.width.into(), self.height.into());
+        // A rectangle lies within an ellipse where its corners do.
+        let is_within = |corner: DVec2, size: DVec2| {
+            let corners = [DVec2::ZERO, DVec2::X, DVec2::Y, DVec2::ONE];
+            let mut corners = corners.into_iter().map(|at| corner + at * size);
+            corners.all(|at| ((at - self.principal_point) / self.focal).length() < reach)
+        };
+        if is_within(DVec2::ZERO, size) {
+            return vec![];
+        }
+        let corner = |pixel: u64| {
+            let [column, row] = [pixel % u64::from(self.width), pixel / u64::from(self.width)];
+            DVec2::new(column as f64, row as f64)
+        };
+        let all = 0..u64::from(self.width) * u64::from(self.height);
+        all.filter(|&pixel| !is_within(corner(pixel), DVec2::ONE))
+            .map(|pixel| pixel as usize)
+            .collect()
     }
 
     /// The same camera over an image of another size.
@@ -58,7 +97,7 @@ impl Camera {
             height,
             focal: self.focal * scale,
             principal_point: self.principal_point * scale,
-            view_from_world: self.view_from_world,
+            ..*self
         }
     }
 }
@@ -134,14 +173,14 @@ impl Distortion {
 
     /// The factor of a fisheye, and the derivative of the distorted distance with respect to r.
     fn fisheye(&self, r: f64) -> [f64; 2] {
-        let Self { k1, k2, k3, k4, .. } = *self;
-        let angle = r.atan();
-        let t2 = angle * angle;
-        let factor = 1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)));
-        let slope = 1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)));
-        // atan(r) / r, which is 1 on the axis.
-        let ratio = if r > 1e-8 { angle / r } else { 1.0 };
-        [ratio * factor, slope / (1.0 + r * r)]
+        let (lens, angle) = (self.kannala_brandt(), r.atan());
+        let factor = if r > 1e-8 { lens.radius(angle) / r } else { 1.0 };
+        [factor, lens.slope(angle) / (1.0 + r * r)]
+    }
+
+    /// What a fisheye makes of angles.
+    fn kannala_brandt(&self) -> KannalaBrandt {
+        KannalaBrandt { coefficients: [self.k1, self.k2, self.k3, self.k4] }
     }
 
     /// Every coefficient.
@@ -170,9 +209,15 @@ impl Lens {
     /// The longest side that is taken for an image's; anything beyond comes from a corrupt file.
     pub const MAX_SIDE: u32 = 65_535;
 
-    /// Whether the lens is a pinhole already.
-    pub fn is_pinhole(&self) -> bool {
-        self.distortion == Distortion::default()
+    /// The model that renders what the lens shows; `None` where there is none, and photographs are undistorted.
+    pub fn model(&self) -> Option<CameraModel> {
+        match self.distortion {
+            distortion if distortion == Distortion::default() => Some(CameraModel::Pinhole),
+            distortion if distortion.is_fisheye => {
+                Some(CameraModel::Fisheye(distortion.kannala_brandt()))
+            }
+            _ => None,
+        }
     }
 
     /// What makes the numbers unusable, if anything.
@@ -220,6 +265,7 @@ mod tests {
             height: 60,
             focal: DVec2::new(80.0, 90.0),
             principal_point: DVec2::new(47.0, 33.0),
+            model: CameraModel::Pinhole,
             view_from_world: DAffine3::from_rotation_translation(
                 rotation,
                 DVec3::new(1.0, -2.0, 3.0),

@@ -9,16 +9,16 @@ mod depth;
 pub mod exposure;
 mod image;
 mod log;
+mod parameters;
 mod structure;
 
 use std::sync::Arc;
 
 use glam::UVec2;
-use serde::{Deserialize, Serialize};
 
 use crate::base::random::Stream;
+use crate::base::settings::{Rule, settings};
 use crate::gpu::{Buffer, Gpu, Recorder};
-use crate::kernels::ToneParameters;
 use crate::splats::scene::{Feature, Features};
 use crate::{Error, Result};
 
@@ -26,33 +26,30 @@ pub use denoising::{DenoisingGradients, DenoisingInputs, DenoisingLoss, Denoisin
 pub use depth::{DepthBoxes, DepthInputs, DepthLoss, DepthSettings};
 pub use image::{Loss, LossInputs, LossSettings};
 pub use log::{LogSlot, LossLog, LossLogDownload, StepLosses};
+pub use parameters::{ParameterInputs, ParameterTerms, ParameterWeights};
 pub use structure::{StructureInputs, StructureLoss};
 
 /// Every term, in the order of the columns.
-pub const TERMS: [LossSpec; 5] =
-    [image::TARGET, image::DARK, structure::SPEC, depth::SPEC, denoising::SPEC];
+pub const TERMS: [LossSpec; 6] =
+    [image::TARGET, image::DARK, structure::SPEC, depth::SPEC, denoising::SPEC, parameters::SPEC];
 
+settings! {
+"model.weights."
 /// What the terms weigh beside (1 - w) L1 + w (1 - SSIM). The defaults are those of LITA-GS's code but for the total variation,
 /// which blurs what holds no noise.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Weights {
     /// Of mean `(R_K - target)^2`, in the paper's form `(R_K - R_0)^2`.
-    pub denoising: f64,
+    denoising: f64 = 1.0 => Rule::POSITIVE_OR_0;
     /// Of the total variation of R_K.
-    pub total_variation: f64,
+    total_variation: f64 = 0.0 => Rule::POSITIVE_OR_0;
     /// The reconstruction of the dark photograph weighs 1: (1 - w) L1 + w (1 - SSIM); this is its w.
-    pub low_ssim: f64,
+    low_ssim: f64 = 0.2 => Rule::SHARE;
     /// Of mean |structure - edges of the target|.
-    pub structure: f64,
+    structure: f64 = 0.01 => Rule::POSITIVE_OR_0;
     /// Of 1 minus the correlation with the depth map, over the view and over boxes.
-    pub depth: f64,
+    depth: f64 = 0.1 => Rule::POSITIVE_OR_0;
 }
-
-impl Default for Weights {
-    fn default() -> Self {
-        Self { denoising: 1.0, total_variation: 0.0, low_ssim: 0.2, structure: 0.01, depth: 0.1 }
-    }
 }
 
 impl Weights {
@@ -62,19 +59,36 @@ impl Weights {
     }
 }
 
-/// All that is to know about a term.
+/// All that is to know about a term; it is on where something that it logs has a weight above 0.
 #[derive(Debug)]
 pub struct LossSpec {
-    /// What the Gaussians carry for it; none: every model has the term.
-    pub feature: Option<Feature>,
     /// What it logs.
     pub terms: &'static [Term],
-    /// Builds it where it is one of the render; those of the networks' outputs are built and recorded with the networks.
-    pub on_render: Option<BuildTerm>,
+    /// What it looks at, and what builds it.
+    pub on: TermOn,
 }
 
-/// Builds a term of the render.
-pub type BuildTerm = fn(&Gpu, &LossConfig) -> Result<Box<dyn LossTerm>>;
+/// What a term looks at, with what builds it.
+#[derive(Clone, Copy, Debug)]
+pub enum TermOn {
+    /// The colours of the render. The first such term writes their gradient, every other adds to it.
+    Colors(fn(&Gpu, &LossConfig, Gradient) -> Result<Box<dyn LossTerm>>),
+    /// The channels of the render that show a feature, whose gradient it writes.
+    Feature(Feature, fn(&Gpu, &LossConfig) -> Result<Box<dyn LossTerm>>),
+    /// Outputs of the networks, with which it is built and recorded.
+    Networks,
+    /// The parameters of the Gaussians, to whose gradient it adds; recorded by [`ParameterTerms`].
+    Parameters,
+}
+
+/// What a term of the colours does with the gradient that is there.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Gradient {
+    /// It overwrites it.
+    Written,
+    /// It adds to it.
+    Added,
+}
 
 /// A value that a loss term logs, and how it enters the loss.
 #[derive(Clone, Copy)]
@@ -119,12 +133,14 @@ impl std::fmt::Debug for Term {
 /// What the terms of a model are built from.
 #[derive(Clone, Copy, Debug)]
 pub struct LossConfig {
-    /// A `CURVE_*` of include/tone.glsl.
-    pub tone_curve: u32,
     /// w of (1 - w) L1 + w (1 - SSIM), in [0, 1].
     pub ssim_weight: f64,
-    /// What the other terms weigh.
+    /// What the other terms weigh; 0 of a part that the model lacks.
     pub weights: Weights,
+    /// What the reconstruction of the dark photograph weighs: 1, or 0 where the model has no tonemapper.
+    pub low: f64,
+    /// What the parameters of the Gaussians weigh.
+    pub parameters: ParameterWeights,
     /// The side of the boxes of the local depth term, in pixels.
     pub depth_box: u32,
     /// The random numbers that place these boxes.
@@ -148,19 +164,9 @@ impl LossConfig {
         self.terms().into_iter().map(of_term).sum()
     }
 
-    /// # Errors
-    /// [`Error::Usage`] names a setting that gives a term, whether the model has it or not, a weight that makes no sense.
-    pub fn check(&self) -> Result<()> {
-        for term in Term::all() {
-            let weight = (term.weight)(self);
-            check_weight(&format!("{} (by {})", term.name, term.setting), weight)?;
-        }
-        Ok(())
-    }
-
-    fn specs(&self) -> impl Iterator<Item = &'static LossSpec> {
-        let features = self.features;
-        TERMS.iter().filter(move |spec| spec.feature.is_none_or(|feature| features.has(feature)))
+    fn specs(&self) -> impl Iterator<Item = &'static LossSpec> + '_ {
+        let is_on = |spec: &&LossSpec| spec.terms.iter().any(|term| (term.weight)(self) > 0.0);
+        TERMS.iter().filter(is_on)
     }
 }
 
@@ -191,10 +197,8 @@ pub struct TermInputs<'a> {
     /// What is held to the target, (3, H, W) or longer, not clamped: the colours of the render, or what the view's exposure
     /// makes of them.
     pub colors: &'a Buffer<f32>,
-    /// (3, H, W), sRGB-encoded; its tone curve is the pseudo-GT.
-    pub low: &'a Buffer<f32>,
-    /// The curve of this view, one element.
-    pub tone: &'a Buffer<ToneParameters>,
+    /// The pseudo-GT, (3, H, W).
+    pub target: &'a Buffer<f32>,
 }
 
 impl TermInputs<'_> {
@@ -212,7 +216,7 @@ pub trait LossTerm: std::fmt::Debug + Send {
     /// The device is out of memory or lost.
     fn prepare(&mut self, views: &[ViewSource<'_>]) -> Result<()>;
 
-    /// Records the term of a step: writes its channels of `d_render`, (channels, H, W), and its values to the log.
+    /// Records the term of a step: its part of `d_render`, (channels, H, W), and its values in the log.
     ///
     /// # Errors
     /// A buffer is shorter than the view, or the view is larger than those prepared for.
@@ -235,8 +239,20 @@ impl Losses {
     /// # Errors
     /// A weight makes no sense, or the device refuses a pipeline.
     pub fn new(gpu: &Gpu, config: &LossConfig) -> Result<Self> {
-        let build = config.specs().filter_map(|spec| spec.on_render);
-        Ok(Self(build.map(|build| build(gpu, config)).collect::<Result<_>>()?))
+        let (mut terms, mut gradient) = (vec![], Gradient::Written);
+        for spec in config.specs() {
+            match spec.on {
+                TermOn::Colors(build) => {
+                    terms.push(build(gpu, config, gradient)?);
+                    gradient = Gradient::Added;
+                }
+                TermOn::Feature(feature, build) if config.features.has(feature) => {
+                    terms.push(build(gpu, config)?);
+                }
+                TermOn::Feature(..) | TermOn::Networks | TermOn::Parameters => {}
+            }
+        }
+        Ok(Self(terms))
     }
 
     /// Computes what stays the same of these views, and makes room for them.
@@ -347,7 +363,7 @@ mod tests {
     #[test]
     fn a_term_reads_the_first_channel_of_its_feature() {
         let gpu = gpu();
-        let (image, tone) = (gpu.zeros("image", 1).unwrap(), gpu.uninit("tone", 1).unwrap());
+        let image = gpu.zeros("image", 1).unwrap();
         let features = Features { depth: true, structure: true, noise: true, illumination: true };
         let inputs = TermInputs {
             step: 1,
@@ -356,8 +372,7 @@ mod tests {
             features,
             render: &image,
             colors: &image,
-            low: &image,
-            tone: &tone,
+            target: &image,
         };
         let all = [Feature::Depth, Feature::Structure, Feature::Noise, Feature::Illumination];
         assert_eq!(all.map(|feature| inputs.plane(feature)), [3, 4, 5, 8]);

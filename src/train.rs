@@ -6,22 +6,28 @@ mod checkpoint;
 mod config;
 mod decisions;
 pub mod diagnose;
+mod difference;
 mod early_stopping;
+mod epochs;
 mod exposures;
 mod fill;
 mod growth;
+mod layers;
 mod masks;
+mod measuring;
 mod memory;
 mod model;
 mod networks;
-mod overrides;
 mod parts;
 mod passes;
 mod patches;
 mod paths;
+mod planned;
 mod precision;
 mod preset;
+mod reference;
 mod rendered;
+pub mod settings;
 mod start;
 mod submission;
 mod target_views;
@@ -36,10 +42,10 @@ use crate::camera::{Camera, Frame};
 use crate::gpu::CheckReport;
 use crate::gpu::{Buffer, Gpu, PassTime, Recorder};
 use crate::loss::exposure::Exposures;
-use crate::loss::{LogSlot, LossLog, Losses, StepLosses, Term, TermInputs};
-use crate::networks::Form;
-use crate::photographs::dataset::{Dataset, Fingerprint, Split};
+use crate::loss::{LogSlot, LossLog, Losses, ParameterTerms, StepLosses, Term, TermInputs};
+use crate::photographs::dataset::{Dataset, Fingerprint, Original, Split};
 use crate::photographs::pseudo_gt::PseudoGt;
+use crate::photographs::tone::Scene;
 use crate::splats::densify::{Densifier, DensityControl};
 use crate::splats::optimizer::{Adam, FiniteCheck, LearningRates};
 use crate::splats::render::{Damping, Gradients, RenderOptions, Renderer};
@@ -49,24 +55,29 @@ use crate::{Error, Result};
 use best::Snapshot;
 pub use cache::CacheSize;
 pub use checkpoint::check_checkpoint;
-pub use config::{Background, CheckConfig, DensityConfig, TrainConfig};
+pub use config::{
+    Background, CheckConfig, DensityConfig, ExposureConfig, Learning, NotFinite, StopConfig,
+    TrainConfig,
+};
 use decisions::Decisions;
-pub use early_stopping::{EndReason, Ended, NotFinite, StopConfig};
-pub use exposures::{ExposureConfig, Learning};
+pub use early_stopping::{EndReason, Ended};
+pub use layers::{Layer, Origin, Settings, values};
 use masks::Masks;
+pub use measuring::TargetExposure;
 pub use memory::MemoryEstimate;
 use model::Model;
 pub use networks::Networks;
 pub use parts::{ModelConfig, ModelName, NetworkRates, Part};
 use passes::{Kernels, background, first_sh_degree, learnables};
+pub use planned::{Planned, Planning, Said, diagnosed};
 pub use precision::{PhotographBits, PrecisionConfig};
 pub use preset::Preset;
+pub use reference::reference;
 pub use rendered::Rendered;
 use submission::{MOST_STEPS, Pace};
 use target_views::TargetViews;
 pub use target_views::TestTargets;
 use terms::{NetworkTerms, Photographs};
-pub use views::TargetExposure;
 use views::{TrainView, Views};
 
 /// The streams of random numbers that training draws from, one per purpose.
@@ -140,6 +151,8 @@ pub struct Trainer {
     frame: Frame,
     /// In units of the frame.
     extent: f64,
+    /// What the curves of the photographs have in common.
+    scene: Scene,
     target_exposure: Option<TargetExposure>,
     held_out: TargetViews,
     /// Training views that tell what a round of density control costs; none where nothing is done about it.
@@ -167,8 +180,13 @@ pub struct Trainer {
     failed: Option<Error>,
     /// On the device, beside what follows the number of Gaussians and intersections, in bytes.
     fixed_bytes: f64,
-    /// Of a step's view, what is kept in fewer bits: the loss's input, and the photograph where a network sees it besides.
-    decoded: [Buffer<f32>; 2],
+    /// What makes the target of a step's view,
+    pseudo_gt: PseudoGt,
+    /// the target, (3, H, W),
+    target: Buffer<f32>,
+    /// and the dark photograph, where a network sees it.
+    photograph: Buffer<f32>,
+    parameter_terms: Option<ParameterTerms>,
     d_render: Buffer<f32>,
     log: LossLog,
     pace: Pace,
@@ -249,11 +267,8 @@ impl Trainer {
         let settings = config.render_settings();
         let mut pseudo_gt = PseudoGt::new(gpu, &config.tone)?;
         let frame = config.frame.unwrap_or_default();
-        let (mut views, scene, target_exposure) =
+        let (views, scene, target_exposure) =
             Views::upload(gpu, &mut pseudo_gt, dataset, &frame, &config)?;
-        if config.model.denoiser && config.model.network.form == Form::Identity {
-            views.keep_targets(gpu, &pseudo_gt)?;
-        }
         let held_out = dataset.views.iter().filter(|view| view.split == Split::HeldOut);
         let held_out = TargetViews::new(&mut pseudo_gt, held_out, &frame, &scene)?;
         if config.stop.views > 0 && held_out.is_empty() {
@@ -290,21 +305,26 @@ impl Trainer {
         views.say_what_shows_nothing(&gaussians);
         let pixels = sizes.iter().map(|size| size.x as usize * size.y as usize).max();
         let values = settings.channels() * pixels.unwrap_or_default();
-        let masks = Masks::new(gpu, dataset, &views, config.loss().tone_curve)?;
+        let masks = Masks::new(gpu, dataset, &views)?;
         let exposures = starts.map(|starts| Exposures::new(gpu, config.exposure.rates, &starts));
         let mut exposures = exposures.transpose()?;
         if let Some(exposures) = &mut exposures {
             sizes.iter().try_for_each(|&size| exposures.reserve(size))?;
         }
+        dataset.views.iter().filter_map(|view| view.original.as_ref()).for_each(Original::release);
         let (Kernels { renderer, mut losses, adam, finite, densifier }, fingerprint) =
             beside.join().unwrap_or_else(|panic| resume_unwind(panic))?;
         losses.prepare(&views.sources(gpu, &pseudo_gt, dataset))?;
-        let [inputs, photographs] = views.decoded_lens();
+        let networks = NetworkTerms::new(gpu, &config, &sizes, !masks.is_empty())?;
+        let pictures = views.most_values();
+        // Beside the target only networks look at the photograph.
+        let photographs = if networks.is_some() { pictures } else { 0 };
         let mut trainer = Self {
             gpu: gpu.clone(),
             fingerprint,
             frame,
             extent: dataset.extent() * frame.scale,
+            scene,
             target_exposure,
             held_out,
             probes,
@@ -315,7 +335,9 @@ impl Trainer {
             model: Model::upload(gpu, &gaussians, first_sh_degree(&config), &config.precision)?,
             renderer,
             losses,
-            networks: NetworkTerms::new(gpu, &config, &sizes, !masks.is_empty())?,
+            networks,
+            pseudo_gt,
+            parameter_terms: ParameterTerms::new(gpu, config.loss)?,
             masks,
             exposures,
             adam,
@@ -325,7 +347,8 @@ impl Trainer {
             has_said_room: false,
             failed: None,
             fixed_bytes: 0.0,
-            decoded: [gpu.uninit("decoded", inputs)?, gpu.uninit("decoded low", photographs)?],
+            target: gpu.uninit("target", pictures)?,
+            photograph: gpu.uninit("low", photographs)?,
             d_render: gpu.uninit("d_render", values)?,
             log: LossLog::new(gpu, MOST_STEPS as usize)?,
             pace: Pace::default(),
@@ -342,11 +365,6 @@ impl Trainer {
     /// Steps done so far.
     pub fn steps_done(&self) -> u64 {
         self.step
-    }
-
-    /// How bright the targets are; none where the curve's constants say that.
-    pub fn target_exposure(&self) -> Option<&TargetExposure> {
-        self.target_exposure.as_ref()
     }
 
     /// The number of Gaussians.
@@ -464,12 +482,12 @@ impl Trainer {
         };
         let damping = Damping { weight: schedule.damping_weight(step), depth: self.extent as f32 };
         let model = &mut self.model;
-        let [decoded, decoded_photograph] = &mut self.decoded;
 
-        self.renderer.forward(pass, &model.gaussians, view.patch, &options)?;
+        let viewpoint = self.views.viewpoint(view);
+        self.renderer.forward(pass, &model.gaussians, viewpoint, &options)?;
         let (render, status) = self.renderer.render_and_status();
         let (d_render, size) = (&mut self.d_render, view.size());
-        let input = view.input.decoded(pass, decoded)?;
+        let target = self.views.record_target(pass, &self.pseudo_gt, view, &mut self.target)?;
         let log = &mut LogSlot { log: &mut self.log, slot, status };
         let channels = COLOR_CHANNELS + model.shape().features.width();
         let masks = &mut self.masks;
@@ -480,32 +498,28 @@ impl Trainer {
             features: model.shape().features,
             render,
             colors: render,
-            low: input,
-            tone: &view.tone,
+            target,
         };
         match &mut self.exposures {
             Some(exposures) => {
                 exposures.expose(pass, view.place, size, render)?;
                 let exposed = exposures.exposed();
-                let colors = masks.shown(pass, view.number, size, exposed, (input, &view.tone))?;
+                let colors = masks.shown(pass, view.number, size, exposed, target)?;
                 let inputs = &TermInputs { colors, ..*inputs };
                 self.losses.record(pass, inputs, d_render, log)?;
                 masks.hide(pass, view.number, (size, channels), d_render)?;
                 exposures.backward(pass, view.place, size, render, d_render)?;
             }
             None => {
-                let colors = masks.shown(pass, view.number, size, render, (input, &view.tone))?;
+                let colors = masks.shown(pass, view.number, size, render, target)?;
                 self.losses.record(pass, &TermInputs { colors, ..*inputs }, d_render, log)?;
                 masks.hide(pass, view.number, (size, channels), d_render)?;
             }
         }
         if let Some(networks) = &mut self.networks {
-            let low = match &view.photograph {
-                Some(photograph) => photograph.decoded(pass, decoded_photograph)?,
-                None => input,
-            };
+            let (pseudo_gt, scratch) = (&self.pseudo_gt, &mut self.photograph);
+            let low = self.views.record_photograph(pass, pseudo_gt, view, scratch)?;
             // Networks see the model at the neutral exposure.
-            let target = view.target.as_deref().unwrap_or(input);
             let target = match &mut self.exposures {
                 Some(exposures) if networks.follow_target() => {
                     exposures.neutralize(pass, view.place, size, target)?;
@@ -520,7 +534,7 @@ impl Trainer {
         self.renderer.backward(
             pass,
             &model.gaussians,
-            view.patch,
+            viewpoint,
             &options,
             damping,
             &self.d_render,
@@ -530,6 +544,11 @@ impl Trainer {
                 visit_counts: &mut model.visit_counts,
             },
         )?;
+        if let Some(terms) = &mut self.parameter_terms {
+            let (_, status) = self.renderer.render_and_status();
+            let log = &mut LogSlot { log: &mut self.log, slot, status };
+            model.record_terms((&self.gpu, pass), terms, log)?;
+        }
         let rates = schedule.learning_rates(step, self.extent).scaled(settling_rate);
         let (degree, status) = (options.sh_degree, self.renderer.status());
         model.update((&self.gpu, pass), &self.adam, step, &rates, degree, status)?;

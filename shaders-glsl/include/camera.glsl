@@ -1,40 +1,73 @@
-// A pinhole camera: what a point in its view projects to, and how that changes.
+// A camera: where a point of its view is seen, and how that changes with the point.
+//
+// Every model has the same functions in a file of its own; those at the end of this file choose. A kernel is specialised for
+// one model, or defines CAMERA_MODEL as the `camera.model` that it meets at run time. A point in the view has x to the right,
+// y down and z forward, in world units.
 
-// It looks along +z, x to the right and y down.
+const uint CAMERA_PINHOLE = 0;
+const uint CAMERA_FISHEYE = 1;
+
+#ifndef CAMERA_MODEL
+layout(constant_id = 7) const uint CAMERA_MODEL = 0;  // CAMERA_*
+#endif
+
 struct Camera {
     mat4x3 view_from_world;
     vec2  focal;            // pixels
     vec2  principal_point;  // pixels
     uvec2 size;             // pixels
-    vec2  least_slope;      // where the Jacobian of the projection is taken at the least
+    vec2  least_slope;      // pinhole: where the Jacobian of the projection is taken at the least
     vec2  most_slope;       // and at the most: beyond, the affine approximation of a splat explodes
+    vec4  distortion;       // fisheye: coefficients of the angle's powers 3, 5, 7 and 9
+    float largest_angle;    // fisheye: nothing is seen so far off the axis or farther, radians
+    uint  model;            // CAMERA_*
+};
+
+// The derivative of a pixel's two coordinates with respect to the point: scale.x * row0 and scale.y * row1.
+struct Jacobian {
+    vec2 scale;
+    vec3 row0;
+    vec3 row1;
 };
 
 // A renderer without a near plane counts from here, in world units.
 const float NEAREST = 1e-4;
 
-// x / z and y / z, no farther than the Jacobian is taken.
-vec2 clamped_slope(vec3 mean_in_view, Camera camera) {
-    return clamp(mean_in_view.xy / mean_in_view.z, camera.least_slope, camera.most_slope);
+#include "camera_pinhole.glsl"
+#include "camera_fisheye.glsl"
+
+// The depth of a point, by which splats are sorted and the near plane cuts; not positive where the model does not see it.
+float camera_depth(vec3 point, Camera camera) {
+    if (CAMERA_MODEL == CAMERA_FISHEYE) return fisheye_depth(point, camera);
+    return pinhole_depth(point);
 }
 
-// The rotation of a unit quaternion (w, x, y, z).
-mat3 rotation(vec4 q) {
-    float w = q.x, x = q.y, y = q.z, z = q.w;
-    return mat3(
-        1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y),
-        2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x),
-        2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)
-    );
+// The pixel at which a point of positive depth is seen.
+vec2 camera_project(vec3 point, Camera camera) {
+    if (CAMERA_MODEL == CAMERA_FISHEYE) return fisheye_project(point, camera);
+    return pinhole_project(point, camera);
 }
 
-// What a vector is multiplied by before its length counts, where that is too large or not finite: beyond 1e19 the squares
-// of its numbers are infinite.
-float finite_scale(float length) { return length < 1e18 ? 1.0 : 1e-25; }
+// The derivative of the pixel with respect to the point.
+Jacobian camera_jacobian(vec3 point, Camera camera) {
+    if (CAMERA_MODEL == CAMERA_FISHEYE) return fisheye_jacobian(point, camera);
+    return pinhole_jacobian(point, camera);
+}
 
-// A quaternion of unit length; the identity where the length is not a positive number.
-vec4 unit_quat(vec4 q) {
-    q *= finite_scale(length(q));
-    float norm = length(q);
-    return norm > 1e-12 ? q / norm : vec4(1.0, 0.0, 0.0, 0.0);
+// The gradient of the point, from that of its pixel and those of the Jacobian's rows, scaled.
+vec3 camera_backward(vec3 point, Camera camera, vec2 d_pixel, vec3 d_row0, vec3 d_row1) {
+    if (CAMERA_MODEL == CAMERA_FISHEYE) return fisheye_backward(point, camera, d_pixel, d_row0, d_row1);
+    return pinhole_backward(point, camera, d_pixel, d_row0, d_row1);
+}
+
+// How much deeper a point is that lies beside another by an offset, to first order.
+float camera_depth_change(vec3 point, vec3 offset, Camera camera) {
+    if (CAMERA_MODEL == CAMERA_FISHEYE) return fisheye_depth_change(point, offset);
+    return pinhole_depth_change(offset);
+}
+
+// The point at another depth.
+vec3 camera_at_depth(vec3 point, float depth, Camera camera) {
+    if (CAMERA_MODEL == CAMERA_FISHEYE) return fisheye_at_depth(point, depth);
+    return pinhole_at_depth(point, depth);
 }

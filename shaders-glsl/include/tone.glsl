@@ -9,6 +9,7 @@ struct ToneParameters {
     float white;                     // t = x / white: p90, or what the curve puts in its place
     float offset;                    // delta0, the black level
     float gain;                      // g where black is rescaled, b where it is added
+    float weight;                    // of the curve beside the photograph as it is, from 0 to 1
     float constants[MAX_CONSTANTS];  // of the family
 };
 

@@ -1,18 +1,18 @@
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
-#include "tone.glsl"
 
 //! The gradient of mean|a - b| with respect to the render a, b the pseudo-GT, and partial sums of |a - b|.
 //!
 //! A thread takes `VALUES_PER_THREAD` values, one subgroup apart, so that a subgroup reads one run. At a = b the gradient
-//! is 0. With `WITH_INTERIOR` the mean is over a rectangle of the view, and outside it the gradient is 0. Reference:
-//! `src/reference/l1.rs`.
+//! is 0. With `WITH_INTERIOR` the mean is over a rectangle of the view, and outside it the gradient is 0. The first term of
+//! a step writes the gradient, the others add to it. Reference: `src/reference/l1.rs`.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 layout(constant_id = 0) const uint VALUES_PER_THREAD = 32;
 layout(constant_id = 1) const bool WITH_INTERIOR = false;
+layout(constant_id = 2) const bool ADDS = false;
 
 layout(push_constant) uniform Params {
     uint  value_count;     // 3HW
@@ -23,11 +23,10 @@ layout(push_constant) uniform Params {
     uvec2 interior_end;    // one past the last
 };
 
-layout(binding = 0) readonly  buffer Render   { float render[]; };         // (3, H, W), not clamped
-layout(binding = 1) readonly  buffer Low      { float low[]; };            // (3, H, W), sRGB-encoded
-layout(binding = 2) readonly  buffer Tone     { ToneParameters tone[]; };  // (1,)
-layout(binding = 3) writeonly buffer DRender  { float d_render[]; };       // (3, H, W)
-layout(binding = 4) writeonly buffer Partials { float partials[]; };       // one per workgroup
+layout(binding = 0) readonly  buffer Render   { float render[]; };    // (3, H, W), not clamped
+layout(binding = 1) readonly  buffer Target   { float target[]; };    // (3, H, W)
+layout(binding = 2)           buffer DRender  { float d_render[]; };  // (3, H, W)
+layout(binding = 3) writeonly buffer Partials { float partials[]; };  // one per workgroup
 
 bool counts(uint i) {
     if (WITH_INTERIOR) {
@@ -42,13 +41,13 @@ void main() {
     uint first = WORKGROUP_INDEX * SUBGROUP_SIZE * VALUES_PER_THREAD;
     if (first >= value_count) return;
     first += gl_LocalInvocationID.x;
-    ToneParameters curve = tone[0];
     float sum = 0.0;
     for (uint k = 0; k < VALUES_PER_THREAD; ++k) {
         uint i = first + k * SUBGROUP_SIZE;
         if (i < value_count) {
-            float difference = counts(i) ? render[i] - tone_curve(low[i], curve) : 0.0;
-            d_render[i] = l1_scale * sign(difference);
+            float difference = counts(i) ? render[i] - target[i] : 0.0;
+            float gradient = l1_scale * sign(difference);
+            d_render[i] = ADDS ? d_render[i] + gradient : gradient;
             sum += abs(difference);
         }
     }

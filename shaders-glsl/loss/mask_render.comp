@@ -1,7 +1,6 @@
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
-#include "tone.glsl"
 
 //! Mask: what the loss sees of a render, w a + (1 - w) b with the weights w of the pixels, a the render and b the pseudo-GT,
 //! one thread per value.
@@ -15,11 +14,10 @@ layout(push_constant) uniform Params {
     uint pixel_count;  // HW
 };
 
-layout(binding = 0) readonly  buffer Weights { float weights[]; };        // (H, W), within 0 and 1
-layout(binding = 1) readonly  buffer Render  { float render[]; };         // (3, H, W) and more, not clamped
-layout(binding = 2) readonly  buffer Low     { float low[]; };            // (3, H, W), sRGB-encoded
-layout(binding = 3) readonly  buffer Tone    { ToneParameters tone[]; };  // (1,)
-layout(binding = 4) writeonly buffer Shown   { float shown[]; };          // (3, H, W)
+layout(binding = 0) readonly  buffer Weights { float weights[]; };  // (H, W), within 0 and 1
+layout(binding = 1) readonly  buffer Render  { float render[]; };   // (3, H, W) and more, not clamped
+layout(binding = 2) readonly  buffer Target  { float target[]; };   // (3, H, W)
+layout(binding = 3) writeonly buffer Shown   { float shown[]; };    // (3, H, W)
 
 void main() {
     uint i = THREAD_INDEX;
@@ -27,5 +25,5 @@ void main() {
     float weight = weights[i % pixel_count];
     float a = render[i];
     // What counts in full stays as it is, to the bit.
-    shown[i] = weight < 1.0 ? weight * a + (1.0 - weight) * tone_curve(low[i], tone[0]) : a;
+    shown[i] = weight < 1.0 ? weight * a + (1.0 - weight) * target[i] : a;
 }

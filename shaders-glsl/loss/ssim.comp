@@ -1,7 +1,6 @@
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
-#include "tone.glsl"
 
 //! L1 and SSIM of a render a against the pseudo-GT b: the gradient of (1 - w) mean|a - b| + w (1 - mean SSIM) with respect to
 //! a, and partial sums of |a - b| and of SSIM.
@@ -13,7 +12,8 @@
 //! and the gradient of sum S is E[dS/dE[a]] + 2 a E[dS/dE[aa]] + b E[dS/dE[ab]]: the window is symmetric and zero outside the
 //! image, so the transposed blur is the blur. At a = b the gradient of the L1 term is 0. Means are over the interior: pixels
 //! outside are seen by the windows, but their S counts neither in the sum nor in the derivatives. The L1 term stays inside
-//! it, the SSIM term reaches a window's radius beyond. Reference: `src/reference/ssim.rs`.
+//! it, the SSIM term reaches a window's radius beyond. The first term of a step writes the gradient, the others add to it.
+//! Reference: `src/reference/ssim.rs`.
 //!
 //! A subgroup owns a run of columns of one channel and marches down ROWS rows. Every lane loads COLUMNS of a row and takes
 //! what its windows reach beyond from the lanes beside it, so that a value is loaded once, but for the ends of the run, where
@@ -27,6 +27,7 @@ layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 layout(constant_id = 0) const uint COLUMNS = 8;    // per row and lane; SUBGROUP_SIZE COLUMNS > 2 HALO
 layout(constant_id = 1) const uint ROWS = 32;      // per subgroup, beside 4 RADIUS rows of warm-up
 layout(constant_id = 2) const uint ALIGNMENT = 1;  // 4 where width and COLUMNS are multiples of four: whole vectors
+layout(constant_id = 3) const bool ADDS = false;
 
 layout(push_constant) uniform Params {
     uint  width;           // pixels
@@ -38,11 +39,10 @@ layout(push_constant) uniform Params {
 };
 
 layout(binding = 0) readonly  buffer Render       { vec4 render[]; };          // (3, H, W), not clamped
-layout(binding = 1) readonly  buffer Low          { vec4 low[]; };             // (3, H, W), sRGB-encoded
-layout(binding = 2) readonly  buffer Tone         { ToneParameters tone[]; };  // (1,)
-layout(binding = 3) writeonly buffer DRender      { vec4 d_render[]; };        // (3, H, W)
-layout(binding = 4) writeonly buffer L1Partials   { float l1_partials[]; };    // one per workgroup: sum of |a - b|
-layout(binding = 5) writeonly buffer SsimPartials { float ssim_partials[]; };  // one per workgroup: sum of S
+layout(binding = 1) readonly  buffer Target       { vec4 target[]; };          // (3, H, W)
+layout(binding = 2)           buffer DRender      { vec4 d_render[]; };        // (3, H, W)
+layout(binding = 3) writeonly buffer L1Partials   { float l1_partials[]; };    // one per workgroup: sum of |a - b|
+layout(binding = 4) writeonly buffer SsimPartials { float ssim_partials[]; };  // one per workgroup: sum of S
 
 const float C1 = 0.0001;  // (0.01 L)^2, L = 1
 const float C2 = 0.0009;  // (0.03 L)^2
@@ -106,21 +106,21 @@ float unpack(vec4 quads[QUADS], uint k, int shift) {
     return (shift & 1) == 0 ? (by_two ? at[2] : at[0]) : (by_two ? at[3] : at[1]);
 }
 
-// Row `y` of both images in a lane's columns, the second one behind the curve; zero outside the image.
-void load_row(Strip strip, int y, ToneParameters curve, out float a[COLUMNS], out float b[COLUMNS]) {
+// Row `y` of both images in a lane's columns; zero outside the image.
+void load_row(Strip strip, int y, out float a[COLUMNS], out float b[COLUMNS]) {
     int from = (int(strip.channel * height) + y) * int(width) + strip.x;
     int last_quad = int(3 * width * height - 1) / 4;
-    vec4 render_quads[QUADS], low_quads[QUADS];
+    vec4 render_quads[QUADS], target_quads[QUADS];
     [[unroll]] for (int q = 0; q < QUADS; ++q) {
         int quad = clamp((from >> 2) + q, 0, last_quad);
         render_quads[q] = render[quad];
-        low_quads[q] = low[quad];
+        target_quads[q] = target[quad];
     }
     bool is_row = uint(y) < height;
     [[unroll]] for (uint c = 0; c < COLUMNS; ++c) {
         bool inside = is_row && uint(strip.x) + c < width;
         a[c] = inside ? unpack(render_quads, c, from & 3) : 0.0;
-        b[c] = inside ? tone_curve(unpack(low_quads, c, from & 3), curve) : 0.0;
+        b[c] = inside ? unpack(target_quads, c, from & 3) : 0.0;
     }
 }
 
@@ -128,11 +128,16 @@ void load_row(Strip strip, int y, ToneParameters curve, out float a[COLUMNS], ou
 void store_row(Strip strip, uint at, float gradient[COLUMNS]) {
     if (is_aligned()) {
         [[unroll]] for (uint x = 0; x < COLUMNS; x += 4)
-            if (has_output(strip, x))
-                d_render[(at + x) / 4] = vec4(gradient[x], gradient[x + 1], gradient[x + 2], gradient[x + 3]);
+            if (has_output(strip, x)) {
+                vec4 own = vec4(gradient[x], gradient[x + 1], gradient[x + 2], gradient[x + 3]);
+                d_render[(at + x) / 4] = ADDS ? d_render[(at + x) / 4] + own : own;
+            }
     } else {
         [[unroll]] for (uint x = 0; x < COLUMNS; ++x)
-            if (has_output(strip, x)) d_render[(at + x) / 4][(at + x) % 4] = gradient[x];
+            if (has_output(strip, x)) {
+                uint quad = (at + x) / 4, lane = (at + x) % 4;
+                d_render[quad][lane] = ADDS ? d_render[quad][lane] + gradient[x] : gradient[x];
+            }
     }
 }
 
@@ -187,11 +192,10 @@ void main() {
         }
     }
 
-    ToneParameters curve = tone[0];
     float l1_sum = 0.0, ssim_sum = 0.0;
     for (int y = strip.y - 2 * RADIUS; y < strip.end + 2 * RADIUS; ++y) {
         float a[COLUMNS], b[COLUMNS];
-        load_row(strip, y, curve, a, b);
+        load_row(strip, y, a, b);
         float row[MOMENTS][REACH];
         [[unroll]] for (uint k = 0; k < REACH; ++k) {
             float a_here = seen(a, k);
@@ -218,7 +222,7 @@ void main() {
         [[unroll]] for (uint m = 0; m < DERIVATIVES; ++m)
             [[unroll]] for (uint k = 0; k < REACH; ++k) d_row[m][k] = seen(own[m], k);
         int done = y - 2 * RADIUS;
-        load_row(strip, done, curve, a, b);
+        load_row(strip, done, a, b);
         float gradient[COLUMNS];
         [[unroll]] for (uint x = 0; x < COLUMNS; ++x) {
             float d[DERIVATIVES];

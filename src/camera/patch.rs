@@ -5,10 +5,11 @@ use std::ops::Range;
 
 use glam::{DAffine3, DVec2, UVec2, Vec2};
 
-use super::Camera;
+use super::{Camera, CameraModel};
 use crate::kernels;
+use crate::kernels::camera::{CAMERA_FISHEYE, CAMERA_PINHOLE};
 
-/// The Jacobian of the projection is taken no farther outside the view than this fraction of its width and height.
+/// The Jacobian of a pinhole's projection is taken no farther outside the view than this fraction of its width and height.
 const JACOBIAN_MARGIN: f32 = 0.15;
 
 /// Patches of which both sides would be shorter are no patches, pixels: what compares them looks at 11 x 11.
@@ -127,7 +128,7 @@ impl Patch {
     }
 
     /// A camera whose whole view it is; splats far beyond its edges may have another shape there.
-    pub fn pinhole(&self) -> Camera {
+    pub fn own_camera(&self) -> Camera {
         let Self { camera, origin, size } = *self;
         Camera {
             width: size.x,
@@ -155,13 +156,32 @@ impl From<&Patch> for kernels::Camera {
             [patch.camera.focal, patch.camera.principal_point].map(|at: DVec2| at.as_vec2());
         let whole = Patch::from(&patch.camera).size.as_vec2();
         let margin = JACOBIAN_MARGIN * whole;
+        let (distortion, largest_angle) = match patch.camera.model {
+            CameraModel::Pinhole => ([0.0; 4], 0.0),
+            CameraModel::Fisheye(lens) => {
+                (lens.coefficients.map(|k| k as f32), lens.largest_angle() as f32)
+            }
+        };
         Self {
             view_from_world: columns.map(|column| column.as_vec3().to_array()),
             focal,
-            principal_point: patch.pinhole().principal_point.as_vec2(),
+            principal_point: patch.own_camera().principal_point.as_vec2(),
             size: patch.size,
             least_slope: -(principal_point + margin) / focal,
             most_slope: (whole - principal_point + margin) / focal,
+            distortion,
+            largest_angle,
+            model: patch.camera.model.number(),
+        }
+    }
+}
+
+impl CameraModel {
+    /// What kernels call it, and are specialised for.
+    pub(crate) fn number(&self) -> u32 {
+        match self {
+            Self::Pinhole => CAMERA_PINHOLE,
+            Self::Fisheye(_) => CAMERA_FISHEYE,
         }
     }
 }
@@ -178,6 +198,7 @@ mod tests {
             height,
             focal: DVec2::new(80.0, 90.0),
             principal_point: DVec2::new(47.0, 33.0),
+            model: CameraModel::Pinhole,
             view_from_world: DAffine3::from_translation(DVec3::new(0.5, 0.0, 2.0)),
         }
     }
@@ -212,7 +233,7 @@ mod tests {
         let point = DVec3::new(0.1, -0.2, 0.3);
         let whole = camera.project(point).unwrap();
         for patch in camera.patches(|size| size.x <= 30 && size.y <= 30) {
-            let at = patch.pinhole().project(point).unwrap();
+            let at = patch.own_camera().project(point).unwrap();
             assert!((at + patch.origin.as_dvec2() - whole).length() < 1e-12);
         }
     }

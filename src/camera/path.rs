@@ -187,6 +187,7 @@ mod tests {
     use glam::DVec2;
 
     use super::*;
+    use crate::camera::CameraModel;
 
     const TARGET: DVec3 = DVec3::new(0.5, -0.25, 2.0);
 
@@ -200,6 +201,7 @@ mod tests {
                 height: 48,
                 focal: DVec2::splat(50.0),
                 principal_point: DVec2::new(32.0, 24.0),
+                model: CameraModel::Pinhole,
                 view_from_world: looking(center, TARGET, DVec3::NEG_Y),
             }
         };

@@ -29,6 +29,11 @@ impl Places {
         own
     }
 
+    /// Every `step`th of the places, in the same units.
+    pub(crate) fn every(self, step: usize) -> Self {
+        Self { places: self.places.into_iter().step_by(step).collect(), ..self }
+    }
+
     /// The squared distance of each place from that of a camera.
     pub(crate) fn squared_distances(&self, camera: &Camera) -> impl Iterator<Item = f64> {
         let from = self.place(camera);
@@ -100,12 +105,20 @@ mod tests {
     use glam::{DAffine3, DMat3, DVec2, DVec3};
 
     use super::*;
+    use crate::camera::CameraModel;
 
     fn camera(position: DVec3, turn: f64) -> Camera {
         let rotation = DMat3::from_rotation_y(turn);
         let view_from_world = DAffine3::from_mat3_translation(rotation, -(rotation * position));
         let (focal, principal_point) = (DVec2::splat(10.0), DVec2::splat(5.0));
-        Camera { width: 10, height: 10, focal, principal_point, view_from_world }
+        Camera {
+            width: 10,
+            height: 10,
+            focal,
+            principal_point,
+            model: CameraModel::Pinhole,
+            view_from_world,
+        }
     }
 
     #[test]

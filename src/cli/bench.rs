@@ -32,8 +32,8 @@ pub struct BenchArgs {
     /// Find the fastest tiles of the device, for 3 and 11 channels, and keep them
     #[arg(long)]
     pub tune: bool,
-    /// Show how milliseconds and memory grow with Gaussians, pixels and channels, to 25 and 40 times the scene, with fitted
-    /// exponents
+    /// Show how milliseconds and memory grow with Gaussians, pixels and channels, to 25 and 40 times the scene, and with the
+    /// photographs and points of a capture, with fitted exponents
     #[arg(long, conflicts_with = "tune")]
     pub growth: bool,
     /// Train on hostile inputs instead, every pass checked, and show what comes of each and the largest errors against the
@@ -123,7 +123,7 @@ pub fn run(args: &BenchArgs) -> Result<()> {
     };
     checked.agree()?;
     let kernels = stages::time_kernels(&bench, &mut trainers)?;
-    let stages = stages::time(&bench, &scene, &mut trainers)?;
+    let stages = stages::time(&bench, &mut trainers)?;
     let findings = Findings { checked, kernels, stages };
     let mut out = std::io::stdout().lock();
     if args.json {

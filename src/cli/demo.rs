@@ -13,7 +13,7 @@ use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::Dataset;
 use crate::photographs::dataset::synthetic::{self, SyntheticOptions};
 use crate::photographs::pseudo_gt::PseudoGt;
-use crate::photographs::tone::{Scene, ToneCurve, ToneSettings};
+use crate::photographs::tone::{Measured, Scene, ToneCurve, ToneSettings};
 use crate::results::eval::{self, ViewScore};
 use crate::results::report::{Distribution, Report, distributions};
 use crate::results::run::HeldRun;
@@ -53,7 +53,7 @@ pub fn run(args: &DemoArgs) -> Result<()> {
     // Absolute, so that the runs can be evaluated from anywhere.
     let folder = std::path::absolute(args.out.join("dataset"))?;
     synthetic::write(&folder, &SyntheticOptions::default())?;
-    let dataset = Dataset::load(&folder, &TrainConfig::default().load_options())?;
+    let dataset = Dataset::load(&folder, &TrainConfig::bare().load_options())?;
     let mut runs = vec![];
     for curve in CURVES {
         runs.push(train_with(curve, &gpu, &dataset, &args.out)?);
@@ -97,7 +97,7 @@ fn config(curve: ToneCurve, dataset: &Dataset, gpu: &Gpu) -> TrainConfig {
             densify_interval: STEPS / 10,
             ..Schedule::paper()
         },
-        ..TrainConfig::default()
+        ..TrainConfig::bare()
     }
 }
 
@@ -143,10 +143,10 @@ fn luminances(gpu: &Gpu, dataset: &Dataset) -> crate::Result<String> {
     let mut drawn = vec![photographs];
     for curve in CURVES {
         let settings = ToneSettings::new(curve);
-        let mut pseudo_gt = PseudoGt::new(gpu, &settings)?;
+        let pseudo_gt = PseudoGt::new(gpu, &settings)?;
         let mut targets = Distribution::new(title(curve));
         for (photograph, _) in &pairs {
-            let measured = pseudo_gt.measure(&photograph.data)?;
+            let measured = Measured::of(&photograph.data);
             let lift = settings.lift(&Scene::default(), &measured);
             targets.add(&pseudo_gt.lifted(photograph, &lift)?.data);
         }

@@ -158,7 +158,8 @@ fn provenance(args: &ExportArgs, config: &TrainConfig) -> Provenance {
     }
 }
 
-/// The page, with a bookmark for some of the test views, or of all where none is held out.
+/// The page, with a bookmark for some of the test views, or of all where none is held out. Its viewer is a pinhole: what a
+/// fisheye took is undistorted for it, to what lies within 60 degrees of the axis.
 fn page(
     args: &ExportArgs,
     config: &TrainConfig,
@@ -168,8 +169,14 @@ fn page(
     let mut frame = config.frame.unwrap_or_default();
     let title = format!("{} by nightsplat", provenance.dataset);
     let bookmarks = if has_networks(config) {
-        let FinishedRun { mut player, dataset, .. } =
-            FinishedRun::open(&args.run, args.dataset.as_deref(), args.device.as_ref())?;
+        let FinishedRun { mut player, dataset, .. } = FinishedRun::open_with(
+            &args.run,
+            args.dataset.as_deref(),
+            args.device.as_ref(),
+            |own| {
+                own.undistort = true;
+            },
+        )?;
         bookmarks(args, gaussians.origin, &dataset, |view| {
             let networks = player.render(view)?.output().clone();
             Ok(Some(("model with its networks".to_owned(), networks)))
@@ -181,6 +188,7 @@ fn page(
         }
         let mut options = config.load_options();
         options.load_low_test = true;
+        options.undistort = true;
         let dataset = Dataset::load(&config.dataset, &options)?;
         if is_model(&args.run) {
             frame = dataset.frame();

@@ -31,6 +31,19 @@ impl FinishedRun {
         dataset: Option<&Path>,
         device: Option<&DeviceChoice>,
     ) -> Result<Self> {
+        Self::open_with(folder, dataset, device, |_| {})
+    }
+
+    /// The same with something in the configuration changed.
+    ///
+    /// # Errors
+    /// As there.
+    pub(super) fn open_with(
+        folder: &Path,
+        dataset: Option<&Path>,
+        device: Option<&DeviceChoice>,
+        change: impl FnOnce(&mut TrainConfig),
+    ) -> Result<Self> {
         if is_model(folder) {
             return Self::open_model(folder, dataset, device);
         }
@@ -38,6 +51,7 @@ impl FinishedRun {
         if let Some(dataset) = dataset {
             config.move_dataset(dataset);
         }
+        change(&mut config);
         let raw_colors = config.model.raw_colors;
         let gaussians = run::load_model(folder, raw_colors)?;
         if !config.dataset.is_dir() {

@@ -22,6 +22,9 @@ pub struct SynthArgs {
     /// Changes the textures, the noise and the sampled points.
     #[arg(long, default_value_t = SyntheticOptions::default().seed)]
     pub seed: u64,
+    /// Take the photographs with a fisheye (OPENCV_FISHEYE) that sees 130 degrees across the longer side
+    #[arg(long)]
+    pub fisheye: bool,
     /// Write into a folder that is not empty; files of the same names are replaced.
     #[arg(long)]
     pub overwrite: bool,
@@ -32,12 +35,12 @@ pub struct SynthArgs {
 /// # Errors
 /// [`Error::Output`] where the folder is not empty and `--overwrite` is not given, and those of [`synthetic::write`].
 pub fn run(args: SynthArgs) -> Result<()> {
-    let SynthArgs { dir, views, width, height, seed, overwrite } = args;
+    let SynthArgs { dir, views, width, height, seed, fisheye, overwrite } = args;
     let is_empty = std::fs::read_dir(&dir).map_or(true, |mut entries| entries.next().is_none());
     if !is_empty && !overwrite {
         return Err(Error::output(dir, "is not empty; choose another folder or pass --overwrite"));
     }
-    synthetic::write(&dir, &SyntheticOptions { views, width, height, seed })?;
+    synthetic::write(&dir, &SyntheticOptions { views, width, height, seed, fisheye })?;
     tracing::info!("{views} views of {width}x{height} are in {}", dir.display());
     Ok(())
 }

@@ -19,8 +19,8 @@ use crate::photographs::image::{Image, Mask};
 use crate::photographs::metrics::Scores;
 use crate::photographs::pseudo_gt::PseudoGt;
 use crate::photographs::tone::{
-    CurveChoice, Exposure, GainChoice, Profile, Scene, Statistics, ToneCurve, ToneSettings,
-    all_black,
+    CurveChoice, Exposure, GainChoice, Measured, Profile, Scene, Statistics, ToneCurve,
+    ToneSettings, all_black,
 };
 use crate::results::eval;
 use crate::results::report::Distribution;
@@ -320,13 +320,13 @@ impl CurveOnSet {
         photographs: &[Listed],
         (input, inverted): (&Path, bool),
     ) -> Result<Self> {
-        let mut pseudo_gt = PseudoGt::new(gpu, &settings)?;
+        let pseudo_gt = PseudoGt::new(gpu, &settings)?;
         let mut measured = vec![];
         if settings.scene_statistics || settings.takes_exposure() {
             for listed in photographs.iter().filter(|listed| listed.split != Some(Split::Test)) {
                 // What cannot be used is named where it would be mapped.
                 let Ok((photograph, gaps)) = loaded(listed, inverted) else { continue };
-                measured.push(pseudo_gt.measure(&without(&photograph, &gaps))?);
+                measured.push(Measured::of(&without(&photograph, &gaps)));
             }
             if measured.is_empty() && settings.scene_statistics {
                 let problem = "--scene-statistics needs training photographs; there are none";
@@ -347,7 +347,7 @@ impl CurveOnSet {
         photograph: &Image,
         gaps: &[usize],
     ) -> Result<(Statistics, Image, Option<f64>)> {
-        let measured = self.pseudo_gt.measure(&without(photograph, gaps))?;
+        let measured = Measured::of(&without(photograph, gaps));
         let lift = self.pseudo_gt.settings().lift(&self.scene, &measured);
         Ok((measured.statistics, self.pseudo_gt.lifted(photograph, &lift)?, lift.gain))
     }
@@ -355,8 +355,8 @@ impl CurveOnSet {
 
 /// A photograph with those of its pixels that do not count.
 fn loaded(listed: &Listed, inverted: bool) -> Result<(Image, Vec<usize>)> {
-    let photograph = Image::load(&listed.input)?;
-    let (photograph, gaps) = listed.turned(photograph, listed.hidden(inverted)?);
+    let (photograph, gaps) = listed.load(inverted)?;
+    let (photograph, gaps) = listed.turned(photograph, gaps);
     if gaps.len() == photograph.pixel_count() {
         return Err(Error::input(
             &listed.input,

@@ -87,6 +87,9 @@ pub(super) const HOST_SUBMITS: u64 = 0;
 /// Timestamps that fit one recording; passes beyond are not timed.
 pub(super) const MAX_TIMESTAMPS: u32 = 4096;
 
+/// What `vkCmdUpdateBuffer` takes at most, in bytes.
+const MAX_UPDATE: usize = 65_536;
+
 impl<'g> Recorder<'g> {
     /// Starts with a barrier behind everything submitted before.
     pub(super) fn new(
@@ -198,6 +201,26 @@ impl<'g> Recorder<'g> {
         unsafe {
             self.shared.device.cmd_fill_buffer(self.commands, raw, offset, size, word);
         }
+    }
+
+    /// Overwrites the first elements of `buffer` with `data`, which the command buffer itself holds: for a few numbers that the
+    /// host knows when it records.
+    ///
+    /// # Errors
+    /// `data` is longer than the buffer, or than the 64 KiB that Vulkan takes.
+    pub fn update<T: bytemuck::Pod>(&mut self, buffer: &mut Buffer<T>, data: &[T]) -> Result<()> {
+        let bytes: &[u8] = bytemuck::cast_slice(data);
+        let Bound { raw, offset, size } = buffer.bound();
+        if bytes.len() as u64 > size || bytes.len() > MAX_UPDATE {
+            let (name, count) = (buffer.name(), data.len());
+            return Err(Error::Usage(format!("{count} elements do not fit buffer `{name}`")));
+        }
+        if !bytes.is_empty() {
+            self.synchronize([(raw, true)].into_iter());
+            // SAFETY: recording; the buffer holds the bytes. Sizes of our element types are multiples of four.
+            unsafe { self.shared.device.cmd_update_buffer(self.commands, raw, offset, bytes) };
+        }
+        Ok(())
     }
 
     /// Copies the first elements of `source` to `target`, as many as both hold.

@@ -3,17 +3,13 @@
 use glam::UVec2;
 
 use super::log::{LogSlot, PartialSums};
-use super::{Interior, LossSpec, Term, check_weight, holds, no_scratch, value_count};
+use super::{Interior, LossSpec, Term, TermOn, check_weight, holds, no_scratch, value_count};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::denoising;
-use crate::splats::scene::Feature;
 
-pub(super) const SPEC: LossSpec = LossSpec {
-    feature: Some(Feature::Noise),
-    terms: &[Term::DENOISING, Term::TOTAL_VARIATION],
-    on_render: None,
-};
+pub(super) const SPEC: LossSpec =
+    LossSpec { terms: &[Term::DENOISING, Term::TOTAL_VARIATION], on: TermOn::Networks };
 
 impl Term {
     /// Mean squared difference of the denoised image and what it is held to.
@@ -95,6 +91,11 @@ impl DenoisingLoss {
             mse_partials: gpu.uninit("mse_partials", 0)?,
             tv_partials: gpu.uninit("tv_partials", 0)?,
         })
+    }
+
+    /// Whether a weight is above 0.
+    pub fn is_on(&self) -> bool {
+        self.weights.mse > 0.0 || self.weights.total_variation > 0.0
     }
 
     /// Scratch memory for views of `size`, and for those reserved for before.

@@ -7,7 +7,8 @@ use glam::UVec2;
 
 use super::log::{LogSlot, PartialSums};
 use super::{
-    LossSpec, LossTerm, Term, TermInputs, ViewSource, check_weight, holds, no_scratch, pixel_count,
+    LossSpec, LossTerm, Term, TermInputs, TermOn, ViewSource, check_weight, holds, no_scratch,
+    pixel_count,
 };
 use crate::base::random::Stream;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
@@ -18,9 +19,8 @@ use crate::splats::scene::Feature;
 use crate::{Error, Result};
 
 pub(super) const SPEC: LossSpec = LossSpec {
-    feature: Some(Feature::Depth),
     terms: &[Term::DEPTH, Term::DEPTH_LOCAL],
-    on_render: Some(|gpu, config| {
+    on: TermOn::Feature(Feature::Depth, |gpu, config| {
         let settings = DepthSettings { weight: config.weights.depth, box_side: config.depth_box };
         let loss = DepthLoss::new(gpu, settings)?;
         Ok(Box::new(DepthTerm { loss, boxes: config.boxes, depths: vec![] }))

@@ -1,40 +1,32 @@
 //! A render against an image: L = (1 - w) mean|a - b| + w (1 - mean SSIM), means over all values of the interior.
 //!
-//! `a` is the render, not clamped, and `b` the tone curve of the dark photograph, evaluated inside the kernels. SSIM is
-//! that of 3DGS: 11 x 11 Gaussian window with sigma 1.5, per channel, zero padding. R_0 is held to the pseudo-GT, and
+//! `a` is the render, not clamped, and `b` what it is held to. SSIM is that of 3DGS: 11 x 11 Gaussian window with sigma 1.5, per channel, zero padding. R_0 is held to the pseudo-GT, and
 //! the tonemapper's output to the dark photograph itself.
 
 use glam::UVec2;
 
 use super::log::{LogSlot, PartialSums};
 use super::{
-    Interior, LossSpec, LossTerm, Term, TermInputs, ViewSource, holds, no_scratch, value_count,
+    Gradient, Interior, LossSpec, LossTerm, Term, TermInputs, TermOn, ViewSource, holds,
+    no_scratch, value_count,
 };
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
-use crate::kernels::{ToneParameters, l1, ssim};
-use crate::splats::scene::Feature;
+use crate::kernels::{l1, ssim};
 use crate::{Error, Result};
 
 /// R_0 and the pseudo-GT.
 pub(super) const TARGET: LossSpec = LossSpec {
-    feature: None,
     terms: &[Term::L1, Term::SSIM],
-    on_render: Some(|gpu, config| {
-        let settings = LossSettings {
-            tone_curve: config.tone_curve,
-            ssim_weight: config.ssim_weight,
-            terms: [Term::L1, Term::SSIM],
-        };
-        Ok(Box::new(Loss::new(gpu, settings)?))
+    on: TermOn::Colors(|gpu, config, gradient| {
+        let ssim_weight = config.ssim_weight;
+        let terms = [Term::L1, Term::SSIM];
+        Ok(Box::new(Loss::new(gpu, LossSettings { ssim_weight, terms, gradient })?))
     }),
 };
 
 /// The dark reconstruction and the photograph.
-pub(super) const DARK: LossSpec = LossSpec {
-    feature: Some(Feature::Illumination),
-    terms: &[Term::LOW_L1, Term::LOW_SSIM],
-    on_render: None,
-};
+pub(super) const DARK: LossSpec =
+    LossSpec { terms: &[Term::LOW_L1, Term::LOW_SSIM], on: TermOn::Networks };
 
 impl Term {
     /// Mean |render - target|.
@@ -58,7 +50,7 @@ impl Term {
         column: "low_l1",
         name: "L1 of the dark reconstruction",
         is_likeness: false,
-        weight: |config| 1.0 - config.weights.low_ssim,
+        weight: |config| config.low * (1.0 - config.weights.low_ssim),
         setting: "model.weights.low_ssim",
     };
     /// Mean SSIM of the dark reconstruction and the photograph.
@@ -66,7 +58,7 @@ impl Term {
         column: "low_ssim",
         name: "SSIM of the dark reconstruction",
         is_likeness: true,
-        weight: |config| config.weights.low_ssim,
+        weight: |config| config.low * config.weights.low_ssim,
         ..Self::LOW_L1
     };
 }
@@ -116,12 +108,12 @@ const GPU_COLUMNS: u32 = 64;
 /// What a loss compares and how.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LossSettings {
-    /// A `CURVE_*` of include/tone.glsl.
-    pub tone_curve: u32,
     /// w, in [0, 1].
     pub ssim_weight: f64,
     /// The columns of the log for mean|a - b| and for mean SSIM.
     pub terms: [Term; 2],
+    /// What it does with the gradient.
+    pub gradient: Gradient,
 }
 
 /// What one step's loss reads.
@@ -133,10 +125,8 @@ pub struct LossInputs<'a> {
     pub interior: Interior,
     /// (3, H, W), not clamped.
     pub render: &'a Buffer<f32>,
-    /// (3, H, W), sRGB-encoded.
-    pub low: &'a Buffer<f32>,
-    /// The curve of this view, one element.
-    pub tone: &'a Buffer<ToneParameters>,
+    /// (3, H, W)
+    pub target: &'a Buffer<f32>,
 }
 
 /// The kernels of L1 and SSIM and their scratch memory.
@@ -174,7 +164,8 @@ impl Loss {
     /// # Errors
     /// The weight is outside [0, 1], or the device is out of memory.
     pub fn new(gpu: &Gpu, settings: LossSettings) -> Result<Self> {
-        let LossSettings { tone_curve, ssim_weight, terms } = settings;
+        let LossSettings { ssim_weight, terms, gradient } = settings;
+        let adds = gradient == Gradient::Added;
         if !(0.0..=1.0).contains(&ssim_weight) {
             return Err(Error::Usage(format!(
                 "the SSIM weight is {ssim_weight}; it must be within 0 and 1"
@@ -184,7 +175,7 @@ impl Loss {
         let kernels = if ssim_weight > 0.0 {
             let kernel = |march| {
                 let March { columns, rows, alignment } = march;
-                let constants = ssim::Constants { columns, rows, alignment, tone_curve };
+                let constants = ssim::Constants { columns, rows, alignment, adds };
                 Ok((march, gpu.pipeline(&constants)?))
             };
             Kernels::Ssim(Ssim {
@@ -193,7 +184,7 @@ impl Loss {
                 kernels: March::on(gpu).into_iter().map(kernel).collect::<Result<_>>()?,
             })
         } else {
-            let constants = l1::Constants { tone_curve, ..Default::default() };
+            let constants = l1::Constants { adds, ..Default::default() };
             Kernels::L1 {
                 whole: gpu.pipeline(&constants)?,
                 interior: gpu.pipeline(&l1::Constants { with_interior: true, ..constants })?,
@@ -224,7 +215,7 @@ impl Loss {
         Ok(())
     }
 
-    /// Writes dL/d render, (3, H, W), to `d_render`, also outside the interior, and the means of |a - b| and of SSIM to
+    /// Writes dL/d render, (3, H, W), to `d_render` or adds it, also outside the interior, and writes the means of |a - b| and of SSIM to
     /// the log. Where the SSIM weight is 0, SSIM is neither evaluated nor logged.
     ///
     /// # Errors
@@ -244,7 +235,7 @@ impl Loss {
         let mut ssim_count = 0;
         match &mut self.kernels {
             Kernels::L1 { whole, interior, .. } => {
-                let LossInputs { size, render, low, tone, .. } = inputs;
+                let LossInputs { size, render, target, .. } = inputs;
                 let is_whole = inputs.interior == Interior::whole(size);
                 pass.dispatch(
                     if is_whole { whole } else { interior },
@@ -258,8 +249,7 @@ impl Loss {
                     },
                     l1::Buffers {
                         render: render.slice(),
-                        low: low.slice(),
-                        tone: tone.slice(),
+                        target: target.slice(),
                         d_render: d_render.slice_mut(),
                         partials: l1_partials.slice_mut(),
                     },
@@ -296,11 +286,8 @@ impl Loss {
             return Err(no_scratch("loss", inputs.size));
         }
         inputs.interior.check(inputs.size)?;
-        for buffer in [inputs.render, inputs.low, d_render] {
+        for buffer in [inputs.render, inputs.target, d_render] {
             holds(buffer, values as usize)?;
-        }
-        if inputs.tone.is_empty() {
-            return Err(Error::Usage("there are no tone parameters".to_owned()));
         }
         log.check()
     }
@@ -330,7 +317,7 @@ impl Ssim {
         &self,
         pass: &mut Recorder<'_>,
         threads: Threads<'_>,
-        LossInputs { size, interior, render, low, tone }: LossInputs<'_>,
+        LossInputs { size, interior, render, target }: LossInputs<'_>,
         d_render: &mut Buffer<f32>,
         [l1_partials, ssim_partials]: [&mut Buffer<f32>; 2],
     ) -> Result<()> {
@@ -347,8 +334,7 @@ impl Ssim {
             },
             ssim::Buffers {
                 render: render.slice(),
-                low: low.slice(),
-                tone: tone.slice(),
+                target: target.slice(),
                 d_render: d_render.slice_mut(),
                 l1_partials: l1_partials.slice_mut(),
                 ssim_partials: ssim_partials.slice_mut(),
@@ -366,11 +352,11 @@ impl LossTerm for Loss {
     fn record_step(
         &mut self,
         pass: &mut Recorder<'_>,
-        &TermInputs { size, colors: render, low, tone, .. }: &TermInputs<'_>,
+        &TermInputs { size, colors: render, target, .. }: &TermInputs<'_>,
         d_render: &mut Buffer<f32>,
         log: &mut LogSlot<'_>,
     ) -> Result<()> {
-        let inputs = LossInputs { size, interior: Interior::whole(size), render, low, tone };
+        let inputs = LossInputs { size, interior: Interior::whole(size), render, target };
         self.record(pass, inputs, d_render, log)
     }
 }

@@ -147,15 +147,16 @@ impl LogSlot<'_> {
 mod tests {
     use super::*;
     use crate::base::random::Stream;
-    use crate::loss::{LossConfig, Weights};
+    use crate::loss::{LossConfig, ParameterWeights, Weights};
     use crate::splats::scene::Features;
 
     #[test]
     fn the_total_is_one_of_distances_and_of_what_likenesses_lack() {
         let config = LossConfig {
-            tone_curve: 0,
             ssim_weight: 0.25,
-            weights: Weights::default(),
+            weights: Weights { denoising: 0.0, structure: 0.0, depth: 0.0, ..Weights::default() },
+            low: 0.0,
+            parameters: ParameterWeights::default(),
             depth_box: 1,
             boxes: Stream::new(0, 0),
             features: Features::NONE,

@@ -4,7 +4,8 @@ use glam::UVec2;
 
 use super::log::{LogSlot, PartialSums};
 use super::{
-    LossSpec, LossTerm, Term, TermInputs, ViewSource, check_weight, holds, no_scratch, pixel_count,
+    LossSpec, LossTerm, Term, TermInputs, TermOn, ViewSource, check_weight, holds, no_scratch,
+    pixel_count,
 };
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
@@ -13,9 +14,8 @@ use crate::photographs::structure::StructureTarget;
 use crate::splats::scene::Feature;
 
 pub(super) const SPEC: LossSpec = LossSpec {
-    feature: Some(Feature::Structure),
     terms: &[Term::STRUCTURE],
-    on_render: Some(|gpu, config| {
+    on: TermOn::Feature(Feature::Structure, |gpu, config| {
         let loss = StructureLoss::new(gpu, config.weights.structure)?;
         Ok(Box::new(StructureTerm { loss, structures: vec![] }))
     }),

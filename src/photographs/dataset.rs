@@ -12,11 +12,13 @@ mod masks;
 mod members;
 mod names;
 mod options;
+mod packed;
 mod pixels;
 mod place;
 mod points;
 mod similarity;
 mod split;
+mod stamp;
 pub mod synthetic;
 mod transforms;
 mod undistort;
@@ -26,7 +28,7 @@ use std::borrow::Cow;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use glam::DVec3;
+use glam::{DVec3, UVec2};
 
 use crate::camera::Camera;
 use crate::photographs::image::files::Files;
@@ -36,7 +38,8 @@ pub use fingerprint::Fingerprint;
 use listed::{ListedView, Listing};
 use listing::{list, warn};
 use members::with_held_out;
-pub use options::{DepthOptions, LoadOptions};
+pub use options::{DOWNSCALE, DepthOptions, LoadOptions, MeasuredSize};
+pub(crate) use pixels::Look;
 pub use pixels::Original;
 use pixels::Source;
 use points::points;
@@ -163,6 +166,12 @@ impl View {
         }
     }
 
+    /// Width and height of what [`View::photograph`] gives; none where the view has no photograph.
+    pub fn own_size(&self) -> Option<UVec2> {
+        let kept = self.image.as_ref().map(|image| UVec2::new(image.width, image.height));
+        self.original.as_ref().map(Original::size).or(kept)
+    }
+
     /// The photograph as its camera took it, undistorted and not shrunk; none where the view has none.
     ///
     /// # Errors
@@ -236,7 +245,18 @@ impl Dataset {
     /// # Ok::<(), nightsplat::Error>(())
     /// ```
     pub fn load(root: impl AsRef<Path>, options: &LoadOptions) -> Result<Self> {
-        let root = root.as_ref();
+        Self::load_and_look(root.as_ref(), options, None)
+    }
+
+    /// The same; `look` sees every training photograph as it is stored while it is in memory.
+    ///
+    /// # Errors
+    /// As [`Dataset::load`].
+    pub(crate) fn load_and_look(
+        root: &Path,
+        options: &LoadOptions,
+        look: Option<Look<'_>>,
+    ) -> Result<Self> {
         options.check()?;
         let files = Files::default();
         let Listing { mut frames, mut skipped, remarks } = list(root, &files)?;
@@ -244,7 +264,7 @@ impl Dataset {
         split(root, &mut frames, options.test_every, &files)?;
 
         let sources = sources(root, &frames, options, &files, &mut skipped);
-        let views = pixels::load(sources, options, &mut skipped)?;
+        let views = pixels::load(sources, options, look, &mut skipped)?;
         if !views.iter().any(|view| view.split == Split::Train) {
             let first = skipped.first().map(|line| format!(" ({line})")).unwrap_or_default();
             let problem = format!(

@@ -25,6 +25,10 @@ mod raw;
 mod source;
 
 #[cfg(feature = "io")]
+pub(crate) use codec::PictureFile;
+#[cfg(all(feature = "io", test))]
+pub(crate) use codec::openings;
+#[cfg(feature = "io")]
 pub use exif::exposure_value;
 #[cfg(feature = "io")]
 pub use jpeg::exif_segment;

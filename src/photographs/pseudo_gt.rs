@@ -1,7 +1,8 @@
 //! The pseudo-GT on the GPU: the statistics of a dark photograph, and the tone curve they give it.
 //!
 //! ```text
-//! luminance -> select -> histogram -> select -> histogram -> select -> tone_statistics -> host -> curve, in the loss or tone_map
+//! luminance -> select -> histogram -> select -> histogram -> select -> tone_statistics -> host -> parameters
+//! stored photograph, parameters -> pseudo_gt -> target
 //! ```
 //!
 //! Percentiles are exact: luminance is not negative, so its bits sort as integers, and a radix select finds both
@@ -10,7 +11,12 @@
 //! makes the [`LuminanceHistogram`] from which the exposure follows. A photograph beyond the device's limits comes in tiles,
 //! whose counts and sums add up.
 
+mod encoded;
 mod photographs;
+
+pub use encoded::Encoded;
+
+use std::sync::OnceLock;
 
 use glam::Vec3;
 
@@ -25,6 +31,9 @@ use crate::{Error, Result};
 /// Threads that share an image: enough to fill a large GPU, few enough that their partial sums add up quickly.
 const THREADS: u32 = 128 * WORKGROUP;
 
+/// The bits that a stored value may have.
+const CODE_BITS: [u32; 3] = [8, 16, 32];
+
 /// Takes the statistics of photographs and applies a tone curve, with scratch memory for the largest so far.
 #[derive(Debug)]
 pub struct PseudoGt {
@@ -34,7 +43,14 @@ pub struct PseudoGt {
     histogram: Pipeline<kernels::luminance_histogram::Kernel>,
     select: Pipeline<kernels::percentile_select::Kernel>,
     statistics: Pipeline<kernels::tone_statistics::Kernel>,
-    map: Map,
+    /// Of what is stored in 8, 16 and 32 bits, once there is some: with the curve, and decoding alone.
+    with_curve: [OnceLock<Pipeline<kernels::pseudo_gt::Kernel>>; 3],
+    decoders: [OnceLock<Pipeline<kernels::pseudo_gt::Kernel>>; 3],
+    /// The curve's beside its parameters: knots of a table, or what a profile is made of.
+    numbers: Buffer<f32>,
+    knot_count: u32,
+    no_parameters: Buffer<ToneParameters>,
+    no_codes: Buffer<u32>,
     /// One for each tile.
     luminances: Vec<Buffer<f32>>,
     sums: Buffer<Vec3>,
@@ -48,46 +64,6 @@ pub struct PseudoGt {
     pixel_count: u32,
 }
 
-/// What applies the curve to a whole image.
-#[derive(Debug)]
-enum Map {
-    Formula {
-        pipeline: Pipeline<kernels::tone_map::Kernel>,
-        quads_per_thread: u32,
-    },
-    Mix(Pipeline<kernels::tone_mix::Kernel>),
-    /// (3, K) knots.
-    Table(Pipeline<kernels::tone_table::Kernel>, Buffer<Vec3>),
-    /// (3, `PROFILE_WIDTH`) numbers.
-    Profile(Pipeline<kernels::tone_profile::Kernel>, Buffer<f32>),
-}
-
-impl Map {
-    fn new(gpu: &Gpu, settings: &ToneSettings) -> Result<Self> {
-        let tone_curve = settings.curve.constant();
-        if let Some(profile) = &settings.profile {
-            return Ok(Self::Profile(
-                gpu.pipeline(&kernels::tone_profile::Constants::default())?,
-                gpu.buffer("camera profile", &profile.rows())?,
-            ));
-        }
-        Ok(match &settings.table {
-            Some(table) => Self::Table(
-                gpu.pipeline(&kernels::tone_table::Constants::default())?,
-                gpu.buffer("tone table", &table.knots())?,
-            ),
-            None if !settings.curve.is_formula() => {
-                Self::Mix(gpu.pipeline(&kernels::tone_mix::Constants { tone_curve })?)
-            }
-            None => {
-                let constants = kernels::tone_map::Constants { tone_curve, ..Default::default() };
-                let quads_per_thread = constants.quads_per_thread;
-                Self::Formula { pipeline: gpu.pipeline(&constants)?, quads_per_thread }
-            }
-        })
-    }
-}
-
 impl PseudoGt {
     /// Builds the kernels for one curve.
     ///
@@ -96,6 +72,11 @@ impl PseudoGt {
     pub fn new(gpu: &Gpu, settings: &ToneSettings) -> Result<Self> {
         settings.check()?;
         let takes_p80 = settings.white() == White::P80;
+        let numbers = match (&settings.table, &settings.profile) {
+            (_, Some(profile)) => profile.rows(),
+            (Some(table), None) => table.knots().iter().flat_map(|knot| knot.to_array()).collect(),
+            (None, None) => vec![],
+        };
         let bins = (0..SEARCHES).map(|histogram| RankSearch {
             prefix: FIRST_PREFIX + histogram,
             rank: 0,
@@ -107,7 +88,12 @@ impl PseudoGt {
             histogram: gpu.pipeline(&kernels::luminance_histogram::Constants {})?,
             select: gpu.pipeline(&kernels::percentile_select::Constants {})?,
             statistics: gpu.pipeline(&kernels::tone_statistics::Constants { takes_p80 })?,
-            map: Map::new(gpu, settings)?,
+            with_curve: Default::default(),
+            decoders: Default::default(),
+            knot_count: (numbers.len() / 9) as u32,
+            numbers: gpu.buffer("curve numbers", &numbers)?,
+            no_parameters: gpu.uninit("no parameters", 0)?,
+            no_codes: gpu.uninit("no codes", 0)?,
             luminances: vec![],
             sums: gpu.uninit("channel sums", 0)?,
             searches: gpu.uninit("rank searches", 2 * SEARCHES as usize)?,
@@ -274,7 +260,6 @@ impl PseudoGt {
         view: u32,
         target: &mut Buffer<f32>,
     ) -> Result<()> {
-        in_range(parameters, view)?;
         if target.len() != image.len() {
             let (name, len) = (target.name(), target.len());
             return Err(Error::Usage(format!(
@@ -282,56 +267,77 @@ impl PseudoGt {
                 image.len()
             )));
         }
-        let value_count = image.len() as u32;
-        let pixel_count = value_count / 3;
-        match &self.map {
-            Map::Formula { pipeline, quads_per_thread } => pass.dispatch(
-                pipeline,
-                &kernels::tone_map::Params { value_count, view },
-                kernels::tone_map::Buffers {
-                    image: image.slice(),
-                    parameters: parameters.slice(),
-                    target: target.slice_mut(),
-                },
-                Threads::Exactly([value_count.div_ceil(4 * quads_per_thread), 1, 1]),
-            ),
-            Map::Mix(pipeline) => pass.dispatch(
-                pipeline,
-                &kernels::tone_mix::Params { pixel_count, view },
-                kernels::tone_mix::Buffers {
-                    image: image.slice(),
-                    parameters: parameters.slice(),
-                    target: target.slice_mut(),
-                },
-                Threads::Exactly([pixel_count, 1, 1]),
-            ),
-            Map::Profile(pipeline, profile) => pass.dispatch(
-                pipeline,
-                &kernels::tone_profile::Params { pixel_count, view },
-                kernels::tone_profile::Buffers {
-                    image: image.slice(),
-                    parameters: parameters.slice(),
-                    profile: profile.slice(),
-                    target: target.slice_mut(),
-                },
-                Threads::Exactly([pixel_count, 1, 1]),
-            ),
-            Map::Table(pipeline, knots) => pass.dispatch(
-                pipeline,
-                &kernels::tone_table::Params {
-                    pixel_count,
-                    view,
-                    knot_count: (knots.len() / 3) as u32,
-                },
-                kernels::tone_table::Buffers {
-                    image: image.slice(),
-                    parameters: parameters.slice(),
-                    knots: knots.slice(),
-                    target: target.slice_mut(),
-                },
-                Threads::Exactly([value_count, 1, 1]),
-            ),
+        let stored = Stored { code_bits: 32, codes: &self.no_codes, values: image };
+        self.dispatch(pass, stored, image.len(), Some((parameters, view)), target)
+    }
+
+    /// Records the pseudo-GT of a stored photograph, decoded and under the curve of `parameters[view]`, where one is named; or
+    /// what is stored, decoded. `target`, (3, pixels), is as long or longer. What is stored as it is and has no curve needs no
+    /// pass: the result is the buffer that holds it.
+    ///
+    /// # Errors
+    /// `target` is shorter, `parameters` ends before `view`, or the device refuses the kernel.
+    pub fn record<'a>(
+        &self,
+        pass: &mut Recorder<'_>,
+        photograph: &'a Encoded,
+        curve: Option<(&Buffer<ToneParameters>, u32)>,
+        target: &'a mut Buffer<f32>,
+    ) -> Result<&'a Buffer<f32>> {
+        let &Encoded { code_bits, value_count, ref codes, ref values } = photograph;
+        if code_bits == 32 && curve.is_none() {
+            return Ok(values);
         }
+        if target.len() < value_count {
+            let (name, len) = (target.name(), target.len());
+            let problem = format!("buffer `{name}` holds {len} values, not {value_count}");
+            return Err(Error::Usage(problem));
+        }
+        self.dispatch(pass, Stored { code_bits, codes, values }, value_count, curve, target)?;
+        Ok(target)
+    }
+
+    fn dispatch(
+        &self,
+        pass: &mut Recorder<'_>,
+        Stored { code_bits, codes, values }: Stored<'_>,
+        value_count: usize,
+        curve: Option<(&Buffer<ToneParameters>, u32)>,
+        target: &mut Buffer<f32>,
+    ) -> Result<()> {
+        let (parameters, view) = curve.unwrap_or((&self.no_parameters, 0));
+        if curve.is_some() {
+            in_range(parameters, view)?;
+        }
+        let pixel_count = (value_count / 3) as u32;
+        pass.dispatch(
+            self.pipeline(code_bits, curve.is_some())?,
+            &kernels::pseudo_gt::Params { pixel_count, view, knot_count: self.knot_count },
+            kernels::pseudo_gt::Buffers {
+                codes: codes.slice(),
+                values: values.slice(),
+                parameters: parameters.slice(),
+                numbers: self.numbers.slice(),
+                target: target.slice_mut(),
+            },
+            Threads::Exactly([pixel_count, 1, 1]),
+        )
+    }
+
+    fn pipeline(
+        &self,
+        code_bits: u32,
+        with_curve: bool,
+    ) -> Result<&Pipeline<kernels::pseudo_gt::Kernel>> {
+        let place = CODE_BITS.iter().position(|&bits| bits == code_bits).unwrap_or_default();
+        let pipelines = if with_curve { &self.with_curve } else { &self.decoders };
+        if let Some(pipeline) = pipelines[place].get() {
+            return Ok(pipeline);
+        }
+        let tone_curve = self.settings.curve.constant();
+        let constants = kernels::pseudo_gt::Constants { code_bits, with_curve, tone_curve };
+        let pipeline = self.gpu.pipeline(&constants)?;
+        Ok(pipelines[place].get_or_init(|| pipeline))
     }
 
     /// The statistics measured last; waits for them.
@@ -351,6 +357,13 @@ impl PseudoGt {
         let counts = self.gpu.read(&self.counts)?;
         Ok(LuminanceHistogram::from_counts(&counts, self.pixel_count.into()))
     }
+}
+
+/// What of a photograph a dispatch binds.
+struct Stored<'a> {
+    code_bits: u32,
+    codes: &'a Buffer<u32>,
+    values: &'a Buffer<f32>,
 }
 
 /// Counts a digit of the luminances of all tiles that begin with the prefix of a search.

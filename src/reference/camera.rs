@@ -1,10 +1,13 @@
-//! The pinhole camera of `include/camera.glsl`, in f64.
+//! The camera of `include/camera.glsl`, in f64.
 
-use glam::{DMat3, DVec2, DVec3, DVec4};
+use glam::{DMat3, DVec2, DVec3};
 
+use super::camera_fisheye::Fisheye;
+use super::camera_pinhole::Pinhole;
 use crate::kernels;
+use crate::kernels::camera::CAMERA_FISHEYE;
 
-/// A view as the parameters of the projecting kernels describe it.
+/// A view as the buffer of cameras describes it.
 #[derive(Clone, Debug)]
 pub struct Camera {
     /// The rotation from world to view.
@@ -17,24 +20,49 @@ pub struct Camera {
     pub principal_point: DVec2,
     /// Pixels.
     pub size: DVec2,
-    /// Where the Jacobian of the projection is taken at the least, x / z and y / z.
-    pub least_slope: DVec2,
-    /// And at the most.
-    pub most_slope: DVec2,
+    /// Where it shows what, in units of the focal lengths.
+    pub model: Model,
+}
+
+/// A camera model.
+#[derive(Clone, Debug)]
+pub enum Model {
+    /// `include/camera_pinhole.glsl`
+    Pinhole(Pinhole),
+    /// `include/camera_fisheye.glsl`
+    Fisheye(Fisheye),
+}
+
+/// What a model makes of a point: all in units of the focal lengths.
+#[derive(Clone, Copy, Debug)]
+pub struct Place {
+    /// Relative to the principal point.
+    pub at: DVec2,
+    /// Its derivative with respect to the point, row by row.
+    pub jacobian: [DVec3; 2],
 }
 
 impl From<&kernels::Camera> for Camera {
     fn from(camera: &kernels::Camera) -> Self {
         let [x, y, z, translation] =
             camera.view_from_world.map(|column| DVec3::from(column.map(f64::from)));
+        let model = match camera.model {
+            CAMERA_FISHEYE => Model::Fisheye(Fisheye {
+                distortion: camera.distortion.map(f64::from),
+                largest_angle: camera.largest_angle.into(),
+            }),
+            _ => Model::Pinhole(Pinhole {
+                least_slope: camera.least_slope.as_dvec2(),
+                most_slope: camera.most_slope.as_dvec2(),
+            }),
+        };
         Self {
             rotation: DMat3::from_cols(x, y, z),
             translation,
             focal: camera.focal.as_dvec2(),
             principal_point: camera.principal_point.as_dvec2(),
             size: camera.size.as_dvec2(),
-            least_slope: camera.least_slope.as_dvec2(),
-            most_slope: camera.most_slope.as_dvec2(),
+            model,
         }
     }
 }
@@ -50,31 +78,55 @@ impl Camera {
         -(self.rotation.transpose() * self.translation)
     }
 
-    /// x / z and y / z, no farther than the Jacobian is taken.
-    pub fn clamped_slope(&self, mean_in_view: DVec3) -> DVec2 {
-        let slope = mean_in_view.truncate() / mean_in_view.z;
-        slope.max(self.least_slope).min(self.most_slope)
+    /// The depth of a point of the view; not positive where the model does not see it.
+    pub fn depth(&self, point: DVec3) -> f64 {
+        match &self.model {
+            Model::Pinhole(_) => point.z,
+            Model::Fisheye(fisheye) => fisheye.depth(point),
+        }
     }
-}
 
-/// The rotation of a unit quaternion (w, x, y, z).
-pub fn rotation(q: DVec4) -> DMat3 {
-    let [w, x, y, z] = q.to_array();
-    DMat3::from_cols_array(&[
-        1.0 - 2.0 * (y * y + z * z),
-        2.0 * (x * y + w * z),
-        2.0 * (x * z - w * y),
-        2.0 * (x * y - w * z),
-        1.0 - 2.0 * (x * x + z * z),
-        2.0 * (y * z + w * x),
-        2.0 * (x * z + w * y),
-        2.0 * (y * z - w * x),
-        1.0 - 2.0 * (x * x + y * y),
-    ])
-}
+    /// The pixel at which a point of positive depth is seen.
+    pub fn project(&self, point: DVec3) -> DVec2 {
+        self.focal * self.place(point).at + self.principal_point
+    }
 
-/// A quaternion of unit length; the identity where the length is not a positive number.
-pub fn unit_quat(q: DVec4) -> DVec4 {
-    let norm = q.length();
-    if norm > 1e-12 { q / norm } else { DVec4::X }
+    /// The derivative of the pixel with respect to the point, row by row.
+    pub fn jacobian(&self, point: DVec3) -> [DVec3; 2] {
+        let [x, y] = self.place(point).jacobian;
+        [self.focal.x * x, self.focal.y * y]
+    }
+
+    fn place(&self, point: DVec3) -> Place {
+        match &self.model {
+            Model::Pinhole(pinhole) => pinhole.place(point),
+            Model::Fisheye(fisheye) => fisheye.place(point),
+        }
+    }
+
+    /// The gradient of the point, from that of its pixel and those of the rows of [`Camera::jacobian`].
+    pub fn backward(&self, point: DVec3, d_pixel: DVec2, d_rows: [DVec3; 2]) -> DVec3 {
+        let d_place = self.focal * d_pixel;
+        let d_rows = [self.focal.x * d_rows[0], self.focal.y * d_rows[1]];
+        match &self.model {
+            Model::Pinhole(pinhole) => pinhole.backward(point, d_place, d_rows),
+            Model::Fisheye(fisheye) => fisheye.backward(point, d_place, d_rows),
+        }
+    }
+
+    /// How much deeper a point is that lies beside another by an offset, to first order.
+    pub(super) fn depth_change(&self, point: DVec3, offset: DVec3) -> f64 {
+        match &self.model {
+            Model::Pinhole(_) => offset.z,
+            Model::Fisheye(_) => point.dot(offset) / point.length(),
+        }
+    }
+
+    /// The point at another depth.
+    pub(super) fn at_depth(&self, point: DVec3, depth: f64) -> DVec3 {
+        match &self.model {
+            Model::Pinhole(_) => point.truncate().extend(depth),
+            Model::Fisheye(_) => point * (depth / point.length()),
+        }
+    }
 }

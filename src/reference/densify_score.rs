@@ -2,8 +2,9 @@
 
 use glam::{DMat3, DVec2, DVec3, DVec4};
 
-use super::camera::{Camera, rotation, unit_quat};
+use super::camera::Camera;
 use super::gaussian::{Gaussian, sigmoid};
+use super::rotation::{rotation, unit_quat};
 use super::rounding::UNIT;
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::camera::NEAREST;
@@ -29,21 +30,26 @@ pub(super) fn view_change(near: f64, camera: &Camera, gaussian: &Gaussian) -> f6
     let scale = DMat3::from_diagonal(gaussian.log_scale.exp());
     let view_axes = camera.rotation * rotation(unit_quat(gaussian.quat)) * scale;
     let mean = camera.view(gaussian.mean);
-    let shift = SPLIT_OFFSET * view_axes.col(gaussian.log_scale.max_position()).z.abs();
-    if mean.z + shift <= near {
+    let depth = camera.depth(mean);
+    let longest = view_axes.col(gaussian.log_scale.max_position());
+    let shift = SPLIT_OFFSET * camera.depth_change(mean, longest).abs();
+    if depth + shift <= near {
         return 0.0;
     }
-    let mean = mean.truncate().extend((mean.z - shift).max(near.max(NEAREST)));
-    let (slope, rows) = (camera.clamped_slope(mean), view_axes.transpose());
-    let u0 = camera.focal.x / mean.z * (rows * DVec3::new(1.0, 0.0, -slope.x));
-    let u1 = camera.focal.y / mean.z * (rows * DVec3::new(0.0, 1.0, -slope.y));
+    let depth = (depth - shift).max(near.max(NEAREST));
+    let mean = camera.at_depth(mean, depth);
+    if camera.depth(mean) <= 0.0 {
+        return 0.0;
+    }
+    let rows = view_axes.transpose();
+    let [u0, u1] = camera.jacobian(mean).map(|row| rows * row);
     let variance = DVec2::new(u0.dot(u0), u1.dot(u1)) + DILATION;
     let level = 2.002 * (255.0 * opacity).ln() + 1e-3;
     let half_extent = (level.max(0.0) * variance).map(f64::sqrt);
-    let mean2d = camera.focal * mean.truncate() / mean.z + camera.principal_point;
+    let mean2d = camera.project(mean);
     let clamped = |corner: DVec2| corner.clamp(DVec2::ZERO, camera.size);
     let covered = (clamped(mean2d + half_extent) - clamped(mean2d - half_extent)) / camera.size;
-    covered.element_product() * (opacity * shift / mean.z).powi(2)
+    covered.element_product() * (opacity * shift / depth).powi(2)
 }
 
 /// The most that a split of Gaussian `i` changes in a camera's view; NaN where one is.

@@ -2,16 +2,17 @@
 
 use glam::{DMat3, DVec2, DVec3, DVec4, UVec2};
 
-use super::camera::{Camera, rotation, unit_quat};
+use super::camera::Camera;
 use super::gaussian::{Gaussian, Planes, sigmoid};
+use super::rotation::{rotation, unit_quat};
 use super::rounding::{UNIT, sensitivity};
 use super::sh::sh_basis;
 use super::splat::{Splat, extent_error, splat_level, splat_tile_rows, splat_tiles, stored_color};
 use crate::gpu::{Reference, Tolerance};
-use crate::kernels::ProjectedSplat;
 use crate::kernels::camera::NEAREST;
 use crate::kernels::project::{CULLED, Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::splat::{ALPHA_MIN, DILATION};
+use crate::kernels::{self, ProjectedSplat};
 
 /// What one Gaussian is on the image plane.
 #[derive(Clone, Debug)]
@@ -22,7 +23,7 @@ pub struct Projection {
     pub half_extent: DVec2,
     /// RGB; not below zero, but for raw colours.
     pub color: DVec3,
-    /// z in the view, world units.
+    /// As the camera model counts it, world units.
     pub depth: f64,
 }
 
@@ -35,24 +36,22 @@ pub fn project_gaussian(
     gaussian: &Gaussian,
 ) -> Option<Projection> {
     let mean_in_view = camera.view(gaussian.mean);
-    let depth = mean_in_view.z;
+    let depth = camera.depth(mean_in_view);
     let opacity = sigmoid(gaussian.raw_opacity);
     if !(depth > near && opacity > ALPHA_MIN) {
         return None;
     }
 
-    let slope = camera.clamped_slope(mean_in_view);
     let scale = DMat3::from_diagonal(gaussian.log_scale.exp());
     let view_axes = camera.rotation * rotation(unit_quat(gaussian.quat)) * scale;
     let rows = view_axes.transpose();
-    let u0 = camera.focal.x / depth * (rows * DVec3::new(1.0, 0.0, -slope.x));
-    let u1 = camera.focal.y / depth * (rows * DVec3::new(0.0, 1.0, -slope.y));
+    let [u0, u1] = camera.jacobian(mean_in_view).map(|row| rows * row);
 
     let (xx, xy, yy) = (u0.dot(u0), u0.dot(u1), u1.dot(u1));
     let normal = u0.cross(u1);
     let det = normal.dot(normal) + DILATION * (xx + yy) + DILATION * DILATION;
     let cov2d = DVec3::new(xx + DILATION, xy, yy + DILATION);
-    let mean2d = camera.focal * mean_in_view.truncate() / depth + camera.principal_point;
+    let mean2d = camera.project(mean_in_view);
     if !(det < 1e30 && mean2d.abs().cmplt(DVec2::splat(1e30)).all()) {
         return None;
     }
@@ -99,11 +98,11 @@ fn depth_key(depth: f32, near: f32) -> u32 {
 }
 
 /// The tiles of an image that a splat covers.
-fn tile_count(params: &Params, constants: &Constants, splat: &ProjectedSplat) -> u32 {
+fn tile_count(size: UVec2, constants: &Constants, splat: &ProjectedSplat) -> u32 {
     let tile = UVec2::new(constants.tile_width, constants.tile_height);
-    let [top, bottom] = splat_tile_rows(splat, params.camera.size.y, tile);
+    let [top, bottom] = splat_tile_rows(splat, size.y, tile);
     let row = |row| {
-        let [first, end] = splat_tiles(splat, row, params.camera.size.x, tile);
+        let [first, end] = splat_tiles(splat, row, size.x, tile);
         end - first
     };
     (top..bottom).map(row).sum()
@@ -113,16 +112,19 @@ fn tile_count(params: &Params, constants: &Constants, splat: &ProjectedSplat) ->
 struct Scene<'a> {
     params: &'a Params,
     constants: &'a Constants,
+    /// Of the image, pixels.
+    size: UVec2,
     camera: Camera,
     planes: Planes,
 }
 
 impl<'a> Scene<'a> {
-    fn new(params: &'a Params, constants: &'a Constants) -> Self {
+    fn new(params: &'a Params, constants: &'a Constants, cameras: &[kernels::Camera]) -> Self {
         let Constants { channels, sh_degree, .. } = *constants;
         let planes = Planes::of(params.gaussian_count, channels, sh_degree);
-        let camera = Camera::from(&params.camera);
-        Self { params, constants, camera, planes }
+        let camera = &cameras[params.camera_index as usize];
+        let (size, camera) = (camera.size, Camera::from(camera));
+        Self { params, constants, size, camera, planes }
     }
 
     fn project(&self, gaussian: &Gaussian) -> Option<Projection> {
@@ -212,19 +214,15 @@ impl<'a> Scene<'a> {
         [1.0 - grown, 1.0 + grown].map(|factor| {
             let (conic, half_extent) =
                 (splat.conic / (factor * factor), splat.half_extent * factor);
-            tile_count(
-                self.params,
-                self.constants,
-                &ProjectedSplat { conic, half_extent, ..*splat },
-            )
+            tile_count(self.size, self.constants, &ProjectedSplat { conic, half_extent, ..*splat })
         })
     }
 }
 
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
-        let Slices { parameters, splats, colors, depth_keys, ids, tile_counts } = slices;
-        let scene = Scene::new(params, constants);
+        let Slices { parameters, splats, colors, depth_keys, ids, tile_counts, cameras } = slices;
+        let scene = Scene::new(params, constants, cameras);
         let parameters = scene.planes.floats(parameters, constants.half_rest);
         let stored = stored_color(constants.channels);
         let colors = bytemuck::cast_slice_mut::<_, f32>(colors);
@@ -240,7 +238,7 @@ impl Reference for Kernel {
             for (color, value) in colors[stored * i..][..stored].iter_mut().zip(values) {
                 *color = value as f32;
             }
-            tile_counts[i] = tile_count(params, constants, &splats[i]);
+            tile_counts[i] = tile_count(scene.size, constants, &splats[i]);
             if tile_counts[i] > 0 {
                 depth_keys[i] = depth_key(projection.depth as f32, params.near);
             }
@@ -249,7 +247,7 @@ impl Reference for Kernel {
 
     /// A Gaussian at the border of being culled may be; one whose ellipse borders on a tile may cover it.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
-        let scene = Scene::new(params, constants);
+        let scene = Scene::new(params, constants, slices.cameras);
         let parameters = scene.planes.floats(slices.parameters, constants.half_rest);
         let (n, stored) = (scene.planes.count, stored_color(constants.channels));
         let [mut splats, mut colors, mut depth_keys, mut tile_counts] =
@@ -266,7 +264,7 @@ impl Reference for Kernel {
             splats[8 * i..][..8].copy_from_slice(&errors[..8]);
             colors[stored * i..][..3].copy_from_slice(&errors[8..11]);
             let splat = projection.stored();
-            let count = tile_count(params, constants, &splat);
+            let count = tile_count(scene.size, constants, &splat);
             let [fewest, most] = scene.tile_counts(&splat, &errors);
             tile_counts[i] = (count - count.min(fewest)).max(most.max(count) - count).into();
             // The keys of positive numbers are as far apart as these in sixteenths of units of the last place.

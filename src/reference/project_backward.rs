@@ -2,12 +2,14 @@
 
 use glam::{DMat3, DVec2, DVec3, DVec4, UVec2, Vec3};
 
-use super::camera::{Camera, rotation, unit_quat};
+use super::camera::Camera;
 use super::gaussian::{Gaussian, Planes, sigmoid};
+use super::rotation::{rotation, unit_quat};
 use super::rounding::{Rounded, UNIT, chain, sensitivity};
 use super::sh::{sh_basis, sh_basis_gradient};
 use super::splat::{Splat, stored_color, stored_record};
 use crate::gpu::{Reference, Tolerance};
+use crate::kernels;
 use crate::kernels::project_backward::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::shared_slots::SHARED_SLOTS;
 use crate::kernels::splat::{DILATION, RECORD_HEAD};
@@ -37,15 +39,11 @@ pub fn project_gaussian_backward(
     d_splat: &DSplat,
 ) -> Gaussian {
     let mean_in_view = camera.view(gaussian.mean);
-    let z = mean_in_view.z;
-    let free_slope = mean_in_view.truncate() / z;
-    let slope = camera.clamped_slope(mean_in_view);
     let unit = unit_quat(gaussian.quat);
     let scale = gaussian.log_scale.exp();
     let scaled_axes = rotation(unit) * DMat3::from_diagonal(scale);
     let world_from_view = camera.rotation.transpose();
-    let t0 = world_from_view * (camera.focal.x / z * DVec3::new(1.0, 0.0, -slope.x));
-    let t1 = world_from_view * (camera.focal.y / z * DVec3::new(0.0, 1.0, -slope.y));
+    let [t0, t1] = camera.jacobian(mean_in_view).map(|row| world_from_view * row);
     let (u0, u1) = (scaled_axes.transpose() * t0, scaled_axes.transpose() * t1);
 
     let [a, b, c] = splat.conic.to_array();
@@ -66,24 +64,14 @@ pub fn project_gaussian_backward(
     let norm = gaussian.quat.length();
     let d_quat = if norm > 1e-12 { (d_unit - unit * unit.dot(d_unit)) / norm } else { DVec4::ZERO };
 
-    let d_j0 = camera.rotation * (scaled_axes * d_u0);
-    let d_j1 = camera.rotation * (scaled_axes * d_u1);
-    let mut d_slope = -camera.focal / z * DVec2::new(d_j0.z, d_j1.z);
-    for axis in 0..2 {
-        if free_slope[axis] != slope[axis] {
-            d_slope[axis] = 0.0;
-        }
-    }
-    let d_xy_view = (camera.focal * d_splat.mean2d + d_slope) / z;
-    let d_inverse_z =
-        camera.focal.x * (d_j0.x - slope.x * d_j0.z) + camera.focal.y * (d_j1.y - slope.y * d_j1.z);
-    let d_z = -d_inverse_z / (z * z) - d_xy_view.dot(free_slope);
+    let d_rows = [d_u0, d_u1].map(|d_u| camera.rotation * (scaled_axes * d_u));
+    let d_mean_in_view = camera.backward(mean_in_view, d_splat.mean2d, d_rows);
 
     let (d_mean_sh, d_sh) =
         sh_backward(sh_degree, &gaussian.sh, gaussian.mean - camera.center(), d_splat.color);
     let opacity = sigmoid(gaussian.raw_opacity);
     Gaussian {
-        mean: world_from_view * d_xy_view.extend(d_z) + d_mean_sh,
+        mean: world_from_view * d_mean_in_view + d_mean_sh,
         quat: d_quat,
         log_scale: d_log_scale,
         raw_opacity: d_splat.opacity * opacity * sigmoid(-gaussian.raw_opacity),
@@ -137,10 +125,10 @@ struct Scene<'a> {
 }
 
 impl<'a> Scene<'a> {
-    fn new(params: &'a Params, constants: &'a Constants) -> Self {
+    fn new(params: &'a Params, constants: &'a Constants, cameras: &[kernels::Camera]) -> Self {
         let Constants { channels, sh_degree, .. } = *constants;
         let planes = Planes::of(params.gaussian_count, channels, sh_degree);
-        let camera = Camera::from(&params.camera);
+        let camera = Camera::from(&cameras[params.camera_index as usize]);
         Self { params, constants, camera, planes }
     }
 
@@ -170,8 +158,7 @@ impl<'a> Scene<'a> {
         let d_xy = 2.0 * a * b * d.x + (a * c + b * b) * d.y + 2.0 * b * c * d.z;
         let d_yy = b * b * d.x + b * c * d.y + c * c * d.z;
         let mean_in_view = self.camera.view(gaussian.mean);
-        let slope = self.camera.clamped_slope(mean_in_view);
-        let t = self.camera.focal / mean_in_view.z * (1.0 + slope * slope).map(f64::sqrt);
+        let t = DVec2::from_array(self.camera.jacobian(mean_in_view).map(DVec3::length));
         let scale = gaussian.log_scale.max_element().exp();
         let d_u = DVec2::new(2.0 * d_xx * t.x + d_xy * t.y, 2.0 * d_yy * t.y + d_xy * t.x);
         512.0 * UNIT * scale * scale * t.dot(d_u) / gaussian.quat.length().max(1e-12)
@@ -180,7 +167,8 @@ impl<'a> Scene<'a> {
     /// What the statistics of density control grow by.
     fn damped_norm(&self, gaussian: &Gaussian, d_splat: &DSplat) -> f64 {
         let Params { damping_weight, damping_depth, .. } = *self.params;
-        let (weight, depth) = (f64::from(damping_weight), self.camera.view(gaussian.mean).z);
+        let (weight, depth) =
+            (f64::from(damping_weight), self.camera.depth(self.camera.view(gaussian.mean)));
         let nearness = (depth / f64::from(damping_depth)).min(1.0);
         let damping = weight * nearness * nearness + 1.0 - weight;
         damping * (self.params.half_view.as_dvec2() * d_splat.mean2d).length()
@@ -215,7 +203,7 @@ impl Reference for Kernel {
         let Slices { status, gradients, grad_norm_sums, visit_counts, .. } = slices;
         // Of all Gaussians, as the device may look at them in any order.
         let before = status[0];
-        let scene = Scene::new(params, constants);
+        let scene = Scene::new(params, constants, slices.cameras);
         let parameters = scene.planes.floats(parameters, constants.half_rest);
         gradients[..scene.planes.len()].fill(0.0);
         for i in (0..scene.planes.count).filter(|&i| tile_counts[i] > 0) {
@@ -241,7 +229,7 @@ impl Reference for Kernel {
     /// Attributes also pass through sums and exponentials with terms of order one, means through the view.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         const OFF: f64 = 256.0 * UNIT;
-        let scene = Scene::new(params, constants);
+        let scene = Scene::new(params, constants, slices.cameras);
         let parameters = scene.planes.floats(slices.parameters, constants.half_rest);
         let one = Planes { count: 1, ..scene.planes };
         let far = scene.camera.center().length();

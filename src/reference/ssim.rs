@@ -3,7 +3,7 @@
 use glam::UVec2;
 
 use super::inside;
-use super::rounding::{Rounded, UNIT, chain, rounded_tone_curve, values};
+use super::rounding::{Rounded, UNIT, chain};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::ssim::{C1, C2, Constants, Kernel, Params, Slices, Tolerances};
 use crate::photographs::tone::Real;
@@ -108,14 +108,13 @@ struct Outcome {
     ssim: Rounded,
 }
 
-fn outcomes(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Vec<Outcome> {
+fn outcomes(params: &Params, slices: &Slices<'_>) -> Vec<Outcome> {
     let pixels = params.width as usize * params.height as usize;
     let channel = |channel: usize| {
         let plane = channel * pixels..(channel + 1) * pixels;
         let exact = |&x: &f32| Rounded::exact(x);
         let a: Vec<_> = slices.render[plane.clone()].iter().map(exact).collect();
-        let target = |&x: &f32| rounded_tone_curve(constants.tone_curve, x, &slices.tone[0]);
-        let b: Vec<_> = slices.low[plane].iter().map(target).collect();
+        let b: Vec<_> = slices.target[plane].iter().map(exact).collect();
         outcomes_of_channel(params, &a, &b)
     };
     (0..3).flat_map(channel).collect()
@@ -143,11 +142,7 @@ fn outcomes_of_channel(params: &Params, a: &[Rounded], b: &[Rounded]) -> Vec<Out
     let outcome = |i: usize| {
         let difference = if counts(i) { a[i] - b[i] } else { Rounded::default() };
         let own = difference.value;
-        let sign = Rounded {
-            value: if own == 0.0 { 0.0 } else { own.signum() },
-            // Either one where a rounding of the curve decides.
-            error: if difference.error > 0.0 && difference.may_cross(0.0) { 2.0 } else { 0.0 },
-        };
+        let sign = Rounded::of(if own == 0.0 { 0.0 } else { own.signum() });
         let d_ssim = d_ssim(a[i], b[i], [0, 1, 2].map(|m| derivatives[m][i]));
         let gradient = l1_scale * sign - ssim_scale * d_ssim;
         Outcome { gradient, difference: difference.abs(), ssim: map[i].value }
@@ -155,12 +150,26 @@ fn outcomes_of_channel(params: &Params, a: &[Rounded], b: &[Rounded]) -> Vec<Out
     (0..a.len()).map(outcome).collect()
 }
 
+/// The gradients, with those of the terms before where they are added to.
+fn accumulated<'a>(
+    outcomes: &'a [Outcome],
+    constants: &Constants,
+    before: &'a [f32],
+) -> impl Iterator<Item = Rounded> + 'a {
+    let adds = constants.adds;
+    let sum = move |(of, &before): (&Outcome, &f32)| {
+        if adds { Rounded::exact(before) + of.gradient } else { of.gradient }
+    };
+    outcomes.iter().zip(before).map(sum)
+}
+
 impl Reference for Kernel {
     /// The whole sums go into the first partials: how many there are is the device's choice.
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
-        let outcomes = outcomes(params, constants, &slices);
-        let gradients = values(outcomes.iter().map(|of| of.gradient));
-        slices.d_render.iter_mut().zip(gradients).for_each(|(to, d)| *to = d);
+        let (outcomes, before) = (outcomes(params, &slices), slices.d_render.to_vec());
+        for (to, d) in slices.d_render.iter_mut().zip(accumulated(&outcomes, constants, &before)) {
+            *to = d.value as f32;
+        }
         let sum = |of: fn(&Outcome) -> f64| outcomes.iter().map(of).sum::<f64>() as f32;
         for (partials, sum) in [
             (slices.l1_partials, sum(|of| of.difference.value)),
@@ -172,13 +181,13 @@ impl Reference for Kernel {
     }
 
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
-        let outcomes = outcomes(params, constants, &slices);
+        let outcomes = outcomes(params, &slices);
         let chain = chain(0) + f64::from(constants.columns * constants.rows);
         let sum = |of: fn(&Outcome) -> Rounded| {
             Tolerance::Sum(Rounded::sum(chain, outcomes.iter().map(of)).bound())
         };
         Tolerances {
-            d_render: outcomes.iter().map(|of| of.gradient).collect(),
+            d_render: accumulated(&outcomes, constants, slices.d_render).collect(),
             l1_partials: sum(|of| of.difference),
             ssim_partials: sum(|of| of.ssim),
         }

@@ -14,7 +14,7 @@ use crate::networks::lpips::{Lpips, Measure};
 use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::image::Image;
 use crate::photographs::metrics::{self, Scores};
-use crate::photographs::tone::{ToneCurve, ToneSettings};
+use crate::photographs::tone::{Scene, ToneCurve, ToneSettings};
 use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
 use crate::splats::scene::{DeviceGaussians, Feature, Gaussians, Shape};
 use crate::train::{Networks, Rendered, TestTargets, TrainConfig};
@@ -79,9 +79,29 @@ impl Yardstick {
     /// # Errors
     /// Every photograph is as good as black, one can no longer be read, or the device is out of memory or lost.
     pub fn of(gpu: &Gpu, tone: &ToneSettings, dataset: &Dataset) -> Result<Self> {
+        Self::made_by(tone, dataset, || TestTargets::new(gpu, tone, dataset))
+    }
+
+    /// The same where the scene of the training photographs is known.
+    ///
+    /// # Errors
+    /// The device is out of memory.
+    pub fn in_scene(
+        gpu: &Gpu,
+        tone: &ToneSettings,
+        dataset: &Dataset,
+        scene: &Scene,
+    ) -> Result<Self> {
+        Self::made_by(tone, dataset, || TestTargets::in_scene(gpu, tone, scene))
+    }
+
+    fn made_by(
+        tone: &ToneSettings,
+        dataset: &Dataset,
+        targets: impl FnOnce() -> Result<TestTargets>,
+    ) -> Result<Self> {
         let against = Self::kind(tone, dataset);
-        let is_made = against != Against::References;
-        let targets = is_made.then(|| TestTargets::new(gpu, tone, dataset)).transpose()?;
+        let targets = (against != Against::References).then(targets).transpose()?;
         Ok(Self { against, targets, made: BTreeMap::new() })
     }
 

@@ -16,7 +16,7 @@ mod tensorboard;
 mod train;
 
 pub use directory::{Progress, RunDirectory, load_progress};
-pub use done::done_steps;
+pub use done::{done_steps, done_steps_by_stamp};
 pub use events::{Event, Trained};
 #[cfg(feature = "cli")]
 pub(crate) use files::{ENDED, HELD_OUT_COURSE, SPENT, TARGET_EXPOSURE};

@@ -8,15 +8,18 @@
 //! Counts stay on the device. Where the intersections of a view exceed the memory reserved for them, a status flag is
 //! raised, nothing is rendered or updated, and the host grows the buffers and redoes the step ([`Renderer::grow`]).
 
+mod cameras;
 mod frame;
 mod limits;
 mod pictures;
 mod room;
 mod settings;
 
+use std::collections::BTreeMap;
+
 use glam::{UVec2, Vec2};
 
-use crate::camera::Patch;
+use crate::camera::CameraModel;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Statistic, Threads, Tile};
 use crate::kernels::project::DEPTH_BITS;
 use crate::kernels::splat::MAX_CHANNELS;
@@ -28,6 +31,7 @@ use crate::splats::scene::{GaussianSlice, Layout, Shape};
 use crate::splats::sort::{Count, RadixSort};
 use crate::{Error, Result};
 
+pub use cameras::{Viewpoint, Viewpoints};
 #[doc(hidden)]
 pub use frame::Frame;
 pub use frame::Status;
@@ -90,12 +94,12 @@ pub struct Renderer {
     tile: Tile,
     /// The most splats of one tile that the blending kernels follow.
     longest_run: u32,
-    project: Pipeline<project::Kernel>,
+    /// By camera model; those of a model come with the first view of it, a pinhole's at once.
+    projections: BTreeMap<u32, Projections>,
     order_counts: Pipeline<order_counts::Kernel>,
     emit: Pipeline<emit::Kernel>,
     blend_forward: Pipeline<blend_forward::Kernel>,
     blend_backward: Pipeline<blend_backward::Kernel>,
-    project_backward: Pipeline<project_backward::Kernel>,
     depth_sort: RadixSort,
     tile_sort: RadixSort,
     frame: Frame,
@@ -111,7 +115,8 @@ impl Renderer {
         let Tile { size: [tile_width, tile_height], subgroups: subgroups_per_tile } = tile;
         let channels = settings.channels() as u32;
         let (alpha_max, partition_size) = (settings.max_alpha, RANKS_PER_PARTITION);
-        let (project, project_backward) = projections(gpu, &settings, tile.size)?;
+        let pinhole = CameraModel::Pinhole.number();
+        let projections = Projections::new(gpu, &settings, tile.size, pinhole)?;
         let shaping_channels = settings.shaping_channels();
         let (skips_groups, splats_per_turn) = (!gpu.properties().is_cpu, splats_per_turn(gpu));
         // What every kernel that includes `splat.glsl` is specialised with, and what some are beside it.
@@ -125,7 +130,7 @@ impl Renderer {
             settings,
             tile,
             longest_run: longest_run(gpu),
-            project,
+            projections: BTreeMap::from([(pinhole, projections)]),
             order_counts: gpu.pipeline(&order_counts::Constants { partition_size })?,
             emit: gpu.pipeline(&constants!(emit, partition_size))?,
             blend_forward: gpu.pipeline(&constants!(
@@ -141,7 +146,6 @@ impl Renderer {
                 splats_per_turn,
                 subgroups_per_tile
             ))?,
-            project_backward,
             depth_sort: RadixSort::new(gpu, 0)?,
             tile_sort: RadixSort::new(gpu, 0)?,
             frame: Frame::new(gpu, settings.channels())?,
@@ -158,7 +162,10 @@ impl Renderer {
         }
         let shape = Shape { sh_degree, ..self.settings.shape };
         let settings = RenderSettings { shape, ..self.settings };
-        (self.project, self.project_backward) = projections(&self.gpu, &settings, self.tile.size)?;
+        let own = |&model: &u32| {
+            Ok((model, Projections::new(&self.gpu, &settings, self.tile.size, model)?))
+        };
+        self.projections = self.projections.keys().map(own).collect::<Result<_>>()?;
         self.settings = settings;
         Ok(())
     }
@@ -218,22 +225,27 @@ impl Renderer {
         pass.fill(&mut self.frame.status, 0);
     }
 
-    /// Records the render of `gaussians` as a camera sees them, or a patch of what it sees.
+    /// Records the render of `gaussians` as a camera sees them, or a patch of what it sees. The first view of a camera model
+    /// builds the kernels for it.
     ///
     /// # Errors
-    /// The Gaussians are not made of what the settings say; they or the image exceed what was reserved; or a pass exceeds what
-    /// the device launches.
+    /// The Gaussians are not made of what the settings say; they or the image exceed what was reserved; a pass exceeds what
+    /// the device launches; or the driver refuses a kernel.
     pub fn forward<'a>(
         &mut self,
         pass: &mut Recorder<'_>,
         gaussians: impl Into<GaussianSlice<'a>>,
-        patch: impl Into<Patch>,
+        viewpoint: impl Into<Viewpoint<'a>>,
         options: &RenderOptions,
     ) -> Result<()> {
-        let (gaussians, view) = (gaussians.into(), self.view(&patch.into())?);
+        let (gaussians, viewpoint) = (gaussians.into(), viewpoint.into());
         self.check(&gaussians.layout)?;
+        let view = self.view(&viewpoint)?;
         let gaussian_count = gaussians.layout.count as u32;
         pass.fill(&mut self.frame.gaussian_counts, gaussian_count);
+        if viewpoint.on_device.is_none() {
+            pass.update(&mut self.frame.camera, &[(&viewpoint.patch).into()])?;
+        }
         self.record_project(pass, gaussians, &view, options.sh_degree)?;
         self.record_bins(pass, gaussian_count, &view)?;
         let mut background = [0.0; MAX_CHANNELS as usize];
@@ -242,7 +254,7 @@ impl Renderer {
         pass.dispatch(
             &self.blend_forward,
             &blend_forward::Params {
-                size: view.camera.size,
+                size: view.size,
                 tile_columns: view.tiles.x,
                 longest_run: self.longest_run,
                 background,
@@ -263,7 +275,8 @@ impl Renderer {
         )
     }
 
-    /// Records the gradients of the Gaussians, given `d_render`, that of the render recorded last (channels, H, W).
+    /// Records the gradients of the Gaussians, given `d_render`, that of the render recorded last (channels, H, W), which was
+    /// of the same viewpoint.
     ///
     /// # Errors
     /// The Gaussians are not made of what the settings say, or a pass exceeds what the device launches.
@@ -272,19 +285,19 @@ impl Renderer {
         &mut self,
         pass: &mut Recorder<'_>,
         gaussians: impl Into<GaussianSlice<'a>>,
-        patch: impl Into<Patch>,
+        viewpoint: impl Into<Viewpoint<'a>>,
         options: &RenderOptions,
         damping: Damping,
         d_render: &Buffer<f32>,
         gradients: Gradients<'_>,
     ) -> Result<()> {
-        let (gaussians, view) = (gaussians.into(), self.view(&patch.into())?);
+        let (gaussians, view) = (gaussians.into(), self.view(&viewpoint.into())?);
         self.check(&gaussians.layout)?;
         let color_vectors = color_vectors(self.settings.channels());
         let frame = &mut self.frame;
         pass.dispatch(
             &self.blend_backward,
-            &blend_backward::Params { size: view.camera.size, tile_columns: view.tiles.x },
+            &blend_backward::Params { size: view.size, tile_columns: view.tiles.x },
             blend_backward::Buffers {
                 tile_ranges: frame.tile_ranges.slice(),
                 sorted_slots: frame.slots.slice(),
@@ -298,12 +311,13 @@ impl Renderer {
             Threads::Workgroups([view.tile_count(), 1, 1]),
         )?;
         let GaussianSlice { layout, parameters } = gaussians;
+        let project_backward = &self.projections[&view.model].backward;
         for batch in layout.batches(&self.gpu).iter() {
             let gaussian_count = batch.gaussian_count();
             pass.dispatch(
-                &self.project_backward,
+                project_backward,
                 &project_backward::Params {
-                    camera: view.camera,
+                    camera_index: view.camera_index,
                     half_view: view.half_view,
                     gaussian_count,
                     sh_degree: options.sh_degree,
@@ -321,6 +335,7 @@ impl Renderer {
                     gradients: batch.planes_mut(&mut *gradients.parameters)?,
                     grad_norm_sums: batch.rows_mut(&mut *gradients.grad_norm_sums, 1)?,
                     visit_counts: batch.rows_mut(&mut *gradients.visit_counts, 1)?,
+                    cameras: view.cameras.unwrap_or(&frame.camera).slice(),
                 },
                 Threads::Exactly([gaussian_count, 1, 1]),
             )?;
@@ -332,16 +347,17 @@ impl Renderer {
         &mut self,
         pass: &mut Recorder<'_>,
         GaussianSlice { layout, parameters }: GaussianSlice<'_>,
-        view: &View,
+        view: &View<'_>,
         sh_degree: u32,
     ) -> Result<()> {
         let color_vectors = color_vectors(self.settings.channels());
         let frame = &mut self.frame;
+        let project = &self.projections[&view.model].forward;
         layout.batches(&self.gpu).iter().try_for_each(|batch| {
             pass.dispatch(
-                &self.project,
+                project,
                 &project::Params {
-                    camera: view.camera,
+                    camera_index: view.camera_index,
                     near: self.settings.near,
                     gaussian_count: batch.gaussian_count(),
                     sh_degree,
@@ -354,6 +370,7 @@ impl Renderer {
                     depth_keys: batch.rows_mut(&mut frame.depth_keys, 1)?,
                     ids: batch.rows_mut(&mut frame.ids, 1)?,
                     tile_counts: batch.rows_mut(&mut frame.tile_counts, 1)?,
+                    cameras: view.cameras.unwrap_or(&frame.camera).slice(),
                 },
                 Threads::Exactly([batch.gaussian_count(), 1, 1]),
             )
@@ -386,7 +403,7 @@ impl Renderer {
         &mut self,
         pass: &mut Recorder<'_>,
         gaussian_count: u32,
-        view: &View,
+        view: &View<'_>,
     ) -> Result<()> {
         let frame = &mut self.frame;
         let all = Count { counts: &frame.gaussian_counts, index: 0 };
@@ -407,7 +424,7 @@ impl Renderer {
         )?;
         pass.dispatch(
             &self.emit,
-            &emit::Params { size: view.camera.size, gaussian_count, tile_columns: view.tiles.x },
+            &emit::Params { size: view.size, gaussian_count, tile_columns: view.tiles.x },
             emit::Buffers {
                 counts: frame.counts.slice(),
                 sorted_ids: frame.ids.slice(),
@@ -434,7 +451,8 @@ impl Renderer {
         (size + tile - 1) / tile
     }
 
-    fn view(&self, patch: &Patch) -> Result<View> {
+    fn view<'a>(&mut self, viewpoint: &Viewpoint<'a>) -> Result<View<'a>> {
+        let Viewpoint { patch, on_device } = viewpoint;
         let tiles = self.tiles(patch.size);
         if self.settings.channels() * patch.pixel_count() > self.frame.render.len()
             || (tiles.x * tiles.y) as usize > self.frame.tile_ranges.len()
@@ -443,48 +461,65 @@ impl Renderer {
             let what = format!("a {width}x{height} image exceeds what the renderer reserved");
             return Err(Error::Usage(what));
         }
-        Ok(View { camera: patch.into(), half_view: patch.half_view(), tiles })
+        let model = patch.camera.model.number();
+        if !self.projections.contains_key(&model) {
+            let own = Projections::new(&self.gpu, &self.settings, self.tile.size, model)?;
+            self.projections.insert(model, own);
+        }
+        let (cameras, camera_index) = on_device.unzip();
+        let camera_index = camera_index.unwrap_or_default();
+        let (size, half_view) = (patch.size, patch.half_view());
+        Ok(View { model, cameras, camera_index, size, half_view, tiles })
     }
 }
 
-/// The kernels that read the Gaussians: of all kernels these alone know their SH degree.
-fn projections(
-    gpu: &Gpu,
-    settings: &RenderSettings,
-    [tile_width, tile_height]: [u32; 2],
-) -> Result<(Pipeline<project::Kernel>, Pipeline<project_backward::Kernel>)> {
-    let (channels, alpha_max) = (settings.channels() as u32, settings.max_alpha);
-    let (sh_degree, raw_colors) = (settings.shape.sh_degree, settings.raw_colors);
-    let half_rest = settings.rest == StorageFormat::Half;
-    let project = project::Constants {
-        channels,
-        alpha_max,
-        tile_width,
-        tile_height,
-        sh_degree,
-        raw_colors,
-        half_rest,
-    };
-    let project_backward = project_backward::Constants {
-        channels,
-        alpha_max,
-        tile_width,
-        tile_height,
-        sh_degree,
-        raw_colors,
-        half_rest,
-    };
-    Ok((gpu.pipeline(&project)?, gpu.pipeline(&project_backward)?))
+/// The kernels that read Gaussians and camera: of all kernels these alone know the SH degree and the camera model.
+#[derive(Debug)]
+struct Projections {
+    forward: Pipeline<project::Kernel>,
+    backward: Pipeline<project_backward::Kernel>,
 }
 
-/// A patch as the kernels take it, and the columns and rows of tiles of its image.
-struct View {
-    camera: kernels::Camera,
+impl Projections {
+    fn new(
+        gpu: &Gpu,
+        settings: &RenderSettings,
+        [tile_width, tile_height]: [u32; 2],
+        camera_model: u32,
+    ) -> Result<Self> {
+        let (channels, alpha_max) = (settings.channels() as u32, settings.max_alpha);
+        let (sh_degree, raw_colors) = (settings.shape.sh_degree, settings.raw_colors);
+        let half_rest = settings.rest == StorageFormat::Half;
+        macro_rules! pipeline {
+            ($kernel:ident) => {
+                gpu.pipeline(&$kernel::Constants {
+                    channels,
+                    alpha_max,
+                    tile_width,
+                    tile_height,
+                    sh_degree,
+                    raw_colors,
+                    half_rest,
+                    camera_model,
+                })?
+            };
+        }
+        Ok(Self { forward: pipeline!(project), backward: pipeline!(project_backward) })
+    }
+}
+
+/// A viewpoint as the kernels take it, and the columns and rows of tiles of its image.
+struct View<'a> {
+    model: u32,
+    /// None: those of the renderer.
+    cameras: Option<&'a Buffer<kernels::Camera>>,
+    camera_index: u32,
+    size: UVec2,
     half_view: Vec2,
     tiles: UVec2,
 }
 
-impl View {
+impl View<'_> {
     fn tile_count(&self) -> u32 {
         self.tiles.x * self.tiles.y
     }

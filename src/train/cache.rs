@@ -3,6 +3,7 @@
 //! The file holds them as the device had them, so that the cache changes no bit. It has no name where the system allows
 //! that, and goes with the run.
 
+use std::collections::BTreeSet;
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
@@ -10,8 +11,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use serde::{Deserialize, Serialize};
 
-use super::precision::{Decoder, Photograph};
-use crate::gpu::{Buffer, Gpu, Recorder};
+use crate::gpu::Gpu;
+use crate::photographs::pseudo_gt::Encoded;
 use crate::{Error, Result};
 
 /// The fraction of the device's memory, and of the machine's, that photographs take where nothing else is asked for.
@@ -97,6 +98,9 @@ fn host_memory() -> Option<u64> {
 #[derive(Debug)]
 pub(super) struct Cache {
     gpu: Gpu,
+    kept: Vec<Kept>,
+    /// Those on the device, by when they were asked for last.
+    on_device: BTreeSet<(u64, usize)>,
     budget: u64,
     /// Bytes that are on the device.
     taken: u64,
@@ -107,42 +111,73 @@ pub(super) struct Cache {
     spool: Option<Arc<Spool>>,
 }
 
+/// The place of a photograph in the cache.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Slot(usize);
+
 /// A photograph on the device, in the file, or both.
 #[derive(Debug)]
 pub(super) struct Kept {
-    on_device: Option<Photograph>,
+    on_device: Option<Arc<Encoded>>,
     in_file: Option<InFile>,
-    value_count: usize,
-    decoded_len: usize,
     bytes: u64,
     /// When it was asked for last.
     asked: u64,
 }
 
 impl Cache {
-    /// One of so many bytes on the device; what does not fit lies in `folder`, or where the system has temporary files.
+    /// One of `budget` bytes on the device; what does not fit lies in `folder`, or where the system has temporary files.
     pub(super) fn new(gpu: &Gpu, budget: u64, folder: Option<PathBuf>) -> Self {
-        Self { gpu: gpu.clone(), budget, taken: 0, clock: 0, folder, spool: None }
+        let (kept, on_device) = (vec![], BTreeSet::new());
+        Self { gpu: gpu.clone(), kept, on_device, budget, taken: 0, clock: 0, folder, spool: None }
     }
 
     /// Takes in a photograph, which stays on the device where there is room.
     ///
     /// # Errors
     /// The file cannot be written, or the device was lost.
-    pub(super) fn keep(&mut self, photograph: Photograph) -> Result<Kept> {
-        let mut kept = Kept {
+    pub(super) fn keep(&mut self, photograph: Encoded) -> Result<Slot> {
+        let place = self.kept.len();
+        let bytes = photograph.bytes();
+        self.kept.push(Kept {
             in_file: None,
-            value_count: photograph.len(),
-            decoded_len: photograph.decoded_len(),
-            bytes: photograph.bytes(),
+            bytes,
             asked: 0,
-            on_device: Some(photograph),
-        };
-        self.taken += kept.bytes;
+            on_device: Some(Arc::new(photograph)),
+        });
+        self.on_device.insert((0, place));
+        self.taken += bytes;
         if self.taken > self.budget {
-            self.put_away(&mut kept)?;
+            self.put_away(place)?;
         }
-        Ok(kept)
+        Ok(Slot(place))
+    }
+
+    /// What a photograph takes on the device.
+    pub(super) fn bytes(&self, Slot(place): Slot) -> u64 {
+        self.kept[place].bytes
+    }
+
+    /// A photograph that is on the device.
+    ///
+    /// # Errors
+    /// It was not brought there.
+    pub(super) fn on_device(&self, Slot(place): Slot) -> Result<&Encoded> {
+        let absent =
+            || Error::Usage("a photograph is trained on that is not on the device".to_owned());
+        self.kept[place].on_device.as_deref().ok_or_else(absent)
+    }
+
+    /// A photograph, wherever it lies.
+    ///
+    /// # Errors
+    /// The file cannot be read, or the device is out of memory or lost.
+    pub(super) fn load(&self, Slot(place): Slot) -> Result<Arc<Encoded>> {
+        match &self.kept[place] {
+            Kept { on_device: Some(photograph), .. } => Ok(Arc::clone(photograph)),
+            Kept { in_file: Some(in_file), .. } => Ok(Arc::new(in_file.load(&self.gpu)?)),
+            _ => Err(Error::Usage("a photograph is gone".to_owned())),
+        }
     }
 
     /// Whether everything taken in so far is on the device, and always will be.
@@ -155,38 +190,44 @@ impl Cache {
         self.budget
     }
 
-    /// Brings `wanted` of `all` to the device, in place of those that were not asked for the longest; they stay there until
-    /// the next call.
+    /// Brings `wanted` to the device, in place of those that were not asked for the longest; they stay there until the next
+    /// call.
     ///
     /// # Errors
     /// The file cannot be read or written, or the device is out of memory or lost.
-    pub(super) fn bring(&mut self, all: &mut [&mut Kept], wanted: &[usize]) -> Result<()> {
+    pub(super) fn bring(&mut self, wanted: &[Slot]) -> Result<()> {
         self.clock += 1;
-        for &place in wanted {
-            all[place].asked = self.clock;
+        for &Slot(place) in wanted {
+            let kept = &mut self.kept[place];
+            if self.on_device.remove(&(kept.asked, place)) {
+                self.on_device.insert((self.clock, place));
+            }
+            kept.asked = self.clock;
         }
-        for &place in wanted {
-            if all[place].on_device.is_some() {
-                continue;
+        for &Slot(place) in wanted {
+            let Kept { on_device: None, bytes, .. } = self.kept[place] else { continue };
+            while self.taken + bytes > self.budget {
+                let oldest = self.on_device.first().copied();
+                let Some((_, idle)) = oldest.filter(|(asked, _)| *asked < self.clock) else {
+                    break;
+                };
+                self.put_away(idle)?;
             }
-            while self.taken + all[place].bytes > self.budget {
-                let idle = all.iter_mut().filter(|kept| kept.on_device.is_some());
-                let idle = idle.filter(|kept| kept.asked < self.clock);
-                let Some(oldest) = idle.min_by_key(|kept| kept.asked) else { break };
-                self.put_away(oldest)?;
-            }
-            let kept = &mut all[place];
+            let kept = &mut self.kept[place];
             if let Some(in_file) = &kept.in_file {
-                kept.on_device = Some(in_file.load(&self.gpu)?);
-                self.taken += kept.bytes;
+                kept.on_device = Some(Arc::new(in_file.load(&self.gpu)?));
+                self.on_device.insert((self.clock, place));
+                self.taken += bytes;
             }
         }
         Ok(())
     }
 
-    /// Takes a photograph off the device, behind writing it to the file the first time.
-    fn put_away(&mut self, kept: &mut Kept) -> Result<()> {
+    /// Takes a photograph off the device, after it has been written to the file the first time.
+    fn put_away(&mut self, place: usize) -> Result<()> {
+        let kept = &mut self.kept[place];
         let Some(photograph) = kept.on_device.take() else { return Ok(()) };
+        self.on_device.remove(&(kept.asked, place));
         if kept.in_file.is_none() {
             let spool = match &self.spool {
                 Some(spool) => Arc::clone(spool),
@@ -208,102 +249,45 @@ impl Cache {
     }
 }
 
-impl Kept {
-    /// How many values it has.
-    pub(super) fn len(&self) -> usize {
-        self.value_count
-    }
-
-    /// How many floats have to be there to decode it to.
-    pub(super) fn decoded_len(&self) -> usize {
-        self.decoded_len
-    }
-
-    /// What it takes on the device.
-    pub(super) fn bytes(&self) -> u64 {
-        self.bytes
-    }
-
-    /// Its values: as they are, or decoded into `scratch`, which is as long or longer.
-    ///
-    /// # Errors
-    /// `scratch` is shorter, or the photograph was not brought to the device.
-    pub(super) fn decoded<'a>(
-        &'a self,
-        pass: &mut Recorder<'_>,
-        scratch: &'a mut Buffer<f32>,
-    ) -> Result<&'a Buffer<f32>> {
-        let absent =
-            || Error::Usage("a photograph is trained on that is not on the device".to_owned());
-        self.on_device.as_ref().ok_or_else(absent)?.decoded(pass, scratch)
-    }
-
-    /// Its values in a buffer of their own, or in the one that it is; wherever it lies.
-    ///
-    /// # Errors
-    /// The file cannot be read, or the device is out of memory or lost.
-    pub(super) fn whole(&self, gpu: &Gpu) -> Result<Arc<Buffer<f32>>> {
-        match (&self.on_device, &self.in_file) {
-            (None, Some(in_file)) => in_file.load(gpu)?.whole(gpu),
-            (Some(photograph), _) => photograph.whole(gpu),
-            (None, None) => Err(Error::Usage("a photograph is gone".to_owned())),
-        }
-    }
-}
-
 /// Where a photograph lies in the file.
 #[derive(Debug)]
 struct InFile {
     spool: Arc<Spool>,
     name: String,
     offset: u64,
-    /// Codes, or the values themselves.
-    word_count: usize,
+    code_bits: u32,
     value_count: usize,
-    /// What codes stand for lies behind them.
-    palette: Option<(Arc<Decoder>, usize)>,
+    /// Words of codes, and what they stand for after them.
+    lens: [usize; 2],
 }
 
 impl InFile {
-    fn save(gpu: &Gpu, photograph: &Photograph, spool: &Arc<Spool>) -> Result<Self> {
-        let (name, words, palette, decoder) = match photograph {
-            Photograph::Plain(buffer) => {
-                let words = gpu.read(&**buffer)?.into_iter().map(f32::to_bits).collect();
-                (buffer.name(), words, vec![], None)
-            }
-            Photograph::Coded(coded) => {
-                let palette = gpu.read(&*coded.values)?;
-                let words = gpu.read(&coded.codes)?;
-                (coded.codes.name(), words, palette, Some(Arc::clone(&coded.decoder)))
-            }
-        };
-        let offset =
-            spool.append(&[bytemuck::cast_slice(&words), bytemuck::cast_slice(&palette)])?;
+    fn save(gpu: &Gpu, photograph: &Encoded, spool: &Arc<Spool>) -> Result<Self> {
+        let Encoded { code_bits, value_count, codes, values } = photograph;
+        let name = if codes.is_empty() { values.name() } else { codes.name() }.to_owned();
+        let (codes, values) = (gpu.read(codes)?, gpu.read(&**values)?);
+        let parts = [bytemuck::cast_slice(&codes), bytemuck::cast_slice(&values)];
         Ok(Self {
             spool: Arc::clone(spool),
-            name: name.to_owned(),
-            offset,
-            word_count: words.len(),
-            value_count: photograph.len(),
-            palette: decoder.map(|decoder| (decoder, palette.len())),
+            name,
+            offset: spool.append(&parts)?,
+            code_bits: *code_bits,
+            value_count: *value_count,
+            lens: [codes.len(), values.len()],
         })
     }
 
-    fn load(&self, gpu: &Gpu) -> Result<Photograph> {
-        let Self { spool, name, offset, word_count, value_count, palette } = self;
-        let Some((decoder, palette_len)) = palette else {
-            let values: Vec<f32> = spool.read(*offset, *word_count)?;
-            return Ok(Photograph::Plain(Arc::new(gpu.buffer(name, &values)?)));
-        };
-        let words: Vec<u32> = spool.read(*offset, *word_count)?;
-        let behind = offset + size_of_val(words.as_slice()) as u64;
-        let values: Vec<f32> = spool.read(behind, *palette_len)?;
-        Ok(Photograph::Coded(super::precision::Coded {
-            decoder: Arc::clone(decoder),
-            value_count: *value_count,
-            codes: gpu.buffer(name, &words)?,
-            values: Arc::new(gpu.buffer("palette", &values)?),
-        }))
+    fn load(&self, gpu: &Gpu) -> Result<Encoded> {
+        let &Self { ref spool, ref name, offset, code_bits, value_count, lens } = self;
+        let codes: Vec<u32> = spool.read(offset, lens[0])?;
+        let values: Vec<f32> =
+            spool.read(offset + size_of_val(codes.as_slice()) as u64, lens[1])?;
+        Ok(Encoded {
+            code_bits,
+            value_count,
+            codes: gpu.buffer(name, &codes)?,
+            values: Arc::new(gpu.buffer(if codes.is_empty() { name } else { "palette" }, &values)?),
+        })
     }
 }
 
@@ -343,16 +327,18 @@ impl Spool {
 
 fn unusable(folder: &Path, error: &std::io::Error) -> Error {
     let problem = format!(
-        "cannot hold the photographs that exceed the cache ({error}); raise `TrainConfig::cache` or make room on the disk"
+        "cannot hold the photographs that exceed the cache ({error}); raise cache or make room on the disk"
     );
     Error::output(folder, problem)
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::precision::Darkroom;
+    use super::super::precision::Encoder;
     use super::*;
     use crate::gpu::testing::gpu;
+    use crate::photographs::pseudo_gt::PseudoGt;
+    use crate::photographs::tone::ToneSettings;
     use crate::train::PhotographBits;
 
     #[test]
@@ -377,6 +363,18 @@ mod tests {
     #[test]
     fn whatever_the_cache_holds_every_photograph_comes_back_bit_for_bit() {
         let gpu = gpu();
+        let pseudo_gt = PseudoGt::new(&gpu, &ToneSettings::default()).unwrap();
+        let decoded = |photograph: &Encoded| {
+            let mut scratch = gpu.uninit("decoded", 9000).unwrap();
+            let mut plain = None;
+            gpu.run("decode", |pass| {
+                let decoded = pseudo_gt.record(pass, photograph, None, &mut scratch)?;
+                plain = Some(pass.download(decoded)?);
+                Ok(())
+            })
+            .unwrap();
+            plain.unwrap().wait().unwrap()
+        };
         // Few different values are coded in 8 bits, more in 16, most not at all.
         let values = |photograph: usize| -> Vec<f32> {
             let different = [7, 700, 100_000][photograph % 3];
@@ -384,33 +382,26 @@ mod tests {
         };
         for budget in [0, 40_000, 1 << 30] {
             let mut cache = Cache::new(&gpu, budget, None);
-            let mut darkroom = Darkroom::new(&gpu, PhotographBits::Exact);
-            let kept = (0..7).map(|i| cache.keep(darkroom.upload("low", &values(i)).unwrap()));
-            let mut kept = kept.collect::<Result<Vec<_>>>().unwrap();
+            let mut encoder = Encoder::new(&gpu, PhotographBits::Exact);
+            let kept = (0..7).map(|i| cache.keep(encoder.upload("low", &values(i)).unwrap()));
+            let slots = kept.collect::<Result<Vec<_>>>().unwrap();
             assert_eq!(cache.holds_all(), budget == 1 << 30);
             for wanted in [&[0, 1][..], &[6], &[5, 2], &[3], &[0, 4], &[2]] {
-                let mut all: Vec<&mut Kept> = kept.iter_mut().collect();
-                cache.bring(&mut all, wanted).unwrap();
+                let of_wanted: Vec<Slot> = wanted.iter().map(|&place| slots[place]).collect();
+                cache.bring(&of_wanted).unwrap();
                 for &place in wanted {
-                    let mut scratch = gpu.uninit("decoded", 9000).unwrap();
-                    let mut plain = None;
-                    gpu.run("decode", |pass| {
-                        let decoded = kept[place].decoded(pass, &mut scratch)?;
-                        plain = Some(pass.download(decoded)?);
-                        Ok(())
-                    })
-                    .unwrap();
-                    let decoded = plain.unwrap().wait().unwrap();
-                    assert!(decoded[..9000] == values(place), "{budget}: {place}");
+                    let brought = cache.on_device(slots[place]).unwrap();
+                    assert!(decoded(brought) == values(place), "{budget}: {place}");
                 }
+                let kept = &cache.kept;
                 let on_device: u64 =
-                    kept.iter().filter(|one| one.on_device.is_some()).map(Kept::bytes).sum();
+                    kept.iter().filter(|one| one.on_device.is_some()).map(|one| one.bytes).sum();
                 assert_eq!(on_device, cache.taken);
-                let asked: u64 = wanted.iter().map(|&place| kept[place].bytes()).sum();
+                let asked: u64 = wanted.iter().map(|&place| kept[place].bytes).sum();
                 assert!(cache.taken <= budget.max(asked), "{} of {budget}", cache.taken);
             }
-            for (place, kept) in kept.iter().enumerate() {
-                assert!(gpu.read(&*kept.whole(&gpu).unwrap()).unwrap() == values(place));
+            for (place, &slot) in slots.iter().enumerate() {
+                assert!(decoded(&cache.load(slot).unwrap()) == values(place));
             }
         }
     }

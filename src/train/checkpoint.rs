@@ -243,7 +243,7 @@ impl Trainer {
     /// The header of a checkpoint that this run can go on from, and the settings in it.
     fn header_of(&self, path: &Path, file: &TensorFile<'_>) -> Result<(Header, TrainConfig)> {
         let refused = |problem: String| Error::input(path, problem);
-        let anew = "begin anew with `HeldRun::Replace`";
+        let anew = "begin anew with --overwrite";
         let header = file.note(HEADER).and_then(|header| serde_json::from_str(header).ok());
         let Some(header) = header.filter(|h: &Header| h.format == FORMAT) else {
             return Err(refused(format!("is no `{FORMAT}`; {anew}")));
@@ -271,7 +271,7 @@ impl Trainer {
         let steps = self.config.steps;
         if *step > steps {
             return Err(refused(format!(
-                "is at step {step}, this run ends at {steps}; raise `TrainConfig::steps`"
+                "is at step {step}, this run ends at {steps}; raise steps"
             )));
         }
         Ok((header, config))

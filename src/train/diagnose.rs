@@ -14,15 +14,16 @@ mod photograph;
 mod plan;
 mod sharpness;
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeSet, HashMap, HashSet};
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
 
 use rayon::prelude::*;
 use serde::Serialize;
 
 use crate::camera::Camera;
 use crate::photographs::dataset::{self, Dataset, LoadOptions, View};
-use crate::photographs::image::{Image, MIDDLE_GREY, Mask, files};
+use crate::photographs::image::{Image, MIDDLE_GREY, Mask, PictureFile, files};
 use crate::photographs::tone::{Exposure, LuminanceHistogram, is_black};
 use crate::{Error, Result};
 use geometry::Shared;
@@ -142,32 +143,54 @@ pub struct Diagnosis {
 }
 
 impl Diagnosis {
-    /// Looks at the training photographs of a dataset, as stored, and at what its cameras share. `options` are those that it
-    /// was loaded with.
+    /// Loads a dataset, and looks at its training photographs, as stored, while they are decoded, and at what its cameras
+    /// share.
+    ///
+    /// # Errors
+    /// As [`Dataset::load`], or every photograph is as good as black.
+    pub fn load(root: &Path, options: &LoadOptions) -> Result<(Dataset, Self)> {
+        let looked_at = Mutex::new(HashMap::new());
+        let look = |name: &str, image: &Image, mask: Option<&Mask>| {
+            let photograph = Photograph::of(image, mask);
+            let mut looked_at = looked_at.lock().unwrap_or_else(PoisonError::into_inner);
+            looked_at.insert(name.to_owned(), photograph);
+        };
+        let dataset = Dataset::load_and_look(root, options, Some(&look))?;
+        let looked_at = looked_at.into_inner().unwrap_or_else(PoisonError::into_inner);
+        let diagnosis = Self::with_photographs(&dataset, options, looked_at)?;
+        Ok((dataset, diagnosis))
+    }
+
+    /// The same of a dataset that is loaded, whose photographs are read anew; `options` are those that it was loaded with.
     ///
     /// # Errors
     /// Every photograph is as good as black, or one cannot be read any more.
     pub fn of(dataset: &Dataset, options: &LoadOptions) -> Result<Self> {
+        Self::with_photographs(dataset, options, HashMap::new())
+    }
+
+    /// Of photographs by name; those that are missing are read.
+    fn with_photographs(
+        dataset: &Dataset,
+        options: &LoadOptions,
+        mut known: HashMap<String, Photograph>,
+    ) -> Result<Self> {
         let views: Vec<(usize, &View)> =
             dataset.views.iter().enumerate().filter(|(_, view)| view.is_for_training()).collect();
         let (files, ..) = Dataset::listed(&dataset.root, options)?;
+        let by_name: HashMap<&str, &dataset::Photograph> =
+            files.iter().map(|file| (file.name.as_str(), file)).collect();
         let path = |view: &View| {
-            let file = files.iter().find(|file| file.name == view.name);
-            file.ok_or_else(|| {
+            by_name.get(view.name.as_str()).copied().ok_or_else(|| {
                 Error::input(&dataset.root, format!("no longer has photograph {}", view.name))
             })
         };
         let paths = views.iter().map(|(_, view)| path(view)).collect::<Result<Vec<_>>>()?;
         let shared = Shared::of(dataset, &views)?;
-        let area = |file: &&dataset::Photograph| {
-            Image::size_of(&file.input).map(|(w, h)| u64::from(w) * u64::from(h))
-        };
-        let largest = paths.iter().filter_map(|file| area(file).ok()).max().unwrap_or_default();
-        let (mut photographs, invert) = (vec![], options.invert_masks);
-        for files in paths.chunks(Image::decoded_at_once(largest)) {
-            let loaded = files.par_iter().map(|file| Photograph::load(file, invert));
-            photographs.extend(loaded.collect::<Result<Vec<_>>>()?);
-        }
+        let unknown = paths.iter().copied().filter(|file| !known.contains_key(&file.name));
+        known.extend(read(unknown.collect(), options)?);
+        let photographs = views.iter().filter_map(|(_, view)| known.remove(&view.name));
+        let photographs: Vec<Photograph> = photographs.collect();
         let exposure = Exposure::of(photographs.iter().map(|one| &one.histogram), None);
         let Some(exposure) = exposure else {
             let problem = "every training photograph is as good as black (99 % of its pixels are below 2 of 255); \
@@ -210,6 +233,25 @@ fn pixels(camera: &Camera) -> u64 {
     u64::from(camera.width) * u64::from(camera.height)
 }
 
+/// Reads photographs and looks at them; each with its name.
+fn read(
+    files: Vec<&dataset::Photograph>,
+    options: &LoadOptions,
+) -> Result<Vec<(String, Photograph)>> {
+    let area = |file: &&dataset::Photograph| {
+        Image::size_of(&file.input).map(|(w, h)| u64::from(w) * u64::from(h))
+    };
+    let largest = files.iter().filter_map(|file| area(file).ok()).max().unwrap_or_default();
+    let mut photographs = vec![];
+    for files in files.chunks(Image::decoded_at_once(largest)) {
+        let read = files
+            .par_iter()
+            .map(|file| Ok((file.name.clone(), Photograph::load(file, options.invert_masks)?)));
+        photographs.extend(read.collect::<Result<Vec<_>>>()?);
+    }
+    Ok(photographs)
+}
+
 /// A photograph and what was measured of it.
 struct Photograph {
     size: [u32; 2],
@@ -219,15 +261,20 @@ struct Photograph {
 
 impl Photograph {
     fn load(file: &dataset::Photograph, invert_masks: bool) -> Result<Self> {
-        let image = Image::load(&file.input)?;
-        let mask = Mask::load(&file.input, file.mask.as_deref(), invert_masks)?;
-        let counted = mask.map(|mask| mask.counted(&image));
+        let (image, alpha) = PictureFile::open(&file.input)?.decode()?;
+        let decoded = (&image, alpha.as_ref());
+        let mask = Mask::over(&file.input, decoded, file.mask.as_deref(), invert_masks)?;
+        Ok(Self::of(&image, mask.as_ref()))
+    }
+
+    fn of(image: &Image, mask: Option<&Mask>) -> Self {
+        let counted = mask.map(|mask| mask.counted(image));
         let counted = counted.as_deref().unwrap_or(&image.data);
-        Ok(Self {
+        Self {
             size: [image.width, image.height],
-            measured: Measured::of(&image, counted),
+            measured: Measured::of(image, counted),
             histogram: LuminanceHistogram::of(counted),
-        })
+        }
     }
 
     fn diagnosis(&self, name: &str, shared: &Shared, place: usize) -> ViewDiagnosis {
@@ -333,14 +380,14 @@ fn without_pose(
     dataset: &Dataset,
 ) -> Result<Vec<String>> {
     let folders: BTreeSet<&Path> = paths.iter().filter_map(|file| file.input.parent()).collect();
+    let of_views: HashSet<&Path> = files.iter().map(|file| file.input.as_path()).collect();
+    let posed: HashSet<&str> = dataset.views.iter().map(|view| view.name.as_str()).collect();
     let mut names = vec![];
     for folder in folders {
         let photographs = files::photographs_in(folder)?;
-        let is_a_views = |path: &&PathBuf| files.iter().any(|file| file.input == **path);
-        let others = photographs.iter().filter(|path| !is_a_views(path));
+        let others = photographs.iter().filter(|path| !of_views.contains(path.as_path()));
         let stems = others.filter_map(|path| path.file_stem()?.to_str());
-        let is_posed = |name: &&str| dataset.views.iter().any(|view| view.name == **name);
-        names.extend(stems.filter(|name| !is_posed(name)).map(str::to_owned));
+        names.extend(stems.filter(|name| !posed.contains(name)).map(str::to_owned));
     }
     Ok(names)
 }
@@ -369,9 +416,11 @@ fn remarks(
         }
     };
     say(names(&|place| views[place].is_black), "as good as black, left out of training");
-    let checksum = |place: usize| photographs[place].measured.checksum;
-    let repeats = |place: usize| (0..place).any(|other| checksum(other) == checksum(place));
-    say(names(&|place| repeats(place) && !views[place].is_black), "the same photograph as another");
+    let mut checksums = HashSet::new();
+    let is_new =
+        photographs.iter().map(|photograph| checksums.insert(photograph.measured.checksum));
+    let is_new: Vec<bool> = is_new.collect();
+    say(names(&|place| !is_new[place] && !views[place].is_black), "the same photograph as another");
     let blur = geometry::median(views.iter().filter_map(|view| view.blur).collect());
     let [times, more] = BLURRED;
     let is_blurred = |place: usize| {
@@ -387,4 +436,42 @@ fn remarks(
         remarks.push("all cameras stand in one spot: they tell no depth".to_owned());
     }
     remarks
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::testing::gpu;
+    use crate::photographs::dataset::synthetic::{self, SyntheticOptions};
+    use crate::photographs::image::openings;
+    use crate::photographs::tone::{ToneCurve, ToneSettings};
+    use crate::train::{CacheSize, TrainConfig, Trainer};
+
+    #[test]
+    fn a_photograph_is_opened_once_before_the_first_step() {
+        let set = SyntheticOptions { views: 9, width: 64, height: 48, ..Default::default() };
+        for (downscale, curve) in [
+            (1.0, ToneCurve::Auto),
+            (2.0, ToneCurve::Auto),
+            (1.0, ToneCurve::Ase),
+            (2.0, ToneCurve::Ase),
+        ] {
+            let folder = tempfile::tempdir().unwrap();
+            synthetic::write(folder.path(), &set).unwrap();
+            let config = TrainConfig {
+                dataset: folder.path().to_owned(),
+                tone: ToneSettings::new(curve),
+                cache: Some(CacheSize(1 << 28)),
+                downscale,
+                ..TrainConfig::default()
+            };
+            let (dataset, _) = Diagnosis::load(&config.dataset, &config.load_options()).unwrap();
+            Trainer::new(&gpu(), config, &dataset).unwrap();
+            let opened = openings::below(folder.path());
+            assert!(opened.len() >= 9, "{opened:?}");
+            for (path, count) in opened {
+                assert_eq!(count, 1, "{}: {downscale}, {curve:?}", path.display());
+            }
+        }
+    }
 }

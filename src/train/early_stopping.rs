@@ -9,110 +9,12 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::Trainer;
 use super::decisions::Score;
-use super::{TrainConfig, Trainer};
-use crate::{Error, Result};
+use crate::Result;
 
 /// Steps after a round of density control in which the held-out views are not scored: the model has settled by then.
 const SETTLING_DISTANCE: u64 = 50;
-
-/// When a run, or a part of it, ends before its last step. Scores are against targets, never against references.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct StopConfig {
-    /// The number of training views that are held out, an eighth of them at most; 0: none, and no run ends early.
-    pub views: usize,
-    /// The steps from one score of theirs to the next. A score that falls within 50 steps after a round of density control
-    /// is taken at the end of these.
-    pub every: u64,
-    /// dB. Once two scores in a row do not exceed the best before by this much, the run has converged: it settles
-    /// ([`crate::splats::optimizer::Schedule::settle_steps`]) and ends.
-    pub gain: f64,
-    /// dB. A run that ends worse than its best score by more than this keeps the model of that score.
-    pub margin: f64,
-    /// dB. Growth ends once four rounds of density control gain less than this for each doubling of the Gaussians; 0: it
-    /// goes on to its last step.
-    pub growth_gain: f64,
-    /// What is done about a view whose loss or gradient is not finite.
-    #[serde(skip_serializing_if = "NotFinite::is_stop")]
-    pub not_finite: NotFinite,
-    /// dB. The SH degree rises no further, and falls back, once the one in use gains less than this; 0: it always rises.
-    pub degree_gain: f64,
-}
-
-/// What is done about a view whose loss or gradient is NaN or infinite. The step that finds it changes nothing, either way.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum NotFinite {
-    /// The run ends with an error that names step, view and term.
-    #[default]
-    Stop,
-    /// The view is trained on no more.
-    SkipView,
-}
-
-impl NotFinite {
-    #[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes a reference")]
-    fn is_stop(&self) -> bool {
-        *self == Self::Stop
-    }
-}
-
-impl Default for StopConfig {
-    fn default() -> Self {
-        Self {
-            views: 0,
-            every: 250,
-            gain: 0.05,
-            margin: 0.25,
-            growth_gain: 0.0,
-            not_finite: NotFinite::Stop,
-            degree_gain: 0.0,
-        }
-    }
-}
-
-impl StopConfig {
-    /// Whether a run with these scores, in order, has converged.
-    pub fn has_converged(&self, scores: &[f64]) -> bool {
-        const PATIENCE: usize = 2;
-        let Some(before) = scores.len().checked_sub(PATIENCE).filter(|&before| before > 0) else {
-            return false;
-        };
-        let best = |of: &[f64]| of.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-        best(&scores[before..]) < best(&scores[..before]) + self.gain
-    }
-
-    /// The first of the settings that a resumed run may change in which `other` differs, with both values.
-    pub(super) fn change(&self, other: &Self) -> Option<String> {
-        let settings = [
-            ("every", self.every as f64, other.every as f64),
-            ("gain", self.gain, other.gain),
-            ("margin", self.margin, other.margin),
-        ];
-        let changed = settings.into_iter().find(|(_, before, now)| before != now);
-        changed.map(|(name, before, now)| format!("stop.{name} was {before} and is {now}"))
-    }
-
-    /// # Errors
-    /// [`Error::Usage`] names a value that makes no sense.
-    pub(super) fn check(&self) -> Result<()> {
-        let gain = |name, gain: f64| (name, gain, gain.is_finite() && gain >= 0.0, "0 or more");
-        let rules = [
-            ("stop.every", self.every as f64, self.every >= 1, "at least 1"),
-            gain("stop.gain", self.gain),
-            gain("stop.margin", self.margin),
-            gain("stop.growth_gain", self.growth_gain),
-            gain("stop.degree_gain", self.degree_gain),
-        ];
-        match rules.into_iter().find(|(_, _, holds, _)| !holds) {
-            Some((name, value, _, rule)) => {
-                Err(Error::Usage(format!("{name} is {value}; it must be {rule}")))
-            }
-            None => Ok(()),
-        }
-    }
-}
 
 /// Why a run has ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -148,13 +50,6 @@ impl std::fmt::Display for Ended {
         } else {
             write!(out, "; the model of step {best_step} is kept")
         }
-    }
-}
-
-impl TrainConfig {
-    /// The length of the settling phase: that of the schedule, or a third of a run that is short for it.
-    pub fn settling_steps(&self) -> u64 {
-        self.schedule.settle_steps.min(self.steps / 3)
     }
 }
 
@@ -313,9 +208,15 @@ mod tests {
     /// A trainer on a small set with a held-out view, after some steps and a score.
     fn scored(margin: f64) -> Trainer {
         let folder = tempfile::tempdir().unwrap();
-        let options = SyntheticOptions { views: 10, width: 32, height: 24, seed: 3 };
+        let options = SyntheticOptions {
+            views: 10,
+            width: 32,
+            height: 24,
+            seed: 3,
+            ..SyntheticOptions::default()
+        };
         synthetic::write(folder.path(), &options).unwrap();
-        let mut config = TrainConfig { steps: 20, ..TrainConfig::default() };
+        let mut config = TrainConfig { steps: 20, ..TrainConfig::bare() };
         (config.stop.views, config.stop.margin) = (1, margin);
         config.schedule.resolution_steps = [0, 0];
         let dataset = Dataset::load(folder.path(), &config.load_options()).unwrap();

@@ -1,71 +1,17 @@
 //! What is learned of the training views' exposures, and where they begin.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::{Path, PathBuf};
-use std::str::FromStr;
-
-use serde::{Deserialize, Serialize};
+use std::path::Path;
 
 use super::views::Views;
-use super::{TrainConfig, Trainer};
+use super::{Learning, TrainConfig, Trainer};
 use crate::camera::Camera;
-use crate::loss::exposure::{Affine, ExposureRates, table};
+use crate::loss::exposure::{Affine, table};
 use crate::photographs::dataset::{Dataset, LoadOptions, Photograph, View};
 use crate::photographs::image::{Image, exposure_value, linear_from_srgb, srgb_from_linear};
 use crate::photographs::pseudo_gt::PseudoGt;
-use crate::photographs::tone::Scene;
+use crate::photographs::tone::{Measured, Scene};
 use crate::{Error, Result};
-
-/// Whether something is learned.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Learning {
-    /// It is not there: no buffer, no kernel.
-    #[default]
-    Off,
-    /// It is.
-    On,
-}
-
-impl FromStr for Learning {
-    type Err = Error;
-
-    fn from_str(name: &str) -> Result<Self> {
-        match name {
-            "off" => Ok(Self::Off),
-            "on" => Ok(Self::On),
-            _ => Err(Error::Usage(format!("`{name}` is neither off nor on"))),
-        }
-    }
-}
-
-/// Gain and bias of each channel of each training view, [`crate::loss::exposure`].
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct ExposureConfig {
-    /// Whether they are learned.
-    pub learn: Learning,
-    /// A table of where they begin ([`table`]), in place of `exposures.csv` of the dataset.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub start: Option<PathBuf>,
-    /// Adam's learning rate.
-    pub rates: ExposureRates,
-}
-
-impl ExposureConfig {
-    /// # Errors
-    /// [`Error::Usage`] names a value that makes no sense.
-    pub(super) fn check(&self) -> Result<()> {
-        let ExposureRates { initial, last, .. } = self.rates;
-        for (name, rate) in [("initial", initial), ("last", last)] {
-            if !(rate.is_finite() && rate > 0.0) {
-                let problem = format!("exposure.rates.{name} is {rate}; it must be above 0");
-                return Err(Error::Usage(problem));
-            }
-        }
-        Ok(())
-    }
-}
 
 impl Trainer {
     /// What the exposure of each training view makes of the model, by name; none where exposures are not learned.
@@ -194,7 +140,7 @@ struct Targets<'a> {
 
 impl Targets<'_> {
     fn target(&mut self, photograph: &Image, camera: &Camera) -> Result<Image> {
-        let measured = self.pseudo_gt.measure(&photograph.data)?.seen_by(camera);
+        let measured = Measured::of(&photograph.data).seen_by(camera);
         let lift = self.pseudo_gt.settings().lift(self.scene, &measured);
         self.pseudo_gt.lifted(photograph, &lift)
     }
@@ -203,7 +149,9 @@ impl Targets<'_> {
     /// photograph without them nearest to the target of the photograph as it is. A curve that follows from each photograph
     /// takes much of the difference away before.
     fn affine_of_stops(&mut self, name: &str, stops: f64) -> Result<Affine> {
-        let view = self.dataset.train_views().find(|view| view.name == name);
+        let views = &self.dataset.views;
+        let place = views.binary_search_by(|view| view.name.as_str().cmp(name));
+        let view = place.ok().map(|place| &views[place]);
         let photograph = view.map(View::loaded).transpose()?.flatten();
         let Some((view, photograph)) = view.zip(photograph) else { return Ok(Affine::IDENTITY) };
         let scale = (-stops).exp2() as f32;

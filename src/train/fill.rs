@@ -7,6 +7,7 @@
 use glam::{DVec2, DVec3, Vec3};
 
 use super::model::Model;
+use super::patches::put_together;
 use super::views::TrainView;
 use super::{Trainer, streams};
 use crate::Result;
@@ -14,7 +15,6 @@ use crate::base::random::Stream;
 use crate::camera::{Camera, Patch};
 use crate::loss::exposure::{Affine, Exposures};
 use crate::photographs::image::Image;
-use crate::photographs::pseudo_gt::PseudoGt;
 use crate::splats::attributes::planes;
 use crate::splats::halves::StorageFormat;
 use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
@@ -100,7 +100,6 @@ impl Trainer {
             ..self.config.render_settings()
         };
         let mut renderer = Renderer::new(&self.gpu, settings)?;
-        let pseudo_gt = PseudoGt::new(&self.gpu, &self.config.tone)?;
         let exposures = self.exposures.as_ref().map(Exposures::affines).transpose()?;
         let count = self.views.photographs().count();
         let views = self.views.photographs().step_by(count.div_ceil(VIEWS).max(1));
@@ -109,9 +108,7 @@ impl Trainer {
         for view in views {
             let camera = coarse(&view.patch.camera, pixels);
             let depths = self.depths(&mut renderer, gaussians, &camera)?;
-            let target = self
-                .views
-                .put_together(&self.gpu, view.place, |patch| patch.target(&self.gpu, &pseudo_gt))?;
+            let target = self.views.picture(&self.gpu, &self.pseudo_gt, view.place)?;
             let exposure = exposures.as_ref().and_then(|exposures| exposures.get(view.place));
             let neutral = exposure.map(Affine::inverse).map(|inverse| inverse.applied(&target));
             let target = neutral.unwrap_or(target).resized(camera.width, camera.height);
@@ -134,7 +131,7 @@ impl Trainer {
         bare.log_scales_mut().copy_from_slice(gaussians.log_scales());
         bare.raw_opacities_mut().copy_from_slice(gaussians.raw_opacities());
         for (dc, mean) in bare.dc_mut().iter_mut().zip(gaussians.means()) {
-            let depth = camera.view_from_world.transform_point3(mean.as_dvec3()).z;
+            let depth = camera.depth(mean.as_dvec3()).unwrap_or_default();
             *dc = Vec3::new(depth as f32, 1.0, 0.0) / SH_C0;
         }
         renderer.reserve(bare.count, [camera])?;
@@ -147,12 +144,13 @@ impl Trainer {
         if self.masks.of_view(view.number).is_none() {
             return Ok(None);
         }
-        let mask = self.views.put_together(&self.gpu, view.place, |patch| {
-            let weights = self.masks.of_view(patch.number).map(|weights| self.gpu.read(weights));
-            let weights = weights.transpose()?.unwrap_or_default();
-            Ok(self.gpu.buffer("mask", &weights.repeat(3))?.into())
-        })?;
-        Ok(Some(mask))
+        let views = self.views.of_places(view.place..view.place + 1);
+        let weights = |view: &TrainView| {
+            let weights = self.masks.of_view(view.number).map(|weights| self.gpu.read(weights));
+            Ok(weights.transpose()?.unwrap_or_default().repeat(3))
+        };
+        let parts = views.iter().map(weights).collect::<Result<_>>()?;
+        Ok(put_together(views, parts).pop())
     }
 }
 
@@ -172,8 +170,7 @@ fn seen(camera: &Camera, depths: &Image, target: &Image, mask: Option<&Image>) -
         let depth = f64::from(depths.data[at] / cover);
         let (column, row) = (at % camera.width as usize, at / camera.width as usize);
         let pixel = DVec2::new(column as f64 + 0.5, row as f64 + 0.5);
-        let in_view = ((pixel - camera.principal_point) / camera.focal).extend(1.0) * depth;
-        let position = world_from_view.transform_point3(in_view);
+        let position = world_from_view.transform_point3(camera.in_view(pixel, depth)?);
         let color = Vec3::from_array([0, 1, 2].map(|c| target.data[c * pixels + at]));
         let counts = mask.is_none_or(|mask| mask.data[at] >= 1.0);
         let is_sound = cover >= LEAST_COVER && position.is_finite() && color.is_finite();
@@ -215,12 +212,20 @@ mod tests {
     use glam::DAffine3;
 
     use super::*;
+    use crate::camera::CameraModel;
     use crate::splats::scene::{Features, Shape};
 
     fn camera(width: u32, height: u32) -> Camera {
         let (focal, principal_point) = (DVec2::splat(2.0), DVec2::new(1.0, 0.5));
         let view_from_world = DAffine3::from_translation(DVec3::new(0.0, 0.0, 1.0));
-        Camera { width, height, focal, principal_point, view_from_world }
+        Camera {
+            width,
+            height,
+            focal,
+            principal_point,
+            model: CameraModel::Pinhole,
+            view_from_world,
+        }
     }
 
     #[test]

@@ -135,8 +135,8 @@ mod tests {
     use crate::photographs::dataset::synthetic::{self, SyntheticOptions};
     use crate::photographs::pseudo_gt::PseudoGt;
     use crate::train::Preset;
+    use crate::train::measuring::measured;
     use crate::train::target_views::TargetViews;
-    use crate::train::views::measured;
 
     /// dB that no round may cost the training views.
     const BOUND: f64 = 0.3;
@@ -147,7 +147,7 @@ mod tests {
         let dataset = Dataset::load(&config.dataset, &config.load_options()).unwrap();
         let frame = dataset.frame();
         let mut pseudo_gt = PseudoGt::new(&gpu, &config.tone).unwrap();
-        let (scene, _) = measured(&mut pseudo_gt, &dataset).unwrap();
+        let (scene, _) = measured(pseudo_gt.settings(), &dataset).unwrap();
         let all = [usize::MAX; 2];
         let views = TargetViews::probes(&mut pseudo_gt, &dataset, &frame, &scene, all).unwrap();
         let mut trainer = Trainer::new(&gpu, config.clone(), &dataset).unwrap();
@@ -185,7 +185,13 @@ mod tests {
     fn no_round_costs_the_training_views_much() {
         for seed in 1..=3 {
             let folder = tempfile::tempdir().unwrap();
-            let options = SyntheticOptions { views: 12, width: 64, height: 48, seed };
+            let options = SyntheticOptions {
+                views: 12,
+                width: 64,
+                height: 48,
+                seed,
+                ..SyntheticOptions::default()
+            };
             synthetic::write(folder.path(), &options).unwrap();
             let mut config = of(Preset::Fast, folder.path(), seed);
             config.schedule.densify_interval = 50;

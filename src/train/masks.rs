@@ -7,7 +7,7 @@ use super::views::Views;
 use crate::Result;
 use crate::camera::Camera;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
-use crate::kernels::{ToneParameters, mask_gradient, mask_render};
+use crate::kernels::{mask_gradient, mask_render};
 use crate::photographs::dataset::Dataset;
 use crate::splats::scene::COLOR_CHANNELS;
 
@@ -21,27 +21,21 @@ pub(super) struct Masks {
 }
 
 impl Masks {
-    /// The masks of the dataset's views at the sizes that they are trained on; `tone_curve` is a `CURVE_*`.
+    /// The masks of the dataset's views at the sizes that they are trained on.
     ///
     /// # Errors
     /// The device is out of memory.
-    pub(super) fn new(
-        gpu: &Gpu,
-        dataset: &Dataset,
-        views: &Views,
-        tone_curve: u32,
-    ) -> Result<Self> {
+    pub(super) fn new(gpu: &Gpu, dataset: &Dataset, views: &Views) -> Result<Self> {
         let (mut weights, mut largest) = (vec![], 0);
         for view in views.all() {
             let (size, Camera { width, height, .. }) = (view.size(), view.patch.camera);
-            let own = dataset.views.iter().find(|own| own.name == view.name);
-            let mask = own.and_then(|own| own.mask.as_ref());
+            let mask = dataset.views[view.index].mask.as_ref();
             let mask = mask.map(|mask| mask.resized(width, height));
             let mask = mask.map(|mask| gpu.buffer("mask", &view.patch.cut(&mask.weights)));
             largest = largest.max(if mask.is_some() { value_count(size) } else { 0 });
             weights.push(mask.transpose()?);
         }
-        let masking = (largest > 0).then(|| Masking::new(gpu, tone_curve, largest));
+        let masking = (largest > 0).then(|| Masking::new(gpu, largest));
         Ok(Self { weights, masking: masking.transpose()? })
     }
 
@@ -65,7 +59,7 @@ impl Masks {
         view: usize,
         size: UVec2,
         render: &'a Buffer<f32>,
-        target: (&Buffer<f32>, &Buffer<ToneParameters>),
+        target: &Buffer<f32>,
     ) -> Result<&'a Buffer<f32>> {
         let weights = self.weights.get(view).and_then(Option::as_ref);
         match weights.zip(self.masking.as_mut()) {
@@ -102,13 +96,13 @@ pub(super) struct Masking {
 }
 
 impl Masking {
-    /// For images of so many values and targets by `tone_curve`, a `CURVE_*`.
+    /// For images of at most `values` values.
     ///
     /// # Errors
     /// The device is out of memory.
-    pub(super) fn new(gpu: &Gpu, tone_curve: u32, values: usize) -> Result<Self> {
+    pub(super) fn new(gpu: &Gpu, values: usize) -> Result<Self> {
         Ok(Self {
-            render: gpu.pipeline(&mask_render::Constants { tone_curve })?,
+            render: gpu.pipeline(&mask_render::Constants {})?,
             gradient: gpu.pipeline(&mask_gradient::Constants {})?,
             shown: gpu.uninit("shown", values)?,
         })
@@ -124,7 +118,7 @@ impl Masking {
         weights: &Buffer<f32>,
         size: UVec2,
         render: &Buffer<f32>,
-        (low, tone): (&Buffer<f32>, &Buffer<ToneParameters>),
+        target: &Buffer<f32>,
     ) -> Result<&Buffer<f32>> {
         let value_count = value_count(size) as u32;
         pass.dispatch(
@@ -133,8 +127,7 @@ impl Masking {
             mask_render::Buffers {
                 weights: weights.slice(),
                 render: render.slice(),
-                low: low.slice(),
-                tone: tone.slice(),
+                target: target.slice(),
                 shown: self.shown.slice_mut(),
             },
             Threads::Exactly([value_count, 1, 1]),

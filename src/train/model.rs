@@ -3,6 +3,7 @@
 use super::{PrecisionConfig, Trainer};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Recorder};
+use crate::loss::{LogSlot, ParameterInputs, ParameterTerms};
 use crate::splats::attributes::{PlaneCounts, planes};
 use crate::splats::densify::{Densifier, DensifyInputs, DensifyReport, Round};
 use crate::splats::halves::StorageFormat;
@@ -182,6 +183,25 @@ impl Model {
         })
     }
 
+    /// Records the terms on parameters: adds to the gradients.
+    ///
+    /// # Errors
+    /// As [`ParameterTerms::record`].
+    pub(super) fn record_terms(
+        &mut self,
+        (gpu, pass): (&Gpu, &mut Recorder<'_>),
+        terms: &mut ParameterTerms,
+        log: &mut LogSlot<'_>,
+    ) -> Result<()> {
+        let Self { gaussians, gradients, .. } = self;
+        let inputs = ParameterInputs {
+            batches: &gaussians.layout.batches(gpu),
+            words: gaussians.layout.words(),
+            parameters: &gaussians.parameters,
+        };
+        terms.record(pass, inputs, gradients, log)
+    }
+
     /// One round of density control, whose new parameters `keeps` agrees to ([`Densifier::densify`]); the statistics
     /// begin anew.
     ///
@@ -273,7 +293,8 @@ mod tests {
         let gpu = gpu();
         let shape = Shape { sh_degree: 3, features: Features::NONE };
         for rest in [StorageFormat::Single, StorageFormat::Half] {
-            let precision = PrecisionConfig { rest, ..PrecisionConfig::default() };
+            let precision =
+                PrecisionConfig { rest, moments: StorageFormat::Single, ..Default::default() };
             let mut given = Gaussians::zeros(10, shape);
             // What is in use of the degree 3 is none, and room is for that.
             given.parameters[..140].fill(0.5);

@@ -3,20 +3,20 @@
 //! A patch is a view of its own: a step takes one of them. What is measured of a photograph, its target, and what is learned
 //! of its exposure belong to all of it.
 
-use std::sync::Arc;
+use std::ops::Range;
 
 use glam::UVec2;
 
 use super::config::LEAST_PATCH;
 use super::memory::MARGIN;
-use super::views::{TrainView, Views};
+use super::views::{Shown, TrainView, Views};
 use super::{TrainConfig, Trainer};
-use crate::Result;
 use crate::camera::{Camera, Patch};
-use crate::gpu::{Buffer, Gpu};
+use crate::gpu::Gpu;
 use crate::networks::{Denoiser, Tonemapper};
 use crate::photographs::image::Image;
-use crate::splats::scene::COLOR_CHANNELS;
+use crate::photographs::pseudo_gt::PseudoGt;
+use crate::{Error, Result};
 
 impl TrainConfig {
     /// What a view is trained on in: all of it where the device and [`TrainConfig::patch_pixels`] allow it.
@@ -72,26 +72,56 @@ impl Views {
         );
     }
 
-    /// An image of a photograph, unshrunk, from what its views have of it, (3, h, w) each.
-    pub(super) fn put_together(
+    /// The target of a photograph, unshrunk.
+    ///
+    /// # Errors
+    /// As [`Views::pictures`].
+    pub(super) fn picture(&self, gpu: &Gpu, pseudo_gt: &PseudoGt, place: usize) -> Result<Image> {
+        let pictures = self.pictures(gpu, pseudo_gt, place..place + 1, Shown::Targets)?;
+        let gone = || Error::Usage(format!("there is no photograph {place} to train on"));
+        pictures.into_iter().next().ok_or_else(gone)
+    }
+
+    /// Pictures of photographs, unshrunk, put together from their views.
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub(super) fn pictures(
         &self,
         gpu: &Gpu,
-        place: usize,
-        of: impl Fn(&TrainView) -> Result<Arc<Buffer<f32>>>,
-    ) -> Result<Image> {
-        let mut image = Image { width: 0, height: 0, data: vec![] };
-        for view in self.whole().iter().filter(|view| view.place == place) {
-            let (patch, data) = (&view.patch, gpu.read(&*of(view)?)?);
-            let Camera { width, height, .. } = patch.camera;
-            if patch.is_whole() {
-                return Ok(Image { width, height, data });
-            }
-            (image.width, image.height) = (width, height);
-            image.data.resize(COLOR_CHANNELS * image.pixel_count(), 0.0);
+        pseudo_gt: &PseudoGt,
+        places: Range<usize>,
+        shown: Shown,
+    ) -> Result<Vec<Image>> {
+        let views = self.of_places(places);
+        Ok(put_together(views, self.read(gpu, pseudo_gt, views, shown)?))
+    }
+
+    /// The unshrunk views of some photographs.
+    pub(super) fn of_places(&self, places: Range<usize>) -> &[TrainView] {
+        let views = self.whole();
+        let first = |place: usize| views.partition_point(|view| view.place < place);
+        &views[first(places.start)..first(places.end)]
+    }
+}
+
+/// Images of photographs from what their views have of them, (3, h, w) each.
+pub(super) fn put_together(views: &[TrainView], parts: Vec<Vec<f32>>) -> Vec<Image> {
+    let mut images: Vec<Image> = vec![];
+    for (TrainView { patch, .. }, data) in views.iter().zip(parts) {
+        let Camera { width, height, .. } = patch.camera;
+        if patch.is_whole() {
+            images.push(Image { width, height, data });
+            continue;
+        }
+        if patch.is_first() {
+            images.push(Image::filled(width, height, [0.0; 3]));
+        }
+        if let Some(image) = images.last_mut() {
             patch.paste((patch, &data), (&Patch::from(&patch.camera), &mut image.data));
         }
-        Ok(image)
     }
+    images
 }
 
 #[cfg(test)]
@@ -99,6 +129,7 @@ mod tests {
     use glam::{DAffine3, DVec2};
 
     use super::*;
+    use crate::camera::CameraModel;
     use crate::gpu::testing::gpu;
     use crate::train::Part;
 
@@ -109,6 +140,7 @@ mod tests {
             height,
             focal: size,
             principal_point: 0.5 * size,
+            model: CameraModel::Pinhole,
             view_from_world: DAffine3::IDENTITY,
         }
     }
@@ -120,7 +152,7 @@ mod tests {
             eprintln!("not run: this device binds {}", gpu.properties().max_storage_buffer_range);
             return;
         }
-        let mut config = TrainConfig::default();
+        let mut config = TrainConfig::bare();
         let count = |config: &TrainConfig, width, height| {
             let patches = config.patches(&gpu, &camera(width, height));
             patches.iter().for_each(|patch| assert!(patch.pixel_count() <= 1 << 24));

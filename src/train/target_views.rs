@@ -1,10 +1,11 @@
 //! Views that the model is scored on against their targets: those held out from training, and probes among those trained on.
 
-use glam::DVec2;
+use glam::{DVec2, UVec2};
 
 use super::Trainer;
+use super::measuring::{TargetExposure, lifted_from, measured};
 use super::terms::NetworkTerms;
-use super::views::{lifted_from, measured};
+use super::views::Shown;
 use crate::Result;
 use crate::camera::{Camera, Frame};
 use crate::gpu::Gpu;
@@ -13,7 +14,7 @@ use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::image::{Image, Mask};
 use crate::photographs::metrics::psnr_of_counted;
 use crate::photographs::pseudo_gt::PseudoGt;
-use crate::photographs::tone::{LuminanceHistogram, Scene, ToneSettings, is_black};
+use crate::photographs::tone::{LuminanceHistogram, Measured, Scene, ToneSettings, is_black};
 
 use super::rendered::Rendered;
 
@@ -141,7 +142,7 @@ fn target_of(
     photograph: &Image,
     scene: &Scene,
 ) -> Result<Image> {
-    let measured = pseudo_gt.measure(&view.counted(photograph))?.seen_by(&view.camera);
+    let measured = Measured::of(&view.counted(photograph)).seen_by(&view.camera);
     let lift = pseudo_gt.settings().lift(scene, &measured);
     let target = pseudo_gt.lifted(photograph, &lift)?;
     Ok(target.resized(view.camera.width, view.camera.height))
@@ -162,9 +163,16 @@ impl TestTargets {
     /// Every training photograph is as good as black where their exposure is asked for; a photograph can no longer be read;
     /// the device is out of memory or lost.
     pub fn new(gpu: &Gpu, tone: &ToneSettings, dataset: &Dataset) -> Result<Self> {
-        let mut pseudo_gt = PseudoGt::new(gpu, tone)?;
-        let (scene, _) = measured(&mut pseudo_gt, dataset)?;
-        Ok(Self { pseudo_gt, scene })
+        let (scene, _) = measured(tone, dataset)?;
+        Self::in_scene(gpu, tone, &scene)
+    }
+
+    /// The same where the training photographs are measured already.
+    ///
+    /// # Errors
+    /// The device is out of memory.
+    pub fn in_scene(gpu: &Gpu, tone: &ToneSettings, scene: &Scene) -> Result<Self> {
+        Ok(Self { pseudo_gt: PseudoGt::new(gpu, tone)?, scene: scene.clone() })
     }
 
     /// That of a view, of its camera's size; none where it has no photograph.
@@ -179,6 +187,16 @@ impl TestTargets {
 }
 
 impl Trainer {
+    /// What the curves of the training photographs have in common, for [`TestTargets::in_scene`].
+    pub fn scene(&self) -> &Scene {
+        &self.scene
+    }
+
+    /// How bright the targets are; none where the curve's constants say that.
+    pub fn target_exposure(&self) -> Option<&TargetExposure> {
+        self.target_exposure.as_ref()
+    }
+
     /// The mean PSNR, dB, of what the Gaussians show of the held-out views against their targets; none where there are none.
     ///
     /// # Errors
@@ -239,8 +257,11 @@ impl Trainer {
         const MOST: usize = 8;
         let views = self.views.whole();
         let some = views.iter().step_by(views.len().div_ceil(MOST).max(1)).map(|view| {
-            let target = view.image(&self.gpu, &*view.kept_target(&self.gpu)?)?;
-            let (camera, place) = (view.patch.pinhole(), Some(view.place));
+            let views = std::slice::from_ref(view);
+            let target = self.views.read(&self.gpu, &self.pseudo_gt, views, Shown::Targets)?;
+            let UVec2 { x: width, y: height } = view.size();
+            let target = Image { width, height, data: target.concat() };
+            let (camera, place) = (view.patch.own_camera(), Some(view.place));
             Ok(TargetView { camera, target, mask: None, place })
         });
         Ok(TargetViews(some.collect::<Result<_>>()?))

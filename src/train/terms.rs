@@ -7,15 +7,13 @@ use super::networks::Networks;
 use super::{ModelConfig, TrainConfig, streams};
 use crate::base::random::Stream;
 use crate::gpu::{Buffer, Gpu, Recorder};
-use crate::kernels::ToneParameters;
 use crate::kernels::ssim::RADIUS;
 use crate::loss::{
-    DenoisingGradients, DenoisingInputs, DenoisingLoss, DenoisingWeights, Interior, LogSlot, Loss,
-    LossInputs, LossSettings, Term, TermInputs,
+    DenoisingGradients, DenoisingInputs, DenoisingLoss, DenoisingWeights, Gradient, Interior,
+    LogSlot, Loss, LossInputs, LossSettings, Term, TermInputs,
 };
 use crate::networks::window::Window;
 use crate::networks::{Denoiser, Form};
-use crate::photographs::tone::ToneCurve;
 use crate::splats::scene::{COLOR_CHANNELS, Feature};
 use crate::{Error, Result};
 
@@ -42,8 +40,6 @@ pub(super) struct NetworkTerms {
     low: Loss,
     /// None where no view has a mask.
     masking: Option<WindowMask>,
-    /// The curve that leaves a photograph as it is.
-    no_curve: Buffer<ToneParameters>,
     /// Of the window, (3, h, w) each: inputs, then gradients.
     illumination: Buffer<f32>,
     /// What an output is held to.
@@ -71,7 +67,7 @@ impl WindowMask {
         pass: &mut Recorder<'_>,
         size: UVec2,
         output: &Buffer<f32>,
-        held_to: (&Buffer<f32>, &Buffer<ToneParameters>),
+        held_to: &Buffer<f32>,
     ) -> Result<&Buffer<f32>> {
         self.masking.shown(pass, &self.weights, size, output, held_to)
     }
@@ -115,14 +111,10 @@ impl NetworkTerms {
             low: Loss::new(
                 gpu,
                 LossSettings {
-                    tone_curve: ToneCurve::None.constant(),
                     ssim_weight: weights.low_ssim,
                     terms: [Term::LOW_L1, Term::LOW_SSIM],
+                    gradient: Gradient::Written,
                 },
-            )?,
-            no_curve: gpu.buffer(
-                "no_curve",
-                &[ToneParameters { white: 1.0, gain: 1.0, ..ToneParameters::default() }],
             )?,
             masking: None,
             illumination: empty("window_illumination")?,
@@ -138,7 +130,7 @@ impl NetworkTerms {
         if is_masked {
             let values = terms.photograph.len();
             terms.masking = Some(WindowMask {
-                masking: Masking::new(gpu, ToneCurve::None.constant(), values)?,
+                masking: Masking::new(gpu, values)?,
                 weights: gpu.uninit("window_mask", values / COLOR_CHANNELS)?,
             });
         }
@@ -256,6 +248,11 @@ impl NetworkTerms {
         let Networks { denoiser: Some(denoiser), windows, colors, .. } = &self.networks else {
             return Ok(());
         };
+        if !self.denoising.is_on() {
+            pass.fill(&mut self.d_denoised, 0);
+            pass.fill(&mut self.d_colors, 0);
+            return Ok(());
+        }
         if let Some(target) = target {
             let own = &mut self.photograph;
             windows.gather(pass, target, size, 0..COLOR_CHANNELS, window, own)?;
@@ -263,9 +260,7 @@ impl NetworkTerms {
         let held_to = if target.is_some() { &self.photograph } else { colors };
         let mut mask = self.masking.as_mut().filter(|_| is_masked);
         let denoised = match &mut mask {
-            Some(mask) => {
-                mask.shown(pass, window.size, denoiser.denoised(), (held_to, &self.no_curve))?
-            }
+            Some(mask) => mask.shown(pass, window.size, denoiser.denoised(), held_to)?,
             None => denoiser.denoised(),
         };
         self.denoising.record(
@@ -338,10 +333,7 @@ impl NetworkTerms {
         tonemapper.forward(pass, size, &self.illumination, denoised)?;
         let mut mask = self.masking.as_mut().filter(|_| is_masked);
         let output = match &mut mask {
-            Some(mask) => {
-                let target = (&self.photograph, &self.no_curve);
-                mask.shown(pass, size, tonemapper.output(), target)?
-            }
+            Some(mask) => mask.shown(pass, size, tonemapper.output(), &self.photograph)?,
             None => tonemapper.output(),
         };
         self.low.record(
@@ -350,8 +342,7 @@ impl NetworkTerms {
                 size,
                 interior: interior(window),
                 render: output,
-                low: &self.photograph,
-                tone: &self.no_curve,
+                target: &self.photograph,
             },
             &mut self.d_output,
             log,

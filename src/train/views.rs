@@ -6,26 +6,26 @@ use std::ops::RangeInclusive;
 use std::sync::Arc;
 
 use glam::{DVec3, UVec2, Vec3};
-use serde::Serialize;
 
-use super::cache::{Cache, CacheSize, Kept};
-use super::precision::Darkroom;
+use super::cache::{Cache, CacheSize, Slot};
+use super::epochs::Epochs;
+use super::measuring::{TargetExposure, measured, photographs};
+use super::precision::Encoder;
 use super::{TrainConfig, streams};
-use crate::Result;
 use crate::base::random::Stream;
 use crate::camera::{Camera, Frame, Patch};
-use crate::gpu::{Buffer, Gpu};
+use crate::gpu::{Buffer, Download, Gpu, Recorder};
 use crate::kernels::ToneParameters;
 use crate::loss::ViewSource;
 use crate::loss::exposure::Affine;
 use crate::networks::Form;
-use crate::photographs::dataset::{Dataset, Point, View};
+use crate::photographs::dataset::{Dataset, Point};
 use crate::photographs::image::Image;
 use crate::photographs::pseudo_gt::PseudoGt;
-use crate::photographs::tone::{
-    Exposure, Measured, Scene, Statistics, ToneCurve, ToneSettings, all_black,
-};
+use crate::photographs::tone::Scene;
+use crate::splats::render::{Viewpoint, Viewpoints};
 use crate::splats::scene::{COLOR_CHANNELS, Feature, Gaussians, Shape, init};
+use crate::{Error, Result};
 
 /// One training view: a photograph, or a patch of one that is too large to be trained on at once.
 #[derive(Debug)]
@@ -36,41 +36,18 @@ pub(super) struct TrainView {
     /// Its photograph's place among those that are trained on.
     pub(super) place: usize,
     /// Index into the dataset's views.
-    index: usize,
+    pub(super) index: usize,
     /// What it is of its photograph, in the frame.
     pub(super) patch: Patch,
     /// Depth from elsewhere, (H, W), where the dataset's is of another size.
     depth: Option<Vec<f32>>,
-    /// What the loss applies `tone` to, planar (3, H, W), sRGB-encoded: the dark photograph, or the target itself.
-    pub(super) input: Kept,
-    /// The dark photograph, where that is not the input and a network sees it.
-    pub(super) photograph: Option<Kept>,
-    /// The curve that the photograph gets; one element. Where the input is the target already, none.
-    pub(super) tone: Buffer<ToneParameters>,
-    /// Whether the input is the target.
-    is_baked: bool,
-    /// The target, where that is not the input and a network is held to it.
-    pub(super) target: Option<Arc<Buffer<f32>>>,
-}
-
-/// How bright the targets are, and what a model makes of them.
-#[derive(Clone, Debug, Serialize)]
-pub struct TargetExposure {
-    /// The gain that a model of views with differing gains agrees on, their geometric mean: the exposure at which it
-    /// renders and is scored.
-    pub model_gain: f64,
-    /// What was found for the training photographs together.
-    pub scene: Exposure,
-    /// The gain of every training view, by name.
-    pub gains: BTreeMap<String, f64>,
-}
-
-impl TargetExposure {
-    fn new(scene: Exposure, gains: BTreeMap<String, f64>) -> Self {
-        let logarithms: f64 = gains.values().map(|gain| gain.ln()).sum();
-        let model_gain = (logarithms / gains.len().max(1) as f64).exp();
-        Self { model_gain, scene, gains }
-    }
+    /// What its target is made of in every step, planar (3, H, W), sRGB-encoded.
+    stored: Slot,
+    /// Whether that is the dark photograph, and gets the curve of its place; else it is the target, whose curve was applied to
+    /// the photograph at its own size.
+    gets_curve: bool,
+    /// The dark photograph, where that is not what is stored and a network sees it.
+    photograph: Option<Slot>,
 }
 
 /// All training views in the dataset's order, as they are and then by level of the resolution schedule, each half the
@@ -78,9 +55,14 @@ impl TargetExposure {
 #[derive(Debug)]
 pub(super) struct Views {
     levels: Vec<Vec<TrainView>>,
+    /// By their numbers.
+    viewpoints: Viewpoints,
     /// The places of those that are trained on no more.
     left_out: BTreeSet<usize>,
     cache: Cache,
+    epochs: Epochs,
+    /// The curve of every photograph, by place.
+    curves: Buffer<ToneParameters>,
 }
 
 /// A view whose shorter side would fall below this is not shrunk any more, in pixels.
@@ -102,48 +84,58 @@ impl Views {
     ) -> Result<(Self, Scene, Option<TargetExposure>)> {
         let settings = pseudo_gt.settings().clone();
         let keeps_photographs = config.model.denoiser || config.model.tonemapper;
-        let (scene, measured) = measured(pseudo_gt, dataset)?;
-        let mut darkroom = Darkroom::new(gpu, config.precision.photographs);
+        let (scene, measured) = measured(&settings, dataset)?;
+        let mut encoder = Encoder::new(gpu, config.precision.photographs);
         let budget = CacheSize::on_device(config.cache, config.max_vram, gpu);
         let mut cache = Cache::new(gpu, budget, config.spool.clone());
         let mut views = vec![];
         views.resize_with(config.schedule.resolution_levels(), Vec::<TrainView>::new);
-        let mut gains = BTreeMap::new();
+        let (mut gains, mut curves) = (BTreeMap::new(), vec![]);
         for (place, ((index, view), measured)) in photographs(dataset).zip(&measured).enumerate() {
             let lift = settings.lift(&scene, measured);
             gains.extend(lift.gain.map(|gain| (view.name.clone(), gain)));
-            let original = if settings.lift_first { view.photograph()? } else { None };
-            let target = original.map(|original| pseudo_gt.lifted(&original, &lift)).transpose()?;
+            curves.push(lift.parameters);
             let Some(image) = view.loaded()? else { continue };
-            for (level, views) in views.iter_mut().enumerate() {
-                let size = shrunk(UVec2::new(image.width, image.height), level as u32);
-                let photograph = view.blacked_out(image.resized(size.x, size.y));
-                let target = match &target {
-                    Some(target) => Some(view.blacked_out(target.resized(size.x, size.y))),
-                    None if settings.needs_baking() => Some(pseudo_gt.lifted(&photograph, &lift)?),
-                    None => None,
-                };
+            let own = UVec2::new(image.width, image.height);
+            let sizes = (0..views.len()).map(|level| shrunk(own, level as u32));
+            let sizes: Vec<UVec2> = sizes.collect();
+            // What is trained on at its own size gets its curve in every step.
+            let own = view.own_size().filter(|_| settings.lift_first);
+            let is_larger = own.filter(|own| sizes.iter().any(|size| size != own));
+            let whole = if is_larger.is_some() { view.photograph()? } else { None };
+            let whole = whole.map(|whole| pseudo_gt.lifted(&whole, &lift)).transpose()?;
+            for (views, size) in views.iter_mut().zip(sizes) {
+                let resized = |whole: &Image| view.blacked_out(whole.resized(size.x, size.y));
                 let camera = frame.camera(&view.camera).resized(size.x, size.y);
                 let patches = config.patches(gpu, &camera);
-                let is_as_loaded = level == 0 && patches.len() == 1;
+                let is_as_loaded =
+                    size == UVec2::new(image.width, image.height) && patches.len() == 1;
                 let depth = view.depth.as_ref().filter(|_| !is_as_loaded);
                 let print = Print {
                     name: &view.name,
                     place,
                     index,
-                    keeps_photograph: target.is_some() && keeps_photographs,
-                    photograph,
-                    target,
+                    keeps_photograph: keeps_photographs,
+                    photograph: resized(&image),
+                    target: whole.as_ref().filter(|_| own != Some(size)).map(resized),
                     depth: depth.map(|depth| resized_plane(depth, &image, size)),
-                    tone: lift.parameters,
                 };
                 for patch in patches {
-                    views.push(print.view(gpu, patch, &mut darkroom, &mut cache)?);
+                    views.push(print.view(patch, &mut encoder, &mut cache)?);
                 }
             }
         }
         views.iter_mut().flatten().enumerate().for_each(|(number, view)| view.number = number);
-        let views = Self { levels: views, left_out: BTreeSet::new(), cache };
+        let patches = views.iter().flatten().map(|view| view.patch).collect();
+        let viewpoints = Viewpoints::new(gpu, patches)?;
+        let views = Self {
+            levels: views,
+            viewpoints,
+            left_out: BTreeSet::new(),
+            cache,
+            epochs: Epochs::default(),
+            curves: gpu.buffer("curves", &curves)?,
+        };
         // The targets of a profile are as bright as its references.
         let exposure = scene.exposure.clone().filter(|_| settings.profile.is_none());
         let exposure = exposure.map(|scene| TargetExposure::new(scene, gains));
@@ -163,40 +155,25 @@ impl Views {
         if self.cache.holds_all() {
             return Ok(*steps.end());
         }
-        let (mut wanted, mut bytes, mut last) = (BTreeSet::new(), 0, *steps.start());
+        let (mut numbers, mut wanted) = (BTreeSet::new(), vec![]);
+        let (mut bytes, mut last) = (0, *steps.start());
         for step in steps {
             let level = config.schedule.resolution_level(step);
             let view = self.of_step(config.seed, step, level);
-            let own = view.input.bytes() + view.photograph.as_ref().map_or(0, Kept::bytes);
-            let is_new = !wanted.contains(&view.number);
-            if !wanted.is_empty() && is_new && bytes + own > self.cache.budget() {
+            let slots = [Some(view.stored), view.photograph].into_iter().flatten();
+            let own: u64 = slots.clone().map(|slot| self.cache.bytes(slot)).sum();
+            let is_new = !numbers.contains(&view.number);
+            if !numbers.is_empty() && is_new && bytes + own > self.cache.budget() {
                 break;
             }
-            bytes += if is_new { own } else { 0 };
-            wanted.insert(view.number);
+            if numbers.insert(view.number) {
+                bytes += own;
+                wanted.extend(slots);
+            }
             last = step;
         }
-        let (mut all, mut places) = (vec![], vec![]);
-        for view in self.levels.iter_mut().flatten() {
-            let is_wanted = wanted.contains(&view.number);
-            for kept in std::iter::once(&mut view.input).chain(view.photograph.as_mut()) {
-                places.extend(is_wanted.then_some(all.len()));
-                all.push(kept);
-            }
-        }
-        self.cache.bring(&mut all, &places)?;
+        self.cache.bring(&wanted)?;
         Ok(last)
-    }
-
-    /// Keeps the target of every view beside what the loss makes it of, for [`TrainView::kept_target`].
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
-    pub(super) fn keep_targets(&mut self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<()> {
-        for view in self.levels.iter_mut().flatten().filter(|view| !view.is_baked) {
-            view.target = Some(view.target(gpu, pseudo_gt)?);
-        }
-        Ok(())
     }
 
     /// What the loss terms may compare the views with.
@@ -209,27 +186,104 @@ impl Views {
         let source = |view: &'a TrainView| ViewSource {
             size: view.size(),
             depth: view.depth.as_deref().or(dataset.views[view.index].depth.as_deref()),
-            target: Box::new(|| view.target(gpu, pseudo_gt)),
+            target: Box::new(|| self.target(gpu, pseudo_gt, view)),
         };
         self.levels.iter().flatten().map(source).collect()
+    }
+
+    /// Records the target of a view that is on the device, (3, H, W); it may be `scratch` or what is stored.
+    ///
+    /// # Errors
+    /// The photograph is not on the device, or `scratch` is shorter.
+    pub(super) fn record_target<'a>(
+        &'a self,
+        pass: &mut Recorder<'_>,
+        pseudo_gt: &PseudoGt,
+        view: &TrainView,
+        scratch: &'a mut Buffer<f32>,
+    ) -> Result<&'a Buffer<f32>> {
+        pseudo_gt.record(pass, self.cache.on_device(view.stored)?, self.curve(view), scratch)
+    }
+
+    /// The same for the dark photograph of a view, where that is kept.
+    ///
+    /// # Errors
+    /// As there.
+    pub(super) fn record_photograph<'a>(
+        &'a self,
+        pass: &mut Recorder<'_>,
+        pseudo_gt: &PseudoGt,
+        view: &TrainView,
+        scratch: &'a mut Buffer<f32>,
+    ) -> Result<&'a Buffer<f32>> {
+        let photograph = self.cache.on_device(view.photograph.unwrap_or(view.stored))?;
+        pseudo_gt.record(pass, photograph, None, scratch)
+    }
+
+    /// The curve that makes the target of what is stored of a view.
+    fn curve(&self, view: &TrainView) -> Option<(&Buffer<ToneParameters>, u32)> {
+        view.gets_curve.then_some((&self.curves, view.place as u32))
+    }
+
+    /// Targets or dark photographs, (3, H, W), of views wherever they are stored, in one submission.
+    pub(super) fn read(
+        &self,
+        gpu: &Gpu,
+        pseudo_gt: &PseudoGt,
+        views: &[TrainView],
+        shown: Shown,
+    ) -> Result<Vec<Vec<f32>>> {
+        let (mut stored, mut scratch) = (vec![], vec![]);
+        for view in views {
+            let slot = view.photograph.filter(|_| shown == Shown::Photographs);
+            let photograph = self.cache.load(slot.unwrap_or(view.stored))?;
+            let curve = self.curve(view).filter(|_| shown == Shown::Targets);
+            scratch.push(gpu.uninit("target", photograph.value_count)?);
+            stored.push((photograph, curve));
+        }
+        let mut downloads = vec![];
+        gpu.run("pseudo-GT", |pass| {
+            for ((photograph, curve), scratch) in stored.iter().zip(&mut scratch) {
+                let target = pseudo_gt.record(pass, photograph, *curve, scratch)?;
+                downloads.push(pass.download(target)?);
+            }
+            Ok(())
+        })?;
+        downloads.into_iter().map(Download::wait).collect()
+    }
+
+    /// The target of a view, (3, H, W), in a buffer of its own or in the one that it is stored in.
+    fn target(
+        &self,
+        gpu: &Gpu,
+        pseudo_gt: &PseudoGt,
+        view: &TrainView,
+    ) -> Result<Arc<Buffer<f32>>> {
+        let stored = self.cache.load(view.stored)?;
+        let curve = self.curve(view);
+        if stored.code_bits == 32 && curve.is_none() {
+            return Ok(Arc::clone(&stored.values));
+        }
+        let mut target = gpu.uninit("target", stored.value_count)?;
+        gpu.run("pseudo-GT", |pass| {
+            pseudo_gt.record(pass, &stored, curve, &mut target).map(|_| ())
+        })?;
+        Ok(Arc::new(target))
     }
 
     /// The view that a step trains on, at one of the levels: every epoch takes each view once, in an order of its own, and
     /// for one that is left out the next again.
     pub(super) fn of_step(&self, seed: u64, step: u64, level: usize) -> &TrainView {
         let views = &self.levels[level];
-        let count = views.len() as u64;
-        let (epoch, place) = ((step - 1) / count, (step - 1) % count);
-        let stream = Stream::new(seed, streams::VIEWS);
-        // Fisher-Yates from the end; the picks of an epoch only depend on its number.
-        let mut order: Vec<usize> = (0..views.len()).collect();
-        for left in (1..count).rev() {
-            let draw = stream.bits(epoch * count + left) % (left + 1);
-            order.swap(left as usize, draw as usize);
-        }
-        let from_place = order.iter().cycle().skip(place as usize).take(views.len());
+        let (order, place) = self.epochs.of_step(seed, step, views.len());
+        let from_place = order.iter().cycle().skip(place).take(views.len());
         let own = from_place.copied().find(|at| !self.left_out.contains(&views[*at].place));
-        &views[own.unwrap_or(order[place as usize])]
+        &views[own.unwrap_or(order[place])]
+    }
+
+    /// A view as it is rendered.
+    pub(super) fn viewpoint(&self, view: &TrainView) -> Viewpoint<'_> {
+        self.viewpoints.get(view.number)
     }
 
     /// Trains on a view no more; false where there is no other.
@@ -260,13 +314,10 @@ impl Views {
         self.levels.first().map_or(&[], Vec::as_slice)
     }
 
-    /// How many floats the largest input, and the largest photograph beside one, have to be decoded to.
-    pub(super) fn decoded_lens(&self) -> [usize; 2] {
-        let views = || self.levels.iter().flatten();
-        let inputs = views().map(|view| view.input.decoded_len()).max();
-        let photographs = views().filter_map(|view| view.photograph.as_ref());
-        let photographs = photographs.map(Kept::decoded_len).max();
-        [inputs, photographs].map(Option::unwrap_or_default)
+    /// How many floats the largest view has.
+    pub(super) fn most_values(&self) -> usize {
+        let values = |view: &TrainView| COLOR_CHANNELS * view.size().element_product() as usize;
+        self.all().map(values).max().unwrap_or_default()
     }
 
     /// One view of every photograph, unshrunk.
@@ -278,7 +329,7 @@ impl Views {
     pub(super) fn say_what_shows_nothing(&self, gaussians: &Gaussians) {
         let means: Vec<DVec3> = gaussians.means().iter().map(|mean| mean.as_dvec3()).collect();
         for TrainView { name, patch, .. } in self.photographs() {
-            if !means.iter().any(|&mean| patch.camera.sees(mean).is_some()) {
+            if !scattered(means.len()).any(|at| patch.camera.sees(means[at]).is_some()) {
                 tracing::warn!(
                     "view {name} shows nothing: none of the {} first Gaussians lies in it; check its pose",
                     means.len()
@@ -339,13 +390,15 @@ impl Views {
             tracing::warn!("{fitting} of {of} points begin as Gaussians: {device} binds no more");
         }
         let kept = &kept[..kept.len().min(fitting)];
+        // Of the views of the dataset, the place of each among those that are trained on.
+        let mut places = vec![None; dataset.views.len()];
+        self.photographs().for_each(|view| places[view.index] = Some(view.place));
+        let mut targets = Pictures::new(self, gpu, pseudo_gt, Shown::Targets);
         let colors = init::colors_from_views(kept, &dataset.views, |index| {
-            let Some(view) = self.photographs().find(|view| view.index == index) else {
-                return Ok(None);
-            };
-            let target = self.put_together(gpu, view.place, |view| view.target(gpu, pseudo_gt))?;
-            let exposure = exposures.and_then(|exposures| exposures.get(view.place));
-            Ok(Some(exposure.map_or(target.clone(), |own| own.inverse().applied(&target))))
+            let Some(place) = places[index] else { return Ok(None) };
+            let target = targets.next(place)?;
+            let exposure = exposures.and_then(|exposures| exposures.get(place));
+            Ok(Some(exposure.map_or_else(|| target.clone(), |own| own.inverse().applied(&target))))
         })?;
         let positions: Vec<DVec3> =
             kept.iter().map(|point| frame.from_world(point.position)).collect();
@@ -354,10 +407,9 @@ impl Views {
         let mut gaussians = init::from_points(&positions, &colors, shape, &config.start, seed)?;
         if config.model.network.form == Form::Identity {
             let low = if shape.features.illumination {
+                let mut photographs = Pictures::new(self, gpu, pseudo_gt, Shown::Photographs);
                 init::colors_from_views(kept, &dataset.views, |index| {
-                    let view = self.photographs().find(|view| view.index == index);
-                    let low = |view: &TrainView| view.whole_photograph(gpu);
-                    view.map(|view| self.put_together(gpu, view.place, low)).transpose()
+                    places[index].map(|place| photographs.next(place)).transpose()
                 })?
             } else {
                 vec![]
@@ -368,38 +420,79 @@ impl Views {
     }
 }
 
+/// What is looked at of a view.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Shown {
+    /// What it is held to.
+    Targets,
+    /// What it was made of; only where that is kept.
+    Photographs,
+}
+
+/// Pictures of the photographs one after the other, made several at a time.
+struct Pictures<'a> {
+    views: &'a Views,
+    gpu: &'a Gpu,
+    pseudo_gt: &'a PseudoGt,
+    shown: Shown,
+    /// By place.
+    made: BTreeMap<usize, Image>,
+}
+
+impl<'a> Pictures<'a> {
+    fn new(views: &'a Views, gpu: &'a Gpu, pseudo_gt: &'a PseudoGt, shown: Shown) -> Self {
+        Self { views, gpu, pseudo_gt, shown, made: BTreeMap::new() }
+    }
+
+    /// That of a place; those before are gone.
+    fn next(&mut self, place: usize) -> Result<Image> {
+        /// Of those that are made at a time.
+        const MOST_PIXELS: usize = 1 << 20;
+        let Self { views, gpu, pseudo_gt, shown, ref mut made } = *self;
+        if !made.contains_key(&place) {
+            let mut pixels = 0;
+            let whole = views.whole();
+            let after = &whole[whole.partition_point(|view| view.place < place)..];
+            let after = after.iter().filter(|view| view.patch.is_first());
+            let now = after.take_while(|view| {
+                let is_first = pixels == 0;
+                pixels += Patch::from(&view.patch.camera).pixel_count();
+                is_first || pixels <= MOST_PIXELS
+            });
+            let last = now.last().map_or(place, |view| view.place);
+            let images = views.pictures(gpu, pseudo_gt, place..last + 1, shown)?;
+            *made = (place..).zip(images).collect();
+        }
+        let gone = || Error::Usage(format!("there is no photograph {place} to train on"));
+        made.remove(&place).ok_or_else(gone)
+    }
+}
+
 /// A photograph at the size of a level.
 struct Print<'a> {
     name: &'a str,
     place: usize,
     index: usize,
     photograph: Image,
-    /// None where the loss makes it.
+    /// Where its curve was applied at another size.
     target: Option<Image>,
     /// Whether the photograph stays beside the target.
     keeps_photograph: bool,
     /// Where it is not the dataset's.
     depth: Option<Vec<f32>>,
-    tone: ToneParameters,
 }
 
 impl Print<'_> {
-    fn view(
-        &self,
-        gpu: &Gpu,
-        patch: Patch,
-        darkroom: &mut Darkroom,
-        cache: &mut Cache,
-    ) -> Result<TrainView> {
+    fn view(&self, patch: Patch, encoder: &mut Encoder, cache: &mut Cache) -> Result<TrainView> {
         let mut upload =
-            |name, image: &Image| cache.keep(darkroom.upload(name, &patch.cut(&image.data))?);
-        let photograph = self.keeps_photograph.then(|| upload("low", &self.photograph));
-        let (input, tone) = match &self.target {
+            |name, image: &Image| cache.keep(encoder.upload(name, &patch.cut(&image.data))?);
+        let (stored, photograph) = match &self.target {
             Some(target) => {
-                let none = ToneSettings::new(ToneCurve::None).parameters(&Statistics::default());
-                (upload("target", target)?, none)
+                let photograph = self.keeps_photograph.then(|| upload("low", &self.photograph));
+                let photograph = photograph.transpose()?;
+                (upload("target", target)?, photograph)
             }
-            None => (upload("low", &self.photograph)?, self.tone),
+            None => (upload("low", &self.photograph)?, None),
         };
         Ok(TrainView {
             name: self.name.to_owned(),
@@ -408,11 +501,9 @@ impl Print<'_> {
             index: self.index,
             patch,
             depth: self.depth.as_ref().map(|depth| patch.cut(depth).into_owned()),
-            input,
-            photograph: photograph.transpose()?,
-            tone: gpu.buffer("tone", &[tone])?,
-            is_baked: self.target.is_some(),
-            target: None,
+            stored,
+            gets_curve: self.target.is_none(),
+            photograph,
         })
     }
 }
@@ -436,38 +527,26 @@ fn begin_as_identity(gaussians: &mut Gaussians, colors: &[Vec3], low: &[Vec3]) {
     }
 }
 
-/// The training views that have a photograph, and their places in the dataset.
-fn photographs(dataset: &Dataset) -> impl Iterator<Item = (usize, &View)> {
-    let views = dataset.views.iter().enumerate();
-    views.filter(|(_, view)| view.is_train() && view.has_photograph())
-}
-
-/// What is measured of all training photographs together, and of each.
-///
-/// # Errors
-/// Every photograph is as good as black where their exposure is asked for; a photograph can no longer be read; the
-/// device is out of memory or lost.
-pub(super) fn measured(
-    pseudo_gt: &mut PseudoGt,
-    dataset: &Dataset,
-) -> Result<(Scene, Vec<Measured>)> {
-    let lift_first = pseudo_gt.settings().lift_first;
-    let mut measured = vec![];
-    for (_, view) in photographs(dataset) {
-        let Some(photograph) = lifted_from(view, lift_first)? else { continue };
-        measured.push(pseudo_gt.measure(&view.counted(&photograph))?.seen_by(&view.camera));
+/// The numbers below `count`, each once, with neighbours far apart: what is found at some place in a list is found after few
+/// steps, however the list is sorted.
+fn scattered(count: usize) -> impl Iterator<Item = usize> {
+    const GOLDEN: f64 = 0.618_033_988_75;
+    let divides_both = |step: usize| {
+        let (mut a, mut b) = (step, count);
+        while b > 0 {
+            (a, b) = (b, a % b);
+        }
+        a > 1
+    };
+    let mut step = ((GOLDEN * count as f64) as usize).max(1);
+    while divides_both(step) {
+        step += 1;
     }
-    let scene = pseudo_gt.settings().scene(&measured).ok_or_else(|| all_black(&dataset.root))?;
-    Ok((scene, measured))
-}
-
-/// What is measured of a view and becomes its target: the photograph as its camera took it where it is lifted before it is
-/// shrunk, else as it was loaded; none where the view has none.
-///
-/// # Errors
-/// As [`View::photograph`].
-pub(super) fn lifted_from(view: &View, lift_first: bool) -> Result<Option<Cow<'_, Image>>> {
-    if lift_first { view.photograph() } else { view.loaded() }
+    (0..count).scan(0, move |at, _| {
+        let here = *at;
+        *at = (here + step) % count;
+        Some(here)
+    })
 }
 
 /// A size halved as often as its level says and its shorter side allows.
@@ -489,32 +568,21 @@ impl TrainView {
     pub(super) fn size(&self) -> UVec2 {
         self.patch.size
     }
+}
 
-    /// The dark photograph, planar (3, H, W); only there where it is the input, or was kept.
-    fn whole_photograph(&self, gpu: &Gpu) -> Result<Arc<Buffer<f32>>> {
-        self.photograph.as_ref().unwrap_or(&self.input).whole(gpu)
-    }
+#[cfg(test)]
+mod tests {
+    use super::scattered;
 
-    /// The pseudo-GT of the view, (3, H, W), where the input is that, or it was kept.
-    pub(super) fn kept_target(&self, gpu: &Gpu) -> Result<Arc<Buffer<f32>>> {
-        self.target.as_ref().map_or_else(|| self.input.whole(gpu), |target| Ok(Arc::clone(target)))
-    }
-
-    /// The pseudo-GT of the view, (3, H, W).
-    pub(super) fn target(&self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<Arc<Buffer<f32>>> {
-        if self.is_baked {
-            return self.input.whole(gpu);
+    #[test]
+    fn scattered_numbers_are_all_there_and_neighbours_far_apart() {
+        for count in [0, 1, 2, 3, 4, 6, 10, 97, 1000] {
+            let numbers: Vec<usize> = scattered(count).collect();
+            let near = numbers.windows(2).filter(|two| two[0].abs_diff(two[1]) < count / 4).count();
+            assert!(near <= 1 || count < 4, "{count}: {near}");
+            let mut sorted = numbers;
+            sorted.sort_unstable();
+            assert!(sorted.into_iter().eq(0..count));
         }
-        let input = self.input.whole(gpu)?;
-        let mut target = gpu.uninit("target", self.input.len())?;
-        gpu.run("target", |pass| pseudo_gt.map(pass, &input, &self.tone, 0, &mut target))?;
-        Ok(Arc::new(target))
-    }
-
-    /// Pixels of the view on the host.
-    pub(super) fn image(&self, gpu: &Gpu, pixels: &Buffer<f32>) -> Result<Image> {
-        let data = gpu.read(pixels)?;
-        let UVec2 { x: width, y: height } = self.size();
-        Ok(Image { width, height, data })
     }
 }

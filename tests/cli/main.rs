@@ -350,7 +350,6 @@ fn bench_checks_and_times_every_kernel_of_a_step_and_names_the_others() {
         "conv3x3_half",
         "conv3x3_weight_gradient_half",
         "conv_strided",
-        "decode",
         "expose",
         "expose_backward",
         "exposure_center",
@@ -362,9 +361,7 @@ fn bench_checks_and_times_every_kernel_of_a_step_and_names_the_others() {
         "max_pool",
         "pack_map",
         "pack_weights",
-        "tone_mix",
-        "tone_profile",
-        "tone_table",
+        "parameter_terms",
     ];
     assert_eq!(everywhere, elsewhere);
     let mut named = [keys(&printed["errors"]), not_covered].concat();

@@ -161,13 +161,17 @@ fn growth_has_its_axes_exponents_and_memory_and_says_what_does_not_fit() {
     let printed: Value = serde_json::from_str(&Place::new().run(arguments).0).unwrap();
     let axes = printed["axes"].as_array().unwrap();
     let quantities: Vec<_> = axes.iter().map(|axis| axis["quantity"].as_str().unwrap()).collect();
-    assert_eq!(quantities, ["Gaussians", "pixels", "channels"]);
+    assert_eq!(quantities, ["Gaussians", "pixels", "channels", "photographs", "points"]);
     for axis in axes {
         for point in axis["points"].as_array().unwrap() {
             assert!(point["ms"].as_f64().unwrap() > 0.0, "{point}");
             assert!(point["bytes"].as_u64().unwrap() > 0, "{point}");
         }
         assert!(axis["time_exponent"].is_f64() && axis["memory_exponent"].is_f64(), "{axis}");
+    }
+    for axis in &axes[3..] {
+        let exponent = axis["time_exponent"].as_f64().unwrap();
+        assert!(exponent < 1.3, "loading is linear in views and points: {axis:#}");
     }
     // Each scene is gone before the next is measured.
     let bytes = |axis: usize, point: usize| axes[axis]["points"][point]["bytes"].as_u64().unwrap();

@@ -11,7 +11,13 @@ pub(crate) struct Place(pub(crate) tempfile::TempDir);
 impl Place {
     pub(crate) fn new() -> Self {
         let place = Self(tempfile::tempdir().unwrap());
-        let options = SyntheticOptions { views: 9, width: 40, height: 30, seed: 2 };
+        let options = SyntheticOptions {
+            views: 9,
+            width: 40,
+            height: 30,
+            seed: 2,
+            ..SyntheticOptions::default()
+        };
         synthetic::write(place.path("set"), &options).unwrap();
         place
     }

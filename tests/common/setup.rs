@@ -1,11 +1,13 @@
 //! Gaussians and a view of them, through the renderer that ships.
 
 use glam::{DAffine3, DMat3, DVec2, DVec3, UVec2, Vec2};
-use nightsplat::camera;
+use nightsplat::camera::{self, CameraModel, KannalaBrandt};
 use nightsplat::gpu::Tile;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::photographs::tone::Profile;
-use nightsplat::reference::camera::Camera;
+use nightsplat::reference::camera::{Camera, Model};
+use nightsplat::reference::camera_fisheye::Fisheye;
+use nightsplat::reference::camera_pinhole::Pinhole;
 use nightsplat::reference::gaussian::{Gaussian, Planes};
 use nightsplat::reference::sh::sh_count;
 use nightsplat::splats::render::{self, Damping, RenderOptions, RenderSettings, Renderer, Status};
@@ -37,8 +39,19 @@ pub(crate) struct Setup {
 }
 
 impl Setup {
-    /// `count` Gaussians inside the view of a turned camera with an off-centre principal point.
+    /// `count` Gaussians inside the view of a turned pinhole with an off-centre principal point.
     pub(crate) fn new(count: usize, size: [u32; 2], shape: impl Into<Shape>, seed: u64) -> Self {
+        Self::seen_by(CameraModel::Pinhole, count, size, shape, seed)
+    }
+
+    /// The same of another camera model, whose numbers are of f32.
+    pub(crate) fn seen_by(
+        model: CameraModel,
+        count: usize,
+        size: [u32; 2],
+        shape: impl Into<Shape>,
+        seed: u64,
+    ) -> Self {
         let shape = shape.into();
         let (sin, cos) = 0.3f32.sin_cos();
         // Every number is one of f32, which is what the kernels are given.
@@ -50,6 +63,7 @@ impl Setup {
             height,
             focal: (Vec2::new(0.9, 0.8) * width as f32).as_dvec2(),
             principal_point: (Vec2::new(0.42, 0.57) * UVec2::from(size).as_vec2()).as_dvec2(),
+            model,
             view_from_world: DAffine3 {
                 matrix3: DMat3::from_cols(x, y, z),
                 translation: wide([0.2, -0.1, 0.4]),
@@ -85,10 +99,10 @@ impl Setup {
         }
     }
 
-    /// The point of the world that is seen at `pixel`, so deep in the view.
+    /// The point of the world that is seen at `pixel`, so deep in the view; behind the camera where a fisheye shows nothing.
     pub(crate) fn at_pixel(&self, pixel: DVec2, depth: f64) -> DVec3 {
+        let in_view = self.camera.in_view(pixel, depth).unwrap_or(DVec3::NEG_Z * depth);
         let camera = self.camera();
-        let in_view = ((pixel - camera.principal_point) / camera.focal * depth).extend(depth);
         camera.rotation.transpose() * (in_view - camera.translation)
     }
 
@@ -99,14 +113,23 @@ impl Setup {
 
     /// The camera as the references know it.
     pub(crate) fn camera(&self) -> Camera {
-        let camera::Camera { width, height, focal, principal_point, view_from_world } = self.camera;
+        let camera::Camera { width, height, focal, principal_point, model, view_from_world } =
+            self.camera;
         let size = UVec2::new(width, height).as_dvec2();
         let DAffine3 { matrix3: rotation, translation } = view_from_world;
         // As far outside the view as a fraction of its size.
         let margin = 0.15 * size;
-        let least_slope = -(principal_point + margin) / focal;
-        let most_slope = (size - principal_point + margin) / focal;
-        Camera { rotation, translation, focal, principal_point, size, least_slope, most_slope }
+        let model = match model {
+            CameraModel::Pinhole => Model::Pinhole(Pinhole {
+                least_slope: -(principal_point + margin) / focal,
+                most_slope: (size - principal_point + margin) / focal,
+            }),
+            CameraModel::Fisheye(lens) => Model::Fisheye(Fisheye {
+                distortion: lens.coefficients,
+                largest_angle: lens.largest_angle(),
+            }),
+        };
+        Camera { rotation, translation, focal, principal_point, size, model }
     }
 
     pub(crate) fn get(&self, i: usize) -> Gaussian {
@@ -260,11 +283,17 @@ pub(crate) fn tile_of((size, subgroups): ([u32; 2], u32)) -> Tile {
     Tile { size, subgroups }
 }
 
+/// A fisheye as they are sold, in numbers of f32.
+pub(crate) fn fisheye() -> CameraModel {
+    let coefficients = [0.05f32, -0.02, 0.006, -0.001].map(f64::from);
+    CameraModel::Fisheye(KannalaBrandt { coefficients })
+}
+
 /// Every size, channel count, tile and SH degree (stored, in use) that a kernel may trip over; colours are raw in those
 /// with many channels.
 pub(crate) fn variants() -> Vec<Setup> {
     type Row = (usize, [u32; 2], [u32; 2], usize, ([u32; 2], u32));
-    let rows: [Row; 9] = [
+    let rows: [Row; 11] = [
         (0, [33, 17], [0, 0], 3, ([16, 8], 1)),
         (1, [16, 16], [0, 0], 3, ([16, 16], 1)),
         (63, [50, 37], [1, 1], 4, ([16, 8], 1)),
@@ -274,10 +303,15 @@ pub(crate) fn variants() -> Vec<Setup> {
         (300, [131, 77], [3, 3], 3, ([16, 8], 1)),
         (300, [70, 53], [1, 1], 3, ([16, 16], 4)),
         (120, [51, 37], [2, 2], 11, ([16, 16], 2)),
+        (64, [50, 37], [1, 1], 3, ([16, 8], 1)),
+        (200, [66, 52], [2, 1], 4, ([16, 16], 1)),
     ];
-    let build = |(count, size, [stored, used], channels, tile): Row| {
+    /// Those from here on are seen by a fisheye.
+    const PINHOLES: usize = 9;
+    let build = |(i, (count, size, [stored, used], channels, tile)): (usize, Row)| {
         let shape = Shape { sh_degree: stored, features: features(channels) };
-        let mut setup = Setup::new(count, size, shape, count as u64);
+        let model = if i < PINHOLES { CameraModel::Pinhole } else { fisheye() };
+        let mut setup = Setup::seen_by(model, count, size, shape, count as u64);
         setup.options.sh_degree = used;
         setup.settings.raw_colors = channels > 4;
         // Tiles that do not suit its subgroups a device replaces by its own.
@@ -285,5 +319,5 @@ pub(crate) fn variants() -> Vec<Setup> {
             Some(tile_of(tile)).filter(|&tile| gpu().properties().suits_tile(tile));
         setup
     };
-    rows.map(build).to_vec()
+    rows.into_iter().enumerate().map(build).collect()
 }

@@ -9,8 +9,12 @@ use nightsplat::train::{StepReport, TrainConfig, Trainer};
 /// So many synthetic views of a size, loaded as by default.
 pub(crate) fn dataset(views: usize, [width, height]: [u32; 2]) -> Dataset {
     let folder = tempfile::tempdir().unwrap();
-    synthetic::write(folder.path(), &SyntheticOptions { views, width, height, seed: 1 }).unwrap();
-    Dataset::load(folder.path(), &TrainConfig::default().load_options()).unwrap()
+    synthetic::write(
+        folder.path(),
+        &SyntheticOptions { views, width, height, seed: 1, ..SyntheticOptions::default() },
+    )
+    .unwrap();
+    Dataset::load(folder.path(), &TrainConfig::bare().load_options()).unwrap()
 }
 
 /// Trains until a step; what the steps said.

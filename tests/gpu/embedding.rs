@@ -10,7 +10,7 @@ use ash::vk::Handle as _;
 use ash::{ext, khr, vk};
 use glam::{DAffine3, DVec2};
 use nightsplat::base::random::Stream;
-use nightsplat::camera::Camera;
+use nightsplat::camera::{Camera, CameraModel};
 use nightsplat::gpu::testing::gpu;
 use nightsplat::gpu::{Gpu, HostDevice, required_device_features};
 use nightsplat::photographs::image::Image;
@@ -84,6 +84,7 @@ fn camera() -> Camera {
         height: 40,
         focal: DVec2::splat(40.0),
         principal_point: DVec2::new(24.0, 20.0),
+        model: CameraModel::Pinhole,
         view_from_world: DAffine3::IDENTITY,
     }
 }

@@ -10,6 +10,7 @@ mod denoising;
 mod depth;
 mod image;
 mod log;
+mod parameters;
 mod structure;
 
 mod masks;

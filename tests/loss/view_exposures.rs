@@ -264,11 +264,17 @@ const FACTORS: [f32; 4] = [1.0, 0.5, 0.25, 2.0];
 
 /// Synthetic views of which each is darkened or brightened, under one curve.
 fn varied(folder: &Path) -> (TrainConfig, Dataset) {
-    let options = SyntheticOptions { views: 14, width: 40, height: 30, seed: 3 };
+    let options = SyntheticOptions {
+        views: 14,
+        width: 40,
+        height: 30,
+        seed: 3,
+        ..SyntheticOptions::default()
+    };
     synthetic::write(folder, &options).unwrap();
     let mut tone = ToneSettings::new(ToneCurve::Ase);
     tone.scene_statistics = true;
-    let mut config = TrainConfig { steps: 300, sh_degree: 0, tone, ..Default::default() };
+    let mut config = TrainConfig { steps: 300, sh_degree: 0, tone, ..TrainConfig::bare() };
     config.schedule.densify_before = 0;
     config.schedule.resolution_steps = [0, 40];
     config.exposure.learn = Learning::On;

@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
 use glam::{DAffine3, DVec2, DVec3};
-use nightsplat::camera::Camera;
+use nightsplat::camera::{Camera, CameraModel};
 use nightsplat::photographs::tone::{Exposure, LuminanceHistogram, Statistics, exposed_anew, soft};
 
 /// A reproducible photograph whose luminance crowds near black, planar; `contrast` is the power that crowds it.
@@ -125,6 +125,7 @@ fn camera(step: usize) -> Camera {
         height: 8,
         focal: DVec2::splat(8.0),
         principal_point: DVec2::splat(4.0),
+        model: CameraModel::Pinhole,
         view_from_world: DAffine3::from_translation(-(step as f64) * DVec3::X),
     }
 }

@@ -5,11 +5,16 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use glam::{DVec2, DVec3};
+use nightsplat::camera::CameraModel;
 use nightsplat::photographs::dataset::synthetic::{self, DARKENING, SyntheticOptions};
 use nightsplat::photographs::dataset::{Dataset, LoadOptions, Split};
 use nightsplat::photographs::image::{Image, linear_from_srgb};
 
-const SMALL: SyntheticOptions = SyntheticOptions { views: 10, width: 48, height: 36, seed: 5 };
+use crate::common::command::run;
+
+const SMALL: SyntheticOptions =
+    SyntheticOptions { views: 10, width: 48, height: 36, seed: 5, fisheye: false };
 
 /// Every file below a folder by its path there.
 fn files(root: &Path) -> BTreeMap<String, Vec<u8>> {
@@ -176,7 +181,13 @@ fn a_folder_that_cannot_be_made_is_named() {
 
 #[test]
 fn every_eighth_view_is_for_testing() {
-    let dir = written(&SyntheticOptions { views: 17, width: 16, height: 16, seed: 0 });
+    let dir = written(&SyntheticOptions {
+        views: 17,
+        width: 16,
+        height: 16,
+        seed: 0,
+        ..SyntheticOptions::default()
+    });
     let dataset = Dataset::load(dir.path(), &LoadOptions::default()).unwrap();
     let is_test = |(index, view): (usize, &nightsplat::photographs::dataset::View)| {
         (view.split == Split::Test) == (index % 8 == 0)
@@ -190,9 +201,9 @@ mod command {
     use nightsplat::cli::synth::{SynthArgs, run};
 
     fn args(dir: &Path, overwrite: bool) -> SynthArgs {
-        let SyntheticOptions { views, width, height, seed } =
+        let SyntheticOptions { views, width, height, seed, fisheye } =
             SyntheticOptions { width: 16, height: 16, ..SMALL };
-        SynthArgs { dir: dir.to_owned(), views, width, height, seed, overwrite }
+        SynthArgs { dir: dir.to_owned(), views, width, height, seed, fisheye, overwrite }
     }
 
     #[test]
@@ -211,5 +222,59 @@ mod command {
         let dir = tempfile::tempdir().unwrap();
         run(args(&dir.path().join("new"), false)).unwrap();
         assert!(dir.path().join("new/transforms_train.json").is_file());
+    }
+}
+
+#[test]
+fn a_fisheye_set_has_one_lens_in_both_listings_and_its_points_where_its_photographs_show_them() {
+    let dir = written(&SyntheticOptions { fisheye: true, ..SMALL });
+    let root = dir.path();
+    let listed = Dataset::load(root, &LoadOptions::default()).unwrap();
+    let camera = listed.views[0].camera;
+    assert!(matches!(camera.model, CameraModel::Fisheye(_)), "{camera:?}");
+    // The middle of the longer side is 65 degrees off the picture's middle; nothing lies outside the circle.
+    let reach = camera.focal.x / 48.0;
+    let CameraModel::Fisheye(lens) = camera.model else { panic!() };
+    assert!((lens.angle(0.5 / reach).unwrap().to_degrees() - 65.0).abs() < 1e-9);
+    assert!(listed.views.iter().all(|view| view.mask.is_none()));
+    let model = std::fs::read_to_string(root.join("colmap_sparse/0/cameras.txt")).unwrap();
+    assert!(model.contains("OPENCV_FISHEYE"), "{model}");
+    let points = std::fs::read_to_string(root.join("colmap_sparse/0/points3D.txt")).unwrap();
+    let images = std::fs::read_to_string(root.join("colmap_sparse/0/images.txt")).unwrap();
+    // Observations of the first view, and the positions of their points.
+    let seen: Vec<f64> =
+        images.lines().nth(3).unwrap().split(' ').map(|n| n.parse().unwrap()).collect();
+    assert!(seen.len() > 300);
+    let view = listed.views.iter().find(|view| view.name == "000").unwrap();
+    for observation in seen.chunks(3) {
+        let id = format!("{} ", observation[2]);
+        let point = points.lines().find(|line| line.starts_with(&id)).unwrap();
+        let xyz: Vec<f64> = point.split(' ').skip(1).take(3).map(|n| n.parse().unwrap()).collect();
+        let pixel = view.camera.project(DVec3::from_slice(&xyz)).unwrap();
+        let off = pixel.distance(DVec2::new(observation[0], observation[1]));
+        // Positions are off by a reconstruction's noise.
+        assert!(off < 0.3, "point {id}: off by {off}");
+    }
+}
+
+#[test]
+fn a_fisheye_set_trains_renders_scores_and_exports() {
+    let dir = tempfile::tempdir().unwrap();
+    let [set, native, undistorted] =
+        ["set", "native", "undistorted"].map(|name| dir.path().join(name).display().to_string());
+    run(&format!("synth {set} --fisheye --views 10 --width 48 --height 36"), 0);
+    let said = run(&format!("train {set} --out {native} --steps 200 --seed 1"), 0).1;
+    assert!(!said.contains("cropped"), "{said}");
+    run(&format!("train {set} --out {undistorted} --steps 1 --undistort"), 0);
+    let scores = run(&format!("eval {native} --json"), 0).0;
+    let scores: serde_json::Value = serde_json::from_str(&scores).unwrap();
+    let psnr = scores["mean"]["psnr"].as_f64().unwrap_or_else(|| panic!("{scores}"));
+    assert!(psnr > 15.0, "{psnr}");
+    let frames = dir.path().join("frames");
+    run(&format!("render {native} --path interpolate --frames 2 --out {}", frames.display()), 0);
+    for (to, name) in [("ply", "model.ply"), ("html", "page.html")] {
+        let out = dir.path().join(name);
+        run(&format!("export {native} --to {to} --out {}", out.display()), 0);
+        assert!(out.exists());
     }
 }

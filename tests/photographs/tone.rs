@@ -101,7 +101,8 @@ fn the_f32_curves_follow_the_f64_curves() {
     grid.extend([0.0, 1e-12, 1e-9, 1e-6, 0.009_999, 0.01, 0.010_001, 65.0, 1e6, f32::MAX]);
     for curve in PAPER {
         for (white, offset, gain) in [(1.0, 0.0, 1.0), (0.0816, 0.0754, 1.16), (1e-6, 0.12, 4.0)] {
-            let parameters = ToneParameters { white, offset, gain, constants: [0.0; 8] };
+            let parameters =
+                ToneParameters { white, offset, gain, weight: 1.0, constants: [0.0; 8] };
             for &x in &grid {
                 let t = f64::from(x) / f64::from(white);
                 let exact = curve.value(t, offset.into(), gain.into(), &[]);

@@ -23,7 +23,7 @@ const STEPS: u64 = 16;
 
 fn config() -> TrainConfig {
     let mut config =
-        TrainConfig { steps: STEPS, background: Background::Random, ..TrainConfig::default() };
+        TrainConfig { steps: STEPS, background: Background::Random, ..TrainConfig::bare() };
     config.schedule.densify_after = 5;
     config.schedule.densify_interval = 6;
     config.schedule.sh_degree_interval = 5;
@@ -124,7 +124,13 @@ fn file_name(device: &str, driver: &str) -> String {
 fn tiny_run() -> (tempfile::TempDir, PathBuf) {
     let folder = tempfile::tempdir().unwrap();
     let [set, run] = ["set", "run"].map(|name| folder.path().join(name));
-    let options = SyntheticOptions { views: 8, width: 32, height: 24, seed: 1 };
+    let options = SyntheticOptions {
+        views: 8,
+        width: 32,
+        height: 24,
+        seed: 1,
+        ..SyntheticOptions::default()
+    };
     synthetic::write(&set, &options).unwrap();
     succeed(&format!(
         "train {} --out {} --plan none --model plain --curve ap3 --steps 60 --hash-every 20 --set tile=[16,8] \

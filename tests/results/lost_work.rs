@@ -2,11 +2,11 @@
 #![cfg(all(unix, feature = "cli"))]
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
-use std::fs;
+use std::fs::{self, File};
 use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 use crate::common::command::{command, refused, run, succeed};
 use crate::common::place::Place;
@@ -309,4 +309,31 @@ fn too_little_address_space_is_said_before_a_driver_faults() {
         assert_eq!(output.status.code(), Some(4), "{stderr}");
         assert!(stderr.contains("`ulimit -v`") && stderr.lines().count() == 1, "{stderr}");
     }
+}
+
+#[test]
+fn a_finished_run_is_recognised_without_decoding_a_photograph() {
+    let place = Place::new();
+    let train = place.train("run", "--steps 2 --resume");
+    succeed(&train);
+    let photograph = place.path("set/low/001.png");
+    let (bytes, time) = (fs::read(&photograph).unwrap(), modified(&photograph));
+    // Of the same length and time, and no picture any more: whoever decoded it would leave the view out.
+    fs::write(&photograph, vec![0; bytes.len()]).unwrap();
+    set_modified(&photograph, time);
+    assert!(succeed(&train).contains("is done"));
+    // Of another time the pixels decide.
+    fs::write(&photograph, &bytes).unwrap();
+    set_modified(&photograph, time + Duration::from_secs(5));
+    assert!(succeed(&train).contains("is done"));
+    fs::write(&photograph, fs::read(place.path("set/low/002.png")).unwrap()).unwrap();
+    refused(&train, 3, &["view 001 shows other pixels"]);
+}
+
+fn modified(path: &Path) -> SystemTime {
+    path.metadata().unwrap().modified().unwrap()
+}
+
+fn set_modified(path: &Path, time: SystemTime) {
+    File::options().write(true).open(path).unwrap().set_modified(time).unwrap();
 }

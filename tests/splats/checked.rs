@@ -25,7 +25,13 @@ use crate::common::setup::variants;
 /// Six views of 40 x 30 pixels with depth maps, as the model wants them.
 fn dataset(config: &TrainConfig) -> Dataset {
     let folder = tempfile::tempdir().unwrap();
-    let options = SyntheticOptions { views: 6, width: 40, height: 30, seed: 1 };
+    let options = SyntheticOptions {
+        views: 6,
+        width: 40,
+        height: 30,
+        seed: 1,
+        ..SyntheticOptions::default()
+    };
     synthetic::write(folder.path(), &options).unwrap();
     let depth = folder.path().join("depth");
     std::fs::create_dir(&depth).unwrap();
@@ -41,7 +47,7 @@ fn dataset(config: &TrainConfig) -> Dataset {
 fn config(parts: &[Part]) -> TrainConfig {
     let tone = ToneSettings::new(ToneCurve::Ap3);
     let mut config =
-        TrainConfig { steps: 40, background: Background::Random, tone, ..Default::default() };
+        TrainConfig { steps: 40, background: Background::Random, tone, ..TrainConfig::bare() };
     config.schedule.densify_after = 1;
     config.schedule.densify_interval = 2;
     config.schedule.sh_degree_interval = 1;
@@ -297,7 +303,13 @@ fn data_that_is_not_finite_is_no_difference_and_no_panic() {
 fn the_command_checks_a_dataset_and_names_what_differs() {
     use clap::Parser as _;
     let folder = tempfile::tempdir().unwrap();
-    let options = SyntheticOptions { views: 3, width: 24, height: 18, seed: 1 };
+    let options = SyntheticOptions {
+        views: 3,
+        width: 24,
+        height: 18,
+        seed: 1,
+        ..SyntheticOptions::default()
+    };
     synthetic::write(folder.path(), &options).unwrap();
     let check = |path: &Path| {
         let arguments = ["nightsplat", "check", path.to_str().unwrap(), "--steps", "1", "--json"];

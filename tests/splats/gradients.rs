@@ -2,11 +2,12 @@
 
 use glam::{DVec2, DVec3, DVec4};
 use nightsplat::gpu::testing::gpu;
+use nightsplat::reference::camera::Model;
 use nightsplat::reference::gaussian::Gaussian;
 use nightsplat::splats::scene::Shape;
 
 use crate::common::chain::Chain;
-use crate::common::setup::{Gradients, Rendered, Setup, features, tile_of, variants};
+use crate::common::setup::{Gradients, Rendered, Setup, features, fisheye, tile_of, variants};
 
 const SIZE: [u32; 2] = [26, 19];
 
@@ -63,6 +64,14 @@ fn the_chain_s_gradients_are_its_central_differences() {
 }
 
 #[test]
+fn the_chain_s_gradients_are_its_central_differences_through_a_fisheye_too() {
+    for degree in [0, 2] {
+        let setup = Setup::seen_by(fisheye(), 7, SIZE, degree, 21 + u64::from(degree));
+        check(&setup, &format!("fisheye, degree {degree}"));
+    }
+}
+
+#[test]
 fn every_feature_and_every_raw_color_has_its_central_difference() {
     for (channels, raw_colors) in [(5, false), (11, true)] {
         let shape = Shape { sh_degree: 1, features: features(channels) };
@@ -86,11 +95,13 @@ fn coefficients_above_the_degree_in_use_have_no_gradient() {
 fn the_gradient_holds_where_the_slope_is_clamped() {
     let mut setup = Setup::new(5, SIZE, 1, 41);
     let camera = setup.camera();
+    let Model::Pinhole(pinhole) = &camera.model else { panic!("{camera:?}") };
     for (i, x, y) in [(0, 1.3, 0.5), (1, -0.4, 0.4), (2, 0.5, 1.5), (3, 1.3, -0.3)] {
         let depth = 2.0 + 0.3 * i as f64;
         let mean = setup.at_pixel(DVec2::new(x, y) * camera.size, depth);
         let slope = camera.view(mean).truncate() / depth;
-        assert!((camera.clamped_slope(camera.view(mean)) - slope).length() > 1e-3, "not clamped");
+        let clamped = pinhole.clamped_slope(camera.view(mean));
+        assert!((clamped - slope).length() > 1e-3, "not clamped");
         let log_scale = DVec3::new(-0.3, -0.6, -0.1);
         setup.set(i, &Gaussian { mean, log_scale, raw_opacity: 1.0, ..setup.get(i) });
     }

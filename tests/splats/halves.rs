@@ -238,7 +238,7 @@ fn alone() -> MutexGuard<'static, ()> {
 /// Density control and a growing SH degree among its steps.
 fn config([rest, moments]: [StorageFormat; 2]) -> TrainConfig {
     let precision = PrecisionConfig { rest, moments, ..PrecisionConfig::default() };
-    let mut config = TrainConfig { steps: 40, precision, ..TrainConfig::default() };
+    let mut config = TrainConfig { steps: 40, precision, ..TrainConfig::bare() };
     config.random_points = 3000;
     (config.schedule.densify_after, config.schedule.densify_interval) = (4, 5);
     config.schedule.densify_before = 35;
@@ -311,7 +311,7 @@ fn runs_in_fewer_bits_go_on_to_the_same_bits() {
 
 #[test]
 fn the_bits_are_settings_like_any_other() {
-    let with = |assignment: &str| TrainConfig::default().with(&[assignment.to_owned()]);
+    let with = |assignment: &str| TrainConfig::bare().with(&[assignment.to_owned()]);
     let config = with("precision.rest=16").unwrap().with(&["precision.moments=16".to_owned()]);
     let config = config.unwrap();
     assert_eq!([config.precision.rest, config.precision.moments], [StorageFormat::Half; 2]);

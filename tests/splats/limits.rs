@@ -11,7 +11,9 @@ use nightsplat::camera::Patch;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::gpu::{Threads, Tile};
 use nightsplat::kernels::status::STATUS_CROWDED;
-use nightsplat::kernels::{ProjectedSplat, blend_forward, emit, order_counts, project_backward};
+use nightsplat::kernels::{
+    self, ProjectedSplat, blend_forward, emit, order_counts, project_backward,
+};
 use nightsplat::reference::gaussian::Gaussian;
 use nightsplat::splats::render::{RenderSettings, Renderer, Status};
 use nightsplat::splats::scene::Shape;
@@ -180,11 +182,12 @@ fn sums(emitted: Vec<UVec2>, records: &[Record]) -> Vec<f32> {
     let records: Vec<Vec3> = records.concat();
     let gradients = vec![f32::NAN; parameters.len()];
     let (grad_norm_sums, visit_counts) = (vec![0.0f32; count], vec![0; count]);
+    let cameras = vec![kernels::Camera::from(&Patch::from(&setup.camera))];
     let (_, gradients, _, _) = run_kernel!(
         project_backward,
         project_backward::Constants { channels: 4, ..Default::default() },
         project_backward::Params {
-            camera: (&Patch::from(&setup.camera)).into(),
+            camera_index: 0,
             half_view: Vec2::splat(16.0),
             gaussian_count: count as u32,
             sh_degree: 3,
@@ -192,7 +195,7 @@ fn sums(emitted: Vec<UVec2>, records: &[Record]) -> Vec<f32> {
             damping_depth: 1.0,
         },
         Threads::Exactly([count as u32, 1, 1]),
-        [parameters, splats, colors, tile_counts, emitted, records],
+        [parameters, splats, colors, tile_counts, emitted, records, cameras],
         [status, gradients, grad_norm_sums, visit_counts]
     );
     (0..count).map(|i| setup.planes().load(&gradients, i).features[0] as f32).collect()

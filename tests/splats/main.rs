@@ -11,6 +11,7 @@ mod checked;
 mod conditioning;
 mod coverage;
 mod densify;
+mod fisheye;
 mod gradients;
 mod halves;
 mod limits;

@@ -327,7 +327,7 @@ fn write_golden(path: &Path, setup: &Setup) {
         assert!(most < 10.0 * f64::from(GOLDEN_TOLERANCE), "{path:?} hangs on a rounding: {most}");
     }
     let narrow = |values: &[f64]| values.iter().map(|&v| v as f32).collect::<Vec<_>>();
-    let Camera { width, height, focal, principal_point, view_from_world } = setup.camera;
+    let Camera { width, height, focal, principal_point, view_from_world, .. } = setup.camera;
     let (width, height) = (width as usize, height as usize);
     safetensors::write(
         path,

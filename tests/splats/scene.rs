@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
 use glam::{DAffine3, DVec2, DVec3, Quat, Vec3};
-use nightsplat::camera::Camera;
+use nightsplat::camera::{Camera, CameraModel};
 use nightsplat::photographs::dataset::{Point, Split, View};
 use nightsplat::photographs::image::Image;
 use nightsplat::splats::attributes::planes;
@@ -19,6 +19,7 @@ fn camera(position: DVec3) -> Camera {
         height: 6,
         focal: DVec2::splat(10.0),
         principal_point: DVec2::new(4.0, 3.0),
+        model: CameraModel::Pinhole,
         view_from_world: DAffine3::from_translation(-position),
     }
 }

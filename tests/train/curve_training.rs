@@ -17,7 +17,7 @@ fn train(config: &TrainConfig, dataset: &Dataset) -> (Vec<f64>, Vec<f32>) {
 }
 
 fn config(tone: ToneSettings) -> TrainConfig {
-    TrainConfig { steps: 5, sh_degree: 0, tone, ..TrainConfig::default() }
+    TrainConfig { steps: 5, sh_degree: 0, tone, ..TrainConfig::bare() }
 }
 
 /// Points so close that the cubics between them are the curve's to 1e-4.
@@ -134,7 +134,13 @@ fn odd_sets_have_a_defined_brightness_or_say_why_not() {
 #[test]
 fn photographs_are_lifted_before_they_are_shrunk() {
     let folder = tempfile::tempdir().unwrap();
-    let options = SyntheticOptions { views: 5, width: 96, height: 72, seed: 1 };
+    let options = SyntheticOptions {
+        views: 5,
+        width: 96,
+        height: 72,
+        seed: 1,
+        ..SyntheticOptions::default()
+    };
     synthetic::write(folder.path(), &options).unwrap();
     let load = || {
         let options = LoadOptions { downscale: 3.0, ..LoadOptions::default() };

@@ -19,7 +19,13 @@ use crate::common::train::train;
 
 /// Six views of 40 x 30 pixels, with depth maps where asked.
 fn make_set(folder: &Path, with_depth: bool) {
-    let options = SyntheticOptions { views: 6, width: 40, height: 30, seed: 1 };
+    let options = SyntheticOptions {
+        views: 6,
+        width: 40,
+        height: 30,
+        seed: 1,
+        ..SyntheticOptions::default()
+    };
     synthetic::write(folder, &options).unwrap();
     if with_depth {
         let depth = folder.join("depth");
@@ -35,7 +41,7 @@ fn make_set(folder: &Path, with_depth: bool) {
 
 fn config(parts: &[Part]) -> TrainConfig {
     let tone = ToneSettings::new(ToneCurve::Ap3);
-    let mut config = TrainConfig { steps: 40, sh_degree: 0, tone, ..Default::default() };
+    let mut config = TrainConfig { steps: 40, sh_degree: 0, tone, ..TrainConfig::bare() };
     config.schedule.densify_after = 10;
     config.schedule.densify_interval = 15;
     config.model.set_parts(parts);

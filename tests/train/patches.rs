@@ -129,7 +129,7 @@ fn dataset() -> Dataset {
 
 fn config(patch_pixels: Option<u64>) -> TrainConfig {
     let tone = ToneSettings::new(ToneCurve::Ap3);
-    let mut config = TrainConfig { steps: 60, tone, patch_pixels, ..Default::default() };
+    let mut config = TrainConfig { steps: 60, tone, patch_pixels, ..TrainConfig::bare() };
     config.schedule.densify_after = 10;
     config.schedule.densify_interval = 20;
     config
@@ -245,7 +245,11 @@ fn a_run_on_patches_says_so_is_resumed_to_the_same_bits_and_scored() {
             place.model("whole")
         }
     );
-    refused(&place.train("few", "--patch-pixels 255"), 2, &["--patch-pixels is 255", "256"]);
+    refused(
+        &place.train("few", "--patch-pixels 255"),
+        2,
+        &["patch_pixels (--patch-pixels) is 255", "256"],
+    );
     assert!(!fs::exists(place.path("few")).unwrap());
 }
 

@@ -22,14 +22,20 @@ use crate::common::train::advance;
 
 /// A set of nine small views.
 fn make_set(folder: &Path) {
-    let options = SyntheticOptions { views: 9, width: 40, height: 30, seed: 2 };
+    let options = SyntheticOptions {
+        views: 9,
+        width: 40,
+        height: 30,
+        seed: 2,
+        ..SyntheticOptions::default()
+    };
     synthetic::write(folder, &options).unwrap();
 }
 
 /// Density control acts after steps 10 and 20 of thirty.
 fn config(parts: &[Part]) -> TrainConfig {
     let mut config =
-        TrainConfig { steps: 30, background: Background::Random, ..TrainConfig::default() };
+        TrainConfig { steps: 30, background: Background::Random, ..TrainConfig::bare() };
     config.schedule.densify_after = 5;
     config.schedule.densify_interval = 10;
     config.schedule.sh_degree_interval = 8;
@@ -84,7 +90,13 @@ fn a_restored_run_goes_on_bit_for_bit() {
 fn growth_and_the_sh_degree_end_where_held_out_views_gain_too_little_and_a_resumed_run_knows_it() {
     let folder = tempfile::tempdir().unwrap();
     // So many that one can be held out.
-    let options = SyntheticOptions { views: 12, width: 40, height: 30, seed: 2 };
+    let options = SyntheticOptions {
+        views: 12,
+        width: 40,
+        height: 30,
+        seed: 2,
+        ..SyntheticOptions::default()
+    };
     synthetic::write(folder.path(), &options).unwrap();
     let gpu = gpu();
     let mut free = config(&[]);
@@ -119,7 +131,13 @@ fn growth_and_the_sh_degree_end_where_held_out_views_gain_too_little_and_a_resum
 
 /// A set of which one view is held out, and a run on it that converges as soon as it can: what is gained is never enough.
 fn early(folder: &Path) -> (Dataset, TrainConfig) {
-    let options = SyntheticOptions { views: 12, width: 40, height: 30, seed: 2 };
+    let options = SyntheticOptions {
+        views: 12,
+        width: 40,
+        height: 30,
+        seed: 2,
+        ..SyntheticOptions::default()
+    };
     synthetic::write(folder, &options).unwrap();
     let mut config = config(&[]);
     config.steps = 60;
@@ -226,11 +244,7 @@ fn a_checkpoint_that_does_not_fit_is_refused_and_changes_nothing() {
     refuses(&mut trainer, &edited("checkpoint 1", "checkpoint 9"), &["is no `nightsplat"]);
     refuses(&mut trainer, &edited("visit_counts", "visit_c0unts"), &["density.visit_counts"]);
     refuses(&mut trainer, &edited("first_moments", "first_m0ments"), &["gaussians.first_moments"]);
-    refuses(
-        &mut trainer,
-        &edited("seed = 10", "seed = 11"),
-        &["seed = 11, not 10", "HeldRun::Replace"],
-    );
+    refuses(&mut trainer, &edited("seed = 10", "seed = 11"), &["seed = 11, not 10", "--overwrite"]);
     refuses(&mut trainer, &edited("steps = 30", "stepz = 30"), &["another version"]);
     let file = SafeTensors::deserialize(&whole).unwrap();
     let sums = file.tensor("density.grad_norm_sums").unwrap().data();
@@ -242,7 +256,7 @@ fn a_checkpoint_that_does_not_fit_is_refused_and_changes_nothing() {
 
     let shorter = TrainConfig { steps: 5, ..config };
     let mut shorter = Trainer::new(&gpu, shorter, &dataset).unwrap();
-    refuses(&mut shorter, &whole, &["at step 6", "ends at 5", "TrainConfig::steps"]);
+    refuses(&mut shorter, &whole, &["at step 6", "ends at 5", "raise steps"]);
 }
 
 #[test]

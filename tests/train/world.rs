@@ -15,7 +15,7 @@ use nightsplat::train::{TrainConfig, Trainer};
 use crate::common::train::advance;
 
 fn config() -> TrainConfig {
-    let mut config = TrainConfig { steps: 150, ..TrainConfig::default() };
+    let mut config = TrainConfig { steps: 150, ..TrainConfig::bare() };
     config.schedule.densify_after = 10;
     config.schedule.densify_interval = 40;
     config.schedule.resolution_steps = [0, 40];

@@ -2,7 +2,7 @@
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
 #include "gaussian.glsl"
-#include "camera.glsl"
+#include "rotation.glsl"
 #include "fate.glsl"
 #include "random.glsl"
 

@@ -2,7 +2,9 @@
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
 #include "gaussian.glsl"
+#define CAMERA_MODEL camera.model
 #include "camera.glsl"
+#include "rotation.glsl"
 #include "splat.glsl"
 #include "fate.glsl"
 
@@ -54,21 +56,24 @@ bool is_sound(uint i) {
 float view_change(vec3 mean, mat3 axes, float opacity, uint axis, Camera camera) {
     vec3 mean_in_view = camera.view_from_world * vec4(mean, 1.0);
     mat3 view_axes = mat3(camera.view_from_world) * axes;
-    float shift = SPLIT_OFFSET * abs(view_axes[axis].z);
+    float depth = camera_depth(mean_in_view, camera);
+    float shift = SPLIT_OFFSET * abs(camera_depth_change(mean_in_view, view_axes[axis], camera));
     // No half is beyond the near plane.
-    if (mean_in_view.z + shift <= near) return 0.0;
+    if (depth + shift <= near) return 0.0;
     // Where the nearer half is, the footprint is the largest.
-    mean_in_view.z = max(mean_in_view.z - shift, max(near, NEAREST));
-    vec2 slope = clamped_slope(mean_in_view, camera);
+    depth = max(depth - shift, max(near, NEAREST));
+    mean_in_view = camera_at_depth(mean_in_view, depth, camera);
+    if (camera_depth(mean_in_view, camera) <= 0.0) return 0.0;
+    Jacobian jacobian = camera_jacobian(mean_in_view, camera);
     mat3 rows = transpose(view_axes);
-    vec3 u0 = camera.focal.x / mean_in_view.z * (rows * vec3(1.0, 0.0, -slope.x));
-    vec3 u1 = camera.focal.y / mean_in_view.z * (rows * vec3(0.0, 1.0, -slope.y));
+    vec3 u0 = jacobian.scale.x * (rows * jacobian.row0);
+    vec3 u1 = jacobian.scale.y * (rows * jacobian.row1);
     vec2 variance = vec2(dot(u0, u0), dot(u1, u1)) + DILATION;
     vec2 half_extent = sqrt(max(splat_level(opacity), 0.0) * variance);
-    vec2 mean2d = camera.focal * mean_in_view.xy / mean_in_view.z + camera.principal_point;
+    vec2 mean2d = camera_project(mean_in_view, camera);
     vec2 size = vec2(camera.size);
     vec2 covered = clamp(mean2d + half_extent, vec2(0.0), size) - clamp(mean2d - half_extent, vec2(0.0), size);
-    float change = opacity * shift / mean_in_view.z;
+    float change = opacity * shift / depth;
     return covered.x / size.x * (covered.y / size.y) * change * change;
 }
 

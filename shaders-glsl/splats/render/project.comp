@@ -3,12 +3,13 @@
 #include "kernel.glsl"
 #include "gaussian.glsl"
 #include "camera.glsl"
+#include "rotation.glsl"
 #include "sh.glsl"
 #include "splat.glsl"
 
 //! Project: one thread per Gaussian, world space to image plane.
 //!
-//! EWA: cov2d = U U^T + 0.3 I with U = J W R S, so it is positive definite by construction, and its determinant is
+//! EWA: cov2d = U U^T + 0.3 I with U = J W R S, where J is the camera's Jacobian at the mean, so it is positive definite by construction, and its determinant is
 //! |U0 x U1|^2 + 0.3 trace(U U^T) + 0.09, which cannot cancel. Colour is max(SH + 0.5, 0), what every viewer shows, or
 //! the bare SH sum of LITA-GS; features are taken as they are.
 //! A culled Gaussian gets the last depth key and covers no tile.
@@ -16,8 +17,8 @@
 layout(local_size_x = 64) in;
 
 layout(push_constant, scalar) uniform Params {
-    Camera camera;
-    float near;       // world units
+    uint  camera_index;
+    float near;       // the least depth, world units
     uint  gaussian_count;
     uint  sh_degree;  // in use; at most SH_DEGREE
     uint  first_gaussian;  // how many lie before those of this dispatch
@@ -33,6 +34,7 @@ layout(binding = 2) writeonly buffer Colors     { vec3 colors[]; };         // (
 layout(binding = 3) writeonly buffer DepthKeys  { uint depth_keys[]; };
 layout(binding = 4) writeonly buffer Ids        { uint ids[]; };
 layout(binding = 5) writeonly buffer TileCounts { uint tile_counts[]; };
+layout(binding = 6) readonly  buffer Cameras    { Camera cameras[]; };
 
 // A depth key is how many sixteenfold roundings the depth is beyond `near`: 2e-6 of the depth each, over 32 octaves.
 const uint DEPTH_BITS = 24;
@@ -64,26 +66,28 @@ void main() {
     depth_keys[i] = CULLED;
     tile_counts[i] = 0;
 
+    Camera camera = cameras[camera_index];
     vec3 mean = LOAD_VEC3(parameters, MEANS_COLUMN, gaussian_count, i);
     vec3 mean_in_view = camera.view_from_world * vec4(mean, 1.0);
     float opacity = sigmoid(parameters[RAW_OPACITIES_COLUMN * gaussian_count + i]);
+    float depth = camera_depth(mean_in_view, camera);
     // Positive phrasing: a NaN depth or opacity fails the test too.
-    if (!(mean_in_view.z > near && opacity > ALPHA_MIN)) return;
+    if (!(depth > near && opacity > ALPHA_MIN)) return;
 
-    vec2 slope = clamped_slope(mean_in_view, camera);
     mat3 world_axes = rotation(unit_quat(LOAD_VEC4(parameters, QUATS_COLUMN, gaussian_count, i)));
     vec3 scale = exp(LOAD_VEC3(parameters, LOG_SCALES_COLUMN, gaussian_count, i));
     mat3 view_axes = mat3(camera.view_from_world) * world_axes;
     for (uint k = 0; k < 3; k++) view_axes[k] *= scale[k];
     mat3 rows = transpose(view_axes);  // row k of W R S as rows[.][k]
-    vec3 u0 = camera.focal.x / mean_in_view.z * (rows * vec3(1.0, 0.0, -slope.x));
-    vec3 u1 = camera.focal.y / mean_in_view.z * (rows * vec3(0.0, 1.0, -slope.y));
+    Jacobian jacobian = camera_jacobian(mean_in_view, camera);
+    vec3 u0 = jacobian.scale.x * (rows * jacobian.row0);
+    vec3 u1 = jacobian.scale.y * (rows * jacobian.row1);
 
     float xx = dot(u0, u0), xy = dot(u0, u1), yy = dot(u1, u1);
     vec3 normal = cross(u0, u1);
     float det = dot(normal, normal) + DILATION * (xx + yy) + DILATION * DILATION;
     vec3 cov2d = vec3(xx + DILATION, xy, yy + DILATION);
-    vec2 mean2d = camera.focal * mean_in_view.xy / mean_in_view.z + camera.principal_point;
+    vec2 mean2d = camera_project(mean_in_view, camera);
     // Positive phrasing: an overflow or a NaN is culled.
     if (!(det < 1e30 && all(lessThan(abs(mean2d), vec2(1e30))))) return;
 
@@ -114,5 +118,5 @@ void main() {
         count += columns.y - columns.x;
     }
     tile_counts[i] = count;
-    if (count > 0) depth_keys[i] = depth_key(mean_in_view.z);
+    if (count > 0) depth_keys[i] = depth_key(depth);
 }

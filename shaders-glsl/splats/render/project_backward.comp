@@ -3,6 +3,7 @@
 #include "kernel.glsl"
 #include "gaussian.glsl"
 #include "camera.glsl"
+#include "rotation.glsl"
 #include "sh.glsl"
 #include "splat.glsl"
 #include "status.glsl"
@@ -20,7 +21,7 @@ layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 #include "subgroup_sum.glsl"
 
 layout(push_constant, scalar) uniform Params {
-    Camera camera;
+    uint  camera_index;
     vec2  half_view;       // half the view, pixels, by the share that the render is of its pixels
     uint  gaussian_count;
     uint  sh_degree;       // in use; at most SH_DEGREE
@@ -42,6 +43,7 @@ layout(binding = 6)           buffer Status     { uint status[]; };
 layout(binding = 7) writeonly buffer Gradients  { float gradients[]; };   // (columns x gaussian_count)
 layout(binding = 8) buffer GradNormSums { float grad_norm_sums[]; };
 layout(binding = 9) buffer VisitCounts  { uint visit_counts[]; };
+layout(binding = 10) readonly buffer Cameras { Camera cameras[]; };
 
 const uint FEATURE_COUNT = CHANNELS - 3;
 
@@ -164,12 +166,10 @@ void main() {
     [[unroll]] for (uint k = 0; k < FEATURE_COUNT; k++) gradients[features + k] = record[RECORD_HEAD + 3 + k];
 
     // The forward pass again.
+    Camera camera = cameras[camera_index];
     mat3 view_rotation = mat3(camera.view_from_world);
     vec3 mean = LOAD_VEC3(parameters, MEANS_COLUMN, gaussian_count, i);
     vec3 mean_in_view = camera.view_from_world * vec4(mean, 1.0);
-    float z = mean_in_view.z;
-    vec2 free_slope = mean_in_view.xy / z;
-    vec2 slope = clamped_slope(mean_in_view, camera);
     vec4 quat = LOAD_VEC4(parameters, QUATS_COLUMN, gaussian_count, i);
     vec4 unit = unit_quat(quat);
     mat3 axes = rotation(unit);
@@ -177,8 +177,9 @@ void main() {
     mat3 scaled_axes = axes;
     for (uint k = 0; k < 3; k++) scaled_axes[k] *= scale[k];
     mat3 world_from_view = transpose(view_rotation);
-    vec3 t0 = world_from_view * (camera.focal.x / z * vec3(1.0, 0.0, -slope.x));  // rows of J W
-    vec3 t1 = world_from_view * (camera.focal.y / z * vec3(0.0, 1.0, -slope.y));
+    Jacobian jacobian = camera_jacobian(mean_in_view, camera);
+    vec3 t0 = world_from_view * (jacobian.scale.x * jacobian.row0);  // rows of J W
+    vec3 t1 = world_from_view * (jacobian.scale.y * jacobian.row1);
     vec3 u0 = t0 * scaled_axes, u1 = t1 * scaled_axes;
 
     // conic = inverse(cov2d), cov2d = U U^T + 0.3 I. Of conic U the large terms cancel, all of them for a needle; by hand,
@@ -203,16 +204,11 @@ void main() {
     float norm = length(small * quat);
     vec4 d_quat = norm > 1e-12 ? small * ((d_unit - unit * dot(unit, d_unit)) / norm) : vec4(0.0);
 
-    // J = focal / z (1, 0, -slope)
-    vec3 d_j0 = view_rotation * (scaled_axes * d_u0);
-    vec3 d_j1 = view_rotation * (scaled_axes * d_u1);
-    vec2 d_slope = -camera.focal / z * vec2(d_j0.z, d_j1.z);
-    bvec2 is_free = equal(free_slope, slope);
-    vec2 d_xy_view = camera.focal * d_mean2d / z + mix(vec2(0.0), d_slope / z, is_free);
-    float d_z = -(camera.focal.x * (d_j0.x - slope.x * d_j0.z) + camera.focal.y * (d_j1.y - slope.y * d_j1.z)) / (z * z)
-        - dot(d_xy_view, free_slope);
+    vec3 d_row0 = view_rotation * (scaled_axes * d_u0);
+    vec3 d_row1 = view_rotation * (scaled_axes * d_u1);
+    vec3 d_mean_in_view = camera_backward(mean_in_view, camera, d_mean2d, d_row0, d_row1);
     vec3 center = -world_from_view * camera.view_from_world[3];
-    vec3 d_mean = world_from_view * vec3(d_xy_view, d_z) + sh_backward(i, mean - center, d_color);
+    vec3 d_mean = world_from_view * d_mean_in_view + sh_backward(i, mean - center, d_color);
 
     STORE_VEC3(MEANS_COLUMN, i, d_mean);
     STORE_VEC4(QUATS_COLUMN, i, d_quat);
@@ -231,7 +227,7 @@ void main() {
         return;
     }
     if (status[0] == 0) {
-        float nearness = min(1.0, z / damping_depth);
+        float nearness = min(1.0, camera_depth(mean_in_view, camera) / damping_depth);
         float damping = damping_weight * nearness * nearness + 1.0 - damping_weight;
         grad_norm_sums[i] += damping * length(half_view * d_mean2d);
         visit_counts[i] += 1;

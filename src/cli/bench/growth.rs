@@ -1,17 +1,26 @@
-//! `--growth`: how time and memory grow with Gaussians, pixels and channels.
+//! `--growth`: how time and memory grow with Gaussians, pixels, channels, photographs and points.
 
 use std::io::Write;
+use std::path::Path;
+use std::time::Instant;
 
 use anyhow::Result;
+use glam::DVec3;
 use serde_json::{Value, json};
+use tempfile::TempDir;
 
 use super::scene::{self, Scene};
 use super::tune::Pass;
 use super::{Bench, table, total};
 use crate::Error;
+use crate::base::random::Stream;
+use crate::photographs::dataset::synthetic::{self, SyntheticOptions};
+use crate::photographs::dataset::{self, Dataset};
 use crate::photographs::tone::ToneCurve;
 use crate::splats::render::{RenderSettings, Renderer};
 use crate::splats::scene::{Features, MAX_SH_DEGREE, Shape};
+use crate::train::diagnose::Diagnosis;
+use crate::train::{TrainConfig, Trainer};
 
 /// Gaussians, in those that are asked for: 10 000 to 500 000 at the default.
 const GAUSSIANS: [f64; 5] = [0.5, 1.5, 5.0, 12.5, 25.0];
@@ -27,6 +36,12 @@ const CHANNELS: [Features; 5] = [
     Features { illumination: false, ..Features::ALL },
     Features::ALL,
 ];
+
+/// Photographs of a capture, the last of which is the scene of the points.
+const VIEWS: [usize; 4] = [16, 48, 144, 432];
+
+/// Points of a capture, in those of its own.
+const POINTS: [usize; 4] = [1, 4, 16, 64];
 
 /// What one quantity does while the others stay.
 struct Axis {
@@ -61,6 +76,10 @@ pub(super) fn run(bench: &Bench, size: [u32; 2], gaussians: usize, as_json: bool
         Axis::of("channels", "rasteriser", &CHANNELS, |features| {
             (features.channels() as f64, rasteriser(bench, size, gaussians, features))
         })?,
+        Axis::of("photographs", "reading and placing", &VIEWS, |views| {
+            (views as f64, reading(bench, views))
+        })?,
+        points(bench)?,
     ];
     let mut out = std::io::stdout().lock();
     if as_json {
@@ -91,6 +110,53 @@ fn step(bench: &Bench, [width, height]: [u32; 2], gaussians: usize) -> crate::Re
     let mut trainer = scene::plain(&bench.gpu, &scene, ToneCurve::Ap3)?;
     let milliseconds = bench.least(|| Ok(total(&trainer.profile_step()?)))?;
     Ok((milliseconds, bench.gpu.peak_memory()))
+}
+
+/// From the files of a capture of small photographs to the first step.
+fn reading(bench: &Bench, views: usize) -> crate::Result<(f64, u64)> {
+    let folder = capture(views)?;
+    bench.gpu.reset_peak_memory();
+    let begin = Instant::now();
+    let config = config(folder.path());
+    let (dataset, _) = Diagnosis::load(folder.path(), &config.load_options())?;
+    Trainer::new(&bench.gpu, config, &dataset)?;
+    Ok((begin.elapsed().as_secs_f64() * 1e3, bench.gpu.peak_memory()))
+}
+
+/// The first Gaussians of a capture whose points are there several times, side by side.
+fn points(bench: &Bench) -> crate::Result<Axis> {
+    let folder = capture(VIEWS[0])?;
+    let config = config(folder.path());
+    let dataset = Dataset::load(folder.path(), &config.load_options())?;
+    Axis::of("points", "placing", &POINTS, |times| {
+        let near = |at: usize| {
+            let draws = Stream::new(7, at as u64);
+            let beside = DVec3::new(draws.normal(0), draws.normal(1), draws.normal(2));
+            let dataset::Point { position, views } = &dataset.points[at % dataset.points.len()];
+            dataset::Point { position: *position + 0.01 * beside, views: views.clone() }
+        };
+        let points: Vec<dataset::Point> = (0..times * dataset.points.len()).map(near).collect();
+        let count = points.len() as f64;
+        let dataset = Dataset { points, ..dataset.clone() };
+        bench.gpu.reset_peak_memory();
+        let begin = Instant::now();
+        let trainer = Trainer::new(&bench.gpu, config.clone(), &dataset);
+        let milliseconds = begin.elapsed().as_secs_f64() * 1e3;
+        (count, trainer.map(|_| (milliseconds, bench.gpu.peak_memory())))
+    })
+}
+
+/// Of photographs so small that pixels cost little.
+fn capture(views: usize) -> crate::Result<TempDir> {
+    let folder = tempfile::tempdir()
+        .map_err(|error| Error::output(std::env::temp_dir(), format!("cannot be used: {error}")))?;
+    let options = SyntheticOptions { views, width: 48, height: 36, ..SyntheticOptions::default() };
+    synthetic::write(folder.path(), &options)?;
+    Ok(folder)
+}
+
+fn config(dataset: &Path) -> TrainConfig {
+    TrainConfig { dataset: dataset.to_owned(), random_points: 1, ..TrainConfig::default() }
 }
 
 /// The rasteriser, there and back: the channels of a render reach no further, but for the parts that ask for them.

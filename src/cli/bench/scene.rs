@@ -6,7 +6,7 @@ use glam::{DAffine3, DVec2, Vec3};
 
 use crate::Result;
 use crate::base::random::Stream;
-use crate::camera::Camera;
+use crate::camera::{Camera, CameraModel};
 use crate::gpu::{CheckReport, Gpu};
 use crate::photographs::dataset::{Dataset, Point, Split, View};
 use crate::photographs::image::Image;
@@ -70,7 +70,7 @@ pub(super) fn trainers(gpu: &Gpu, scene: &Scene) -> Result<Trainers> {
 
 /// A configuration whose steps all do the same work, behind those that the SH take to come into use.
 fn config(curve: ToneCurve) -> TrainConfig {
-    let mut config = TrainConfig { tone: ToneSettings::new(curve), ..TrainConfig::default() };
+    let mut config = TrainConfig { tone: ToneSettings::new(curve), ..TrainConfig::bare() };
     config.schedule.sh_degree_interval = 1;
     config.schedule.boost = 1.0;
     config.schedule.densify_after = i64::MAX as u64;
@@ -122,6 +122,7 @@ pub(super) fn camera(width: u32, height: u32) -> Camera {
         height,
         focal: DVec2::splat(0.9 * f64::from(width)),
         principal_point: DVec2::new(0.51 * f64::from(width), 0.49 * f64::from(height)),
+        model: CameraModel::Pinhole,
         view_from_world: DAffine3::IDENTITY,
     }
 }
@@ -137,13 +138,13 @@ pub(super) fn gaussians(camera: &Camera, count: usize, shape: impl Into<Shape>) 
     for i in 0..count {
         let depth = 2.0 + 4.0 * uniform(i, 0);
         let pixel = size * DVec2::new(uniform(i, 1), uniform(i, 2));
-        let in_view = (pixel - camera.principal_point) / camera.focal * depth;
+        let in_view = camera.in_view(pixel, depth).unwrap_or_default();
         let axis = |draw: u64| {
             let log_pixels = LOG_PIXELS[0] + LOG_PIXELS[1] * f64::from(normal(i, draw));
             (log_pixels.exp().clamp(0.6, 20.0) * depth / camera.focal.x).ln() as f32
         };
         let opacity = 0.03 + 0.9 * uniform(i, 3).powi(2);
-        gaussians.means_mut()[i] = in_view.extend(depth).as_vec3();
+        gaussians.means_mut()[i] = in_view.as_vec3();
         gaussians.log_scales_mut()[i] = Vec3::new(axis(4), axis(5), axis(6));
         gaussians.quats_mut()[i] = [7, 8, 9, 10].map(|draw| normal(i, draw));
         gaussians.raw_opacities_mut()[i] = (opacity / (1.0 - opacity)).ln() as f32;

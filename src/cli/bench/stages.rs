@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::time::Instant;
 
-use super::scene::{self, Scene, Trainers};
+use super::scene::{self, Trainers};
 use super::{Bench, Timing, median, total};
 use crate::Result;
 use crate::base::random::Stream;
@@ -84,14 +84,10 @@ pub(super) fn of_kernels(times: &[PassTime], names: &[&str]) -> f64 {
 ///
 /// # Errors
 /// The device is out of memory or lost.
-pub(super) fn time(bench: &Bench, scene: &Scene, trainers: &mut Trainers) -> Result<Stages> {
-    let gpu = &bench.gpu;
+pub(super) fn time(bench: &Bench, trainers: &mut Trainers) -> Result<Stages> {
     let steps = repeated(bench, || trainers.plain.profile_step())?;
     let of_step = |names: &[&str]| median(steps.iter().map(|t| of_kernels(t, names)).collect());
     let loss_kernels = ["ssim", "loss_log"];
-    let mut without_curve = scene::plain(gpu, scene, ToneCurve::None)?;
-    let loss_without_curve =
-        bench.median(|| Ok(of_kernels(&without_curve.profile_step()?, &loss_kernels)))?;
     let (tone_statistics, whole_pseudo_gt) = pseudo_gt(bench)?;
     let group = |name, milliseconds, bound| Timing { name, milliseconds, bound };
     let groups = vec![
@@ -101,7 +97,7 @@ pub(super) fn time(bench: &Bench, scene: &Scene, trainers: &mut Trainers) -> Res
         group("tone_statistics_1920x1080", tone_statistics, Some(60.0)),
         group("pseudo_gt_1920x1080", whole_pseudo_gt, Some(80.0)),
         group("loss", of_step(&loss_kernels), None),
-        group("loss_without_curve", loss_without_curve, None),
+        group("target", of_step(&["pseudo_gt"]), None),
     ];
     let milliseconds = whole_step(bench, trainers)?;
     let intersections = trainers.intersections;
@@ -173,7 +169,7 @@ impl Photograph {
 fn pseudo_gt(bench: &Bench) -> Result<(f64, f64)> {
     let mut photograph = Photograph::new(&bench.gpu)?;
     let times = repeated(bench, || photograph.profile(&bench.gpu))?;
-    let map = |times: &Vec<PassTime>| of_kernels(times, &["tone_map"]);
+    let map = |times: &Vec<PassTime>| of_kernels(times, &["pseudo_gt"]);
     let statistics = times.iter().map(|times| total(times) - map(times)).collect();
     Ok((median(statistics), median(times.iter().map(|times| total(times)).collect())))
 }

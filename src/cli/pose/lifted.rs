@@ -3,13 +3,14 @@
 use std::path::{Path, PathBuf};
 
 use super::create;
+use crate::Result;
+use crate::base::input;
 use crate::cli::progress_bar;
 use crate::gpu::Gpu;
 use crate::photographs::image::files::{photographs_in, stem};
 use crate::photographs::image::{Image, exif_segment};
 use crate::photographs::pseudo_gt::PseudoGt;
-use crate::photographs::tone::{ToneSettings, all_black};
-use crate::{Result, base::input};
+use crate::photographs::tone::{Measured, ToneSettings, all_black};
 
 /// Lifts the photographs into `folder`, as stored, and returns the gain of the scene. A JPEG stays one and keeps its Exif,
 /// so that COLMAP finds the focal length; everything else becomes PNG.
@@ -20,11 +21,11 @@ pub(super) fn write(gpu: &Gpu, photographs: &[PathBuf], folder: &Path) -> Result
     create(folder)?;
     // One curve for all: what two photographs show of one place stays alike.
     let settings = ToneSettings { scene_statistics: true, ..ToneSettings::default() };
-    let mut pseudo_gt = PseudoGt::new(gpu, &settings)?;
+    let pseudo_gt = PseudoGt::new(gpu, &settings)?;
     let progress = progress_bar(2 * photographs.len());
     let mut measured = vec![];
     for path in photographs {
-        measured.push(pseudo_gt.measure(&Image::load(path)?.data)?);
+        measured.push(Measured::of(&Image::load(path)?.data));
         progress.inc(1);
     }
     let root = photographs.first().and_then(|path| path.parent()).unwrap_or(folder);

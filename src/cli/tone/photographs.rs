@@ -7,7 +7,7 @@ use super::{ToneArgs, is_same_file};
 use crate::cli::ImageFormat;
 use crate::photographs::dataset::{Dataset, LoadOptions, Photograph, Split};
 use crate::photographs::image::files::{photographs_in, unread_in};
-use crate::photographs::image::{Image, Mask, Orientation};
+use crate::photographs::image::{Image, Mask, Orientation, PictureFile};
 use crate::{Error, Result};
 
 /// A photograph to map.
@@ -25,10 +25,14 @@ pub(super) struct Listed {
 }
 
 impl Listed {
-    /// Its pixels that do not count: those that are no numbers, and what alpha or mask hides.
-    pub(super) fn hidden(&self, inverted: bool) -> Result<Vec<usize>> {
-        let mask = Mask::load(&self.input, self.mask.as_deref(), inverted)?;
-        Ok(mask.as_ref().map(Mask::hidden).unwrap_or_default())
+    /// The photograph as it is stored, with its pixels that do not count: those that are no numbers, and what alpha or mask
+    /// hides.
+    pub(super) fn load(&self, inverted: bool) -> Result<(Image, Vec<usize>)> {
+        let (image, alpha) = PictureFile::open(&self.input)?.decode()?;
+        let decoded = (&image, alpha.as_ref());
+        let mask = Mask::over(&self.input, decoded, self.mask.as_deref(), inverted)?;
+        let hidden = mask.as_ref().map(Mask::hidden).unwrap_or_default();
+        Ok((image, hidden))
     }
 
     /// Turned upright, as its pixels that do not count are, unless cameras may say how it is stored.

@@ -5,9 +5,10 @@ use std::collections::BTreeMap;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::{Dataset, View};
+use super::{Dataset, Original, View};
 use crate::Result;
 use crate::base::hash::{self, Hasher};
+use crate::camera::CameraModel;
 
 /// What distinguishes one dataset from another, as it was loaded.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -74,12 +75,18 @@ fn camera(View { camera, .. }: &View) -> u64 {
     hasher.write_numbers(&camera.focal.to_array());
     hasher.write_numbers(&camera.principal_point.to_array());
     hasher.write_numbers(&camera.view_from_world.to_cols_array());
+    if let CameraModel::Fisheye(lens) = camera.model {
+        hasher.write_numbers(&lens.coefficients);
+    }
     hasher.finish()
 }
 
 fn pixels(view: &View) -> Result<u64> {
-    let mut hasher = Hasher::default();
-    let image = view.loaded()?;
+    // A photograph that is not kept was looked at while it was decoded.
+    let not_kept = view.original.as_ref().filter(|_| view.image.is_none());
+    let known = not_kept.and_then(Original::checksum);
+    let image = if known.is_some() { None } else { view.loaded()? };
+    let mut hasher = known.unwrap_or_default();
     for numbers in image.iter().map(|image| &image.data).chain(&view.depth) {
         hasher.write(bytemuck::cast_slice(numbers));
     }

@@ -3,12 +3,12 @@
 use std::path::{Path, PathBuf};
 
 use super::listed::ListedView;
-use super::pixels::{prepared, turn};
+use super::pixels::prepared;
 use super::undistort::Undistortion;
 use crate::Result;
 use crate::camera::Lens;
-use crate::photographs::image::Mask;
 use crate::photographs::image::files::Files;
+use crate::photographs::image::{Mask, Orientation};
 
 /// Where masks lie below the root.
 const FOLDER: &str = "masks";
@@ -22,16 +22,14 @@ pub(super) fn find(root: &Path, frame: &ListedView, files: &Files) -> Option<Pat
     names.into_iter().chain(of_file).find_map(|name| files.find(&folder, &name))
 }
 
-/// Which pixels of a view count, as its camera sees them; none where all do.
-pub(super) fn load(
-    (photograph, file): (&Path, Option<&Path>),
-    lens: &Lens,
+/// Which pixels of a view count, as its camera sees them, of its mask as its photograph is stored; none where all do.
+pub(super) fn seen(
+    stored: &Mask,
+    photograph: &Path,
+    (lens, orientation): (&Lens, Orientation),
     undistortion: Option<&Undistortion>,
     size: (u32, u32),
-    inverted: bool,
 ) -> Result<Option<Mask>> {
-    let Some(mask) = Mask::load(photograph, file, inverted)? else { return Ok(None) };
-    let orientation = turn(photograph, (mask.width, mask.height), lens);
-    let plane = mask.to_image().turned(orientation);
+    let plane = stored.to_image().turned(orientation);
     Ok(Mask::of_plane(&prepared(plane, photograph, lens, undistortion, size)?))
 }

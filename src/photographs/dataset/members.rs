@@ -1,5 +1,7 @@
 //! Which views take part: some are left out by name, some kept from training.
 
+use std::collections::HashSet;
+
 use super::{Dataset, Split, View};
 use crate::camera::Camera;
 
@@ -16,15 +18,15 @@ impl Dataset {
 
     /// Leaves out views by name; points forget them.
     pub fn leave_out(&mut self, names: &[String]) {
-        let stays: Vec<bool> = self.views.iter().map(|view| !names.contains(&view.name)).collect();
-        let place = |view: u32| {
-            let stays_before = stays[..view as usize].iter().filter(|&&stays| stays).count();
-            stays[view as usize].then_some(stays_before as u32)
-        };
+        let names: HashSet<&str> = names.iter().map(String::as_str).collect();
+        let stays = |view: &View| !names.contains(view.name.as_str());
+        let mut places = 0..;
+        let of_view = self.views.iter().map(|view| if stays(view) { places.next() } else { None });
+        let places: Vec<Option<u32>> = of_view.collect();
         for point in &mut self.points {
-            point.views = point.views.iter().filter_map(|&view| place(view)).collect();
+            point.views = point.views.iter().filter_map(|&view| places[view as usize]).collect();
         }
-        self.views.retain(|view| !names.contains(&view.name));
+        self.views.retain(stays);
     }
 }
 

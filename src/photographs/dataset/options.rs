@@ -1,8 +1,13 @@
 //! How a dataset is loaded.
 
+use std::ops::Bound;
 use std::path::PathBuf;
 
+use crate::base::settings::Rule;
 use crate::{Error, Result};
+
+/// The factors by which photographs may shrink.
+pub const DOWNSCALE: Rule = Rule::Number(Bound::Included(1.0), Bound::Unbounded);
 
 /// How a dataset is loaded.
 #[derive(Clone, Debug)]
@@ -25,8 +30,25 @@ pub struct LoadOptions {
     pub hold_out: usize,
     /// Masks hide what is white, not what is black.
     pub invert_masks: bool,
+    /// At which size training photographs are measured while they are decoded, if they are not kept at that size.
+    pub measured: MeasuredSize,
+    /// Photographs of a fisheye are undistorted to a pinhole's, too, as those of every other lens are; without it the
+    /// fisheye itself is trained on.
+    pub undistort: bool,
     /// What is looked for as the training views' depth.
     pub depth: DepthOptions,
+}
+
+/// At which size a curve is applied to photographs, and what it follows from is measured.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum MeasuredSize {
+    /// They are not measured.
+    #[default]
+    None,
+    /// Their own.
+    Own,
+    /// That of the view's camera.
+    Loaded,
 }
 
 /// Where depth maps come from: `STEM.*` or `depth_STEM.*` in a folder.
@@ -51,6 +73,8 @@ impl Default for LoadOptions {
             load_low_test: true,
             hold_out: 0,
             invert_masks: false,
+            measured: MeasuredSize::default(),
+            undistort: false,
             depth: DepthOptions::default(),
         }
     }
@@ -79,18 +103,21 @@ impl LoadOptions {
     /// Refuses options that make no sense.
     ///
     /// # Errors
-    /// [`Error::Usage`] for the downscale, [`Error::Input`] for a folder that is not there.
+    /// [`Error::Setting`], and [`Error::Input`] for a folder that is not there.
     pub(super) fn check(&self) -> Result<()> {
-        // Positive phrasing: a NaN fails the test too.
-        if !(self.downscale >= 1.0 && self.downscale.is_finite()) {
-            let downscale = self.downscale;
-            return Err(Error::Usage(format!(
-                "`LoadOptions::downscale` is {downscale}; it must be 1 or more"
-            )));
+        let refused = |key: &str, value: f64, rule: &dyn ToString| {
+            let (key, value, rule) = (key.to_owned(), value.to_string(), rule.to_string());
+            Err(Error::Setting { key, value, rule })
+        };
+        if !DOWNSCALE.takes_number(self.downscale) {
+            return refused("downscale", self.downscale, &DOWNSCALE);
         }
         if self.test_every == Some(1) {
-            let problem = "`LoadOptions::test_every` is 1, which leaves no view to train on; it must be 0 or 2 and more";
-            return Err(Error::Usage(problem.to_owned()));
+            return refused(
+                "test_every",
+                1.0,
+                &"0, or 2 and more: else no view is left to train on",
+            );
         }
         match &self.reference {
             Some(folder) if !folder.is_dir() => {

@@ -1,14 +1,20 @@
 //! From files to views: decode, check against the camera, undistort, shrink. Parallel over views.
 
+use std::collections::HashMap;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicI64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 
-use glam::DAffine3;
+use glam::{DAffine3, UVec2};
 use rayon::prelude::*;
 
+use super::packed::Packed;
 use super::undistort::{Undistortion, WIDEST};
-use super::{LoadOptions, Split, View, masks};
-use crate::camera::{Camera, Lens};
-use crate::photographs::image::{Image, Mask, Orientation};
+use super::{LoadOptions, MeasuredSize, Split, View, masks};
+use crate::base::hash::Hasher;
+use crate::camera::{Camera, CameraModel, Lens};
+use crate::photographs::image::{Image, Mask, Orientation, PictureFile};
+use crate::photographs::tone::Measured;
 use crate::{Error, Result};
 
 /// The shortest side that leaves something to train on, pixels.
@@ -29,6 +35,8 @@ pub(super) struct Source {
     pub(super) reference: Option<PathBuf>,
     pub(super) mask: Option<PathBuf>,
     pub(super) depth: Option<PathBuf>,
+    /// Photograph and reference image, where they are read already.
+    read: [Option<Arc<PictureFile>>; 2],
 }
 
 impl Source {
@@ -38,20 +46,54 @@ impl Source {
         (lens, view_from_world): (Lens, DAffine3),
         [input, reference, mask, depth]: [Option<PathBuf>; 4],
     ) -> Self {
-        Self { name, split, lens, view_from_world, input, reference, mask, depth }
+        let read = [None, None];
+        Self { name, split, lens, view_from_world, input, reference, mask, depth, read }
+    }
+
+    /// Reads the files of the photograph and of the reference image; gives the size of each as it is stored, where its header
+    /// is readable, and keeps what is read while `room`, bytes, is left.
+    fn sized(&mut self, room: &AtomicI64) -> [Option<(u32, u32)>; 2] {
+        let paths = [self.input.as_deref(), self.reference.as_deref()];
+        let mut sizes = [None; 2];
+        for ((path, read), size) in paths.into_iter().zip(&mut self.read).zip(&mut sizes) {
+            let Some(path) = path else { continue };
+            let bytes = path.metadata().map_or(i64::MAX, |there| there.len().cast_signed());
+            if room.fetch_sub(bytes, Ordering::Relaxed) < bytes {
+                room.fetch_add(bytes, Ordering::Relaxed);
+                *size = Image::size_of(path).ok();
+            } else if let Ok(file) = PictureFile::open(path) {
+                *size = file.size().ok();
+                *read = Some(Arc::new(file));
+            }
+        }
+        sizes
     }
 }
+
+/// What files may take that are read before they are decoded, bytes: those beyond are opened once for their size, and again.
+const MOST_READ: i64 = 1 << 28;
+
+/// Sees a training photograph as it is stored, with its mask, while it is decoded; from any thread.
+pub(crate) type Look<'a> = &'a (dyn Fn(&str, &Image, Option<&Mask>) + Sync);
 
 /// The views in order of name. Files that do not decode are named in `skipped`.
 pub(super) fn load(
     sources: Vec<Source>,
     options: &LoadOptions,
+    look: Option<Look<'_>>,
     skipped: &mut Vec<String>,
 ) -> Result<Vec<View>> {
+    let room = AtomicI64::new(MOST_READ);
+    let sized = sources.into_par_iter().map(|mut source| {
+        let sizes = source.sized(&room);
+        Ok(Source { lens: fitted_lens(&source, sizes)?, ..source })
+    });
     let mut groups: Vec<(Lens, Vec<Source>)> = Vec::new();
-    for source in sources {
-        let source = Source { lens: fitted_lens(&source)?, ..source };
-        match groups.iter_mut().find(|(lens, _)| *lens == source.lens) {
+    let mut places = HashMap::new();
+    for source in sized.collect::<Result<Vec<_>>>()? {
+        // Debug tells every two lenses apart.
+        let place = *places.entry(format!("{:?}", source.lens)).or_insert(groups.len());
+        match groups.get_mut(place) {
             Some((_, group)) => group.push(source),
             None => groups.push((source.lens, vec![source])),
         }
@@ -59,11 +101,14 @@ pub(super) fn load(
     let options = &resolved(&groups, options);
     let largest = groups.iter().map(|(lens, _)| pixels(lens.width, lens.height)).max();
     let at_once = Image::decoded_at_once(largest.unwrap_or_default());
+    let stored = AtomicI64::new(room_for_originals(&groups, options));
+    let loading = Loading { options, at_once, look, stored: &stored };
     let mut loaded: Vec<Loaded> = vec![];
-    for groups in groups.chunks(at_once) {
-        let groups =
-            groups.par_iter().map(|(lens, group)| load_group(lens, group, options, at_once));
-        loaded.extend(groups.collect::<Result<Vec<_>>>()?.into_iter().flatten());
+    while !groups.is_empty() {
+        // What was read goes with its group.
+        let now: Vec<_> = groups.drain(..groups.len().min(at_once)).collect();
+        let now = now.into_par_iter().map(|(lens, group)| load_group(&lens, group, &loading));
+        loaded.extend(now.collect::<Result<Vec<_>>>()?.into_iter().flatten());
     }
     loaded.sort_by(|a, b| a.name.cmp(&b.name));
     let mut views = Vec::with_capacity(loaded.len());
@@ -74,18 +119,46 @@ pub(super) fn load(
     Ok(views)
 }
 
+/// What loading the views has in common.
+struct Loading<'a> {
+    options: &'a LoadOptions,
+    /// How many photographs are decoded side by side.
+    at_once: usize,
+    look: Option<Look<'a>>,
+    /// Bytes that are left for photographs at their own size.
+    stored: &'a AtomicI64,
+}
+
+/// What `keep` leaves, bytes, for the photographs at their own size that are shrunk: a curve that is applied to them there
+/// needs the measurements of all first.
+fn room_for_originals(groups: &[(Lens, Vec<Source>)], options: &LoadOptions) -> i64 {
+    let Some(most) = options.keep.filter(|_| options.measured == MeasuredSize::Own) else {
+        return 0;
+    };
+    let taken = kept_bytes(groups, options);
+    most.saturating_sub(taken).try_into().unwrap_or(i64::MAX)
+}
+
+/// What photographs and reference images take as they are loaded.
+fn kept_bytes(groups: &[(Lens, Vec<Source>)], options: &LoadOptions) -> u64 {
+    let bytes = |(lens, group): &(Lens, Vec<Source>)| {
+        let (width, height) = options.loaded_size(lens.width, lens.height);
+        let pictures = group.iter().flat_map(|source| [&source.input, &source.reference]).flatten();
+        pictures.count() as u64 * pixels(width, height) * BYTES_PER_PIXEL
+    };
+    groups.iter().map(bytes).sum()
+}
+
 fn pixels(width: u32, height: u32) -> u64 {
     u64::from(width) * u64::from(height)
 }
 
-/// The options with `keep` decided: none where every photograph is kept. Says where `max_resolution` acts.
+/// The options, of which `keep` is 0 where the photographs exceed it: none is kept. Says where `max_resolution` acts.
 fn resolved(groups: &[(Lens, Vec<Source>)], options: &LoadOptions) -> LoadOptions {
-    let mut bytes = 0;
+    let bytes = kept_bytes(groups, options);
     let mut shrunk: Vec<&Lens> = vec![];
-    for (lens, group) in groups {
+    for (lens, _) in groups {
         let (width, height) = options.loaded_size(lens.width, lens.height);
-        let pictures = group.iter().flat_map(|source| [&source.input, &source.reference]).flatten();
-        bytes += pictures.count() as u64 * pixels(width, height) * BYTES_PER_PIXEL;
         let free = LoadOptions { max_resolution: 0, ..options.clone() };
         if free.loaded_size(lens.width, lens.height) != (width, height) {
             shrunk.push(lens);
@@ -100,13 +173,14 @@ fn resolved(groups: &[(Lens, Vec<Source>)], options: &LoadOptions) -> LoadOption
              takes them as they are"
         );
     }
-    let keep = options.keep.filter(|&most| bytes > most);
-    if let Some(most) = keep {
+    let excess = options.keep.filter(|&most| bytes > most);
+    if let Some(most) = excess {
         let [bytes, most] = [bytes, most].map(|bytes| bytes as f64 / f64::from(1 << 30));
         tracing::info!(
             "the photographs take {bytes:.1} GiB decoded, the cache has {most:.1}: they are read anew when they are looked at"
         );
     }
+    let keep = if excess.is_some() { Some(0) } else { options.keep };
     LoadOptions { keep, ..options.clone() }
 }
 
@@ -116,19 +190,57 @@ pub struct Original {
     path: PathBuf,
     /// Fitted to the photograph's size.
     lens: Lens,
+    /// As [`LoadOptions::undistort`].
+    undistort: bool,
+    /// At which size, and what.
+    measured: Option<(MeasuredSize, Measured)>,
+    /// Of the pixels as they are loaded, where they are not kept.
+    checksum: Option<Hasher>,
+    /// The photograph at its own size, while there is room and until it is released.
+    stored: Arc<Mutex<Option<Packed>>>,
 }
 
 impl Original {
-    /// Reads it anew, undistorted, at its own size.
-    pub(super) fn load(&self) -> Result<Image> {
-        self.load_at((self.lens.width, self.lens.height))
+    fn of(path: PathBuf, lens: Lens, undistort: bool) -> Self {
+        Self { path, lens, undistort, measured: None, checksum: None, stored: Arc::default() }
     }
 
-    /// The same, shrunk.
+    /// Width and height, undistorted.
+    pub(super) fn size(&self) -> UVec2 {
+        UVec2::new(self.lens.width, self.lens.height)
+    }
+
+    /// Undistorted, at its own size: as it was kept, or read anew.
+    pub(super) fn load(&self) -> Result<Image> {
+        let stored = self.stored.lock().unwrap_or_else(PoisonError::into_inner);
+        match &*stored {
+            Some(packed) => Ok(packed.image()),
+            None => self.load_at((self.lens.width, self.lens.height)),
+        }
+    }
+
+    /// Read anew, undistorted and shrunk.
     pub(super) fn load_at(&self, size: (u32, u32)) -> Result<Image> {
-        let Self { path, lens } = self;
-        let undistortion = undistortion(lens, &path.to_string_lossy())?;
-        prepared(loaded(path, lens)?, path, lens, undistortion.as_ref(), size)
+        let Self { path, lens, undistort, .. } = self;
+        let undistortion = undistortion(lens, *undistort, &path.to_string_lossy())?;
+        let (image, _) = PictureFile::open(path)?.decode()?;
+        let orientation = turn(path, (image.width, image.height), lens);
+        prepared(image.turned(orientation), path, lens, undistortion.as_ref(), size)
+    }
+
+    /// What was measured of it at a size while it was decoded.
+    pub(crate) fn measured(&self, size: MeasuredSize) -> Option<&Measured> {
+        self.measured.as_ref().filter(|(own, _)| *own == size).map(|(_, measured)| measured)
+    }
+
+    /// Of the pixels as they are loaded, where they are not kept.
+    pub(super) fn checksum(&self) -> Option<Hasher> {
+        self.checksum
+    }
+
+    /// Keeps it no longer in memory.
+    pub(crate) fn release(&self) {
+        *self.stored.lock().unwrap_or_else(PoisonError::into_inner) = None;
     }
 }
 
@@ -140,15 +252,15 @@ struct Loaded {
 }
 
 /// The listed lens over the photograph as it is: the input's size, without one the reference image's.
-fn fitted_lens(source: &Source) -> Result<Lens> {
+fn fitted_lens(source: &Source, sizes: [Option<(u32, u32)>; 2]) -> Result<Lens> {
     let lens = source.lens;
     // What has no readable header is named when it is decoded.
-    let sized = [&source.input, &source.reference].into_iter().flatten();
-    let sized = sized.filter_map(|path| {
-        let size = Image::size_of(path).ok()?;
+    let sized = [&source.input, &source.reference].into_iter().zip(sizes);
+    let mut sized = sized.filter_map(|(path, size)| {
+        let (path, size) = (path.as_deref()?, size?);
         Some((path, turn(path, size, &lens).size(size)))
     });
-    let Some((path, (width, height))) = sized.clone().next() else {
+    let Some((path, (width, height))) = sized.next() else {
         return Ok(lens);
     };
     let fitted =
@@ -175,18 +287,11 @@ pub(super) fn turn(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Ori
     if lens.fitted(width, height).is_some() { said } else { Orientation::UPRIGHT }
 }
 
-/// A photograph as its camera took it.
-fn loaded(path: &Path, lens: &Lens) -> Result<Image> {
-    let image = Image::load(path)?;
-    let orientation = turn(path, (image.width, image.height), lens);
-    Ok(image.turned(orientation))
-}
-
 /// Refuses a file by the size that it declares, before that costs memory: a picture of another shape than its camera's, or
 /// of far more pixels.
-fn check_size(path: &Path, lens: &Lens) -> Result<()> {
+fn check_size(path: &Path, file: &PictureFile, lens: &Lens) -> Result<()> {
     // What has no readable header is named when it is decoded.
-    let Ok(size) = Image::size_of(path) else { return Ok(()) };
+    let Ok(size) = file.size() else { return Ok(()) };
     let (width, height) = turn(path, size, lens).size(size);
     if lens.fitted(width, height).is_none() {
         return Err(disagreement(path, size, lens));
@@ -222,14 +327,11 @@ fn disagreement(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Error 
 }
 
 /// Views of one lens share its undistortion map.
-fn load_group(
-    lens: &Lens,
-    group: &[Source],
-    options: &LoadOptions,
-    at_once: usize,
-) -> Result<Vec<Loaded>> {
+fn load_group(lens: &Lens, mut group: Vec<Source>, loading: &Loading<'_>) -> Result<Vec<Loaded>> {
+    let options = loading.options;
     let size = options.loaded_size(lens.width, lens.height);
-    let name = group.first().map_or("", |source| source.name.as_str());
+    let first = group.first().map(|source| source.name.clone()).unwrap_or_default();
+    let name = first.as_str();
     if lens.width.min(lens.height) < MIN_SIDE {
         let (width, height) = (lens.width, lens.height);
         let problem = format!(
@@ -243,92 +345,217 @@ fn load_group(
             options.downscale, size.0, size.1
         )));
     }
-    let undistortion = undistortion(lens, name)?;
+    let undistortion = undistortion(lens, options.undistort, name)?;
     if undistortion.as_ref().is_some_and(|undistortion| undistortion.is_cropped) {
         tracing::warn!(
-            "view {name} and {} more are of a fisheye that sees farther off its axis than the {WIDEST} degrees at the corners of what is trained on; the rest is cropped",
+            "view {name} and {} more are of a fisheye that sees farther off its axis than the {WIDEST} degrees at the corners of what is trained on; the rest is cropped, without `--undistort` it is not",
             group.len() - 1
         );
     }
+    let lens = &Prepared { lens, undistortion: undistortion.as_ref(), size };
     let mut loaded = vec![];
-    for sources in group.chunks(at_once) {
-        let views = sources.par_iter().cloned();
-        let views =
-            views.map(|source| load_view(source, lens, undistortion.as_ref(), size, options));
+    while !group.is_empty() {
+        let now: Vec<_> = group.drain(..group.len().min(loading.at_once)).collect();
+        let views = now.into_par_iter().map(|source| load_view(source, lens, loading));
         loaded.extend(views.collect::<Result<Vec<_>>>()?);
     }
     Ok(loaded)
 }
 
-/// What makes a pinhole of the lens; none where it is one.
-fn undistortion(lens: &Lens, name: &str) -> Result<Option<Undistortion>> {
-    let undistortion = (!lens.is_pinhole()).then(|| {
-        Undistortion::new(lens).ok_or_else(|| {
-            let problem = "its distortion coefficients describe no lens; calibrate again or undistort with COLMAP";
-            Error::input(name, problem)
-        })
-    });
-    undistortion.transpose()
+/// What makes a pinhole of the lens; none where it is rendered as it is.
+///
+/// # Errors
+/// The distortion describes no lens: no pinhole sees inside the photograph only, or a fisheye shows too little of it.
+fn undistortion(lens: &Lens, undistort: bool, name: &str) -> Result<Option<Undistortion>> {
+    let native = lens.model().filter(|&model| model == CameraModel::Pinhole || !undistort);
+    let undistortion = match native {
+        Some(_) => shows_enough(lens).then_some(None),
+        None => Undistortion::new(lens).map(Some),
+    };
+    undistortion.ok_or_else(|| {
+        let problem = "its distortion coefficients describe no lens; calibrate again or undistort with COLMAP";
+        Error::input(name, problem)
+    })
 }
 
-fn load_view(
-    source: Source,
-    lens: &Lens,
-    undistortion: Option<&Undistortion>,
+/// Whether a lens that is rendered as it is shows something at a quarter of its pixels at least: the circle of a fisheye in a
+/// wide picture covers more.
+fn shows_enough(lens: &Lens) -> bool {
+    const LEAST: f64 = 0.25;
+    let unseen = native_camera(lens).unseen().len() as f64;
+    unseen <= (1.0 - LEAST) * pixels(lens.width, lens.height) as f64
+}
+
+/// A lens at the world's origin, as it is rendered where it is not undistorted.
+fn native_camera(lens: &Lens) -> Camera {
+    Camera {
+        width: lens.width,
+        height: lens.height,
+        focal: lens.focal,
+        principal_point: lens.principal_point,
+        model: lens.model().unwrap_or_default(),
+        view_from_world: DAffine3::IDENTITY,
+    }
+}
+
+/// How the photographs of a lens become those of a pinhole.
+struct Prepared<'a> {
+    lens: &'a Lens,
+    undistortion: Option<&'a Undistortion>,
+    /// As they are loaded.
     size: (u32, u32),
-    options: &LoadOptions,
-) -> Result<Loaded> {
-    let Source { name, split, view_from_world, input, reference, mask, depth, .. } = source;
-    let mut problems = Vec::new();
-    let mut image = |path: Option<PathBuf>| -> Result<Option<Image>> {
+}
+
+/// A picture of a view.
+struct Decoded {
+    path: PathBuf,
+    /// As it is stored.
+    image: Image,
+    alpha: Option<Image>,
+    orientation: Orientation,
+}
+
+impl Prepared<'_> {
+    /// Decodes a file; none, and a problem, where that is no picture.
+    ///
+    /// # Errors
+    /// The picture does not fit its camera.
+    fn decode(
+        &self,
+        (path, read): (Option<PathBuf>, Option<Arc<PictureFile>>),
+        problems: &mut Vec<String>,
+    ) -> Result<Option<Decoded>> {
         let Some(path) = path else { return Ok(None) };
-        check_size(&path, lens)?;
-        match loaded(&path, lens) {
-            Ok(image) => prepared(image, &path, lens, undistortion, size).map(Some),
+        let file =
+            read.map_or_else(|| PictureFile::open(&path), |read| Ok(Arc::unwrap_or_clone(read)));
+        if let Ok(file) = &file {
+            check_size(&path, file, self.lens)?;
+        }
+        match file.and_then(PictureFile::decode) {
+            Ok((image, alpha)) => {
+                let orientation = turn(&path, (image.width, image.height), self.lens);
+                Ok(Some(Decoded { path, image, alpha, orientation }))
+            }
             Err(error) => {
                 problems.push(error.to_string());
                 Ok(None)
             }
         }
-    };
-    let is_shrunk = size != (lens.width, lens.height);
-    let is_kept = options.keep.is_none();
-    let original = input.clone().filter(|_| is_shrunk || !is_kept);
-    let original = original.map(|path| Original { path, lens: *lens });
-    let file = |path| Original { path, lens: *lens };
-    let reference_file = reference.clone().filter(|_| !is_kept).map(file);
-    let paths = [input.clone(), reference.clone()];
-    let (mut image, mut reference) = (image(input)?, image(reference)?);
-    // Of what was read: a file that does not decode is named once.
-    let [of_input, of_reference] = paths;
-    let hidden = of_input
-        .filter(|_| image.is_some())
-        .or(of_reference.filter(|_| reference.is_some()))
-        .map(|path| {
-            let files = (path.as_path(), mask.as_deref());
-            masks::load(files, lens, undistortion, size, options.invert_masks)
-        });
-    let mask = hidden.transpose()?.flatten();
-    if mask.as_ref().is_some_and(Mask::hides_all) {
-        problems.push(format!("{name}: no pixel is a number that its mask shows"));
-        (image, reference) = (None, None);
     }
+
+    /// As the camera sees it, of its own size.
+    fn whole(&self, Decoded { path, image, orientation, .. }: Decoded) -> Result<Image> {
+        let size = (self.lens.width, self.lens.height);
+        prepared(image.turned(orientation), &path, self.lens, self.undistortion, size)
+    }
+
+    fn shrunk(&self, image: Image) -> Image {
+        let (width, height) = self.size;
+        if (image.width, image.height) == self.size { image } else { image.resized(width, height) }
+    }
+
+    /// What stays of a photograph of its own size: itself as it is loaded, and where it is read from if that is not all of it.
+    /// One that is for training, for which there is `room`, is measured.
+    fn kept(
+        &self,
+        path: PathBuf,
+        whole: Image,
+        mask: Option<&Mask>,
+        room: Option<&AtomicI64>,
+        options: &LoadOptions,
+    ) -> (Option<Image>, Option<Original>) {
+        let (is_shrunk, is_kept) =
+            (self.size != (whole.width, whole.height), options.keep != Some(0));
+        if is_kept && !is_shrunk {
+            return (Some(whole), None);
+        }
+        let mut original = Original::of(path, *self.lens, options.undistort);
+        let measured = |image: &Image| match mask {
+            Some(mask) => Measured::of(&mask.counted(image)),
+            None => Measured::of(&image.data),
+        };
+        let at = if room.is_some() { options.measured } else { MeasuredSize::None };
+        if at == MeasuredSize::Own {
+            original.measured = Some((at, measured(&whole)));
+        }
+        let bytes = Packed::bytes(&whole);
+        let has_room = |room: &AtomicI64| {
+            let is_left = room.fetch_sub(bytes, Ordering::Relaxed) >= bytes;
+            room.fetch_add(if is_left { 0 } else { bytes }, Ordering::Relaxed);
+            is_left
+        };
+        if is_shrunk && at == MeasuredSize::Own && room.is_some_and(has_room) {
+            original.stored = Arc::new(Mutex::new(Some(Packed::of(&whole))));
+        }
+        let image = self.shrunk(whole);
+        if is_kept {
+            return (Some(image), Some(original));
+        }
+        if at == MeasuredSize::Loaded {
+            original.measured = Some((at, measured(&image)));
+        }
+        let mut hasher = Hasher::default();
+        hasher.write(bytemuck::cast_slice(&image.data));
+        original.checksum = Some(hasher);
+        (None, Some(original))
+    }
+}
+
+fn load_view(source: Source, lens: &Prepared<'_>, loading: &Loading<'_>) -> Result<Loaded> {
+    let Source { name, split, view_from_world, input, reference, mask, depth, read, .. } = source;
+    let (options, [read, read_reference]) = (loading.options, read);
+    let mut problems = Vec::new();
+    let photograph = lens.decode((input, read), &mut problems)?;
+    let reference = lens.decode((reference, read_reference), &mut problems)?;
+    let stored_mask = match photograph.as_ref().or(reference.as_ref()) {
+        Some(Decoded { path, image, alpha, orientation }) => {
+            let decoded = (image, alpha.as_ref());
+            Mask::over(path, decoded, mask.as_deref(), options.invert_masks)?
+                .map(|stored| (stored, path.clone(), *orientation))
+        }
+        None => None,
+    };
+    if let (Some(look), Some(photograph), Split::Train) = (loading.look, &photograph, split) {
+        look(&name, &photograph.image, stored_mask.as_ref().map(|(stored, ..)| stored));
+    }
+    let Prepared { lens: own, undistortion, size } = *lens;
+    let mask = stored_mask.map(|(stored, path, orientation)| {
+        masks::seen(&stored, &path, (own, orientation), undistortion, size)
+    });
+    let camera = Camera { view_from_world, ..native_camera(own) };
+    let camera = match undistortion {
+        Some(&Undistortion { focal, .. }) => {
+            Camera { focal, model: CameraModel::Pinhole, ..camera }
+        }
+        None => camera,
+    };
+    let camera = camera.resized(size.0, size.1);
+    let mask = Mask::hiding_too(mask.transpose()?.flatten(), size, &camera.unseen());
+    let is_hidden = mask.as_ref().is_some_and(Mask::hides_all);
+    if is_hidden {
+        problems.push(format!("{name}: no pixel is a number that its mask shows"));
+    }
+    let is_kept = options.keep != Some(0);
+    let of_reference = |reference: Decoded| {
+        let file =
+            (!is_kept).then(|| Original::of(reference.path.clone(), *own, options.undistort));
+        let image = is_kept.then(|| lens.whole(reference).map(|image| lens.shrunk(image)));
+        Ok((image.transpose()?, file))
+    };
+    let photograph = photograph.filter(|_| !is_hidden).map(|decoded| {
+        let is_training = split == Split::Train;
+        let (path, whole) = (decoded.path.clone(), lens.whole(decoded)?);
+        Ok(lens.kept(path, whole, mask.as_ref(), is_training.then_some(loading.stored), options))
+    });
+    let (image, original) = photograph.transpose()?.unwrap_or_default();
+    let reference = reference.filter(|_| !is_hidden).map(of_reference);
+    let (reference, reference_file) = reference.transpose()?.unwrap_or_default();
     let depth = depth.and_then(|path| {
-        depth_map(&path, lens, undistortion, size, options.depth.is_disparity)
+        depth_map(&path, own, undistortion, size, options.depth.is_disparity)
             .map_err(|problem| tracing::warn!("the depth of view {name} is not used: {problem}"))
             .ok()
     });
-    let camera = Camera {
-        width: lens.width,
-        height: lens.height,
-        focal: undistortion.map_or(lens.focal, |undistortion| undistortion.focal),
-        principal_point: lens.principal_point,
-        view_from_world,
-    };
-    let camera = camera.resized(size.0, size.1);
-    let original = original.filter(|_| image.is_some());
-    let reference_file = reference_file.filter(|_| reference.is_some());
-    let (image, reference) = (image.filter(|_| is_kept), reference.filter(|_| is_kept));
+
     let view = View::new(&name, split, camera, image);
     let view = View { original, reference, reference_file, mask, depth, ..view };
     let view = (split == Split::Test || view.has_photograph()).then_some(view);

@@ -4,6 +4,7 @@
 //! is the same light divided by [`DARKENING`], with the shot and read noise of a small sensor, encoded and quantised
 //! to 8 bits: what a camera stores when the exposure is far too short.
 
+use std::f64::consts::PI;
 use std::fmt::Write as _;
 use std::fs;
 use std::path::Path;
@@ -14,7 +15,7 @@ use serde_json::{Value, json};
 
 use self::room::{FOCUS, Room};
 use crate::base::random::Stream;
-use crate::camera::Camera;
+use crate::camera::{Camera, CameraModel, KannalaBrandt};
 use crate::photographs::image::{Image, srgb_from_linear};
 use crate::{Error, Result};
 
@@ -79,13 +80,21 @@ pub struct SyntheticOptions {
     pub height: u32,
     /// Changes the textures, the noise and the sampled points.
     pub seed: u64,
+    /// Taken with a fisheye that sees 130 degrees across the picture's longer side; black outside its circle.
+    pub fisheye: bool,
 }
 
 impl Default for SyntheticOptions {
     fn default() -> Self {
-        Self { views: 24, width: 160, height: 120, seed: 0 }
+        Self { views: 24, width: 160, height: 120, seed: 0, fisheye: false }
     }
 }
+
+/// The fisheye of such a set.
+const FISHEYE: KannalaBrandt = KannalaBrandt { coefficients: [0.03, -0.008, 0.002, -0.0004] };
+
+/// What it sees off its axis at the middle of the picture's shorter sides, radians.
+const FISHEYE_REACH: f64 = 65.0 * PI / 180.0;
 
 impl SyntheticOptions {
     fn check(&self) -> Result<()> {
@@ -195,21 +204,27 @@ fn camera(view: usize, options: &SyntheticOptions) -> Camera {
     let right = DVec3::Z.cross(back).normalize();
     let world_from_view = DMat3::from_cols(right, -back.cross(right), -back);
     let size = DVec2::new(options.width.into(), options.height.into());
-    let focal = 0.92 * size.max_element();
+    let (model, focal) = if options.fisheye {
+        (CameraModel::Fisheye(FISHEYE), 0.5 / FISHEYE.radius(FISHEYE_REACH))
+    } else {
+        (CameraModel::Pinhole, 0.92)
+    };
+    let focal = focal * size.max_element();
     Camera {
         width: options.width,
         height: options.height,
         focal: DVec2::new(focal, 1.01 * focal),
         principal_point: size * DVec2::new(0.525, 0.485),
+        model,
         view_from_world: DAffine3::from_mat3_translation(world_from_view, FOCUS + distance * back)
             .inverse(),
     }
 }
 
-/// The unit direction, in the world, of the ray through a place in pixels.
-fn ray(camera: &Camera, pixel: DVec2) -> DVec3 {
-    let in_view = ((pixel - camera.principal_point) / camera.focal).extend(1.0);
-    (camera.view_from_world.matrix3.transpose() * in_view).normalize()
+/// The unit direction, in the world, of the ray through a place in pixels; none outside a fisheye's circle.
+fn ray(camera: &Camera, pixel: DVec2) -> Option<DVec3> {
+    let in_view = camera.in_view(pixel, 1.0)?;
+    Some((camera.view_from_world.matrix3.transpose() * in_view).normalize())
 }
 
 /// Linear radiance, row by row, the mean of 2x2 rays per pixel.
@@ -224,8 +239,8 @@ fn render(room: &Room, camera: &Camera) -> Vec<DVec3> {
     let radiance = |index: u32| {
         let corner = DVec2::new((index % camera.width).into(), (index / camera.width).into());
         OFFSETS
-            .map(|offset| room.radiance(center, ray(camera, corner + offset)))
             .iter()
+            .filter_map(|&offset| Some(room.radiance(center, ray(camera, corner + offset)?)))
             .sum::<DVec3>()
             / 4.0
     };
@@ -268,7 +283,7 @@ fn photograph(camera: &Camera, linear: impl Fn(usize, usize) -> f64) -> Image {
 
 /// The list of a split's frames, as instant-ngp writes it: poses are world-from-camera in OpenGL axes.
 fn transforms(cameras: &[Camera], folder: &str, views: &[usize]) -> Value {
-    let Camera { width, height, focal, principal_point, .. } = cameras[0];
+    let Camera { width, height, focal, principal_point, model, .. } = cameras[0];
     let frame = |&view: &usize| {
         let pose = cameras[view].view_from_world.inverse();
         let [right, down, forward] =
@@ -279,7 +294,7 @@ fn transforms(cameras: &[Camera], folder: &str, views: &[usize]) -> Value {
         rows.push([0.0, 0.0, 0.0, 1.0]);
         json!({ "file_path": format!("{folder}/{}", file_name(view)), "transform_matrix": rows })
     };
-    json!({
+    let mut list = json!({
         "camera_angle_x": 2.0 * (f64::from(width) / (2.0 * focal.x)).atan(),
         "camera_angle_y": 2.0 * (f64::from(height) / (2.0 * focal.y)).atan(),
         "fl_x": focal.x, "fl_y": focal.y,
@@ -287,7 +302,18 @@ fn transforms(cameras: &[Camera], folder: &str, views: &[usize]) -> Value {
         "cx": principal_point.x, "cy": principal_point.y,
         "w": f64::from(width), "h": f64::from(height),
         "frames": views.iter().map(frame).collect::<Vec<_>>(),
-    })
+    });
+    if let CameraModel::Fisheye(KannalaBrandt { coefficients: [k1, k2, k3, k4] }) = model {
+        list["camera_model"] = "OPENCV_FISHEYE".into();
+        for (key, value) in [("k1", k1), ("k2", k2), ("k3", k3), ("k4", k4)] {
+            list[key] = value.into();
+        }
+        // Of a pinhole.
+        for key in ["camera_angle_x", "camera_angle_y", "p1", "p2"] {
+            list.as_object_mut().map(|list| list.remove(key));
+        }
+    }
+    list
 }
 
 /// A sparse point: its position and the views that see it with where they do, pixels.
@@ -307,7 +333,7 @@ fn sparse_points(room: &Room, cameras: &[Camera], seed: u64) -> Vec<SparsePoint>
         let camera = &cameras[(uniform(0) * cameras.len() as f64) as usize];
         let pixel =
             DVec2::new(uniform(1) * f64::from(camera.width), uniform(2) * f64::from(camera.height));
-        let position = room.first_point(camera.center(), ray(camera, pixel))?;
+        let position = room.first_point(camera.center(), ray(camera, pixel)?)?;
         let seen =
             |(view, camera): (usize, &Camera)| Some((view, seen_at(room, camera, position)?));
         let track: Vec<_> = cameras.iter().enumerate().filter_map(seen).collect();
@@ -326,7 +352,7 @@ fn seen_at(room: &Room, camera: &Camera, position: DVec3) -> Option<DVec2> {
     let pixel = camera.project(position)?;
     let size = DVec2::new(camera.width.into(), camera.height.into());
     let inside = pixel.cmpge(DVec2::ZERO).all() && pixel.cmplt(size).all();
-    let first = room.first_point(camera.center(), ray(camera, pixel))?;
+    let first = room.first_point(camera.center(), ray(camera, pixel)?)?;
     (inside && first.distance(position) < TOLERANCE).then_some(pixel)
 }
 
@@ -334,9 +360,15 @@ fn seen_at(room: &Room, camera: &Camera, position: DVec3) -> Option<DVec2> {
 fn colmap_model(room: &Room, cameras: &[Camera], seed: u64) -> [(&'static str, String); 3] {
     const GREY: &str = "128 128 128";
     let points = sparse_points(room, cameras, seed);
-    let Camera { width, height, focal, principal_point, .. } = cameras[0];
+    let Camera { width, height, focal, principal_point, model, .. } = cameras[0];
+    let (name, distortion) = match model {
+        CameraModel::Pinhole => ("PINHOLE", String::new()),
+        CameraModel::Fisheye(lens) => {
+            ("OPENCV_FISHEYE", lens.coefficients.map(|k| format!(" {k}")).concat())
+        }
+    };
     let camera_list = format!(
-        "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 PINHOLE {width} {height} {} {} {} {}\n",
+        "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 {name} {width} {height} {} {} {} {}{distortion}\n",
         focal.x, focal.y, principal_point.x, principal_point.y
     );
 

@@ -19,7 +19,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use super::pairs::{files_of, name_of};
-use crate::kernels::tone_profile::SEGMENTS;
+use crate::kernels::pseudo_gt::SEGMENTS;
 use crate::photographs::image::Image;
 use crate::photographs::tone::{Exposure, LuminanceHistogram, Profile, measurable, soft};
 use crate::{Error, Result};
@@ -149,7 +149,7 @@ pub fn fit_profile(scenes: &[(&str, Vec<&ColourPair>)], huber: f64) -> Result<Pr
     // Positive phrasing: a NaN fails the test too.
     let is_positive = huber > 0.0;
     if !is_positive {
-        let problem = format!("`FitOptions::huber` is {huber}; it must be above 0");
+        let problem = format!("huber is {huber}; it must be above 0");
         return Err(Error::Usage(problem));
     }
     let colours = || pairs.iter().flat_map(|pair| &pair.colours);

@@ -2,11 +2,10 @@
 
 use std::fs::File;
 use std::io::{BufReader, Cursor};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use ::image::{
-    DynamicImage, ExtendedColorType, ImageDecoder, ImageEncoder, ImageError, ImageFormat,
-    ImageReader,
+    DynamicImage, ExtendedColorType, ImageEncoder, ImageError, ImageFormat, ImageReader,
     codecs::{jpeg::JpegEncoder, png::PngEncoder},
     error::UnsupportedErrorKind,
 };
@@ -20,13 +19,127 @@ use crate::base::input;
 use crate::base::output::write_whole;
 use crate::{Error, Result};
 
-fn bytes_of(path: &Path) -> Result<Vec<u8>> {
-    input::bytes(path)
+/// The file of a picture, read whole.
+#[derive(Clone, Debug)]
+pub(crate) struct PictureFile {
+    path: PathBuf,
+    bytes: Vec<u8>,
+}
+
+impl PictureFile {
+    /// # Errors
+    /// [`Error::Input`] names the file when it cannot be read.
+    pub(crate) fn open(path: &Path) -> Result<Self> {
+        #[cfg(test)]
+        openings::count(path);
+        Ok(Self { path: path.to_owned(), bytes: input::bytes(path)? })
+    }
+
+    /// Width and height, from its header alone.
+    ///
+    /// # Errors
+    /// [`Error::Input`] names the file when it is no image.
+    pub(crate) fn size(&self) -> Result<(u32, u32)> {
+        if is_raw(&self.path) {
+            return raw_size(&self.path, self.bytes.clone());
+        }
+        let reader = reader(Cursor::new(self.bytes.as_slice()));
+        size_of_reader(&self.path, reader.map_err(|error| unreadable(&self.path, &error))?)
+    }
+
+    /// The photograph, and its alpha: that of a PNG, WebP or TIFF file, or 0 where a value of an EXR file is not finite, in all
+    /// three planes; none where the file hides nothing.
+    ///
+    /// # Errors
+    /// As [`Image::load`].
+    pub(crate) fn decode(self) -> Result<(Image, Option<Image>)> {
+        decode(&self.path, self.bytes, from_linear)
+    }
+}
+
+/// The encoded value of a value of an EXR file that is a colour.
+fn from_linear(linear: f32) -> Option<f32> {
+    (linear >= 0.0).then(|| srgb_from_linear(linear))
+}
+
+fn decode(
+    path: &Path,
+    bytes: Vec<u8>,
+    from_exr_value: exr_file::FromExrValue,
+) -> Result<(Image, Option<Image>)> {
+    budget::check(path, &bytes)?;
+    if bytes.starts_with(&exr_file::MAGIC) {
+        return exr_file::load(path, bytes, from_exr_value);
+    }
+    if bytes.starts_with(&jpeg::MAGIC)
+        && let Some(image) = jpeg::load(path, &bytes)?
+    {
+        return Ok((image, None));
+    }
+    refuse_heic(path, &bytes)?;
+    if is_raw(path) {
+        return Ok((load_raw(path, bytes)?, None));
+    }
+    let reader = reader(Cursor::new(bytes));
+    let decoded = reader.map_err(ImageError::from).and_then(ImageReader::decode);
+    let decoded = decoded.map_err(|error| undecodable(path, &error))?;
+    let alpha = alpha_of(&decoded);
+    Ok((from_decoded(decoded), alpha))
+}
+
+/// The alpha of a decoded picture in all three planes; none of one that hides nothing.
+fn alpha_of(decoded: &DynamicImage) -> Option<Image> {
+    if !decoded.color().has_alpha() {
+        return None;
+    }
+    let values = decoded.to_rgba32f().into_raw();
+    let alpha: Vec<f32> = values.into_iter().skip(3).step_by(4).collect();
+    let hides = alpha.iter().any(|&value| value < 1.0);
+    let (width, height) = (decoded.width(), decoded.height());
+    hides.then(|| Image { width, height, data: alpha.repeat(3) })
+}
+
+/// How often each file was opened, by tests.
+#[cfg(test)]
+pub(crate) mod openings {
+    use std::collections::HashMap;
+    use std::path::{Path, PathBuf};
+    use std::sync::{LazyLock, Mutex};
+
+    static COUNTS: LazyLock<Mutex<HashMap<PathBuf, usize>>> = LazyLock::new(Mutex::default);
+
+    pub(super) fn count(path: &Path) {
+        *COUNTS.lock().unwrap().entry(path.to_owned()).or_default() += 1;
+    }
+
+    /// Those of the files below a folder.
+    pub(crate) fn below(folder: &Path) -> Vec<(PathBuf, usize)> {
+        let counts = COUNTS.lock().unwrap();
+        let own = counts.iter().filter(|(path, _)| path.starts_with(folder));
+        own.map(|(path, count)| (path.clone(), *count)).collect()
+    }
 }
 
 fn file_reader(path: &Path) -> Result<ImageReader<Box<dyn Source>>> {
+    #[cfg(test)]
+    openings::count(path);
     let opened = File::open(path).and_then(|file| reader(BufReader::new(file)));
-    opened.map_err(|error| Error::input(path, format!("cannot be read: {error}")))
+    opened.map_err(|error| unreadable(path, &error))
+}
+
+fn unreadable(path: &Path, error: &std::io::Error) -> Error {
+    Error::input(path, format!("cannot be read: {error}"))
+}
+
+fn size_of_reader(path: &Path, reader: ImageReader<Box<dyn Source + '_>>) -> Result<(u32, u32)> {
+    if reader.format() != Some(ImageFormat::OpenExr) {
+        return reader.into_dimensions().map_err(|error| not_an_image(path, &error));
+    }
+    let meta = exr::meta::MetaData::read_from_buffered(reader.into_inner(), false)
+        .map_err(|error| not_an_image(path, &error))?;
+    let size = meta.headers.first().map(|header| header.layer_size);
+    let size = size.ok_or_else(|| Error::input(path, "this EXR file has no layer"))?;
+    Ok((size.width() as u32, size.height() as u32))
 }
 
 impl Image {
@@ -40,9 +153,8 @@ impl Image {
     /// # Errors
     /// [`Error::Input`] names the file when it cannot be read, is cut short or is of another format.
     pub fn load(path: impl AsRef<Path>) -> Result<Self> {
-        let encode = |linear: f32| (linear >= 0.0).then(|| srgb_from_linear(linear));
-        let path = path.as_ref();
-        Self::decode(path, bytes_of(path)?, encode)
+        let file = PictureFile::open(path.as_ref())?;
+        Ok(file.decode()?.0)
     }
 
     /// The same for numbers that are no colour, such as depth: EXR values are taken as they are, also negative ones.
@@ -50,59 +162,8 @@ impl Image {
     /// # Errors
     /// As [`Image::load`].
     pub fn load_as_stored(path: impl AsRef<Path>) -> Result<Self> {
-        let path = path.as_ref();
-        Self::decode(path, bytes_of(path)?, Some)
-    }
-
-    fn decode(path: &Path, bytes: Vec<u8>, from_exr_value: exr_file::FromExrValue) -> Result<Self> {
-        budget::check(path, &bytes)?;
-        if bytes.starts_with(&exr_file::MAGIC) {
-            return exr_file::load(path, bytes, from_exr_value);
-        }
-        if bytes.starts_with(&jpeg::MAGIC)
-            && let Some(image) = jpeg::load(path, &bytes)?
-        {
-            return Ok(image);
-        }
-        refuse_heic(path, &bytes)?;
-        if is_raw(path) {
-            return load_raw(path, bytes);
-        }
-        let reader = reader(Cursor::new(bytes));
-        let decoded = reader.map_err(ImageError::from).and_then(ImageReader::decode);
-        Ok(from_decoded(decoded.map_err(|error| undecodable(path, &error))?))
-    }
-
-    /// The alpha of a PNG, WebP or TIFF file, and 0 where a value of an EXR file is not finite, in all three planes; none of a
-    /// file that hides nothing.
-    ///
-    /// # Errors
-    /// [`Error::Input`] names the file when it cannot be read.
-    pub(super) fn load_alpha(path: &Path) -> Result<Option<Self>> {
-        if is_raw(path) {
-            return Ok(None);
-        }
-        let reader = file_reader(path)?;
-        if reader.format() == Some(ImageFormat::OpenExr) {
-            let bytes = bytes_of(path)?;
-            budget::check(path, &bytes)?;
-            return exr_file::finite_part(path, bytes);
-        }
-        let with_alpha = [ImageFormat::Png, ImageFormat::WebP, ImageFormat::Tiff];
-        if !reader.format().is_some_and(|format| with_alpha.contains(&format)) {
-            return Ok(None);
-        }
-        let decoder = reader.into_decoder().map_err(|error| not_an_image(path, &error))?;
-        if !decoder.color_type().has_alpha() {
-            return Ok(None);
-        }
-        let decoded =
-            DynamicImage::from_decoder(decoder).map_err(|error| not_an_image(path, &error))?;
-        let (width, height) = (decoded.width(), decoded.height());
-        let values = decoded.into_rgba32f().into_raw();
-        let alpha: Vec<f32> = values.into_iter().skip(3).step_by(4).collect();
-        let hides = alpha.iter().any(|&value| value < 1.0);
-        Ok(hides.then(|| Self { width, height, data: alpha.repeat(3) }))
+        let PictureFile { path, bytes } = PictureFile::open(path.as_ref())?;
+        Ok(decode(&path, bytes, Some)?.0)
     }
 
     /// Width and height of an image file, from its header alone.
@@ -112,17 +173,9 @@ impl Image {
     pub fn size_of(path: impl AsRef<Path>) -> Result<(u32, u32)> {
         let path = path.as_ref();
         if is_raw(path) {
-            return raw_size(path);
+            return raw_size(path, input::bytes(path)?);
         }
-        let reader = file_reader(path)?;
-        if reader.format() != Some(ImageFormat::OpenExr) {
-            return reader.into_dimensions().map_err(|error| not_an_image(path, &error));
-        }
-        let meta = exr::meta::MetaData::read_from_buffered(reader.into_inner(), false)
-            .map_err(|error| not_an_image(path, &error))?;
-        let size = meta.headers.first().map(|header| header.layer_size);
-        let size = size.ok_or_else(|| Error::input(path, "this EXR file has no layer"))?;
-        Ok((size.width() as u32, size.height() as u32))
+        size_of_reader(path, file_reader(path)?)
     }
 
     /// Writes an 8-bit RGB PNG: values clamped to [0, 1], rounded to nearest.
@@ -246,7 +299,7 @@ fn load_raw(path: &Path, _: Vec<u8>) -> Result<Image> {
 }
 
 #[cfg(not(feature = "raw"))]
-fn raw_size(path: &Path) -> Result<(u32, u32)> {
+fn raw_size(path: &Path, _: Vec<u8>) -> Result<(u32, u32)> {
     load_raw(path, vec![]).map(|image| (image.width, image.height))
 }
 
@@ -274,7 +327,7 @@ mod tests {
     use super::*;
 
     /// A path in a folder that goes when the second is dropped.
-    fn file(name: &str) -> (std::path::PathBuf, tempfile::TempDir) {
+    fn file(name: &str) -> (PathBuf, tempfile::TempDir) {
         let folder = tempfile::tempdir().unwrap();
         (folder.path().join(name), folder)
     }

@@ -16,13 +16,18 @@ pub(super) const MAGIC: [u8; 4] = [0x76, 0x2F, 0x31, 0x01];
 /// What a finite value of an EXR file means; none where it makes no sense.
 pub(super) type FromExrValue = fn(f32) -> Option<f32>;
 
-/// The first layer's R, G and B (or Y), each value through `from_exr_value`. Values that mean nothing become 0, with a warning
-/// that counts them.
+/// The first layer's R, G and B (or Y), each value through `from_exr_value`, and where not all values of a pixel are finite.
+/// Values that mean nothing become 0, with a warning that counts them.
 ///
 /// # Errors
 /// [`Error::Input`] names the file when it is damaged or has no such channels.
-pub(super) fn load(path: &Path, bytes: Vec<u8>, from_exr_value: FromExrValue) -> Result<Image> {
+pub(super) fn load(
+    path: &Path,
+    bytes: Vec<u8>,
+    from_exr_value: FromExrValue,
+) -> Result<(Image, Option<Image>)> {
     let mut image = decoded(path, bytes)?;
+    let finite = finite_part(&image);
     let mut replaced = 0_usize;
     for value in &mut image.data {
         let usable = Some(*value).filter(|value| value.is_finite()).and_then(from_exr_value);
@@ -35,20 +40,18 @@ pub(super) fn load(path: &Path, bytes: Vec<u8>, from_exr_value: FromExrValue) ->
             path.display()
         );
     }
-    Ok(image)
+    Ok((image, finite))
 }
 
 /// 1 where all values of a pixel are finite, 0 elsewhere, in all three planes; none where all are.
-///
-/// # Errors
-/// As [`load`].
-pub(super) fn finite_part(path: &Path, bytes: Vec<u8>) -> Result<Option<Image>> {
-    let Image { width, height, data } = decoded(path, bytes)?;
+fn finite_part(Image { width, height, data }: &Image) -> Option<Image> {
+    if data.iter().all(|value| value.is_finite()) {
+        return None;
+    }
     let pixels = data.len() / 3;
     let is_finite = |pixel: usize| (0..3).all(|plane| data[plane * pixels + pixel].is_finite());
     let shown: Vec<f32> = (0..pixels).map(|pixel| f32::from(is_finite(pixel))).collect();
-    let hides = shown.contains(&0.0);
-    Ok(hides.then(|| Image { width, height, data: shown.repeat(3) }))
+    Some(Image { width: *width, height: *height, data: shown.repeat(3) })
 }
 
 /// The first layer's R, G and B (or Y), as they are.

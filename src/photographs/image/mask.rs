@@ -6,7 +6,7 @@ use std::path::Path;
 
 use super::Image;
 #[cfg(feature = "io")]
-use super::Orientation;
+use super::{Orientation, codec::PictureFile};
 #[cfg(feature = "io")]
 use crate::{Error, Result};
 
@@ -43,10 +43,24 @@ impl Mask {
     /// [`Error::Input`] names a file that cannot be read, or a mask of another shape than its photograph.
     #[cfg(feature = "io")]
     pub fn load(photograph: &Path, file: Option<&Path>, inverted: bool) -> Result<Option<Self>> {
-        let alpha = Image::load_alpha(photograph)?;
-        let Some(file) = file else { return Ok(alpha.as_ref().and_then(Self::of_plane)) };
+        let (image, alpha) = PictureFile::open(photograph)?.decode()?;
+        Self::over(photograph, (&image, alpha.as_ref()), file, inverted)
+    }
+
+    /// The same of a photograph that is decoded, with its alpha.
+    ///
+    /// # Errors
+    /// As [`Mask::load`].
+    #[cfg(feature = "io")]
+    pub(crate) fn over(
+        photograph: &Path,
+        (image, alpha): (&Image, Option<&Image>),
+        file: Option<&Path>,
+        inverted: bool,
+    ) -> Result<Option<Self>> {
+        let Some(file) = file else { return Ok(alpha.and_then(Self::of_plane)) };
         let mut mask = Image::load(file)?;
-        let size = Image::size_of(photograph)?;
+        let size = (image.width, image.height);
         let (own, upright) = ((mask.width, mask.height), Orientation::of(photograph).size(size));
         let is_of_shape = |(width, height): (u32, u32)| {
             let [a, b] = [own.0 * height, own.1 * width].map(f64::from);
@@ -69,7 +83,7 @@ impl Mask {
         let pixels = mask.pixel_count();
         for pixel in 0..pixels {
             let shown = (mask.data[pixel] >= 0.5) != inverted;
-            let alpha = alpha.as_ref().map_or(1.0, |alpha| alpha.data[pixel]);
+            let alpha = alpha.map_or(1.0, |alpha| alpha.data[pixel]);
             mask.data[pixel] = if shown { alpha } else { 0.0 };
         }
         Ok(Self::of_plane(&mask))
@@ -81,6 +95,22 @@ impl Mask {
         pixels.iter().for_each(|&pixel| weights[pixel] = 0.0);
         let Image { width, height, .. } = *image;
         (!pixels.is_empty()).then_some(Self { width, height, weights })
+    }
+
+    #[cfg(feature = "io")]
+    /// A mask of an image of this size that hides these pixels beside those that `own` hides; none of none.
+    pub(crate) fn hiding_too(
+        own: Option<Self>,
+        (width, height): (u32, u32),
+        pixels: &[usize],
+    ) -> Option<Self> {
+        if pixels.is_empty() {
+            return own;
+        }
+        let all = || Self { width, height, weights: vec![1.0; width as usize * height as usize] };
+        let mut mask = own.unwrap_or_else(all);
+        pixels.iter().for_each(|&pixel| mask.weights[pixel] = 0.0);
+        Some(mask)
     }
 
     /// The mask of an image of another size.

@@ -48,8 +48,7 @@ pub(super) fn load(path: &Path, bytes: Vec<u8>) -> Result<Image> {
 ///
 /// # Errors
 /// As there.
-pub(super) fn size_of(path: &Path) -> Result<(u32, u32)> {
-    let bytes = input::bytes(path)?;
+pub(super) fn size_of(path: &Path, bytes: Vec<u8>) -> Result<(u32, u32)> {
     decoded(path, bytes, true, |raw| {
         let area = raw.crop_area.or(raw.active_area).map(|area| area.d);
         let (width, height) = area.map_or((raw.width, raw.height), |size| (size.w, size.h));

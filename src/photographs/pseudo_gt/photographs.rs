@@ -2,7 +2,7 @@
 
 use super::PseudoGt;
 use crate::Result;
-use crate::gpu::Buffer;
+use crate::gpu::{Buffer, Download};
 use crate::photographs::image::Image;
 use crate::photographs::tone::{Lift, Measured};
 
@@ -25,31 +25,26 @@ impl PseudoGt {
     /// # Errors
     /// The device is out of memory or lost.
     pub fn lifted(&self, photograph: &Image, lift: &Lift) -> Result<Image> {
-        let mut target = photograph.clone();
-        if lift.weight < 1.0 {
-            target.data.iter_mut().for_each(|x| *x = if *x > 0.0 { x.min(1.0) } else { 0.0 });
-        }
-        if lift.weight == 0.0 {
-            return Ok(target);
-        }
         let parameters = self.gpu.buffer("tone parameters", &[lift.parameters])?;
+        let Image { width, height, .. } = *photograph;
         let pixels = photograph.pixel_count();
-        let mut first = 0;
+        let (mut data, mut first) = (vec![0.0; photograph.data.len()], 0);
         for tile in self.tiles(&photograph.data)? {
             let mut mapped = self.gpu.uninit("pseudo-GT", tile.len())?;
-            self.gpu.run("tone", |pass| self.map(pass, &tile, &parameters, 0, &mut mapped))?;
+            let mut download = None;
+            self.gpu.run("pseudo-GT", |pass| {
+                self.map(pass, &tile, &parameters, 0, &mut mapped)?;
+                download = Some(pass.download(&mapped)?);
+                Ok(())
+            })?;
+            let mapped = download.map_or_else(|| Ok(vec![]), Download::wait)?;
             let count = tile.len() / 3;
-            for (plane, values) in self.gpu.read(&mapped)?.chunks_exact(count).enumerate() {
-                let target = &mut target.data[plane * pixels + first..][..count];
-                if lift.weight == 1.0 {
-                    target.copy_from_slice(values);
-                } else {
-                    target.iter_mut().zip(values).for_each(|(x, y)| *x += lift.weight * (y - *x));
-                }
+            for (plane, values) in mapped.chunks_exact(count.max(1)).enumerate() {
+                data[plane * pixels + first..][..count].copy_from_slice(values);
             }
             first += count;
         }
-        Ok(target)
+        Ok(Image { width, height, data })
     }
 
     /// Runs of pixels, each planar (3, count), that the device can bind.

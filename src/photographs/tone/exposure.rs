@@ -46,6 +46,9 @@ const NOISE: f64 = 0.1;
 /// h: how far apart cameras are whose views have about one gain.
 const REACH: f64 = 0.15;
 
+/// Of a larger scene the cameras at even distances in the list, at most this many, say what gain its surroundings have: the time is linear in the photographs.
+const MOST_PLACES: usize = 1024;
+
 /// Lifts up to the first leave the photograph as it is; from the second on the curve has its whole weight.
 const WELL_LIT: [f64; 2] = [1.5, 2.0];
 
@@ -149,15 +152,17 @@ impl Exposure {
             return self;
         }
         let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
-        let mut around = Around { places: Places::new(&cameras), gains, own: 0.0 };
+        let every = gains.len().div_ceil(MOST_PLACES);
+        let (places, at) = (Places::new(&cameras), gains.iter().step_by(every).copied().collect());
+        let mut around = Around { places: places.every(every), gains: at, own: 0.0 };
         let smooth: Vec<f64> = cameras.iter().map(|camera| around.ln_gain(camera)).collect();
-        let squares = around.gains.iter().zip(&smooth).map(|(own, smooth)| (own - smooth).powi(2));
+        let squares = gains.iter().zip(&smooth).map(|(own, smooth)| (own - smooth).powi(2));
         let variance = mean(&squares.collect::<Vec<_>>());
         around.own = variance / (variance + NOISE * NOISE);
         // The slope of ln k over ln gain.
-        let middle = mean(&around.gains);
+        let middle = mean(&gains);
         let (mut products, mut squares) = (0.0, 0.0);
-        for (own, smooth) in around.gains.iter().zip(&smooth) {
+        for (own, smooth) in gains.iter().zip(&smooth) {
             let used = around.own * own + (1.0 - around.own) * smooth;
             products += (used - middle) * (own - middle);
             squares += (own - middle).powi(2);

@@ -21,6 +21,12 @@ pub struct Measured {
 }
 
 impl Measured {
+    /// Of the planes (3, pixels) of a photograph.
+    pub fn of(planes: &[f32]) -> Self {
+        let (statistics, luminance) = (Statistics::of(planes), LuminanceHistogram::of(planes));
+        Self { statistics, luminance, camera: None }
+    }
+
     /// The same of a photograph that `camera` took.
     #[must_use]
     pub fn seen_by(self, camera: &Camera) -> Self {
@@ -37,13 +43,11 @@ pub struct Scene {
     pub exposure: Option<Exposure>,
 }
 
-/// How a photograph becomes a target: `weight` of its curve, and the rest of it as it is.
+/// How a photograph becomes a target.
 #[derive(Clone, Copy, Debug)]
 pub struct Lift {
     /// The curve.
     pub parameters: ToneParameters,
-    /// The weight of the curve, from 0 to 1.
-    pub weight: f32,
     /// k of soft(x; k), of whose mean luminance the target is; where it follows from the exposure.
     pub gain: Option<f64>,
 }
@@ -73,17 +77,18 @@ impl ToneSettings {
         let statistics = scene.statistics.as_ref().unwrap_or(&photograph.statistics);
         let parameters = self.parameters(statistics);
         let Some(exposure) = &scene.exposure else {
-            return Lift { parameters, weight: 1.0, gain: None };
+            return Lift { parameters, gain: None };
         };
         let gain = exposure.gain_of(&photograph.luminance, photograph.camera.as_ref());
         let strength = match self.curve {
             ToneCurve::Auto | ToneCurve::Profile => gain,
             _ => self.strength(&parameters, &photograph.luminance, gain),
         };
-        let parameters = ToneParameters { white: (1.0 / strength) as f32, gain: 1.0, ..parameters };
         // What is known of a camera holds for bright photographs too.
         let weight = if self.profile.is_some() { 1.0 } else { exposure.weight() };
-        Lift { parameters, weight: weight as f32, gain: Some(gain) }
+        let (white, weight) = ((1.0 / strength) as f32, weight as f32);
+        let parameters = ToneParameters { white, gain: 1.0, weight, ..parameters };
+        Lift { parameters, gain: Some(gain) }
     }
 
     /// The factor on x at which the curve has the mean luminance of soft(x; gain).

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::real::Real;
-use crate::kernels::tone_profile::{PROFILE_WIDTH, SEGMENTS};
+use crate::kernels::pseudo_gt::{PROFILE_WIDTH, SEGMENTS};
 
 /// The largest weight, gain or bias that a profile may have.
 const LARGEST: f64 = 1e3;

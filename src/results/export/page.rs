@@ -7,18 +7,18 @@ use half::f16;
 use serde_json::json;
 
 use super::{GENERATOR, Provenance, gzip};
-use crate::Result;
-use crate::camera::Camera;
+use crate::camera::{Camera, CameraModel};
 use crate::photographs::image::Image;
 use crate::results::report::{base64, escape, jpeg};
 use crate::splats::scene::Gaussians;
+use crate::{Error, Result};
 
 /// A bookmark: a camera, and pictures of what it saw.
 #[derive(Clone, Debug)]
 pub struct Bookmark {
     /// The view's name.
     pub name: String,
-    /// In the coordinates of the Gaussians.
+    /// In the coordinates of the Gaussians: a pinhole.
     pub camera: Camera,
     /// Each with what it is.
     pub pictures: Vec<(String, Image)>,
@@ -43,9 +43,15 @@ impl Page<'_> {
     /// The page as HTML.
     ///
     /// # Errors
-    /// None but for what no memory is left for.
+    /// [`Error::Usage`] for a bookmark that is no pinhole.
     pub fn html(&self) -> Result<String> {
         let Self { title, gaussians, provenance, bookmarks, near } = self;
+        let other = bookmarks.iter().find(|own| own.camera.model != CameraModel::Pinhole);
+        if let Some(Bookmark { name, .. }) = other {
+            return Err(Error::Usage(format!(
+                "view {name} is of a fisheye, and the page shows pinholes; load its dataset with `LoadOptions::undistort`"
+            )));
+        }
         let scene = json!({
             "generator": GENERATOR,
             "provenance": provenance.lines(),
@@ -81,7 +87,7 @@ impl Page<'_> {
 
 fn view(bookmark: &Bookmark) -> serde_json::Value {
     let Bookmark { name, camera, pictures } = bookmark;
-    let Camera { width, height, focal, principal_point, view_from_world } = camera;
+    let Camera { width, height, focal, principal_point, view_from_world, .. } = camera;
     let pictures =
         pictures.iter().map(|(label, image)| json!({ "label": label, "image": jpeg(image) }));
     json!({
@@ -115,6 +121,7 @@ fn model(gaussians: &Gaussians) -> Vec<u8> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::camera::KannalaBrandt;
     use crate::results::export::tests::drawn;
 
     #[test]
@@ -125,6 +132,7 @@ mod tests {
             height: 30,
             focal: glam::DVec2::splat(35.0),
             principal_point: glam::DVec2::new(20.0, 15.0),
+            model: CameraModel::Pinhole,
             view_from_world: glam::DAffine3::IDENTITY,
         };
         let evil = "</script><b>@MODEL@";
@@ -137,6 +145,10 @@ mod tests {
             near: 0.2,
         };
         let html = page.html().unwrap();
+        let mut of_fisheye = page.clone();
+        of_fisheye.bookmarks[0].camera.model = CameraModel::Fisheye(KannalaBrandt::default());
+        let refused = of_fisheye.html().unwrap_err().to_string();
+        assert!(refused.contains("fisheye") && refused.contains("undistort"), "{refused}");
         assert!(!html.contains("<b>"));
         assert_eq!(html.matches("<script").count(), html.matches("</script>").count());
         for outside in ["http://", "https://", "src=\"/", "@import"] {

@@ -39,7 +39,7 @@ use crate::loss::exposure::{Affine, table};
 use crate::photographs::dataset::{Dataset, Split, View};
 use crate::splats::scene::{Gaussians, ply};
 use crate::train::diagnose::Plan;
-use crate::train::{Networks, StepReport, TrainConfig, Trainer};
+use crate::train::{Networks, Settings, StepReport, TrainConfig, Trainer};
 use crate::{Error, Result};
 
 /// A run directory and the log that grows in it.
@@ -161,9 +161,8 @@ impl RunDirectory {
         let lines: Vec<&str> = text.split_inclusive('\n').take(step as usize + 1).collect();
         let last = lines.last().filter(|line| line.starts_with(&format!("{step},")));
         if last.is_none_or(|line| !line.ends_with('\n')) {
-            let problem = format!(
-                "ends before step {step} of the checkpoint; begin anew with `HeldRun::Replace`"
-            );
+            let problem =
+                format!("ends before step {step} of the checkpoint; begin anew with --overwrite");
             return Err(Error::input(&log_path, problem));
         }
         let milliseconds = |line: &&str| line.trim_end().rsplit(',').next()?.parse::<f64>().ok();
@@ -218,6 +217,15 @@ impl RunDirectory {
         let lines: String = progress.iter().map(Progress::line).collect();
         let text = format!("{}\n{lines}", Progress::COLUMNS);
         write_whole(&self.path.join(PROGRESS), text.as_bytes())
+    }
+
+    /// Writes the configuration with who says each value.
+    ///
+    /// # Errors
+    /// The disk is full or gone.
+    pub(super) fn save_config(&self, config: &TrainConfig, settings: &Settings) -> Result<()> {
+        let text = settings.written(&config.clone().with_absolute_paths())?;
+        write_whole(&self.path.join("config.toml"), text.as_bytes())
     }
 
     /// Writes the plan that the configuration follows.
@@ -382,7 +390,7 @@ fn is_run(path: &Path) -> bool {
 }
 
 fn held(path: &Path, file: &str) -> Error {
-    let problem = format!("already holds a run ({file}); pass `HeldRun::Replace` to replace it");
+    let problem = format!("already holds a run ({file}); --overwrite replaces it");
     Error::output(path, problem)
 }
 
@@ -417,7 +425,7 @@ mod tests {
         drop(RunDirectory::create(folder.path(), &config, false).unwrap());
         std::fs::write(folder.path().join("notes.txt"), "mine").unwrap();
         let error = RunDirectory::create(folder.path(), &config, false).unwrap_err();
-        assert!(error.to_string().contains("HeldRun::Replace"), "{error}");
+        assert!(error.to_string().contains("--overwrite"), "{error}");
         drop(RunDirectory::create(folder.path(), &config, true).unwrap());
         assert!(folder.path().join("notes.txt").exists());
         assert_eq!(load_config(folder.path()).unwrap(), config);

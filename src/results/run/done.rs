@@ -17,6 +17,9 @@ struct Done {
     configuration: String,
     /// Checksum of what was trained on.
     dataset: String,
+    /// [`Dataset::stamp`]; none where the dataset is in no folder. Older files have none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    stamp: Option<String>,
     /// The last step.
     steps: u64,
     /// How it ended; older files do not say.
@@ -28,12 +31,13 @@ struct Done {
 pub(super) fn save(
     run: &Path,
     config: &TrainConfig,
-    dataset: &Fingerprint,
+    (dataset, stamp): (&Fingerprint, Option<String>),
     ended: &Ended,
 ) -> Result<()> {
     let done = Done {
         configuration: config.checksum()?,
         dataset: dataset.checksum(),
+        stamp,
         steps: ended.step,
         ended: Some(*ended),
     };
@@ -42,16 +46,34 @@ pub(super) fn save(
     write_whole(&run.join(DONE), (text + "\n").as_bytes())
 }
 
+/// What the sign says, if it is there and the files of the run are.
+fn load(run: &Path) -> Option<Done> {
+    let text = std::fs::read_to_string(run.join(DONE)).unwrap_or_default();
+    let is_whole = ["model.ply", "metrics.json"].iter().all(|file| run.join(file).is_file());
+    serde_json::from_str::<Done>(&text).ok().filter(|_| is_whole)
+}
+
 /// The step that ended the run in a directory, if it is the whole of one of this configuration on this dataset.
 ///
 /// # Errors
 /// None for a configuration that [`TrainConfig::check`] accepts.
 pub fn done_steps(run: &Path, config: &TrainConfig, dataset: &Dataset) -> Result<Option<u64>> {
-    let text = std::fs::read_to_string(run.join(DONE)).unwrap_or_default();
-    let is_whole = ["model.ply", "metrics.json"].iter().all(|file| run.join(file).is_file());
-    let done = serde_json::from_str::<Done>(&text).ok().filter(|_| is_whole);
-    let Some(done) = done else { return Ok(None) };
+    let Some(done) = load(run) else { return Ok(None) };
     let is_same = done.configuration == config.checksum()?
         && done.dataset == Fingerprint::of(dataset)?.checksum();
     Ok(is_same.then_some(done.steps))
+}
+
+/// The same without a look at a photograph: none where the files of the dataset are others than the run was trained on, by
+/// their times of change, whatever they hold.
+///
+/// # Errors
+/// None for a configuration that [`TrainConfig::check`] accepts.
+pub fn done_steps_by_stamp(run: &Path, config: &TrainConfig) -> Result<Option<u64>> {
+    let Some(Done { stamp: Some(stamp), configuration, steps, .. }) = load(run) else {
+        return Ok(None);
+    };
+    let is_same = configuration == config.checksum()?
+        && Dataset::stamp(&config.dataset, &config.load_options()).is_ok_and(|own| own == stamp);
+    Ok(is_same.then_some(steps))
 }

@@ -13,7 +13,7 @@ use crate::photographs::dataset::{Dataset, View};
 use crate::results::eval::{self, Compared, ViewScore, Yardstick};
 use crate::splats::attributes::{ATTRIBUTES, AttributeSpec};
 use crate::train::diagnose::Plan;
-use crate::train::{Ended, Learning, MemoryEstimate, StepReport, TrainConfig, Trainer};
+use crate::train::{Ended, Learning, MemoryEstimate, Settings, StepReport, TrainConfig, Trainer};
 use crate::{Error, Result, Stop};
 
 /// What becomes of a run that the directory already holds.
@@ -33,6 +33,8 @@ pub enum HeldRun {
 pub struct Session<'a> {
     /// The plan that its configuration and dataset follow already; it is kept in the run directory.
     pub plan: Option<&'a Plan>,
+    /// Where the configuration's values come from; config.toml says so.
+    pub settings: Option<&'a Settings>,
     /// What becomes of a run that is there.
     pub held: HeldRun,
     /// What is asked of it on the way.
@@ -90,7 +92,8 @@ pub fn train_in(
     mut observe: impl FnMut(Event<'_>),
 ) -> Result<Trained> {
     gpu.reset_peak_memory();
-    let (mut directory, mut trainer) = begin(gpu, config, dataset, out, session.held)?;
+    let stamp = Dataset::stamp(&dataset.root, &config.load_options()).ok();
+    let (mut directory, mut trainer) = begin(gpu, config, dataset, out, session)?;
     if let Some(plan) = session.plan {
         directory.save_plan(plan)?;
     }
@@ -125,7 +128,7 @@ pub fn train_in(
         metrics[HELD_OUT_COURSE] = course;
     }
     directory.save_metrics(&metrics)?;
-    done::save(out, config, trainer.fingerprint(), &ended)?;
+    done::save(out, config, (trainer.fingerprint(), stamp), &ended)?;
     let trained = Trained { trainer, ended, scored, losses, spent };
     observe(Event::Finished(&trained));
     Ok(trained)
@@ -152,8 +155,9 @@ fn begin(
     config: &TrainConfig,
     dataset: &Dataset,
     out: &Path,
-    held: HeldRun,
+    session: &Session<'_>,
 ) -> Result<(RunDirectory, Trainer)> {
+    let held = session.held;
     // A tile that does not suit the device is said before there is a directory.
     config.render_settings().tile_on(gpu)?;
     match held {
@@ -169,6 +173,10 @@ fn begin(
     // A disk that has room for the run has it for photographs.
     config.spool.get_or_insert_with(|| out.to_owned());
     let config = &config;
+    let explain = |directory: &RunDirectory| match session.settings {
+        Some(settings) => directory.save_config(config, settings),
+        None => Ok(()),
+    };
     let mut trainer = match checkpoint {
         Some(_) => Trainer::to_restore(gpu, config.clone(), dataset)?,
         None => Trainer::new(gpu, config.clone(), dataset)?,
@@ -180,6 +188,7 @@ fn begin(
         let mut directory = RunDirectory::resume(out, lock, config, step)?;
         // What it had of a later step is gone: the model is that of the checkpoint again.
         directory.save_trained(&mut trainer)?;
+        explain(&directory)?;
         return Ok((directory, trainer));
     }
     // Without a checkpoint, an unfinished run is nothing to lose.
@@ -188,7 +197,9 @@ fn begin(
         HeldRun::Replace => true,
         HeldRun::Resume => !load::is_finished(out),
     };
-    Ok((RunDirectory::create_locked(out, lock, config, replaces)?, trainer))
+    let directory = RunDirectory::create_locked(out, lock, config, replaces)?;
+    explain(&directory)?;
+    Ok((directory, trainer))
 }
 
 /// The configuration with the tile and the frame that are to be recorded: the same ones give the same bits, whatever is
@@ -368,7 +379,9 @@ impl<'a> Course<'a> {
     ) -> Result<Vec<ViewScore>> {
         let mut yardstick = match self.yardstick.take() {
             Some(known) => known,
-            None => Yardstick::of(self.gpu, &self.config.tone, self.dataset)?,
+            None => {
+                Yardstick::in_scene(self.gpu, &self.config.tone, self.dataset, trainer.scene())?
+            }
         };
         let (step, mut is_first) = (trainer.steps_done(), true);
         let render = |view: &View| trainer.render(&view.camera);

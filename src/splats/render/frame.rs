@@ -4,11 +4,11 @@ use glam::{UVec2, Vec3};
 
 use crate::Result;
 use crate::gpu::{Buffer, Gpu};
-use crate::kernels::ProjectedSplat;
 use crate::kernels::splat::RECORD_HEAD;
 use crate::kernels::status::{
     STATUS_CROWDED, STATUS_GRADIENT, STATUS_NOT_FINITE, STATUS_OVERFLOWED, STATUS_WORDS,
 };
+use crate::kernels::{self, ProjectedSplat};
 
 /// The first guess of how many tiles a Gaussian meets; a view that needs more makes the memory grow.
 const TILES_PER_GAUSSIAN: u32 = 6;
@@ -72,6 +72,8 @@ pub struct Frame {
     pub render: Buffer<f32>,
     pub transmittances: Buffer<f32>,
     pub tile_ranges: Buffer<UVec2>,
+    /// The camera of a view whose camera lies nowhere else on the device.
+    pub camera: Buffer<kernels::Camera>,
     // single numbers
     pub counts: Buffer<u32>,
     pub status: Buffer<u32>,
@@ -100,6 +102,7 @@ impl Frame {
             render: gpu.uninit("render", 0)?,
             transmittances: gpu.uninit("transmittances", 0)?,
             tile_ranges: gpu.uninit("tile_ranges", 0)?,
+            camera: gpu.zeros("camera", 1)?,
             counts: gpu.zeros("counts", 1)?,
             status: gpu.zeros("status", STATUS_WORDS as usize)?,
             arrivals: gpu.zeros("arrivals", 1)?,

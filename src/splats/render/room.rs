@@ -103,7 +103,7 @@ impl Renderer {
         let device = &self.gpu.properties().name;
         Error::Usage(format!(
             "a {width}x{height} view has {count} tiles of {tile_width}x{tile_height} pixels, {device} follows {most}; \
-             lower `TrainConfig::patch_pixels` or take a larger `tile`"
+             lower patch_pixels or take a larger tile"
         ))
     }
 }
@@ -112,7 +112,7 @@ impl Renderer {
 mod tests {
     use glam::{DAffine3, DVec2};
 
-    use crate::camera::Camera;
+    use crate::camera::{Camera, CameraModel};
     use crate::gpu::{DeviceChoice, Gpu};
     use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
     use crate::splats::scene::Gaussians;
@@ -124,7 +124,14 @@ mod tests {
         let (gaussians, intersections) = (200_000, 300_000);
         let (principal_point, view_from_world) = (DVec2::new(8.0, 4.0), DAffine3::IDENTITY);
         let focal = DVec2::splat(16.0);
-        let camera = Camera { width: 16, height: 8, focal, principal_point, view_from_world };
+        let camera = Camera {
+            width: 16,
+            height: 8,
+            focal,
+            principal_point,
+            model: CameraModel::Pinhole,
+            view_from_world,
+        };
         let settings = RenderSettings::default();
         let model = Gaussians::zeros(gaussians, settings.shape).upload(&gpu).unwrap();
         let mut renderer = Renderer::new(&gpu, settings).unwrap();

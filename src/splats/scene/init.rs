@@ -1,40 +1,38 @@
 //! The Gaussians that training begins with.
 
 use std::borrow::Borrow;
+use std::ops::Bound::Excluded;
 
 use glam::{DMat3, DQuat, DVec2, DVec3, Vec3};
 use nalgebra::{Matrix3, SymmetricEigen};
 use rayon::prelude::*;
-use serde::{Deserialize, Serialize};
 
 use super::neighbours::Neighbours;
 use super::{Gaussians, SH_C0, Shape};
 use crate::base::random::Stream;
+use crate::base::settings::{Rule, settings};
 use crate::camera::Camera;
 use crate::photographs::dataset::{Point, Split, View};
 use crate::photographs::image::Image;
 use crate::{Error, Result};
 
+settings! {
+"start."
 /// What the first Gaussians look like; the points say where they are and in which colour.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+///
+/// The defaults are denser and smaller than 3DGS begins, which scores higher after as many steps, in less time, since what is
+/// opaque hides what lies behind it (docs/benchmarks.md). Still denser ones score higher yet, but lose more when they are split.
+/// Discs score as round ones do, with more Gaussians.
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Start {
-    /// The opacity of each, in (0, 1).
-    pub opacity: f64,
-    /// Standard deviation in units of the root mean squared distance to the three nearest points, above 0.
-    pub scale: f64,
-    /// The thinnest axis of a disc in units of its longest, in (0, 1]: neighbours that lie on a surface make discs along it.
-    /// 1: all are round.
-    pub thinnest: f64,
+    /// The opacity of each first Gaussian.
+    opacity: f64 = 0.2 => Rule::Number(Excluded(0.0), Excluded(1.0));
+    /// Standard deviation in units of the root mean squared distance to the three nearest points.
+    scale: f64 = 0.8 => Rule::from_to(1e-3, 1e3);
+    /// The thinnest axis of a disc in units of its longest: neighbours that lie on a surface make discs along it. 1: all are
+    /// round.
+    thinnest: f64 = 1.0 => Rule::from_to(1e-3, 1.0);
 }
-
-/// Denser and smaller than 3DGS begins, which scores higher after as many steps, in less time, since what is opaque hides
-/// what lies behind it (docs/benchmarks.md). Still denser ones score higher yet, but lose more when they are split. Discs
-/// score as round ones do, with more Gaussians.
-impl Default for Start {
-    fn default() -> Self {
-        Self { opacity: 0.2, scale: 0.8, thinnest: 1.0 }
-    }
 }
 
 impl Start {
@@ -46,21 +44,7 @@ impl Start {
     /// # Errors
     /// [`Error::Usage`].
     pub fn check(&self) -> Result<()> {
-        for (name, value, holds, rule) in [
-            (
-                "opacity",
-                self.opacity,
-                self.opacity > 0.0 && self.opacity < 1.0,
-                "above 0 and below 1",
-            ),
-            ("scale", self.scale, (1e-3..=1e3).contains(&self.scale), "0.001 to 1000"),
-            ("thinnest", self.thinnest, (1e-3..=1.0).contains(&self.thinnest), "0.001 to 1"),
-        ] {
-            if !holds {
-                return Err(Error::Usage(format!("start.{name} is {value}; it must be {rule}")));
-            }
-        }
-        Ok(())
+        self.check_rows()
     }
 }
 
@@ -202,19 +186,26 @@ pub fn random(cameras: &[Camera], count: usize, seed: u64) -> Vec<DVec3> {
         let stream = Stream::new(seed, point);
         let position = |attempt: u64| {
             let uniform = |draw: u64| stream.uniform(attempt * DRAWS_PER_TRY + draw);
-            let camera = &cameras[(uniform(0) * cameras.len() as f64) as usize];
+            let place = (uniform(0) * cameras.len() as f64) as usize;
+            let camera = &cameras[place];
             let pixel = DVec2::new(
                 uniform(1) * f64::from(camera.width),
                 uniform(2) * f64::from(camera.height),
             );
             let depth = near * (far / near).powf(uniform(3));
-            let in_view = ((pixel - camera.principal_point) / camera.focal).extend(1.0) * depth;
-            camera.view_from_world.inverse().transform_point3(in_view)
+            // Where a fisheye shows nothing, straight ahead.
+            let in_view = camera.in_view(pixel, depth).unwrap_or(DVec3::Z * depth);
+            (place, camera.view_from_world.inverse().transform_point3(in_view))
         };
-        let seen_twice = |position: &DVec3| {
-            cameras.iter().filter(|camera| camera.sees(*position).is_some()).nth(1).is_some()
+        // Views that follow each other show the same: the second camera is found among the first ones most often.
+        let seen_twice = |(place, position): &(usize, DVec3)| {
+            let (before, from) = cameras.split_at(*place);
+            let seen = from.iter().chain(before.iter().rev());
+            seen.filter(|camera| camera.sees(*position).is_some()).nth(1).is_some()
         };
-        (1..TRIES).map(position).find(seen_twice).unwrap_or_else(|| position(0))
+        let (_, position) =
+            (1..TRIES).map(position).find(seen_twice).unwrap_or_else(|| position(0));
+        position
     };
     (0..count as u64).into_par_iter().map(draw).collect()
 }
@@ -235,6 +226,8 @@ fn radius(cameras: &[Camera]) -> f64 {
 /// point that no training view sees gets the mean grey of the targets. `target` gives the target of a view (an index
 /// into `views`), or nothing where there is none; it is asked once per training view, in order, so it may compute.
 ///
+/// The time is proportional to the length of all tracks, and for points without a track to points times views.
+///
 /// # Errors
 /// Those of `target`.
 pub fn colors_from_views<I: Borrow<Image>>(
@@ -242,27 +235,67 @@ pub fn colors_from_views<I: Borrow<Image>>(
     views: &[View],
     mut target: impl FnMut(usize) -> Result<Option<I>>,
 ) -> Result<Vec<Vec3>> {
-    let mut seen = vec![[Mean::default(); 2]; points.len()];
+    let Candidates { of_view, untracked } = Candidates::of(points, views);
+    let mut colors = vec![Mean::default(); points.len()];
     let mut grey = Mean::default();
     for (index, view) in views.iter().enumerate().filter(|(_, view)| view.split == Split::Train) {
         let Some(target) = target(index)? else { continue };
         let target = target.borrow();
         grey.add(mean_grey(&view.counted(target)));
-        seen.par_iter_mut().zip(points).for_each(|([tracked, inside], point)| {
-            let Some(pixel) = view.camera.sees(point.position) else { return };
-            if view.mask.as_ref().is_some_and(|mask| mask.hides_around(pixel)) {
-                return;
-            }
-            let color = bilinear(target, pixel);
-            inside.add(color);
-            if point.views.contains(&(index as u32)) {
-                tracked.add(color);
-            }
-        });
+        let color = |&point: &u32| {
+            let pixel = shown(view, &points[point as usize])?;
+            Some((point, bilinear(target, pixel)))
+        };
+        let own = of_view[index].par_iter().chain(&untracked).filter_map(color);
+        for (point, color) in own.collect::<Vec<_>>() {
+            colors[point as usize].add(color);
+        }
     }
     let grey = grey.value().unwrap_or(Vec3::splat(0.5));
-    let color = |[tracked, inside]: [Mean; 2]| tracked.value().or(inside.value()).unwrap_or(grey);
-    Ok(seen.into_iter().map(color).collect())
+    Ok(colors.into_iter().map(|color| color.value().unwrap_or(grey)).collect())
+}
+
+/// Where a view shows a point, in pixels; none where the point lies outside of it or its pixels are hidden.
+fn shown(view: &View, point: &Point) -> Option<DVec2> {
+    let pixel = view.camera.sees(point.position)?;
+    let is_hidden = view.mask.as_ref().is_some_and(|mask| mask.hides_around(pixel));
+    (!is_hidden).then_some(pixel)
+}
+
+/// Which points a view may give their colour to.
+struct Candidates {
+    /// Of each view the points whose track has it, ascending.
+    of_view: Vec<Vec<u32>>,
+    /// The points that no training view of their track shows: any view may.
+    untracked: Vec<u32>,
+}
+
+impl Candidates {
+    fn of(points: &[Point], views: &[View]) -> Self {
+        let is_training = |&&view: &&u32| {
+            let view = views.get(view as usize);
+            view.is_some_and(|view| view.split == Split::Train && view.has_photograph())
+        };
+        let is_shown = |point: &Point| {
+            let mut track = point.views.iter().filter(is_training);
+            track.any(|&view| shown(&views[view as usize], point).is_some())
+        };
+        let is_tracked: Vec<bool> = points.par_iter().map(is_shown).collect();
+        let mut own = Self { of_view: vec![vec![]; views.len()], untracked: vec![] };
+        for (number, (point, is_tracked)) in (0..).zip(points.iter().zip(is_tracked)) {
+            if !is_tracked {
+                own.untracked.push(number);
+                continue;
+            }
+            for &view in point.views.iter().filter(is_training) {
+                let of_view = &mut own.of_view[view as usize];
+                if of_view.last() != Some(&number) {
+                    of_view.push(number);
+                }
+            }
+        }
+        own
+    }
 }
 
 /// A running mean of colours.

@@ -1,6 +1,7 @@
 //! What the cameras share: points, overlap, and how much brighter one shows a point than another.
 
 use glam::DVec2;
+use rayon::prelude::*;
 
 use crate::Result;
 use crate::camera::Camera;
@@ -52,27 +53,29 @@ impl Shared {
             let sees = |view: &View| pixel(&view.camera, point).is_some();
             (0..views.len()).filter(|&place| sees(views[place].1)).collect()
         };
-        let seen: Vec<Vec<usize>> = points.iter().map(inside).collect();
+        let seen: Vec<Vec<usize>> = points.par_iter().map(inside).collect();
         let tracked: Vec<Vec<usize>> = points.iter().map(|point| track(point, views)).collect();
         let has_tracks = tracked.iter().any(|track| !track.is_empty());
         let counted = if has_tracks { &tracked } else { &seen };
 
-        let count = |seen: &[Vec<usize>], place: usize| {
-            seen.iter().filter(|places| places.contains(&place)).count()
-        };
         let others = views.len().saturating_sub(1).max(1) as f64;
-        let overlap = |place: usize| {
-            let shown = seen.iter().filter(|places| places.contains(&place));
-            let shares: Vec<f64> = shown.map(|places| (places.len() - 1) as f64 / others).collect();
-            shares.iter().sum::<f64>() / shares.len().max(1) as f64
-        };
+        let mut shares = vec![(0.0, 0_usize); views.len()];
+        for places in &seen {
+            for &place in places {
+                let (sum, count) = &mut shares[place];
+                *sum += (places.len() - 1) as f64 / others;
+                *count += 1;
+            }
+        }
+        let mut counts = vec![0; views.len()];
+        counted.iter().flatten().for_each(|&place| counts[place] += 1);
         let visible = seen.iter().map(Vec::len).filter(|&count| count > 0);
         let (sum, visible) = visible.fold((0, 0), |(sum, n), count| (sum + count, n + 1));
-        let own =
-            |place| if dataset.points.is_empty() { 0 } else { stride * count(counted, place) };
+        // Random points are not the dataset's.
+        let each = if dataset.points.is_empty() { 0 } else { stride };
         Ok(Self {
-            points: (0..views.len()).map(own).collect(),
-            overlaps: (0..views.len()).map(overlap).collect(),
+            points: counts.into_iter().map(|count| each * count).collect(),
+            overlaps: shares.iter().map(|&(sum, count)| sum / count.max(1) as f64).collect(),
             views_per_point: sum as f64 / visible.max(1) as f64,
             exposures: if dataset.points.is_empty() {
                 vec![None; views.len()]
@@ -83,9 +86,10 @@ impl Shared {
     }
 }
 
-/// The places of the training views that triangulated a point.
+/// The places of the training views, ascending by index, that triangulated a point.
 fn track(point: &Point, views: &[(usize, &View)]) -> Vec<usize> {
-    let place = |&view: &u32| views.iter().position(|(index, _)| *index == view as usize);
+    let place =
+        |&view: &u32| views.binary_search_by_key(&(view as usize), |(index, _)| *index).ok();
     point.views.iter().filter_map(place).collect()
 }
 
@@ -101,14 +105,18 @@ fn brightness(
     seen: &[Vec<usize>],
     views: &[(usize, &View)],
 ) -> Result<Vec<Vec<(usize, f64)>>> {
+    let mut of_view = vec![vec![]; views.len()];
+    for (point, places) in seen.iter().enumerate() {
+        places.iter().for_each(|&place| of_view[place].push(point));
+    }
     let mut lights = vec![vec![]; points.len()];
     // One photograph after another: they may have to be read anew.
-    for (place, (_, view)) in views.iter().enumerate() {
+    for (place, ((_, view), shown)) in views.iter().zip(of_view).enumerate() {
         let Some(image) = view.loaded()? else { continue };
-        for ((point, places), lights) in points.iter().zip(seen).zip(&mut lights) {
-            let at = pixel(&view.camera, point).filter(|_| places.contains(&place));
+        for point in shown {
+            let at = pixel(&view.camera, points[point]);
             let light = at.and_then(|at| light_around(&image, at));
-            lights.extend(light.map(|light| (place, light.log2())));
+            lights[point].extend(light.map(|light| (place, light.log2())));
         }
     }
     lights.retain(|seen| seen.len() >= 2);

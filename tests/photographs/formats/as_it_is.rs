@@ -3,7 +3,9 @@
 use std::fs;
 use std::path::Path;
 
-use nightsplat::photographs::dataset::Split;
+use glam::DVec2;
+use nightsplat::camera::{Camera, CameraModel, KannalaBrandt};
+use nightsplat::photographs::dataset::{Dataset, LoadOptions, Split};
 use serde_json::json;
 
 use super::synthetic::*;
@@ -120,7 +122,7 @@ fn a_byte_order_mark_changes_nothing() {
 }
 
 #[test]
-fn a_fisheye_and_a_rational_lens_are_undistorted_on_load() {
+fn a_rational_lens_is_undistorted_on_load_and_so_is_a_fisheye_where_that_is_asked_for() {
     let center = [20.0, 15.0];
     let lenses = [
         ("FULL_OPENCV", 6, vec![0.1, 0.01, 0.001, 0.0, 0.003, 0.02, 0.0, 0.0]),
@@ -135,15 +137,77 @@ fn a_fisheye_and_a_rational_lens_are_undistorted_on_load() {
         photographs(folder.path(), "images", 0..9, 1.0);
         let lens = Model { cameras: vec![(3, name, number, parameters)], ..model(9) };
         lens.write_binary(&folder.path().join("sparse/0"));
-        let binary = load(folder.path());
+        let binary = undistorted(folder.path());
         let camera = binary.views[0].camera;
+        assert_eq!(camera.model, CameraModel::Pinhole, "{name}");
         assert!(camera.focal.is_finite() && camera.focal.x != 22.0, "{name}: {camera:?}");
         // No blank pixel: every photograph is of one colour.
         assert_eq!(super::level(view(&binary, "v04").image.as_ref()), Some(14.0), "{name}");
         fs::remove_dir_all(folder.path().join("sparse")).unwrap();
         lens.write_text(&folder.path().join("sparse/0"));
-        assert_eq!(load(folder.path()).views[0].camera, camera, "{name}");
+        assert_eq!(undistorted(folder.path()).views[0].camera, camera, "{name}");
     }
+}
+
+fn undistorted(root: &Path) -> Dataset {
+    Dataset::load(root, &LoadOptions { undistort: true, ..LoadOptions::default() }).unwrap()
+}
+
+#[test]
+fn a_fisheye_is_loaded_as_it_is_from_every_listing_and_what_lies_outside_its_circle_is_hidden() {
+    let [fx, fy, cx, cy, k1, k2, k3, k4] = [15.0, 15.5, 21.0, 14.0, 0.03, -0.01, 0.002, -0.0005];
+    let coefficients = [k1, k2, k3, k4];
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    photographs(root, "images", 0..9, 1.0);
+    let parameters = vec![fx, fy, cx, cy, k1, k2, k3, k4];
+    let model = Model { cameras: vec![(3, "OPENCV_FISHEYE", 5, parameters)], ..model(9) };
+    let sparse = root.join("sparse");
+    model.write_binary(&sparse.join("0"));
+    let binary = load(root);
+    fs::remove_dir_all(&sparse).unwrap();
+    model.write_text(&sparse.join("0"));
+    let text = load(root);
+    fs::remove_dir_all(&sparse).unwrap();
+    let frames = (0..9).map(|index| frame(index, &format!("images/{}.png", name(index)))).collect();
+    let mut listing = transforms(frames);
+    for (key, value) in [("fl_x", fx), ("fl_y", fy), ("cx", cx), ("cy", cy)].into_iter().chain([
+        ("k1", k1),
+        ("k2", k2),
+        ("k3", k3),
+        ("k4", k4),
+    ]) {
+        listing[key] = json!(value);
+    }
+    listing["camera_model"] = json!("OPENCV_FISHEYE");
+    write_json(root.join("transforms.json"), &listing);
+    let lens = KannalaBrandt { coefficients };
+    let reach = lens.radius(lens.largest_angle());
+    for dataset in [binary, text, load(root)] {
+        let view = view(&dataset, "v04");
+        let Camera { focal, principal_point, model, .. } = view.camera;
+        assert_eq!(model, CameraModel::Fisheye(lens));
+        assert_eq!((focal, principal_point), (DVec2::new(fx, fy), DVec2::new(cx, cy)));
+        let mask = view.mask.as_ref().unwrap();
+        for (at, &weight) in mask.weights.iter().enumerate() {
+            let corner = DVec2::new((at % 40) as f64, (at / 40) as f64);
+            let corners = [DVec2::ZERO, DVec2::X, DVec2::Y, DVec2::ONE].map(|by| corner + by);
+            let is_seen =
+                corners.iter().all(|at| ((at - principal_point) / focal).length() < reach);
+            assert_eq!(weight, f32::from(is_seen), "pixel {corner}");
+        }
+    }
+    // Of photographs that shrink the mask is that of the pixels there.
+    let shrunk = LoadOptions { downscale: 1.25, ..LoadOptions::default() };
+    let shrunk = Dataset::load(root, &shrunk).unwrap();
+    let (camera, mask) = (shrunk.views[0].camera, shrunk.views[0].mask.as_ref().unwrap());
+    assert_eq!((camera.focal.x, mask.width, mask.height), (0.8 * fx, 32, 24));
+    assert_eq!(mask.hidden(), camera.unseen());
+    // A polynomial that falls from 5 degrees on is no lens.
+    listing["k1"] = json!(-40.0);
+    write_json(root.join("transforms.json"), &listing);
+    let refused = Dataset::load(root, &LoadOptions::default()).unwrap_err().to_string();
+    assert!(refused.contains("describe no lens"), "{refused}");
 }
 
 #[test]
@@ -164,9 +228,11 @@ fn what_a_pinhole_cannot_show_of_a_fisheye_is_cropped_and_said() {
         listing[key] = value;
     }
     write_json(root.join("transforms.json"), &listing);
-    let camera = load(root).views[0].camera;
-    let corner = (glam::DVec2::new(0.5, 0.5) - camera.principal_point) / camera.focal;
+    let camera = undistorted(root).views[0].camera;
+    let corner = (DVec2::new(0.5, 0.5) - camera.principal_point) / camera.focal;
     assert!((corner.length().atan().to_degrees() - 60.0).abs() < 0.01, "{camera:?}");
-    let said = run(&format!("diagnose {}", root.display()), 0).1;
+    let (shown, out) = (root.display(), root.join("run"));
+    let train = format!("train {shown} --steps 1 --undistort --out {}", out.display());
+    let said = run(&train, 0).1;
     assert!(said.contains("fisheye") && said.contains("60 degrees"), "{said}");
 }

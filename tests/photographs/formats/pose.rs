@@ -339,7 +339,13 @@ fn colmap_finds_the_cameras_of_a_dark_set() {
     }
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
-    let options = SyntheticOptions { views: 20, width: 200, height: 150, seed: 3 };
+    let options = SyntheticOptions {
+        views: 20,
+        width: 200,
+        height: 150,
+        seed: 3,
+        ..SyntheticOptions::default()
+    };
     synthetic::write(root.join("set"), &options).unwrap();
     let photos = root.join("set/low");
     let out = root.join("scene");

@@ -1,7 +1,7 @@
 //! Gaussians in host memory, and what density control makes of them on the device and by its references.
 
 use glam::{DAffine3, DVec2, DVec3, Vec3};
-use nightsplat::camera::{Camera, Patch};
+use nightsplat::camera::{Camera, CameraModel, Patch};
 use nightsplat::gpu::{Gpu, Reference};
 use nightsplat::kernels::fate::{KEY_KEEP, KEY_PRUNE};
 use nightsplat::kernels::{self, densify_decide, densify_moments, densify_scatter, densify_score};
@@ -49,6 +49,7 @@ pub(super) fn camera_at(position: DVec3) -> Camera {
         height: 48,
         focal: DVec2::splat(60.0),
         principal_point: DVec2::new(32.0, 24.0),
+        model: CameraModel::Pinhole,
         view_from_world: DAffine3::from_translation(-position),
     }
 }

@@ -35,8 +35,7 @@ const NEIGHBOURS: usize = 12;
 
 /// Steps that do the same work, in the world, without density control.
 fn config() -> TrainConfig {
-    let mut config =
-        TrainConfig { steps: STEPS, frame: Some(Frame::WORLD), ..TrainConfig::default() };
+    let mut config = TrainConfig { steps: STEPS, frame: Some(Frame::WORLD), ..TrainConfig::bare() };
     config.tone = ToneSettings::new(ToneCurve::Ap3);
     config.schedule.sh_degree_interval = 1;
     config.schedule.boost = 1.0;
@@ -118,7 +117,13 @@ impl Hostile {
         let config = config();
         let files = tempfile::tempdir()
             .map_err(|error| Error::output(std::env::temp_dir(), error.to_string()))?;
-        let options = SyntheticOptions { views: 4, width: 32, height: 24, seed: 14 };
+        let options = SyntheticOptions {
+            views: 4,
+            width: 32,
+            height: 24,
+            seed: 14,
+            ..SyntheticOptions::default()
+        };
         synthetic::write(files.path(), &options)?;
         let low = files.path().join("low");
         for name in 0..options.views {

@@ -1,0 +1,52 @@
+#version 460
+#extension GL_GOOGLE_include_directive : require
+#include "kernel.glsl"
+#include "gaussian.glsl"
+
+//! The gradients of w_o mean sigmoid(o) + w_s mean exp(s) with respect to the raw opacities o and the logarithms s of the
+//! standard deviations, added to those that are there, and partial sums of sigmoid(o) and of exp(s).
+//!
+//! A thread takes `GAUSSIANS_PER_THREAD` Gaussians, one subgroup apart. A weight of 0 leaves the gradients as they are.
+//! Reference: `src/reference/parameter_terms.rs`.
+
+layout(local_size_x_id = 100) in;
+layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
+layout(constant_id = 0) const uint GAUSSIANS_PER_THREAD = 8;
+
+layout(push_constant) uniform Params {
+    uint  gaussian_count;   // of the batch
+    float opacity_scale;    // w_o / N, N the Gaussians of all batches
+    float log_scale_scale;  // w_s / (3N)
+};
+
+layout(binding = 0) readonly  buffer Parameters      { float parameters[]; };        // planes of the batch
+layout(binding = 1)           buffer Gradients       { float gradients[]; };         // planes of the batch
+layout(binding = 2) writeonly buffer OpacityPartials { float opacity_partials[]; };  // one per workgroup
+layout(binding = 3) writeonly buffer ScalePartials   { float scale_partials[]; };    // one per workgroup
+
+void main() {
+    uint first = WORKGROUP_INDEX * SUBGROUP_SIZE * GAUSSIANS_PER_THREAD;
+    if (first >= gaussian_count) return;
+    first += gl_LocalInvocationID.x;
+    float opacities = 0.0, scales = 0.0;
+    for (uint k = 0; k < GAUSSIANS_PER_THREAD; ++k) {
+        uint i = first + k * SUBGROUP_SIZE;
+        if (i >= gaussian_count) break;
+        uint at = RAW_OPACITIES_COLUMN * gaussian_count + i;
+        float opacity = sigmoid(parameters[at]);
+        opacities += opacity;
+        if (opacity_scale > 0.0) gradients[at] += opacity_scale * opacity * (1.0 - opacity);
+        for (uint axis = 0; axis < 3; ++axis) {
+            at = LOG_SCALES_COLUMN * gaussian_count + 3 * i + axis;
+            float scale = exp(parameters[at]);
+            scales += scale;
+            if (log_scale_scale > 0.0) gradients[at] += log_scale_scale * scale;
+        }
+    }
+    opacities = subgroupAdd(opacities);
+    scales = subgroupAdd(scales);
+    if (subgroupElect()) {
+        opacity_partials[WORKGROUP_INDEX] = opacities;
+        scale_partials[WORKGROUP_INDEX] = scales;
+    }
+}

@@ -1,0 +1,148 @@
+#version 460
+#extension GL_GOOGLE_include_directive : require
+#include "kernel.glsl"
+#include "tone.glsl"
+
+//! Pseudo-GT: decodes a stored photograph and applies its curve; one thread per pixel.
+//!
+//! A code is looked up and not divided, which a device may round as it likes: what is decoded has the bits that were encoded.
+//! Most curves map each value alone. `lum_preserve` scales a pixel by what its luminance gains, `per_channel` each channel
+//! by its own white; `auto` mixes the curve of each channel with the curve of the luminance, which keeps the ratios of the
+//! channels; `table` and `profile` are what `tone::Table` and `tone::Profile` are. Of a photograph that is hardly too dark
+//! the curve has a part of the weight: the target is x + weight (curve(x) - x), x clamped to [0, 1]. Reference:
+//! `src/reference/pseudo_gt.rs`.
+
+layout(local_size_x = 256) in;
+
+layout(constant_id = 0) const uint CODE_BITS = 32;       // 8 or 16; 32: `values` are the photograph, and there are no codes
+layout(constant_id = 1) const bool WITH_CURVE = true;    // else the photograph is decoded alone, to the bit
+
+// Of a profile: ramps of equal width of each channel,
+const uint SEGMENTS = 16;
+// and its numbers: three weights, a bias, the value at 0 and the rises.
+const uint PROFILE_WIDTH = 5 + SEGMENTS;
+
+layout(push_constant) uniform Params {
+    uint pixel_count;
+    uint view;        // the element of `parameters`
+    uint knot_count;  // of a table, per channel, at least 2
+};
+
+layout(binding = 0) readonly  buffer Codes      { uint codes[]; };     // (3, H, W), the lowest bits of a word first
+layout(binding = 1) readonly  buffer Values     { float values[]; };   // one per code, or (3, H, W); sRGB-encoded
+layout(binding = 2) readonly  buffer Parameters { ToneParameters parameters[]; };
+layout(binding = 3) readonly  buffer Numbers    { float numbers[]; };  // (3, K, 3) knots x, y, slope; or (3, PROFILE_WIDTH)
+layout(binding = 4) writeonly buffer Target     { float target[]; };   // (3, H, W)
+
+float stored(uint i) {
+    uint bits = CODE_BITS;
+    if (bits == 32) return values[i];
+    uint per_word = 32 / bits;
+    return values[bitfieldExtract(codes[i / per_word], int(bits * (i % per_word)), int(bits))];
+}
+
+// Of values and luminance in units of white; constants[0] is lambda. At black the factor of the luminance's curve is 1.
+vec3 automatic(vec3 t, float y, ToneParameters tone) {
+    float least = max(y, 1e-20);
+    float factor = one_minus_exp(least) / least;
+    vec3 own = vec3(one_minus_exp(t.r), one_minus_exp(t.g), one_minus_exp(t.b));
+    float share = tone.constants[0];
+    return tone.offset + (1.0 - tone.offset) * ((1.0 - share) * own + share * (t * factor));
+}
+
+// Positive phrasing: a NaN becomes black.
+vec3 measurable(vec3 rgb, float most) {
+    return mix(vec3(0.0), min(rgb, vec3(most)), greaterThan(rgb, vec3(0.0)));
+}
+
+vec3 mixed(vec3 rgb, ToneParameters tone) {
+    uint curve = TONE_CURVE;
+    vec3 known = measurable(rgb, 65504.0);
+    float y = 0.299 * known.r + 0.587 * known.g + 0.114 * known.b;
+    vec3 scale = vec3(y * tone.gain / (y + 1e-6));
+    if (curve == CURVE_PER_CHANNEL) scale = 1.0 / vec3(tone.constants[0], tone.constants[1], tone.constants[2]);
+    vec3 mapped = known * scale;
+    if (curve == CURVE_AUTO) mapped = automatic(known / tone.white, y / tone.white, tone);
+    return min(mapped, vec3(1.0));
+}
+
+vec3 knot(uint at) {
+    return vec3(numbers[3 * at], numbers[3 * at + 1], numbers[3 * at + 2]);
+}
+
+// The last knot of those from `first` that is not above x, which lies between the first and the last.
+uint knot_below(uint first, float x) {
+    uint low = first;
+    uint high = first + knot_count - 1;
+    while (high - low > 1) {
+        uint middle = (low + high) / 2;
+        if (numbers[3 * middle] <= x) low = middle;
+        else high = middle;
+    }
+    return low;
+}
+
+// Monotone cubics between the knots of a channel, whose slopes the host finds; constant beyond its ends.
+float tabled(uint channel, float x) {
+    uint first = channel * knot_count;
+    float low = numbers[3 * first];
+    float high = numbers[3 * (first + knot_count - 1)];
+    // Positive phrasing: a NaN counts as the lower end.
+    x = x > low ? min(x, high) : low;
+    uint at = knot_below(first, x);
+    vec3 left = knot(at);
+    vec3 right = knot(at + 1);
+    float width = right.x - left.x;
+    float s = (x - left.x) / width;
+    float rise = right.y - left.y;
+    float a = width * left.z - rise;
+    float b = rise - width * right.z;
+    float y = left.y + rise * s + s * (1.0 - s) * (a * (1.0 - s) + b * s);
+    return clamp(y, 0.0, 1.0);
+}
+
+// v = 1 - exp(-x / white); u = a v + b, clamped to [0, 1]; y = s_0 + sum of s_i clamp(16 u - i + 1, 0, 1) over 16 rises s_i
+// of equal width. The sum of ramps is continuous, so no rounding of u can jump.
+float profiled(uint channel, vec3 v) {
+    uint own = PROFILE_WIDTH * channel;
+    float u = numbers[own] * v.r + numbers[own + 1] * v.g + numbers[own + 2] * v.b + numbers[own + 3];
+    float place = float(SEGMENTS) * clamp(u, 0.0, 1.0);
+    float y = numbers[own + 4];
+    for (uint segment = 0; segment < SEGMENTS; ++segment) {
+        y += numbers[own + 5 + segment] * clamp(place - float(segment), 0.0, 1.0);
+    }
+    return clamp(y, 0.0, 1.0);
+}
+
+vec3 mapped(vec3 rgb, ToneParameters tone) {
+    switch (TONE_CURVE) {
+    case CURVE_AUTO:
+    case CURVE_LUM_PRESERVE:
+    case CURVE_PER_CHANNEL:
+        return mixed(rgb, tone);
+    case CURVE_TABLE:
+        return vec3(tabled(0, rgb.r / tone.white), tabled(1, rgb.g / tone.white), tabled(2, rgb.b / tone.white));
+    case CURVE_PROFILE:
+        vec3 t = measurable(rgb, 65504.0) / tone.white;
+        vec3 v = vec3(one_minus_exp(t.r), one_minus_exp(t.g), one_minus_exp(t.b));
+        return vec3(profiled(0, v), profiled(1, v), profiled(2, v));
+    default:
+        return vec3(tone_curve(rgb.r, tone), tone_curve(rgb.g, tone), tone_curve(rgb.b, tone));
+    }
+}
+
+void main() {
+    uint i = THREAD_INDEX;
+    if (i >= pixel_count) return;
+    vec3 rgb = vec3(stored(i), stored(pixel_count + i), stored(2 * pixel_count + i));
+    if (WITH_CURVE) {
+        ToneParameters tone = parameters[view];
+        vec3 plain = measurable(rgb, 1.0);
+        vec3 curved = mapped(rgb, tone);
+        // What has the whole weight stays as it is, to the bit.
+        rgb = tone.weight < 1.0 ? plain + tone.weight * (curved - plain) : curved;
+    }
+    target[i] = rgb.r;
+    target[pixel_count + i] = rgb.g;
+    target[2 * pixel_count + i] = rgb.b;
+}

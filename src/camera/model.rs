@@ -1,0 +1,154 @@
+//! Camera models: which place of the picture shows which direction.
+
+use std::f64::consts::FRAC_PI_2;
+
+use glam::{DVec2, DVec3};
+
+/// How directions become places of the picture.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub enum CameraModel {
+    /// Light goes straight through a hole: x / z and y / z.
+    #[default]
+    Pinhole,
+    /// `OPENCV_FISHEYE`: angles off the axis make the picture.
+    Fisheye(KannalaBrandt),
+}
+
+/// The polynomial of a fisheye (Kannala and Brandt 2006, as `OpenCV` and COLMAP have it): what is seen at the angle t off the
+/// axis lies `t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8)` focal lengths from the principal point.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct KannalaBrandt {
+    /// k1 to k4.
+    pub coefficients: [f64; 4],
+}
+
+impl KannalaBrandt {
+    /// The distance from the principal point, in focal lengths, of what is seen at an angle off the axis, in radians.
+    pub fn radius(&self, angle: f64) -> f64 {
+        let [k1, k2, k3, k4] = self.coefficients;
+        let t2 = angle * angle;
+        angle * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+    }
+
+    /// Its derivative.
+    pub fn slope(&self, angle: f64) -> f64 {
+        let [k1, k2, k3, k4] = self.coefficients;
+        let t2 = angle * angle;
+        1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)))
+    }
+
+    /// The angle below which the camera sees, in radians: 90 degrees, or less where the radius stops to rise.
+    pub fn largest_angle(&self) -> f64 {
+        const STEPS: u32 = 4096;
+        let at = |step: u32| FRAC_PI_2 * f64::from(step) / f64::from(STEPS);
+        // Positive phrasing: a NaN rises no more.
+        let rises = |angle: f64| self.slope(angle) > 0.0;
+        let Some(step) = (1..=STEPS).find(|&step| !rises(at(step))) else { return FRAC_PI_2 };
+        let (mut low, mut high) = (at(step - 1), at(step));
+        for _ in 0..48 {
+            let middle = 0.5 * (low + high);
+            *(if rises(middle) { &mut low } else { &mut high }) = middle;
+        }
+        low
+    }
+
+    /// The angle of what is seen at a distance from the principal point, in focal lengths; `None` beyond the largest.
+    pub fn angle(&self, radius: f64) -> Option<f64> {
+        let (mut low, mut high) = (0.0, self.largest_angle());
+        if !(0.0..self.radius(high)).contains(&radius) {
+            return None;
+        }
+        // As far as halving goes: the interval's ends are neighbours.
+        for _ in 0..60 {
+            let middle = 0.5 * (low + high);
+            *(if self.radius(middle) <= radius { &mut low } else { &mut high }) = middle;
+        }
+        Some(0.5 * (low + high))
+    }
+}
+
+impl CameraModel {
+    /// The depth of a point of the view (x right, y down, z forward), by which it is sorted and which the near plane cuts: z
+    /// of a pinhole, the distance of a fisheye. `None` where the model does not see it.
+    pub fn depth(&self, point: DVec3) -> Option<f64> {
+        match self {
+            Self::Pinhole => Some(point.z).filter(|&z| z > 0.0),
+            Self::Fisheye(lens) => {
+                let angle = point.truncate().length().atan2(point.z);
+                (point.z > 0.0 && angle < lens.largest_angle()).then(|| point.length())
+            }
+        }
+    }
+
+    /// Where a point of the view is seen, focal lengths from the principal point; `None` where the model does not see it.
+    pub fn place(&self, point: DVec3) -> Option<DVec2> {
+        self.depth(point)?;
+        Some(match self {
+            Self::Pinhole => point.truncate() / point.z,
+            Self::Fisheye(lens) => {
+                let across = point.truncate();
+                let angle = across.length().atan2(point.z);
+                lens.radius(angle) * across.normalize_or(DVec2::X)
+            }
+        })
+    }
+
+    /// The point of the view that is seen at a place, focal lengths from the principal point, at a depth; `None` where the
+    /// model sees nothing.
+    pub fn point(&self, place: DVec2, depth: f64) -> Option<DVec3> {
+        match self {
+            Self::Pinhole => Some(place.extend(1.0) * depth),
+            Self::Fisheye(lens) => {
+                let (sin, cos) = lens.angle(place.length())?.sin_cos();
+                Some((sin * place.normalize_or(DVec2::X)).extend(cos) * depth)
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const LENSES: [[f64; 4]; 4] = [
+        [0.0; 4],
+        [0.05, -0.02, 0.006, -0.001],
+        // Rises to 70 degrees and falls from there on.
+        [-0.2231, 0.0, 0.0, 0.0],
+        [-0.0124, 0.0044, -0.0031, 0.0005],
+    ];
+
+    #[test]
+    fn what_is_seen_at_a_place_is_projected_to_it() {
+        for coefficients in LENSES {
+            let model = CameraModel::Fisheye(KannalaBrandt { coefficients });
+            for (x, y) in [(0.0, 0.0), (0.3, -0.2), (-0.7, 0.1), (1e-9, 0.0), (0.5, 0.5)] {
+                let place = DVec2::new(x, y);
+                let point = model.point(place, 3.0).unwrap();
+                assert!((model.depth(point).unwrap() - 3.0).abs() < 1e-12);
+                assert!(model.place(point).unwrap().distance(place) < 1e-12, "{coefficients:?}");
+            }
+        }
+        let place = DVec2::new(0.4, -3.0);
+        let point = CameraModel::Pinhole.point(place, 2.0).unwrap();
+        assert_eq!((point.z, CameraModel::Pinhole.place(point)), (2.0, Some(place)));
+    }
+
+    #[test]
+    fn nothing_is_seen_from_the_angle_on_at_which_the_radius_falls_or_at_90_degrees_and_behind() {
+        let fold = KannalaBrandt { coefficients: LENSES[2] };
+        let largest = fold.largest_angle();
+        assert!((largest - (1.0f64 / (3.0 * 0.2231)).sqrt()).abs() < 1e-9, "{largest}");
+        for lens in LENSES.map(|coefficients| KannalaBrandt { coefficients }) {
+            let (model, largest) = (CameraModel::Fisheye(lens), lens.largest_angle());
+            let at = |angle: f64| DVec3::new(0.6 * angle.sin(), -0.8 * angle.sin(), angle.cos());
+            assert!(model.place(at(largest - 1e-6)).is_some());
+            for angle in [largest + 1e-6, FRAC_PI_2 + 1e-6, 2.0, 3.0, std::f64::consts::PI] {
+                assert_eq!(model.place(at(angle)), None, "{lens:?} {angle}");
+            }
+            assert_eq!(model.point(DVec2::X * (lens.radius(largest) + 1e-9), 1.0), None);
+            assert_eq!(model.place(DVec3::NAN), None);
+        }
+        assert_eq!(KannalaBrandt { coefficients: [f64::NAN; 4] }.angle(0.5), None);
+    }
+}

@@ -1,0 +1,158 @@
+//! Terms on the parameters of the Gaussians: the mean opacity and the mean standard deviation, each pressed down by its weight.
+//!
+//! L = a mean sigmoid(o) + b mean exp(s), a and b the weights, o the raw opacities, s the logarithms of the three standard
+//! deviations: the regularisers of 3DGS-MCMC (Kheradmand et al. 2024). They look at no view, so they are recorded after the render's gradient
+//! has become that of the parameters, and add to it.
+
+use super::log::{LogSlot, PartialSums};
+use super::{LossSpec, Term, TermOn};
+use crate::Result;
+use crate::base::settings::{Rule, settings};
+use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
+use crate::kernels::parameter_terms;
+use crate::splats::batches::{Batch, Batches};
+
+pub(super) const SPEC: LossSpec =
+    LossSpec { terms: &[Term::OPACITY, Term::SCALE], on: TermOn::Parameters };
+
+impl Term {
+    /// Mean opacity.
+    pub const OPACITY: Self = Self {
+        column: "opacity",
+        name: "opacity",
+        is_likeness: false,
+        weight: |config| config.parameters.opacity_weight,
+        setting: "loss.opacity_weight",
+    };
+    /// Mean standard deviation, in units of the frame.
+    pub const SCALE: Self = Self {
+        column: "scale",
+        name: "scale",
+        weight: |config| config.parameters.scale_weight,
+        setting: "loss.scale_weight",
+        ..Self::OPACITY
+    };
+}
+
+settings! {
+"loss."
+/// What the terms on parameters weigh; 0: they are not there.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ParameterWeights {
+    /// Of the mean opacity, which it presses down; 3DGS-MCMC has 0.01.
+    opacity_weight: f64 = 0.0 => Rule::POSITIVE_OR_0;
+    /// Of the mean standard deviation, in units of the frame, which it presses down; 3DGS-MCMC has 0.01.
+    scale_weight: f64 = 0.0 => Rule::POSITIVE_OR_0;
+}
+}
+
+impl ParameterWeights {
+    fn is_on(self) -> bool {
+        self.opacity_weight > 0.0 || self.scale_weight > 0.0
+    }
+}
+
+/// What the terms read of a step.
+#[derive(Clone, Copy, Debug)]
+pub struct ParameterInputs<'a> {
+    /// How the planes of the Gaussians lie.
+    pub batches: &'a Batches,
+    /// Words that a Gaussian has in `parameters`.
+    pub words: usize,
+    /// The planes; the columns of opacities and scales are those of include/gaussian.glsl.
+    pub parameters: &'a Buffer<f32>,
+}
+
+/// A part begins at a multiple of this many floats, where every device lets a binding begin.
+const PART: usize = 64;
+
+/// Records the terms on parameters that have a weight.
+#[derive(Debug)]
+pub struct ParameterTerms {
+    gpu: Gpu,
+    weights: ParameterWeights,
+    pipeline: Pipeline<parameter_terms::Kernel>,
+    gaussians_per_workgroup: u32,
+    /// One a workgroup, of all batches one after the other.
+    opacity_partials: Buffer<f32>,
+    scale_partials: Buffer<f32>,
+}
+
+impl ParameterTerms {
+    /// None where no weight is above 0.
+    ///
+    /// # Errors
+    /// The device refuses the pipeline.
+    pub fn new(gpu: &Gpu, weights: ParameterWeights) -> Result<Option<Self>> {
+        let constants = parameter_terms::Constants::default();
+        let new = || {
+            Ok(Self {
+                gpu: gpu.clone(),
+                weights,
+                pipeline: gpu.pipeline(&constants)?,
+                gaussians_per_workgroup: gpu.properties().subgroup_size
+                    * constants.gaussians_per_thread,
+                opacity_partials: gpu.uninit("opacity_partials", 0)?,
+                scale_partials: gpu.uninit("scale_partials", 0)?,
+            })
+        };
+        weights.is_on().then(new).transpose()
+    }
+
+    /// Records the terms of a step: adds to the gradients, planes of floats in the same batches, and writes the means to the log.
+    ///
+    /// # Errors
+    /// A buffer is shorter than its batches, the log has no such slot, or the device is out of memory.
+    pub fn record(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        ParameterInputs { batches, words, parameters }: ParameterInputs<'_>,
+        gradients: &mut Buffer<f32>,
+        log: &mut LogSlot<'_>,
+    ) -> Result<()> {
+        log.check()?;
+        let each = self.gaussians_per_workgroup;
+        let workgroups = |batch: &Batch| batch.gaussian_count().div_ceil(each);
+        // Batches bind parts of the partial sums; what lies between these counts as 0.
+        let room = |batch: &Batch| (workgroups(batch) as usize).next_multiple_of(PART);
+        let total: usize = batches.iter().map(|batch| room(&batch)).sum();
+        let all: u32 = batches.iter().map(|batch| batch.gaussian_count()).sum();
+        if self.opacity_partials.len() < total {
+            self.opacity_partials = self.gpu.uninit("opacity_partials", total)?;
+            self.scale_partials = self.gpu.uninit("scale_partials", total)?;
+        }
+        pass.fill(&mut self.opacity_partials, 0);
+        pass.fill(&mut self.scale_partials, 0);
+        let scale = |weight: f64, each: f64| (weight / (each * f64::from(all.max(1)))) as f32;
+        let mut first = 0;
+        for batch in batches.iter() {
+            let part = first..first + room(&batch);
+            first = part.end;
+            pass.dispatch(
+                &self.pipeline,
+                &parameter_terms::Params {
+                    gaussian_count: batch.gaussian_count(),
+                    opacity_scale: scale(self.weights.opacity_weight, 1.0),
+                    log_scale_scale: scale(self.weights.scale_weight, 3.0),
+                },
+                parameter_terms::Buffers {
+                    parameters: batch.rows(parameters, words)?,
+                    gradients: batch.planes_mut(&mut *gradients)?,
+                    opacity_partials: self.opacity_partials.slice_mut().range(part.clone())?,
+                    scale_partials: self.scale_partials.slice_mut().range(part)?,
+                },
+                Threads::Workgroups([workgroups(&batch), 1, 1]),
+            )?;
+        }
+        let mean = |each: f32| 1.0 / (each * all.max(1) as f32);
+        let sums =
+            |term, partials, scale| PartialSums { term, partials, count: total as u32, scale };
+        log.record(
+            pass,
+            [
+                sums(Term::OPACITY, &self.opacity_partials, mean(1.0)),
+                sums(Term::SCALE, &self.scale_partials, mean(3.0)),
+            ],
+        )
+    }
+}

@@ -1,0 +1,56 @@
+//! Whether a dataset is what it was, told without decoding a photograph.
+
+use std::path::Path;
+
+use super::listed::Listing;
+use super::listing::list;
+use super::split::split;
+use super::{Dataset, LoadOptions, colmap, sources};
+use crate::Result;
+use crate::base::hash::{self, Hasher};
+use crate::photographs::image::files::Files;
+
+impl Dataset {
+    /// A checksum of what is listed below `root`: views with their cameras and splits, and of every file that they or the points
+    /// are read from its path, length and time of change. Equal stamps are of the same dataset; one that was copied, or whose
+    /// photographs were written again, has another although it may hold the same pixels.
+    ///
+    /// # Errors
+    /// As [`Dataset::photographs`].
+    pub fn stamp(root: &Path, options: &LoadOptions) -> Result<String> {
+        options.check()?;
+        let files = Files::default();
+        let Listing { mut frames, mut skipped, .. } = list(root, &files)?;
+        split(root, &mut frames, options.test_every, &files)?;
+        let mut hasher = Hasher::default();
+        for source in sources(root, &frames, options, &files, &mut skipped) {
+            // Debug tells every two cameras apart.
+            let view = format!("{} {:?} {:?}", source.name, source.split, source.lens);
+            hasher.write(view.as_bytes());
+            hasher.write_numbers(&source.view_from_world.to_cols_array());
+            for file in [&source.input, &source.reference, &source.mask, &source.depth] {
+                file.iter().for_each(|path| write_file(&mut hasher, path));
+            }
+        }
+        let folders = colmap::find(root, &["images", "points3D"]);
+        for folder in folders.iter().map(|folder| folder.as_path()).chain([root]) {
+            let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+            let mut paths: Vec<_> = entries.map(|entry| entry.path()).collect();
+            paths.sort();
+            paths
+                .iter()
+                .filter(|path| path.is_file())
+                .for_each(|path| write_file(&mut hasher, path));
+        }
+        Ok(hash::text(hasher.finish()))
+    }
+}
+
+fn write_file(hasher: &mut Hasher, path: &Path) {
+    hasher.write(path.as_os_str().as_encoded_bytes());
+    let Ok(there) = path.metadata() else { return };
+    // Debug tells every two times apart.
+    let changed = format!("{:?}", there.modified().ok());
+    hasher.write(&there.len().to_le_bytes());
+    hasher.write(changed.as_bytes());
+}

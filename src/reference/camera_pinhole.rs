@@ -1,0 +1,43 @@
+//! The pinhole of `include/camera_pinhole.glsl`, in f64.
+
+use glam::{DVec2, DVec3};
+
+use super::camera::Place;
+
+/// x / z and y / z.
+#[derive(Clone, Debug)]
+pub struct Pinhole {
+    /// Where the Jacobian of the projection is taken at the least.
+    pub least_slope: DVec2,
+    /// And at the most.
+    pub most_slope: DVec2,
+}
+
+impl Pinhole {
+    /// x / z and y / z, no farther than the Jacobian is taken.
+    pub fn clamped_slope(&self, point: DVec3) -> DVec2 {
+        let slope = point.truncate() / point.z;
+        slope.max(self.least_slope).min(self.most_slope)
+    }
+
+    pub(super) fn place(&self, point: DVec3) -> Place {
+        let slope = self.clamped_slope(point);
+        let rows = [DVec3::new(1.0, 0.0, -slope.x), DVec3::new(0.0, 1.0, -slope.y)];
+        Place { at: point.truncate() / point.z, jacobian: rows.map(|row| row / point.z) }
+    }
+
+    pub(super) fn backward(&self, point: DVec3, d_place: DVec2, d_rows: [DVec3; 2]) -> DVec3 {
+        let (z, free_slope) = (point.z, point.truncate() / point.z);
+        let slope = self.clamped_slope(point);
+        let [d_x, d_y] = d_rows;
+        let mut d_slope = -DVec2::new(d_x.z, d_y.z) / z;
+        for axis in 0..2 {
+            if free_slope[axis] != slope[axis] {
+                d_slope[axis] = 0.0;
+            }
+        }
+        let d_xy = (d_place + d_slope) / z;
+        let d_inverse_z = d_x.x - slope.x * d_x.z + d_y.y - slope.y * d_y.z;
+        d_xy.extend(-d_inverse_z / (z * z) - d_xy.dot(free_slope))
+    }
+}

@@ -1,0 +1,49 @@
+//! What is learned of the training views' exposures.
+
+use std::path::PathBuf;
+use std::str::FromStr;
+
+use serde::{Deserialize, Serialize};
+
+use crate::base::settings::{Rule, settings};
+use crate::loss::exposure::ExposureRates;
+use crate::{Error, Result};
+
+/// Whether something is learned.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Learning {
+    /// It is not there: no buffer, no kernel.
+    #[default]
+    Off,
+    /// It is.
+    On,
+}
+
+impl FromStr for Learning {
+    type Err = Error;
+
+    fn from_str(name: &str) -> Result<Self> {
+        match name {
+            "off" => Ok(Self::Off),
+            "on" => Ok(Self::On),
+            _ => Err(Error::Usage(format!("`{name}` is neither off nor on"))),
+        }
+    }
+}
+
+settings! {
+"exposure."
+/// Gain and bias of each channel of each training view, [`crate::loss::exposure`].
+#[derive(Clone, Debug, PartialEq)]
+pub struct ExposureConfig {
+    /// on: learn gain and bias of each channel of each training view, where photographs are not equally bright; off.
+    learn: Learning = Learning::Off => Rule::OneOf(&["on", "off"]), "--exposure on|off";
+    /// Learn exposures from where this table has them: `name,ev` or `name,gain_r,gain_g,gain_b,bias_r,bias_g,bias_b`.
+    start: Option<PathBuf> = None, "exposures.csv of the dataset" => Rule::PATH, "--exposures FILE";
+}
+sections {
+    /// Adam's learning rate.
+    rates: ExposureRates;
+}
+}

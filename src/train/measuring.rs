@@ -1,0 +1,84 @@
+//! What is measured of the training photographs, and how bright their targets are.
+
+use std::borrow::Cow;
+use std::collections::BTreeMap;
+
+use rayon::prelude::*;
+use serde::Serialize;
+
+use crate::Result;
+use crate::photographs::dataset::{Dataset, MeasuredSize, View};
+use crate::photographs::image::Image;
+use crate::photographs::tone::{Exposure, Measured, Scene, ToneSettings, all_black};
+
+/// How bright the targets are, and what a model makes of them.
+#[derive(Clone, Debug, Serialize)]
+pub struct TargetExposure {
+    /// The gain that a model of views with differing gains agrees on, their geometric mean: the exposure at which it
+    /// renders and is scored.
+    pub model_gain: f64,
+    /// What was found for the training photographs together.
+    pub scene: Exposure,
+    /// The gain of every training view, by name.
+    pub gains: BTreeMap<String, f64>,
+}
+
+impl TargetExposure {
+    pub(super) fn new(scene: Exposure, gains: BTreeMap<String, f64>) -> Self {
+        let logarithms: f64 = gains.values().map(|gain| gain.ln()).sum();
+        let model_gain = (logarithms / gains.len().max(1) as f64).exp();
+        Self { model_gain, scene, gains }
+    }
+}
+
+/// The training views that have a photograph, and their places in the dataset.
+pub(super) fn photographs(dataset: &Dataset) -> impl Iterator<Item = (usize, &View)> {
+    let views = dataset.views.iter().enumerate();
+    views.filter(|(_, view)| view.is_train() && view.has_photograph())
+}
+
+/// What is measured of all training photographs together, and of each.
+///
+/// # Errors
+/// Every photograph is as good as black where their exposure is asked for, or a photograph can no longer be read.
+pub(super) fn measured(
+    settings: &ToneSettings,
+    dataset: &Dataset,
+) -> Result<(Scene, Vec<Measured>)> {
+    let views: Vec<&View> = photographs(dataset).map(|(_, view)| view).collect();
+    let pixels = |view: &&View| u64::from(view.camera.width) * u64::from(view.camera.height);
+    let largest = views.iter().map(pixels).max().unwrap_or_default();
+    let mut measured = vec![];
+    for views in views.chunks(Image::decoded_at_once(largest)) {
+        let of_views = views.par_iter().map(|view| measured_of(view, settings.lift_first));
+        measured.extend(of_views.collect::<Result<Vec<_>>>()?.into_iter().flatten());
+    }
+    let scene = settings.scene(&measured).ok_or_else(|| all_black(&dataset.root))?;
+    Ok((scene, measured))
+}
+
+/// What is measured of a view; known where its photograph was measured while it was decoded.
+///
+/// # Errors
+/// As [`lifted_from`].
+pub(super) fn measured_of(view: &View, lift_first: bool) -> Result<Option<Measured>> {
+    let size = if lift_first { MeasuredSize::Own } else { MeasuredSize::Loaded };
+    let read_anew = view.original.as_ref().filter(|_| lift_first || view.image.is_none());
+    let measured = match read_anew.and_then(|original| original.measured(size)) {
+        Some(measured) => Some(measured.clone()),
+        None => {
+            let photograph = lifted_from(view, lift_first)?;
+            photograph.map(|photograph| Measured::of(&view.counted(&photograph)))
+        }
+    };
+    Ok(measured.map(|measured| measured.seen_by(&view.camera)))
+}
+
+/// What is measured of a view and becomes its target: the photograph as its camera took it where it is lifted before it is
+/// shrunk, else as it was loaded; none where the view has none.
+///
+/// # Errors
+/// As [`View::photograph`].
+pub(super) fn lifted_from(view: &View, lift_first: bool) -> Result<Option<Cow<'_, Image>>> {
+    if lift_first { view.photograph() } else { view.loaded() }
+}
