@@ -8,6 +8,7 @@
 //! - a borrowed device ([`Gpu::from_host`]) keeps everything that it had: we destroy what we created and nothing else.
 
 mod address_space;
+mod allocated;
 mod buffer;
 #[cfg(feature = "check")]
 mod check;

@@ -202,14 +202,6 @@ impl Trainer {
         Self::on_patches(gpu, config, dataset, initial.as_ref())
     }
 
-    /// A trainer whose state a checkpoint is to replace: the model that its run began with need not be there any more.
-    ///
-    /// # Errors
-    /// As [`Trainer::new`].
-    pub(crate) fn to_restore(gpu: &Gpu, config: TrainConfig, dataset: &Dataset) -> Result<Self> {
-        Self::on_patches(gpu, config, dataset, None)
-    }
-
     /// The same from Gaussians that there are already.
     ///
     /// # Errors

@@ -5,7 +5,7 @@ use std::marker::PhantomData;
 use gpu_allocator::MemoryLocation;
 use gpu_allocator::vulkan::Allocation;
 
-use super::buffer::Memory;
+use super::allocated::Memory;
 use super::recorder::HOST_SUBMITS;
 use super::{Bound, Gpu, Recorder, Slice};
 use crate::{Error, Result};

@@ -4,8 +4,8 @@
 use std::marker::PhantomData;
 use std::ops::Range;
 
-use super::buffer::Memory;
-use super::{Bound, Buffer};
+use super::Bound;
+use super::allocated::Memory;
 use crate::{Error, Result};
 
 /// Elements of a buffer to read. While it lives, no [`SliceMut`] of them can be made:
@@ -64,31 +64,12 @@ pub struct SliceMut<'a, T> {
 /// Vulkan lets no device ask for more of where a binding begins, in bytes.
 const ALIGNMENT: usize = 256;
 
-impl<T: bytemuck::Pod> Buffer<T> {
-    /// All of it, to read.
-    pub fn slice(&self) -> Slice<'_, T> {
-        Slice { memory: self.memory(), first: 0, len: self.len(), element: PhantomData }
+impl<'a, T: bytemuck::Pod> Slice<'a, T> {
+    /// The first `len` elements of the memory.
+    pub(super) fn new(memory: &'a Memory, len: usize) -> Self {
+        Self { memory, first: 0, len, element: PhantomData }
     }
 
-    /// All of it, to read and write.
-    pub fn slice_mut(&mut self) -> SliceMut<'_, T> {
-        SliceMut { len: self.len(), memory: self.memory(), first: 0, element: PhantomData }
-    }
-}
-
-impl<'a, T: bytemuck::Pod> From<&'a Buffer<T>> for Slice<'a, T> {
-    fn from(buffer: &'a Buffer<T>) -> Self {
-        buffer.slice()
-    }
-}
-
-impl<'a, T: bytemuck::Pod> From<&'a mut Buffer<T>> for SliceMut<'a, T> {
-    fn from(buffer: &'a mut Buffer<T>) -> Self {
-        buffer.slice_mut()
-    }
-}
-
-impl<T: bytemuck::Pod> Slice<'_, T> {
     /// The number of elements.
     pub fn len(&self) -> usize {
         self.len
@@ -120,6 +101,11 @@ impl<T: bytemuck::Pod> Slice<'_, T> {
 }
 
 impl<'a, T: bytemuck::Pod> SliceMut<'a, T> {
+    /// The first `len` elements of memory whose owner is borrowed for it alone.
+    pub(super) fn new(memory: &'a Memory, len: usize) -> Self {
+        Self { memory, first: 0, len, element: PhantomData }
+    }
+
     /// The number of elements.
     pub fn len(&self) -> usize {
         self.len

@@ -1,6 +1,8 @@
 //! The model that a training begins with, where one is given.
 
-use super::TrainConfig;
+use super::{TrainConfig, Trainer};
+use crate::gpu::Gpu;
+use crate::photographs::dataset::Dataset;
 use crate::splats::scene::{FEATURES, Gaussians, Shape, ply};
 use crate::{Error, Result};
 
@@ -38,5 +40,15 @@ impl TrainConfig {
     pub(super) fn sh_degree_at(&self, step: u64, highest: u32) -> u32 {
         // Without the degrees that a model has, the first steps would teach it to do without them.
         if self.init.is_some() { highest } else { self.schedule.sh_degree(step, highest) }
+    }
+}
+
+impl Trainer {
+    /// A trainer whose state a checkpoint is to replace: the model that its run began with need not be there any more.
+    ///
+    /// # Errors
+    /// As [`Trainer::new`].
+    pub(crate) fn to_restore(gpu: &Gpu, config: TrainConfig, dataset: &Dataset) -> Result<Self> {
+        Self::on_patches(gpu, config, dataset, None)
     }
 }

@@ -29,9 +29,7 @@ fn a_run_begins_with_a_model_and_its_highest_sh_degree() {
     let bytes = with_property(&fs::read(&model).unwrap());
     fs::write(place.path("foreign.ply"), bytes).unwrap();
     let foreign = place.path("foreign.ply");
-    succeed(
-        &place.train("third", &format!("--steps 1 --sh-degree 3 --init {}", foreign.display())),
-    );
+    succeed(&place.train("third", &format!("--steps 1 --init {}", foreign.display())));
 }
 
 /// A binary PLY with one more float of every vertex.
