@@ -22,7 +22,7 @@ pub struct SynthArgs {
     /// Changes the textures, the noise and the sampled points.
     #[arg(long, default_value_t = SyntheticOptions::default().seed)]
     pub seed: u64,
-    /// Take the photographs with a fisheye (OPENCV_FISHEYE) that sees 130 degrees across the longer side
+    /// Take the photographs with a fisheye (`OPENCV_FISHEYE`) that sees 130 degrees across the longer side
     #[arg(long)]
     pub fisheye: bool,
     /// Write into a folder that is not empty; files of the same names are replaced.

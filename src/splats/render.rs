@@ -32,7 +32,7 @@ use crate::splats::scene::{Shape, width};
 use crate::splats::sort::{Count, RadixSort};
 use crate::{Error, Result};
 
-pub use cameras::{Viewpoint, Viewpoints};
+pub use cameras::{CameraGradient, Viewpoint, Viewpoints};
 #[doc(hidden)]
 pub use frame::Frame;
 pub use frame::Status;

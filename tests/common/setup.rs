@@ -177,7 +177,7 @@ impl Setup {
 /// A setup, rendered.
 pub(crate) struct Rendered<'a> {
     setup: &'a Setup,
-    gaussians: Buffer<f32>,
+    pub(crate) gaussians: Buffer<f32>,
     pub(crate) renderer: Renderer,
     /// (channels, H, W)
     pub(crate) render: Vec<f32>,

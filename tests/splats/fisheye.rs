@@ -34,7 +34,7 @@ fn reference(camera: &Camera) -> camera::Camera {
     camera::Camera::from(&kernels::Camera::from(&Patch::from(camera)))
 }
 
-/// The formula of OpenCV's documentation of `cv::fisheye::projectPoints`.
+/// The formula of `OpenCV`'s documentation of `cv::fisheye::projectPoints`.
 fn published(camera: &Camera, point: DVec3) -> DVec2 {
     let CameraModel::Fisheye(KannalaBrandt { coefficients: [k1, k2, k3, k4] }) = camera.model
     else {
