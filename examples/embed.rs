@@ -35,7 +35,7 @@ fn main() -> Result<(), Box<dyn Error>> {
 
 fn render(host: &Host, gpu: &Gpu) -> Result<Image, Box<dyn Error>> {
     let (camera, gaussians) = (camera(), ring()?);
-    let parameters = gaussians.upload(gpu)?;
+    let on_device = gaussians.upload(gpu)?;
     let settings = RenderSettings { shape: gaussians.shape, ..RenderSettings::default() };
     let mut renderer = Renderer::new(gpu, settings)?;
     // Memory is taken before anything is recorded.
@@ -46,7 +46,7 @@ fn render(host: &Host, gpu: &Gpu) -> Result<Image, Box<dyn Error>> {
             unsafe {
                 gpu.record_into(commands.as_raw(), |pass| {
                     renderer.clear_status(pass);
-                    renderer.forward(pass, &parameters, &camera, &OPTIONS)
+                    renderer.forward(pass, &on_device, &camera, &OPTIONS)
                 })
             }
             // The host goes on here: `renderer.render().handle()` is a buffer that its own shaders can bind.

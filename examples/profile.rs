@@ -20,7 +20,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut config = TrainConfig {
         downscale: downscale.parse()?,
         steps: steps + REPEATS,
-        ..TrainConfig::default()
+        ..TrainConfig::bare()
     };
     config.schedule.resolution_steps = [0, 0];
     let gpu = Gpu::new(&DeviceChoice::Best)?;

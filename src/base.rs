@@ -4,8 +4,10 @@
 //! - [`output`]: files that are never seen half-written
 //! - [`hash`]: checksums of numbers and bytes
 //! - [`random`]: counter-based random numbers
+//! - [`settings`]: a row for each setting: key, default, rule, unit, help, option
 
 pub mod hash;
 pub mod input;
 pub mod output;
 pub mod random;
+pub mod settings;

@@ -3,10 +3,12 @@
 use std::path::Path;
 
 use anyhow::Result;
-use clap::{CommandFactory, Parser, Subcommand};
+use clap::{Parser, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
 
+use crate::base::settings::Setting;
 use crate::photographs::image::Image;
+use crate::train::settings::setting;
 
 pub mod ablate;
 mod batch;
@@ -140,27 +142,14 @@ impl Cli {
     }
 }
 
-/// A message of the library with options in place of what they set: `--steps` for `` `TrainConfig::steps` ``.
-pub fn in_options(message: &str) -> String {
-    let command = Cli::command();
-    let arguments = || command.get_subcommands().flat_map(clap::Command::get_arguments);
-    let option = |quoted: &str| {
-        let long = match quoted.rsplit_once("::")?.1 {
-            "gain_c" => "gain".to_owned(),
-            "Replace" => "overwrite".to_owned(),
-            "Resume" => "resume".to_owned(),
-            "Name" => "device".to_owned(),
-            field => field.replace('_', "-"),
-        };
-        arguments().any(|own| own.get_long() == Some(&long)).then(|| format!("--{long}"))
-    };
-    let parts: Vec<&str> = message.split('`').collect();
-    let said = parts.iter().enumerate().map(|(index, part)| match index % 2 {
-        0 => (*part).to_owned(),
-        _ if index + 1 == parts.len() => format!("`{part}"),
-        _ => option(part).unwrap_or_else(|| format!("`{part}`")),
-    });
-    said.collect()
+/// What is said of an error, in one line: a setting by its key and by its option, where it has one.
+pub fn message(error: &anyhow::Error) -> String {
+    let message = format!("{error:#}");
+    let Some(crate::Error::Setting { key, .. }) = error.downcast_ref() else { return message };
+    match setting(key).and_then(Setting::option) {
+        Some((option, _)) => message.replacen(key, &format!("{key} (--{option})"), 1),
+        None => message,
+    }
 }
 
 /// The picture files that a command writes.
@@ -204,27 +193,17 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_an_option_sets_is_called_by_the_option() {
-        for (message, said) in [
-            (
-                "`TrainConfig::steps` is 0; it must be at least 1",
-                "--steps is 0; it must be at least 1",
-            ),
-            (
-                "raise `LoadOptions::downscale` or `TrainConfig::max_gaussians`",
-                "raise --downscale or --max-gaussians",
-            ),
-            ("`ToneSettings::gain_c` is -1", "--gain is -1"),
-            ("pass `HeldRun::Replace`", "pass --overwrite"),
-            ("`DeviceChoice::Name` picks another", "--device picks another"),
-            // Neither a setting, nor one that has an option, nor closed.
-            (
-                "buffer `steps` of `Trainer::log` is `odd",
-                "buffer `steps` of `Trainer::log` is `odd",
-            ),
-        ] {
-            assert_eq!(in_options(message), said);
-        }
+    fn a_setting_is_named_by_its_key_and_its_option() {
+        let refused = |key: &str| {
+            let (key, value, rule) = (key.to_owned(), "0".to_owned(), "at least 1".to_owned());
+            message(&crate::Error::Setting { key, value, rule }.into())
+        };
+        assert_eq!(refused("steps"), "steps (--steps) is 0; it must be at least 1");
+        assert_eq!(
+            refused("density.control"),
+            "density.control (--density) is 0; it must be at least 1"
+        );
+        assert_eq!(refused("stop.every"), "stop.every is 0; it must be at least 1");
     }
 }
 

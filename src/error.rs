@@ -1,7 +1,6 @@
 //! What can go wrong, sorted by what the user can do about it.
 //!
-//! A message names what a caller sets by its place in the library, in backquotes: `` `TrainConfig::steps` ``. The command
-//! line says its option instead.
+//! A message names a setting by its key in config.toml: `max_gaussians`, `density.fill`.
 
 use std::path::{Path, PathBuf};
 
@@ -28,6 +27,16 @@ pub enum Error {
         /// The fact and the remedy.
         problem: String,
     },
+    /// A setting has a value that it does not take; the exit code is 2.
+    #[error("{key} is {value}; it must be {rule}")]
+    Setting {
+        /// Its dotted path in config.toml.
+        key: String,
+        /// The value.
+        value: String,
+        /// The values that it takes.
+        rule: String,
+    },
     /// A setting, an argument or a combination of them that makes no sense; the exit code is 2.
     #[error("{0}")]
     Usage(String),
@@ -36,7 +45,7 @@ pub enum Error {
     NoDevice(String),
     /// The device lacks something every kernel needs.
     #[error(
-        "{device} lacks {feature}; `nightsplat doctor` lists every device and what it offers, `DeviceChoice::Name` picks another"
+        "{device} lacks {feature}; `nightsplat doctor` lists every device and what it offers, --device picks another"
     )]
     MissingFeature {
         /// The device's name.
@@ -46,8 +55,8 @@ pub enum Error {
     },
     /// A buffer did not fit into device memory.
     #[error(
-        "out of device memory: buffer `{buffer}` needs {bytes} bytes; lower `TrainConfig::max_gaussians`, \
-         `TrainConfig::patch_pixels` or `TrainConfig::cache`"
+        "out of device memory: buffer `{buffer}` needs {bytes} bytes; lower max_gaussians, patch_pixels \
+         or cache"
     )]
     OutOfMemory {
         /// The buffer's name.
@@ -59,8 +68,7 @@ pub enum Error {
     },
     /// A buffer exceeds what one binding may hold on this device.
     #[error(
-        "buffer `{buffer}` needs {bytes} bytes, {device} binds {limit} at most; lower `TrainConfig::max_gaussians` or \
-         `TrainConfig::patch_pixels`"
+        "buffer `{buffer}` needs {bytes} bytes, {device} binds {limit} at most; lower max_gaussians or patch_pixels"
     )]
     BufferTooLarge {
         /// The buffer's name.
@@ -105,7 +113,7 @@ pub enum Error {
     /// More splats lie on one tile than a kernel gets through on this device.
     #[error(
         "{view}: {splats} splats on one tile of {tile} pixels, {device} follows {limit}; lower \
-         `TrainConfig::max_gaussians` or take another device"
+         max_gaussians or take another device"
     )]
     Crowded {
         /// The render, or the training step and its view.
@@ -122,7 +130,7 @@ pub enum Error {
     /// A parameter became NaN or infinite.
     #[error(
         "step {step}: number {gaussian} of {plane} is not finite; lower its learning rate, or begin with another \
-         `TrainConfig::seed`"
+         seed"
     )]
     ParameterNotFinite {
         /// The last step, from 1.
@@ -133,7 +141,7 @@ pub enum Error {
         gaussian: usize,
     },
     /// A run that was asked to stop did so, and saved what it goes on from.
-    #[error("{}: {cause} after step {step}, and saved; go on with `HeldRun::Resume`", run.display())]
+    #[error("{}: {cause} after step {step}, and saved; go on with --resume", run.display())]
     Stopped {
         /// The run directory.
         run: PathBuf,
@@ -180,7 +188,7 @@ impl Error {
     /// device and its memory, those of [`Stop`] for a run that can go on, 1 for everything else.
     pub fn exit_code(&self) -> u8 {
         match self {
-            Self::Usage(_) => 2,
+            Self::Setting { .. } | Self::Usage(_) => 2,
             Self::Input { .. } => 3,
             Self::NoDevice(_)
             | Self::MissingFeature { .. }

@@ -14,9 +14,9 @@ mod structure;
 use std::sync::Arc;
 
 use glam::UVec2;
-use serde::{Deserialize, Serialize};
 
 use crate::base::random::Stream;
+use crate::base::settings::{Rule, settings};
 use crate::gpu::{Buffer, Gpu, Recorder};
 use crate::kernels::ToneParameters;
 use crate::splats::scene::{Feature, Features};
@@ -32,27 +32,23 @@ pub use structure::{StructureInputs, StructureLoss};
 pub const TERMS: [LossSpec; 5] =
     [image::TARGET, image::DARK, structure::SPEC, depth::SPEC, denoising::SPEC];
 
+settings! {
+"model.weights."
 /// What the terms weigh beside (1 - w) L1 + w (1 - SSIM). The defaults are those of LITA-GS's code but for the total variation,
 /// which blurs what holds no noise.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Weights {
     /// Of mean `(R_K - target)^2`, in the paper's form `(R_K - R_0)^2`.
-    pub denoising: f64,
+    denoising: f64 = 1.0 => Rule::POSITIVE_OR_0;
     /// Of the total variation of R_K.
-    pub total_variation: f64,
+    total_variation: f64 = 0.0 => Rule::POSITIVE_OR_0;
     /// The reconstruction of the dark photograph weighs 1: (1 - w) L1 + w (1 - SSIM); this is its w.
-    pub low_ssim: f64,
+    low_ssim: f64 = 0.2 => Rule::SHARE;
     /// Of mean |structure - edges of the target|.
-    pub structure: f64,
+    structure: f64 = 0.01 => Rule::POSITIVE_OR_0;
     /// Of 1 minus the correlation with the depth map, over the view and over boxes.
-    pub depth: f64,
+    depth: f64 = 0.1 => Rule::POSITIVE_OR_0;
 }
-
-impl Default for Weights {
-    fn default() -> Self {
-        Self { denoising: 1.0, total_variation: 0.0, low_ssim: 0.2, structure: 0.01, depth: 0.1 }
-    }
 }
 
 impl Weights {
@@ -146,16 +142,6 @@ impl LossConfig {
             (term.weight)(self) * if term.is_likeness { 1.0 - value } else { value }
         };
         self.terms().into_iter().map(of_term).sum()
-    }
-
-    /// # Errors
-    /// [`Error::Usage`] names a setting that gives a term, whether the model has it or not, a weight that makes no sense.
-    pub fn check(&self) -> Result<()> {
-        for term in Term::all() {
-            let weight = (term.weight)(self);
-            check_weight(&format!("{} (by {})", term.name, term.setting), weight)?;
-        }
-        Ok(())
     }
 
     fn specs(&self) -> impl Iterator<Item = &'static LossSpec> {

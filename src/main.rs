@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use clap::Parser;
 use nightsplat::Error;
 use nightsplat::base::output::printable;
-use nightsplat::cli::{Cli, in_options};
+use nightsplat::cli::{Cli, message};
 use tracing_subscriber::filter::LevelFilter;
 
 fn main() -> ExitCode {
@@ -31,7 +31,7 @@ fn main() -> ExitCode {
         return ExitCode::SUCCESS;
     }
     // A closed stderr leaves nobody to tell.
-    let message = in_options(&format!("{error:#}"));
+    let message = message(&error);
     let _ = writeln!(std::io::stderr(), "error: {}", in_one_line(&message));
     ExitCode::from(error.downcast_ref::<Error>().map_or(1, Error::exit_code))
 }

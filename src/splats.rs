@@ -4,9 +4,9 @@
 //! Gaussians.
 //!
 //! - [`attributes`]: the one table of what every Gaussian has
-//! - [`halves`]: numbers that are kept in 16 bits
+//! - [`halves`]: how numbers are stored, and those of 16 bits
 //! - [`batches`]: Gaussians of more planes than one binding holds
-//! - [`scene`]: Gaussians on the host, PLY
+//! - [`scene`]: Gaussians on the host and on the device, PLY
 //! - [`sort`]: scan and radix sort on the device
 //! - [`optimizer`]: Adam, what it learns beside the Gaussians, and the schedules of its rates
 //! - [`render`]: the differentiable rasteriser

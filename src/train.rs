@@ -6,22 +6,27 @@ mod checkpoint;
 mod config;
 mod decisions;
 pub mod diagnose;
+mod difference;
 mod early_stopping;
 mod exposures;
 mod fill;
 mod growth;
+mod layers;
 mod masks;
 mod memory;
 mod model;
 mod networks;
-mod overrides;
 mod parts;
 mod passes;
 mod patches;
 mod paths;
+mod planned;
 mod precision;
 mod preset;
+mod reference;
 mod rendered;
+pub mod settings;
+mod start;
 mod submission;
 mod target_views;
 mod terms;
@@ -29,8 +34,6 @@ mod views;
 
 use std::panic::resume_unwind;
 use std::thread::{self, ScopedJoinHandle};
-
-use glam::DVec3;
 
 use crate::camera::{Camera, Frame};
 #[cfg(feature = "check")]
@@ -54,14 +57,17 @@ pub use config::{Background, CheckConfig, DensityConfig, TrainConfig};
 use decisions::Decisions;
 pub use early_stopping::{EndReason, Ended, NotFinite, StopConfig};
 pub use exposures::{ExposureConfig, Learning};
+pub use layers::{Layer, Origin, Settings, values};
 use masks::Masks;
 pub use memory::MemoryEstimate;
 use model::Model;
 pub use networks::Networks;
 pub use parts::{ModelConfig, ModelName, NetworkRates, Part};
 use passes::{Kernels, background, first_sh_degree, learnables};
+pub use planned::{Planned, Planning, Said, diagnosed};
 pub use precision::{PhotographBits, PrecisionConfig};
 pub use preset::Preset;
+pub use reference::reference;
 pub use rendered::Rendered;
 use submission::{MOST_STEPS, Pace};
 use target_views::TargetViews;
@@ -176,11 +182,20 @@ pub struct Trainer {
 }
 
 impl Trainer {
-    /// Uploads the training views, takes their statistics and places the first Gaussians.
+    /// Uploads the training views, takes their statistics and places the first Gaussians, or those of [`TrainConfig::init`].
     ///
     /// # Errors
-    /// The configuration makes no sense, or the device is out of memory or lost.
+    /// The configuration makes no sense, the model to begin with does not suit it, or the device is out of memory or lost.
     pub fn new(gpu: &Gpu, config: TrainConfig, dataset: &Dataset) -> Result<Self> {
+        let initial = config.initial_model()?;
+        Self::on_patches(gpu, config, dataset, initial.as_ref())
+    }
+
+    /// A trainer whose state a checkpoint is to replace: the model that its run began with need not be there any more.
+    ///
+    /// # Errors
+    /// As [`Trainer::new`].
+    pub(crate) fn to_restore(gpu: &Gpu, config: TrainConfig, dataset: &Dataset) -> Result<Self> {
         Self::on_patches(gpu, config, dataset, None)
     }
 
@@ -277,11 +292,7 @@ impl Trainer {
         let gaussians = match gaussians {
             // A run that ended before its highest SH degree was in use has a model without it.
             Some(gaussians) if settings.shape.holds(gaussians.shape) => {
-                let gaussians = gaussians.with_sh_degree(settings.shape.sh_degree);
-                match frame {
-                    Frame::WORLD => gaussians,
-                    _ => gaussians.from_world(&frame, DVec3::ZERO),
-                }
+                gaussians.with_sh_degree(settings.shape.sh_degree).from_world(&frame)
             }
             Some(Gaussians { shape: own, .. }) => {
                 let problem = format!("Gaussians of {own:?} make no model of {:?}", settings.shape);
@@ -364,11 +375,7 @@ impl Trainer {
     /// # Errors
     /// The device was lost.
     pub fn gaussians(&self) -> Result<Gaussians> {
-        let gaussians = self.gaussians_in_frame()?;
-        Ok(match self.frame {
-            Frame::WORLD => gaussians,
-            frame => gaussians.to_world(&frame, DVec3::ZERO),
-        })
+        Ok(self.gaussians_in_frame()?.to_world(&self.frame))
     }
 
     /// The same in [`Trainer::frame`], to the bit as they are trained.
@@ -475,7 +482,7 @@ impl Trainer {
         let [decoded, decoded_photograph] = &mut self.decoded;
 
         let viewpoint = self.views.viewpoint(view);
-        self.renderer.forward(pass, &model.gaussians.parameters, viewpoint, &options)?;
+        self.renderer.forward(pass, &model.gaussians, viewpoint, &options)?;
         let (render, status) = self.renderer.render_and_status();
         let (d_render, size) = (&mut self.d_render, view.size());
         let input = view.input.decoded(pass, decoded)?;
@@ -528,7 +535,7 @@ impl Trainer {
         }
         self.renderer.backward(
             pass,
-            &model.gaussians.parameters,
+            &model.gaussians,
             viewpoint,
             &options,
             damping,
@@ -574,7 +581,7 @@ impl Trainer {
     /// As [`Trainer::render`], of a camera in the frame.
     fn render_of_degree(&mut self, camera: &Camera, sh_degree: u32) -> Result<Rendered> {
         let options = RenderOptions { sh_degree, background: [0.0; 3] };
-        let gaussians = (&self.model.gaussians.parameters, self.model.count());
+        let gaussians = &self.model.gaussians;
         let networks = self.networks.as_mut().map(|terms| &mut terms.networks);
         Rendered::new(&mut self.renderer, gaussians, camera, &options, networks)
     }
@@ -586,7 +593,7 @@ impl Trainer {
     fn reserve(&mut self) -> Result<()> {
         let Self { model, views, renderer, .. } = self;
         let sizes = views.all().map(TrainView::size);
-        renderer.reserve_with_headroom([model.count(), model.capacity()], sizes)
+        renderer.reserve_sizes(model.count(), model.capacity(), sizes)
     }
 
     fn report(&self, step: u64, losses: &StepLosses, milliseconds: f64) -> StepReport {

@@ -9,19 +9,25 @@
 //! of two and a world that lies near its origin is not moved, so that a world of an extent of 1.5 to 3 is its own frame, to
 //! the bit.
 
+use std::ops::Bound;
+
 use glam::{DAffine3, DVec3};
-use serde::{Deserialize, Serialize};
 
 use super::Camera;
+use crate::base::settings::{Rule, settings};
 
+settings! {
+"frame."
 /// A translation and a scaling of the world.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Frame {
-    /// The frame's origin in the world.
-    pub center: [f64; 3],
-    /// Units of the frame in a unit of the world, above 0.
-    pub scale: f64,
+    /// The origin of the frame in which the model is trained, in the world.
+    center: [f64; 3] = [0.0; 3], "found from the cameras, and recorded"
+        => Rule::List(3, 3, &Rule::Number(Bound::Unbounded, Bound::Unbounded)), in "world units";
+    /// Units of the frame in a unit of the world.
+    scale: f64 = 1.0, "found from the cameras, and recorded"
+        => Rule::Number(Bound::Included(f64::MIN_POSITIVE), Bound::Unbounded);
+}
 }
 
 /// The extent that a frame is made for.
@@ -36,12 +42,6 @@ const FAR_FROM_ORIGIN: f64 = 64.0;
 /// A camera so many times as far from the middle as half of them are stands elsewhere.
 const OUTLIER: f64 = 32.0;
 
-impl Default for Frame {
-    fn default() -> Self {
-        Self::WORLD
-    }
-}
-
 impl Frame {
     /// The world itself.
     pub const WORLD: Self = Self { center: [0.0; 3], scale: 1.0 };
@@ -54,11 +54,6 @@ impl Frame {
         let is_near = center.abs().max_element() * scale <= NEAR_ORIGIN * FRAME_EXTENT;
         let center = if is_near { DVec3::ZERO } else { center };
         Self { center: center.to_array(), scale }
-    }
-
-    /// Refuses numbers that are no frame.
-    pub fn is_sound(&self) -> bool {
-        self.scale.is_normal() && self.scale > 0.0 && self.center().is_finite()
     }
 
     fn center(&self) -> DVec3 {
@@ -180,7 +175,7 @@ mod tests {
         assert_eq!((far.center[0], far.file_origin().x), (1e7, 1e7));
         assert_eq!(Frame::new(DVec3::new(100.0, 0.0, 0.0), 2.0).file_origin(), DVec3::ZERO);
         for extent in [1e-300, 1e300, f64::MIN_POSITIVE, f64::MAX] {
-            assert!(Frame::new(DVec3::ZERO, extent).is_sound(), "{extent}");
+            assert!(Frame::new(DVec3::ZERO, extent).check_rows().is_ok(), "{extent}");
         }
     }
 

@@ -59,7 +59,7 @@ pub fn run(args: &AblateArgs) -> Result<()> {
         let problem = "ablate trains every part by itself; leave out --model and --parts (lita's L1 alone is --ssim-weight 0)";
         return Err(Error::Usage(problem.to_owned()).into());
     }
-    let mut config = args.options.config(args.dataset.clone())?;
+    let mut config = args.options.config(&args.dataset, None)?;
     // Whether there are depth maps is for the dataset to say.
     config.model.depth = true;
     let gpu = Gpu::new(&config.device.parse::<DeviceChoice>()?)?;

@@ -66,10 +66,7 @@ impl Run {
         arguments.extend(["--plan", file].map(str::to_owned));
         arguments.extend(["--out".to_owned(), unicode(&folder)?, "--resume".to_owned()]);
         let args = train_args(&name, &arguments)?;
-        let config = match plan {
-            Some((_, plan)) => args.options.planned_config(args.dataset, Some(plan))?,
-            None => args.options.config(args.dataset)?,
-        };
+        let config = args.options.config(&args.dataset, plan.map(|(_, plan)| plan))?;
         Ok(Self { name, point, folder, arguments, config })
     }
 

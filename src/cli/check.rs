@@ -32,9 +32,9 @@ pub struct CheckArgs {
 /// [`crate::Error::Disagrees`] where something differs, or whatever keeps a run from training.
 pub fn run(args: &CheckArgs) -> Result<()> {
     // The schedule is that of a whole run; so many of its steps are checked.
-    let mut options = args.options.clone();
-    let steps = options.steps.take().unwrap_or(1);
-    let mut config = options.config(args.dataset.clone())?;
+    let steps = args.options.config(&args.dataset, None)?.steps;
+    let steps = if args.options.gives("steps") { steps } else { 1 };
+    let mut config = args.options.without("steps").config(&args.dataset, None)?;
     // Sizes that training comes to, from the first step on.
     config.schedule.resolution_steps = [0, 0];
     let steps = steps.min(config.steps);

@@ -53,7 +53,7 @@ pub fn run(args: &DemoArgs) -> Result<()> {
     // Absolute, so that the runs can be evaluated from anywhere.
     let folder = std::path::absolute(args.out.join("dataset"))?;
     synthetic::write(&folder, &SyntheticOptions::default())?;
-    let dataset = Dataset::load(&folder, &TrainConfig::default().load_options())?;
+    let dataset = Dataset::load(&folder, &TrainConfig::bare().load_options())?;
     let mut runs = vec![];
     for curve in CURVES {
         runs.push(train_with(curve, &gpu, &dataset, &args.out)?);
@@ -97,7 +97,7 @@ fn config(curve: ToneCurve, dataset: &Dataset, gpu: &Gpu) -> TrainConfig {
             densify_interval: STEPS / 10,
             ..Schedule::paper()
         },
-        ..TrainConfig::default()
+        ..TrainConfig::bare()
     }
 }
 

@@ -14,10 +14,10 @@ use super::table;
 use crate::Error;
 use crate::base::output::write_whole;
 use crate::gpu::{DeviceChoice, Gpu};
-use crate::photographs::dataset::{Dataset, LoadOptions};
+use crate::photographs::dataset::Dataset;
 use crate::results::eval::{Leftover, hole_warning};
 use crate::train::diagnose::{Diagnosis, Noise, Plan, SceneDiagnosis, ViewDiagnosis};
-use crate::train::{Preset, TrainConfig};
+use crate::train::{Preset, TrainConfig, diagnosed};
 
 /// Look at dark photographs before training: what they are, and what a model of them needs.
 ///
@@ -56,7 +56,7 @@ pub struct DiagnoseArgs {
     #[arg(long, value_name = "F")]
     pub downscale: Option<f64>,
     /// Plan for photographs of at most so many pixels on their longest side, as `train` has it; 0 or none: no limit [default: {max_resolution}]
-    #[arg(long, value_name = "N|none", value_parser = super::train::max_resolution)]
+    #[arg(long, value_name = "N|none", value_parser = max_resolution)]
     pub max_resolution: Option<u32>,
     /// Plan for this preset: draft, fast, balanced or best [default: balanced]
     #[arg(long, value_name = "NAME")]
@@ -92,7 +92,7 @@ pub fn run(args: &DiagnoseArgs) -> Result<()> {
     config.downscale = args.downscale.unwrap_or(config.downscale);
     config.max_resolution = args.max_resolution.unwrap_or(config.max_resolution);
     let gpu = Gpu::new(&args.device.clone().unwrap_or_default())?;
-    let options = load_options(&config);
+    let options = diagnosed(&config);
     let dataset = Dataset::load(&config.dataset, &options)?;
     let mut diagnosis = Diagnosis::of(&dataset, &options)?;
     let run = args.run.as_deref().map(|run| holes(run, args)).transpose()?;
@@ -140,11 +140,12 @@ fn holes(run: &Path, args: &DiagnoseArgs) -> Result<(String, BTreeMap<String, Le
     Ok((remark, leftovers))
 }
 
-/// As the configuration's, with depth maps wherever there are some: whether there are is part of the diagnosis.
-pub(super) fn load_options(config: &TrainConfig) -> LoadOptions {
-    let mut options = config.load_options();
-    options.depth.load = true;
-    options
+/// What `--max-resolution` says.
+fn max_resolution(text: &str) -> Result<u32, String> {
+    match text {
+        "none" => Ok(0),
+        _ => text.parse().map_err(|_| "a number of pixels, or none".to_owned()),
+    }
 }
 
 fn text(device: &str, dataset: &Dataset, diagnosis: &Diagnosis, plan: &Plan) -> String {

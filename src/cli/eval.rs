@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use anyhow::Result;
 
-use super::finished_run::FinishedRun;
+use super::finished_run::{FinishedRun, is_model};
 use super::{progress_bar, table};
 use crate::base::output::printable;
 use crate::gpu::DeviceChoice;
@@ -28,7 +28,7 @@ use crate::train::Learning;
 /// of the pixels stay below. No score tells a hole before black from a dark surface; a mean above 0.1 is a warning.
 #[derive(Clone, Debug, clap::Args)]
 pub struct EvalArgs {
-    /// The run directory that `nightsplat train` wrote
+    /// The run directory that `nightsplat train` wrote, or a PLY of Gaussians with --dataset
     pub run: PathBuf,
     /// Print what metrics.json holds instead of a table
     #[arg(long)]
@@ -44,7 +44,7 @@ pub struct EvalArgs {
     /// what the table you compare with took
     #[arg(long, value_name = "RANGE", value_enum, default_value_t, requires = "lpips")]
     pub lpips_range: LpipsRange,
-    /// Write what was scored to RUN/eval/renders, and what it was compared with to RUN/eval/references or RUN/eval/targets
+    /// Write what was scored to RUN/eval/renders, and what it was compared with to RUN/eval/references or RUN/eval/targets; of MODEL.ply, below MODEL.eval
     #[arg(long)]
     pub save_images: bool,
     /// The device: uuid:, pci: or index of `nightsplat doctor`, a part of its name, or cpu [default: that of the run]
@@ -82,6 +82,10 @@ pub fn run(args: &EvalArgs) -> Result<()> {
     let lpips = args.lpips.as_ref().map(load).transpose()?;
     let measure = lpips.as_ref().map(Lpips::measure);
     let mut yardstick = Yardstick::of(&gpu, &config.tone, &dataset)?;
+    let images = match is_model(&args.run) {
+        true => args.run.with_extension("eval"),
+        false => args.run.join("eval"),
+    };
     let bar = progress_bar(yardstick.view_count(&dataset));
     let render = |view: &View| {
         bar.set_message(printable(&view.name).into_owned());
@@ -94,7 +98,7 @@ pub fn run(args: &EvalArgs) -> Result<()> {
             score.aligned = Some(compared.aligned()?);
         }
         if args.save_images {
-            compared.save(&args.run.join("eval"), score.against)?;
+            compared.save(&images, score.against)?;
         }
         bar.inc(1);
         Ok(())
@@ -114,6 +118,9 @@ pub fn run(args: &EvalArgs) -> Result<()> {
         let steps = recorded["steps"].as_u64().or_else(|| run::stopped_at(&args.run));
         let steps = steps.unwrap_or(config.steps);
         let mut metrics = eval::metrics(&scored, seconds, gaussian_count, steps);
+        if is_model(&args.run) {
+            metrics["steps"] = serde_json::Value::Null;
+        }
         if let Some(measure) = measure {
             eval::add_lpips(&mut metrics, &scored, measure);
         }

@@ -4,9 +4,9 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use anyhow::Result;
-use glam::DAffine3;
+use glam::{DAffine3, DVec3};
 
-use super::finished_run::FinishedRun;
+use super::finished_run::{FinishedRun, is_model, load_model, needs_photographs};
 use crate::base::output::{printable, write_whole};
 use crate::camera::Camera;
 use crate::gpu::DeviceChoice;
@@ -14,7 +14,6 @@ use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::image::Image;
 use crate::results::export::page::{Bookmark, Page};
 use crate::results::export::{Provenance, glb, sog, spz};
-use crate::splats::render::RenderSettings;
 use crate::splats::scene::{Gaussians, ply};
 use crate::train::TrainConfig;
 use crate::{Error, results::run};
@@ -27,7 +26,7 @@ use crate::{Error, results::run};
   nightsplat export run --to glb              glTF with KHR_gaussian_splatting, every number as it was trained"
 )]
 pub struct ExportArgs {
-    /// The run directory that `nightsplat train` wrote
+    /// The run directory that `nightsplat train` wrote, or a PLY of Gaussians
     pub run: PathBuf,
     /// The format
     #[arg(long, value_enum, value_name = "FORMAT")]
@@ -82,11 +81,7 @@ impl Format {
 /// The folder holds no run with a model, the model does not fit the format, or the file cannot be written; nothing
 /// half-written is left.
 pub fn run(args: &ExportArgs) -> Result<()> {
-    let config = run::load_config(&args.run)?;
-    // As the file has it, which is as viewers show it.
-    let gaussians = run::load_model(&args.run, false)?;
-    let extension = args.to.extension();
-    let own = args.run.join(format!("model.{extension}"));
+    let (gaussians, config, own) = opened(args)?;
     let out = args.out.as_ref().unwrap_or(&own);
     if args.to == Format::Ply && is_same(out, &own) {
         let problem =
@@ -121,11 +116,24 @@ pub fn run(args: &ExportArgs) -> Result<()> {
     }
     let (shown, count) = (out.display().to_string(), gaussians.count);
     let kib = std::fs::metadata(out).map_or(0, |file| file.len()).div_ceil(1024);
-    let line = format!(
-        "{}: {count} Gaussians in {kib} KiB, as bright as their targets",
-        printable(&shown)
-    );
+    let brightness = if is_model(&args.run) { "" } else { ", as bright as their targets" };
+    let line = format!("{}: {count} Gaussians in {kib} KiB{brightness}", printable(&shown));
     Ok(writeln!(std::io::stdout(), "{line}")?)
+}
+
+/// The model as its file has it, which is as viewers show it; its settings, and the file to write where none is named.
+fn opened(args: &ExportArgs) -> crate::Result<(Gaussians, TrainConfig, PathBuf)> {
+    let (from, extension) = (&args.run, args.to.extension());
+    if is_model(from) {
+        if args.to == Format::Html && args.dataset.is_none() {
+            return Err(needs_photographs(from));
+        }
+        let (gaussians, config) = load_model(from, args.dataset.as_deref())?;
+        return Ok((gaussians, config, from.with_extension(extension)));
+    }
+    let config = run::load_config(from)?;
+    let gaussians = run::load_model(from, false)?;
+    Ok((gaussians, config, from.join(format!("model.{extension}"))))
 }
 
 fn has_networks(config: &TrainConfig) -> bool {
@@ -137,10 +145,14 @@ fn is_same(a: &Path, b: &Path) -> bool {
 }
 
 fn provenance(args: &ExportArgs, config: &TrainConfig) -> Provenance {
+    let dataset = config.dataset.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    if is_model(&args.run) {
+        return Provenance { dataset, ..Provenance::default() };
+    }
     let gain = run::load_metrics(&args.run)[run::TARGET_EXPOSURE]["model_gain"].as_f64();
     let exposure = gain.map(|gain| format!("its photographs', times {gain:.2} before the curve"));
     Provenance {
-        dataset: config.dataset.file_name().unwrap_or_default().to_string_lossy().into_owned(),
+        dataset,
         curve: config.tone.curve.to_string(),
         exposure: exposure.unwrap_or_else(|| "of its targets".to_owned()),
     }
@@ -154,7 +166,7 @@ fn page(
     gaussians: &Gaussians,
     provenance: Provenance,
 ) -> Result<String> {
-    let frame = config.frame.unwrap_or_default();
+    let mut frame = config.frame.unwrap_or_default();
     let title = format!("{} by nightsplat", provenance.dataset);
     let bookmarks = if has_networks(config) {
         let FinishedRun { mut player, dataset, .. } = FinishedRun::open_with(
@@ -165,7 +177,7 @@ fn page(
                 own.undistort = true;
             },
         )?;
-        bookmarks(args, config, &dataset, |view| {
+        bookmarks(args, gaussians.origin, &dataset, |view| {
             let networks = player.render(view)?.output().clone();
             Ok(Some(("model with its networks".to_owned(), networks)))
         })?
@@ -178,15 +190,18 @@ fn page(
         options.load_low_test = true;
         options.undistort = true;
         let dataset = Dataset::load(&config.dataset, &options)?;
-        bookmarks(args, &config, &dataset, |_| Ok(None))?
+        if is_model(&args.run) {
+            frame = dataset.frame();
+        }
+        bookmarks(args, gaussians.origin, &dataset, |_| Ok(None))?
     };
-    let near = f64::from(RenderSettings::default().near) / frame.scale;
+    let near = f64::from(config.render_settings().near) / frame.scale;
     Ok(Page { title, gaussians, provenance, bookmarks, near }.html()?)
 }
 
 fn bookmarks(
     args: &ExportArgs,
-    config: &TrainConfig,
+    origin: DVec3,
     dataset: &Dataset,
     mut rendered: impl FnMut(&View) -> crate::Result<Option<(String, Image)>>,
 ) -> crate::Result<Vec<Bookmark>> {
@@ -195,7 +210,6 @@ fn bookmarks(
         views = dataset.views.iter().collect();
     }
     let (all, count) = (views.len(), args.views.clamp(1, views.len().max(1)));
-    let origin = config.frame.unwrap_or_default().file_origin();
     let bookmark = |place: usize| {
         let view = views[place * all / count];
         let pictures = [
@@ -213,7 +227,7 @@ fn bookmarks(
 }
 
 /// The same camera before positions that are relative to `origin`.
-fn moved(camera: &Camera, origin: glam::DVec3) -> Camera {
+fn moved(camera: &Camera, origin: DVec3) -> Camera {
     let DAffine3 { matrix3, translation } = camera.view_from_world;
     let view_from_world = DAffine3 { matrix3, translation: translation + matrix3 * origin };
     Camera { view_from_world, ..*camera }

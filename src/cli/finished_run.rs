@@ -1,11 +1,13 @@
-//! A run, finished or stopped, opened to be rendered: what `eval` and `render` begin with.
+//! A run, finished or stopped, or a model file, opened to be rendered: what `eval` and `render` begin with.
 
 use std::path::Path;
 
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::Dataset;
+use crate::photographs::tone::{ToneCurve, ToneSettings};
 use crate::results::eval::Player;
 use crate::results::run;
+use crate::splats::scene::{Gaussians, ply};
 use crate::train::TrainConfig;
 use crate::{Error, Result};
 
@@ -42,6 +44,9 @@ impl FinishedRun {
         device: Option<&DeviceChoice>,
         change: impl FnOnce(&mut TrainConfig),
     ) -> Result<Self> {
+        if is_model(folder) {
+            return Self::open_model(folder, dataset, device);
+        }
         let mut config = run::load_config(folder)?;
         if let Some(dataset) = dataset {
             config.move_dataset(dataset);
@@ -80,4 +85,50 @@ impl FinishedRun {
             gpu,
         })
     }
+
+    /// The same of a model without a run, which says nothing of how it was trained.
+    fn open_model(
+        path: &Path,
+        dataset: Option<&Path>,
+        device: Option<&DeviceChoice>,
+    ) -> Result<Self> {
+        let dataset = dataset.ok_or_else(|| needs_photographs(path))?;
+        let (gaussians, mut config) = load_model(path, Some(dataset))?;
+        let gpu = Gpu::new(device.unwrap_or(&DeviceChoice::Best))?;
+        let dataset = Dataset::load(&config.dataset, &config.load_options())?;
+        config.frame = Some(dataset.frame());
+        let player = Player::new(&gpu, &gaussians, &config, None)?;
+        Ok(Self { gpu, config, dataset, gaussian_count: gaussians.count, player })
+    }
+}
+
+/// What to say of a model file where its photographs are needed and not named.
+pub(super) fn needs_photographs(path: &Path) -> Error {
+    Error::input(path, "is a model without a run; name its photographs with --dataset")
+}
+
+/// Whether a path names a model file in place of a run.
+pub(super) fn is_model(path: &Path) -> bool {
+    path.is_file() || (!path.is_dir() && path.extension().is_some_and(|name| name == "ply"))
+}
+
+/// A model file's Gaussians, with the settings that they are shown by, which are the defaults; says that their training is
+/// unknown.
+///
+/// # Errors
+/// The file is no model.
+pub(super) fn load_model(path: &Path, dataset: Option<&Path>) -> Result<(Gaussians, TrainConfig)> {
+    let gaussians = ply::load(path)?;
+    let config = TrainConfig {
+        dataset: dataset.unwrap_or(Path::new("")).to_owned(),
+        sh_degree: gaussians.shape.sh_degree,
+        // Without references, photographs are what there is to compare with.
+        tone: ToneSettings::new(ToneCurve::None),
+        ..TrainConfig::default()
+    };
+    tracing::warn!(
+        "{}: its training is unknown; it is shown with the default near plane",
+        path.display()
+    );
+    Ok((gaussians, config))
 }

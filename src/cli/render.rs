@@ -25,7 +25,7 @@ use crate::{Error, results::run};
 #[derive(Clone, Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub struct RenderArgs {
-    /// The run directory that `nightsplat train` wrote
+    /// The run directory that `nightsplat train` wrote, or a PLY of Gaussians with --dataset
     pub run: PathBuf,
     /// Which cameras
     #[arg(long, value_enum, required_unless_present = "path", conflicts_with = "path")]

@@ -32,14 +32,14 @@ use super::batch::options::{Lists, Options};
 use super::batch::point::{Axis, PRESET, Point, SEED};
 use super::batch::runner::Failure;
 use super::batch::{self, Common, Run, absolute, runner, train_args};
-use super::{diagnose, progress_bar, table};
+use super::{progress_bar, table};
 use crate::Error;
 use crate::base::output::write_whole;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::Dataset;
 use crate::results::run::energy_counters;
 use crate::train::diagnose::{Diagnosis, Plan};
-use crate::train::{Preset, TrainConfig, Trainer};
+use crate::train::{Preset, TrainConfig, Trainer, diagnosed};
 
 /// Train the presets, and every single change of balanced, and draw what time and memory buy.
 ///
@@ -175,7 +175,7 @@ impl Comparison {
 
         let base = config_of(BASE, &path, &shared)?;
         let gpu = Gpu::new(&base.device.parse::<DeviceChoice>()?)?;
-        let mut dataset = Dataset::load(&base.dataset, &diagnose::load_options(&base))?;
+        let mut dataset = Dataset::load(&base.dataset, &diagnosed(&base))?;
         let target = Target::of(&dataset)?;
         let plans = plans(&gpu, &dataset, &points, &path, &shared, &out)?;
         // All are of one diagnosis.
@@ -269,7 +269,7 @@ fn pseudo_gt(out: impl AsRef<Path>) -> String {
 /// What `train --preset` has before its photographs are looked at.
 fn config_of(preset: Preset, dataset: &str, shared: &[String]) -> crate::Result<TrainConfig> {
     let args = train_args(preset.name(), &arguments(preset, dataset, shared))?;
-    args.options.config(args.dataset.clone())
+    args.options.config(&args.dataset, None)
 }
 
 fn arguments(preset: Preset, dataset: &str, shared: &[String]) -> Vec<String> {
@@ -298,9 +298,9 @@ fn plans(
         let plan = if Path::new(&file).exists() {
             Plan::load(Path::new(&file), dataset)?
         } else {
-            let config = args.options.planned_config(args.dataset.clone(), None)?;
+            let config = args.options.config(&args.dataset, None)?;
             if diagnosis.is_none() {
-                diagnosis = Some(Diagnosis::of(dataset, &diagnose::load_options(&config))?);
+                diagnosis = Some(Diagnosis::of(dataset, &diagnosed(&config))?);
             }
             let Some(diagnosis) = &diagnosis else { continue };
             Plan::new(diagnosis, &config, gpu.properties().memory)

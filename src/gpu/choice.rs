@@ -253,7 +253,7 @@ impl<'a> Named<'a> {
         found.ok_or_else(|| {
             let problem = format!(
                 "{}={list} names {name}, which Vulkan does not have (a container needs \
-                 NVIDIA_DRIVER_CAPABILITIES=compute,utility,graphics; `DeviceChoice::Name` picks another)",
+                 NVIDIA_DRIVER_CAPABILITIES=compute,utility,graphics; --device picks another)",
                 self.variable
             );
             no_such_device(&problem, self.all)

@@ -14,7 +14,7 @@ use crate::{Error, Result};
 /// # use nightsplat::gpu::{Buffer, Gpu};
 /// # use nightsplat::kernels::window_gather;
 /// fn copied_onto_itself(buffer: &mut Buffer<f32>) -> window_gather::Buffers<'_> {
-///     window_gather::Buffers { image: buffer.slice().slice(), content: buffer.slice_mut().slice_mut() }
+///     window_gather::Buffers { image: buffer.slice(), content: buffer.slice_mut() }
 /// }
 /// ```
 ///
@@ -27,7 +27,7 @@ use crate::{Error, Result};
 ///     image: &'a Buffer<f32>,
 ///     content: &'a Buffer<f32>,
 /// ) -> window_gather::Buffers<'a> {
-///     window_gather::Buffers { image: image.slice().slice(), content: content.slice_mut().slice_mut() }
+///     window_gather::Buffers { image: image.slice(), content: content.slice_mut() }
 /// }
 /// ```
 ///
@@ -40,7 +40,7 @@ use crate::{Error, Result};
 ///     image: &'a Buffer<f32>,
 ///     content: &'a mut Buffer<f32>,
 /// ) -> window_gather::Buffers<'a> {
-///     window_gather::Buffers { image: image.slice().slice(), content: content.slice_mut().slice_mut() }
+///     window_gather::Buffers { image: image.slice(), content: content.slice_mut() }
 /// }
 /// ```
 #[derive(Clone, Copy, Debug)]

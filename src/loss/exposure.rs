@@ -9,10 +9,10 @@ mod affine;
 pub mod table;
 
 use glam::{UVec2, Vec2};
-use serde::{Deserialize, Serialize};
 
 pub use affine::Affine;
 
+use crate::base::settings::{Rule, settings};
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::exposure::{BIAS_SCALE, EXPOSURE_WIDTH};
 use crate::kernels::{expose, expose_backward, exposure_center, exposure_gradient};
@@ -20,22 +20,18 @@ use crate::splats::optimizer::{AdamBuffers, Learnable, Moments};
 use crate::splats::scene::COLOR_CHANNELS;
 use crate::{Error, Result};
 
+settings! {
+"exposure.rates."
 /// How fast exposures are learned: Adam's rate, of gains.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ExposureRates {
-    /// At the start.
-    pub initial: f64,
-    /// At the end of its exponential decay and from there on.
-    pub last: f64,
+    /// Adam's rate of the gains at the start.
+    initial: f64 = 0.01 => Rule::POSITIVE;
+    /// Adam's rate of the gains at the end of its exponential decay and from there on.
+    last: f64 = 0.001 => Rule::POSITIVE;
     /// The steps of the decay.
-    pub steps: u64,
+    steps: u64 = 600 => Rule::COUNT, in "steps";
 }
-
-impl Default for ExposureRates {
-    fn default() -> Self {
-        Self { initial: 0.01, last: 0.001, steps: 600 }
-    }
 }
 
 impl ExposureRates {

@@ -15,7 +15,6 @@
 mod memory;
 
 use glam::UVec2;
-use serde::{Deserialize, Serialize};
 
 use self::memory::{Activations, Earlier, Extent, Memory, Repeat};
 use super::conv::{Activation, Adds, Conv, Precision, Seen, Strips};
@@ -26,6 +25,7 @@ use super::parameters::{Layout, Parameters};
 use super::relu::ReluBackward;
 use super::{Form, RGB, check_images, out_of_turn, pixel_count};
 use crate::base::random::Stream;
+use crate::base::settings::{Rule, settings};
 use crate::gpu::{Buffer, Gpu, Pipeline, Properties, Recorder, Threads};
 use crate::kernels::{residual, residual_backward};
 use crate::{Error, Result};
@@ -33,33 +33,24 @@ use crate::{Error, Result};
 /// The stream of random numbers that the weights are drawn from.
 const STREAM: u64 = 5;
 
+settings! {
+"model.network."
 /// How large a denoiser is, and what it begins as. By default it is as small as pays on noisy photographs
 /// (docs/benchmarks.md).
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct DenoiserSettings {
-    /// Estimates of the noise, each with its own weights.
-    pub stages: u32,
-    /// How often a stage applies its inner convolution and norm.
-    pub repeats: u32,
-    /// Feature maps.
-    pub channels: u32,
-    /// Of the inner convolution.
-    pub precision: Precision,
-    /// How the networks begin and end, the tonemapper too.
-    pub form: Form,
+    /// Stages of the denoiser: estimates of the noise, each with its own weights.
+    stages: u32 = 1 => Rule::Whole(1, 16), "--denoiser-stages N";
+    /// Repeats of the inner convolution and norm in a stage of the denoiser.
+    repeats: u32 = 2 => Rule::Whole(1, 64), "--denoiser-repeats N";
+    /// Feature maps of the denoiser.
+    channels: u32 = 8 => Rule::Whole(1, 512), "--denoiser-channels N";
+    /// single, or half: 16-bit factors in the inner convolution where the device has matrices of them.
+    precision: Precision = Precision::Single => Rule::OneOf(&["single", "half"]), "--denoiser-precision P";
+    /// How the networks begin and end, the tonemapper too: identity, which lets through what goes in until something better
+    /// is learned, or paper.
+    form: Form = Form::Identity => Rule::OneOf(&["identity", "paper"]);
 }
-
-impl Default for DenoiserSettings {
-    fn default() -> Self {
-        Self {
-            stages: 1,
-            repeats: 2,
-            channels: 8,
-            precision: Precision::Single,
-            form: Form::default(),
-        }
-    }
 }
 
 impl DenoiserSettings {
@@ -77,17 +68,7 @@ impl DenoiserSettings {
     /// # Errors
     /// A number is out of its range.
     pub fn check(&self) -> Result<()> {
-        let ranges = [
-            ("stages", self.stages, 16),
-            ("repeats", self.repeats, 64),
-            ("channels", self.channels, 512),
-        ];
-        match ranges.into_iter().find(|(_, value, max)| !(1..=*max).contains(value)) {
-            None => Ok(()),
-            Some((name, value, max)) => Err(Error::Usage(format!(
-                "the denoiser's {name} are {value}; they must be within 1 and {max}"
-            ))),
-        }
+        self.check_rows()
     }
 
     /// In the precision that the device offers.

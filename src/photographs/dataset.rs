@@ -36,7 +36,7 @@ pub use fingerprint::Fingerprint;
 use listed::{ListedView, Listing};
 use listing::{list, warn};
 use members::with_held_out;
-pub use options::{DepthOptions, LoadOptions};
+pub use options::{DOWNSCALE, DepthOptions, LoadOptions};
 pub use pixels::Original;
 use pixels::Source;
 use points::points;

@@ -102,20 +102,16 @@ impl FitOptions {
         let is_positive = self.huber > 0.0;
         if !is_positive {
             return Err(Error::Usage(format!(
-                "`FitOptions::huber` is {}; it must be above 0, inf for plain least squares",
+                "huber is {}; it must be above 0, inf for plain least squares",
                 self.huber
             )));
         }
         if !(self.prior >= 0.0 && self.prior.is_finite()) {
-            let problem =
-                format!("`FitOptions::prior` is {}; it must be finite and at least 0", self.prior);
+            let problem = format!("prior is {}; it must be finite and at least 0", self.prior);
             return Err(Error::Usage(problem));
         }
         if !(8..=65_536).contains(&self.bins) {
-            return Err(Error::Usage(format!(
-                "`FitOptions::bins` is {}; it must be from 8 to 65536",
-                self.bins
-            )));
+            return Err(Error::Usage(format!("bins is {}; it must be from 8 to 65536", self.bins)));
         }
         Ok(())
     }

@@ -51,6 +51,8 @@ pub(crate) use self::profile::profiled;
 #[cfg(feature = "fit")]
 pub(crate) use self::real::Dual;
 pub use self::real::Real;
+#[cfg(feature = "io")]
+pub(crate) use self::settings::OF_CURVE;
 pub use self::settings::{GainChoice, ToneSettings};
 pub(crate) use self::statistics::Rank;
 pub use self::statistics::{Statistics, percentile};

@@ -5,7 +5,7 @@ use std::ops::Range;
 
 use glam::{DVec3, DVec4};
 
-use crate::splats::attributes::{column_count, planes};
+use crate::splats::attributes::{Attribute, PlaneCounts, column_count, planes};
 use crate::splats::halves::Halves;
 
 /// A Gaussian, or the gradient of one, in f64.
@@ -65,10 +65,11 @@ impl Planes {
 
     /// The floats that an array stands for, which may hold its last plane in halves.
     pub(super) fn floats(self, parameters: &[f32], half_rest: bool) -> Cow<'_, [f32]> {
-        let columns = column_count(self.feature_count, self.sh_degree);
+        let Self { count: gaussians, feature_count: features, sh_degree } = self;
+        let columns = column_count(features, sh_degree);
         match half_rest {
             true => {
-                Halves::new(self.count, [columns, self.feature_count]).unpack(parameters).into()
+                Halves::new(PlaneCounts { gaussians, columns, features }).unpack(parameters).into()
             }
             false => parameters.into(),
         }
@@ -77,13 +78,18 @@ impl Planes {
     /// Gaussian `i` of the array.
     pub fn load<T: Copy + Into<f64>>(self, parameters: &[T], i: usize) -> Gaussian {
         let v: Vec<f64> = self.places(i).map(|at| parameters[at].into()).collect();
+        let planes = planes(self.feature_count, v.len());
+        let of = |attribute: Attribute| {
+            let (column, width) = planes[attribute as usize];
+            &v[column..column + width]
+        };
         Gaussian {
-            mean: DVec3::from_slice(&v[0..3]),
-            quat: DVec4::from_slice(&v[3..7]),
-            log_scale: DVec3::from_slice(&v[7..10]),
-            raw_opacity: v[10],
-            features: v[14..14 + self.feature_count].to_vec(),
-            sh: [&v[11..14], &v[14 + self.feature_count..]]
+            mean: DVec3::from_slice(of(Attribute::Means)),
+            quat: DVec4::from_slice(of(Attribute::Quats)),
+            log_scale: DVec3::from_slice(of(Attribute::LogScales)),
+            raw_opacity: of(Attribute::RawOpacities)[0],
+            features: of(Attribute::Features).to_vec(),
+            sh: [of(Attribute::Dc), of(Attribute::Rest)]
                 .into_iter()
                 .flat_map(|sh| sh.chunks_exact(3).map(DVec3::from_slice))
                 .collect(),

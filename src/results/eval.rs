@@ -1,7 +1,6 @@
 //! Scores a model on the test views of its dataset: against their reference images, or where there are none against what
 //! the model was trained to show of them.
 
-use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::str::FromStr;
@@ -9,7 +8,7 @@ use std::str::FromStr;
 use serde_json::{Map, Value, json};
 
 use crate::camera::{Camera, Frame};
-use crate::gpu::{Buffer, Gpu};
+use crate::gpu::Gpu;
 use crate::loss::exposure::Affine;
 use crate::networks::lpips::{Lpips, Measure};
 use crate::photographs::dataset::{Dataset, View};
@@ -17,7 +16,7 @@ use crate::photographs::image::Image;
 use crate::photographs::metrics::{self, Scores};
 use crate::photographs::tone::{ToneCurve, ToneSettings};
 use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
-use crate::splats::scene::{Feature, Features, Gaussians};
+use crate::splats::scene::{DeviceGaussians, Feature, Gaussians, Shape};
 use crate::train::{Networks, Rendered, TestTargets, TrainConfig};
 use crate::{Error, Result};
 
@@ -191,10 +190,7 @@ impl Compared<'_> {
 /// A finished model on the device, ready to be rendered.
 #[derive(Debug)]
 pub struct Player {
-    parameters: Buffer<f32>,
-    count: usize,
-    sh_degree: u32,
-    features: Features,
+    gaussians: DeviceGaussians,
     renderer: Renderer,
     networks: Option<Networks>,
     /// Where the Gaussians lie.
@@ -218,16 +214,10 @@ impl Player {
         let tile = own.tile.filter(|&tile| gpu.properties().suits_tile(tile));
         let settings = RenderSettings { shape, tile, ..own };
         let frame = config.frame.unwrap_or_default();
-        let gaussians = match frame {
-            Frame::WORLD => Cow::Borrowed(gaussians),
-            _ => Cow::Owned(gaussians.from_world(&frame, frame.file_origin())),
-        };
+        let gaussians = gaussians.from_world(&frame);
         Ok(Self {
             frame,
-            parameters: gaussians.upload(gpu)?,
-            count: gaussians.count,
-            sh_degree: shape.sh_degree,
-            features: shape.features,
+            gaussians: gaussians.upload(gpu)?,
             renderer: Renderer::new(gpu, settings)?,
             networks,
         })
@@ -247,8 +237,8 @@ impl Player {
     /// The device is out of memory or lost.
     pub fn render_camera(&mut self, camera: &Camera) -> Result<Rendered> {
         let (camera, options) = (&self.frame.camera(camera), self.options());
-        let (gaussians, networks) = ((&self.parameters, self.count), self.networks.as_mut());
-        Rendered::new(&mut self.renderer, gaussians, camera, &options, networks)
+        let networks = self.networks.as_mut();
+        Rendered::new(&mut self.renderer, &self.gaussians, camera, &options, networks)
     }
 
     /// One layer of what a camera sees; a feature of one channel is repeated.
@@ -269,12 +259,12 @@ impl Player {
             Layer::Illumination => Feature::Illumination,
             Layer::Noise => Feature::Noise,
         };
-        let planes = self.features.channels_of(feature).ok_or_else(lacks)?;
+        let planes = self.shape().features.channels_of(feature).ok_or_else(lacks)?;
         let Camera { width, height, .. } = *camera;
         let pixels = width as usize * height as usize;
         let (camera, options) = (&self.frame.camera(camera), self.options());
-        self.renderer.reserve(self.count, [camera])?;
-        let channels = self.renderer.render_channels(&self.parameters, camera, &options)?;
+        self.renderer.reserve(self.gaussians.layout.count, [camera])?;
+        let channels = self.renderer.render_channels(&self.gaussians, camera, &options)?;
         let plane = |c: usize| {
             let plane = planes.start + c.min(planes.len() - 1);
             channels[plane * pixels..][..pixels].iter().copied()
@@ -285,14 +275,18 @@ impl Player {
     /// What the model does have, for a message.
     fn layers(&self) -> String {
         let denoised = self.networks.as_ref().is_some_and(Networks::has_denoiser);
-        let features = self.features.specs().map(|spec| spec.name);
+        let features = self.shape().features.specs().map(|spec| spec.name);
         let names: Vec<&str> =
             ["rgb"].into_iter().chain(denoised.then_some("denoised")).chain(features).collect();
         format!("it has {}", names.join(", "))
     }
 
     fn options(&self) -> RenderOptions {
-        RenderOptions { sh_degree: self.sh_degree, background: [0.0; 3] }
+        RenderOptions { sh_degree: self.shape().sh_degree, background: [0.0; 3] }
+    }
+
+    fn shape(&self) -> Shape {
+        self.gaussians.layout.shape
     }
 }
 

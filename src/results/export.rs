@@ -12,8 +12,8 @@ pub mod spz;
 
 use std::io::Write as _;
 
-use flate2::{Compression, write::GzEncoder};
-use glam::Vec3;
+use flate2::{Compression, GzBuilder};
+use glam::{DVec3, Vec3};
 
 use crate::splats::scene::Gaussians;
 use crate::{Error, Result};
@@ -83,8 +83,22 @@ fn sigmoid(x: f32) -> f32 {
     1.0 / (1.0 + (-x).exp())
 }
 
+/// What is added to a model's positions to get those of the world, where that is not nothing: a line for a header. `turned`: the
+/// file's axes are those of OpenGL.
+fn origin_line(gaussians: &Gaussians, turned: bool) -> Option<String> {
+    let [x, y, z] = gaussians.origin.to_array();
+    let position = if turned { "(x, -y, -z)" } else { "(x, y, z)" };
+    (gaussians.origin != DVec3::ZERO).then(|| format!("world = {position} + ({x}, {y}, {z})"))
+}
+
 fn gzip(bytes: &[u8]) -> Result<Vec<u8>> {
-    let mut encoder = GzEncoder::new(vec![], Compression::best());
+    gzip_with(bytes, None)
+}
+
+/// With a comment in the header, which readers skip.
+fn gzip_with(bytes: &[u8], comment: Option<String>) -> Result<Vec<u8>> {
+    let builder = comment.into_iter().fold(GzBuilder::new(), GzBuilder::comment);
+    let mut encoder = builder.write(vec![], Compression::best());
     let written = encoder.write_all(bytes).and_then(|()| encoder.finish());
     written.map_err(|error| Error::output("an export", format!("cannot be compressed: {error}")))
 }
@@ -110,6 +124,27 @@ pub(crate) mod tests {
         gaussians.raw_opacities_mut().iter_mut().for_each(|opacity| *opacity *= 4.0);
         gaussians.rest_mut().iter_mut().for_each(|value| *value *= 0.3);
         gaussians
+    }
+
+    #[test]
+    fn every_format_says_where_the_origin_of_its_positions_lies() {
+        let mut model = drawn(4, 1);
+        model.origin = DVec3::new(4_499_999.6, 519_997.7, -10_001.8);
+        let provenance = Provenance::default();
+        let numbers = "(4499999.6, 519997.7, -10001.8)";
+        let turned = format!("world = (x, -y, -z) + {numbers}");
+        let has =
+            |file: &[u8], text: &str| file.windows(text.len()).any(|own| own == text.as_bytes());
+        for version in [spz::Version::V3, spz::Version::V4] {
+            assert!(has(&spz::encode(&model, version).unwrap(), &turned), "{version:?}");
+        }
+        assert!(has(&glb::encode(&model, &provenance).unwrap(), &turned));
+        let sog = sog::encode(&model, &provenance).unwrap();
+        let mut archive = zip::ZipArchive::new(std::io::Cursor::new(sog)).unwrap();
+        let meta = std::io::read_to_string(archive.by_name("meta.json").unwrap()).unwrap();
+        assert!(meta.contains(&format!("world = (x, y, z) + {numbers}")), "{meta}");
+        model.origin = DVec3::ZERO;
+        assert!(!has(&glb::encode(&model, &provenance).unwrap(), "world ="));
     }
 
     #[test]

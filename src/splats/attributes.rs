@@ -141,6 +141,39 @@ pub fn column_count(feature_count: usize, sh_degree: u32) -> usize {
     Attribute::Rest.column(feature_count) + 3 * rest_coefficients(sh_degree)
 }
 
+/// How many numbers planes are made of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct PlaneCounts {
+    /// The number of Gaussians.
+    pub gaussians: usize,
+    /// Numbers of each.
+    pub columns: usize,
+    /// How many of these are features.
+    pub features: usize,
+}
+
+impl PlaneCounts {
+    /// Numbers of all planes.
+    pub fn len(self) -> usize {
+        self.gaussians * self.columns
+    }
+
+    /// True where there is no number.
+    pub fn is_empty(self) -> bool {
+        self.len() == 0
+    }
+
+    /// Numbers of each Gaussian before its SH coefficients above degree 0.
+    pub fn before_rest(self) -> usize {
+        Attribute::Rest.column(self.features)
+    }
+
+    /// The SH coefficients above degree 0 of each, every channel counted.
+    pub fn rest(self) -> usize {
+        self.columns.saturating_sub(self.before_rest())
+    }
+}
+
 /// First column and width of every plane, of Gaussians of `column_count` floats, of which `feature_count` are features.
 pub fn planes(feature_count: usize, column_count: usize) -> [(usize, usize); ATTRIBUTES.len()] {
     ATTRIBUTES.each_ref().map(|spec| {

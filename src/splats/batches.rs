@@ -7,14 +7,13 @@ use std::ops::Range;
 
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Slice, SliceMut};
+use crate::splats::attributes::PlaneCounts;
 use crate::splats::attributes::planes;
 
-/// How the planes of so many Gaussians lie in a buffer.
+/// How planes lie in a buffer.
 #[derive(Clone, Copy, Debug)]
 pub struct Batches {
-    count: usize,
-    columns: usize,
-    features: usize,
+    planes: PlaneCounts,
     /// The most Gaussians of a batch.
     size: usize,
 }
@@ -33,23 +32,23 @@ pub struct Batch {
 const ALIGNMENT: usize = 64;
 
 impl Batches {
-    /// Of `count` Gaussians with `columns` floats each, of which `features` are features.
-    pub fn new(gpu: &Gpu, count: usize, [columns, features]: [usize; 2]) -> Self {
+    /// Of planes of floats: a batch of every one fits a binding.
+    pub fn new(gpu: &Gpu, planes: PlaneCounts) -> Self {
         let floats = gpu.properties().max_storage_buffer_range / size_of::<f32>() as u64;
         // A kernel counts floats in 32 bits.
         let floats = floats.min(u64::from(u32::MAX)) as usize;
-        let size = (floats / columns.max(1) / ALIGNMENT).max(1) * ALIGNMENT;
-        Self { count, columns, features, size }
+        let size = (floats / planes.columns.max(1) / ALIGNMENT).max(1) * ALIGNMENT;
+        Self { planes, size }
     }
 
     /// The same Gaussians with so many words each in the place of their floats.
     pub(crate) fn with_columns(self, columns: usize) -> Self {
-        Self { columns, ..self }
+        Self { planes: PlaneCounts { columns, ..self.planes }, ..self }
     }
 
     /// One after the other; of no Gaussians an empty one.
     pub fn iter(&self) -> impl Iterator<Item = Batch> + use<> {
-        let Self { count, columns, size, .. } = *self;
+        let Self { planes: PlaneCounts { gaussians: count, columns, .. }, size } = *self;
         let begins = (0..count.max(1)).step_by(size);
         begins.map(move |first| Batch { first, count: size.min(count - first), columns })
     }
@@ -69,7 +68,7 @@ impl Batches {
     /// # Errors
     /// The device is out of memory.
     pub fn uninit(&self, gpu: &Gpu, name: &str) -> Result<Buffer<f32>> {
-        gpu.uninit_in_windows(name, self.count * self.columns)
+        gpu.uninit_in_windows(name, self.planes.len())
     }
 
     /// A buffer of planes of zeros.
@@ -90,7 +89,7 @@ impl Batches {
         buffer: impl Into<SliceMut<'a, f32>>,
         planes: &[f32],
     ) -> Result<()> {
-        if self.count <= self.size {
+        if self.planes.gaussians <= self.size {
             return gpu.write(buffer, planes);
         }
         let batched: Vec<f32> = self.parts().flat_map(|part| &planes[part]).copied().collect();
@@ -103,8 +102,8 @@ impl Batches {
     /// The device was lost.
     pub fn read<'a>(&self, gpu: &Gpu, buffer: impl Into<Slice<'a, f32>>) -> Result<Vec<f32>> {
         let mut batched = gpu.read(buffer)?;
-        batched.truncate(self.count * self.columns);
-        if self.count <= self.size {
+        batched.truncate(self.planes.len());
+        if self.planes.gaussians <= self.size {
             return Ok(batched);
         }
         let mut planes = vec![0.0; batched.len()];
@@ -131,7 +130,7 @@ impl Batches {
 
     /// What of the planes of all Gaussians lies where in a buffer, from its begin on.
     fn parts(&self) -> impl Iterator<Item = Range<usize>> + use<> {
-        let Self { count, columns, features, .. } = *self;
+        let PlaneCounts { gaussians: count, columns, features } = self.planes;
         self.iter().flat_map(move |batch| {
             planes(features, columns).map(|(column, width)| {
                 let begin = column * count + width * batch.first;

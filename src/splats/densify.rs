@@ -8,10 +8,6 @@
 //! plane set into the buffer that is free, which the gradients of the last step leave: no memory beyond what training
 //! holds, and buffers grow with headroom, so most rounds allocate nothing.
 
-mod gaussians;
-
-pub use gaussians::DeviceGaussians;
-
 use std::iter;
 use std::str::FromStr;
 
@@ -23,8 +19,11 @@ use crate::kernels::fate::{
     TALLY_CANDIDATES, TALLY_CLONED, TALLY_PRUNED, TALLY_SPLIT, TALLY_WORDS,
 };
 use crate::kernels::{self, densify_decide, densify_moments, densify_scatter, densify_score};
-use crate::splats::batches::{Batch, Batches};
-use crate::splats::halves::Bits;
+use crate::splats::attributes::PlaneCounts;
+use crate::splats::batches::Batch;
+use crate::splats::halves::StorageFormat;
+use crate::splats::optimizer::Moments;
+use crate::splats::scene::{DeviceGaussians, GaussianSlice, Layout};
 use crate::splats::sort::{Count, RadixSort, Scan};
 use crate::{Error, Result};
 
@@ -74,9 +73,12 @@ pub struct DensifySettings {
     pub seed: u64,
 }
 
-/// What the steps since the last round have gathered, per Gaussian, and a buffer to work with.
+/// What there is of every Gaussian beside its parameters: what Adam keeps, what the steps since the last round have gathered,
+/// and a buffer to work with.
 #[derive(Debug)]
 pub struct DensifyInputs<'a> {
+    /// Carried over to the new Gaussians.
+    pub moments: &'a mut Moments,
     /// Sums of the norms of the screen-space gradients, in normalised device units.
     pub grad_norm_sums: &'a mut Buffer<f32>,
     /// In how many steps the Gaussian was seen.
@@ -204,7 +206,7 @@ impl Densifier {
     /// One round of density control: prunes and splits `gaussians`, or clones them under the paper's control. The statistics
     /// are to be zeroed for the new count; buffers that were too short for it are longer.
     ///
-    /// `keeps` looks at the new parameters, `(columns x count)`, before anything is final, and says which share of the splits
+    /// `keeps` looks at the new Gaussians before anything is final, and says which share of the splits
     /// may stay: 1 or more for all of them. Else the round is tried again with as many fewer, those with the largest
     /// gradients first, and at last with none.
     ///
@@ -216,22 +218,24 @@ impl Densifier {
         gaussians: &mut DeviceGaussians,
         mut inputs: DensifyInputs<'_>,
         round: Round,
-        mut keeps: impl FnMut(&Buffer<f32>, usize) -> Result<f64>,
+        mut keeps: impl FnMut(GaussianSlice<'_>) -> Result<f64>,
     ) -> Result<DensifyReport> {
         check(gaussians, &inputs)?;
         let limit = self.settings.max_gaussians.min(round.most);
         let mut most_added = u32::MAX;
         for trial in 1..=TRIALS {
             let tally = self.decide(gaussians, &inputs, limit, most_added, round)?;
-            let report = report(gaussians.count, &tally);
+            let report = report(gaussians.layout.count, &tally);
             let added = report.split + report.cloned;
             if added + report.pruned == 0 {
                 return Ok(report);
             }
             let mut room = self.room(gaussians, &inputs, report.count, limit)?;
             self.scatter(gaussians, &mut inputs, &mut room, &report, round.step)?;
-            let new = room.words.as_ref().unwrap_or(inputs.gradients);
-            let share = if added == 0 { 1.0 } else { keeps(new, report.count)? };
+            let parameters = room.words.as_ref().unwrap_or(inputs.gradients).slice();
+            let layout = Layout { count: report.count, ..gaussians.layout };
+            let new = GaussianSlice { layout, parameters };
+            let share = if added == 0 { 1.0 } else { keeps(new)? };
             if share >= 1.0 {
                 self.commit(gaussians, inputs, room, &report)?;
                 return Ok(report);
@@ -257,9 +261,10 @@ impl Densifier {
         most_added: u32,
         round: Round,
     ) -> Result<Vec<u32>> {
-        let DeviceGaussians { count, feature_count, ref parameters, .. } = *gaussians;
-        let columns = gaussians.parameter_columns();
-        if self.scratch.keys.len() < count as usize {
+        let DeviceGaussians { layout, parameters, .. } = gaussians;
+        let (columns, count) = (layout.words(), layout.count as u32);
+        let feature_count = layout.floats().features as u32;
+        if self.scratch.keys.len() < layout.count {
             self.scratch = Scratch::new(&self.gpu, grad_norm_sums.len())?;
         }
         let DensifySettings { gradient_threshold, split_scale, min_opacity, near, .. } =
@@ -285,7 +290,7 @@ impl Densifier {
             split_log_scale: split_scale.ln() as f32,
             most_added,
         };
-        let batches = gaussians.batches(&self.gpu);
+        let batches = layout.batches(&self.gpu);
         let Self { scratch, sort, scan, cameras, .. } = self;
         self.gpu.write(&mut scratch.count, &[count])?;
         let mut download = None;
@@ -335,8 +340,8 @@ impl Densifier {
         report: &DensifyReport,
         step: u64,
     ) -> Result<()> {
-        let DeviceGaussians { feature_count, ref parameters, .. } = *gaussians;
-        let columns = gaussians.parameter_columns();
+        let DeviceGaussians { layout, parameters, .. } = gaussians;
+        let (columns, feature_count) = (layout.words(), layout.floats().features as u32);
         let seed = self.settings.seed;
         let params = |from: Batch, to: Batch| densify_scatter::Params {
             gaussian_count: from.gaussian_count(),
@@ -356,7 +361,7 @@ impl Densifier {
             }
         };
         let Scratch { fates, offsets, .. } = &self.scratch;
-        let pairs = self.pairs(gaussians, report);
+        let pairs = self.pairs(&gaussians.layout, report);
         self.gpu.run("densify_scatter", |pass| {
             for &(from, to) in &pairs {
                 let buffers = densify_scatter::Buffers {
@@ -381,19 +386,18 @@ impl Densifier {
         Room { mut planes, mut words, statistics }: Room,
         report: &DensifyReport,
     ) -> Result<()> {
-        let DeviceGaussians { column_count, feature_count, .. } = *gaussians;
+        let PlaneCounts { columns, features, .. } = gaussians.layout.floats();
         let params = |from: Batch, to: Batch| densify_moments::Params {
             gaussian_count: from.gaussian_count(),
             new_gaussian_count: to.gaussian_count(),
-            column_count,
-            feature_count,
+            column_count: columns as u32,
+            feature_count: features as u32,
             first_new_gaussian: to.first_gaussian(),
         };
-        let DensifyInputs { grad_norm_sums, visit_counts, gradients: spare } = inputs;
+        let DensifyInputs { moments, grad_norm_sums, visit_counts, gradients: spare } = inputs;
         let Scratch { fates, offsets, .. } = &self.scratch;
-        let pairs = self.pairs(gaussians, report);
-        let DeviceGaussians { parameters, moments, .. } = &mut *gaussians;
-        std::mem::swap(parameters, words.as_mut().unwrap_or(spare));
+        let pairs = self.pairs(&gaussians.layout, report);
+        std::mem::swap(&mut gaussians.parameters, words.as_mut().unwrap_or(spare));
         self.gpu.run("densify_moments", |pass| {
             for (_, moments) in moments.planes_mut() {
                 take(&mut planes, spare);
@@ -415,16 +419,15 @@ impl Densifier {
         if let Some((sums, counts)) = statistics {
             (*grad_norm_sums, *visit_counts) = (sums, counts);
         }
-        gaussians.count = report.count as u32;
+        gaussians.layout.count = report.count;
+        gaussians.layout.capacity = grad_norm_sums.len();
         Ok(())
     }
 
     /// Every batch with each of the new ones that its Gaussians go to.
-    fn pairs(&self, gaussians: &DeviceGaussians, report: &DensifyReport) -> Vec<(Batch, Batch)> {
-        let DeviceGaussians { column_count, feature_count, .. } = *gaussians;
-        let dimensions = [column_count, feature_count].map(|n| n as usize);
-        let (old, new) =
-            (gaussians.batches(&self.gpu), Batches::new(&self.gpu, report.count, dimensions));
+    fn pairs(&self, layout: &Layout, report: &DensifyReport) -> Vec<(Batch, Batch)> {
+        let new = Layout { count: report.count, ..*layout }.batches(&self.gpu);
+        let old = layout.batches(&self.gpu);
         old.iter().flat_map(|from| new.iter().map(move |to| (from, to))).collect()
     }
 
@@ -436,17 +439,17 @@ impl Densifier {
         count: usize,
         limit: usize,
     ) -> Result<Room> {
-        let DeviceGaussians { column_count, parameters, moments, rest, .. } = gaussians;
-        let (columns, capacity) = (*column_count as usize, capacity(count, limit));
+        let DeviceGaussians { layout, parameters, .. } = gaussians;
+        let (columns, capacity) = (layout.floats().columns, capacity(count, limit));
         let buffer = |columns| self.gpu.uninit_in_windows("planes", capacity * columns);
         // Parameters with halves are too short to take turns with floats.
-        let (turns, words) = match rest {
-            Bits::Single => (Some(parameters), None),
-            Bits::Half => (None, Some(buffer(gaussians.parameter_columns())?)),
+        let (turns, words) = match layout.sh_rest {
+            StorageFormat::Single => (Some(parameters), None),
+            StorageFormat::Half => (None, Some(buffer(layout.words())?)),
         };
         // In the order in which they are free.
         let planes = iter::once(&*inputs.gradients).chain(turns);
-        let planes = planes.chain(moments.planes().into_iter().map(|(_, plane)| plane));
+        let planes = planes.chain(inputs.moments.planes().into_iter().map(|(_, plane)| plane));
         let planes = planes.map(|plane| {
             let is_short = plane.len() < count * columns;
             is_short.then(|| buffer(columns)).transpose()
@@ -483,34 +486,29 @@ pub(crate) fn capacity(count: usize, limit: usize) -> usize {
     (count + count / 2).min(limit).max(count)
 }
 
-fn report(count: u32, tally: &[u32]) -> DensifyReport {
+fn report(count: usize, tally: &[u32]) -> DensifyReport {
     let tally = |place: u32| tally.get(place as usize).map_or(0, |&count| count as usize);
     let (cloned, split, pruned) = (tally(TALLY_CLONED), tally(TALLY_SPLIT), tally(TALLY_PRUNED));
     DensifyReport {
         cloned,
         split,
         pruned,
-        count: count as usize - pruned + cloned + split,
+        count: count - pruned + cloned + split,
         refused: tally(TALLY_CANDIDATES) - cloned - split,
     }
 }
 
 /// A kernel that runs beyond a buffer reads its neighbours: refuse before anything is recorded.
 fn check(gaussians: &DeviceGaussians, inputs: &DensifyInputs<'_>) -> Result<()> {
-    let DeviceGaussians { count, column_count, feature_count, parameters, moments, .. } = gaussians;
-    let (count, columns) = (*count as usize, *column_count as usize);
-    let DensifyInputs { grad_norm_sums, visit_counts, .. } = inputs;
-    let words = count * gaussians.parameter_columns();
-    let parameters = iter::once((parameters.name(), parameters.len(), words));
-    let moments =
-        moments.planes().into_iter().map(|(name, plane)| (name, plane.len(), count * columns));
+    let DeviceGaussians { layout, parameters, .. } = gaussians;
+    let DensifyInputs { moments, grad_norm_sums, visit_counts, .. } = inputs;
+    let (count, floats) = (layout.count, layout.floats().len());
+    let parameters = iter::once((parameters.name(), parameters.len(), count * layout.words()));
+    let moments = moments.planes().into_iter().map(|(name, plane)| (name, plane.len(), floats));
     let per_gaussian = [
         (grad_norm_sums.name(), grad_norm_sums.len(), count),
         (visit_counts.name(), visit_counts.len(), count),
     ];
-    if columns < crate::splats::scene::width(0) + *feature_count as usize {
-        return Err(Error::Usage(format!("density control: {columns} floats make no Gaussian")));
-    }
     match parameters.chain(moments).chain(per_gaussian).find(|(_, len, needed)| len < needed) {
         Some((name, len, needed)) => Err(Error::Usage(format!(
             "buffer `{name}` holds {len} elements, density control needs {needed}"

@@ -4,11 +4,11 @@
 use serde::{Deserialize, Serialize};
 
 use crate::kernels::half::{LARGEST_HALF, SMALLEST_HALF};
-use crate::splats::attributes::Attribute;
+use crate::splats::attributes::PlaneCounts;
 
-/// In how many bits the numbers of a training are kept; they are computed in 32.
+/// How numbers of a training are stored; they are computed in 32 bits.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub enum Bits {
+pub enum StorageFormat {
     /// 32.
     #[default]
     #[serde(rename = "32")]
@@ -18,13 +18,12 @@ pub enum Bits {
     Half,
 }
 
-impl Bits {
-    /// Words per Gaussian whose SH coefficients above degree 0 are so many bits each, of `columns` numbers of which `features`
-    /// are features.
-    pub fn columns(self, [columns, features]: [usize; 2]) -> usize {
+impl StorageFormat {
+    /// Words of each Gaussian whose SH coefficients above degree 0 are stored so.
+    pub fn words(self, planes: PlaneCounts) -> usize {
         match self {
-            Self::Single => columns,
-            Self::Half => Halves::new(0, [columns, features]).columns(),
+            Self::Single => planes.columns,
+            Self::Half => Halves::new(planes).columns(),
         }
     }
 }
@@ -40,10 +39,9 @@ pub(crate) struct Halves {
 }
 
 impl Halves {
-    /// Of `count` Gaussians that have `columns` floats each, of which `features` are features.
-    pub(crate) fn new(count: usize, [columns, features]: [usize; 2]) -> Self {
-        let before = Attribute::Rest.column(features);
-        Self { count, before, own: columns - before }
+    /// What takes the place of planes of floats.
+    pub(crate) fn new(planes: PlaneCounts) -> Self {
+        Self { count: planes.gaussians, before: planes.before_rest(), own: planes.rest() }
     }
 
     /// Words of each.
@@ -97,7 +95,7 @@ pub(crate) fn nearest(value: f32) -> u16 {
 #[cfg(test)]
 mod tests {
     use super::{Halves, nearest, value};
-    use crate::splats::attributes::column_count;
+    use crate::splats::attributes::{PlaneCounts, column_count};
 
     #[test]
     fn every_half_comes_back_and_numbers_become_the_nearest() {
@@ -122,7 +120,7 @@ mod tests {
         for (degree, words) in (0..=3).zip([16, 21, 28, 39]) {
             for count in [0, 1, 5] {
                 let columns = column_count(2, degree);
-                let halves = Halves::new(count, [columns, 2]);
+                let halves = Halves::new(PlaneCounts { gaussians: count, columns, features: 2 });
                 assert_eq!(halves.columns(), words);
                 let planes: Vec<f32> =
                     (0..count * columns).map(|i| value(nearest(i as f32 * 0.25))).collect();

@@ -12,8 +12,9 @@ use std::sync::OnceLock;
 
 use crate::gpu::{Buffer, Gpu, Kernel, Pipeline, Recorder, Slice, SliceMut, Threads};
 use crate::kernels::{adam, adam_rest};
+use crate::splats::attributes::PlaneCounts;
 use crate::splats::batches::Batch;
-use crate::splats::halves::Bits;
+use crate::splats::halves::StorageFormat;
 use crate::{Error, Result};
 
 /// The exponential means of the gradients and of their squares: planes, as the parameters are, in buffers or in slices of
@@ -37,19 +38,19 @@ impl Moments {
     /// # Errors
     /// The device is out of memory.
     pub fn zeros(gpu: &Gpu, len: usize) -> Result<Self> {
-        Self::of(Bits::Single, |name| gpu.zeros(name, len))
+        Self::of(StorageFormat::Single, |name| gpu.zeros(name, len))
     }
 
     /// Moments of what makes their planes, by name.
     pub(crate) fn of(
-        bits: Bits,
+        bits: StorageFormat,
         mut plane: impl FnMut(&'static str) -> Result<Buffer<f32>>,
     ) -> Result<Self> {
         Ok(match bits {
-            Bits::Single => {
+            StorageFormat::Single => {
                 Self::Single { first: plane("first_moments")?, second: plane("second_moments")? }
             }
-            Bits::Half => Self::Half(plane("moments")?),
+            StorageFormat::Half => Self::Half(plane("moments")?),
         })
     }
 
@@ -111,10 +112,10 @@ impl<P> Moments<P> {
     }
 
     /// In how many bits they are.
-    pub fn bits(&self) -> Bits {
+    pub fn bits(&self) -> StorageFormat {
         match self {
-            Self::Single { .. } => Bits::Single,
-            Self::Half(_) => Bits::Half,
+            Self::Single { .. } => StorageFormat::Single,
+            Self::Half(_) => StorageFormat::Half,
         }
     }
 }
@@ -191,8 +192,7 @@ impl Adam {
         Ok(adam)
     }
 
-    /// Records step number `step`, from 1, over the first `column_count` columns of `gaussian_count` Gaussians, of which
-    /// `feature_count` are features. Nothing changes while the first element of `status`, the sticky word, is not zero.
+    /// Records step number `step`, from 1, over `planes`, which may be the first of more. Nothing changes while the first element of `status`, the sticky word, is not zero.
     ///
     /// # Errors
     /// A buffer is shorter than that, the step is 0, or the device refuses the kernel.
@@ -201,13 +201,13 @@ impl Adam {
         pass: &mut Recorder<'_>,
         step: u64,
         rates: &LearningRates,
-        [gaussian_count, column_count, feature_count]: [u32; 3],
+        planes: PlaneCounts,
         AdamBuffers { parameters, gradients, moments }: AdamBuffers<'_>,
         status: &Buffer<u32>,
     ) -> Result<()> {
-        let len = gaussian_count as usize * column_count as usize;
+        let len = planes.len();
         check(step, status, [(parameters.as_slice(), len), (gradients, len)], (&moments, len))?;
-        let half_moments = moments.bits() == Bits::Half;
+        let half_moments = moments.bits() == StorageFormat::Half;
         let constants = adam::Constants { half_moments };
         let pipeline = self.pipeline(&self.floats, half_moments, &constants)?;
         let [first_moments, second_moments, both_moments] = moments.bindings()?;
@@ -215,9 +215,9 @@ impl Adam {
         pass.dispatch(
             pipeline,
             &adam::Params {
-                gaussian_count,
-                column_count,
-                feature_count,
+                gaussian_count: planes.gaussians as u32,
+                column_count: planes.columns as u32,
+                feature_count: planes.features as u32,
                 second_correction,
                 step: step as u32,
                 rates: rates.0.map(|rate| (rate / uncorrected) as f32),
@@ -234,7 +234,7 @@ impl Adam {
         )
     }
 
-    /// The same for SH coefficients in halves, `coefficient_count` of each Gaussian behind `first_column` columns.
+    /// The same for the SH coefficients above degree 0 of `planes` where they are stored in halves.
     ///
     /// # Errors
     /// As [`Adam::record`].
@@ -243,15 +243,16 @@ impl Adam {
         pass: &mut Recorder<'_>,
         step: u64,
         rate: f64,
-        [gaussian_count, first_column, coefficient_count]: [u32; 3],
+        planes: PlaneCounts,
         AdamBuffers { parameters, gradients, moments }: AdamBuffers<'_>,
         status: &Buffer<u32>,
     ) -> Result<()> {
-        let len = |own: u32| gaussian_count as usize * (first_column + own) as usize;
-        let (words, floats) = (len(coefficient_count.div_ceil(2)), len(coefficient_count));
-        let planes = [(parameters.as_slice(), words), (gradients, floats)];
-        check(step, status, planes, (&moments, floats))?;
-        let half_moments = moments.bits() == Bits::Half;
+        let words = planes.gaussians * StorageFormat::Half.words(planes);
+        let buffers = [(parameters.as_slice(), words), (gradients, planes.len())];
+        check(step, status, buffers, (&moments, planes.len()))?;
+        let [gaussian_count, first_column, coefficient_count] =
+            [planes.gaussians, planes.before_rest(), planes.rest()].map(|n| n as u32);
+        let half_moments = moments.bits() == StorageFormat::Half;
         let constants = adam_rest::Constants { half_moments };
         let pipeline = self.pipeline(&self.halves, half_moments, &constants)?;
         let [first_moments, second_moments, both_moments] = moments.bindings()?;

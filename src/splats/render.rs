@@ -26,9 +26,8 @@ use crate::kernels::splat::MAX_CHANNELS;
 use crate::kernels::{
     self, blend_backward, blend_forward, emit, order_counts, project, project_backward,
 };
-use crate::splats::batches::Batches;
-use crate::splats::halves::Bits;
-use crate::splats::scene::{Shape, width};
+use crate::splats::halves::StorageFormat;
+use crate::splats::scene::{GaussianSlice, Layout, Shape};
 use crate::splats::sort::{Count, RadixSort};
 use crate::{Error, Result};
 
@@ -82,10 +81,10 @@ pub struct Gradients<'a> {
 /// let gaussians = ply::load("run/model.ply")?;
 /// let settings = RenderSettings { shape: gaussians.shape, ..RenderSettings::default() };
 /// let mut renderer = Renderer::new(&gpu, settings)?;
-/// let parameters = gaussians.upload(&gpu)?;
+/// let on_device = gaussians.upload(&gpu)?;
 /// renderer.reserve(gaussians.count, [&camera])?;
 /// let options = RenderOptions { sh_degree: gaussians.shape.sh_degree, background: [0.0; 3] };
-/// renderer.render_image(&parameters, &camera, &options)?.save_png8("view.png")?;
+/// renderer.render_image(&on_device, &camera, &options)?.save_png8("view.png")?;
 /// # Ok::<(), nightsplat::Error>(())
 /// ```
 #[derive(Debug)]
@@ -226,25 +225,29 @@ impl Renderer {
         pass.fill(&mut self.frame.status, 0);
     }
 
-    /// Records the render of `gaussians` (planes of all attributes, in [`Batches`]) as a camera sees them, or a patch of what it
-    /// sees. The first view of a camera model builds the kernels for it.
+    /// Records the render of `gaussians` as a camera sees them, or a patch of what it sees. The first view of a camera model
+    /// builds the kernels for it.
     ///
     /// # Errors
-    /// The image exceeds what was reserved, a pass exceeds what the device launches, or the driver refuses a kernel.
+    /// The Gaussians are not made of what the settings say; they or the image exceed what was reserved; a pass exceeds what
+    /// the device launches; or the driver refuses a kernel.
     pub fn forward<'a>(
         &mut self,
         pass: &mut Recorder<'_>,
-        gaussians: &Buffer<f32>,
+        gaussians: impl Into<GaussianSlice<'a>>,
         viewpoint: impl Into<Viewpoint<'a>>,
         options: &RenderOptions,
     ) -> Result<()> {
-        let viewpoint = viewpoint.into();
+        let (gaussians, viewpoint) = (gaussians.into(), viewpoint.into());
+        self.check(&gaussians.layout)?;
         let view = self.view(&viewpoint)?;
+        let gaussian_count = gaussians.layout.count as u32;
+        pass.fill(&mut self.frame.gaussian_counts, gaussian_count);
         if viewpoint.on_device.is_none() {
             pass.update(&mut self.frame.camera, &[(&viewpoint.patch).into()])?;
         }
         self.record_project(pass, gaussians, &view, options.sh_degree)?;
-        self.record_bins(pass, &view)?;
+        self.record_bins(pass, gaussian_count, &view)?;
         let mut background = [0.0; MAX_CHANNELS as usize];
         background[..3].copy_from_slice(&options.background);
         let frame = &mut self.frame;
@@ -276,19 +279,20 @@ impl Renderer {
     /// of the same viewpoint.
     ///
     /// # Errors
-    /// A pass exceeds what the device launches.
+    /// The Gaussians are not made of what the settings say, or a pass exceeds what the device launches.
     #[expect(clippy::too_many_arguments, reason = "what the forward pass takes, and its gradient")]
     pub fn backward<'a>(
         &mut self,
         pass: &mut Recorder<'_>,
-        gaussians: &Buffer<f32>,
+        gaussians: impl Into<GaussianSlice<'a>>,
         viewpoint: impl Into<Viewpoint<'a>>,
         options: &RenderOptions,
         damping: Damping,
         d_render: &Buffer<f32>,
         gradients: Gradients<'_>,
     ) -> Result<()> {
-        let view = self.view(&viewpoint.into())?;
+        let (gaussians, view) = (gaussians.into(), self.view(&viewpoint.into())?);
+        self.check(&gaussians.layout)?;
         let color_vectors = color_vectors(self.settings.channels());
         let frame = &mut self.frame;
         pass.dispatch(
@@ -306,11 +310,10 @@ impl Renderer {
             },
             Threads::Workgroups([view.tile_count(), 1, 1]),
         )?;
-        let parameter_columns = self.parameter_columns();
+        let GaussianSlice { layout, parameters } = gaussians;
         let project_backward = &self.projections[&view.model].backward;
-        for batch in self.batches().iter() {
+        for batch in layout.batches(&self.gpu).iter() {
             let gaussian_count = batch.gaussian_count();
-            let frame = &mut self.frame;
             pass.dispatch(
                 project_backward,
                 &project_backward::Params {
@@ -322,7 +325,7 @@ impl Renderer {
                     damping_depth: damping.depth,
                 },
                 project_backward::Buffers {
-                    parameters: batch.rows(gaussians, parameter_columns)?,
+                    parameters: batch.rows(parameters, layout.words())?,
                     splats: batch.rows(&frame.splats, 1)?,
                     colors: batch.rows(&frame.colors, color_vectors)?,
                     tile_counts: batch.rows(&frame.tile_counts, 1)?,
@@ -343,15 +346,14 @@ impl Renderer {
     fn record_project(
         &mut self,
         pass: &mut Recorder<'_>,
-        gaussians: &Buffer<f32>,
+        GaussianSlice { layout, parameters }: GaussianSlice<'_>,
         view: &View<'_>,
         sh_degree: u32,
     ) -> Result<()> {
         let color_vectors = color_vectors(self.settings.channels());
-        let parameter_columns = self.parameter_columns();
-        let (batches, frame) = (self.batches(), &mut self.frame);
+        let frame = &mut self.frame;
         let project = &self.projections[&view.model].forward;
-        batches.iter().try_for_each(|batch| {
+        layout.batches(&self.gpu).iter().try_for_each(|batch| {
             pass.dispatch(
                 project,
                 &project::Params {
@@ -362,7 +364,7 @@ impl Renderer {
                     first_gaussian: batch.first_gaussian(),
                 },
                 project::Buffers {
-                    parameters: batch.rows(gaussians, parameter_columns)?,
+                    parameters: batch.rows(parameters, layout.words())?,
                     splats: batch.rows_mut(&mut frame.splats, 1)?,
                     colors: batch.rows_mut(&mut frame.colors, color_vectors)?,
                     depth_keys: batch.rows_mut(&mut frame.depth_keys, 1)?,
@@ -375,22 +377,35 @@ impl Renderer {
         })
     }
 
-    /// How those that render lie in the buffers of their planes.
-    /// Words per Gaussian of what is rendered.
-    fn parameter_columns(&self) -> usize {
+    /// Refuses Gaussians that the kernels would read as others, or that there is no memory for.
+    fn check(&self, layout: &Layout) -> Result<()> {
         let RenderSettings { shape, rest, .. } = self.settings;
-        rest.columns([width(shape), shape.features.width()])
-    }
-
-    fn batches(&self) -> Batches {
-        let (count, shape) = (self.frame.gaussian_count as usize, self.settings.shape);
-        Batches::new(&self.gpu, count, [width(shape), shape.features.width()])
+        let reserved = self.frame.splats.len();
+        let problem = if layout.shape != shape {
+            let [own, made_for] = [layout.shape, shape];
+            format!("Gaussians of {own} cannot be rendered by a renderer made for {made_for}")
+        } else if layout.sh_rest != rest {
+            let [own, made_for] = [layout.sh_rest, rest];
+            format!(
+                "Gaussians with SH coefficients as {own:?} cannot be rendered by a renderer made for {made_for:?}"
+            )
+        } else if layout.count > reserved {
+            let count = layout.count;
+            format!("{count} Gaussians exceed the {reserved} that the renderer reserved")
+        } else {
+            return Ok(());
+        };
+        Err(Error::Usage(problem))
     }
 
     /// From projected splats to each tile's list of them, front to back.
-    fn record_bins(&mut self, pass: &mut Recorder<'_>, view: &View<'_>) -> Result<()> {
+    fn record_bins(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        gaussian_count: u32,
+        view: &View<'_>,
+    ) -> Result<()> {
         let frame = &mut self.frame;
-        let gaussian_count = frame.gaussian_count;
         let all = Count { counts: &frame.gaussian_counts, index: 0 };
         self.depth_sort.record(pass, all, &mut frame.depth_keys, &mut frame.ids, DEPTH_BITS)?;
         pass.dispatch(
@@ -474,7 +489,7 @@ impl Projections {
     ) -> Result<Self> {
         let (channels, alpha_max) = (settings.channels() as u32, settings.max_alpha);
         let (sh_degree, raw_colors) = (settings.shape.sh_degree, settings.raw_colors);
-        let half_rest = settings.rest == Bits::Half;
+        let half_rest = settings.rest == StorageFormat::Half;
         macro_rules! pipeline {
             ($kernel:ident) => {
                 gpu.pipeline(&$kernel::Constants {

@@ -1,11 +1,11 @@
 //! The scene: 3D Gaussians on the host.
 
+use std::fmt;
 use std::ops::Range;
 
 use glam::{DVec3, Vec3};
 
-use crate::Result;
-
+mod device;
 mod features;
 #[cfg(feature = "io")]
 pub mod init;
@@ -14,10 +14,9 @@ mod neighbours;
 pub mod ply;
 
 use crate::camera::Frame;
-use crate::gpu::{Buffer, Gpu};
-pub use crate::splats::attributes::{ATTRIBUTES, Attribute, rest_coefficients};
+pub use crate::splats::attributes::{ATTRIBUTES, Attribute, PlaneCounts, rest_coefficients};
 use crate::splats::attributes::{column_count, planes};
-use crate::splats::batches::Batches;
+pub use device::{DeviceGaussians, GaussianSlice, Layout};
 pub use features::{COLOR_CHANNELS, FEATURES, Feature, FeatureSpec, Features};
 
 pub use crate::kernels::sh::MAX_SH_DEGREE;
@@ -32,6 +31,15 @@ pub struct Shape {
     pub sh_degree: u32,
     /// What is blended beside colour.
     pub features: Features,
+}
+
+impl fmt::Display for Shape {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { sh_degree, features } = self;
+        write!(f, "SH degree {sh_degree}")?;
+        let names: Vec<&str> = features.specs().map(|spec| spec.name).collect();
+        if names.is_empty() { Ok(()) } else { write!(f, " with {}", names.join(", ")) }
+    }
 }
 
 /// Colour alone.
@@ -63,22 +71,15 @@ pub struct Gaussians {
     pub shape: Shape,
     /// `count * width(shape)` floats.
     pub parameters: Vec<f32>,
+    /// The world position that the means are relative to: f32 is too coarse for positions far from the world's own origin.
+    pub origin: DVec3,
 }
 
 impl Gaussians {
     /// `count` Gaussians with every parameter zero.
     pub fn zeros(count: usize, shape: impl Into<Shape>) -> Self {
         let shape = shape.into();
-        Self { count, shape, parameters: vec![0.0; count * width(shape)] }
-    }
-
-    /// A copy on the device, planes in [`Batches`]: what a [`Renderer`](crate::splats::render::Renderer) takes.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
-    pub fn upload(&self, gpu: &Gpu) -> Result<Buffer<f32>> {
-        let columns = [width(self.shape), self.shape.features.width()];
-        Batches::new(gpu, self.count, columns).upload(gpu, "parameters", &self.parameters)
+        Self { count, shape, parameters: vec![0.0; count * width(shape)], origin: DVec3::ZERO }
     }
 
     /// Where an attribute lies in [`Gaussians::parameters`].
@@ -92,28 +93,59 @@ impl Gaussians {
         planes(self.shape.features.width(), width(self.shape))[attribute as usize]
     }
 
-    /// The same Gaussians out of a frame, relative to an origin in the world: [`Frame::file_origin`] where f32 is to hold
-    /// them.
-    pub fn to_world(&self, frame: &Frame, origin: DVec3) -> Self {
+    /// The same Gaussians out of a frame, relative to an origin that lets f32 hold them: [`Frame::file_origin`].
+    pub fn to_world(&self, frame: &Frame) -> Self {
+        let origin = frame.file_origin();
+        if *frame == Frame::WORLD {
+            return self.clone();
+        }
         let offset = DVec3::from_array(frame.center) - origin;
-        self.moved(|mean| (mean / frame.scale + offset).as_vec3(), -frame.scale.ln())
+        let position = |mean: DVec3| (mean / frame.scale + offset).as_vec3();
+        Self { origin, ..self.moved(position, -frame.scale.ln()) }
     }
 
-    /// Back into the frame: what [`Gaussians::to_world`] gave.
-    pub fn from_world(&self, frame: &Frame, origin: DVec3) -> Self {
-        let offset = DVec3::from_array(frame.center) - origin;
-        self.moved(|mean| ((mean - offset) * frame.scale).as_vec3(), frame.scale.ln())
+    /// Gaussians of the world in a frame: what [`Gaussians::to_world`] gave comes back.
+    pub fn from_world(&self, frame: &Frame) -> Self {
+        if *frame == Frame::WORLD && self.origin == DVec3::ZERO {
+            return self.clone();
+        }
+        let offset = DVec3::from_array(frame.center) - self.origin;
+        let position = |mean: DVec3| ((mean - offset) * frame.scale).as_vec3();
+        Self { origin: DVec3::ZERO, ..self.moved(position, frame.scale.ln()) }
     }
 
     /// The same with room for another SH degree: coefficients that come are zero, those beyond it go.
     pub fn with_sh_degree(&self, sh_degree: u32) -> Self {
         let mut other = Self::zeros(self.count, Shape { sh_degree, ..self.shape });
+        other.origin = self.origin;
         let before = self.plane(Attribute::Rest).start;
         other.parameters[..before].copy_from_slice(&self.parameters[..before]);
         let [own, new] = [self.shape.sh_degree, sh_degree].map(rest_coefficients);
         let kept = own.min(new);
         let pairs = other.rest_mut().chunks_mut(new.max(1)).zip(self.rest().chunks(own.max(1)));
         pairs.for_each(|(new, own)| new[..kept].copy_from_slice(&own[..kept]));
+        other
+    }
+
+    /// The same with these features: those that come are zero, others go.
+    pub fn with_features(&self, features: Features) -> Self {
+        let mut other = Self::zeros(self.count, Shape { features, ..self.shape });
+        other.origin = self.origin;
+        let kept = |attribute: &Attribute| *attribute != Attribute::Features;
+        for attribute in ATTRIBUTES.iter().map(|spec| spec.attribute).filter(kept) {
+            let plane = other.plane(attribute);
+            other.parameters[plane].copy_from_slice(&self.parameters[self.plane(attribute)]);
+        }
+        let [own, new] = [self.shape.features, features].map(Features::width);
+        for feature in FEATURES.iter().map(|spec| spec.feature) {
+            let channels = [self.shape.features, features].map(|all| all.channels_of(feature));
+            let [Some(from), Some(to)] = channels else { continue };
+            let [from, to] = [from, to].map(|c| c.start - COLOR_CHANNELS..c.end - COLOR_CHANNELS);
+            let rows = other.features_mut().chunks_exact_mut(new);
+            rows.zip(self.features().chunks_exact(own)).for_each(|(new, own)| {
+                new[to.clone()].copy_from_slice(&own[from.clone()]);
+            });
+        }
         other
     }
 
@@ -166,7 +198,7 @@ macro_rules! accessors {
 }
 
 accessors! {
-    /// Positions in the world, (count).
+    /// Positions in the world, relative to the origin, (count).
     Means: means, means_mut -> Vec3,
     /// Rotations (w, x, y, z), not normalised, (count).
     Quats: quats, quats_mut -> [f32; 4],

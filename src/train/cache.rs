@@ -343,7 +343,7 @@ impl Spool {
 
 fn unusable(folder: &Path, error: &std::io::Error) -> Error {
     let problem = format!(
-        "cannot hold the photographs that exceed the cache ({error}); raise `TrainConfig::cache` or make room on the disk"
+        "cannot hold the photographs that exceed the cache ({error}); raise cache or make room on the disk"
     );
     Error::output(folder, problem)
 }

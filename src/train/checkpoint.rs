@@ -22,7 +22,6 @@ use crate::gpu::{Gpu, SliceMut};
 use crate::networks::TensorFile;
 use crate::photographs::dataset::Fingerprint;
 use crate::splats::batches::Batches;
-use crate::splats::densify::DeviceGaussians;
 use crate::splats::optimizer::{AdamBuffers, Moments};
 use crate::splats::scene::{Gaussians, Shape, width};
 use crate::{Error, Result};
@@ -233,7 +232,7 @@ impl Trainer {
     /// The SH degree that the Gaussians of a checkpoint have room for, by the columns of what Adam keeps of them.
     fn sh_degree_of(&self, file: &TensorFile<'_>) -> u32 {
         let whole = self.model.whole_shape();
-        let columns = self.model.gaussians.moments.planes().first().and_then(|(name, _)| {
+        let columns = self.model.moments.planes().first().and_then(|(name, _)| {
             file.tensor(&format!("gaussians.{name}"))?.0.shape.first().copied()
         });
         let fits = |&sh_degree: &u32| Some(width(Shape { sh_degree, ..whole })) == columns;
@@ -244,7 +243,7 @@ impl Trainer {
     /// The header of a checkpoint that this run can go on from, and the settings in it.
     fn header_of(&self, path: &Path, file: &TensorFile<'_>) -> Result<(Header, TrainConfig)> {
         let refused = |problem: String| Error::input(path, problem);
-        let anew = "begin anew with `HeldRun::Replace`";
+        let anew = "begin anew with --overwrite";
         let header = file.note(HEADER).and_then(|header| serde_json::from_str(header).ok());
         let Some(header) = header.filter(|h: &Header| h.format == FORMAT) else {
             return Err(refused(format!("is no `{FORMAT}`; {anew}")));
@@ -272,7 +271,7 @@ impl Trainer {
         let steps = self.config.steps;
         if *step > steps {
             return Err(refused(format!(
-                "is at step {step}, this run ends at {steps}; raise `TrainConfig::steps`"
+                "is at step {step}, this run ends at {steps}; raise steps"
             )));
         }
         Ok((header, config))
@@ -298,10 +297,10 @@ impl Trainer {
 
     /// What to say of a value of the state, by its tensor's name.
     pub(super) fn not_finite(&self, name: &str, at: usize) -> Error {
-        let DeviceGaussians { column_count, .. } = self.model.gaussians;
+        let layout = self.model.gaussians.layout;
         match name.strip_prefix("gaussians.") {
-            Some("parameters") => self.not_finite_in(at, self.model.gaussians.parameter_columns()),
-            Some(_) => self.not_finite_in(at, column_count as usize),
+            Some("parameters") => self.not_finite_in(at, layout.words()),
+            Some(_) => self.not_finite_in(at, layout.floats().columns),
             None => {
                 Error::ParameterNotFinite { step: self.step, plane: name.to_owned(), gaussian: at }
             }
@@ -342,18 +341,16 @@ impl Trainer {
 
     /// Everything that the next step depends on but the visit counts, which are integers.
     pub(super) fn state(&mut self) -> Vec<State<'_>> {
-        let Model { gaussians, grad_norm_sums, .. } = &mut self.model;
-        let batches = gaussians.batches(&self.gpu);
-        let [of_parameters, of_moments] =
-            [gaussians.parameter_columns(), gaussians.column_count as usize].map(|columns| {
-                (vec![columns, gaussians.count as usize], batches.with_columns(columns))
-            });
+        let Model { gaussians, moments, grad_norm_sums, .. } = &mut self.model;
+        let layout = gaussians.layout;
+        let batches = layout.batches(&self.gpu);
+        let [of_parameters, of_moments] = [layout.words(), layout.floats().columns]
+            .map(|columns| (vec![columns, layout.count], batches.with_columns(columns)));
         let name = "density.grad_norm_sums".to_owned();
-        let shape = vec![gaussians.count as usize];
+        let shape = vec![layout.count];
         let buffer = grad_norm_sums.slice_mut();
         let mut state = vec![State { name, shape, buffer, batches: None }];
-        let DeviceGaussians { parameters, moments, .. } = gaussians;
-        let (parameters, moments) = (parameters.slice_mut(), moments.slice_mut());
+        let (parameters, moments) = (gaussians.parameters.slice_mut(), moments.slice_mut());
         state.extend(optimized("gaussians", parameters, moments).enumerate().map(
             |(place, (name, buffer))| {
                 let (shape, batches) = if place == 0 { &of_parameters } else { &of_moments };

@@ -76,7 +76,7 @@ impl Trainer {
     /// The SH degree that a step trains.
     pub(super) fn sh_degree(&self, step: u64) -> u32 {
         let highest = self.decisions.sh_degree.unwrap_or(self.config.sh_degree);
-        self.config.schedule.sh_degree(step, highest)
+        self.config.sh_degree_at(step, highest)
     }
 
     /// The SH degree of what the model shows.

@@ -11,33 +11,35 @@ use serde::{Deserialize, Serialize};
 
 use super::decisions::Score;
 use super::{TrainConfig, Trainer};
-use crate::{Error, Result};
+use crate::Result;
+use crate::base::settings::{Rule, settings};
 
 /// Steps after a round of density control in which the held-out views are not scored: the model has settled by then.
 const SETTLING_DISTANCE: u64 = 50;
 
+settings! {
+"stop."
 /// When a run, or a part of it, ends before its last step. Scores are against targets, never against references.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct StopConfig {
     /// The number of training views that are held out, an eighth of them at most; 0: none, and no run ends early.
-    pub views: usize,
-    /// The steps from one score of theirs to the next. A score that falls within 50 steps after a round of density control
-    /// is taken at the end of these.
-    pub every: u64,
-    /// dB. Once two scores in a row do not exceed the best before by this much, the run has converged: it settles
-    /// ([`crate::splats::optimizer::Schedule::settle_steps`]) and ends.
-    pub gain: f64,
-    /// dB. A run that ends worse than its best score by more than this keeps the model of that score.
-    pub margin: f64,
-    /// dB. Growth ends once four rounds of density control gain less than this for each doubling of the Gaussians; 0: it
-    /// goes on to its last step.
-    pub growth_gain: f64,
-    /// What is done about a view whose loss or gradient is not finite.
-    #[serde(skip_serializing_if = "NotFinite::is_stop")]
-    pub not_finite: NotFinite,
-    /// dB. The SH degree rises no further, and falls back, once the one in use gains less than this; 0: it always rises.
-    pub degree_gain: f64,
+    views: usize = 8 => Rule::COUNT, in "views";
+    /// The steps from one score of theirs to the next. A score that falls within 50 steps after a round of density control is
+    /// taken at the end of these.
+    every: u64 = 250 => Rule::at_least(1), in "steps";
+    /// Once two scores in a row do not exceed the best before by this much, the run has converged: it settles and ends.
+    gain: f64 = 0.05 => Rule::POSITIVE_OR_0, in "dB";
+    /// A run that ends worse than its best score by more than this keeps the model of that score.
+    margin: f64 = 0.25 => Rule::POSITIVE_OR_0, in "dB";
+    /// Growth ends once four rounds of density control gain less than this for each doubling of the Gaussians; 0: it goes on
+    /// to its last step.
+    growth_gain: f64 = 0.0 => Rule::POSITIVE_OR_0, in "dB";
+    /// What is done about a view whose loss or gradient is not finite: stop ends the run with an error that names step, view
+    /// and term, skip-view trains on that view no more.
+    not_finite: NotFinite = NotFinite::Stop => Rule::OneOf(&["stop", "skip-view"]);
+    /// The SH degree rises no further, and falls back, once the one in use gains less than this; 0: it always rises.
+    degree_gain: f64 = 0.0 => Rule::POSITIVE_OR_0, in "dB";
+}
 }
 
 /// What is done about a view whose loss or gradient is NaN or infinite. The step that finds it changes nothing, either way.
@@ -49,27 +51,6 @@ pub enum NotFinite {
     Stop,
     /// The view is trained on no more.
     SkipView,
-}
-
-impl NotFinite {
-    #[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes a reference")]
-    fn is_stop(&self) -> bool {
-        *self == Self::Stop
-    }
-}
-
-impl Default for StopConfig {
-    fn default() -> Self {
-        Self {
-            views: 0,
-            every: 250,
-            gain: 0.05,
-            margin: 0.25,
-            growth_gain: 0.0,
-            not_finite: NotFinite::Stop,
-            degree_gain: 0.0,
-        }
-    }
 }
 
 impl StopConfig {
@@ -92,25 +73,6 @@ impl StopConfig {
         ];
         let changed = settings.into_iter().find(|(_, before, now)| before != now);
         changed.map(|(name, before, now)| format!("stop.{name} was {before} and is {now}"))
-    }
-
-    /// # Errors
-    /// [`Error::Usage`] names a value that makes no sense.
-    pub(super) fn check(&self) -> Result<()> {
-        let gain = |name, gain: f64| (name, gain, gain.is_finite() && gain >= 0.0, "0 or more");
-        let rules = [
-            ("stop.every", self.every as f64, self.every >= 1, "at least 1"),
-            gain("stop.gain", self.gain),
-            gain("stop.margin", self.margin),
-            gain("stop.growth_gain", self.growth_gain),
-            gain("stop.degree_gain", self.degree_gain),
-        ];
-        match rules.into_iter().find(|(_, _, holds, _)| !holds) {
-            Some((name, value, _, rule)) => {
-                Err(Error::Usage(format!("{name} is {value}; it must be {rule}")))
-            }
-            None => Ok(()),
-        }
     }
 }
 
@@ -321,7 +283,7 @@ mod tests {
             ..SyntheticOptions::default()
         };
         synthetic::write(folder.path(), &options).unwrap();
-        let mut config = TrainConfig { steps: 20, ..TrainConfig::default() };
+        let mut config = TrainConfig { steps: 20, ..TrainConfig::bare() };
         (config.stop.views, config.stop.margin) = (1, margin);
         config.schedule.resolution_steps = [0, 0];
         let dataset = Dataset::load(folder.path(), &config.load_options()).unwrap();

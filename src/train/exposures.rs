@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::views::Views;
 use super::{TrainConfig, Trainer};
+use crate::base::settings::{Rule, settings};
 use crate::camera::Camera;
 use crate::loss::exposure::{Affine, ExposureRates, table};
 use crate::photographs::dataset::{Dataset, LoadOptions, Photograph, View};
@@ -39,32 +40,20 @@ impl FromStr for Learning {
     }
 }
 
+settings! {
+"exposure."
 /// Gain and bias of each channel of each training view, [`crate::loss::exposure`].
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct ExposureConfig {
-    /// Whether they are learned.
-    pub learn: Learning,
-    /// A table of where they begin ([`table`]), in place of `exposures.csv` of the dataset.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub start: Option<PathBuf>,
-    /// Adam's learning rate.
-    pub rates: ExposureRates,
+    /// on: learn gain and bias of each channel of each training view, where photographs are not equally bright; off.
+    learn: Learning = Learning::Off => Rule::OneOf(&["on", "off"]), "--exposure on|off";
+    /// Learn exposures from where this table has them: `name,ev` or `name,gain_r,gain_g,gain_b,bias_r,bias_g,bias_b`.
+    start: Option<PathBuf> = None, "exposures.csv of the dataset" => Rule::PATH, "--exposures FILE";
 }
-
-impl ExposureConfig {
-    /// # Errors
-    /// [`Error::Usage`] names a value that makes no sense.
-    pub(super) fn check(&self) -> Result<()> {
-        let ExposureRates { initial, last, .. } = self.rates;
-        for (name, rate) in [("initial", initial), ("last", last)] {
-            if !(rate.is_finite() && rate > 0.0) {
-                let problem = format!("exposure.rates.{name} is {rate}; it must be above 0");
-                return Err(Error::Usage(problem));
-            }
-        }
-        Ok(())
-    }
+sections {
+    /// Adam's learning rate.
+    rates: ExposureRates;
+}
 }
 
 impl Trainer {

@@ -16,7 +16,7 @@ use crate::loss::exposure::{Affine, Exposures};
 use crate::photographs::image::Image;
 use crate::photographs::pseudo_gt::PseudoGt;
 use crate::splats::attributes::planes;
-use crate::splats::halves::Bits;
+use crate::splats::halves::StorageFormat;
 use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
 use crate::splats::scene::init::{self, Start};
 use crate::splats::scene::{Gaussians, SH_C0, width};
@@ -96,7 +96,7 @@ impl Trainer {
         let settings = RenderSettings {
             shape: 0.into(),
             raw_colors: true,
-            rest: Bits::Single,
+            rest: StorageFormat::Single,
             ..self.config.render_settings()
         };
         let mut renderer = Renderer::new(&self.gpu, settings)?;

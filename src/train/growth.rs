@@ -8,10 +8,11 @@ use super::{TrainConfig, Trainer, streams};
 use crate::Result;
 use crate::base::random::Stream;
 use crate::camera::Camera;
-use crate::gpu::{Buffer, Gpu};
+use crate::gpu::Gpu;
 use crate::photographs::dataset::Dataset;
 use crate::splats::densify::{Densifier, DensifyReport, DensifySettings, DensityControl, Round};
 use crate::splats::render::RenderOptions;
+use crate::splats::scene::GaussianSlice;
 
 /// dB. A round that costs the probes more is tried again with fewer splits. All training views may lose somewhat more.
 const MOST_LOST: f64 = 0.2;
@@ -59,16 +60,14 @@ impl Trainer {
         let options = RenderOptions { sh_degree: self.sh_degree(self.step), background: [0.0; 3] };
         let affines = self.affines()?;
         let Self { gpu, model, densifier, renderer, probes, .. } = self;
-        let mut psnr = |parameters: &Buffer<f32>, count: usize| {
-            let show = |camera: &Camera| {
-                Rendered::new(renderer, (parameters, count), camera, &options, None)
-            };
+        let mut psnr = |gaussians: GaussianSlice<'_>| {
+            let show = |camera: &Camera| Rendered::new(renderer, gaussians, camera, &options, None);
             Ok(probes.mean_psnr(&affines, show)?.map_or(0.0, |[colors, _]| colors))
         };
-        let before = psnr(&model.gaussians.parameters, model.count())?;
+        let before = psnr(model.gaussians.slice())?;
         let mut after = before;
-        let report = model.densify(gpu, densifier, round, |parameters, count| {
-            after = psnr(parameters, count)?;
+        let report = model.densify(gpu, densifier, round, |new| {
+            after = psnr(new)?;
             Ok(share_that_stays(before - after))
         })?;
         tracing::debug!("step {}: {report:?}; probes {before:.3} -> {after:.3} dB", round.step);

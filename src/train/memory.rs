@@ -9,9 +9,8 @@ use serde::Serialize;
 use super::{CacheSize, Trainer};
 use crate::Result;
 use crate::camera::Patch;
-use crate::splats::densify::DeviceGaussians;
 use crate::splats::render::RenderOptions;
-use crate::splats::scene::{Shape, width};
+use crate::splats::scene::{Layout, Shape};
 
 /// What the program, the driver and its compiled kernels take on the host, about.
 const PROGRAM: f64 = 256.0 * 1024.0 * 1024.0;
@@ -83,8 +82,7 @@ impl Trainer {
         let largest = self.views.all().map(|view| view.patch).max_by_key(Patch::pixel_count);
         let Some(patch) = largest else { return Ok(0) };
         let options = RenderOptions { sh_degree: 0, background: [0.0; 3] };
-        let gaussians = &self.model.gaussians.parameters;
-        self.renderer.render_patch(gaussians, &patch, &options)?;
+        self.renderer.render_patch(&self.model.gaussians, &patch, &options)?;
         self.renderer.intersections()
     }
 
@@ -175,11 +173,11 @@ impl Trainer {
     }
 
     fn per_gaussian_of(&self, shape: Shape) -> PerGaussian {
-        let DeviceGaussians { rest, moments, .. } = &self.model.gaussians;
-        let columns = [width(shape), rest.columns([width(shape), shape.features.width()])];
+        let layout = Layout { shape, ..self.model.gaussians.layout };
+        let columns = [layout.floats().columns, layout.words()];
         let [plane, parameters] = columns.map(|columns| (columns * size_of::<f32>()) as f64);
         // Beside the moments, gradients are planes.
-        let planes = 1 + moments.planes().len();
+        let planes = 1 + self.model.moments.planes().len();
         PerGaussian {
             plane,
             model: parameters + planes as f64 * plane + STATISTICS,

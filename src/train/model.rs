@@ -3,11 +3,13 @@
 use super::{PrecisionConfig, Trainer};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Recorder};
-use crate::splats::attributes::planes;
-use crate::splats::densify::{Densifier, DensifyInputs, DensifyReport, DeviceGaussians, Round};
-use crate::splats::halves::Bits;
-use crate::splats::optimizer::{Adam, AdamBuffers, FiniteCheck, LearningRates};
-use crate::splats::scene::{ATTRIBUTES, Attribute, Gaussians, Shape, width};
+use crate::splats::attributes::{PlaneCounts, planes};
+use crate::splats::densify::{Densifier, DensifyInputs, DensifyReport, Round};
+use crate::splats::halves::StorageFormat;
+use crate::splats::optimizer::{Adam, AdamBuffers, FiniteCheck, LearningRates, Moments};
+use crate::splats::scene::{
+    ATTRIBUTES, Attribute, DeviceGaussians, GaussianSlice, Gaussians, Layout, Shape,
+};
 
 impl Trainer {
     /// The gradient of every parameter that the last step left, in the frame.
@@ -16,7 +18,7 @@ impl Trainer {
     /// The device was lost.
     pub fn gradients(&self) -> Result<Gaussians> {
         let Model { gaussians, gradients, .. } = &self.model;
-        let planes = gaussians.batches(&self.gpu).read(&self.gpu, gradients)?;
+        let planes = gaussians.layout.batches(&self.gpu).read(&self.gpu, gradients)?;
         Ok(self.model.host(planes))
     }
 }
@@ -28,8 +30,8 @@ impl Trainer {
 #[derive(Debug)]
 pub(super) struct Model {
     pub(super) gaussians: DeviceGaussians,
-    /// Of the planes.
-    shape: Shape,
+    /// What Adam keeps.
+    pub(super) moments: Moments,
     /// The SH degree that the Gaussians have wherever they are seen.
     sh_degree: u32,
     /// As many as parameters.
@@ -52,15 +54,12 @@ impl Model {
     ) -> Result<Self> {
         let sh_degree = gaussians.shape.sh_degree;
         let gaussians = gaussians.with_sh_degree(in_use.max(gaussians.sh_degree_in_use()));
-        let Gaussians { count, shape, parameters } = gaussians;
-        let dimensions = [width(shape), shape.features.width()];
-        let bits = [precision.rest, precision.moments];
-        let mut gaussians = DeviceGaussians::new(gpu, count, dimensions, bits)?;
-        gaussians.write(gpu, &parameters)?;
+        let gaussians = gaussians.upload_as(gpu, precision.rest)?;
+        let (batches, count) = (gaussians.layout.batches(gpu), gaussians.layout.count);
         Ok(Self {
-            shape,
             sh_degree,
-            gradients: gaussians.batches(gpu).zeros(gpu, "gradients")?,
+            moments: Moments::of(precision.moments, |name| batches.zeros(gpu, name))?,
+            gradients: batches.zeros(gpu, "gradients")?,
             grad_norm_sums: gpu.zeros("grad_norm_sums", count)?,
             visit_counts: gpu.zeros("visit_counts", count)?,
             gaussians,
@@ -74,12 +73,11 @@ impl Model {
     pub(super) fn sh_degree_of_words(&self, words: usize) -> u32 {
         let whole = self.whole_shape();
         let of = |sh_degree| {
-            let columns = width(Shape { sh_degree, ..whole });
-            self.gaussians.rest.columns([columns, whole.features.width()])
+            Layout { shape: Shape { sh_degree, ..whole }, ..self.gaussians.layout }.words()
         };
         (0..=whole.sh_degree)
             .find(|&sh_degree| of(sh_degree) == words)
-            .unwrap_or(self.shape.sh_degree)
+            .unwrap_or(self.shape().sh_degree)
     }
 
     /// As many others of the same make, to be overwritten.
@@ -87,20 +85,20 @@ impl Model {
     /// # Errors
     /// The device is out of memory or lost.
     pub(super) fn zeros_like(&self, gpu: &Gpu, count: usize, in_use: u32) -> Result<Self> {
-        let DeviceGaussians { rest, ref moments, .. } = self.gaussians;
-        let precision =
-            PrecisionConfig { rest, moments: moments.bits(), ..PrecisionConfig::default() };
+        let (rest, moments) = (self.gaussians.layout.sh_rest, self.moments.bits());
+        let precision = PrecisionConfig { rest, moments, ..PrecisionConfig::default() };
         Self::upload(gpu, &Gaussians::zeros(count, self.whole_shape()), in_use, &precision)
     }
 
     /// What the Gaussians are made of wherever they are seen.
     pub(super) fn whole_shape(&self) -> Shape {
-        Shape { sh_degree: self.sh_degree, ..self.shape }
+        Shape { sh_degree: self.sh_degree, ..self.shape() }
     }
 
     /// Gaussians of planes as they are on the device: with the SH degree that was in use so far.
     fn host(&self, parameters: Vec<f32>) -> Gaussians {
-        Gaussians { count: self.count(), shape: self.shape, parameters }
+        let DeviceGaussians { layout: Layout { count, shape, .. }, origin, .. } = self.gaussians;
+        Gaussians { count, shape, parameters, origin }
     }
 
     /// Makes room for another SH degree; coefficients beyond it go, with what Adam keeps of them.
@@ -108,45 +106,45 @@ impl Model {
     /// # Errors
     /// The device is out of memory or lost; the model is as it was.
     pub(super) fn set_sh_degree(&mut self, gpu: &Gpu, sh_degree: u32) -> Result<()> {
-        let (count, room, own) = (self.count(), self.capacity(), self.shape);
-        let new = Shape { sh_degree, ..own };
-        let columns = width(new);
+        let own = self.gaussians.layout;
+        let new = Layout { shape: Shape { sh_degree, ..own.shape }, ..own };
+        let (room, columns) = (own.capacity, new.floats().columns);
         // Longer buffers with what they held, one after the other, and with room for as many Gaussians as before.
-        let words = self.gaussians.rest.columns([columns, new.features.width()]);
-        lengthen(gpu, &mut self.gaussians.parameters, room * words)?;
+        lengthen(gpu, &mut self.gaussians.parameters, room * new.words())?;
         self.planes_mut().try_for_each(|plane| lengthen(gpu, plane, room * columns))?;
         let parameters = self.gaussians.read(gpu)?;
-        let batches = self.gaussians.batches(gpu);
+        let batches = own.batches(gpu);
         let planes = self.planes_mut().map(|plane| batches.read(gpu, &*plane));
         let planes = planes.collect::<Result<Vec<_>>>()?;
 
-        (self.shape, self.gaussians.column_count) = (new, columns as u32);
+        self.gaussians.layout = new;
+        let (count, shape, origin) = (own.count, own.shape, self.gaussians.origin);
         let resized = |parameters| {
-            Gaussians { count, shape: own, parameters }.with_sh_degree(sh_degree).parameters
+            Gaussians { count, shape, parameters, origin }.with_sh_degree(sh_degree).parameters
         };
         self.gaussians.write(gpu, &resized(parameters))?;
-        let batches = self.gaussians.batches(gpu);
+        let batches = new.batches(gpu);
         let mut pairs = self.planes_mut().zip(planes);
         pairs.try_for_each(|(plane, values)| batches.write(gpu, plane, &resized(values)))
     }
 
     /// What has a float of every column beside the parameters.
     fn planes_mut(&mut self) -> impl Iterator<Item = &mut Buffer<f32>> {
-        let moments = self.gaussians.moments.planes_mut().into_iter().map(|(_, plane)| plane);
+        let moments = self.moments.planes_mut().into_iter().map(|(_, plane)| plane);
         std::iter::once(&mut self.gradients).chain(moments)
     }
 
     pub(super) fn shape(&self) -> Shape {
-        self.shape
+        self.gaussians.layout.shape
     }
 
     pub(super) fn count(&self) -> usize {
-        self.gaussians.count as usize
+        self.gaussians.layout.count
     }
 
     /// How many Gaussians the buffers have room for.
     pub(super) fn capacity(&self) -> usize {
-        self.grad_norm_sums.len()
+        self.gaussians.layout.capacity
     }
 
     /// Records a step of Adam, over the columns that the SH degree in use leaves: coefficients beyond have no gradient and no
@@ -163,26 +161,24 @@ impl Model {
         sh_degree: u32,
         status: &Buffer<u32>,
     ) -> Result<()> {
-        let gaussians = &mut self.gaussians;
-        let DeviceGaussians { column_count, feature_count, rest, .. } = *gaussians;
-        let first = width(0) as u32 + feature_count;
-        let of_floats = if sh_degree == 0 || rest == Bits::Half { first } else { column_count };
-        gaussians.batches(gpu).iter().try_for_each(|batch| {
-            let words = gaussians.parameter_columns();
+        let Self { gaussians, moments, .. } = self;
+        let layout = gaussians.layout;
+        let is_half = layout.sh_rest == StorageFormat::Half;
+        layout.batches(gpu).iter().try_for_each(|batch| {
+            let planes = PlaneCounts { gaussians: batch.count, ..layout.floats() };
+            let columns =
+                if sh_degree == 0 || is_half { planes.before_rest() } else { planes.columns };
+            let floats = PlaneCounts { columns, ..planes };
             let mut buffers = AdamBuffers {
-                parameters: batch.rows_mut(&mut gaussians.parameters, words)?,
+                parameters: batch.rows_mut(&mut gaussians.parameters, layout.words())?,
                 gradients: batch.planes(&self.gradients)?,
-                moments: gaussians.moments.of_batch(&batch)?,
+                moments: moments.of_batch(&batch)?,
             };
-            let count = batch.gaussian_count();
-            let floats = [count, of_floats, feature_count];
             adam.record(pass, step, rates, floats, buffers.reborrow(), status)?;
-            if sh_degree == 0 || rest == Bits::Single {
+            if sh_degree == 0 || !is_half {
                 return Ok(());
             }
-            let rate = rates[Attribute::Rest];
-            let halves = [count, first, column_count - first];
-            adam.record_halves(pass, step, rate, halves, buffers, status)
+            adam.record_halves(pass, step, rates[Attribute::Rest], planes, buffers, status)
         })
     }
 
@@ -196,9 +192,10 @@ impl Model {
         gpu: &Gpu,
         densifier: &mut Densifier,
         round: Round,
-        keeps: impl FnMut(&Buffer<f32>, usize) -> Result<f64>,
+        keeps: impl FnMut(GaussianSlice<'_>) -> Result<f64>,
     ) -> Result<DensifyReport> {
         let inputs = DensifyInputs {
+            moments: &mut self.moments,
             grad_norm_sums: &mut self.grad_norm_sums,
             visit_counts: &mut self.visit_counts,
             gradients: &mut self.gradients,
@@ -221,8 +218,8 @@ impl Model {
         gpu: &Gpu,
         finite: &mut FiniteCheck,
     ) -> Result<Option<usize>> {
-        let (batches, words) =
-            (self.gaussians.parameter_batches(gpu), self.gaussians.parameter_columns());
+        let layout = self.gaussians.layout;
+        let (batches, words) = (layout.parameter_batches(gpu), layout.words());
         let mut before = 0;
         for batch in batches.iter() {
             let planes = batch.rows(&self.gaussians.parameters, words)?;
@@ -236,7 +233,7 @@ impl Model {
 
     /// The attribute and the Gaussian that the number at an index of planes of so many columns belongs to.
     pub(super) fn place_of(&self, index: usize, columns: usize) -> (String, usize) {
-        let (count, features) = (self.count().max(1), self.shape.features.width());
+        let (count, features) = (self.count().max(1), self.shape().features.width());
         let mut planes = ATTRIBUTES.iter().zip(planes(features, columns));
         let within = |(column, width): (usize, usize)| {
             (column * count..(column + width) * count).contains(&index)
@@ -250,7 +247,7 @@ impl Model {
     /// # Errors
     /// The device was lost.
     pub(super) fn download(&self, gpu: &Gpu) -> Result<Gaussians> {
-        Ok(self.host(self.gaussians.read(gpu)?))
+        self.gaussians.download(gpu)
     }
 }
 
@@ -275,20 +272,20 @@ mod tests {
     fn another_sh_degree_keeps_the_room_and_what_the_planes_hold() {
         let gpu = gpu();
         let shape = Shape { sh_degree: 3, features: Features::NONE };
-        for rest in [Bits::Single, Bits::Half] {
-            let precision = PrecisionConfig { rest, ..PrecisionConfig::default() };
+        for rest in [StorageFormat::Single, StorageFormat::Half] {
+            let precision =
+                PrecisionConfig { rest, moments: StorageFormat::Single, ..Default::default() };
             let mut given = Gaussians::zeros(10, shape);
             // What is in use of the degree 3 is none, and room is for that.
             given.parameters[..140].fill(0.5);
             let mut model = Model::upload(&gpu, &given, 0, &precision).unwrap();
             assert_eq!(model.gaussians.parameters.len(), 140);
             model.set_sh_degree(&gpu, 2).unwrap();
-            let words = rest.columns([width(Shape { sh_degree: 2, ..shape }), 0]);
-            assert_eq!(model.gaussians.parameters.len(), 10 * words);
+            assert_eq!(model.gaussians.parameters.len(), 10 * model.gaussians.layout.words());
             assert_eq!(model.download(&gpu).unwrap(), given.with_sh_degree(2));
 
             // As after a round that left room for half as many again.
-            model.gaussians.count = 6;
+            model.gaussians.layout.count = 6;
             model.set_sh_degree(&gpu, 3).unwrap();
             let lens = model.planes_mut().map(|plane| plane.len()).collect::<Vec<_>>();
             assert_eq!((model.capacity(), lens), (10, vec![590; 3]));

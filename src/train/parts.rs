@@ -4,8 +4,8 @@ use std::path::PathBuf;
 use std::str::FromStr;
 
 use glam::UVec2;
-use serde::{Deserialize, Serialize};
 
+use crate::base::settings::{Rule, settings};
 use crate::loss::{DepthBoxes, Weights};
 use crate::networks::{Denoiser, DenoiserSettings, Form, Tonemapper};
 use crate::splats::scene::Features;
@@ -71,71 +71,51 @@ impl FromStr for Part {
     }
 }
 
+settings! {
+"model."
 /// Which parts a model has beside colour, and their constants. The default is colour alone.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct ModelConfig {
-    /// [`Part::Denoiser`].
-    pub denoiser: bool,
-    /// [`Part::Tonemapper`].
-    pub tonemapper: bool,
-    /// [`Part::Structure`].
-    pub structure: bool,
-    /// [`Part::Depth`]; off for views without a depth map.
-    pub depth: bool,
+    /// Stages of a network that take the noise from the render.
+    denoiser: bool = false => Rule::Flag;
+    /// A network that darkens illumination times the render to the dark photograph.
+    tonemapper: bool = false => Rule::Flag;
+    /// A feature that is held to the colour-invariant edges of the target.
+    structure: bool = false => Rule::Flag;
+    /// A feature that is held to a depth map from elsewhere; off for views without one.
+    depth: bool = false => Rule::Flag;
     /// Colours are the bare SH sum of LITA-GS instead of max(SH + 0.5, 0), what viewers show.
-    pub raw_colors: bool,
-    /// Side in pixels of the random crop that the networks train on; 0: the whole view.
-    pub denoiser_crop: u32,
-    /// Side in pixels of the boxes of the local depth term.
-    pub depth_box: u32,
-    /// A folder of depth maps, in place of `depth/` or `depth_maps/` of the dataset.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub depth_folder: Option<PathBuf>,
+    raw_colors: bool = false => Rule::Flag, "--raw-colors BOOL";
+    /// Train the networks on a random crop of at most N x N pixels a step; 0: on the whole view.
+    denoiser_crop: u32 = 0 => Rule::Whole(0, u32::MAX as u64), in "pixels", "--denoiser-crop N";
+    /// The side of the boxes of the local depth term.
+    depth_box: u32 = 128 => Rule::Whole(2, u32::MAX as u64), in "pixels";
+    /// A folder of depth maps, `NAME.*` or `depth_NAME.*`, larger is farther.
+    depth_folder: Option<PathBuf> = None, "`depth/` or `depth_maps/` of the dataset" => Rule::PATH, "--depth DIR";
     /// The depth maps hold disparity: larger is nearer.
-    pub depth_is_disparity: bool,
+    depth_is_disparity: bool = false => Rule::Flag, "--depth-is-disparity";
+}
+sections {
     /// The size of the denoiser, and what the networks begin as.
-    pub network: DenoiserSettings,
+    network: DenoiserSettings;
     /// What each term weighs beside (1 - w) L1 + w (1 - SSIM).
-    pub weights: Weights,
+    weights: Weights;
     /// Adam's learning rates of the networks.
-    pub rates: NetworkRates,
+    rates: NetworkRates;
+}
 }
 
-/// Adam's learning rates, constant.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+settings! {
+"model.rates."
+/// Adam's learning rates, constant. A denoiser that begins as the identity learns in hundreds of steps at ten times the
+/// paper's rate.
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct NetworkRates {
-    /// Of the denoiser.
-    pub denoiser: f64,
-    /// Of the tonemapper.
-    pub tonemapper: f64,
+    /// Adam's rate of the denoiser.
+    denoiser: f64 = 5e-4 => Rule::POSITIVE_OR_0;
+    /// Adam's rate of the tonemapper.
+    tonemapper: f64 = Tonemapper::LEARNING_RATE => Rule::POSITIVE_OR_0;
 }
-
-impl Default for ModelConfig {
-    fn default() -> Self {
-        Self {
-            denoiser: false,
-            tonemapper: false,
-            structure: false,
-            depth: false,
-            raw_colors: false,
-            denoiser_crop: 0,
-            depth_box: 128,
-            depth_folder: None,
-            depth_is_disparity: false,
-            network: DenoiserSettings::default(),
-            weights: Weights::default(),
-            rates: NetworkRates::default(),
-        }
-    }
-}
-
-/// A denoiser that begins as the identity learns in hundreds of steps at ten times the paper's rate.
-impl Default for NetworkRates {
-    fn default() -> Self {
-        Self { denoiser: 5e-4, ..Self::paper() }
-    }
 }
 
 impl NetworkRates {
@@ -204,21 +184,12 @@ impl ModelConfig {
     }
 
     /// # Errors
-    /// [`Error::Usage`] names a value that makes no sense.
+    /// [`Error::Setting`].
     pub(super) fn check(&self) -> Result<()> {
-        self.network.check()?;
-        let NetworkRates { denoiser, tonemapper } = self.rates;
-        for (name, rate) in [("denoiser", denoiser), ("tonemapper", tonemapper)] {
-            if !(rate.is_finite() && rate >= 0.0) {
-                let problem = format!("model.rates.{name} is {rate}; it must be 0 or more");
-                return Err(Error::Usage(problem));
-            }
-        }
-        if self.depth_box < 2 {
-            let problem = format!("model.depth_box is {}; it must be at least 2", self.depth_box);
-            return Err(Error::Usage(problem));
-        }
-        Ok(())
+        self.check_rows()?;
+        self.network.check_rows()?;
+        self.weights.check_rows()?;
+        self.rates.check_rows()
     }
 }
 

@@ -38,7 +38,7 @@ impl Kernels {
 
 /// The SH degree of the first step.
 pub(super) fn first_sh_degree(config: &TrainConfig) -> u32 {
-    config.schedule.sh_degree(1, config.sh_degree)
+    config.sh_degree_at(1, config.sh_degree)
 }
 
 /// Everything that is learned beside the Gaussians: Adam trains it, and checkpoints keep it.

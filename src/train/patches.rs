@@ -44,7 +44,7 @@ impl Trainer {
         let Some((largest, _)) = largest else { return Ok(None) };
         let patches: Vec<Patch> =
             patches().filter(|&(place, _)| place == largest).map(|(_, patch)| patch).collect();
-        let gaussians = &self.model.gaussians.parameters;
+        let gaussians = self.model.gaussians.slice();
         let mut met = 0;
         for patch in &patches {
             met = met.max(self.renderer.count_intersections(gaussians, patch)?);
@@ -122,7 +122,7 @@ mod tests {
             eprintln!("not run: this device binds {}", gpu.properties().max_storage_buffer_range);
             return;
         }
-        let mut config = TrainConfig::default();
+        let mut config = TrainConfig::bare();
         let count = |config: &TrainConfig, width, height| {
             let patches = config.patches(&gpu, &camera(width, height));
             patches.iter().for_each(|patch| assert!(patch.pixel_count() <= 1 << 24));

@@ -36,9 +36,9 @@ impl TrainConfig {
 
     /// Those that are given.
     fn paths(&mut self) -> Vec<&mut PathBuf> {
-        let optional =
-            [&mut self.reference, &mut self.model.depth_folder, &mut self.exposure.start];
-        let paths = optional.into_iter().flatten().chain([&mut self.dataset]);
+        let Self { dataset, reference, init, model, exposure, .. } = self;
+        let optional = [reference, init, &mut model.depth_folder, &mut exposure.start];
+        let paths = optional.into_iter().flatten().chain([dataset]);
         paths.filter(|path| !path.as_os_str().is_empty()).collect()
     }
 }

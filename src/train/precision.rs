@@ -8,20 +8,23 @@ use rustc_hash::{FxHashMap, FxHashSet};
 use serde::{Deserialize, Serialize};
 
 use crate::Result;
+use crate::base::settings::{Rule, settings};
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::decode;
-use crate::splats::halves::Bits;
+use crate::splats::halves::StorageFormat;
 
+settings! {
+"precision."
 /// In how many bits a run keeps what it could keep in fewer.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PrecisionConfig {
-    /// The training photographs, or the targets that are made of them once.
-    pub photographs: PhotographBits,
-    /// SH coefficients above degree 0.
-    pub rest: Bits,
-    /// What Adam keeps of the gradients of every Gaussian.
-    pub moments: Bits,
+    /// Bits of the training photographs, or of the targets that are made of them once. exact: as few as give every value back.
+    photographs: PhotographBits = PhotographBits::Exact => Rule::OneOf(&["exact", "32", "16", "8"]);
+    /// Bits of the SH coefficients above degree 0.
+    rest: StorageFormat = StorageFormat::Half => Rule::OneOf(&["32", "16"]);
+    /// Bits of what Adam keeps of the gradients of every Gaussian.
+    moments: StorageFormat = StorageFormat::Half => Rule::OneOf(&["32", "16"]);
+}
 }
 
 /// In how many bits a photograph, or a target, is kept on the device.

@@ -1,14 +1,15 @@
 //! Presets: how much time a run takes for its score, and every constant that the paper and its code state for a benchmark.
 //!
-//! Those of the first kind are files in `presets/`: settings as config.toml has them, over whatever is set already.
+//! They are files in `presets/`: settings as config.toml has them, in which they differ from the defaults.
 
+use std::path::Path;
 use std::str::FromStr;
 
-use super::{DensityConfig, TrainConfig};
+use toml::Value;
+
+use super::TrainConfig;
+use super::layers::{Layer, Origin};
 use crate::photographs::tone::ToneCurve;
-use crate::splats::attributes::Attribute;
-use crate::splats::optimizer::Schedule;
-use crate::splats::scene::init::Start;
 use crate::{Error, Result};
 
 /// A trade of time for quality, or a benchmark that the paper reports.
@@ -59,15 +60,17 @@ impl Preset {
         }
     }
 
-    /// The settings of a preset that trades time for quality, as TOML; a benchmark's depend on curve and scene.
-    pub fn toml(self) -> Option<&'static str> {
+    /// The settings of a preset that trades time for quality, as TOML, in which it differs from the defaults; a benchmark has
+    /// those of the paper and more, which depend on curve and scene.
+    pub fn toml(self) -> &'static str {
         match self {
-            Self::Draft => Some(include_str!("presets/draft.toml")),
-            Self::Fast => Some(include_str!("presets/fast.toml")),
-            Self::Balanced => Some(include_str!("presets/balanced.toml")),
-            Self::Best => Some(include_str!("presets/best.toml")),
-            Self::Paper => Some(include_str!("presets/paper.toml")),
-            Self::Lom | Self::RealX3d | Self::Mip360Varying => None,
+            Self::Draft => include_str!("presets/draft.toml"),
+            Self::Fast => include_str!("presets/fast.toml"),
+            Self::Balanced => include_str!("presets/balanced.toml"),
+            Self::Best => include_str!("presets/best.toml"),
+            Self::Paper | Self::Lom | Self::RealX3d | Self::Mip360Varying => {
+                include_str!("presets/paper.toml")
+            }
         }
     }
 
@@ -76,69 +79,79 @@ impl Preset {
         matches!(self, Self::Draft | Self::Fast | Self::Balanced | Self::Best)
     }
 
-    /// Sets what its TOML says; of a benchmark the first Gaussians, density control, schedule and what the paper states for
-    /// it and, where its code has a file for the scene that the dataset's folder is named after, what that file states. c is
-    /// that of the configuration's curve; the automatic one gives way to AP3 there and with [`Preset::Paper`].
+    /// Whether it has the constants of one of the paper's benchmarks.
+    pub fn is_benchmark(self) -> bool {
+        matches!(self, Self::Lom | Self::RealX3d | Self::Mip360Varying)
+    }
+
+    /// Sets what the preset says, for the curve that the configuration has; the automatic one gives way to AP3 in those of the
+    /// paper.
     ///
     /// # Errors
     /// None for the presets that there are.
     pub fn apply(self, config: &mut TrainConfig) -> Result<()> {
-        if !self.is_planned() && config.tone.curve == ToneCurve::Auto {
-            config.tone = config.tone.with_curve(ToneCurve::Ap3);
-        }
-        match self.toml() {
-            Some(text) => *config = config.overlaid(text)?,
-            None => self.apply_benchmark(config),
-        }
+        let curve = Some(config.tone.curve).filter(|&curve| curve != ToneCurve::Auto);
+        *config = config.overlaid(&self.layer(curve, &config.dataset)?)?;
         Ok(())
     }
 
-    fn apply_benchmark(self, config: &mut TrainConfig) {
-        (config.schedule, config.density) = (Schedule::paper(), DensityConfig::paper());
-        config.start = Start::PAPER;
-        config.max_resolution = 0;
-        config.model.follow_paper();
-        let curve = config.tone.curve;
-        let of_curve = |ase: f64, ap3: f64| match curve {
-            ToneCurve::Ase => ase,
-            ToneCurve::Ap3 => ap3,
-            _ => config.tone.gain_c,
+    /// What the preset says, where `curve` is the one that is named: of a benchmark what the paper states for it and, where
+    /// its code has a file for the scene that the dataset's folder is named after, what that file states.
+    ///
+    /// # Errors
+    /// None for the presets that there are.
+    pub(super) fn layer(self, curve: Option<ToneCurve>, dataset: &Path) -> Result<Layer> {
+        let origin = Origin::Preset(self.name());
+        let mut layer = Layer::of_toml(self.toml(), &origin)?;
+        let mut say = |key: &str, value: Value| layer.push(key, value, origin.clone());
+        if let (false, Some(curve)) = (self.is_planned(), curve) {
+            say("tone.curve", curve.name().into())?;
+        }
+        if !self.is_benchmark() {
+            return Ok(layer);
+        }
+        let is_realx3d = self == Self::RealX3d;
+        let curve = curve.unwrap_or(ToneCurve::Ap3);
+        let [of_ase, of_ap3] = match self {
+            Self::Lom => [3.0, 1.0],
+            Self::RealX3d => [4.0, 2.0],
+            _ => [0.0, 0.0],
         };
-        let gain_c = match self {
-            Self::Lom => of_curve(3.0, 1.0),
-            Self::RealX3d => of_curve(4.0, 2.0),
-            _ => of_curve(0.0, 0.0),
-        };
-        let tone = &mut config.tone;
-        (tone.gain_c, tone.alpha, tone.beta, tone.base_gain) = (gain_c, 0.12, 2.5, 1.0);
-        tone.theta = if self == Self::RealX3d { 0.37 } else { 0.49 };
-        config.steps = if self == Self::Lom { 5_000 } else { 15_000 };
-        config.seed = 10;
-        config.ssim_weight = if self == Self::RealX3d { 0.2 } else { 0.0 };
-        self.apply_scene(config);
-    }
-
-    fn apply_scene(self, config: &mut TrainConfig) {
-        let folder = config.dataset.canonicalize().unwrap_or_else(|_| config.dataset.clone());
+        match curve {
+            ToneCurve::Ase => say("tone.gain_c", of_ase.into())?,
+            ToneCurve::Ap3 => say("tone.gain_c", of_ap3.into())?,
+            _ => {}
+        }
+        if curve != ToneCurve::Auto {
+            say("tone.alpha", 0.12.into())?;
+        }
+        say("tone.theta", if is_realx3d { 0.37 } else { 0.49 }.into())?;
+        say("max_resolution", 0.into())?;
+        say("steps", if self == Self::Lom { 5_000 } else { 15_000 }.into())?;
+        say("ssim_weight", if is_realx3d { 0.2 } else { 0.0 }.into())?;
+        let folder = dataset.canonicalize().unwrap_or_else(|_| dataset.to_owned());
         let scene = folder.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
-        let schedule = &mut config.schedule;
-        match (self, scene.as_str()) {
-            (Self::Lom, "chair") => config.model.weights.low_ssim = 0.5,
+        let of_scene: &[(&str, f64)] = match (self, scene.as_str()) {
+            (Self::Lom, "chair") => &[("model.weights.low_ssim", 0.5)],
             (Self::Lom, "sofa") => {
-                config.ssim_weight = 0.25;
-                schedule.means_rate_steps = 10_000;
+                say("schedule.means_rate_steps", 10_000.into())?;
+                &[("ssim_weight", 0.25)]
             }
             (Self::Lom, "shrub") => {
-                config.ssim_weight = 0.4;
-                config.model.network.stages = 6;
-                schedule.means_rate_steps = 20_000;
-                schedule.initial_rates[Attribute::Means] = 2.5e-4;
-                schedule.final_means_rate = 2.5e-6;
+                say("schedule.means_rate_steps", 20_000.into())?;
+                say("model.network.stages", 6.into())?;
+                &[
+                    ("ssim_weight", 0.4),
+                    ("schedule.initial_rates.means", 2.5e-4),
+                    ("schedule.final_means_rate", 2.5e-6),
+                ]
             }
-            (Self::RealX3d, "bluehawaii") => config.ssim_weight = 0.0,
-            _ => return,
-        }
+            (Self::RealX3d, "bluehawaii") => &[("ssim_weight", 0.0)],
+            _ => return Ok(layer),
+        };
         tracing::info!("preset {}: the constants of scene {scene}", self.name());
+        of_scene.iter().try_for_each(|&(key, value)| say(key, value.into()))?;
+        Ok(layer)
     }
 }
 
@@ -161,15 +174,15 @@ impl FromStr for Preset {
 
 #[cfg(test)]
 mod tests {
-    use std::path::Path;
-
     use super::*;
     use crate::loss::Weights;
     use crate::networks::Form;
     use crate::photographs::tone::ToneSettings;
+    use crate::splats::attributes::Attribute;
     use crate::splats::densify::DensityControl;
-    use crate::splats::halves::Bits;
-    use crate::train::{Background, ModelConfig};
+    use crate::splats::optimizer::Schedule;
+    use crate::splats::scene::init::Start;
+    use crate::train::{DensityConfig, ModelConfig};
 
     fn applied(preset: Preset, scene: &str, curve: ToneCurve) -> TrainConfig {
         let tone = ToneSettings::new(curve);
@@ -198,9 +211,11 @@ mod tests {
     }
 
     #[test]
-    fn paper_is_the_paper_and_balanced_is_the_library_default_but_for_its_end_its_background_its_bits_and_what_fills()
-     {
-        let paper = applied(Preset::Paper, "x", ToneCurve::Auto);
+    fn balanced_is_the_default_and_paper_is_the_paper_beside_the_bare_method() {
+        assert_eq!(
+            applied(Preset::Balanced, "x", ToneCurve::Auto),
+            TrainConfig { dataset: "data/x".into(), ..TrainConfig::default() }
+        );
         let mut model = ModelConfig::default();
         model.follow_paper();
         let expected = TrainConfig {
@@ -210,37 +225,10 @@ mod tests {
             schedule: Schedule::paper(),
             density: DensityConfig::paper(),
             model,
-            ..Default::default()
+            ..TrainConfig::bare()
         };
-        assert_eq!(paper, expected);
-        let (balanced, defaults) =
-            (applied(Preset::Balanced, "x", ToneCurve::Ase), TrainConfig::default());
-        assert_eq!((balanced.tone.curve, balanced.stop.views), (ToneCurve::Ase, 8));
-        assert_eq!(
-            (balanced.background, defaults.background),
-            (Background::Random, Background::Black)
-        );
-        assert_eq!((balanced.schedule.settle_steps, defaults.schedule.settle_steps), (250, 0));
-        assert_eq!((balanced.precision.rest, balanced.precision.moments), (Bits::Half, Bits::Half));
-        let (tone, stop) = (defaults.tone.clone(), defaults.stop.clone());
-        assert_eq!((balanced.density.fill, defaults.density.fill), (5_000, 0));
-        let (density, precision) = (defaults.density.clone(), defaults.precision.clone());
-        assert_eq!(DensityConfig { fill: 0, ..balanced.density.clone() }, density);
-        let (schedule, background) = (defaults.schedule.clone(), defaults.background);
-        let plain =
-            TrainConfig { tone, stop, density, precision, schedule, background, ..balanced };
-        assert_eq!(plain, TrainConfig { dataset: "data/x".into(), ..defaults });
+        assert_eq!(applied(Preset::Paper, "x", ToneCurve::Auto), expected);
         assert!(!Preset::Paper.is_planned() && Preset::Balanced.is_planned());
-    }
-
-    #[test]
-    fn the_guide_shows_every_preset_as_it_is() {
-        let guide = include_str!("../../docs/guide.md");
-        for preset in Preset::ALL {
-            let Some(text) = preset.toml() else { continue };
-            let shown = format!("```toml\n# --preset {}\n{text}```", preset.name());
-            assert!(guide.contains(&shown), "docs/guide.md lacks\n{shown}");
-        }
     }
 
     #[test]
@@ -250,7 +238,6 @@ mod tests {
         Preset::Draft.apply(&mut config).unwrap();
         assert_eq!((config.seed, config.schedule.means_rate_steps), (4, 7));
         assert_eq!((config.sh_degree, config.schedule.densify_interval), (0, 50));
-        assert!(config.overlaid("stepz = 3").unwrap_err().to_string().contains("stepz"));
     }
 
     #[test]

@@ -3,9 +3,9 @@
 use super::Networks;
 use crate::Result;
 use crate::camera::{Camera, Patch};
-use crate::gpu::Buffer;
 use crate::photographs::image::Image;
 use crate::splats::render::{RenderOptions, Renderer};
+use crate::splats::scene::{GaussianSlice, Layout};
 
 /// What a model shows of a view.
 #[derive(Clone, Debug)]
@@ -19,18 +19,20 @@ pub struct Rendered {
 }
 
 impl Rendered {
-    /// Renders what `camera` sees of so many `gaussians`, (columns x Gaussians), and what the networks make of it: patch by
+    /// Renders what `camera` sees of `gaussians`, and what the networks make of it: patch by
     /// patch where the device takes no more at once. A denoiser's norms then look at each patch.
     ///
     /// # Errors
     /// As [`Renderer::render_image`]; the device is out of memory for the view or the networks.
-    pub fn new(
+    pub fn new<'a>(
         renderer: &mut Renderer,
-        (gaussians, count): (&Buffer<f32>, usize),
+        gaussians: impl Into<GaussianSlice<'a>>,
         camera: &Camera,
         options: &RenderOptions,
         networks: Option<&mut Networks>,
     ) -> Result<Self> {
+        let gaussians = gaussians.into();
+        let Layout { count, capacity, .. } = gaussians.layout;
         let Some(networks) = networks.filter(|networks| networks.has_denoiser()) else {
             renderer.reserve(count, [camera])?;
             let planes = renderer.render_planes(gaussians, camera, options)?;
@@ -42,7 +44,7 @@ impl Rendered {
         let mut planes = vec![];
         for patch in patches {
             let around = patch.with_margin(margin);
-            renderer.reserve_with_headroom([count; 2], [around.size])?;
+            renderer.reserve_sizes(count, capacity, [around.size])?;
             let own = renderer.render_patch(gaussians, &around, options)?;
             planes.resize(own.len() / around.pixel_count() * whole.pixel_count(), 0.0);
             patch.paste((&around, &own), (&whole, &mut planes));

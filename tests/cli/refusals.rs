@@ -155,8 +155,12 @@ fn misuse_is_said_in_one_line_with_exit_code_2() {
     train("--steps 0", &["--steps"]);
     train("--sh-degree 4", &["--sh-degree", "0 to 3"]);
     train("--downscale 0.5", &["downscale"]);
-    train("--background blue", &["blue", "black or random"]);
+    train("--background blue", &["background (--background) is \"blue\"", "black or random"]);
     train("--stepz 3", &["--stepz"]);
+    train("--steps many", &["steps (--steps) is \"many\"; it must be a whole number, at least 1"]);
+    train("--set stop.not_finite=skip", &["stop.not_finite is", "stop or skip-view"]);
+    train("--set density.gradient=1", &["`density.gradient`", "`density.gradient_threshold`"]);
+    train("--exposure on --parts tonemapper", &["exposure.learn (--exposure) is on", "tonemapper"]);
     refused("train", 2, &["--out", "required"]);
     refused("evaluate x", 2, &["evaluate"]);
     refused("render x --split none --out y", 2, &["none", "train, test, all"]);
@@ -176,6 +180,34 @@ fn a_configuration_with_an_unknown_key_names_it() {
         3,
         &["config.toml", "stepz", "(line 2)"],
     );
+}
+
+#[test]
+fn every_setting_is_explained_with_who_says_it_and_nothing_is_trained() {
+    let folder = tempfile::tempdir().unwrap();
+    let (file, run) = (folder.path().join("a.toml"), folder.path().join("run"));
+    fs::write(&file, "near = 0.2\nsteps = 3\n").unwrap();
+    let explained = |options: &str| {
+        let train = format!("train {} --out {} --explain", fixture().set(), run.display());
+        crate::common::command::run(&format!("{train} {options}"), 0).0
+    };
+    let said = explained("--preset draft --seed 4 --set stop.margin=1");
+    for line in [
+        "steps = 400  (preset draft)\n",
+        "seed = 4  (--seed)\n",
+        "stop.margin = 1.0  (--set)\n",
+        "exposure.learn = \"off\"  (plan)\n",
+        "ssim_weight = 0.2  (default)\n    Weight of 1 - SSIM",
+    ] {
+        assert!(said.contains(line), "no {line} in {said}");
+    }
+    let said = explained(&format!("--preset draft --config {} --steps 5", file.display()));
+    assert!(said.contains(&format!("near = 0.2  ({})\n", file.display())), "{said}");
+    assert!(
+        said.contains("steps = 5  (--steps)\n") && said.contains("sh_degree = 0  (preset draft)"),
+        "{said}"
+    );
+    assert!(!run.exists());
 }
 
 #[test]

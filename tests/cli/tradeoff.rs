@@ -173,7 +173,7 @@ fn misuse_is_refused_before_anything_is_trained() {
     };
     refused("--knob density.grad=1", 2, &["density.grad", "nearest"]);
     refused("--knob steps", 2, &["--knob steps", "KEY=V1,V2"]);
-    refused("--knob steps=many", 2, &["steps=many"]);
+    refused("--knob steps=many", 2, &["steps (--steps) is \"many\"", "a whole number"]);
     refused("--knob downscale=2,4", 2, &["downscale", "resolution_steps"]);
     refused("--preset fast", 2, &["--presets"]);
     refused("--presets fast,slow", 2, &["slow", "draft"]);

@@ -2,8 +2,8 @@
 
 use glam::{DAffine3, DMat3, DVec2, DVec3, UVec2, Vec2};
 use nightsplat::camera::{self, CameraModel, KannalaBrandt};
+use nightsplat::gpu::Tile;
 use nightsplat::gpu::testing::gpu;
-use nightsplat::gpu::{Buffer, Tile};
 use nightsplat::photographs::tone::Profile;
 use nightsplat::reference::camera::{Camera, Model};
 use nightsplat::reference::camera_fisheye::Fisheye;
@@ -11,7 +11,7 @@ use nightsplat::reference::camera_pinhole::Pinhole;
 use nightsplat::reference::gaussian::{Gaussian, Planes};
 use nightsplat::reference::sh::sh_count;
 use nightsplat::splats::render::{self, Damping, RenderOptions, RenderSettings, Renderer, Status};
-use nightsplat::splats::scene::{Features, Shape};
+use nightsplat::splats::scene::{DeviceGaussians, Features, Gaussians, Shape};
 
 use super::Random;
 
@@ -156,11 +156,23 @@ impl Setup {
         background
     }
 
+    /// The Gaussians on the device.
+    pub(crate) fn upload(&self) -> DeviceGaussians {
+        self.gaussians().upload(&gpu()).unwrap()
+    }
+
+    /// The Gaussians as a scene's.
+    pub(crate) fn gaussians(&self) -> Gaussians {
+        let mut gaussians = Gaussians::zeros(self.count, self.settings.shape);
+        gaussians.parameters.copy_from_slice(&self.parameters);
+        gaussians
+    }
+
     /// The render, with as much memory as it takes.
     pub(crate) fn render(&self) -> Rendered<'_> {
         let mut rendered = Rendered::new(self);
         let Rendered { renderer, gaussians, .. } = &mut rendered;
-        renderer.render_channels(gaussians, &self.camera, &self.options).unwrap();
+        renderer.render_channels(&*gaussians, &self.camera, &self.options).unwrap();
         rendered.download()
     }
 
@@ -177,7 +189,7 @@ impl Setup {
 /// A setup, rendered.
 pub(crate) struct Rendered<'a> {
     setup: &'a Setup,
-    pub(crate) gaussians: Buffer<f32>,
+    pub(crate) gaussians: DeviceGaussians,
     pub(crate) renderer: Renderer,
     /// (channels, H, W)
     pub(crate) render: Vec<f32>,
@@ -200,7 +212,7 @@ impl<'a> Rendered<'a> {
     pub(crate) const VISITS_BEFORE: u32 = 3;
 
     fn new(setup: &'a Setup) -> Self {
-        let gaussians = gpu().buffer("parameters", &setup.parameters).unwrap();
+        let gaussians = setup.upload();
         let mut renderer = Renderer::new(&gpu(), setup.settings).unwrap();
         renderer.reserve(setup.count, [&setup.camera]).unwrap();
         Self { setup, gaussians, renderer, render: vec![], transmittances: vec![] }
@@ -210,7 +222,9 @@ impl<'a> Rendered<'a> {
     pub(crate) fn forward(&mut self) {
         let Self { setup, gaussians, renderer, .. } = self;
         gpu()
-            .run("forward", |pass| renderer.forward(pass, gaussians, &setup.camera, &setup.options))
+            .run("forward", |pass| {
+                renderer.forward(pass, &*gaussians, &setup.camera, &setup.options)
+            })
             .unwrap();
     }
 
@@ -237,7 +251,15 @@ impl<'a> Rendered<'a> {
                 visit_counts: &mut visit_counts,
             };
             let Setup { camera, options, .. } = setup;
-            renderer.backward(pass, gaussians, camera, options, Self::DAMPING, &d_render, gradients)
+            renderer.backward(
+                pass,
+                &*gaussians,
+                camera,
+                options,
+                Self::DAMPING,
+                &d_render,
+                gradients,
+            )
         })
         .unwrap();
         Gradients {

@@ -14,7 +14,7 @@ pub(crate) fn dataset(views: usize, [width, height]: [u32; 2]) -> Dataset {
         &SyntheticOptions { views, width, height, seed: 1, ..SyntheticOptions::default() },
     )
     .unwrap();
-    Dataset::load(folder.path(), &TrainConfig::default().load_options()).unwrap()
+    Dataset::load(folder.path(), &TrainConfig::bare().load_options()).unwrap()
 }
 
 /// Trains until a step; what the steps said.

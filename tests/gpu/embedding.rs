@@ -114,13 +114,13 @@ fn renderer(gpu: &Gpu) -> Renderer {
 }
 
 fn render(gpu: &Gpu) -> Image {
-    let parameters = gpu.buffer("parameters", &gaussians().parameters).unwrap();
-    renderer(gpu).render_image(&parameters, &camera(), &OPTIONS).unwrap()
+    let on_device = gaussians().upload(gpu).unwrap();
+    renderer(gpu).render_image(&on_device, &camera(), &OPTIONS).unwrap()
 }
 
 /// Renders within a command buffer that the host begins, continues with a copy to its memory, and submits.
 fn render_into(host: &Host, gpu: &Gpu, memory: &mut Memory) {
-    let parameters = gpu.buffer("parameters", &gaussians().parameters).unwrap();
+    let on_device = gaussians().upload(gpu).unwrap();
     // A renderer of its own, so that no earlier render can pass for this one.
     let mut renderer = renderer(gpu);
     let mut held = None;
@@ -129,9 +129,9 @@ fn render_into(host: &Host, gpu: &Gpu, memory: &mut Memory) {
         let recorded = unsafe {
             gpu.record_into(commands.as_raw(), |pass| {
                 // Nothing of ours would know when the copy is there.
-                let message = pass.download(&parameters).unwrap_err().to_string();
+                let message = pass.download(&on_device.parameters).unwrap_err().to_string();
                 assert!(message.contains("`parameters`"), "{message}");
-                renderer.forward(pass, &parameters, &camera(), &OPTIONS)
+                renderer.forward(pass, &on_device, &camera(), &OPTIONS)
             })
         };
         held = Some(recorded.unwrap());

@@ -32,7 +32,7 @@ fn config() -> TrainConfig {
         checkpoint_every: 6,
         checkpoint_minutes: 0.0,
         eval_every: 7,
-        ..TrainConfig::default()
+        ..TrainConfig::bare()
     };
     config.model = ModelConfig::default();
     config.model.set_parts(&[Part::Structure]);
@@ -162,7 +162,7 @@ fn growing() -> TrainConfig {
         sh_degree: 2,
         max_gaussians: 9000,
         checkpoint_every: 40,
-        ..TrainConfig::default()
+        ..TrainConfig::bare()
     };
     config.schedule.densify_after = 2;
     config.schedule.densify_interval = 10;

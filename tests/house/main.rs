@@ -8,3 +8,4 @@ mod common;
 mod architecture;
 mod circles;
 mod install;
+mod settings;

@@ -40,7 +40,7 @@ fn dataset() -> Dataset {
 
 /// Density control acts twice within thirty steps.
 fn config(tone: ToneSettings) -> TrainConfig {
-    let mut config = TrainConfig { steps: 30, tone, ..Default::default() };
+    let mut config = TrainConfig { steps: 30, tone, ..TrainConfig::bare() };
     config.schedule.densify_after = 8;
     config.schedule.densify_interval = 10;
     config

@@ -274,7 +274,7 @@ fn varied(folder: &Path) -> (TrainConfig, Dataset) {
     synthetic::write(folder, &options).unwrap();
     let mut tone = ToneSettings::new(ToneCurve::Ase);
     tone.scene_statistics = true;
-    let mut config = TrainConfig { steps: 300, sh_degree: 0, tone, ..Default::default() };
+    let mut config = TrainConfig { steps: 300, sh_degree: 0, tone, ..TrainConfig::bare() };
     config.schedule.densify_before = 0;
     config.schedule.resolution_steps = [0, 40];
     config.exposure.learn = Learning::On;

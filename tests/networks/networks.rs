@@ -396,7 +396,7 @@ fn misuse_is_told_in_one_line() {
         DenoiserSettings { channels: 513, ..Default::default() },
     ] {
         let error = Denoiser::new(&gpu, settings, 0).unwrap_err().to_string();
-        assert!(error.contains("must be within 1 and"), "{error}");
+        assert!(error.contains("it must be a whole number, 1 to"), "{error}");
     }
     let settings = DenoiserSettings { stages: 1, repeats: 1, channels: 4, ..Default::default() };
     let mut denoiser = Denoiser::new(&gpu, settings, 0).unwrap();

@@ -57,7 +57,7 @@ fn a_configuration_holds_the_whole_curve() {
     let constants = vec![0.1 + 0.2, -1.0 / 3.0, 1.0, 1e-3];
     let cubic = ToneSettings { constants, ..ToneSettings::new(ToneCurve::FittedCubic) };
     for tone in [csv, cubic, ToneSettings::new(ToneCurve::PerChannel)] {
-        let config = TrainConfig { tone, ..TrainConfig::default() };
+        let config = TrainConfig { tone, ..TrainConfig::bare() };
         let text = config.to_toml().unwrap();
         assert_eq!(toml::from_str::<TrainConfig>(&text).unwrap(), config, "{text}");
         // A run's configuration is a file with a curve, too.
@@ -133,7 +133,7 @@ fn the_family_of_a_curve_has_one_key_and_its_old_name_is_read() {
     let twice = load("my.toml", "family = \"ap3\"\ncurve = \"ase\"\n").unwrap_err().to_string();
     assert!(twice.contains("twice"), "{twice}");
     let tone = ToneSettings::new(ToneCurve::Ap3);
-    let text = TrainConfig { tone, ..TrainConfig::default() }.to_toml().unwrap();
+    let text = TrainConfig { tone, ..TrainConfig::bare() }.to_toml().unwrap();
     assert!(text.contains("curve = \"ap3\"") && !text.contains("family"), "{text}");
     for name in ["AP3", "Ap3", "ap3"] {
         assert_eq!(name.parse::<CurveChoice>().unwrap(), ToneCurve::Ap3.into());

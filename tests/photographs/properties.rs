@@ -187,7 +187,7 @@ proptest! {
         steps in 1..u64::from(u32::MAX), seed in 0..i64::MAX as u64, near in 1e-6..1.0_f64, rate in 0.0..1.0_f64,
         max_gaussians in 1..1_000_000_000_usize, vram in 1..1_u64 << 50,
     ) {
-        let mut config = TrainConfig { steps, seed, near, max_gaussians, ..TrainConfig::default() };
+        let mut config = TrainConfig { steps, seed, near, max_gaussians, ..TrainConfig::bare() };
         config.max_vram = vram.to_string().parse().ok();
         config.density.min_opacity = 0.99 * rate;
         config.schedule.initial_rates.0[1] = rate;

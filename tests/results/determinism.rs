@@ -23,7 +23,7 @@ const STEPS: u64 = 16;
 
 fn config() -> TrainConfig {
     let mut config =
-        TrainConfig { steps: STEPS, background: Background::Random, ..TrainConfig::default() };
+        TrainConfig { steps: STEPS, background: Background::Random, ..TrainConfig::bare() };
     config.schedule.densify_after = 5;
     config.schedule.densify_interval = 6;
     config.schedule.sh_degree_interval = 5;

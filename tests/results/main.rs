@@ -9,6 +9,7 @@ mod determinism;
 mod export;
 mod injected;
 mod lost_work;
+mod model_files;
 mod profile;
 mod report;
 mod run;

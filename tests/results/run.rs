@@ -147,7 +147,7 @@ fn another_split_is_asked_for_said_and_kept() {
     assert!(views("all").is_empty());
     let listed = fs::read_to_string(path("all/views.csv")).unwrap();
     assert_eq!(listed.lines().filter(|line| line.contains(",train,48,32")).count(), 10, "{listed}");
-    refused(&train(folder.path(), "one", "--test-every 1"), 2, &["--test-every is 1"]);
+    refused(&train(folder.path(), "one", "--test-every 1"), 2, &["test_every (--test-every) is 1"]);
     // A test view whose dark photograph is gone stays a pose: its bright twin is nothing to train on.
     fs::remove_file(path("set/low/000.png")).unwrap();
     succeed(&train(folder.path(), "pose", "--steps 2 --test-every 0"));

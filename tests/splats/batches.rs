@@ -7,9 +7,9 @@ use glam::{DVec3, Vec3};
 use nightsplat::gpu::Gpu;
 use nightsplat::gpu::testing::{gpu, gpu_that_binds};
 use nightsplat::photographs::dataset::Dataset;
-use nightsplat::splats::batches::Batches;
+use nightsplat::splats::halves::StorageFormat;
 use nightsplat::splats::render::{RenderOptions, RenderSettings, Renderer};
-use nightsplat::splats::scene::{Gaussians, Shape, width};
+use nightsplat::splats::scene::{Gaussians, Layout, Shape, width};
 use nightsplat::train::{TrainConfig, Trainer};
 
 use crate::common::setup::{Setup, features};
@@ -25,7 +25,7 @@ fn planes_go_there_in_batches_and_come_back_whole() {
     let shape = Shape { sh_degree: 2, features: features(5) };
     let columns = width(shape);
     for (count, batches) in [(0, vec![0]), (3000, vec![3000]), (7000, vec![3264, 3264, 472])] {
-        let all = Batches::new(&gpu, count, [columns, shape.features.width()]);
+        let all = Layout::new(count, shape, StorageFormat::Single).batches(&gpu);
         assert_eq!(all.iter().map(|batch| batch.count).collect::<Vec<_>>(), batches);
         let planes: Vec<f32> = (0..count * columns).map(|i| i as f32).collect();
         let buffer = all.upload(&gpu, "planes", &planes).unwrap();
@@ -36,9 +36,13 @@ fn planes_go_there_in_batches_and_come_back_whole() {
         // The scales of a batch's last Gaussian are where its kernels look.
         if let Some(batch) = all.iter().filter(|batch| batch.count > 0).last() {
             let own = gpu.read(batch.planes(&buffer).unwrap()).unwrap();
-            let last = Gaussians { count: batch.count, shape, parameters: own }.log_scales()
-                [batch.count - 1];
-            let whole = Gaussians { count, shape, parameters: planes };
+            let of = |count: usize, parameters: &[f32]| {
+                let mut gaussians = Gaussians::zeros(count, shape);
+                gaussians.parameters.copy_from_slice(parameters);
+                gaussians
+            };
+            let last = of(batch.count, &own).log_scales()[batch.count - 1];
+            let whole = of(count, &planes);
             assert_eq!(last, whole.log_scales()[count - 1]);
         }
     }
@@ -51,12 +55,8 @@ fn views() -> Dataset {
 
 /// Density control and a growing SH degree among its steps.
 fn config() -> TrainConfig {
-    let mut config = TrainConfig {
-        steps: 30,
-        max_gaussians: 5200,
-        random_points: 4200,
-        ..TrainConfig::default()
-    };
+    let mut config =
+        TrainConfig { steps: 30, max_gaussians: 5200, random_points: 4200, ..TrainConfig::bare() };
     (config.schedule.densify_after, config.schedule.densify_interval) = (4, 5);
     config.schedule.densify_before = 25;
     config.schedule.sh_degree_interval = 7;
@@ -145,7 +145,7 @@ fn what_lies_beyond_a_binding_is_rendered() {
         return;
     }
     let seen = Setup::new(500, [64, 48], shape, 5);
-    let own = Gaussians { count: seen.count, shape, parameters: seen.parameters.clone() };
+    let own = seen.gaussians();
     let mut all = Gaussians::zeros(hidden + seen.count, shape);
     let behind = seen.camera.view_from_world.inverse().transform_point3(DVec3::NEG_Z).as_vec3();
     all.means_mut()[..hidden].fill(behind);
@@ -178,12 +178,13 @@ fn what_a_device_cannot_bind_is_refused_and_growth_ends_before_it() {
     let camera = Setup::new(1, [32, 24], 0, 1).camera;
     let refused = renderer.reserve(16_385, [&camera]).unwrap_err().to_string();
     assert!(refused.contains("`splats`"), "{refused}");
-    // Fewer parameters than Gaussians are expected.
     renderer.reserve(3000, [&camera]).unwrap();
-    let short = Gaussians::zeros(2999, settings.shape).upload(&gpu).unwrap();
+    let mut short = Gaussians::zeros(2999, settings.shape).upload(&gpu).unwrap();
+    // Fewer parameters than the layout says.
+    short.layout.count = 3000;
     let options = RenderOptions { sh_degree: 0, background: [0.0; 3] };
     let refused = renderer.render_image(&short, &camera, &options).unwrap_err().to_string();
-    assert!(refused.contains("buffer `parameters` holds"), "{refused}");
+    assert!(refused.contains("out of range for buffer `parameters`"), "{refused}");
 }
 
 #[test]

@@ -79,7 +79,8 @@ fn gradient_of(setup: &Setup, d_render: &[f32]) -> Vec<f32> {
     let mut rendered = setup.render();
     let gradients = gpu.buffer("gradients", &rendered.backward(d_render).parameters).unwrap();
     let mut gradient = gpu.buffer("gradient", &[f32::NAN; WIDTH]).unwrap();
-    let mut of_camera = CameraGradient::new(&rendered.renderer, setup.camera.model).unwrap();
+    let mut of_camera =
+        CameraGradient::new(&rendered.renderer, setup.camera.model, setup.count).unwrap();
     let (done, report) = gpu.checked(|| {
         gpu.run("camera", |pass| {
             let both = (&rendered.gaussians, &gradients);
@@ -118,10 +119,11 @@ fn the_device_gives_the_gradient_of_the_chain_and_the_same_bits_every_time() {
 fn a_camera_of_another_model_is_refused() {
     let setup = Setup::new(3, [16, 16], 0, 1);
     let rendered = setup.render();
-    let mut of_fisheye = CameraGradient::new(&rendered.renderer, fisheye()).unwrap();
+    let mut of_fisheye = CameraGradient::new(&rendered.renderer, fisheye(), 3).unwrap();
     let mut gradient = gpu().buffer("gradient", &[0.0; WIDTH]).unwrap();
+    let gradients = gpu().buffer("gradients", &setup.parameters).unwrap();
     let refused = gpu().run("camera", |pass| {
-        let both = (&rendered.gaussians, &rendered.gaussians);
+        let both = (&rendered.gaussians, &gradients);
         of_fisheye.record(pass, &rendered.renderer, both, &setup.camera, &mut gradient)
     });
     assert!(refused.unwrap_err().to_string().contains("another camera model"));

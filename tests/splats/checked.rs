@@ -47,7 +47,7 @@ fn dataset(config: &TrainConfig) -> Dataset {
 fn config(parts: &[Part]) -> TrainConfig {
     let tone = ToneSettings::new(ToneCurve::Ap3);
     let mut config =
-        TrainConfig { steps: 40, background: Background::Random, tone, ..Default::default() };
+        TrainConfig { steps: 40, background: Background::Random, tone, ..TrainConfig::bare() };
     config.schedule.densify_after = 1;
     config.schedule.densify_interval = 2;
     config.schedule.sh_degree_interval = 1;

@@ -16,6 +16,7 @@ use nightsplat::reference::blend_forward::blend_pixel;
 use nightsplat::reference::gaussian::Gaussian;
 use nightsplat::reference::rounding::UNIT;
 use nightsplat::reference::splat::Splat;
+use nightsplat::splats::attributes::PlaneCounts;
 use nightsplat::splats::attributes::planes;
 use nightsplat::splats::optimizer::{Adam, AdamBuffers, LearningRates, Moments};
 
@@ -172,8 +173,8 @@ fn adam_on_device(steps: u64, start: &[f32]) -> Vec<f32> {
                     gradients: gradients[(step % TURNS) as usize].slice(),
                     moments: moments.slice_mut(),
                 };
-                let counts = [GAUSSIANS as u32, COLUMNS as u32, 0];
-                adam.record(pass, step, &RATES, counts, buffers, &status)?;
+                let planes = PlaneCounts { gaussians: GAUSSIANS, columns: COLUMNS, features: 0 };
+                adam.record(pass, step, &RATES, planes, buffers, &status)?;
             }
             Ok(())
         })

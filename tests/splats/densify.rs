@@ -8,15 +8,14 @@ use glam::{DVec3, Quat, Vec3};
 use nightsplat::camera::Camera;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::splats::densify::{
-    Densifier, DensifyInputs, DensifyReport, DensifySettings, DensityControl, DeviceGaussians,
-    Round,
+    Densifier, DensifyInputs, DensifyReport, DensifySettings, DensityControl, Round,
 };
-use nightsplat::splats::halves::Bits;
+use nightsplat::splats::halves::StorageFormat;
 use nightsplat::splats::optimizer::Moments;
 use nightsplat::splats::render::{RenderOptions, RenderSettings, Renderer};
-use nightsplat::splats::scene::{Features, Shape};
+use nightsplat::splats::scene::{DeviceGaussians, Layout};
 
-use host::{COLUMNS, CONSERVING, FEATURES, Host, LAST, SETTINGS, camera_at, room_for};
+use host::{COLUMNS, CONSERVING, Host, LAST, SETTINGS, camera_at, room_for, shape};
 
 #[test]
 fn density_control_matches_its_references() {
@@ -282,35 +281,27 @@ fn a_buffer_that_is_too_short_is_refused() {
     let gpu = gpu();
     let mut densifier = Densifier::new(&gpu, SETTINGS, &[]).unwrap();
     let needs = |has, needed| format!("holds {has} elements, density control needs {needed}");
-    let no_gaussian = |columns| format!("density control: {columns} floats make no Gaussian");
-    for (short, [columns, features], why) in [
-        (0, [14, 0], needs(27, 28)),
-        (1, [14, 0], needs(27, 28)),
-        (2, [14, 0], needs(27, 28)),
-        (3, [14, 0], needs(1, 2)),
-        (4, [14, 0], needs(1, 2)),
-        (5, [13, 0], no_gaussian(13)),
-        (5, [16, 3], no_gaussian(16)),
+    for (short, why) in [
+        (0, needs(27, 28)),
+        (1, needs(27, 28)),
+        (2, needs(27, 28)),
+        (3, needs(1, 2)),
+        (4, needs(1, 2)),
     ] {
         let len = |index: usize, len: usize| if index == short { len - 1 } else { len };
-        let planes = |index| gpu.zeros("planes", len(index, 2 * columns as usize)).unwrap();
-        let mut gaussians = DeviceGaussians {
-            count: 2,
-            column_count: columns,
-            feature_count: features,
-            rest: Bits::Single,
-            parameters: planes(0),
-            moments: Moments::Single { first: planes(1), second: planes(2) },
-        };
+        let planes = |index| gpu.zeros("planes", len(index, 28)).unwrap();
+        let layout = Layout::new(2, 0, StorageFormat::Single);
+        let (parameters, origin) = (planes(0), DVec3::ZERO);
+        let mut gaussians = DeviceGaussians { layout, parameters, origin };
+        let mut moments = Moments::Single { first: planes(1), second: planes(2) };
         let inputs = DensifyInputs {
+            moments: &mut moments,
             grad_norm_sums: &mut gpu.zeros("grad_norm_sums", len(3, 2)).unwrap(),
             visit_counts: &mut gpu.zeros("visit_counts", len(4, 2)).unwrap(),
             gradients: &mut planes(6),
         };
-        let refused = densifier
-            .densify(&mut gaussians, inputs, LAST, |_, _| Ok(1.0))
-            .unwrap_err()
-            .to_string();
+        let refused =
+            densifier.densify(&mut gaussians, inputs, LAST, |_| Ok(1.0)).unwrap_err().to_string();
         assert!(refused.contains(&why), "{short}: {refused}");
     }
 }
@@ -379,7 +370,9 @@ fn buffers_that_suffice_are_kept_and_others_grow_with_headroom() {
     (0..10).for_each(|i| host.pull_at(i));
     let plane = |name: &str| gpu.zeros(name, 200 * COLUMNS).unwrap();
     let mut gaussians = room_for(&gpu, 200);
-    gaussians.count = 100;
+    gaussians.layout.count = 100;
+    let mut moments =
+        Moments::Single { first: plane("first_moments"), second: plane("second_moments") };
     gpu.write(&mut gaussians.parameters, &host.parameters).unwrap();
     let mut gradients = plane("gradients");
     let mut visit_counts = gpu.buffer("visit_counts", &[1; 300]).unwrap();
@@ -388,15 +381,15 @@ fn buffers_that_suffice_are_kept_and_others_grow_with_headroom() {
         let mut sums = vec![0.0; 300];
         sums[..pulled].fill(1.0);
         let inputs = DensifyInputs {
+            moments: &mut moments,
             grad_norm_sums: &mut gpu.buffer("grad_norm_sums", &sums).unwrap(),
             visit_counts: &mut visit_counts,
             gradients: &mut gradients,
         };
-        let report = densifier.densify(&mut gaussians, inputs, LAST, |_, _| Ok(1.0)).unwrap();
+        let report = densifier.densify(&mut gaussians, inputs, LAST, |_| Ok(1.0)).unwrap();
         assert_eq!(report.count, count);
-        let DeviceGaussians { parameters, moments, .. } = &gaussians;
-        let Moments::Single { first, second } = moments else { panic!("{moments:?}") };
-        for buffer in [parameters, first, second, &gradients] {
+        let Moments::Single { first, second } = &moments else { panic!("{moments:?}") };
+        for buffer in [&gaussians.parameters, first, second, &gradients] {
             assert_eq!(buffer.len(), capacity * COLUMNS);
         }
     }
@@ -472,14 +465,12 @@ fn a_gaussian_whose_halves_a_camera_would_see_otherwise_stays_whole() {
 fn a_split_within_the_bound_changes_no_view_by_much() {
     let gpu = gpu();
     let camera = camera_at(DVec3::ZERO);
-    let features = Features { depth: true, noise: true, ..Features::NONE };
-    assert_eq!(features.width(), FEATURES);
-    let shape = Shape { sh_degree: 1, features };
-    let settings = RenderSettings { shape, ..RenderSettings::default() };
+    let settings = RenderSettings { shape: shape(), ..RenderSettings::default() };
     let options = RenderOptions { sh_degree: 0, background: [0.0; 3] };
     let mut renderer = Renderer::new(&gpu, settings).unwrap();
     let mut image = |host: &Host| {
-        let planes = gpu.buffer("planes", &host.parameters).unwrap();
+        let mut planes = room_for(&gpu, host.count);
+        planes.write(&gpu, &host.parameters).unwrap();
         renderer.reserve(host.count, [&camera]).unwrap();
         renderer.render_image(&planes, &camera, &options).unwrap().data
     };

@@ -230,7 +230,7 @@ fn one_renderer_shows_a_pinhole_and_a_fisheye_in_turn() {
     let alone = [&pinhole, &of_fisheye].map(|setup| setup.render().render);
     assert!(alone[0] != alone[1]);
     let Rendered { mut renderer, .. } = pinhole.render();
-    let gaussians = gpu().buffer("parameters", &pinhole.parameters).unwrap();
+    let gaussians = pinhole.upload();
     for _ in 0..2 {
         for (setup, alone) in [&pinhole, &of_fisheye].into_iter().zip(&alone) {
             let Setup { camera, options, .. } = setup;

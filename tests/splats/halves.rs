@@ -6,21 +6,22 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use nightsplat::gpu::testing::{gpu, gpu_that_binds};
 use nightsplat::gpu::{Buffer, Gpu};
-use nightsplat::splats::densify::DeviceGaussians;
-use nightsplat::splats::halves::Bits;
+use nightsplat::splats::attributes::PlaneCounts;
+use nightsplat::splats::halves::StorageFormat;
 use nightsplat::splats::optimizer::{Adam, AdamBuffers, LearningRates, Moments};
 use nightsplat::splats::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer};
-use nightsplat::splats::scene::{Shape, width};
+use nightsplat::splats::scene::{DeviceGaussians, Layout, Shape, width};
 use nightsplat::train::{PrecisionConfig, TrainConfig, Trainer};
 
 use crate::common::setup::{Setup, features};
 use crate::common::train::{advance, dataset};
 
-const ALL: [[Bits; 2]; 4] = [
-    [Bits::Single, Bits::Single],
-    [Bits::Single, Bits::Half],
-    [Bits::Half, Bits::Single],
-    [Bits::Half, Bits::Half],
+/// Of SH coefficients, and of moments.
+const ALL: [[StorageFormat; 2]; 4] = [
+    [StorageFormat::Single, StorageFormat::Single],
+    [StorageFormat::Single, StorageFormat::Half],
+    [StorageFormat::Half, StorageFormat::Single],
+    [StorageFormat::Half, StorageFormat::Half],
 ];
 
 fn wave(len: usize, scale: f32, phase: f32) -> Vec<f32> {
@@ -30,6 +31,7 @@ fn wave(len: usize, scale: f32, phase: f32) -> Vec<f32> {
 /// What Adam works on in one buffer after the other, all of it learned at one rate.
 struct Learned {
     gaussians: DeviceGaussians,
+    moments: Moments,
     gradients: Buffer<f32>,
     adam: Adam,
     rate: f64,
@@ -37,46 +39,55 @@ struct Learned {
 }
 
 impl Learned {
-    fn new(gpu: &Gpu, [count, columns, features]: [usize; 3], bits: [Bits; 2]) -> Self {
-        let mut gaussians = DeviceGaussians::new(gpu, count, [columns, features], bits).unwrap();
-        gaussians.write(gpu, &wave(count * columns, 0.7, 0.0)).unwrap();
-        let gradients = gpu.buffer("gradients", &wave(count * columns, 1e-3, 1.0)).unwrap();
+    fn new(gpu: &Gpu, count: usize, shape: Shape, [rest, moments]: [StorageFormat; 2]) -> Self {
+        let layout = Layout::new(count, shape, rest);
+        let mut gaussians = DeviceGaussians::uninit(gpu, layout).unwrap();
+        let len = layout.floats().len();
+        gaussians.write(gpu, &wave(len, 0.7, 0.0)).unwrap();
+        let moments = match moments {
+            StorageFormat::Single => Moments::zeros(gpu, len).unwrap(),
+            StorageFormat::Half => Moments::Half(gpu.zeros("moments", len).unwrap()),
+        };
+        let gradients = gpu.buffer("gradients", &wave(len, 1e-3, 1.0)).unwrap();
         let (adam, status) = (Adam::new(gpu).unwrap(), gpu.zeros("status", 1).unwrap());
-        Self { gaussians, gradients, adam, rate: 1e-3, status }
+        Self { gaussians, moments, gradients, adam, rate: 1e-3, status }
     }
 
     /// As [`nightsplat::train::Trainer`] does: floats, and what is in halves.
     fn step(&mut self, gpu: &Gpu, step: u64) {
-        let DeviceGaussians { count, column_count, feature_count, rest, .. } = self.gaussians;
-        let first = 14 + feature_count;
-        let floats = if rest == Bits::Half { first } else { column_count };
+        let layout = self.gaussians.layout;
+        let (planes, rest) = (layout.floats(), layout.sh_rest);
+        let columns = match rest {
+            StorageFormat::Half => planes.before_rest(),
+            StorageFormat::Single => planes.columns,
+        };
+        let floats = PlaneCounts { columns, ..planes };
         let rate = self.rate;
         let rates = LearningRates::uniform(rate);
         gpu.run("adam", |pass| {
-            let Self { gaussians, gradients, adam, status, .. } = self;
+            let Self { gaussians, moments, gradients, adam, status, .. } = self;
             let buffers = AdamBuffers {
                 parameters: gaussians.parameters.slice_mut(),
                 gradients: gradients.slice(),
-                moments: gaussians.moments.slice_mut(),
+                moments: moments.slice_mut(),
             };
-            adam.record(pass, step, &rates, [count, floats, feature_count], buffers, status)?;
-            if rest == Bits::Single {
+            adam.record(pass, step, &rates, floats, buffers, status)?;
+            if rest == StorageFormat::Single {
                 return Ok(());
             }
             let buffers = AdamBuffers {
                 parameters: gaussians.parameters.slice_mut(),
                 gradients: gradients.slice(),
-                moments: gaussians.moments.slice_mut(),
+                moments: moments.slice_mut(),
             };
-            let halves = [count, first, column_count - first];
-            adam.record_halves(pass, step, rate, halves, buffers, status)
+            adam.record_halves(pass, step, rate, planes, buffers, status)
         })
         .unwrap();
     }
 
     /// Both moments of every parameter.
     fn moments(&self, gpu: &Gpu) -> Vec<[f32; 2]> {
-        match &self.gaussians.moments {
+        match &self.moments {
             Moments::Single { first, second } => {
                 let [first, second] = [first, second].map(|plane| gpu.read(plane).unwrap());
                 first.into_iter().zip(second).map(|(m, v)| [m, v]).collect()
@@ -101,10 +112,11 @@ fn steps_on_halves_match_their_references() {
         for (sh_degree, channels) in [(0, 4), (1, 3), (2, 5), (3, 3), (3, 11)] {
             for count in [1, 2, 63, 257] {
                 let shape = Shape { sh_degree, features: features(channels) };
-                let shape = [count, width(shape), shape.features.width()];
-                let mut learned = Learned::new(&gpu, shape, bits);
+                let mut learned = Learned::new(&gpu, count, shape, bits);
                 let (_, report) = gpu.checked(|| (1..=3).for_each(|step| learned.step(&gpu, step)));
-                report.agree().unwrap_or_else(|error| panic!("{bits:?} {shape:?}: {error}"));
+                report
+                    .agree()
+                    .unwrap_or_else(|error| panic!("{bits:?} {count} {shape:?}: {error}"));
             }
         }
     }
@@ -119,8 +131,8 @@ fn moments_in_halves_fade_as_those_of_floats() {
         let moments = learned.moments(&gpu);
         moments.iter().map(|[_, v]| f64::from(*v)).sum::<f64>() / moments.len() as f64
     };
-    let [floats, halves] = [Bits::Single, Bits::Half].map(|bits| {
-        let mut learned = Learned::new(&gpu, [1000, 14, 0], [Bits::Single, bits]);
+    let [floats, halves] = [StorageFormat::Single, StorageFormat::Half].map(|bits| {
+        let mut learned = Learned::new(&gpu, 1000, 0.into(), [StorageFormat::Single, bits]);
         learned.step(&gpu, 1);
         gpu.write(&mut learned.gradients, &vec![0.0; 14_000]).unwrap();
         (2..=700).for_each(|step| learned.step(&gpu, step));
@@ -135,7 +147,8 @@ fn coefficients_in_halves_move_by_less_than_their_unit() {
     let _alone = alone();
     let gpu = gpu();
     let count = 300;
-    let mut learned = Learned::new(&gpu, [count, width(3), 0], [Bits::Half, Bits::Single]);
+    let mut learned =
+        Learned::new(&gpu, count, 3.into(), [StorageFormat::Half, StorageFormat::Single]);
     learned.gaussians.write(&gpu, &vec![0.75; count * width(3)]).unwrap();
     let gradients: Vec<f32> = (0..count * width(3)).map(|i| 1e-3 + 1e-8 * i as f32).collect();
     gpu.write(&mut learned.gradients, &gradients).unwrap();
@@ -153,7 +166,7 @@ fn coefficients_in_halves_move_by_less_than_their_unit() {
 fn coefficients_beyond_halves_and_gradients_that_are_not_finite_leave_finite_halves() {
     let _alone = alone();
     let gpu = gpu();
-    let mut learned = Learned::new(&gpu, [4, width(1), 0], [Bits::Half, Bits::Half]);
+    let mut learned = Learned::new(&gpu, 4, 1.into(), [StorageFormat::Half, StorageFormat::Half]);
     learned.rate = 1e3;
     let mut planes = vec![1e6; 4 * width(1)];
     planes[14 * 4..14 * 4 + 9]
@@ -177,17 +190,15 @@ fn a_render_of_halves_is_that_of_the_floats_they_stand_for() {
     for (degree, channels) in [(1, 3), (2, 11), (3, 3)] {
         let shape = Shape { sh_degree: degree, features: features(channels) };
         let setup = Setup::new(300, [64, 48], shape, 3);
-        let bits = [Bits::Half, Bits::Single];
-        let dimensions = [width(shape), shape.features.width()];
-        let mut halves = DeviceGaussians::new(&gpu, setup.count, dimensions, bits).unwrap();
-        halves.write(&gpu, &setup.parameters).unwrap();
-        let floats = gpu.buffer("floats", &halves.read(&gpu).unwrap()).unwrap();
-        let run = |rest, parameters: &Buffer<f32>| {
+        let halves = setup.gaussians().upload_as(&gpu, StorageFormat::Half).unwrap();
+        let floats = halves.download(&gpu).unwrap().upload(&gpu).unwrap();
+        let run = |gaussians: &DeviceGaussians| {
+            let rest = gaussians.layout.sh_rest;
             let settings = RenderSettings { shape, rest, ..RenderSettings::default() };
             let mut renderer = Renderer::new(&gpu, settings).unwrap();
             renderer.reserve(setup.count, [&setup.camera]).unwrap();
             let options = RenderOptions { sh_degree: degree, background: [0.0; 3] };
-            let image = renderer.render_image(parameters, &setup.camera, &options).unwrap();
+            let image = renderer.render_image(gaussians, &setup.camera, &options).unwrap();
             let d_render =
                 gpu.buffer("d_render", &wave(setup.channels() * setup.pixels(), 1.0, 0.0)).unwrap();
             let mut planes = gpu.zeros("gradients", setup.count * width(shape)).unwrap();
@@ -195,7 +206,7 @@ fn a_render_of_halves_is_that_of_the_floats_they_stand_for() {
             let mut visits = gpu.zeros("visit_counts", setup.count).unwrap();
             let (done, report) = gpu.checked(|| {
                 gpu.run("render", |pass| {
-                    renderer.forward(pass, parameters, &setup.camera, &options)?;
+                    renderer.forward(pass, gaussians, &setup.camera, &options)?;
                     let gradients = Gradients {
                         parameters: &mut planes,
                         grad_norm_sums: &mut sums,
@@ -204,15 +215,14 @@ fn a_render_of_halves_is_that_of_the_floats_they_stand_for() {
                     let damping = Damping { weight: 0.0, depth: 1.0 };
                     let camera = &setup.camera;
                     renderer
-                        .backward(pass, parameters, camera, &options, damping, &d_render, gradients)
+                        .backward(pass, gaussians, camera, &options, damping, &d_render, gradients)
                 })
             });
             done.unwrap();
             report.agree().unwrap();
             (image, gpu.read(&planes).unwrap())
         };
-        let [of_halves, of_floats] =
-            [run(Bits::Half, &halves.parameters), run(Bits::Single, &floats)];
+        let [of_halves, of_floats] = [run(&halves), run(&floats)];
         assert!(of_halves == of_floats, "{shape:?}");
         assert!(of_halves.1.iter().any(|gradient| *gradient != 0.0));
     }
@@ -226,9 +236,9 @@ fn alone() -> MutexGuard<'static, ()> {
 }
 
 /// Density control and a growing SH degree among its steps.
-fn config([rest, moments]: [Bits; 2]) -> TrainConfig {
+fn config([rest, moments]: [StorageFormat; 2]) -> TrainConfig {
     let precision = PrecisionConfig { rest, moments, ..PrecisionConfig::default() };
-    let mut config = TrainConfig { steps: 40, precision, ..TrainConfig::default() };
+    let mut config = TrainConfig { steps: 40, precision, ..TrainConfig::bare() };
     config.random_points = 3000;
     (config.schedule.densify_after, config.schedule.densify_interval) = (4, 5);
     config.schedule.densify_before = 35;
@@ -271,7 +281,7 @@ fn every_pass_of_runs_in_fewer_bits_matches_its_reference() {
         let (_, report) = gpu.checked(|| advance(&mut trainer, 26));
         report.agree().unwrap_or_else(|error| panic!("{bits:?}: {error}"));
         let passes = |kernel| report.passes.iter().filter(|pass| pass.kernel == kernel).count();
-        assert_eq!(passes("adam_rest") > 0, bits[0] == Bits::Half, "{bits:?}");
+        assert_eq!(passes("adam_rest") > 0, bits[0] == StorageFormat::Half, "{bits:?}");
         assert!(passes("densify_scatter") > 0, "{bits:?}");
     }
 }
@@ -301,10 +311,10 @@ fn runs_in_fewer_bits_go_on_to_the_same_bits() {
 
 #[test]
 fn the_bits_are_settings_like_any_other() {
-    let with = |assignment: &str| TrainConfig::default().with(&[assignment.to_owned()]);
+    let with = |assignment: &str| TrainConfig::bare().with(&[assignment.to_owned()]);
     let config = with("precision.rest=16").unwrap().with(&["precision.moments=16".to_owned()]);
     let config = config.unwrap();
-    assert_eq!([config.precision.rest, config.precision.moments], [Bits::Half; 2]);
+    assert_eq!([config.precision.rest, config.precision.moments], [StorageFormat::Half; 2]);
     assert_eq!(TrainConfig::from_toml(&config.to_toml().unwrap()).unwrap(), config);
     let refused = with("precision.moments=8").unwrap_err().to_string();
     assert!(refused.contains("precision.moments=8") && refused.contains("16"), "{refused}");

@@ -242,7 +242,7 @@ fn a_view_has_at_most_the_tiles_that_a_subgroup_of_gaussians_that_cover_them_all
     renderer.reserve(1, [&view([3840, 2160])]).unwrap();
     // The host's renders are put together from patches; one pass takes no such view.
     renderer.reserve(1, [&view([8192, 8192])]).unwrap();
-    let refused = renderer.reserve_with_headroom([1; 2], [UVec2::splat(8192)]).unwrap_err();
+    let refused = renderer.reserve_sizes(1, 1, [UVec2::splat(8192)]).unwrap_err();
     let message = refused.to_string();
     assert!(message.starts_with("a 8192x8192 view has 524288 tiles of 16x8 pixels"), "{message}");
     assert!(!message.contains('\n'), "{message}");
@@ -328,7 +328,7 @@ fn more_splats_on_a_tile_than_the_device_follows_are_an_error_that_says_so() {
         return;
     }
     let setup = crowd(300_000);
-    let gaussians = gpu().buffer("parameters", &setup.parameters).unwrap();
+    let gaussians = setup.upload();
     let mut renderer = Renderer::new(&gpu(), setup.settings).unwrap();
     renderer.reserve(setup.count, [&setup.camera]).unwrap();
     let refused = renderer.render_image(&gaussians, &setup.camera, &setup.options);

@@ -6,6 +6,7 @@ use nightsplat::gpu::testing::gpu;
 use nightsplat::gpu::{Gpu, Reference};
 use nightsplat::kernels::adam;
 use nightsplat::splats::attributes::Attribute;
+use nightsplat::splats::attributes::PlaneCounts;
 use nightsplat::splats::optimizer::{
     Adam, AdamBuffers, FiniteCheck, LearningRates, Moments, Schedule,
 };
@@ -13,6 +14,8 @@ use nightsplat::splats::optimizer::{
 /// Two features and SH of degree 1.
 const COLUMNS: u32 = 25;
 const FEATURES: u32 = 2;
+/// Two Gaussians without features or SH beyond degree 0.
+const PLANES: PlaneCounts = PlaneCounts { gaussians: 2, columns: 14, features: 0 };
 /// Of means, quats, log scales, raw opacities, dc, features, rest.
 const RATES: LearningRates = LearningRates([0.01, 0.02, 0.03, 0.04, 0.05, 0.015, 0.06]);
 
@@ -68,7 +71,11 @@ impl Planes {
                 pass,
                 step,
                 &RATES,
-                [gaussian_count, column_count, FEATURES],
+                PlaneCounts {
+                    gaussians: gaussian_count as usize,
+                    columns: column_count as usize,
+                    features: FEATURES as usize,
+                },
                 buffers,
                 &status,
             )
@@ -270,7 +277,7 @@ fn a_buffer_that_is_too_short_is_refused() {
                 gradients: gradients.slice(),
                 moments: moments.slice_mut(),
             };
-            adam.record(pass, step, &rates, [2, 14, 0], buffers, &status)
+            adam.record(pass, step, &rates, PLANES, buffers, &status)
         });
         assert!(result.is_err(), "{lengths:?} {status_len} {step}");
     }
@@ -296,7 +303,14 @@ fn coefficients_in_halves_are_refused_where_a_buffer_is_too_short() {
                 gradients: gradients.slice(),
                 moments: moments.slice_mut(),
             };
-            adam.record_halves(pass, 1, 1e-3, [2, 14, 9], buffers, &status)
+            adam.record_halves(
+                pass,
+                1,
+                1e-3,
+                PlaneCounts { columns: 23, ..PLANES },
+                buffers,
+                &status,
+            )
         });
         assert_eq!(result.is_ok(), fits, "{short:?}");
     }

@@ -14,11 +14,12 @@ use nightsplat::kernels::splat::ALPHA_MIN;
 use nightsplat::kernels::status::{STATUS_NOT_FINITE, STATUS_OVERFLOWED};
 use nightsplat::reference::gaussian::Gaussian;
 use nightsplat::reference::splat::{Splat, splat_columns};
-use nightsplat::splats::render::Status;
-use nightsplat::splats::scene::{Features, Shape};
+use nightsplat::splats::halves::StorageFormat;
+use nightsplat::splats::render::{RenderSettings, Renderer, Status};
+use nightsplat::splats::scene::{Attribute, Features, Gaussians, Shape};
 
 use crate::common::chain::Chain;
-use crate::common::setup::{Rendered, Setup, tile_of};
+use crate::common::setup::{Rendered, Setup, features, tile_of};
 use crate::common::{Random, assert_close, fixture, safetensors, shared};
 
 const SIZE: [u32; 2] = [50, 40];
@@ -373,4 +374,62 @@ fn golden_renders_of_another_renderer_are_met() {
         let golden = planes((0..3).flat_map(plane).collect(), transmittances);
         assert_golden(case, &setup, &golden, 1e-4);
     }
+}
+
+#[test]
+fn gaussians_of_another_shape_or_storage_are_refused() {
+    let gpu = gpu();
+    let setup = Setup::new(10, [32, 24], Shape { sh_degree: 1, features: features(4) }, 1);
+    let settings = |shape: Shape, rest| RenderSettings { shape, rest, ..setup.settings };
+    let own = setup.settings.shape;
+    for (settings, why) in [
+        (settings(own, StorageFormat::Half), "SH coefficients as Single"),
+        (
+            settings(0.into(), StorageFormat::Single),
+            "Gaussians of SH degree 1 with depth cannot be rendered by a renderer made for SH degree 0",
+        ),
+        (settings(Shape { sh_degree: 3, ..own }, StorageFormat::Single), "made for SH degree 3"),
+    ] {
+        let mut renderer = Renderer::new(&gpu, settings).unwrap();
+        renderer.reserve(setup.count, [&setup.camera]).unwrap();
+        let refused = renderer.render_image(&setup.upload(), &setup.camera, &setup.options);
+        let message = refused.unwrap_err().to_string();
+        assert!(message.contains(why), "{message}");
+    }
+}
+
+#[test]
+fn what_is_drawn_are_the_gaussians_given_whatever_was_reserved() {
+    let gpu = gpu();
+    let setup = Setup::new(100, [32, 24], 0, 1);
+    let mut few = setup.gaussians();
+    // Of every plane the first: those of fewer Gaussians.
+    few = Gaussians { count: 10, parameters: vec![], ..few };
+    for (attribute, width) in [
+        (Attribute::Means, 3),
+        (Attribute::Quats, 4),
+        (Attribute::LogScales, 3),
+        (Attribute::RawOpacities, 1),
+        (Attribute::Dc, 3),
+    ] {
+        let all = setup.gaussians();
+        few.parameters.extend(&all.parameters[all.plane(attribute)][..10 * width]);
+    }
+    let render = |renderer: &mut Renderer, gaussians: &Gaussians| {
+        let gaussians = gaussians.upload(&gpu).unwrap();
+        renderer.render_image(&gaussians, &setup.camera, &setup.options).unwrap()
+    };
+    let alone = || {
+        let mut renderer = Renderer::new(&gpu, setup.settings).unwrap();
+        renderer.reserve(10, [&setup.camera]).unwrap();
+        renderer
+    };
+    let expected = render(&mut alone(), &few);
+    let mut renderer = Renderer::new(&gpu, setup.settings).unwrap();
+    renderer.reserve(300, [&setup.camera]).unwrap();
+    let all = render(&mut renderer, &setup.gaussians());
+    assert!(render(&mut renderer, &few) == expected && all != expected);
+    let too_many = setup.gaussians().upload(&gpu).unwrap();
+    let refused = alone().render_image(&too_many, &setup.camera, &setup.options).unwrap_err();
+    assert_eq!(refused.to_string(), "100 Gaussians exceed the 10 that the renderer reserved");
 }

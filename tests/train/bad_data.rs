@@ -107,7 +107,7 @@ fn a_number_of_a_configuration_that_is_none_names_file_and_setting() {
     let file = set.path().join("wrong.toml");
     fs::write(&file, "[schedule.initial_rates]\nquats = nan\n").unwrap();
     let arguments = format!("{} --config {}", train(set.path()), file.display());
-    refused(&arguments, 3, &["wrong.toml", "schedule.initial_rates.quats is NaN"]);
+    refused(&arguments, 3, &["wrong.toml", "schedule.initial_rates.quats is nan"]);
     let set_it = format!("{} --set schedule.initial_rates.quats=nan", train(set.path()));
-    refused(&set_it, 2, &["schedule.initial_rates.quats is NaN"]);
+    refused(&set_it, 2, &["schedule.initial_rates.quats is nan"]);
 }

@@ -17,7 +17,7 @@ fn train(config: &TrainConfig, dataset: &Dataset) -> (Vec<f64>, Vec<f32>) {
 }
 
 fn config(tone: ToneSettings) -> TrainConfig {
-    TrainConfig { steps: 5, sh_degree: 0, tone, ..TrainConfig::default() }
+    TrainConfig { steps: 5, sh_degree: 0, tone, ..TrainConfig::bare() }
 }
 
 /// Points so close that the cubics between them are the curve's to 1e-4.

@@ -8,11 +8,12 @@ use std::fs;
 use std::path::Path;
 
 use nightsplat::base::random::Stream;
+use nightsplat::gpu::Gpu;
 use nightsplat::photographs::dataset::synthetic::{self, Capture, SyntheticOptions};
 use nightsplat::photographs::dataset::{Dataset, DepthOptions, LoadOptions};
 use nightsplat::photographs::image::{Image, linear_from_srgb, srgb_from_linear};
 use nightsplat::train::diagnose::{Diagnosis, Plan};
-use nightsplat::train::{Preset, TrainConfig};
+use nightsplat::train::{Preset, TrainConfig, Trainer};
 
 use crate::common::command::{refused, run, succeed};
 
@@ -473,4 +474,24 @@ fn a_plan_of_another_dataset_or_none_at_all_is_refused_in_one_line() {
     fs::remove_file(&plan).unwrap();
     refused(&train, 3, &["plan.toml", "cannot be read"]);
     assert!(!out.exists());
+}
+
+#[test]
+fn the_library_plans_and_trains_what_the_command_does() {
+    let (set, out) = (written(&Capture::default()), tempfile::tempdir().unwrap());
+    let folder = out.path().join("run");
+    let train = format!("train {} --out {} --preset draft", set.path().display(), folder.display());
+    // It stops at once, with its configuration written.
+    run(&format!("{train} --max-minutes 1e-9"), 75);
+    let config = TrainConfig::load(&folder.join("config.toml")).unwrap();
+    let dataset = Dataset::load(set.path(), &config.load_options()).unwrap();
+    let gpu = Gpu::new(&config.device.parse().unwrap()).unwrap();
+    let trained = |mut trainer: Trainer| {
+        while trainer.steps_done() < 3 {
+            trainer.advance(3).unwrap();
+        }
+        trainer.gaussians().unwrap()
+    };
+    let planned = Trainer::planned(&gpu, &dataset, Preset::Draft).unwrap();
+    assert!(trained(planned) == trained(Trainer::new(&gpu, config, &dataset).unwrap()));
 }

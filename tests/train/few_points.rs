@@ -25,7 +25,7 @@ fn dataset(points: usize) -> (Vec<DVec3>, Dataset) {
 
 /// The first of two rounds fills.
 fn config() -> TrainConfig {
-    let mut config = TrainConfig { steps: 60, ..TrainConfig::default() };
+    let mut config = TrainConfig { steps: 60, ..TrainConfig::bare() };
     config.schedule.densify_after = 8;
     config.schedule.densify_interval = 20;
     config.density.fill = 300;

@@ -66,13 +66,13 @@ fn rewrite_points(folder: &Path, keeps: impl Fn(DVec3) -> bool) {
 }
 
 fn load(folder: &Path) -> Dataset {
-    Dataset::load(folder, &TrainConfig::default().load_options()).unwrap()
+    Dataset::load(folder, &TrainConfig::bare().load_options()).unwrap()
 }
 
 /// What a dark room is trained with: no curve lifts its black.
 fn config(background: Background) -> TrainConfig {
     let tone = ToneSettings::new(ToneCurve::None);
-    TrainConfig { steps: 200, background, tone, ..TrainConfig::default() }
+    TrainConfig { steps: 200, background, tone, ..TrainConfig::bare() }
 }
 
 /// The mean leftover transmittances of the test views, and what is said of them.
@@ -103,7 +103,7 @@ fn a_dark_room_is_hollow_before_black_which_is_said_and_whole_before_random_colo
 fn a_black_point_cloud_trains_to_what_a_grey_one_does() {
     let folder = tempfile::tempdir().unwrap();
     synthetic::write(folder.path(), &SET).unwrap();
-    let config = TrainConfig { steps: 30, ..TrainConfig::default() };
+    let config = TrainConfig { steps: 30, ..TrainConfig::bare() };
     let grey = train(&config, &load(folder.path())).1;
     rewrite_points(folder.path(), |_| true);
     let black = train(&config, &load(folder.path())).1;
@@ -135,13 +135,13 @@ fn what_a_mask_hides_is_no_hole() {
 #[test]
 fn a_denoiser_and_patches_leave_the_transmittances_as_they_are() {
     let dataset = crate::common::train::dataset(8, [64, 48]);
-    let mut config = TrainConfig { patch_pixels: Some(1000), ..TrainConfig::default() };
+    let mut config = TrainConfig { patch_pixels: Some(1000), ..TrainConfig::bare() };
     config.model.set_parts(&[Part::Denoiser]);
     let mut trainer = Trainer::new(&gpu(), config, &dataset).unwrap();
     let view = dataset.test_views().next().unwrap();
     let rendered = trainer.render(&view.camera).unwrap();
     assert!(rendered.denoised.is_some());
-    let (gaussians, plain) = (trainer.gaussians().unwrap(), TrainConfig::default());
+    let (gaussians, plain) = (trainer.gaussians().unwrap(), TrainConfig::bare());
     let mut player = Player::new(&gpu(), &gaussians, &plain, None).unwrap();
     let whole = player.render(view).unwrap();
     let [in_parts, whole] = [rendered, whole].map(|own| own.transmittances.unwrap());

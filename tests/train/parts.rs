@@ -41,7 +41,7 @@ fn make_set(folder: &Path, with_depth: bool) {
 
 fn config(parts: &[Part]) -> TrainConfig {
     let tone = ToneSettings::new(ToneCurve::Ap3);
-    let mut config = TrainConfig { steps: 40, sh_degree: 0, tone, ..Default::default() };
+    let mut config = TrainConfig { steps: 40, sh_degree: 0, tone, ..TrainConfig::bare() };
     config.schedule.densify_after = 10;
     config.schedule.densify_interval = 15;
     config.model.set_parts(parts);

@@ -13,7 +13,6 @@ use nightsplat::photographs::image::{Image, Mask};
 use nightsplat::photographs::metrics::Scores;
 use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
 use nightsplat::splats::render::{self, Damping, RenderOptions, RenderSettings, Renderer};
-use nightsplat::splats::scene::Gaussians;
 use nightsplat::train::{Learning, Part, Rendered, TrainConfig, Trainer};
 
 use crate::common::Random;
@@ -41,7 +40,7 @@ fn patches_show_what_the_whole_view_shows() {
     let whole = setup(None);
     let rendered = whole.render();
     let expected = [&rendered.render[..], &rendered.transmittances].concat();
-    let gaussians = gpu().buffer("parameters", &whole.parameters).unwrap();
+    let gaussians = whole.upload();
     for (patch_pixels, count) in [(2500, 2), (1000, 6), (300, 20)] {
         let setup = setup(Some(patch_pixels));
         let mut renderer = renderer(&setup);
@@ -59,7 +58,7 @@ fn patches_show_what_the_whole_view_shows() {
 /// The gradients of the parameters, and what density control is told, of a loss per pixel of each patch.
 fn gradients(setup: &Setup, weights: &[f32]) -> [Vec<f32>; 3] {
     let (gpu, mut renderer) = (gpu(), renderer(setup));
-    let gaussians = gpu.buffer("parameters", &setup.parameters).unwrap();
+    let gaussians = setup.upload();
     let mut sums = vec![0.0; setup.parameters.len()];
     let mut grad_norm_sums = gpu.zeros("grad_norm_sums", setup.count).unwrap();
     let mut visit_counts = gpu.zeros("visit_counts", setup.count).unwrap();
@@ -130,7 +129,7 @@ fn dataset() -> Dataset {
 
 fn config(patch_pixels: Option<u64>) -> TrainConfig {
     let tone = ToneSettings::new(ToneCurve::Ap3);
-    let mut config = TrainConfig { steps: 60, tone, patch_pixels, ..Default::default() };
+    let mut config = TrainConfig { steps: 60, tone, patch_pixels, ..TrainConfig::bare() };
     config.schedule.densify_after = 10;
     config.schedule.densify_interval = 20;
     config
@@ -207,13 +206,12 @@ fn a_denoiser_sees_around_each_patch() {
     let sh_degree = config.render_settings().shape.sh_degree;
     let gaussians = trainer.gaussians_in_frame().unwrap().with_sh_degree(sh_degree);
     let camera = trainer.frame().camera(&dataset.views[0].camera);
-    let parameters = gpu().buffer("parameters", &gaussians.parameters).unwrap();
+    let on_device = gaussians.upload(&gpu()).unwrap();
     let options = RenderOptions { sh_degree: 0, background: [0.0; 3] };
     let [whole, patches] = [None, Some(800)].map(|patch_pixels| {
         let settings = RenderSettings { patch_pixels, ..config.render_settings() };
         let mut renderer = Renderer::new(&gpu(), settings).unwrap();
-        let model = (&parameters, gaussians.count);
-        Rendered::new(&mut renderer, model, &camera, &options, trainer.networks()).unwrap()
+        Rendered::new(&mut renderer, &on_device, &camera, &options, trainer.networks()).unwrap()
     });
     let largest = |one: &Image, other: &Image| {
         let errors = one.data.iter().zip(&other.data).map(|(one, other)| (one - other).abs());
@@ -247,7 +245,11 @@ fn a_run_on_patches_says_so_is_resumed_to_the_same_bits_and_scored() {
             place.model("whole")
         }
     );
-    refused(&place.train("few", "--patch-pixels 255"), 2, &["--patch-pixels is 255", "256"]);
+    refused(
+        &place.train("few", "--patch-pixels 255"),
+        2,
+        &["patch_pixels (--patch-pixels) is 255", "256"],
+    );
     assert!(!fs::exists(place.path("few")).unwrap());
 }
 
@@ -273,7 +275,7 @@ fn more_intersections_than_the_device_binds_are_rendered_in_halves() {
         eprintln!("not run: this device binds {most} intersections at once");
         return;
     }
-    let gaussians = gpu().buffer("parameters", &own.parameters).unwrap();
+    let gaussians = own.upload();
     let shown = renderer.render_channels(&gaussians, &own.camera, &own.options).unwrap();
     assert!(renderer.intersections().unwrap() > most / 3, "the last was no half");
     let mut parted = own.clone();
@@ -299,8 +301,7 @@ fn training_takes_patches_of_which_the_device_follows_every_intersection() {
         points: vec![],
         skipped: vec![],
     };
-    let gaussians =
-        Gaussians { count: own.count, shape: own.settings.shape, parameters: own.parameters };
+    let gaussians = own.gaussians();
     let mut config = TrainConfig { steps: 8, sh_degree: 0, ..config(None) };
     config.frame = Some(Frame::WORLD);
     config.schedule.resolution_steps = [0, 0];

@@ -16,8 +16,8 @@ fn alone() -> MutexGuard<'static, ()> {
 }
 
 fn config(tone: ToneSettings, photographs: PhotographBits) -> TrainConfig {
-    let precision = PrecisionConfig { photographs, ..PrecisionConfig::default() };
-    TrainConfig { steps: 4, sh_degree: 0, tone, precision, ..TrainConfig::default() }
+    let precision = PrecisionConfig { photographs, ..TrainConfig::bare().precision };
+    TrainConfig { steps: 4, sh_degree: 0, tone, precision, ..TrainConfig::bare() }
 }
 
 /// The losses of the steps and the parameters after them, and the peak of the memory.
@@ -84,7 +84,7 @@ fn a_step_on_coded_photographs_agrees_with_the_references() {
 
 #[test]
 fn the_bits_are_a_setting_like_any_other() {
-    let with = |assignment: &str| TrainConfig::default().with(&[assignment.to_owned()]);
+    let with = |assignment: &str| TrainConfig::bare().with(&[assignment.to_owned()]);
     for (text, bits) in [
         ("exact", PhotographBits::Exact),
         ("32", PhotographBits::Single),

@@ -13,7 +13,7 @@ use nightsplat::gpu::{DeviceChoice, Gpu};
 use nightsplat::photographs::image::Image;
 use nightsplat::photographs::metrics::Scores;
 use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
-use nightsplat::splats::halves::Bits;
+use nightsplat::splats::halves::StorageFormat;
 use nightsplat::splats::scene::{Gaussians, Shape};
 use nightsplat::train::{Background, StepReport, TrainConfig, Trainer};
 
@@ -27,7 +27,7 @@ fn dataset() -> Dataset {
 /// Density control acts twice within sixty steps.
 fn config() -> TrainConfig {
     let tone = ToneSettings::new(ToneCurve::Ap3);
-    let mut config = TrainConfig { steps: 60, tone, ..Default::default() };
+    let mut config = TrainConfig { steps: 60, tone, ..TrainConfig::bare() };
     config.schedule.densify_after = 10;
     config.schedule.densify_interval = 20;
     config.schedule.sh_degree_interval = 15;
@@ -35,7 +35,7 @@ fn config() -> TrainConfig {
 }
 
 fn mean_psnr(dataset: &Dataset, gaussians: &Gaussians) -> f64 {
-    let mut player = Player::new(&gpu(), gaussians, &TrainConfig::default(), None).unwrap();
+    let mut player = Player::new(&gpu(), gaussians, &TrainConfig::bare(), None).unwrap();
     let scored = eval::score(dataset, |view| player.render(view)).unwrap();
     let scores: Vec<Scores> = scored.iter().map(|view| view.scores).collect();
     Scores::mean(&scores).unwrap().psnr
@@ -176,7 +176,7 @@ fn a_plain_step_is_at_most_24_dispatches_and_20_barriers() {
         config.precision.rest = rest;
         config
     };
-    for bits in [Bits::Single, Bits::Half] {
+    for bits in [StorageFormat::Single, StorageFormat::Half] {
         let [dispatches, barriers] = recorded_for_a_step(with_all_coefficients(bits));
         let counted = format!("{bits:?}: {dispatches} dispatches, {barriers} barriers");
         println!("{counted}");
@@ -333,6 +333,6 @@ fn a_render_shows_what_its_model_was_trained_to() {
     let view = &dataset.views[0];
     let in_training = trainer.render(&view.camera).unwrap();
     let mut player =
-        Player::new(&gpu(), &trainer.gaussians().unwrap(), &TrainConfig::default(), None).unwrap();
+        Player::new(&gpu(), &trainer.gaussians().unwrap(), &TrainConfig::bare(), None).unwrap();
     assert_eq!(in_training.colors.data, player.render(view).unwrap().colors.data);
 }

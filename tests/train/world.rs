@@ -9,12 +9,13 @@ use nightsplat::photographs::dataset::Dataset;
 use nightsplat::photographs::metrics::Scores;
 use nightsplat::results::eval::{self, Player, ViewScore};
 use nightsplat::results::run::{self, HeldRun};
+use nightsplat::splats::scene::ply;
 use nightsplat::train::{TrainConfig, Trainer};
 
 use crate::common::train::advance;
 
 fn config() -> TrainConfig {
-    let mut config = TrainConfig { steps: 150, ..TrainConfig::default() };
+    let mut config = TrainConfig { steps: 150, ..TrainConfig::bare() };
     config.schedule.densify_after = 10;
     config.schedule.densify_interval = 40;
     config.schedule.resolution_steps = [0, 40];
@@ -99,6 +100,29 @@ fn a_run_in_any_world_is_scored_as_it_was_trained_and_its_model_lies_in_that_wor
         let scales = gaussians.log_scales().iter().map(|scale| f64::from(scale.x)).sum::<f64>();
         let typical = (scales / gaussians.count as f64).exp() / there.extent();
         assert!((1e-3..1.0).contains(&typical), "{scale}: {typical} of the extent");
+    }
+}
+
+#[test]
+fn a_run_begins_with_a_model_of_its_world_as_that_model_was_left() {
+    let dataset = crate::common::train::dataset(10, [64, 48]);
+    let config = TrainConfig { steps: 40, ..config() };
+    for (scale, offset) in [(1.0, 0.0), (3.0, 4.5e6)] {
+        let there = moved(&dataset, scale, offset * DVec3::new(1.0, -0.7, 0.1));
+        let psnr = |trainer: &mut Trainer| {
+            mean_psnr(&eval::score(&there, |view| trainer.render(&view.camera)).unwrap())
+        };
+        let mut trainer = Trainer::new(&gpu(), config.clone(), &there).unwrap();
+        advance(&mut trainer, config.steps);
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("model.ply");
+        let model = trainer.gaussians().unwrap();
+        assert_eq!(model.origin != DVec3::ZERO, offset > 0.0);
+        ply::save(&model, &path).unwrap();
+        let from_model = TrainConfig { init: Some(path), ..config.clone() };
+        let mut again = Trainer::new(&gpu(), from_model, &there).unwrap();
+        let [before, after] = [psnr(&mut trainer), psnr(&mut again)];
+        assert!((before - after).abs() < 0.01, "{scale} at {offset}: {after}, not {before}");
     }
 }
 

@@ -103,12 +103,12 @@ fn rasteriser(
     bench.gpu.reset_peak_memory();
     let shape = Shape { sh_degree: MAX_SH_DEGREE, features };
     let camera = scene::camera(width, height);
-    let parameters = scene::gaussians(&camera, gaussians, shape).upload(&bench.gpu)?;
+    let on_device = scene::gaussians(&camera, gaussians, shape).upload(&bench.gpu)?;
     let settings = RenderSettings { shape, ..RenderSettings::default() };
     let mut renderer = Renderer::new(&bench.gpu, settings)?;
     renderer.reserve(gaussians, [&camera])?;
-    renderer.render_channels(&parameters, &camera, &super::tune::OPTIONS)?;
-    let mut pass = Pass::new(bench, camera, parameters, gaussians, features.channels())?;
+    renderer.render_channels(&on_device, &camera, &super::tune::OPTIONS)?;
+    let mut pass = Pass::new(bench, camera, on_device)?;
     let milliseconds = bench.least(|| Ok(pass.profile(bench, &mut renderer)?[2]))?;
     Ok((milliseconds, bench.gpu.peak_memory()))
 }

@@ -70,7 +70,7 @@ pub(super) fn trainers(gpu: &Gpu, scene: &Scene) -> Result<Trainers> {
 
 /// A configuration whose steps all do the same work, behind those that the SH take to come into use.
 fn config(curve: ToneCurve) -> TrainConfig {
-    let mut config = TrainConfig { tone: ToneSettings::new(curve), ..TrainConfig::default() };
+    let mut config = TrainConfig { tone: ToneSettings::new(curve), ..TrainConfig::bare() };
     config.schedule.sh_degree_interval = 1;
     config.schedule.boost = 1.0;
     config.schedule.densify_after = i64::MAX as u64;

@@ -9,7 +9,7 @@ use super::{Bench, median, scene, stages, table, total};
 use crate::camera::Camera;
 use crate::gpu::{Buffer, Statistic, TUNE_VARIABLE, Tile, TunedTile};
 use crate::splats::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer, Status};
-use crate::splats::scene::{Features, MAX_SH_DEGREE, Shape};
+use crate::splats::scene::{DeviceGaussians, Features, Layout, MAX_SH_DEGREE, Shape};
 
 /// From the few pixels of a narrow subgroup to 32 rows of a wide one.
 const SIZES: [[u32; 2]; 7] = [[8, 4], [8, 8], [16, 4], [16, 8], [16, 16], [32, 8], [32, 16]];
@@ -129,7 +129,7 @@ impl Case {
         let shape = Shape { sh_degree: MAX_SH_DEGREE, features };
         let camera = scene::camera(width, height);
         let scene = scene::gaussians(&camera, gaussians, shape);
-        let parameters = scene.upload(gpu)?;
+        let on_device = scene.upload(gpu)?;
         let subgroups = if gpu.properties().is_cpu { &SUBGROUPS[..1] } else { &SUBGROUPS };
         let sharing = |size| subgroups.iter().map(move |&subgroups| Tile { size, subgroups });
         let is_tried = |tile: &Tile| {
@@ -142,7 +142,7 @@ impl Case {
             let settings = RenderSettings { shape, tile: Some(tile), ..RenderSettings::default() };
             let mut renderer = Renderer::new(gpu, settings)?;
             renderer.reserve(gaussians, [&camera])?;
-            let render = renderer.render_channels(&parameters, &camera, &OPTIONS)?;
+            let render = renderer.render_channels(&on_device, &camera, &OPTIONS)?;
             let first = first.get_or_insert_with(|| render.clone());
             let measured = Measured {
                 tile,
@@ -155,7 +155,7 @@ impl Case {
             };
             candidates.push(Candidate { renderer, measured, times: vec![] });
         }
-        let mut pass = Pass::new(bench, camera, parameters, gaussians, features.channels())?;
+        let mut pass = Pass::new(bench, camera, on_device)?;
         // Round by round, so that whatever else the device does meets every tile alike; the first does not count.
         for round in 0..=bench.repeats {
             for candidate in &mut candidates {
@@ -214,7 +214,7 @@ pub(super) const OPTIONS: RenderOptions =
 /// All that a pass of the rasteriser reads and writes beside the memory of its renderer.
 pub(super) struct Pass {
     camera: Camera,
-    parameters: Buffer<f32>,
+    gaussians: DeviceGaussians,
     d_render: Buffer<f32>,
     gradients: Buffer<f32>,
     grad_norm_sums: Buffer<f32>,
@@ -225,18 +225,17 @@ impl Pass {
     pub(super) fn new(
         Bench { gpu, .. }: &Bench,
         camera: Camera,
-        parameters: Buffer<f32>,
-        gaussians: usize,
-        channels: usize,
+        gaussians: DeviceGaussians,
     ) -> crate::Result<Self> {
-        let values = channels * camera.width as usize * camera.height as usize;
+        let Layout { count, shape, .. } = gaussians.layout;
+        let values = shape.features.channels() * camera.width as usize * camera.height as usize;
         Ok(Self {
             camera,
             d_render: gpu.buffer("d_render", &vec![1e-3; values])?,
-            gradients: gpu.zeros("gradients", parameters.len())?,
-            grad_norm_sums: gpu.zeros("grad_norm_sums", gaussians)?,
-            visit_counts: gpu.zeros("visit_counts", gaussians)?,
-            parameters,
+            gradients: gpu.zeros("gradients", gaussians.layout.floats().len())?,
+            grad_norm_sums: gpu.zeros("grad_norm_sums", count)?,
+            visit_counts: gpu.zeros("visit_counts", count)?,
+            gaussians,
         })
     }
 
@@ -246,16 +245,17 @@ impl Pass {
         bench: &Bench,
         renderer: &mut Renderer,
     ) -> crate::Result<[f64; 3]> {
-        let Self { camera, parameters, d_render, .. } = self;
+        let Self { camera, gaussians, d_render, .. } = self;
         let times = bench.gpu.profile("tune", |pass| {
-            renderer.forward(pass, parameters, &*camera, &OPTIONS)?;
+            renderer.forward(pass, &*gaussians, &*camera, &OPTIONS)?;
             let gradients = Gradients {
                 parameters: &mut self.gradients,
                 grad_norm_sums: &mut self.grad_norm_sums,
                 visit_counts: &mut self.visit_counts,
             };
             let damping = Damping { weight: 0.0, depth: 0.0 };
-            renderer.backward(pass, parameters, &*camera, &OPTIONS, damping, d_render, gradients)
+            let drawn = gaussians.slice();
+            renderer.backward(pass, drawn, &*camera, &OPTIONS, damping, d_render, gradients)
         })?;
         let of = |name| stages::of_kernels(&times, &[name]);
         Ok([of("blend_forward"), of("blend_backward"), total(&times)])

@@ -1,8 +1,13 @@
 //! How a dataset is loaded.
 
+use std::ops::Bound;
 use std::path::PathBuf;
 
+use crate::base::settings::Rule;
 use crate::{Error, Result};
+
+/// The factors by which photographs may shrink.
+pub const DOWNSCALE: Rule = Rule::Number(Bound::Included(1.0), Bound::Unbounded);
 
 /// How a dataset is loaded.
 #[derive(Clone, Debug)]
@@ -83,18 +88,21 @@ impl LoadOptions {
     /// Refuses options that make no sense.
     ///
     /// # Errors
-    /// [`Error::Usage`] for the downscale, [`Error::Input`] for a folder that is not there.
+    /// [`Error::Setting`], and [`Error::Input`] for a folder that is not there.
     pub(super) fn check(&self) -> Result<()> {
-        // Positive phrasing: a NaN fails the test too.
-        if !(self.downscale >= 1.0 && self.downscale.is_finite()) {
-            let downscale = self.downscale;
-            return Err(Error::Usage(format!(
-                "`LoadOptions::downscale` is {downscale}; it must be 1 or more"
-            )));
+        let refused = |key: &str, value: f64, rule: &dyn ToString| {
+            let (key, value, rule) = (key.to_owned(), value.to_string(), rule.to_string());
+            Err(Error::Setting { key, value, rule })
+        };
+        if !DOWNSCALE.takes_number(self.downscale) {
+            return refused("downscale", self.downscale, &DOWNSCALE);
         }
         if self.test_every == Some(1) {
-            let problem = "`LoadOptions::test_every` is 1, which leaves no view to train on; it must be 0 or 2 and more";
-            return Err(Error::Usage(problem.to_owned()));
+            return refused(
+                "test_every",
+                1.0,
+                &"0, or 2 and more: else no view is left to train on",
+            );
         }
         match &self.reference {
             Some(folder) if !folder.is_dir() => {

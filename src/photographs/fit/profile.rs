@@ -149,7 +149,7 @@ pub fn fit_profile(scenes: &[(&str, Vec<&ColourPair>)], huber: f64) -> Result<Pr
     // Positive phrasing: a NaN fails the test too.
     let is_positive = huber > 0.0;
     if !is_positive {
-        let problem = format!("`FitOptions::huber` is {huber}; it must be above 0");
+        let problem = format!("huber is {huber}; it must be above 0");
         return Err(Error::Usage(problem));
     }
     let colours = || pairs.iter().flat_map(|pair| &pair.colours);

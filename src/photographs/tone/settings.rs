@@ -1,5 +1,6 @@
 //! A curve with all its constants, as the command line, TOML files and run directories give it.
 
+use std::any::Any;
 use std::collections::BTreeMap;
 use std::str::FromStr;
 
@@ -10,6 +11,7 @@ use super::families::{White, padded};
 use super::law::{Numbers, black_level, law};
 use super::real::Real;
 use super::{Profile, Statistics, Table, ToneCurve, ToneParameters};
+use crate::base::settings::{self, Rule, Setting};
 use crate::{Error, Result};
 
 /// lambda where none is given: the references of views keep more colour than single curves leave.
@@ -57,6 +59,13 @@ pub struct ToneSettings {
     pub profile: Option<Profile>,
 }
 
+/// What the kernels can compute with, in 32 bits.
+const MOST: f64 = 1e30;
+
+/// Settings that belong to a curve: they do not outlast the choice of another one.
+pub(crate) const OF_CURVE: [&str; 8] =
+    ["gain_c", "alpha", "auto_gain", "colour", "lift_first", "constants", "table", "profile"];
+
 impl<T: Real> From<&ToneSettings> for Numbers<T> {
     fn from(settings: &ToneSettings) -> Self {
         Self {
@@ -71,6 +80,38 @@ impl<T: Real> From<&ToneSettings> for Numbers<T> {
 }
 
 impl ToneSettings {
+    /// A row for each setting.
+    pub const SETTINGS: &'static [Setting] = settings::settings! { rows "tone."
+        /// The tone curve: a name that `nightsplat curves` lists.
+        curve => Rule::Text("a curve that `nightsplat curves` lists", |name| name.parse::<ToneCurve>().is_ok()), "--curve NAME|FILE";
+        /// c: how much a brighter photograph raises the curve's gain.
+        gain_c, "the curve's" => Rule::from_to(0.0, MOST), "--gain C|auto";
+        /// theta: the mean over all channels that the linear curve aims at, before clipping.
+        theta => Rule::above(0.0, MOST), "--theta T";
+        /// alpha: the highest black level.
+        alpha, "the curve's" => Rule::SHARE;
+        /// beta: how fast the black level falls as p10 approaches p90; 0: it is alpha for every photograph.
+        beta => Rule::from_to(0.0, MOST);
+        /// g0: the gain of ASE on a black photograph.
+        base_gain => Rule::above(0.0, MOST);
+        /// One curve serves a scene: its statistics are the means over the training views, its gain that of all of them.
+        scene_statistics => Rule::Flag;
+        /// The gain is the one that the photographs ask for, and c and g0 have no say. The curve auto has no other.
+        auto_gain, "the curve's" => Rule::Flag;
+        /// The mean luminance of the targets where the gain is automatic.
+        brightness, "found between 0.44 and 0.54" => Rule::from_to(0.1, 0.9), "--brightness T";
+        /// lambda: how much of the curve auto keeps the ratios of the channels.
+        colour => Rule::SHARE, "--colour L";
+        /// A photograph is lifted at its own size and shrunk after that.
+        lift_first, "as auto_gain" => Rule::Flag;
+        /// The constants of the curve's formula, by name.
+        constants, "the curve's" => Rule::Table("a table with every constant of the curve");
+        /// The values of the curve `table`, as --curve reads them from a .csv or .cube file.
+        table, "none" => Rule::Table("a table of values");
+        /// The camera profile of the curve `profile`, as --profile reads it.
+        profile, "none" => Rule::Table("a camera profile");
+    };
+
     /// The family's constants, and the paper's for LOM; c is 3 for ASE and 1 for AP3. The automatic curve lifts before
     /// photographs are shrunk, the others behind it.
     pub fn new(curve: ToneCurve) -> Self {
@@ -158,34 +199,19 @@ impl ToneSettings {
     /// Refuses constants that leave a curve undefined, decreasing or above white at black.
     ///
     /// # Errors
-    /// [`Error::Usage`] names the constant.
+    /// [`Error::Setting`], and [`Error::Usage`] for what does not go together.
     pub fn check(&self) -> Result<()> {
-        let brightness = self.brightness.unwrap_or(0.5);
-        let rules = [
-            ("`ToneSettings::gain_c`", self.gain_c, self.gain_c >= 0.0, "at least 0"),
-            ("`ToneSettings::theta`", self.theta, self.theta > 0.0, "above 0"),
-            ("alpha", self.alpha, (0.0..=1.0).contains(&self.alpha), "from 0 to 1"),
-            ("beta", self.beta, self.beta >= 0.0, "at least 0"),
-            ("base_gain (g0)", self.base_gain, self.base_gain > 0.0, "above 0"),
-            (
-                "`ToneSettings::colour`",
-                self.colour,
-                (0.0..=1.0).contains(&self.colour),
-                "from 0 to 1",
-            ),
-            (
-                "`ToneSettings::brightness`",
-                brightness,
-                (0.1..=0.9).contains(&brightness),
-                "from 0.1 to 0.9",
-            ),
+        let values: [(&str, &dyn Any); 7] = [
+            ("tone.gain_c", &self.gain_c),
+            ("tone.theta", &self.theta),
+            ("tone.alpha", &self.alpha),
+            ("tone.beta", &self.beta),
+            ("tone.base_gain", &self.base_gain),
+            ("tone.brightness", &self.brightness),
+            ("tone.colour", &self.colour),
         ];
-        for (name, value, holds, rule) in rules {
-            if !(holds && (value as f32).is_finite()) {
-                return Err(Error::Usage(format!(
-                    "{name} is {value}; it must be finite and {rule}"
-                )));
-            }
+        for (key, value) in values {
+            settings::row(Self::SETTINGS, key).map_or(Ok(()), |row| row.check(value))?;
         }
         self.check_gain().and_then(|()| self.check_constants()).map_err(Error::Usage)
     }
@@ -196,15 +222,17 @@ impl ToneSettings {
         let has_gain = self.curve.is_formula() && self.curve != ToneCurve::None;
         if self.curve == ToneCurve::Auto && self.gain_c != 0.0 {
             return Err(format!(
-                "the curve `{name}` takes no `ToneSettings::gain_c`; `ToneSettings::brightness` is its mean"
+                "the curve `{name}` takes no gain (tone.gain_c); tone.brightness sets its mean luminance"
             ));
         }
         if self.curve == ToneCurve::Profile
             && (self.gain_c != 0.0 || !self.auto_gain || self.brightness.is_some())
         {
-            return Err("a camera profile is as bright as its references: it takes no `ToneSettings::gain_c` and no \
-                        `ToneSettings::brightness`"
-                .to_owned());
+            return Err(
+                "a camera profile is as bright as its references: it takes no gain (tone.gain_c) \
+                        and no tone.brightness"
+                    .to_owned(),
+            );
         }
         let is_exposed = matches!(self.curve, ToneCurve::Auto | ToneCurve::Profile);
         if self.auto_gain && !is_exposed && !has_gain {
@@ -214,8 +242,8 @@ impl ToneSettings {
         }
         if self.brightness.is_some() && !self.takes_exposure() {
             return Err(format!(
-                "the curve `{name}` has the brightness that its gain gives it; `ToneSettings::brightness` is for a gain \
-                 that is `auto`"
+                "the curve `{name}` has the brightness that its gain gives it; tone.brightness is for a gain that is \
+                 automatic"
             ));
         }
         Ok(())

@@ -5,7 +5,7 @@
 
 use ruzstd::encoding::{CompressionLevel, compress_to_vec};
 
-use super::{gzip, half_turn, sigmoid, unit};
+use super::{gzip_with, half_turn, origin_line, sigmoid, unit};
 use crate::splats::scene::{Gaussians, rest_coefficients};
 use crate::{Error, Result};
 
@@ -52,7 +52,7 @@ pub fn encode(gaussians: &Gaussians, version: Version) -> Result<Vec<u8>> {
         Version::V3 => {
             file.extend([degree, fraction, 0, 0]);
             streams.iter().for_each(|stream| file.extend(stream));
-            gzip(&file)
+            gzip_with(&file, origin_line(&gaussians, true))
         }
         Version::V4 => {
             const HEADER: u32 = 32;
@@ -68,6 +68,8 @@ pub fn encode(gaussians: &Gaussians, version: Version) -> Result<Vec<u8>> {
                 file.extend((stream.len() as u64).to_le_bytes());
             }
             compressed.iter().for_each(|stream| file.extend(stream));
+            // Behind all that the table names, where a reader does not look.
+            file.extend(origin_line(&gaussians, true).unwrap_or_default().bytes());
             Ok(file)
         }
     }

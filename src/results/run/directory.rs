@@ -26,8 +26,6 @@ use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
-use glam::DVec3;
-
 use super::aside::{self, Aside};
 use super::files::*;
 use super::generations;
@@ -36,13 +34,12 @@ use super::lock::RunLock;
 pub use super::progress::Progress;
 use super::tensorboard::EventFile;
 use crate::base::output::{csv_field, write_whole};
-use crate::camera::Frame;
 use crate::loss::Term;
 use crate::loss::exposure::{Affine, table};
 use crate::photographs::dataset::{Dataset, Split, View};
 use crate::splats::scene::{Gaussians, ply};
 use crate::train::diagnose::Plan;
-use crate::train::{Networks, StepReport, TrainConfig, Trainer};
+use crate::train::{Networks, Settings, StepReport, TrainConfig, Trainer};
 use crate::{Error, Result};
 
 /// A run directory and the log that grows in it.
@@ -164,9 +161,8 @@ impl RunDirectory {
         let lines: Vec<&str> = text.split_inclusive('\n').take(step as usize + 1).collect();
         let last = lines.last().filter(|line| line.starts_with(&format!("{step},")));
         if last.is_none_or(|line| !line.ends_with('\n')) {
-            let problem = format!(
-                "ends before step {step} of the checkpoint; begin anew with `HeldRun::Replace`"
-            );
+            let problem =
+                format!("ends before step {step} of the checkpoint; begin anew with --overwrite");
             return Err(Error::input(&log_path, problem));
         }
         let milliseconds = |line: &&str| line.trim_end().rsplit(',').next()?.parse::<f64>().ok();
@@ -221,6 +217,15 @@ impl RunDirectory {
         let lines: String = progress.iter().map(Progress::line).collect();
         let text = format!("{}\n{lines}", Progress::COLUMNS);
         write_whole(&self.path.join(PROGRESS), text.as_bytes())
+    }
+
+    /// Writes the configuration with who says each value.
+    ///
+    /// # Errors
+    /// The disk is full or gone.
+    pub(super) fn save_config(&self, config: &TrainConfig, settings: &Settings) -> Result<()> {
+        let text = settings.written(&config.clone().with_absolute_paths())?;
+        write_whole(&self.path.join("config.toml"), text.as_bytes())
     }
 
     /// Writes the plan that the configuration follows.
@@ -314,26 +319,19 @@ impl RunDirectory {
         self.log.flush().map_err(|error| unwritable(&self.path, &error))
     }
 
-    /// Writes `model.ply`, in the colours that viewers show and in the dataset's world: relative to
-    /// [`Frame::file_origin`], which a comment says where it is not the world's own.
+    /// Writes `model.ply`, in the colours that viewers show and in the dataset's world.
     ///
     /// # Errors
     /// The disk is full or gone, or a parameter is not finite.
     pub fn save_model(&mut self, trainer: &Trainer) -> Result<()> {
         self.flush_log()?;
-        let (mut gaussians, frame) = (trainer.gaussians_in_frame()?, trainer.frame());
-        trainer.refuse_not_finite(&gaussians)?;
-        let origin = frame.file_origin();
-        if *frame != Frame::WORLD {
-            gaussians = gaussians.to_world(frame, origin);
-        }
+        let in_frame = trainer.gaussians_in_frame()?;
+        trainer.refuse_not_finite(&in_frame)?;
+        let mut gaussians = in_frame.to_world(trainer.frame());
         if self.raw_colors {
             gaussians.shift_colors(-0.5);
         }
-        let [x, y, z] = origin.to_array();
-        let comment = format!("world = position + {x} {y} {z}");
-        let comments = if origin == DVec3::ZERO { &[][..] } else { &[comment.as_str()] };
-        ply::save_with_comments(&gaussians, self.path.join("model.ply"), comments)
+        ply::save(&gaussians, self.path.join("model.ply"))
     }
 
     /// Writes the weights of the networks.
@@ -392,7 +390,7 @@ fn is_run(path: &Path) -> bool {
 }
 
 fn held(path: &Path, file: &str) -> Error {
-    let problem = format!("already holds a run ({file}); pass `HeldRun::Replace` to replace it");
+    let problem = format!("already holds a run ({file}); --overwrite replaces it");
     Error::output(path, problem)
 }
 
@@ -427,7 +425,7 @@ mod tests {
         drop(RunDirectory::create(folder.path(), &config, false).unwrap());
         std::fs::write(folder.path().join("notes.txt"), "mine").unwrap();
         let error = RunDirectory::create(folder.path(), &config, false).unwrap_err();
-        assert!(error.to_string().contains("HeldRun::Replace"), "{error}");
+        assert!(error.to_string().contains("--overwrite"), "{error}");
         drop(RunDirectory::create(folder.path(), &config, true).unwrap());
         assert!(folder.path().join("notes.txt").exists());
         assert_eq!(load_config(folder.path()).unwrap(), config);

@@ -13,7 +13,7 @@ use crate::photographs::dataset::{Dataset, View};
 use crate::results::eval::{self, Compared, ViewScore, Yardstick};
 use crate::splats::attributes::{ATTRIBUTES, AttributeSpec};
 use crate::train::diagnose::Plan;
-use crate::train::{Ended, Learning, MemoryEstimate, StepReport, TrainConfig, Trainer};
+use crate::train::{Ended, Learning, MemoryEstimate, Settings, StepReport, TrainConfig, Trainer};
 use crate::{Error, Result, Stop};
 
 /// What becomes of a run that the directory already holds.
@@ -33,6 +33,8 @@ pub enum HeldRun {
 pub struct Session<'a> {
     /// The plan that its configuration and dataset follow already; it is kept in the run directory.
     pub plan: Option<&'a Plan>,
+    /// Where the configuration's values come from; config.toml says so.
+    pub settings: Option<&'a Settings>,
     /// What becomes of a run that is there.
     pub held: HeldRun,
     /// What is asked of it on the way.
@@ -90,7 +92,7 @@ pub fn train_in(
     mut observe: impl FnMut(Event<'_>),
 ) -> Result<Trained> {
     gpu.reset_peak_memory();
-    let (mut directory, mut trainer) = begin(gpu, config, dataset, out, session.held)?;
+    let (mut directory, mut trainer) = begin(gpu, config, dataset, out, session)?;
     if let Some(plan) = session.plan {
         directory.save_plan(plan)?;
     }
@@ -152,8 +154,9 @@ fn begin(
     config: &TrainConfig,
     dataset: &Dataset,
     out: &Path,
-    held: HeldRun,
+    session: &Session<'_>,
 ) -> Result<(RunDirectory, Trainer)> {
+    let held = session.held;
     // A tile that does not suit the device is said before there is a directory.
     config.render_settings().tile_on(gpu)?;
     match held {
@@ -169,7 +172,14 @@ fn begin(
     // A disk that has room for the run has it for photographs.
     config.spool.get_or_insert_with(|| out.to_owned());
     let config = &config;
-    let mut trainer = Trainer::new(gpu, config.clone(), dataset)?;
+    let explain = |directory: &RunDirectory| match session.settings {
+        Some(settings) => directory.save_config(config, settings),
+        None => Ok(()),
+    };
+    let mut trainer = match checkpoint {
+        Some(_) => Trainer::to_restore(gpu, config.clone(), dataset)?,
+        None => Trainer::new(gpu, config.clone(), dataset)?,
+    };
     if let Some(checkpoint) = checkpoint {
         trainer.restore(&checkpoint)?;
         let step = trainer.steps_done();
@@ -177,6 +187,7 @@ fn begin(
         let mut directory = RunDirectory::resume(out, lock, config, step)?;
         // What it had of a later step is gone: the model is that of the checkpoint again.
         directory.save_trained(&mut trainer)?;
+        explain(&directory)?;
         return Ok((directory, trainer));
     }
     // Without a checkpoint, an unfinished run is nothing to lose.
@@ -185,7 +196,9 @@ fn begin(
         HeldRun::Replace => true,
         HeldRun::Resume => !load::is_finished(out),
     };
-    Ok((RunDirectory::create_locked(out, lock, config, replaces)?, trainer))
+    let directory = RunDirectory::create_locked(out, lock, config, replaces)?;
+    explain(&directory)?;
+    Ok((directory, trainer))
 }
 
 /// The configuration with the tile and the frame that are to be recorded: the same ones give the same bits, whatever is

@@ -3,6 +3,7 @@
 use super::{Adam, AdamBuffers, LearningRates};
 use crate::Result;
 use crate::gpu::{Buffer, Recorder};
+use crate::splats::attributes::PlaneCounts;
 
 /// Numbers that Adam trains at one rate and that a checkpoint keeps, such as the parameters of a network.
 pub trait Learnable {
@@ -33,7 +34,7 @@ impl Adam {
         let rates = LearningRates::uniform(rate * learnable.learning_rate(step));
         let buffers = learnable.buffers();
         // One column of planes.
-        let shape = [buffers.parameters.len() as u32, 1, 0];
-        self.record(pass, step, &rates, shape, buffers, status)
+        let planes = PlaneCounts { gaussians: buffers.parameters.len(), columns: 1, features: 0 };
+        self.record(pass, step, &rates, planes, buffers, status)
     }
 }

@@ -6,6 +6,8 @@ use std::ops::{Index, IndexMut};
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
+use crate::Result;
+use crate::base::settings::{Rule, Setting, settings};
 use crate::splats::attributes::{ATTRIBUTES, Attribute};
 
 /// Adam's learning rate of each attribute, by its name in TOML; that of the means in world units.
@@ -65,61 +67,77 @@ impl<'de> Deserialize<'de> for LearningRates {
     }
 }
 
+settings! {
+"schedule."
 /// The schedules as functions of the step, counted from 1. The defaults are those of 3DGS (Kerbl et al. 2023) but for
-/// density control, which begins early, and for the first steps, which see small views.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+/// density control, which begins early, for the first steps, which see small views, and for the last, which settle.
+#[derive(Clone, Debug, PartialEq)]
 pub struct Schedule {
-    /// The rates at the start; that of the means for a scene of extent 1.
-    pub initial_rates: LearningRates,
     /// The rate of the means at the end of its decay, for a scene of extent 1.
-    pub final_means_rate: f64,
+    final_means_rate: f64 = 1.6e-6 => Rule::above(0.0, MOST_RATE);
     /// The steps over which the rate of the means decays exponentially.
-    pub means_rate_steps: u64,
-    /// All rates but the opacity's begin at this many times themselves
-    pub boost: f64,
-    /// and fall to themselves, exponentially, over so many steps.
-    pub boost_steps: u64,
-    /// The SH degree in use grows by one every so many steps, from 0.
-    pub sh_degree_interval: u64,
-    /// Density control acts after this step,
-    pub densify_after: u64,
-    /// before this one,
-    pub densify_before: u64,
-    /// and every so many steps.
-    pub densify_interval: u64,
-    /// The last steps of a run, a third of it at most: the model settles. There is no density control, and all learning
-    /// rates decay
-    pub settle_steps: u64,
-    /// exponentially, to this part of themselves.
-    pub settle_rate: f64,
+    means_rate_steps: u64 = 30_000 => Rule::COUNT, in "steps";
+    /// All rates but the opacity's begin at this many times themselves, and fall to themselves exponentially.
+    boost: f64 = 4.0 => Rule::from_to(1e-3, 1e3);
+    /// The steps over which the boost fades.
+    boost_steps: u64 = 600 => Rule::COUNT, in "steps";
+    /// The SH degree in use grows by one each time this many steps are done, from 0.
+    sh_degree_interval: u64 = 1_000 => Rule::COUNT, in "steps";
+    /// Density control acts after this step.
+    densify_after: u64 = 50 => Rule::COUNT;
+    /// Density control acts before this step.
+    densify_before: u64 = 3_000 => Rule::COUNT;
+    /// The steps from one round of density control to the next.
+    densify_interval: u64 = 100 => Rule::COUNT, in "steps";
+    /// The last steps of a run, a third of it at most, in which the model settles: there is no density control, and all
+    /// learning rates decay exponentially.
+    settle_steps: u64 = 250 => Rule::COUNT, in "steps";
+    /// The part of themselves to which the rates decay as the model settles.
+    settle_rate: f64 = 0.05 => Rule::above(0.0, 1.0);
     /// Views are a quarter of their width and height before the first of these steps, half before the second.
-    pub resolution_steps: [u64; 2],
+    resolution_steps: [u64; 2] = [0, 200] => Rule::List(2, 2, &Rule::COUNT), in "steps";
     /// The weight of the near-camera damping is 1 before the first of these steps, 1/2 before the second, then 0.
-    pub damping_steps: [u64; 2],
+    damping_steps: [u64; 2] = [4_000, 7_000] => Rule::List(2, 2, &Rule::COUNT), in "steps";
+}
+sections {
+    /// The rates at the start; that of the means for a scene of extent 1.
+    initial_rates: LearningRates;
+}
 }
 
-impl Default for Schedule {
-    fn default() -> Self {
-        Self {
-            initial_rates: LearningRates::default(),
-            final_means_rate: 1.6e-6,
-            means_rate_steps: 30_000,
-            boost: 4.0,
-            boost_steps: 600,
-            sh_degree_interval: 1_000,
-            densify_after: 50,
-            densify_before: 3_000,
-            densify_interval: 100,
-            settle_steps: 0,
-            settle_rate: 0.05,
-            resolution_steps: [0, 200],
-            damping_steps: [4_000, 7_000],
-        }
+/// No rate of use is near it, and a step of it overflows nothing.
+const MOST_RATE: f64 = 100.0;
+
+impl LearningRates {
+    /// A row for each rate.
+    pub fn settings() -> impl Iterator<Item = Setting> {
+        ATTRIBUTES.iter().map(|spec| Setting {
+            key: format!("schedule.initial_rates.{}", spec.name).into(),
+            rule: match spec.attribute {
+                // The decay of the means' rate divides by it.
+                Attribute::Means => Rule::above(0.0, MOST_RATE),
+                _ => Rule::from_to(0.0, MOST_RATE),
+            },
+            unit: "",
+            help: &["Adam's rate at the start; that of the means is for a scene of extent 1."],
+            absent: None,
+            option: None,
+        })
     }
 }
 
 impl Schedule {
+    /// Refuses values that make no sense.
+    ///
+    /// # Errors
+    /// [`Error::Setting`](crate::Error::Setting).
+    pub fn check(&self) -> Result<()> {
+        self.check_rows()?;
+        LearningRates::settings()
+            .zip(&self.initial_rates.0)
+            .try_for_each(|(row, rate)| row.check(rate))
+    }
+
     /// Density control acts between steps 500 and 5 000, every 200 steps, and every step sees whole views (LITA-GS).
     pub fn paper() -> Self {
         Self {
@@ -129,6 +147,7 @@ impl Schedule {
             densify_before: 5_000,
             densify_interval: 200,
             resolution_steps: [0, 0],
+            settle_steps: 0,
             ..Self::default()
         }
     }

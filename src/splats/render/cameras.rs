@@ -6,6 +6,7 @@ use crate::camera::{Camera, CameraModel, Patch};
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::camera::CAMERA_WIDTH;
 use crate::kernels::{self, camera_backward, camera_gradient};
+use crate::splats::scene::GaussianSlice;
 
 /// What is rendered: a patch of what a camera sees, and where on the device the camera is.
 #[derive(Clone, Copy, Debug)]
@@ -68,12 +69,12 @@ impl CameraGradient {
     /// the view; of focal lengths, principal point and the four coefficients of a fisheye.
     pub const WIDTH: usize = CAMERA_WIDTH as usize;
 
-    /// The kernels for a camera model, and memory for the Gaussians that a renderer shows.
+    /// The kernels for a camera model, and memory for so many Gaussians.
     ///
     /// # Errors
     /// The driver refuses a kernel, or the device is out of memory.
-    pub fn new(renderer: &Renderer, model: CameraModel) -> Result<Self> {
-        let Renderer { gpu, settings, frame, tile, .. } = renderer;
+    pub fn new(renderer: &Renderer, model: CameraModel, gaussian_count: usize) -> Result<Self> {
+        let Renderer { gpu, settings, tile, .. } = renderer;
         let [tile_width, tile_height] = tile.size;
         let constants = camera_backward::Constants {
             alpha_max: settings.max_alpha,
@@ -86,7 +87,7 @@ impl CameraGradient {
             model,
             backward: gpu.pipeline(&constants)?,
             sum: gpu.pipeline(&camera_gradient::Constants::default())?,
-            shares: gpu.uninit("camera shares", Self::WIDTH * frame.gaussian_count as usize)?,
+            shares: gpu.uninit("camera shares", Self::WIDTH * gaussian_count)?,
         })
     }
 
@@ -94,31 +95,31 @@ impl CameraGradient {
     /// which has left `gradients` of the parameters. The camera is moved in its view: a point p of it becomes p + shift + turn x p.
     ///
     /// # Errors
-    /// The viewpoint is of another camera model, there are more Gaussians than there were, or a pass exceeds what the device
+    /// The viewpoint is of another camera model, there are more Gaussians than there is memory for, or others than the renderer's, or a pass exceeds what the device
     /// launches.
     pub fn record<'a>(
         &mut self,
         pass: &mut Recorder<'_>,
         renderer: &Renderer,
-        (gaussians, gradients): (&Buffer<f32>, &Buffer<f32>),
+        (gaussians, gradients): (impl Into<GaussianSlice<'a>>, &Buffer<f32>),
         viewpoint: impl Into<Viewpoint<'a>>,
         gradient: &mut Buffer<f32>,
     ) -> Result<()> {
         let Viewpoint { patch, on_device } = viewpoint.into();
-        let (frame, columns) = (&renderer.frame, renderer.parameter_columns());
-        let gaussian_count = frame.gaussian_count;
+        let (frame, GaussianSlice { layout, parameters }) = (&renderer.frame, gaussians.into());
+        renderer.check(&layout)?;
         if patch.camera.model.number() != self.model.number() {
             let problem = "the gradient of a camera was built for another camera model";
             return Err(crate::Error::Usage(problem.to_owned()));
         }
         let (cameras, camera_index) = on_device.unwrap_or((&frame.camera, 0));
-        for batch in renderer.batches().iter() {
+        for batch in layout.batches(&renderer.gpu).iter() {
             let gaussian_count = batch.gaussian_count();
             pass.dispatch(
                 &self.backward,
                 &camera_backward::Params { camera_index, gaussian_count },
                 camera_backward::Buffers {
-                    parameters: batch.rows(gaussians, columns)?,
+                    parameters: batch.rows(parameters, layout.words())?,
                     splats: batch.rows(&frame.splats, 1)?,
                     tile_counts: batch.rows(&frame.tile_counts, 1)?,
                     emitted: batch.rows(&frame.emitted, 1)?,
@@ -132,7 +133,7 @@ impl CameraGradient {
         }
         pass.dispatch(
             &self.sum,
-            &camera_gradient::Params { gaussian_count },
+            &camera_gradient::Params { gaussian_count: layout.count as u32 },
             camera_gradient::Buffers {
                 shares: self.shares.slice(),
                 gradient: gradient.slice_mut(),

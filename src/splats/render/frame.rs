@@ -52,8 +52,7 @@ pub struct Frame {
     /// Values per pixel.
     channels: usize,
     // Gaussians
-    pub gaussian_count: u32,
-    /// `[0]`: the count again, where a pass looks for it
+    /// `[0]`: how many are rendered
     pub gaussian_counts: Buffer<u32>,
     pub splats: Buffer<ProjectedSplat>,
     pub colors: Buffer<Vec3>,
@@ -87,7 +86,6 @@ impl Frame {
     pub(super) fn new(gpu: &Gpu, channels: usize) -> Result<Self> {
         Ok(Self {
             channels,
-            gaussian_count: 0,
             gaussian_counts: gpu.zeros("gaussian_counts", 1)?,
             splats: gpu.uninit("splats", 0)?,
             colors: gpu.uninit("colors", 0)?,
@@ -111,19 +109,15 @@ impl Frame {
         })
     }
 
-    /// Lengths only grow: to `capacity` where they do not suffice for `count` Gaussians, which render from now on;
-    /// intersections begin with a guess.
+    /// Lengths only grow: to `capacity` where they do not suffice for `count` Gaussians; intersections begin with a guess.
     pub(super) fn reserve(
         &mut self,
         gpu: &Gpu,
-        [count, capacity]: [usize; 2],
+        count: usize,
+        capacity: usize,
         pixels: usize,
         tiles: usize,
     ) -> Result<()> {
-        if self.gaussian_count as usize != count {
-            self.gaussian_count = count as u32;
-            gpu.write(&mut self.gaussian_counts, &[count as u32])?;
-        }
         if self.splats.len() < count {
             let count = capacity.max(count);
             self.splats = gpu.uninit("splats", count)?;
@@ -228,7 +222,7 @@ mod tests {
             let mut frame = Frame::new(&gpu, channels).unwrap();
             let before = gpu.memory_in_use();
             let (gaussians, intersections) = (100_000, 30_000);
-            frame.reserve(&gpu, [gaussians; 2], 0, 0).unwrap();
+            frame.reserve(&gpu, gaussians, gaussians, 0, 0).unwrap();
             frame.set_intersection_capacity(&gpu, intersections).unwrap();
             gpu.run("nothing", |_| Ok(())).unwrap();
             gpu.free_unused();

@@ -84,7 +84,7 @@ impl RenderSettings {
         // A side is rounded, and so are tiles.
         let longest = 0.99 * f64::from(width.max(height)) / excess.sqrt();
         Err(Error::Usage(format!(
-            "view {view} is {width}x{height}: {what}; lower `TrainConfig::max_resolution` to {longest:.0}"
+            "view {view} is {width}x{height}: {what}; lower max_resolution to {longest:.0}"
         )))
     }
 }

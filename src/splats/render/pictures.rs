@@ -5,8 +5,8 @@ use glam::UVec2;
 use super::{RenderOptions, RenderSettings, Renderer, Status};
 use crate::Result;
 use crate::camera::{Camera, Patch};
-use crate::gpu::Buffer;
 use crate::photographs::image::Image;
+use crate::splats::scene::GaussianSlice;
 
 impl Renderer {
     /// What a view is rendered in: all of it where the device takes that at once, else patches that it takes.
@@ -33,10 +33,11 @@ impl Renderer {
     /// Renders to the host; grows the memory as the view demands.
     ///
     /// # Errors
-    /// The image exceeds what was reserved, or the device is out of memory or lost.
-    pub fn render_image(
+    /// The Gaussians do not suit the settings, they or the image exceed what was reserved, or the device is out of memory or
+    /// lost.
+    pub fn render_image<'a>(
         &mut self,
-        gaussians: &Buffer<f32>,
+        gaussians: impl Into<GaussianSlice<'a>>,
         camera: &Camera,
         options: &RenderOptions,
     ) -> Result<Image> {
@@ -51,9 +52,9 @@ impl Renderer {
     ///
     /// # Errors
     /// As [`Renderer::render_image`].
-    pub fn render_channels(
+    pub fn render_channels<'a>(
         &mut self,
-        gaussians: &Buffer<f32>,
+        gaussians: impl Into<GaussianSlice<'a>>,
         camera: &Camera,
         options: &RenderOptions,
     ) -> Result<Vec<f32>> {
@@ -66,13 +67,13 @@ impl Renderer {
     ///
     /// # Errors
     /// As [`Renderer::render_image`].
-    pub fn render_planes(
+    pub fn render_planes<'a>(
         &mut self,
-        gaussians: &Buffer<f32>,
+        gaussians: impl Into<GaussianSlice<'a>>,
         camera: &Camera,
         options: &RenderOptions,
     ) -> Result<Vec<f32>> {
-        let patches = self.patches(camera);
+        let (gaussians, patches) = (gaussians.into(), self.patches(camera));
         if let [whole] = &patches[..] {
             return self.render_patch(gaussians, whole, options);
         }
@@ -81,7 +82,7 @@ impl Renderer {
 
     fn render_parts(
         &mut self,
-        gaussians: &Buffer<f32>,
+        gaussians: GaussianSlice<'_>,
         whole: &Patch,
         parts: &[Patch],
         options: &RenderOptions,
@@ -101,7 +102,7 @@ impl Renderer {
     #[cfg(feature = "io")]
     pub(crate) fn count_intersections(
         &mut self,
-        gaussians: &Buffer<f32>,
+        gaussians: GaussianSlice<'_>,
         patch: &Patch,
     ) -> Result<u32> {
         let options = RenderOptions { sh_degree: 0, background: [0.0; 3] };
@@ -111,7 +112,7 @@ impl Renderer {
     /// Renders once, and says how that went; no flag is left.
     fn try_render(
         &mut self,
-        gaussians: &Buffer<f32>,
+        gaussians: GaussianSlice<'_>,
         patch: &Patch,
         options: &RenderOptions,
     ) -> Result<Status> {
@@ -131,12 +132,13 @@ impl Renderer {
     ///
     /// # Errors
     /// As [`Renderer::render_image`].
-    pub fn render_patch(
+    pub fn render_patch<'a>(
         &mut self,
-        gaussians: &Buffer<f32>,
+        gaussians: impl Into<GaussianSlice<'a>>,
         patch: &Patch,
         options: &RenderOptions,
     ) -> Result<Vec<f32>> {
+        let gaussians = gaussians.into();
         loop {
             let status = self.try_render(gaussians, patch, options)?;
             if status.crowd > 0 {

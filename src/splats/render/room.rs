@@ -21,17 +21,17 @@ impl Renderer {
         for camera in cameras {
             sizes.extend(self.patches(camera).iter().map(|patch| patch.size));
         }
-        self.reserve_with_headroom([gaussian_count; 2], sizes)
+        self.reserve_sizes(gaussian_count, gaussian_count, sizes)
     }
 
-    /// The same for images of these sizes and a number of Gaussians, and where that needs more memory, for another number
-    /// that may follow.
+    /// The same for images of these sizes; where `gaussian_count` Gaussians need more memory, for `capacity` of them.
     ///
     /// # Errors
     /// The device is out of memory, or cannot follow so many tiles.
-    pub fn reserve_with_headroom(
+    pub fn reserve_sizes(
         &mut self,
-        [gaussian_count, capacity]: [usize; 2],
+        gaussian_count: usize,
+        capacity: usize,
         sizes: impl IntoIterator<Item = UVec2>,
     ) -> Result<()> {
         let (mut pixels, mut tiles) = (0, 0);
@@ -43,7 +43,7 @@ impl Renderer {
                 return Err(self.too_many_tiles(size));
             }
         }
-        self.frame.reserve(&self.gpu, [gaussian_count, capacity], pixels, tiles)
+        self.frame.reserve(&self.gpu, gaussian_count, capacity, pixels, tiles)
     }
 
     /// Makes room for `intersections`, and half as many again where the device can bind them; what room there is stays.
@@ -103,7 +103,7 @@ impl Renderer {
         let device = &self.gpu.properties().name;
         Error::Usage(format!(
             "a {width}x{height} view has {count} tiles of {tile_width}x{tile_height} pixels, {device} follows {most}; \
-             lower `TrainConfig::patch_pixels` or take a larger `tile`"
+             lower patch_pixels or take a larger tile"
         ))
     }
 }
@@ -115,7 +115,7 @@ mod tests {
     use crate::camera::{Camera, CameraModel};
     use crate::gpu::{DeviceChoice, Gpu};
     use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
-    use crate::splats::scene::width;
+    use crate::splats::scene::Gaussians;
 
     /// With the sorts, whose memory comes with the first render.
     #[test]
@@ -133,13 +133,13 @@ mod tests {
             view_from_world,
         };
         let settings = RenderSettings::default();
-        let parameters = gpu.zeros("parameters", gaussians * width(settings.shape)).unwrap();
+        let model = Gaussians::zeros(gaussians, settings.shape).upload(&gpu).unwrap();
         let mut renderer = Renderer::new(&gpu, settings).unwrap();
         let before = gpu.memory_in_use();
         renderer.reserve(gaussians, [&camera]).unwrap();
         renderer.set_intersection_capacity(intersections).unwrap();
         let options = RenderOptions { sh_degree: 3, background: [0.0; 3] };
-        renderer.render_image(&parameters, &camera, &options).unwrap();
+        renderer.render_image(&model, &camera, &options).unwrap();
         assert_eq!(renderer.intersection_capacity(), intersections);
         gpu.free_unused();
         let taken = (gpu.memory_in_use() - before) as f64;

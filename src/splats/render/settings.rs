@@ -1,7 +1,7 @@
 //! What a renderer is made for, and the tile that suits a device.
 
 use crate::gpu::{Gpu, Tile};
-use crate::splats::halves::Bits;
+use crate::splats::halves::StorageFormat;
 use crate::splats::scene::{Features, Shape};
 use crate::{Error, Result};
 
@@ -16,9 +16,9 @@ pub struct RenderSettings {
     pub shape: Shape,
     /// Colours are the bare SH sum, which can be negative, as in LITA-GS, instead of max(SH + 0.5, 0).
     pub raw_colors: bool,
-    /// In how many bits SH coefficients above degree 0 are: [`Gaussians::upload`](crate::splats::scene::Gaussians::upload) leaves
-    /// 32, a training that is told to 16.
-    pub rest: Bits,
+    /// How SH coefficients above degree 0 are stored: [`Gaussians::upload`](crate::splats::scene::Gaussians::upload) leaves 32 bits,
+    /// a training that is told to 16.
+    pub rest: StorageFormat,
     /// The gradient of noise and illumination moves and shapes no Gaussian; that of depth and structure, which are there for
     /// it, does.
     pub observes: bool,
@@ -35,7 +35,7 @@ impl Default for RenderSettings {
             max_alpha: 0.99,
             shape: 3.into(),
             raw_colors: false,
-            rest: Bits::Single,
+            rest: StorageFormat::Single,
             observes: false,
             tile: None,
             patch_pixels: None,

@@ -1,40 +1,38 @@
 //! The Gaussians that training begins with.
 
 use std::borrow::Borrow;
+use std::ops::Bound::Excluded;
 
 use glam::{DMat3, DQuat, DVec2, DVec3, Vec3};
 use nalgebra::{Matrix3, SymmetricEigen};
 use rayon::prelude::*;
-use serde::{Deserialize, Serialize};
 
 use super::neighbours::Neighbours;
 use super::{Gaussians, SH_C0, Shape};
 use crate::base::random::Stream;
+use crate::base::settings::{Rule, settings};
 use crate::camera::Camera;
 use crate::photographs::dataset::{Point, Split, View};
 use crate::photographs::image::Image;
 use crate::{Error, Result};
 
+settings! {
+"start."
 /// What the first Gaussians look like; the points say where they are and in which colour.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+///
+/// The defaults are denser and smaller than 3DGS begins, which scores higher after as many steps, in less time, since what is
+/// opaque hides what lies behind it (docs/benchmarks.md). Still denser ones score higher yet, but lose more when they are split.
+/// Discs score as round ones do, with more Gaussians.
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Start {
-    /// The opacity of each, in (0, 1).
-    pub opacity: f64,
-    /// Standard deviation in units of the root mean squared distance to the three nearest points, above 0.
-    pub scale: f64,
-    /// The thinnest axis of a disc in units of its longest, in (0, 1]: neighbours that lie on a surface make discs along it.
-    /// 1: all are round.
-    pub thinnest: f64,
+    /// The opacity of each first Gaussian.
+    opacity: f64 = 0.2 => Rule::Number(Excluded(0.0), Excluded(1.0));
+    /// Standard deviation in units of the root mean squared distance to the three nearest points.
+    scale: f64 = 0.8 => Rule::from_to(1e-3, 1e3);
+    /// The thinnest axis of a disc in units of its longest: neighbours that lie on a surface make discs along it. 1: all are
+    /// round.
+    thinnest: f64 = 1.0 => Rule::from_to(1e-3, 1.0);
 }
-
-/// Denser and smaller than 3DGS begins, which scores higher after as many steps, in less time, since what is opaque hides
-/// what lies behind it (docs/benchmarks.md). Still denser ones score higher yet, but lose more when they are split. Discs
-/// score as round ones do, with more Gaussians.
-impl Default for Start {
-    fn default() -> Self {
-        Self { opacity: 0.2, scale: 0.8, thinnest: 1.0 }
-    }
 }
 
 impl Start {
@@ -46,21 +44,7 @@ impl Start {
     /// # Errors
     /// [`Error::Usage`].
     pub fn check(&self) -> Result<()> {
-        for (name, value, holds, rule) in [
-            (
-                "opacity",
-                self.opacity,
-                self.opacity > 0.0 && self.opacity < 1.0,
-                "above 0 and below 1",
-            ),
-            ("scale", self.scale, (1e-3..=1e3).contains(&self.scale), "0.001 to 1000"),
-            ("thinnest", self.thinnest, (1e-3..=1.0).contains(&self.thinnest), "0.001 to 1"),
-        ] {
-            if !holds {
-                return Err(Error::Usage(format!("start.{name} is {value}; it must be {rule}")));
-            }
-        }
-        Ok(())
+        self.check_rows()
     }
 }
 

@@ -1,6 +1,7 @@
 //! Gaussians as a PLY file in the INRIA layout that every splat viewer opens.
 //!
 //! Binary little-endian, one vertex per Gaussian: `x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3`.
+//! Positions far from the world's origin are relative to another one, which a comment names: `world = position + X Y Z`.
 //! Features, where the scene has any, stand between `f_rest_*` and `opacity`: `f_depth_0 f_prior_0 f_noise_0..2 f_illu_0..2`,
 //! which viewers skip. Normals are zero; `f_rest_*` is channel-major (all of red, then green, then blue); opacity is before the sigmoid,
 //! scales are logarithms, `rot_0` is w. Source: `save_ply` of the 3DGS code.
@@ -10,6 +11,8 @@ use std::fs;
 use std::io::{BufWriter, Write as _};
 use std::path::Path;
 
+use glam::DVec3;
+
 use super::{FEATURES, Feature, Features, Gaussians, MAX_SH_DEGREE, Shape, width};
 use crate::base::input;
 use crate::base::output::write_whole_with;
@@ -17,6 +20,9 @@ use crate::splats::attributes::{
     ATTRIBUTES, Attribute, AttributeSpec, Ply, planes, rest_coefficients,
 };
 use crate::{Error, Result};
+
+/// How the comment begins that names the origin of the positions.
+const ORIGIN: &str = "world = position + ";
 
 /// A property of the file: its name, the attribute and the component of it that it holds.
 struct Property {
@@ -85,6 +91,10 @@ fn write(gaussians: &Gaussians, path: &Path, comments: &[&str]) -> std::io::Resu
     let (means, others) = properties.split_at(3);
     let mut file = BufWriter::new(fs::File::create(path)?);
     writeln!(file, "ply\nformat binary_little_endian 1.0")?;
+    if gaussians.origin != DVec3::ZERO {
+        let [x, y, z] = gaussians.origin.to_array();
+        writeln!(file, "comment {ORIGIN}{x} {y} {z}")?;
+    }
     for comment in comments {
         writeln!(file, "comment {comment}")?;
     }
@@ -153,6 +163,7 @@ fn parse(bytes: &[u8]) -> Result<Gaussians, String> {
     let properties =
         properties(shape).into_iter().map(offset_of).collect::<Result<Vec<_>, String>>()?;
     let mut gaussians = Gaussians::zeros(header.count, shape);
+    gaussians.origin = header.origin;
     for (offset, property) in properties {
         let (begin, stride) = property.address(&gaussians);
         for (gaussian, vertex) in body[..expected].chunks_exact(header.stride).enumerate() {
@@ -170,6 +181,21 @@ fn parse(bytes: &[u8]) -> Result<Gaussians, String> {
     Ok(gaussians)
 }
 
+/// Three finite numbers.
+fn parse_origin(numbers: &str) -> Result<DVec3, String> {
+    let parsed: Vec<f64> = numbers.split_whitespace().filter_map(|n| n.parse().ok()).collect();
+    match *parsed {
+        [x, y, z]
+            if numbers.split_whitespace().count() == 3 && parsed.iter().all(|n| n.is_finite()) =>
+        {
+            Ok(DVec3::new(x, y, z))
+        }
+        _ => {
+            Err(format!("names the origin `{}`, which is not three finite numbers", numbers.trim()))
+        }
+    }
+}
+
 /// What the header says about the vertices.
 struct Header {
     /// Bytes before the first vertex.
@@ -182,6 +208,8 @@ struct Header {
     properties: HashMap<String, (usize, String)>,
     /// Whether elements follow the vertices.
     more_elements: bool,
+    /// The world position that the positions are relative to.
+    origin: DVec3,
 }
 
 impl Header {
@@ -206,9 +234,16 @@ impl Header {
             stride: 0,
             properties: HashMap::new(),
             more_elements: false,
+            origin: DVec3::ZERO,
         };
         let (mut format_is_known, mut in_vertices) = (false, false);
         for line in text.lines() {
+            if let Some(origin) = line.trim_start().strip_prefix("comment ") {
+                if let Some(numbers) = origin.trim_start().strip_prefix(ORIGIN) {
+                    header.origin = parse_origin(numbers)?;
+                }
+                continue;
+            }
             match *line.split_whitespace().collect::<Vec<_>>() {
                 ["format", "binary_little_endian", _] => format_is_known = true,
                 ["format", format, _] => {

@@ -3,13 +3,15 @@
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
+use toml::Value;
 
 use super::{Diagnosis, SceneDiagnosis};
 use crate::base::input;
 use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::tone::ToneCurve;
 use crate::splats::scene::{Features, Shape, width};
-use crate::train::{Learning, Part, TrainConfig};
+use crate::train::TrainConfig;
+use crate::train::layers::{Layer, Origin};
 use crate::{Error, Result};
 
 /// Targets less than this many times brighter than their photographs are the photographs: the rule of `--curve auto`.
@@ -99,13 +101,13 @@ pub struct Plan {
     pub curve: Switch,
     /// Each view's exposure is learned.
     pub exposure: Switch,
-    /// [`Part::Denoiser`].
+    /// [`Part::Denoiser`](crate::train::Part::Denoiser).
     pub denoiser: Switch,
-    /// [`Part::Tonemapper`].
+    /// [`Part::Tonemapper`](crate::train::Part::Tonemapper).
     pub tonemapper: Switch,
-    /// [`Part::Structure`].
+    /// [`Part::Structure`](crate::train::Part::Structure).
     pub structure: Switch,
-    /// [`Part::Depth`].
+    /// [`Part::Depth`](crate::train::Part::Depth).
     pub depth: Switch,
     /// Highest degree of the spherical harmonics.
     pub sh_degree: Number,
@@ -136,22 +138,27 @@ impl Plan {
         }
     }
 
-    /// Sets what the plan decides.
-    pub fn apply(&self, config: &mut TrainConfig) {
+    /// What the plan decides, as settings.
+    ///
+    /// # Errors
+    /// A number is out of its range, in a plan that was written by hand.
+    pub(in crate::train) fn layer(&self) -> Result<Layer> {
+        let mut layer = Layer::default();
+        let mut say = |key: &str, value: Value| layer.push(key, value, Origin::Plan);
         if !self.curve.on {
-            config.tone = config.tone.with_curve(ToneCurve::None);
+            say("tone.curve", ToneCurve::None.name().into())?;
         }
-        config.exposure.learn = if self.exposure.on { Learning::On } else { Learning::Off };
-        let parts = [
-            (Part::Denoiser, &self.denoiser),
-            (Part::Tonemapper, &self.tonemapper),
-            (Part::Structure, &self.structure),
-            (Part::Depth, &self.depth),
-        ];
-        let on = parts.iter().filter(|(_, switch)| switch.on).map(|(part, _)| *part);
-        config.model.set_parts(&on.collect::<Vec<_>>());
-        config.sh_degree = u32::try_from(self.sh_degree.value).unwrap_or(u32::MAX);
-        config.max_gaussians = usize::try_from(self.max_gaussians.value).unwrap_or(usize::MAX);
+        say("exposure.learn", if self.exposure.on { "on" } else { "off" }.into())?;
+        say("model.denoiser", self.denoiser.on.into())?;
+        say("model.tonemapper", self.tonemapper.on.into())?;
+        say("model.structure", self.structure.on.into())?;
+        say("model.depth", self.depth.on.into())?;
+        for (key, number) in
+            [("sh_degree", &self.sh_degree), ("max_gaussians", &self.max_gaussians)]
+        {
+            say(key, i64::try_from(number.value).unwrap_or(i64::MAX).into())?;
+        }
+        Ok(layer)
     }
 
     /// Every decision: its name, what was decided, and why.

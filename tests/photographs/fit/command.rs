@@ -3,7 +3,6 @@
 use std::path::{Path, PathBuf};
 
 use nightsplat::cli::fit::{ChannelChoice, FamilyChoice, FitArgs, WeightingChoice, apply};
-use nightsplat::cli::in_options;
 use nightsplat::photographs::tone::CurveChoice;
 
 use super::*;
@@ -85,7 +84,7 @@ fn pairs_that_cannot_be_used_are_named_in_one_line() {
     let path = |name: &str| dir.path().join(name);
     let fails = |args: FitArgs, part: &str, code: u8| {
         let error = apply(&args).unwrap_err();
-        let message = in_options(&error.to_string());
+        let message = error.to_string();
         assert!(message.contains(part) && !message.contains('\n'), "{message}");
         assert_eq!(error.exit_code(), code, "{message}");
     };

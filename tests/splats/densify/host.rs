@@ -2,15 +2,15 @@
 
 use glam::{DAffine3, DVec2, DVec3, Vec3};
 use nightsplat::camera::{Camera, CameraModel, Patch};
-use nightsplat::gpu::{Buffer, Gpu, Reference};
+use nightsplat::gpu::{Gpu, Reference};
 use nightsplat::kernels::fate::{KEY_KEEP, KEY_PRUNE};
 use nightsplat::kernels::{self, densify_decide, densify_moments, densify_scatter, densify_score};
 use nightsplat::splats::densify::{
-    Densifier, DensifyInputs, DensifyReport, DensifySettings, DensityControl, DeviceGaussians,
-    LARGEST_CHANGE, Round,
+    Densifier, DensifyInputs, DensifyReport, DensifySettings, DensityControl, LARGEST_CHANGE, Round,
 };
-use nightsplat::splats::halves::Bits;
+use nightsplat::splats::halves::StorageFormat;
 use nightsplat::splats::optimizer::Moments;
+use nightsplat::splats::scene::{DeviceGaussians, Features, GaussianSlice, Layout, Shape, width};
 
 /// Four features and SH of degree 1.
 pub(super) const COLUMNS: usize = 27;
@@ -30,8 +30,16 @@ pub(super) const CONSERVING: DensifySettings =
 pub(super) const STEP: u64 = 600;
 pub(super) const LAST: Round = Round { step: STEP, rounds_left: 1, most: usize::MAX };
 
+/// Features of four channels.
+pub(super) fn shape() -> Shape {
+    let shape =
+        Shape { sh_degree: 1, features: Features { depth: true, noise: true, ..Features::NONE } };
+    assert_eq!([shape.features.width(), width(shape)], [FEATURES, COLUMNS]);
+    shape
+}
+
 pub(super) fn room_for(gpu: &Gpu, count: usize) -> DeviceGaussians {
-    DeviceGaussians::new(gpu, count, [COLUMNS, FEATURES], [Bits::Single; 2]).unwrap()
+    DeviceGaussians::uninit(gpu, Layout::new(count, shape(), StorageFormat::Single)).unwrap()
 }
 
 /// Of 64 x 48 pixels, at a position, looking along +z.
@@ -150,21 +158,22 @@ impl Host {
         let planes = |data: &[f32]| gpu.buffer("planes", data).unwrap();
         let mut gaussians = room_for(gpu, self.count);
         gaussians.parameters = planes(&self.parameters);
-        gaussians.moments =
+        let mut moments =
             Moments::Single { first: planes(&self.first), second: planes(&self.second) };
         let inputs = DensifyInputs {
+            moments: &mut moments,
             grad_norm_sums: &mut planes(&self.grad_norm_sums),
             visit_counts: &mut gpu.buffer("visit_counts", &self.visit_counts).unwrap(),
             gradients: &mut planes(&vec![f32::NAN; self.count * COLUMNS]),
         };
         let mut densifier = Densifier::new(gpu, settings, cameras).unwrap();
-        let keeps = |new: &Buffer<f32>, count: usize| {
-            assert!(new.len() >= count * COLUMNS);
-            Ok(keeps(count))
+        let keeps = |new: GaussianSlice<'_>| {
+            assert!(new.parameters.len() >= new.layout.count * COLUMNS);
+            Ok(keeps(new.layout.count))
         };
         let report = densifier.densify(&mut gaussians, inputs, round, keeps).unwrap();
-        assert_eq!(report.count, gaussians.count as usize);
-        let Moments::Single { first, second } = &gaussians.moments else { panic!() };
+        assert_eq!(report.count, gaussians.layout.count);
+        let Moments::Single { first, second } = &moments else { panic!() };
         let read = |buffer| {
             let mut planes = gpu.read(buffer).unwrap();
             planes.truncate(report.count * COLUMNS);

@@ -35,8 +35,7 @@ const NEIGHBOURS: usize = 12;
 
 /// Steps that do the same work, in the world, without density control.
 fn config() -> TrainConfig {
-    let mut config =
-        TrainConfig { steps: STEPS, frame: Some(Frame::WORLD), ..TrainConfig::default() };
+    let mut config = TrainConfig { steps: STEPS, frame: Some(Frame::WORLD), ..TrainConfig::bare() };
     config.tone = ToneSettings::new(ToneCurve::Ap3);
     config.schedule.sh_degree_interval = 1;
     config.schedule.boost = 1.0;

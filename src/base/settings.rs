@@ -1,0 +1,320 @@
+//! Settings, a row each: its key in config.toml, its default, the values it takes, its unit, its help, its option.
+//!
+//! `settings!` declares a struct of settings and their rows in one. What reads, writes, checks and explains a setting goes by
+//! the row: config.toml and `--set`, the options of `train` and their help, the guide's reference of settings.
+
+use std::any::Any;
+use std::borrow::Cow;
+use std::fmt;
+use std::ops::{Bound, RangeBounds};
+
+use crate::{Error, Result};
+
+/// All that is to know about one setting but its default, which is that of the struct.
+#[derive(Clone, Debug)]
+pub struct Setting {
+    /// Its dotted path in config.toml.
+    pub key: Cow<'static, str>,
+    /// The values it takes.
+    pub rule: Rule,
+    /// What a number counts or measures; empty where it has no unit.
+    pub unit: &'static str,
+    /// What it does, in lines.
+    pub help: &'static [&'static str],
+    /// What holds where it is left out, if it can be.
+    pub absent: Option<&'static str>,
+    /// The option of `train` and what its value is called: `--steps N`; a flag has no value.
+    pub option: Option<&'static str>,
+}
+
+/// The values that a setting takes.
+#[derive(Clone, Copy, Debug)]
+pub enum Rule {
+    /// true or false.
+    Flag,
+    /// A whole number, from the first to the second.
+    Whole(u64, u64),
+    /// A finite number within bounds.
+    Number(Bound<f64>, Bound<f64>),
+    /// From the first to the second count of values that follow a rule.
+    List(usize, usize, &'static Self),
+    /// One of these words.
+    OneOf(&'static [&'static str]),
+    /// A text of which this is the form, and what tells whether it is one.
+    Text(&'static str, fn(&str) -> bool),
+    /// Several values in a form of their own, which their type checks.
+    Table(&'static str),
+}
+
+impl Rule {
+    /// Any whole number that TOML can hold.
+    pub const COUNT: Self = Self::at_least(0);
+    /// 0 or more.
+    pub const POSITIVE_OR_0: Self = Self::Number(Bound::Included(0.0), Bound::Unbounded);
+    /// Above 0.
+    pub const POSITIVE: Self = Self::Number(Bound::Excluded(0.0), Bound::Unbounded);
+    /// 0 to 1.
+    pub const SHARE: Self = Self::from_to(0.0, 1.0);
+    /// The path of a file or a folder.
+    pub const PATH: Self = Self::Text("a path", |_| true);
+
+    /// A whole number, at least `least`.
+    pub const fn at_least(least: u64) -> Self {
+        Self::Whole(least, i64::MAX as u64)
+    }
+
+    /// A number from `least` to `most`, both included.
+    pub const fn from_to(least: f64, most: f64) -> Self {
+        Self::Number(Bound::Included(least), Bound::Included(most))
+    }
+
+    /// A number above `least` and at most `most`.
+    pub const fn above(least: f64, most: f64) -> Self {
+        Self::Number(Bound::Excluded(least), Bound::Included(most))
+    }
+
+    /// Whether it takes this number.
+    pub fn takes_number(&self, number: f64) -> bool {
+        match self {
+            Self::Number(least, most) => number.is_finite() && (*least, *most).contains(&number),
+            Self::Whole(..) if number >= 0.0 && number.fract() == 0.0 => {
+                self.takes_whole(number as u64)
+            }
+            _ => false,
+        }
+    }
+
+    /// Whether it takes this whole number.
+    pub fn takes_whole(&self, number: u64) -> bool {
+        match self {
+            Self::Whole(least, most) => (*least..=*most).contains(&number),
+            _ => self.takes_number(number as f64),
+        }
+    }
+
+    /// Whether it takes this text.
+    pub fn takes_text(&self, text: &str) -> bool {
+        match self {
+            Self::OneOf(words) => words.contains(&text),
+            Self::Text(_, is_one) => is_one(text),
+            _ => false,
+        }
+    }
+
+    /// Whether its values are texts: an option need not quote them.
+    pub fn is_text(&self) -> bool {
+        matches!(self, Self::OneOf(_) | Self::Text(..))
+    }
+}
+
+impl fmt::Display for Rule {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        use Bound::{Excluded, Included, Unbounded};
+        match self {
+            Self::Flag => out.write_str("true or false"),
+            Self::Whole(least, most) if *most >= u32::MAX.into() => {
+                write!(out, "a whole number, at least {least}")
+            }
+            Self::Whole(least, most) => write!(out, "a whole number, {least} to {most}"),
+            Self::Number(Included(least), Included(most)) => {
+                write!(out, "{} to {}", short(*least), short(*most))
+            }
+            Self::Number(Unbounded, Unbounded) => out.write_str("a finite number"),
+            Self::Number(least, most) => {
+                let least = match least {
+                    Included(least) => Some(format!("at least {}", short(*least))),
+                    Excluded(least) => Some(format!("above {}", short(*least))),
+                    Unbounded => None,
+                };
+                let most = match most {
+                    Included(most) => Some(format!("at most {}", short(*most))),
+                    Excluded(most) => Some(format!("below {}", short(*most))),
+                    Unbounded => Some("finite".to_owned()),
+                };
+                let bounds: Vec<String> = least.into_iter().chain(most).collect();
+                out.write_str(&bounds.join(" and "))
+            }
+            Self::List(least, most, rule) if least == most => write!(out, "{least} of: {rule}"),
+            Self::List(least, most, rule) => write!(out, "{least} to {most} of: {rule}"),
+            Self::OneOf([first, second]) => write!(out, "{first} or {second}"),
+            Self::OneOf(words) => write!(out, "one of {}", words.join(", ")),
+            Self::Text(form, _) | Self::Table(form) => out.write_str(form),
+        }
+    }
+}
+
+/// A number without a row of zeros.
+fn short(number: f64) -> String {
+    let is_plain = number == 0.0 || (1e-6..1e7).contains(&number.abs());
+    if is_plain { number.to_string() } else { format!("{number:e}") }
+}
+
+impl Setting {
+    /// What it does, in one line.
+    pub fn help(&self) -> String {
+        let lines: Vec<&str> = self.help.iter().map(|line| line.trim()).collect();
+        lines.join(" ").trim_end_matches('.').to_owned()
+    }
+
+    /// The values that it takes, with their unit.
+    pub fn takes(&self) -> String {
+        let Self { rule, unit, .. } = self;
+        if unit.is_empty() { rule.to_string() } else { format!("{rule}, in {unit}") }
+    }
+
+    /// The option's name without its dashes, and what its value is called; none is a flag's.
+    pub fn option(&self) -> Option<(&'static str, Option<&'static str>)> {
+        let text = self.option?.trim_start_matches('-');
+        Some(text.split_once(' ').map_or((text, None), |(name, value)| (name, Some(value))))
+    }
+
+    /// What is to be said of a value that it does not take.
+    pub fn refused(&self, value: impl fmt::Display) -> Error {
+        let (key, rule) = (self.key.to_string(), self.takes());
+        Error::Setting { key, value: value.to_string(), rule }
+    }
+
+    /// Refuses a value that the rule does not take; what has a type of its own, such as one of several words, is right by
+    /// its type.
+    ///
+    /// # Errors
+    /// [`Error::Setting`].
+    pub fn check(&self, value: &dyn Any) -> Result<()> {
+        let rule = match self.rule {
+            Rule::List(_, _, rule) => *rule,
+            rule => rule,
+        };
+        let number = |number: &f64| (!rule.takes_number(*number)).then(|| number.to_string());
+        let whole = |number: u64| (!rule.takes_whole(number)).then(|| number.to_string());
+        let wrong = if let Some(value) = value.downcast_ref::<f64>() {
+            number(value)
+        } else if let Some(value) = value.downcast_ref::<Option<f64>>() {
+            value.as_ref().and_then(number)
+        } else if let Some(values) = value.downcast_ref::<[f64; 3]>() {
+            values.iter().find_map(number)
+        } else if let Some(value) = value.downcast_ref::<u64>() {
+            whole(*value)
+        } else if let Some(values) = value.downcast_ref::<[u64; 2]>() {
+            values.iter().find_map(|value| whole(*value))
+        } else if let Some(value) = value.downcast_ref::<Option<u64>>() {
+            value.and_then(whole)
+        } else if let Some(value) = value.downcast_ref::<u32>() {
+            whole((*value).into())
+        } else if let Some(value) = value.downcast_ref::<usize>() {
+            whole(*value as u64)
+        } else if let Some(value) = value.downcast_ref::<Option<usize>>() {
+            value.and_then(|value| whole(value as u64))
+        } else {
+            None
+        };
+        wrong.map_or(Ok(()), |wrong| Err(self.refused(wrong)))
+    }
+}
+
+/// The row of `key` among `rows`.
+pub(crate) fn row<'a>(rows: &'a [Setting], key: &str) -> Option<&'a Setting> {
+    rows.iter().find(|row| row.key == key)
+}
+
+/// Declares a struct of settings with its defaults, its rows and the check of its values.
+///
+/// A field is `name: type = default => rule;`, where `default, "what holds"` says so of one that is left out, and `rule, in
+/// "unit", "--option VALUE"` has what there is of these. Its documentation is its help. Fields of `sections` have rows of
+/// their own, or none.
+macro_rules! settings {
+    (
+        $section:literal
+        $(#[$meta:meta])*
+        pub struct $name:ident {
+            $(
+                $(#[doc = $help:literal])+
+                $field:ident: $type:ty = $default:expr $(, $absent:literal)?
+                    => $rule:expr $(, in $unit:literal)? $(, $option:literal)?;
+            )*
+        }
+        $(sections {
+            $($(#[$inner_meta:meta])* $inner:ident: $inner_type:ty;)*
+        })?
+    ) => {
+        $(#[$meta])*
+        #[derive(serde::Serialize, serde::Deserialize)]
+        #[serde(default, deny_unknown_fields)]
+        pub struct $name {
+            $($(#[doc = $help])+ pub $field: $type,)*
+            $($($(#[$inner_meta])* pub $inner: $inner_type,)*)?
+        }
+
+        impl Default for $name {
+            fn default() -> Self {
+                Self { $($field: $default,)* $($($inner: Default::default(),)*)? }
+            }
+        }
+
+        impl $name {
+            /// A row for each setting but those of sections within.
+            pub const SETTINGS: &'static [$crate::base::settings::Setting] = $crate::base::settings::settings! {
+                rows $section
+                $($(#[doc = $help])+ $field $(, $absent)? => $rule $(, in $unit)? $(, $option)?;)*
+            };
+
+            /// Refuses a value that its row does not take.
+            ///
+            /// # Errors
+            /// [`Error::Setting`](crate::Error::Setting).
+            pub(crate) fn check_rows(&self) -> $crate::Result<()> {
+                let values = [$(&self.$field as &dyn std::any::Any),*];
+                let mut rows = Self::SETTINGS.iter().zip(values);
+                rows.try_for_each(|(row, value)| row.check(value))
+            }
+        }
+    };
+    // The rows alone, of settings that have a form of their own in memory.
+    (
+        rows $section:literal
+        $(
+            $(#[doc = $help:literal])+
+            $field:ident $(, $absent:literal)? => $rule:expr $(, in $unit:literal)? $(, $option:literal)?;
+        )*
+    ) => {
+        &[$($crate::base::settings::Setting {
+            key: std::borrow::Cow::Borrowed(concat!($section, stringify!($field))),
+            rule: $rule,
+            unit: concat!("" $(, $unit)?),
+            help: &[$($help),+],
+            absent: $crate::base::settings::settings!(@option $($absent)?),
+            option: $crate::base::settings::settings!(@option $($option)?),
+        },)*]
+    };
+    (@option) => { None };
+    (@option $value:literal) => { Some($value) };
+}
+
+pub(crate) use settings;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_rule_takes_what_it_says() {
+        use Bound::{Excluded, Included, Unbounded};
+        let open = Rule::Number(Excluded(0.0), Excluded(1.0));
+        for (rule, said, taken, refused) in [
+            (open, "above 0 and below 1", 0.5, 1.0),
+            (Rule::above(0.0, 100.0), "above 0 and at most 100", 100.0, 0.0),
+            (Rule::from_to(0.1, 0.9), "0.1 to 0.9", 0.1, 0.95),
+            (Rule::POSITIVE_OR_0, "at least 0 and finite", 0.0, f64::INFINITY),
+            (Rule::Number(Included(1.0), Unbounded), "at least 1 and finite", 1.0, f64::NAN),
+            (Rule::Number(Unbounded, Unbounded), "a finite number", -3.0, f64::NAN),
+            (Rule::at_least(1), "a whole number, at least 1", 3.0, 2.5),
+            (Rule::Whole(0, 3), "a whole number, 0 to 3", 3.0, 4.0),
+        ] {
+            assert_eq!(rule.to_string(), said);
+            assert!(rule.takes_number(taken) && !rule.takes_number(refused), "{said}");
+        }
+        assert!(
+            Rule::OneOf(&["on", "off"]).takes_text("on") && !Rule::OneOf(&["a"]).takes_text("b")
+        );
+        assert!(!Rule::COUNT.takes_whole(u64::MAX), "TOML holds no more than i64::MAX");
+    }
+}

@@ -1,0 +1,280 @@
+//! The options of a training: those that set one setting are rows of the table of settings, the others are here.
+
+use std::path::{Path, PathBuf};
+
+use clap::builder::ValueParser;
+use clap::{Arg, ArgAction, ArgMatches, Args, Command, FromArgMatches, ValueHint};
+use toml::{Table, Value};
+
+use crate::base::settings::{Rule, Setting};
+use crate::photographs::tone::{CurveChoice, GainChoice, Profile, ToneSettings};
+use crate::train::diagnose::Plan;
+use crate::train::settings::SETTINGS;
+use crate::train::{Layer, ModelName, Origin, Part, Preset, Said, TrainConfig};
+use crate::{Error, Result};
+
+/// The options of a run; each wins over the configuration file.
+#[derive(Clone, Debug, Default, Args)]
+pub(crate) struct TrainOptions {
+    #[command(flatten)]
+    several: SeveralSettings,
+    #[command(flatten)]
+    single: SingleSettings,
+}
+
+/// The options that are not one setting each.
+#[expect(clippy::doc_markdown, reason = "in help, {setting} stands for its default")]
+#[derive(Clone, Debug, Default, Args)]
+struct SeveralSettings {
+    /// The tone curve: a name that `nightsplat curves` lists, or a .toml, .csv or .cube file [default: {tone.curve}]
+    #[arg(long, value_name = "NAME|FILE")]
+    curve: Option<CurveChoice>,
+    /// A camera profile that `nightsplat fit --profile` made, in place of a curve; results are labelled: they know its references
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["curve", "gain", "brightness", "colour", "theta"])]
+    profile: Option<PathBuf>,
+    /// c: how much a brighter photograph raises the curve's gain, or auto: the gain that the photographs ask for, as the curve auto has it [default: {tone.gain_c of ase} for ase, {tone.gain_c of ap3} for ap3, else {tone.gain_c of linear}]
+    #[arg(long, value_name = "C|auto")]
+    gain: Option<GainChoice>,
+    /// A TOML file with any of the settings of a run's config.toml
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Any setting by its place in config.toml, such as tone.alpha=0.1; may be repeated, wins over all else
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// plain: colour alone, as 3DGS; lita: every part of LITA-GS and L1 alone on R_0, which with a preset of the paper's is its model, else each begins as the identity [default: plain]
+    #[arg(long, help_heading = MODEL)]
+    model: Option<ModelName>,
+    /// Exactly these parts, parted by commas: denoiser, tonemapper, structure, depth
+    #[arg(long, value_name = "LIST", value_delimiter = ',', help_heading = MODEL)]
+    parts: Option<Vec<Part>>,
+    /// draft, fast, balanced (the default) or best: time for quality; paper: the paper's curve and length; or the constants that the paper and its code state for a benchmark: lom, realx3d or mip360-varying; other options win
+    #[arg(long, value_name = "NAME", help_heading = MODEL)]
+    preset: Option<Preset>,
+}
+
+const MODEL: &str = "Model";
+
+/// The options that set one setting each, as texts.
+#[derive(Clone, Debug, Default)]
+struct SingleSettings(Vec<(&'static Setting, String)>);
+
+impl SingleSettings {
+    /// The rows with an option that [`SeveralSettings`] has not.
+    fn rows() -> impl Iterator<Item = (&'static Setting, &'static str, Option<&'static str>)> {
+        let rows =
+            SETTINGS.iter().filter_map(|row| row.option().map(|(name, value)| (row, name, value)));
+        rows.filter(|(_, name, _)| !["curve", "gain"].contains(name))
+    }
+}
+
+impl Args for SingleSettings {
+    fn augment_args(command: Command) -> Command {
+        Self::rows().fold(command, |command, (row, name, value)| {
+            let arg = Arg::new(name).long(name).help(help(row));
+            let arg = if row.key.starts_with("model.") { arg.help_heading(MODEL) } else { arg };
+            let is_path = matches!(row.rule, Rule::Text("a path", _));
+            let arg = if is_path { arg.value_hint(ValueHint::AnyPath) } else { arg };
+            command.arg(match value {
+                Some(value) => arg.value_name(value).value_parser(ValueParser::string()),
+                None => arg.action(ArgAction::SetTrue),
+            })
+        })
+    }
+
+    fn augment_args_for_update(command: Command) -> Command {
+        Self::augment_args(command)
+    }
+}
+
+impl FromArgMatches for SingleSettings {
+    fn from_arg_matches(matches: &ArgMatches) -> Result<Self, clap::Error> {
+        let given = |(row, name, value): (&'static Setting, &'static str, Option<&str>)| {
+            let text = match value {
+                Some(_) => matches.get_one::<String>(name).cloned(),
+                None => matches.get_flag(name).then(|| "true".to_owned()),
+            };
+            Some((row, text?))
+        };
+        Ok(Self(Self::rows().filter_map(given).collect()))
+    }
+
+    fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> Result<(), clap::Error> {
+        *self = Self::from_arg_matches(matches)?;
+        Ok(())
+    }
+}
+
+/// The help of an option: what its setting does, what it takes and what holds without it.
+fn help(row: &Setting) -> String {
+    let default = match row.absent {
+        Some(absent) => absent.to_owned(),
+        None if matches!(row.rule, Rule::Flag) => return row.help(),
+        None => format!("{{{}}}", row.key),
+    };
+    let range = match row.rule {
+        Rule::Number(..) | Rule::Whole(1.., _) => format!(", {}", row.rule),
+        Rule::Whole(_, most) if most < u32::MAX.into() => format!(", {}", row.rule),
+        _ => String::new(),
+    };
+    format!("{}{range} [default: {default}]", row.help())
+}
+
+impl TrainOptions {
+    /// Whether the command line has the option of a setting.
+    pub(in crate::cli) fn gives(&self, key: &str) -> bool {
+        self.single.0.iter().any(|(row, _)| row.key == key)
+    }
+
+    /// The same without the option of a setting.
+    pub(in crate::cli) fn without(&self, key: &str) -> Self {
+        let mut options = self.clone();
+        options.single.0.retain(|(row, _)| row.key != key);
+        options
+    }
+
+    /// Whether the command line says which parts the model has.
+    pub(in crate::cli) fn picks_parts(&self) -> bool {
+        self.several.model.is_some() || self.several.parts.is_some()
+    }
+
+    /// A line for each option that says something of what `config` has not.
+    pub(super) fn idle(&self, config: &TrainConfig) -> Vec<String> {
+        let of_parts = |key: &str| -> &[Part] {
+            match key {
+                "model.denoiser_crop" => &[Part::Denoiser, Part::Tonemapper],
+                "model.depth_folder" | "model.depth_is_disparity" => &[Part::Depth],
+                _ if key.starts_with("model.network.") => &[Part::Denoiser],
+                _ => &[],
+            }
+        };
+        let mut lines = vec![];
+        for (row, _) in &self.single.0 {
+            let parts = of_parts(&row.key);
+            if let (Some(first), Some((option, _))) = (parts.first(), row.option())
+                && !parts.iter().any(|&part| config.model.has(part))
+            {
+                let names: Vec<&str> = parts.iter().map(|part| part.name()).collect();
+                lines.push(format!(
+                    "--{option} has no effect, as the model has no {}; --parts {} switches it on",
+                    names.join(" and no "),
+                    first.name()
+                ));
+            }
+        }
+        if config.check.stops && config.check.every == 0 {
+            lines.push("--check-stops has no effect, as no step is checked; --check-every N says which are".to_owned());
+        }
+        let stop = &config.stop;
+        let gains = [("growth_gain", stop.growth_gain), ("degree_gain", stop.degree_gain)];
+        let idle = gains.into_iter().filter(|(_, gain)| stop.views == 0 && *gain > 0.0);
+        lines.extend(idle.map(|(gain, _)| {
+            format!("stop.{gain} has no effect, as no views are held out; --set stop.views=N keeps N of them from training")
+        }));
+        lines
+    }
+
+    /// Whether a diagnosis of the photographs is to decide what no option says.
+    pub(in crate::cli) fn wants_a_plan(&self) -> bool {
+        let Self { several, .. } = self;
+        several.config.is_none() && several.preset.is_none_or(Preset::is_planned)
+    }
+
+    /// The configuration, with what a plan says of what no option says.
+    pub(crate) fn config(&self, dataset: &Path, plan: Option<&Plan>) -> Result<TrainConfig> {
+        let config = self.said(dataset)?.settings(plan)?.config()?;
+        config.check()?;
+        Ok(config)
+    }
+
+    /// What the command line and its files say.
+    pub(crate) fn said(&self, dataset: &Path) -> Result<Said> {
+        let several = &self.several;
+        let mut said = Said { preset: several.preset, ..Said::default() };
+        if let Some(file) = &several.config {
+            said.file = Layer::load(file)?;
+        }
+        for assignment in &several.set {
+            said.set.assign(assignment)?;
+        }
+        let options = &mut said.options;
+        let dataset = dataset
+            .to_str()
+            .ok_or_else(|| Error::input(dataset, "is not Unicode; move it to a path that is"))?;
+        options.push("dataset", dataset.into(), Origin::Option("argument"))?;
+        several.say_tone(options)?;
+        several.say_parts(options)?;
+        if self.gives("exposure.start") {
+            options.push("exposure.learn", "on".into(), Origin::Option("--exposures"))?;
+        }
+        for (row, text) in &self.single.0 {
+            let origin = Origin::Option(
+                row.option.and_then(|option| option.split(' ').next()).unwrap_or_default(),
+            );
+            match (row.key.as_ref(), text.as_str()) {
+                ("max_resolution", "none") => options.push(&row.key, 0.into(), origin)?,
+                (key, text) => options.say(key, text, origin)?,
+            }
+        }
+        if self.gives("steps") {
+            // Whoever says how long a run is to be wants neither less nor views kept from it.
+            options.push("stop.views", 0.into(), Origin::Option("--steps"))?;
+        }
+        Ok(said)
+    }
+}
+
+impl SeveralSettings {
+    fn say_tone(&self, options: &mut Layer) -> Result<()> {
+        let from_file = match (&self.curve, &self.profile) {
+            (_, Some(file)) => Some((ToneSettings::of_profile(Profile::load(file)?), "--profile")),
+            (Some(CurveChoice::Named(curve)), _) => {
+                options.push("tone.curve", curve.name().into(), Origin::Option("--curve"))?;
+                None
+            }
+            (Some(file), _) => {
+                let settings = file.settings()?;
+                let gain = |gain| settings.clone().with_gain(gain);
+                Some((self.gain.map_or_else(|| settings.clone(), gain), "--curve"))
+            }
+            (None, None) => None,
+        };
+        if let Some((settings, option)) = from_file {
+            let table =
+                Table::try_from(settings).map_err(|error| Error::Usage(error.to_string()))?;
+            return table.into_iter().try_for_each(|(name, value)| {
+                options.push(&format!("tone.{name}"), value, Origin::Option(option))
+            });
+        }
+        let mut say = |key: &str, value: Value| options.push(key, value, Origin::Option("--gain"));
+        match self.gain {
+            Some(GainChoice::Auto) => say("tone.auto_gain", true.into()),
+            Some(GainChoice::C(gain)) => {
+                say("tone.auto_gain", false.into())?;
+                say("tone.gain_c", gain.into())
+            }
+            None => Ok(()),
+        }
+    }
+
+    fn say_parts(&self, options: &mut Layer) -> Result<()> {
+        let mut set_parts = |parts: &[Part], option| {
+            Part::ALL.into_iter().try_for_each(|part| {
+                let key = format!("model.{}", part.name());
+                options.push(&key, parts.contains(&part).into(), Origin::Option(option))
+            })
+        };
+        match self.model {
+            Some(ModelName::Plain) => set_parts(&[], "--model")?,
+            Some(ModelName::Lita) => set_parts(&Part::ALL, "--model")?,
+            None => {}
+        }
+        if let Some(parts) = &self.parts {
+            set_parts(parts, "--parts")?;
+        }
+        // A benchmark has a weight of its own.
+        if self.model == Some(ModelName::Lita) && !self.preset.is_some_and(Preset::is_benchmark) {
+            options.push("ssim_weight", Value::Float(0.0), Origin::Option("--model"))?;
+        }
+        Ok(())
+    }
+}

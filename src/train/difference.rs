@@ -1,0 +1,115 @@
+//! In which settings two runs differ, as far as a result depends on them.
+
+use std::collections::BTreeMap;
+
+use toml::Value;
+
+use super::TrainConfig;
+use super::layers::values;
+use crate::Result;
+use crate::base::hash::{self, Hasher};
+
+/// The settings that no result depends on beyond its rounding: where the dataset lies, what is kept and logged and when,
+/// how long the run may take, and what it finds for itself.
+const FREE: [&str; 16] = [
+    "dataset",
+    "device",
+    "tile",
+    "frame.center",
+    "frame.scale",
+    "cache",
+    "max_vram",
+    "max_ram",
+    "tensorboard",
+    "eval_every",
+    "checkpoint_every",
+    "checkpoint_minutes",
+    "max_minutes",
+    "hash_every",
+    "check.every",
+    "check.stops",
+];
+
+impl TrainConfig {
+    /// The first setting in which a run of `self` differs from one of `other`, with both values: `tone.alpha = 0.1, not
+    /// 0.12`. Left out is what changes no step beyond its rounding: how long the run is, where the photographs lie, when it
+    /// is scored and saved, on which device and by which tiles. A lower limit of the Gaussians is no difference either: a
+    /// run that outgrows its machine goes on with what it has.
+    pub fn difference(&self, other: &Self) -> Option<String> {
+        const ALSO: [&str; 5] = ["steps", "reference", "stop.every", "stop.gain", "stop.margin"];
+        let values = [self, other].map(values);
+        let [own, others] = match &values {
+            [Ok(own), Ok(others)] => [own, others],
+            [Err(error), _] | [_, Err(error)] => {
+                return Some(format!("a setting that cannot be compared ({error})"));
+            }
+        };
+        let value = |settings: &BTreeMap<String, Value>, key: &str| {
+            settings.get(key).map_or_else(|| "nothing".to_owned(), Value::to_string)
+        };
+        let is_lower_limit =
+            |key: &String| key == "max_gaussians" && other.max_gaussians <= self.max_gaussians;
+        let keys = own.keys().chain(others.keys());
+        let is_free = |key: &str| FREE.contains(&key) || ALSO.contains(&key);
+        let mut keys = keys.filter(|key| !is_free(key) && !is_lower_limit(key));
+        keys.find(|&key| own.get(key) != others.get(key))
+            .map(|key| format!("{key} = {}, not {}", value(own, key), value(others, key)))
+    }
+
+    /// A checksum of every setting that a result depends on: all but where the dataset lies, when the run is saved and
+    /// checked, how long it may take, and what it finds for itself.
+    ///
+    /// # Errors
+    /// None for a configuration that [`TrainConfig::check`] accepts.
+    pub fn checksum(&self) -> Result<String> {
+        let own = self.clone().with_absolute_paths();
+        let mut hasher = Hasher::default();
+        for (key, value) in values(&own)? {
+            if !FREE.contains(&key.as_str()) {
+                hasher.write(key.as_bytes());
+                hasher.write(value.to_string().as_bytes());
+            }
+        }
+        Ok(hash::text(hasher.finish()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_difference_is_named_unless_it_changes_no_step() {
+        let config = TrainConfig::default();
+        let free = TrainConfig {
+            steps: 9,
+            device: "0".to_owned(),
+            dataset: "b".into(),
+            ..TrainConfig::default()
+        };
+        assert_eq!(config.difference(&free), None);
+        let mut other = free;
+        other.tone.alpha = 0.25;
+        assert_eq!(
+            config.difference(&other).unwrap(),
+            format!("tone.alpha = {}, not 0.25", config.tone.alpha)
+        );
+        let other = TrainConfig {
+            model: crate::train::ModelConfig {
+                depth_folder: Some("d".into()),
+                ..Default::default()
+            },
+            ..TrainConfig::default()
+        };
+        assert_eq!(config.difference(&other).unwrap(), "model.depth_folder = nothing, not \"d\"");
+    }
+
+    #[test]
+    fn what_toml_cannot_hold_is_a_difference() {
+        let huge = TrainConfig { seed: u64::MAX, ..TrainConfig::default() };
+        assert!(huge.difference(&TrainConfig::default()).is_some());
+        assert!(TrainConfig::default().difference(&huge).is_some());
+        let message = huge.check().unwrap_err().to_string();
+        assert!(message.contains("seed is 18446744073709551615"), "{message}");
+    }
+}

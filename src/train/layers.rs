@@ -1,0 +1,450 @@
+//! The settings of a run from everything that says one: defaults, preset, plan, file, options, `--set`. The later wins.
+//!
+//! Each is a [`Layer`]: some keys of config.toml with their values. [`Settings`] merges them, and knows of every value
+//! where it comes from.
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::path::{Path, PathBuf};
+
+use toml::de::{DeTable, DeValue};
+use toml::{Table, Value};
+
+use super::TrainConfig;
+use super::settings::{SETTINGS, flat, number, setting, takes, unknown, value};
+use crate::base::input;
+use crate::base::settings::Setting;
+use crate::photographs::tone::{OF_CURVE, ToneCurve};
+use crate::{Error, Result};
+
+/// Where a value comes from.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Origin {
+    /// Nobody says it.
+    Default,
+    /// This preset.
+    Preset(&'static str),
+    /// What the photographs show.
+    Plan,
+    /// This configuration file.
+    File(PathBuf),
+    /// This option of the command.
+    Option(&'static str),
+    /// `--set`.
+    Set,
+    /// The run that goes on.
+    Run,
+}
+
+impl fmt::Display for Origin {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Default => out.write_str("default"),
+            Self::Preset(name) => write!(out, "preset {name}"),
+            Self::Plan => out.write_str("plan"),
+            Self::File(path) => write!(out, "{}", path.display()),
+            Self::Option(name) => out.write_str(name),
+            Self::Set => out.write_str("--set"),
+            Self::Run => out.write_str("the run that goes on"),
+        }
+    }
+}
+
+/// Some settings with their values; a later one of a key wins.
+#[derive(Clone, Debug, Default)]
+pub struct Layer(pub(super) Vec<(String, Value, Origin)>);
+
+impl Layer {
+    /// Every setting of a TOML text.
+    ///
+    /// # Errors
+    /// The text is no TOML, or has a key that is no setting or a value that its setting does not take; with its line.
+    pub fn of_toml(text: &str, origin: &Origin) -> Result<Self> {
+        let table: Table = text.parse().map_err(|error: toml::de::Error| {
+            let at = error.span().map(|span| line_at(text, span.start));
+            Error::Usage(format!("is no TOML: {}{}", error.message(), at.unwrap_or_default()))
+        })?;
+        let mut layer = Self::default();
+        for (key, value) in flat("", table) {
+            layer.push(&key, value, origin.clone()).map_err(|error| {
+                Error::Usage(format!("{error}{}", line_of(text, &key).unwrap_or_default()))
+            })?;
+        }
+        Ok(layer)
+    }
+
+    /// The settings of a file.
+    ///
+    /// # Errors
+    /// It cannot be read, and as [`Self::of_toml`].
+    pub fn load(path: &Path) -> Result<Self> {
+        let layer = Self::of_toml(&input::text(path)?, &Origin::File(path.to_owned()));
+        layer.map_err(|problem| Error::input(path, problem.to_string()))
+    }
+
+    /// `KEY=VALUE`, such as `tone.alpha=0.1`.
+    ///
+    /// # Errors
+    /// It has no `=`, and as [`Self::say`].
+    pub fn assign(&mut self, assignment: &str) -> Result<()> {
+        let (key, value) = assignment.split_once('=').ok_or_else(|| {
+            let problem =
+                format!("`{assignment}` sets nothing; write KEY=VALUE, as in tone.alpha=0.1");
+            Error::Usage(problem)
+        })?;
+        self.say(key.trim(), value.trim(), Origin::Set)
+    }
+
+    /// A setting and its value as a command line has it: TOML, or a text without quotes.
+    ///
+    /// # Errors
+    /// The key is no setting, or the setting does not take the value.
+    pub fn say(&mut self, key: &str, text: &str, origin: Origin) -> Result<()> {
+        let value = value(text);
+        // A device may be named 0.
+        let is_text = setting(key).is_some_and(|row| row.rule.is_text());
+        let value = value.filter(|value| !is_text || value.is_str());
+        self.push(key, value.unwrap_or_else(|| Value::String(text.to_owned())), origin)
+    }
+
+    /// A setting and its value.
+    ///
+    /// # Errors
+    /// The key is no setting, or the setting does not take the value.
+    pub fn push(&mut self, key: &str, value: Value, origin: Origin) -> Result<()> {
+        let key = if key == "tone.family" { "tone.curve" } else { key };
+        // The constants of a curve can be set one by one.
+        let is_part = key.strip_prefix("tone.constants.").is_some_and(|name| !name.contains('.'));
+        match setting(key) {
+            Some(row) if takes(&row.rule, &value) => {}
+            Some(row) => return Err(row.refused(value)),
+            None if is_part && number(&value).is_some_and(f64::is_finite) => {}
+            None => return Err(unknown(key)),
+        }
+        self.0.push((key.to_owned(), value, origin));
+        Ok(())
+    }
+
+    /// Every setting of a configuration.
+    fn of(config: &TrainConfig) -> Result<Self> {
+        let table = Table::try_from(config).map_err(|error| Error::Usage(error.to_string()))?;
+        let values = flat("", table).into_iter();
+        Ok(Self(values.map(|(key, value)| (key, value, Origin::Default)).collect()))
+    }
+
+    /// Whether it says something of a section.
+    pub(super) fn names(&self, section: &str) -> bool {
+        self.0.iter().any(|(key, ..)| key.starts_with(section))
+    }
+
+    /// What it says of a setting.
+    pub fn get(&self, key: &str) -> Option<&Value> {
+        self.0.iter().rev().find_map(|(own, value, _)| (own == key).then_some(value))
+    }
+}
+
+/// Every value that is said, and where it comes from.
+#[derive(Clone, Debug, Default)]
+pub struct Settings(BTreeMap<String, (Value, Origin)>);
+
+impl Settings {
+    pub(super) fn merge(&mut self, layer: &Layer) {
+        // What belongs to a curve comes after it, wherever it stands.
+        let order = |key: &str| match key {
+            "tone.curve" => 0,
+            "tone.auto_gain" => 1,
+            _ => 2,
+        };
+        let mut said: Vec<_> = layer.0.iter().collect();
+        said.sort_by_key(|(key, ..)| order(key));
+        for (key, value, origin) in said {
+            self.set(key, value.clone(), origin.clone());
+        }
+    }
+
+    fn set(&mut self, key: &str, value: Value, origin: Origin) {
+        let (mut key, mut value) = (key, value);
+        let is_another = self.0.get(key).is_none_or(|(own, _)| *own != value);
+        match key {
+            "tone.curve" if is_another => {
+                self.0.retain(|key, _| {
+                    !OF_CURVE.iter().any(|name| key.strip_prefix("tone.") == Some(name))
+                });
+            }
+            "tone.auto_gain" if is_another => drop(self.0.remove("tone.lift_first")),
+            _ => {}
+        }
+        if let Some(name) = key.strip_prefix("tone.constants.") {
+            let mut constants = match self.0.get("tone.constants") {
+                Some((Value::Table(constants), _)) => constants.clone(),
+                _ => self.constants(),
+            };
+            constants.insert(name.to_owned(), value);
+            (key, value) = ("tone.constants", Value::Table(constants));
+        }
+        self.0.insert(key.to_owned(), (value, origin));
+    }
+
+    /// The constants that the curve comes with.
+    fn constants(&self) -> Table {
+        let curve = self.0.get("tone.curve").and_then(|(value, _)| value.as_str()?.parse().ok());
+        let constants = curve.unwrap_or(ToneCurve::Auto).family().constants.iter();
+        constants.map(|constant| (constant.name.to_owned(), constant.default.into())).collect()
+    }
+
+    /// The configuration.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] for a curve that is not whole.
+    pub fn config(&self) -> Result<TrainConfig> {
+        let mut table = Table::new();
+        for (key, (value, _)) in &self.0 {
+            let mut path: Vec<&str> = key.split('.').collect();
+            let Some(name) = path.pop() else { continue };
+            let section = path.into_iter().try_fold(&mut table, |table, name| {
+                table.entry(name).or_insert_with(|| Value::Table(Table::new())).as_table_mut()
+            });
+            if let Some(section) = section {
+                section.insert(name.to_owned(), value.clone());
+            }
+        }
+        table.try_into().map_err(|error: toml::de::Error| Error::Usage(error.message().to_owned()))
+    }
+
+    /// Where a value comes from, in words.
+    fn origin(&self, row: &Setting) -> String {
+        let said = self.0.get(row.key.as_ref()).map(|(_, origin)| origin.to_string());
+        said.or_else(|| row.absent.map(str::to_owned))
+            .unwrap_or_else(|| Origin::Default.to_string())
+    }
+
+    /// Every setting of a configuration: value, origin, help.
+    ///
+    /// # Errors
+    /// None for a configuration that [`TrainConfig::check`] accepts.
+    pub fn explained(&self, config: &TrainConfig) -> Result<String> {
+        let values = values(config)?;
+        let line = |row: &Setting| {
+            let value = values.get(row.key.as_ref()).map(Value::to_string);
+            let value = value.map(|value| format!(" = {value}")).unwrap_or_default();
+            format!(
+                "{}{value}  ({})\n    {}: {}\n",
+                row.key,
+                self.origin(row),
+                row.help(),
+                row.takes()
+            )
+        };
+        Ok(SETTINGS.iter().map(line).collect())
+    }
+
+    /// config.toml: every setting with its help and, behind it, where its value comes from.
+    ///
+    /// # Errors
+    /// None for a configuration that [`TrainConfig::check`] accepts.
+    pub fn written(&self, config: &TrainConfig) -> Result<String> {
+        let (mut written, mut section) = (String::new(), String::new());
+        for line in config.to_toml()?.lines() {
+            if let Some(name) = line.strip_prefix('[').and_then(|line| line.strip_suffix(']')) {
+                section = format!("{name}.");
+            }
+            let key = line.split_once(" = ").map(|(name, _)| format!("{section}{name}"));
+            // A value of several lines has no room for a comment.
+            let row = key.and_then(|key| setting(&key)).filter(|_| line.parse::<Table>().is_ok());
+            written += &match row {
+                Some(row) => {
+                    format!("# {}: {}\n{line}  # {}\n", row.help(), row.takes(), self.origin(row))
+                }
+                None => format!("{line}\n"),
+            };
+        }
+        Ok(written)
+    }
+}
+
+impl TrainConfig {
+    /// Reads a TOML file; what it leaves out keeps its default.
+    ///
+    /// # Errors
+    /// The file cannot be read, or says something that no run has.
+    pub fn load(path: &Path) -> Result<Self> {
+        let mut settings = Settings::default();
+        settings.merge(&Layer::load(path)?);
+        settings.config().map_err(|problem| Error::input(path, problem.to_string()))
+    }
+
+    /// Reads TOML; what it leaves out keeps its default.
+    ///
+    /// # Errors
+    /// It says something that no run has.
+    pub fn from_toml(text: &str) -> Result<Self> {
+        let mut settings = Settings::default();
+        settings.merge(&Layer::of_toml(text, &Origin::Default)?);
+        settings.config()
+    }
+
+    /// The configuration with each `KEY=VALUE` of `assignments` in turn, such as `tone.alpha=0.1`. A value is TOML, or
+    /// else a string.
+    ///
+    /// # Errors
+    /// [`Error::Setting`] for a value that the setting does not take, [`Error::Usage`] for a key that is no setting.
+    pub fn with(&self, assignments: &[String]) -> Result<Self> {
+        let mut layer = Layer::default();
+        assignments.iter().try_for_each(|assignment| layer.assign(assignment))?;
+        self.overlaid(&layer)
+    }
+
+    /// The configuration with every setting of a layer.
+    pub(super) fn overlaid(&self, layer: &Layer) -> Result<Self> {
+        let mut settings = Settings::default();
+        settings.merge(&Layer::of(self)?);
+        settings.merge(layer);
+        let config = settings.config()?;
+        Ok(Self { spool: self.spool.clone(), ..config })
+    }
+}
+
+/// The values of a configuration that its TOML has, by key.
+///
+/// # Errors
+/// None for a configuration that [`TrainConfig::check`] accepts.
+pub fn values(config: &TrainConfig) -> Result<BTreeMap<String, Value>> {
+    Ok(Layer::of(config)?.0.into_iter().map(|(key, value, _)| (key, value)).collect())
+}
+
+/// The line of a place in a text, as messages have it.
+fn line_at(text: &str, at: usize) -> String {
+    format!(" (line {})", text[..at].matches('\n').count() + 1)
+}
+
+/// The line of a key.
+fn line_of(text: &str, key: &str) -> Option<String> {
+    let document = DeTable::parse(text).ok()?;
+    let (mut table, mut at) = (document.get_ref(), None);
+    for name in key.split('.') {
+        let Some((name, value)) = table.iter().find(|(own, _)| own.get_ref() == name) else {
+            break;
+        };
+        at = Some(name.span().start);
+        match value.get_ref() {
+            DeValue::Table(inner) => table = inner,
+            _ => break,
+        }
+    }
+    at.map(|at| line_at(text, at))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::photographs::tone::ToneSettings;
+    use crate::train::Background;
+
+    fn with(assignments: &[&str]) -> Result<TrainConfig> {
+        let assignments: Vec<String> = assignments.iter().map(|&text| text.to_owned()).collect();
+        TrainConfig::default().with(&assignments)
+    }
+
+    #[test]
+    fn a_setting_is_set_and_nothing_else() {
+        let config = with(&[
+            "tone.alpha=0.25",
+            "density.gradient_threshold = 1e-4",
+            "downscale=4",
+            "background=black",
+            "device=0",
+            "schedule.damping_steps=[1, 2]",
+            "reference=pictures/high",
+            "steps=3",
+            "steps=4",
+        ])
+        .unwrap();
+        let mut expected = TrainConfig::default();
+        expected.tone.alpha = 0.25;
+        expected.density.gradient_threshold = 1e-4;
+        expected.downscale = 4.0;
+        expected.background = Background::Black;
+        expected.device = "0".to_owned();
+        expected.schedule.damping_steps = [1, 2];
+        expected.reference = Some("pictures/high".into());
+        expected.steps = 4;
+        assert_eq!(config, expected);
+        assert_eq!(with(&[]).unwrap(), TrainConfig::default());
+    }
+
+    #[test]
+    fn another_curve_comes_with_its_own_constants_wherever_the_layer_names_it() {
+        let ase = with(&["tone.gain_c=2", "tone.curve=ase"]).unwrap();
+        assert_eq!(ase.tone, ToneSettings { gain_c: 2.0, ..ToneSettings::new(ToneCurve::Ase) });
+        let mut settings = Settings::default();
+        let layer = |text| Layer::of_toml(text, &Origin::Default).unwrap();
+        settings.merge(&layer("[tone]\ncurve = \"ase\"\ngain_c = 2.0\ntheta = 0.4"));
+        settings.merge(&layer("[tone]\ncurve = \"ap3\""));
+        assert_eq!(
+            settings.config().unwrap().tone,
+            ToneSettings { theta: 0.4, ..ToneSettings::new(ToneCurve::Ap3) }
+        );
+    }
+
+    #[test]
+    fn a_single_constant_of_a_curve_can_be_set() {
+        let family = ToneCurve::ALL.into_iter().find(|curve| !curve.family().constants.is_empty());
+        let curve = family.unwrap();
+        let name = curve.family().constants[0].name;
+        let config = with(&[
+            &format!("tone.curve={}", curve.name()),
+            &format!("tone.constants.{name}=0.75"),
+        ]);
+        assert_eq!(config.unwrap().tone.constants[0], 0.75);
+    }
+
+    #[test]
+    fn what_is_wrong_in_a_file_has_its_line() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("config.toml");
+        for (text, parts) in [
+            ("steps = 3\nstepz = 4\n", ["`stepz`", "(line 2)"]),
+            (
+                "steps = 3\n[stop]\nviews = 1\nevery = 0\n",
+                ["stop.every is 0; it must be a whole number, at least 1", "(line 4)"],
+            ),
+            ("steps = 3\nseed = \"x\"\n", ["seed is \"x\"", "(line 2)"]),
+            ("steps = \n", ["is no TOML", "(line 1)"]),
+        ] {
+            std::fs::write(&path, text).unwrap();
+            let message = TrainConfig::load(&path).unwrap_err().to_string();
+            assert!(parts.iter().all(|part| message.contains(part)), "{message}");
+        }
+        std::fs::write(&path, "[tone]\nfamily = \"ap3\"\n").unwrap();
+        assert_eq!(TrainConfig::load(&path).unwrap().tone.curve, ToneCurve::Ap3, "an older name");
+    }
+
+    #[test]
+    fn a_written_configuration_says_who_says_each_value_and_reads_as_it_is() {
+        let mut settings = Settings::default();
+        settings.merge(
+            &Layer::of_toml("steps = 700\n[stop]\nviews = 0", &Origin::Preset("fast")).unwrap(),
+        );
+        let mut set = Layer::default();
+        set.assign("steps=9").unwrap();
+        set.assign("device=a\nb").unwrap();
+        settings.merge(&set);
+        let config = settings.config().unwrap();
+        let text = settings.written(&config).unwrap();
+        for line in [
+            "\nsteps = 9  # --set\n",
+            "\nviews = 0  # preset fast\n",
+            "\nseed = 10  # default\n",
+            "\n# Training steps, one view each: a whole number, at least 1, in steps\n",
+        ] {
+            assert!(text.contains(line), "no {line} in {text}");
+        }
+        assert_eq!(TrainConfig::from_toml(&text).unwrap(), config);
+        let explained = settings.explained(&config).unwrap();
+        assert!(
+            explained.contains("stop.views = 0  (preset fast)\n    The number of"),
+            "{explained}"
+        );
+        assert!(explained.contains("cache  (a quarter of the memory of each)\n"), "{explained}");
+    }
+}

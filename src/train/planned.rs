@@ -1,0 +1,147 @@
+//! What is said of a run, and what is decided by looking at its photographs: the configuration that `nightsplat train` trains.
+
+use std::path::Path;
+
+use toml::Value;
+
+use super::diagnose::{Diagnosis, Plan};
+use super::layers::{Layer, Origin, Settings};
+use super::{Preset, TrainConfig, Trainer};
+use crate::gpu::Gpu;
+use crate::photographs::dataset::{Dataset, LoadOptions};
+use crate::{Error, Result};
+
+/// What is said of a run beside its plan, from the weakest to the strongest.
+#[derive(Clone, Debug, Default)]
+pub struct Said {
+    /// A trade of time for quality, or a benchmark; none: the defaults, which are balanced.
+    pub preset: Option<Preset>,
+    /// A configuration file.
+    pub file: Layer,
+    /// Options.
+    pub options: Layer,
+    /// `--set`.
+    pub set: Layer,
+}
+
+/// What decides what is not said.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Planning<'a> {
+    /// Nothing: it keeps the preset's values.
+    Nothing,
+    /// The plan in this file.
+    File(&'a Path),
+    /// A diagnosis of the photographs.
+    Diagnosis,
+}
+
+/// A run whose every setting is decided.
+#[derive(Debug)]
+pub struct Planned {
+    /// What it trains.
+    pub config: TrainConfig,
+    /// Where each value of that comes from.
+    pub settings: Settings,
+    /// What was decided, and why.
+    pub plan: Option<Plan>,
+    /// Without the views that the plan leaves out.
+    pub dataset: Dataset,
+}
+
+impl Said {
+    /// All that is said, and of what is not said what a plan says.
+    ///
+    /// # Errors
+    /// A plan that was written by hand has a number out of its range.
+    pub fn settings(&self, plan: Option<&Plan>) -> Result<Settings> {
+        let said = [&self.file, &self.options, &self.set];
+        let get = |key: &str| said.iter().rev().find_map(|layer| layer.get(key));
+        let mut settings = Settings::default();
+        if let Some(preset) = self.preset {
+            let curve = get("tone.curve").and_then(|name| name.as_str()?.parse().ok());
+            let dataset = get("dataset").and_then(Value::as_str).unwrap_or_default();
+            settings.merge(&preset.layer(curve, Path::new(dataset))?);
+        }
+        if let Some(plan) = plan {
+            // Whoever says anything of how photographs are brightened has decided that.
+            let names_a_curve = said.iter().any(|layer| layer.names("tone."));
+            // Exposures and the tonemapper exclude each other, and a plan never asks for both.
+            let has_tonemapper = get("model.tonemapper") == Some(&Value::Boolean(true));
+            let mut layer = plan.layer()?;
+            layer.0.retain(|(key, ..)| match key.as_str() {
+                "tone.curve" => !names_a_curve,
+                "exposure.learn" => !has_tonemapper,
+                _ => true,
+            });
+            settings.merge(&layer);
+        }
+        for layer in said {
+            settings.merge(layer);
+        }
+        Ok(settings)
+    }
+
+    /// Loads the dataset and decides what is not said.
+    ///
+    /// # Errors
+    /// A setting makes no sense, the dataset cannot be used, or the plan is that of another one.
+    pub fn planned(&self, planning: Planning<'_>, gpu: &Gpu) -> Result<Planned> {
+        let config = self.settings(None)?.config()?;
+        config.check()?;
+        let options = match planning {
+            Planning::Nothing => config.load_options(),
+            _ => diagnosed(&config),
+        };
+        let mut dataset = Dataset::load(&config.dataset, &options)?;
+        let plan = match planning {
+            Planning::Nothing => None,
+            Planning::File(file) => Some(Plan::load(file, &dataset)?),
+            Planning::Diagnosis => Some(planned(&dataset, &config, gpu)?),
+        };
+        if let Some(plan) = &plan {
+            dataset.leave_out(&plan.left_out);
+        }
+        let settings = self.settings(plan.as_ref())?;
+        let config = settings.config()?;
+        config.check()?;
+        Ok(Planned { config, settings, plan, dataset })
+    }
+}
+
+/// As the configuration's, with depth maps wherever there are some: whether there are is part of the diagnosis.
+pub fn diagnosed(config: &TrainConfig) -> LoadOptions {
+    let mut options = config.load_options();
+    options.depth.load = true;
+    options
+}
+
+fn planned(dataset: &Dataset, config: &TrainConfig, gpu: &Gpu) -> Result<Plan> {
+    let diagnosis = Diagnosis::of(dataset, &diagnosed(config))?;
+    for remark in &diagnosis.remarks {
+        tracing::warn!("{remark}");
+    }
+    Ok(Plan::new(&diagnosis, config, gpu.properties().memory))
+}
+
+impl Trainer {
+    /// A trainer of what `nightsplat train --preset` trains: the photographs are diagnosed, unless the preset states it all.
+    /// `dataset` is what [`TrainConfig::load_options`] loads.
+    ///
+    /// # Errors
+    /// The dataset cannot be used, or the device is out of memory or lost.
+    pub fn planned(gpu: &Gpu, dataset: &Dataset, preset: Preset) -> Result<Self> {
+        let mut said = Said { preset: Some(preset), ..Said::default() };
+        let root = dataset.root.to_str().ok_or_else(|| {
+            Error::input(&dataset.root, "is not Unicode; move it to a path that is")
+        })?;
+        said.options.push("dataset", root.into(), Origin::Option("dataset"))?;
+        let config = said.settings(None)?.config()?;
+        if !preset.is_planned() {
+            return Self::new(gpu, config, dataset);
+        }
+        let plan = planned(dataset, &config, gpu)?;
+        let mut dataset = dataset.clone();
+        dataset.leave_out(&plan.left_out);
+        Self::new(gpu, said.settings(Some(&plan))?.config()?, &dataset)
+    }
+}

@@ -1,0 +1,86 @@
+//! The guide's reference of settings, made from their rows and from the presets.
+
+use std::fmt::Write;
+
+use toml::Value;
+
+use super::layers::values;
+use super::settings::SETTINGS;
+use super::{Preset, TrainConfig};
+use crate::Result;
+use crate::base::settings::Setting;
+
+/// Every setting and every preset, as docs/settings.md has them.
+///
+/// # Errors
+/// None for the settings and presets that there are.
+pub fn reference() -> Result<String> {
+    let mut text = "# Settings\n\n\
+        Every setting of a training run, by its key in `config.toml` and for `train --set KEY=VALUE`; those with an option of their\n\
+        own say which. What wins, from the weakest: default, preset, plan, `--config FILE`, options, `--set`. `train --explain` prints\n\
+        each setting with its value and who says it, and so does `config.toml` of a run. This page is made from the table that the\n\
+        command reads.\n"
+        .to_owned();
+    let values = values(&TrainConfig::default())?;
+    let mut section = None;
+    for row in SETTINGS.iter() {
+        let own = row.key.rsplit_once('.').map_or("", |(section, _)| section);
+        if section != Some(own) {
+            let title = if own.is_empty() { "The run".to_owned() } else { format!("`[{own}]`") };
+            let _ = write!(
+                text,
+                "\n## {title}\n\n| key | default | takes | what it does |\n|---|---|---|---|\n"
+            );
+            section = Some(own);
+        }
+        let default = values.get(row.key.as_ref()).filter(|_| row.absent.is_none());
+        let _ = writeln!(
+            text,
+            "| `{}` | {} | {} | {} |",
+            row.key,
+            default.map_or_else(|| row.absent.unwrap_or_default().to_owned(), cell),
+            escaped(&row.takes()),
+            escaped(&told(row)),
+        );
+    }
+    text += "\n## The presets\n\nEach is the defaults, which are `balanced`, but for\n\n";
+    presets(&mut text)?;
+    Ok(text)
+}
+
+fn told(row: &Setting) -> String {
+    let option = row.option.map(|option| format!(" `{option}`")).unwrap_or_default();
+    format!("{}.{option}", row.help())
+}
+
+/// A table of what the presets set: a row for each setting that one has otherwise.
+fn presets(text: &mut String) -> Result<()> {
+    const SHOWN: [Preset; 5] =
+        [Preset::Balanced, Preset::Draft, Preset::Fast, Preset::Best, Preset::Paper];
+    let of = |preset: Preset| {
+        let mut config = TrainConfig::default();
+        preset.apply(&mut config)?;
+        values(&config)
+    };
+    let all = SHOWN.into_iter().map(of).collect::<Result<Vec<_>>>()?;
+    let names = SHOWN.map(Preset::name).join(" | ");
+    let _ = write!(text, "| | {names} |\n|---|---|---|---|---|---|\n");
+    for row in SETTINGS.iter() {
+        let values = all.iter().map(|values| values.get(row.key.as_ref()));
+        let values: Vec<Option<&Value>> = values.collect();
+        if values.iter().any(|value| *value != values[0]) {
+            let cells = values.iter().map(|value| value.map(cell).unwrap_or_default());
+            let _ = writeln!(text, "| `{}` | {} |", row.key, cells.collect::<Vec<_>>().join(" | "));
+        }
+    }
+    Ok(())
+}
+
+fn cell(value: &Value) -> String {
+    format!("`{value}`")
+}
+
+/// A text within a cell of a table.
+fn escaped(text: &str) -> String {
+    text.replace('|', "\\|")
+}

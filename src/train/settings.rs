@@ -1,0 +1,263 @@
+//! The table of all settings: which key is one, which values it takes, and what is said of others.
+
+use std::sync::LazyLock;
+
+use toml::{Table, Value};
+
+use super::{
+    CheckConfig, DensityConfig, ExposureConfig, ModelConfig, NetworkRates, PrecisionConfig,
+    StopConfig, TrainConfig,
+};
+use crate::Error;
+use crate::base::settings::{Rule, Setting};
+use crate::camera::Frame;
+use crate::loss::Weights;
+use crate::loss::exposure::ExposureRates;
+use crate::networks::DenoiserSettings;
+use crate::photographs::tone::ToneSettings;
+use crate::splats::optimizer::{LearningRates, Schedule};
+use crate::splats::scene::init::Start;
+
+/// Every setting that there is, in the order of config.toml.
+pub static SETTINGS: LazyLock<Vec<Setting>> = LazyLock::new(|| {
+    let rates: Vec<Setting> = LearningRates::settings().collect();
+    [
+        TrainConfig::SETTINGS,
+        Frame::SETTINGS,
+        ToneSettings::SETTINGS,
+        CheckConfig::SETTINGS,
+        Start::SETTINGS,
+        Schedule::SETTINGS,
+        &rates,
+        DensityConfig::SETTINGS,
+        ModelConfig::SETTINGS,
+        DenoiserSettings::SETTINGS,
+        Weights::SETTINGS,
+        NetworkRates::SETTINGS,
+        StopConfig::SETTINGS,
+        ExposureConfig::SETTINGS,
+        ExposureRates::SETTINGS,
+        PrecisionConfig::SETTINGS,
+    ]
+    .concat()
+});
+
+/// The row of a setting.
+pub fn setting(key: &str) -> Option<&'static Setting> {
+    SETTINGS.iter().find(|row| row.key == key)
+}
+
+/// The keys and values of a table; a table that is the value of a setting stays one.
+pub(super) fn flat(prefix: &str, table: Table) -> Vec<(String, Value)> {
+    let of = |(name, value): (String, Value)| {
+        let key = format!("{prefix}{name}");
+        match value {
+            Value::Table(inner) if setting(&key).is_none() && is_section(&key) => {
+                flat(&format!("{key}."), inner)
+            }
+            value => vec![(key, value)],
+        }
+    };
+    table.into_iter().flat_map(of).collect()
+}
+
+/// Whether settings stand under the name.
+fn is_section(name: &str) -> bool {
+    SETTINGS.iter().any(|row| row.key.strip_prefix(name).is_some_and(|rest| rest.starts_with('.')))
+}
+
+/// Whether a rule takes a value.
+pub(super) fn takes(rule: &Rule, value: &Value) -> bool {
+    match (rule, value) {
+        (Rule::Flag, Value::Boolean(_)) | (Rule::Table(_), Value::Table(_)) => true,
+        (Rule::Whole(..), Value::Integer(whole)) => {
+            u64::try_from(*whole).is_ok_and(|whole| rule.takes_whole(whole))
+        }
+        (Rule::Number(..), value) => number(value).is_some_and(|number| rule.takes_number(number)),
+        (Rule::List(least, most, rule), Value::Array(values)) => {
+            (*least..=*most).contains(&values.len())
+                && values.iter().all(|value| takes(rule, value))
+        }
+        (Rule::OneOf(_) | Rule::Text(..), Value::String(text)) => rule.takes_text(text),
+        _ => false,
+    }
+}
+
+pub(super) fn number(value: &Value) -> Option<f64> {
+    value.as_float().or_else(|| value.as_integer().map(|whole| whole as f64))
+}
+
+/// A TOML value; none where the text is no single one.
+pub(super) fn value(text: &str) -> Option<Value> {
+    let mut table: Table = toml::from_str(&format!("value = {text}")).ok()?;
+    (table.len() == 1).then(|| table.remove("value")).flatten()
+}
+
+/// What is to be said of a key that is no setting: the settings of the section that it is, or the nearest one by name, in its
+/// own section if there is one.
+pub(super) fn unknown(key: &str) -> Error {
+    if is_section(key) {
+        let keys = SETTINGS.iter().map(|row| row.key.as_ref());
+        let inner: Vec<&str> = keys.filter(|own| own.starts_with(&format!("{key}."))).collect();
+        return Error::Usage(format!("{key} is a section; set one of {}", inner.join(", ")));
+    }
+    let (section, name) = key.rsplit_once('.').unwrap_or(("", key));
+    // A key without its section, or in one that there is not, is the one of that name.
+    let is_within = !section.is_empty() && is_section(section);
+    let far = |row: &&Setting| {
+        let (own_section, own) = row.key.rsplit_once('.').unwrap_or(("", &row.key));
+        let is_elsewhere = own_section != section;
+        (is_within && is_elsewhere, distance(name, own), is_elsewhere, row.key.len())
+    };
+    let nearest = SETTINGS.iter().min_by_key(far);
+    let hint = nearest.map(|row| format!("; the nearest is `{}`", row.key)).unwrap_or_default();
+    Error::Usage(format!("no setting is called `{key}`{hint}"))
+}
+
+/// How far two names are apart: the insertions, deletions and replacements that turn one into the other (Levenshtein), less
+/// the letters that they begin with alike: half a name is near the whole.
+fn distance(from: &str, to: &str) -> i64 {
+    let alike = from.chars().zip(to.chars()).take_while(|(from, to)| from == to).count();
+    let to: Vec<char> = to.chars().collect();
+    let mut row: Vec<usize> = (0..=to.len()).collect();
+    for (deleted, from) in from.chars().enumerate() {
+        let mut diagonal = std::mem::replace(&mut row[0], deleted + 1);
+        for (column, &to) in to.iter().enumerate() {
+            let replaced = diagonal + usize::from(from != to);
+            diagonal = row[column + 1];
+            row[column + 1] = replaced.min(diagonal + 1).min(row[column] + 1);
+        }
+    }
+    row[to.len()] as i64 - alike as i64
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use super::*;
+    use crate::Result;
+    use crate::train::NotFinite;
+    use crate::train::layers::values;
+
+    fn with(assignments: &[&str]) -> Result<TrainConfig> {
+        let assignments: Vec<String> = assignments.iter().map(|&text| text.to_owned()).collect();
+        TrainConfig::default().with(&assignments)
+    }
+
+    fn refused(assignment: &str, parts: &[&str]) {
+        let message = with(&[assignment]).unwrap_err().to_string();
+        for part in parts {
+            assert!(message.contains(part), "no `{part}` in: {message}");
+        }
+    }
+
+    /// A configuration with every setting that may be left out.
+    fn whole() -> TrainConfig {
+        let set =
+            ["reference", "exposure.start", "model.depth_folder"].map(|key| format!("{key}=a"));
+        let mut set = set.to_vec();
+        set.extend(["cache", "max_vram", "max_ram"].map(|key| format!("{key}=1G")));
+        let rest = [
+            "patch_pixels=512",
+            "test_every=8",
+            "tile=[16,8]",
+            "frame.scale=2",
+            "tone.brightness=0.5",
+        ];
+        set.extend(rest.map(str::to_owned));
+        TrainConfig::default().with(&set).unwrap()
+    }
+
+    #[test]
+    fn every_setting_of_a_configuration_has_one_row_and_every_row_is_one() {
+        let keys: Vec<&str> = SETTINGS.iter().map(|row| row.key.as_ref()).collect();
+        let rows: BTreeSet<&str> = keys.iter().copied().collect();
+        assert_eq!(keys.len(), rows.len(), "a key has two rows");
+        let mut written: BTreeSet<String> = values(&whole()).unwrap().into_keys().collect();
+        // They come with a curve.
+        written.extend(["tone.constants", "tone.table", "tone.profile"].map(str::to_owned));
+        assert_eq!(written, rows.into_iter().map(str::to_owned).collect());
+        let options: Vec<_> =
+            SETTINGS.iter().filter_map(|row| row.option()).map(|(name, _)| name).collect();
+        assert_eq!(
+            options.iter().collect::<BTreeSet<_>>().len(),
+            options.len(),
+            "an option sets two settings"
+        );
+    }
+
+    #[test]
+    fn every_default_follows_its_rule_and_every_word_of_a_rule_is_one_that_its_type_has() {
+        for (key, value) in values(&whole()).unwrap() {
+            let row = setting(&key).unwrap();
+            assert!(takes(&row.rule, &value), "{key} = {value}: {}", row.rule);
+            if let Rule::OneOf(words) = row.rule {
+                for word in words {
+                    let config = with(&[&format!("{key}={word}")]).unwrap();
+                    assert_eq!(values(&config).unwrap()[&key].as_str(), Some(*word), "{key}");
+                }
+            }
+            assert!(!row.help().is_empty() && !row.help().contains("[`"), "{key}");
+        }
+        TrainConfig::default().check().unwrap();
+    }
+
+    #[test]
+    fn a_setting_that_is_left_out_by_default_is_set_and_refused_by_its_own_name() {
+        assert_eq!(with(&["frame.scale=2"]).unwrap().frame.unwrap().scale, 2.0);
+        assert_eq!(
+            with(&["stop.not_finite=skip-view"]).unwrap().stop.not_finite,
+            NotFinite::SkipView
+        );
+        refused("stop.not_finite=skip", &["stop.not_finite is \"skip\"", "stop or skip-view"]);
+        refused("frame.scale=0", &["frame.scale is 0", "it must be at least"]);
+        refused("patch_pixels=8", &["patch_pixels is 8", "at least 256"]);
+        refused("cache=much", &["cache is \"much\"", "512M"]);
+        refused("tile=[8]", &["tile is [8]", "2 to 3 of"]);
+    }
+
+    #[test]
+    fn a_number_that_is_none_or_out_of_its_range_is_refused_wherever_it_stands() {
+        let mut count = 0;
+        for row in SETTINGS.iter() {
+            let wrong: &[&str] = match row.rule {
+                Rule::Number(..) => &["nan", "inf", "-inf", "\"1\"", "-1e300"],
+                Rule::Whole(..) => &["-1", "1.5", "many"],
+                Rule::Flag => &["1", "yes"],
+                Rule::OneOf(_) => &["neither", "3"],
+                _ => &[],
+            };
+            for value in wrong {
+                refused(
+                    &format!("{}={value}", row.key),
+                    &[&format!("{} is ", row.key), "it must be "],
+                );
+                count += 1;
+            }
+        }
+        assert!(count > 200, "{count}");
+    }
+
+    #[test]
+    fn a_key_that_is_no_setting_is_named_with_the_nearest_of_its_section() {
+        for (key, nearest) in [
+            ("tone.alhpa", "tone.alpha"),
+            ("alpha", "tone.alpha"),
+            ("stepz", "steps"),
+            ("density.gradient", "density.gradient_threshold"),
+            ("density.foo", "density."),
+            ("densty.fill", "density.fill"),
+            ("stop.not-finite", "stop.not_finite"),
+            ("frame.scal", "frame.scale"),
+        ] {
+            let is_nearest = format!("no setting is called `{key}`; the nearest is `{nearest}");
+            refused(&format!("{key}=1"), &[&is_nearest]);
+        }
+        refused("steps.more=1", &["`steps.more`"]);
+        refused("=1", &["``"]);
+        refused("tone={}", &["tone is a section", "tone.beta"]);
+        refused("steps=1\nseed=2", &["steps is ", "a whole number"]);
+        refused("steps", &["KEY=VALUE"]);
+    }
+}
