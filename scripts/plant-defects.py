@@ -35,6 +35,8 @@ DEFECTS = [
      "/ (z * z)\n        - dot(d_xy, free_slope);", "/ (z * z);", "--test splats gradients::"),
     ("a fisheye's gradient without what turns about the axis", "shaders-glsl/include/camera_fisheye.glsl",
      " + by_turn * side;", ";", "--test splats renderer_gives"),
+    ("a camera's turn that turns no Gaussian", "shaders-glsl/splats/render/camera_backward.comp",
+     " + cross(d_row0, row0) + cross(d_row1, row1);", ";", "--test splats camera_gradient::"),
     ("guard: what a fisheye would see twice is culled", "shaders-glsl/include/camera_fisheye.glsl",
      "point.z > 0.0 && angle_off_axis(length(point.xy), point.z) < camera.largest_angle", "point.z > 0.0",
      "--test splats nothing_is_seen"),

@@ -30,6 +30,10 @@ struct Jacobian {
     vec3 row1;
 };
 
+// Numbers of a camera's gradient: of a shift of all points in the view and of a turn about the camera, as (x, y, z) each, of
+// focal lengths, principal point and distortion.
+const uint CAMERA_WIDTH = 14;
+
 // A renderer without a near plane counts from here, in world units.
 const float NEAREST = 1e-4;
 
@@ -58,6 +62,12 @@ Jacobian camera_jacobian(vec3 point, Camera camera) {
 vec3 camera_backward(vec3 point, Camera camera, vec2 d_pixel, vec3 d_row0, vec3 d_row1) {
     if (CAMERA_MODEL == CAMERA_FISHEYE) return fisheye_backward(point, camera, d_pixel, d_row0, d_row1);
     return pinhole_backward(point, camera, d_pixel, d_row0, d_row1);
+}
+
+// The gradient of the distortion, from the same.
+vec4 camera_distortion_backward(vec3 point, Camera camera, vec2 d_pixel, vec3 d_row0, vec3 d_row1) {
+    if (CAMERA_MODEL == CAMERA_FISHEYE) return fisheye_distortion_backward(point, camera, d_pixel, d_row0, d_row1);
+    return vec4(0.0);
 }
 
 // How much deeper a point is that lies beside another by an offset, to first order.

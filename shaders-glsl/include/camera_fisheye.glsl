@@ -106,6 +106,20 @@ vec3 fisheye_backward(vec3 point, Camera camera, vec2 d_pixel, vec3 d_row0, vec3
     return vec3(d_xy, d_z) / ray.distance / ray.distance;
 }
 
+// d_pixel . pixel and S / d once more, by k1 to k4.
+vec4 fisheye_distortion_backward(vec3 point, Camera camera, vec2 d_pixel, vec3 d_row0, vec3 d_row1) {
+    FisheyeRay ray = fisheye_ray(point, camera);
+    vec2 n = ray.across, side = vec2(-n.y, n.x);
+    vec3 along_n = n.x * camera.focal.x * d_row0 + n.y * camera.focal.y * d_row1;
+    vec3 along_side = side.x * camera.focal.x * d_row0 + side.y * camera.focal.y * d_row1;
+    float ratio = ray.sine > 0.0 ? ray.angle / ray.sine : 1.0;
+    float by_factor = ratio * dot(along_side.xy, side) / ray.distance + ray.angle * dot(camera.focal * d_pixel, n);
+    float by_slope = (ray.cosine * dot(along_n.xy, n) - ray.sine * along_n.z) / ray.distance;
+    float t2 = ray.angle * ray.angle;
+    vec4 powers = t2 * vec4(1.0, t2, t2 * t2, t2 * t2 * t2);
+    return powers * (by_factor + by_slope * vec4(3.0, 5.0, 7.0, 9.0));
+}
+
 float fisheye_depth_change(vec3 point, vec3 offset) { return dot(point, offset) / length(point); }
 
 vec3 fisheye_at_depth(vec3 point, float depth) { return point * (depth / length(point)); }

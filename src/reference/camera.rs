@@ -5,7 +5,7 @@ use glam::{DMat3, DVec2, DVec3};
 use super::camera_fisheye::Fisheye;
 use super::camera_pinhole::Pinhole;
 use crate::kernels;
-use crate::kernels::camera::CAMERA_FISHEYE;
+use crate::kernels::camera::{CAMERA_FISHEYE, CAMERA_WIDTH};
 
 /// A view as the buffer of cameras describes it.
 #[derive(Clone, Debug)]
@@ -112,6 +112,31 @@ impl Camera {
             Model::Pinhole(pinhole) => pinhole.backward(point, d_place, d_rows),
             Model::Fisheye(fisheye) => fisheye.backward(point, d_place, d_rows),
         }
+    }
+
+    /// The gradient of the camera, from those of what it makes of a point: of a shift of all points in the view, which is
+    /// `d_shift`, and of their turn about the camera, of focal lengths, principal point and distortion.
+    pub fn gradient(
+        &self,
+        point: DVec3,
+        d_shift: DVec3,
+        d_pixel: DVec2,
+        d_rows: [DVec3; 2],
+    ) -> [f64; CAMERA_WIDTH as usize] {
+        let rows = self.jacobian(point);
+        let of_rows = d_rows[0].cross(rows[0]) + d_rows[1].cross(rows[1]);
+        let turn = point.cross(self.backward(point, d_pixel, d_rows)) + of_rows;
+        let along = DVec2::new(d_rows[0].dot(rows[0]), d_rows[1].dot(rows[1])) / self.focal;
+        let focal = d_pixel * self.place(point).at + along;
+        let d_place = self.focal * d_pixel;
+        let d_rows = [self.focal.x * d_rows[0], self.focal.y * d_rows[1]];
+        let distortion = match &self.model {
+            Model::Pinhole(_) => [0.0; 4],
+            Model::Fisheye(fisheye) => fisheye.distortion_backward(point, d_place, d_rows),
+        };
+        let numbers = [&d_shift.to_array()[..], &turn.to_array(), &focal.to_array()].concat();
+        let mut numbers = numbers.into_iter().chain(d_pixel.to_array()).chain(distortion);
+        std::array::from_fn(|_| numbers.next().unwrap_or_default())
     }
 
     /// How much deeper a point is that lies beside another by an offset, to first order.

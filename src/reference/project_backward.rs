@@ -46,18 +46,7 @@ pub fn project_gaussian_backward(
     let [t0, t1] = camera.jacobian(mean_in_view).map(|row| world_from_view * row);
     let (u0, u1) = (scaled_axes.transpose() * t0, scaled_axes.transpose() * t1);
 
-    let [a, b, c] = splat.conic.to_array();
-    let d_conic = d_splat.conic;
-    let normal = u0.cross(u1);
-    let trace = u0.dot(u0) + u1.dot(u1);
-    let det = normal.dot(normal) + DILATION * trace + DILATION * DILATION;
-    let w0 = (u1.cross(normal) + DILATION * u0) / det;
-    let w1 = (normal.cross(u0) + DILATION * u1) / det;
-    let g0 = d_conic.x * w0 + 0.5 * d_conic.y * w1;
-    let g1 = 0.5 * d_conic.y * w0 + d_conic.z * w1;
-    let d_u0 = -2.0 * (a * g0 + b * g1);
-    let d_u1 = -2.0 * (b * g0 + c * g1);
-    let d_log_scale = -2.0 * (w0 * g0 + w1 * g1);
+    let (d_u0, d_u1, d_log_scale) = conic_backward(splat.conic, [u0, u1], d_splat.conic);
 
     let d_scaled_axes = outer_product(t0, d_u0) + outer_product(t1, d_u1);
     let d_unit = rotation_backward(unit, d_scaled_axes * DMat3::from_diagonal(scale));
@@ -78,6 +67,23 @@ pub fn project_gaussian_backward(
         features: d_splat.features.clone(),
         sh: d_sh,
     }
+}
+
+/// From the gradient of a conic to those of the rows of U, of which cov2d = U U^T + 0.3 I, and of the logarithms of the scales.
+pub(super) fn conic_backward(
+    conic: DVec3,
+    [u0, u1]: [DVec3; 2],
+    d_conic: DVec3,
+) -> (DVec3, DVec3, DVec3) {
+    let [a, b, c] = conic.to_array();
+    let normal = u0.cross(u1);
+    let trace = u0.dot(u0) + u1.dot(u1);
+    let det = normal.dot(normal) + DILATION * trace + DILATION * DILATION;
+    let w0 = (u1.cross(normal) + DILATION * u0) / det;
+    let w1 = (normal.cross(u0) + DILATION * u1) / det;
+    let g0 = d_conic.x * w0 + 0.5 * d_conic.y * w1;
+    let g1 = 0.5 * d_conic.y * w0 + d_conic.z * w1;
+    (-2.0 * (a * g0 + b * g1), -2.0 * (b * g0 + c * g1), -2.0 * (w0 * g0 + w1 * g1))
 }
 
 /// The gradient of the mean through the viewing direction, and those of the SH coefficients.
@@ -173,24 +179,23 @@ impl<'a> Scene<'a> {
         let damping = weight * nearness * nearness + 1.0 - weight;
         damping * (self.params.half_view.as_dvec2() * d_splat.mean2d).length()
     }
+}
 
-    /// The sum of the records of Gaussian `i`. Those of few slots are added up in f32 in the kernel's very order; those of
-    /// many by the lanes of a subgroup, in an order that is the device's.
-    fn record(&self, emitted: &[UVec2], records: &[Vec3], i: usize) -> Vec<Rounded> {
-        let (channels, records) =
-            (self.constants.channels, bytemuck::cast_slice::<_, f32>(records));
-        let slots = emitted[i].x as usize..emitted[i].y as usize;
-        let sum = |k: usize| {
-            let numbers = slots.clone().map(|slot| records[stored_record(channels) * slot + k]);
-            if slots.len() <= SHARED_SLOTS as usize {
-                return Rounded::exact(numbers.fold(0.0, |sum, number| sum + number));
-            }
-            let magnitudes: f64 = numbers.clone().map(|number| f64::from(number.abs())).sum();
-            let sum = Rounded::exact(numbers.map(f64::from).sum::<f64>() as f32);
-            Rounded { error: UNIT * chain(slots.len()) * magnitudes, ..sum }
-        };
-        (0..HEAD + channels as usize).map(sum).collect()
-    }
+/// The sum of the records of a Gaussian with these slots. Those of few slots are added up in f32 in the kernel's very order;
+/// those of many by the lanes of a subgroup, in an order that is the device's.
+pub(super) fn summed_record(channels: u32, slots: UVec2, records: &[Vec3]) -> Vec<Rounded> {
+    let records = bytemuck::cast_slice::<_, f32>(records);
+    let slots = slots.x as usize..slots.y as usize;
+    let sum = |k: usize| {
+        let numbers = slots.clone().map(|slot| records[stored_record(channels) * slot + k]);
+        if slots.len() <= SHARED_SLOTS as usize {
+            return Rounded::exact(numbers.fold(0.0, |sum, number| sum + number));
+        }
+        let magnitudes: f64 = numbers.clone().map(|number| f64::from(number.abs())).sum();
+        let sum = Rounded::exact(numbers.map(f64::from).sum::<f64>() as f32);
+        Rounded { error: UNIT * chain(slots.len()) * magnitudes, ..sum }
+    };
+    (0..HEAD + channels as usize).map(sum).collect()
 }
 
 fn values(record: &[Rounded]) -> Vec<f64> {
@@ -207,7 +212,7 @@ impl Reference for Kernel {
         let parameters = scene.planes.floats(parameters, constants.half_rest);
         gradients[..scene.planes.len()].fill(0.0);
         for i in (0..scene.planes.count).filter(|&i| tile_counts[i] > 0) {
-            let record = scene.record(emitted, records, i);
+            let record = summed_record(constants.channels, emitted[i], records);
             let d_splat = scene.d_splat(colors, &values(&record), i);
             let gaussian = scene.planes.load(&parameters, i);
             let gradient = scene.backward(&gaussian, &Splat::from(&splats[i]), &d_splat);
@@ -241,7 +246,7 @@ impl Reference for Kernel {
             let mut inputs = vec![0.0; one.len()];
             one.store(&gaussian, 0, |at, value| inputs[at] = value);
             inputs.extend(splat.conic.to_array());
-            let record = scene.record(slices.emitted, slices.records, i);
+            let record = summed_record(constants.channels, slices.emitted[i], slices.records);
             inputs.extend(values(&record));
             let mut errors: Vec<f64> = (0..inputs.len())
                 .map(|at| {

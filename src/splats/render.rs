@@ -31,7 +31,7 @@ use crate::splats::scene::{GaussianSlice, Layout, Shape};
 use crate::splats::sort::{Count, RadixSort};
 use crate::{Error, Result};
 
-pub use cameras::{Viewpoint, Viewpoints};
+pub use cameras::{CameraGradient, Viewpoint, Viewpoints};
 #[doc(hidden)]
 pub use frame::Frame;
 pub use frame::Status;

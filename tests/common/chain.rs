@@ -4,9 +4,12 @@ use glam::{DVec2, DVec3};
 use nightsplat::kernels::splat::RECORD_HEAD;
 use nightsplat::reference::blend_backward::blend_pixel_backward;
 use nightsplat::reference::blend_forward::blend_pixel;
+use nightsplat::reference::camera::Camera;
+use nightsplat::reference::camera_backward::camera_backward;
 use nightsplat::reference::project::{Projection, project_gaussian};
 use nightsplat::reference::project_backward::{DSplat, project_gaussian_backward};
 use nightsplat::reference::splat::Splat;
+use nightsplat::splats::render::CameraGradient;
 
 use super::setup::{Rendered, Setup};
 use super::{Random, assert_close};
@@ -37,6 +40,8 @@ pub(crate) struct Results {
     grad_norms: Vec<f64>,
     /// By channel.
     pub(crate) d_background: Vec<f64>,
+    /// That of the camera.
+    pub(crate) camera: [f64; CameraGradient::WIDTH],
 }
 
 impl<'a> Chain<'a> {
@@ -57,14 +62,13 @@ impl<'a> Chain<'a> {
         self.setup.background().into_iter().map(f64::from).collect()
     }
 
-    fn project(&self, parameters: &[f64]) -> Projected {
+    fn project(&self, camera: &Camera, parameters: &[f64]) -> Projected {
         let Setup { settings, options, .. } = self.setup;
-        let camera = self.setup.camera();
         let one = |i| -> Option<(usize, Projection, Vec<f64>)> {
             let gaussian = self.setup.planes().load(parameters, i);
             let (near, degree) = (settings.near.into(), options.sh_degree);
             let projection =
-                project_gaussian(&camera, near, degree, settings.raw_colors, &gaussian)?;
+                project_gaussian(camera, near, degree, settings.raw_colors, &gaussian)?;
             Some((i, projection, gaussian.features))
         };
         let mut visible: Vec<_> = (0..self.setup.count).filter_map(one).collect();
@@ -95,7 +99,17 @@ impl<'a> Chain<'a> {
 
     /// The functional's value.
     pub(crate) fn loss(&self, parameters: &[f64], background: &[f64]) -> f64 {
-        let Projected { splats, colors, .. } = self.project(parameters);
+        self.loss_seen_by(&self.setup.camera(), parameters, background)
+    }
+
+    /// The same of another camera.
+    pub(crate) fn loss_seen_by(
+        &self,
+        camera: &Camera,
+        parameters: &[f64],
+        background: &[f64],
+    ) -> f64 {
+        let Projected { splats, colors, .. } = self.project(camera, parameters);
         let pixel = |(center, d): (DVec2, Vec<f64>)| {
             let (render, _) = blend_pixel(&splats, &colors, background, center, self.alpha_max());
             render.iter().zip(d).map(|(value, d)| value * d).sum::<f64>()
@@ -105,7 +119,8 @@ impl<'a> Chain<'a> {
 
     /// The render, and the gradients that the references' own backward gives.
     pub(crate) fn run(&self, parameters: &[f64]) -> Results {
-        let Projected { ids, splats, colors, depths } = self.project(parameters);
+        let camera = self.setup.camera();
+        let Projected { ids, splats, colors, depths } = self.project(&camera, parameters);
         let (channels, pixels, background) =
             (self.setup.channels(), self.setup.pixels(), self.background());
         let record = RECORD_HEAD as usize + channels;
@@ -116,6 +131,7 @@ impl<'a> Chain<'a> {
             gradient: vec![0.0; parameters.len()],
             grad_norms: vec![0.0; self.setup.count],
             d_background: vec![0.0; channels],
+            camera: [0.0; CameraGradient::WIDTH],
         };
         let alpha_max = self.alpha_max();
         for (at, (center, d)) in self.pixels().enumerate() {
@@ -130,13 +146,16 @@ impl<'a> Chain<'a> {
             }
             results.transmittances.push(transmittance);
         }
-        let (planes, camera) = (self.setup.planes(), self.setup.camera());
+        let planes = self.setup.planes();
         for (j, &i) in ids.iter().enumerate() {
             let d_splat = self.d_splat(&records[record * j..][..record], &colors[channels * j..]);
             let gaussian = planes.load(parameters, i);
             let degree = self.setup.options.sh_degree;
             let d = project_gaussian_backward(&camera, degree, &gaussian, &splats[j], &d_splat);
             planes.store(&d, i, |at, value| results.gradient[at] = value);
+            let arriving = (d_splat.mean2d, d_splat.conic);
+            let share = camera_backward(&camera, &gaussian, d.mean, splats[j].conic, arriving);
+            results.camera.iter_mut().zip(share).for_each(|(sum, share)| *sum += share);
             let damping = Rendered::DAMPING;
             let nearness = (depths[j] / f64::from(damping.depth)).min(1.0);
             let undamped = 1.0 - f64::from(damping.weight) * (1.0 - nearness * nearness);

@@ -189,7 +189,7 @@ impl Setup {
 /// A setup, rendered.
 pub(crate) struct Rendered<'a> {
     setup: &'a Setup,
-    gaussians: DeviceGaussians,
+    pub(crate) gaussians: DeviceGaussians,
     pub(crate) renderer: Renderer,
     /// (channels, H, W)
     pub(crate) render: Vec<f32>,

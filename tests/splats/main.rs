@@ -7,6 +7,7 @@
 mod common;
 
 mod batches;
+mod camera_gradient;
 mod checked;
 mod conditioning;
 mod coverage;

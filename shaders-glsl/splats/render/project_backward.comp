@@ -48,6 +48,8 @@ layout(binding = 10) readonly buffer Cameras { Camera cameras[]; };
 const uint FEATURE_COUNT = CHANNELS - 3;
 
 #include "rest.glsl"
+#include "records.glsl"
+#include "conic.glsl"
 
 #define STORE_VEC3(column, i, v) { \
     uint at = (column) * gaussian_count + 3 * (i); \
@@ -55,38 +57,6 @@ const uint FEATURE_COUNT = CHANNELS - 3;
 #define STORE_VEC4(column, i, v) { \
     uint at = (column) * gaussian_count + 4 * (i); \
     gradients[at] = (v).x; gradients[at + 1] = (v).y; gradients[at + 2] = (v).z; gradients[at + 3] = (v).w; }
-
-// The record of the Gaussian whose slots are these, summed in slot order.
-//
-// The lanes share the slots of a Gaussian that has many: each sums every SUBGROUP_SIZE-th, then a tree the lanes. The same
-// order every time gives the same bits every time.
-void sum_records(uvec2 slots, out vec3 sum[RECORD_VECTORS]) {
-    uint lane = gl_SubgroupInvocationID;
-    bool is_shared = slots.y - slots.x > SHARED_SLOTS;
-    uvec4 sharing = subgroupBallot(is_shared);
-
-    // First every lane its own slots, then all together those that are shared: in one loop, for a device that does not
-    // jump over branches pays for a second one even where nothing is shared.
-    uvec2 walked = is_shared ? uvec2(0) : slots;
-    uint owner = lane, stride = 1;
-    while (true) {
-        vec3 part[RECORD_VECTORS];
-        [[unroll]] for (uint k = 0; k < RECORD_VECTORS; k++) part[k] = vec3(0.0);
-        for (uint slot = walked.x; slot < walked.y; slot += stride) {
-            [[unroll]] for (uint k = 0; k < RECORD_VECTORS; k++) part[k] += records[RECORD_VECTORS * slot + k];
-        }
-        bool is_alone = stride == 1;
-        [[unroll]] for (uint k = 0; k < RECORD_VECTORS; k++) {
-            vec3 of_all = subgroup_sum(part[k]);
-            if (owner == lane) sum[k] = is_alone ? part[k] : of_all;
-        }
-        if (all(equal(sharing, uvec4(0)))) break;
-        owner = subgroupBallotFindLSB(sharing);
-        sharing[owner / 32] &= sharing[owner / 32] - 1;
-        stride = SUBGROUP_SIZE;
-        walked = subgroupShuffle(slots, owner) + uvec2(lane, 0);
-    }
-}
 
 // The gradient of a unit quaternion's rotation matrix.
 vec4 rotation_backward(vec4 q, mat3 d) {
@@ -182,21 +152,10 @@ void main() {
     vec3 t1 = world_from_view * (jacobian.scale.y * jacobian.row1);
     vec3 u0 = t0 * scaled_axes, u1 = t1 * scaled_axes;
 
-    // conic = inverse(cov2d), cov2d = U U^T + 0.3 I. Of conic U the large terms cancel, all of them for a needle; by hand,
-    // what is left of them is (U1 x N, N x U0) with N = U0 x U1.
-    float a = splat.conic.x, b = splat.conic.y, c = splat.conic.z;
-    vec3 normal = cross(u0, u1);
-    float det = dot(normal, normal) + DILATION * (dot(u0, u0) + dot(u1, u1)) + DILATION * DILATION;
-    vec3 w0 = (cross(u1, normal) + DILATION * u0) / det;  // rows of conic U
-    vec3 w1 = (cross(normal, u0) + DILATION * u1) / det;
-    vec3 g0 = d_conic.x * w0 + 0.5 * d_conic.y * w1;
-    vec3 g1 = 0.5 * d_conic.y * w0 + d_conic.z * w1;
-    vec3 d_u0 = -2.0 * (a * g0 + b * g1);
-    vec3 d_u1 = -2.0 * (b * g0 + c * g1);
-    vec3 d_log_scale = -2.0 * (w0 * g0 + w1 * g1);
+    ConicGradient d = conic_backward(splat.conic, u0, u1, d_conic);
 
     // U = (J W) (R S)
-    mat3 d_scaled_axes = outerProduct(t0, d_u0) + outerProduct(t1, d_u1);
+    mat3 d_scaled_axes = outerProduct(t0, d.u0) + outerProduct(t1, d.u1);
     mat3 d_axes;
     for (uint k = 0; k < 3; k++) d_axes[k] = d_scaled_axes[k] * scale[k];
     vec4 d_unit = rotation_backward(unit, d_axes);
@@ -204,21 +163,21 @@ void main() {
     float norm = length(small * quat);
     vec4 d_quat = norm > 1e-12 ? small * ((d_unit - unit * dot(unit, d_unit)) / norm) : vec4(0.0);
 
-    vec3 d_row0 = view_rotation * (scaled_axes * d_u0);
-    vec3 d_row1 = view_rotation * (scaled_axes * d_u1);
+    vec3 d_row0 = view_rotation * (scaled_axes * d.u0);
+    vec3 d_row1 = view_rotation * (scaled_axes * d.u1);
     vec3 d_mean_in_view = camera_backward(mean_in_view, camera, d_mean2d, d_row0, d_row1);
     vec3 center = -world_from_view * camera.view_from_world[3];
     vec3 d_mean = world_from_view * d_mean_in_view + sh_backward(i, mean - center, d_color);
 
     STORE_VEC3(MEANS_COLUMN, i, d_mean);
     STORE_VEC4(QUATS_COLUMN, i, d_quat);
-    STORE_VEC3(LOG_SCALES_COLUMN, i, d_log_scale);
+    STORE_VEC3(LOG_SCALES_COLUMN, i, d.log_scale);
     uint raw_opacity = RAW_OPACITIES_COLUMN * gaussian_count + i;
     // Of an opaque Gaussian 1 - opacity is rounding; its complement is not.
     float d_raw_opacity = d_opacity * splat.opacity * sigmoid(-parameters[raw_opacity]);
     gradients[raw_opacity] = d_raw_opacity;
 
-    uint bits = max(max(largest_bits(d_mean), largest_bits(d_quat.xyz)), largest_bits(d_log_scale));
+    uint bits = max(max(largest_bits(d_mean), largest_bits(d_quat.xyz)), largest_bits(d.log_scale));
     // No basis function is beyond 8.
     bits = max(max(bits, largest_bits(vec3(d_quat.w, d_raw_opacity, 0.0))), largest_bits(8.0 * d_color));
     [[unroll]] for (uint k = 0; k < FEATURE_COUNT; k++) bits = max(bits, largest_bits(vec3(record[RECORD_HEAD + 3 + k])));

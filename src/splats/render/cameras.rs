@@ -1,9 +1,12 @@
 //! Cameras on the device: kernels find theirs by its index in a buffer.
 
+use super::Renderer;
 use crate::Result;
-use crate::camera::{Camera, Patch};
-use crate::gpu::{Buffer, Gpu};
-use crate::kernels;
+use crate::camera::{Camera, CameraModel, Patch};
+use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
+use crate::kernels::camera::CAMERA_WIDTH;
+use crate::kernels::{self, camera_backward, camera_gradient};
+use crate::splats::scene::GaussianSlice;
 
 /// What is rendered: a patch of what a camera sees, and where on the device the camera is.
 #[derive(Clone, Copy, Debug)]
@@ -48,5 +51,94 @@ impl Viewpoints {
     /// There is none at this place.
     pub fn get(&self, index: usize) -> Viewpoint<'_> {
         Viewpoint { patch: self.patches[index], on_device: Some((&self.cameras, index as u32)) }
+    }
+}
+
+/// What the gradient of a camera takes. Nothing learns a camera yet.
+#[derive(Debug)]
+pub struct CameraGradient {
+    model: CameraModel,
+    backward: Pipeline<camera_backward::Kernel>,
+    sum: Pipeline<camera_gradient::Kernel>,
+    /// (Gaussians, [`CAMERA_WIDTH`])
+    shares: Buffer<f32>,
+}
+
+impl CameraGradient {
+    /// Numbers of the gradient: of a shift of the view, world units, and of a turn about the camera, radians, (x, y, z) each in
+    /// the view; of focal lengths, principal point and the four coefficients of a fisheye.
+    pub const WIDTH: usize = CAMERA_WIDTH as usize;
+
+    /// The kernels for a camera model, and memory for so many Gaussians.
+    ///
+    /// # Errors
+    /// The driver refuses a kernel, or the device is out of memory.
+    pub fn new(renderer: &Renderer, model: CameraModel, gaussian_count: usize) -> Result<Self> {
+        let Renderer { gpu, settings, tile, .. } = renderer;
+        let [tile_width, tile_height] = tile.size;
+        let constants = camera_backward::Constants {
+            alpha_max: settings.max_alpha,
+            channels: settings.channels() as u32,
+            tile_width,
+            tile_height,
+            camera_model: model.number(),
+        };
+        Ok(Self {
+            model,
+            backward: gpu.pipeline(&constants)?,
+            sum: gpu.pipeline(&camera_gradient::Constants::default())?,
+            shares: gpu.uninit("camera shares", Self::WIDTH * gaussian_count)?,
+        })
+    }
+
+    /// Records the gradient of a viewpoint's camera ([`CameraGradient::WIDTH`]), behind the [`Renderer::backward`] of the same,
+    /// which has left `gradients` of the parameters. The camera is moved in its view: a point p of it becomes p + shift + turn x p.
+    ///
+    /// # Errors
+    /// The viewpoint is of another camera model, there are more Gaussians than there is memory for, or others than the renderer's, or a pass exceeds what the device
+    /// launches.
+    pub fn record<'a>(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        renderer: &Renderer,
+        (gaussians, gradients): (impl Into<GaussianSlice<'a>>, &Buffer<f32>),
+        viewpoint: impl Into<Viewpoint<'a>>,
+        gradient: &mut Buffer<f32>,
+    ) -> Result<()> {
+        let Viewpoint { patch, on_device } = viewpoint.into();
+        let (frame, GaussianSlice { layout, parameters }) = (&renderer.frame, gaussians.into());
+        renderer.check(&layout)?;
+        if patch.camera.model.number() != self.model.number() {
+            let problem = "the gradient of a camera was built for another camera model";
+            return Err(crate::Error::Usage(problem.to_owned()));
+        }
+        let (cameras, camera_index) = on_device.unwrap_or((&frame.camera, 0));
+        for batch in layout.batches(&renderer.gpu).iter() {
+            let gaussian_count = batch.gaussian_count();
+            pass.dispatch(
+                &self.backward,
+                &camera_backward::Params { camera_index, gaussian_count },
+                camera_backward::Buffers {
+                    parameters: batch.rows(parameters, layout.words())?,
+                    splats: batch.rows(&frame.splats, 1)?,
+                    tile_counts: batch.rows(&frame.tile_counts, 1)?,
+                    emitted: batch.rows(&frame.emitted, 1)?,
+                    records: frame.records.slice(),
+                    gradients: batch.planes(gradients)?,
+                    cameras: cameras.slice(),
+                    shares: batch.rows_mut(&mut self.shares, Self::WIDTH)?,
+                },
+                Threads::Exactly([gaussian_count, 1, 1]),
+            )?;
+        }
+        pass.dispatch(
+            &self.sum,
+            &camera_gradient::Params { gaussian_count: layout.count as u32 },
+            camera_gradient::Buffers {
+                shares: self.shares.slice(),
+                gradient: gradient.slice_mut(),
+            },
+            Threads::Workgroups([CAMERA_WIDTH, 1, 1]),
+        )
     }
 }
