@@ -1,11 +1,15 @@
 //! The camera of `include/camera.glsl`, in f64.
 
+pub mod fisheye;
+pub mod pinhole;
+
 use glam::{DMat3, DVec2, DVec3};
 
-use super::camera_fisheye::Fisheye;
-use super::camera_pinhole::Pinhole;
 use crate::kernels;
 use crate::kernels::camera::{CAMERA_FISHEYE, CAMERA_WIDTH};
+
+use fisheye::Fisheye;
+use pinhole::Pinhole;
 
 /// A view as the buffer of cameras describes it.
 #[derive(Clone, Debug)]

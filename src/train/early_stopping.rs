@@ -181,6 +181,7 @@ mod tests {
     use crate::gpu::testing::gpu;
     use crate::photographs::dataset::Dataset;
     use crate::photographs::dataset::synthetic::{self, SyntheticOptions};
+    use crate::train::{StopConfig, TrainConfig};
 
     #[test]
     fn a_run_ends_once_two_scores_in_a_row_gain_too_little() {

@@ -338,7 +338,7 @@ fn a_killed_run_is_resumed_to_the_same_model() {
 
     refused(&train(&killed, "--steps 203 --resume --overwrite"), 2, &["--overwrite"]);
     refused(&train(&killed, "--steps 300 --resume --seed 4"), 3, &["seed = 10, not 4"]);
-    refused(&train(&killed, "--steps 199 --resume"), 3, &["at step 203", "--steps"]);
+    refused(&train(&killed, "--steps 199 --resume"), 3, &["at step 203", "raise steps"]);
     fs::write(killed.join("train.csv"), "step,view\n1,000,1\n").unwrap();
     refused(&train(&killed, "--steps 300 --resume"), 3, &["train.csv", "step 203"]);
     fs::remove_file(&checkpoint).unwrap();

@@ -2,7 +2,7 @@
 
 use glam::{DVec2, DVec3};
 
-use super::camera::Place;
+use super::Place;
 
 /// What is seen at the angle t off the axis lies `t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8)` from the principal point.
 #[derive(Clone, Debug)]

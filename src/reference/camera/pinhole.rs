@@ -2,7 +2,7 @@
 
 use glam::{DVec2, DVec3};
 
-use super::camera::Place;
+use super::Place;
 
 /// x / z and y / z.
 #[derive(Clone, Debug)]
