@@ -42,7 +42,7 @@ use crate::camera::{Camera, Frame};
 use crate::gpu::CheckReport;
 use crate::gpu::{Buffer, Gpu, PassTime, Recorder};
 use crate::loss::exposure::Exposures;
-use crate::loss::{LogSlot, LossLog, Losses, ParameterTerms, StepLosses, Term, TermInputs};
+use crate::loss::{LogSlot, LossLog, Losses, ParameterTerms, Term, TermInputs};
 use crate::photographs::dataset::{Dataset, Fingerprint, Original, Split};
 use crate::photographs::pseudo_gt::PseudoGt;
 use crate::photographs::tone::Scene;
@@ -78,7 +78,7 @@ use submission::{MOST_STEPS, Pace};
 use target_views::TargetViews;
 pub use target_views::TestTargets;
 use terms::{NetworkTerms, Photographs};
-use views::{TrainView, Views};
+use views::Views;
 
 /// The streams of random numbers that training draws from, one per purpose.
 mod streams {
@@ -587,28 +587,5 @@ impl Trainer {
         let gaussians = &self.model.gaussians;
         let networks = self.networks.as_mut().map(|terms| &mut terms.networks);
         Rendered::new(&mut self.renderer, gaussians, camera, &options, networks)
-    }
-
-    fn view_of(&self, step: u64) -> &TrainView {
-        self.views.of_step(self.config.seed, step, self.config.schedule.resolution_level(step))
-    }
-
-    fn reserve(&mut self) -> Result<()> {
-        let Self { model, views, renderer, .. } = self;
-        let sizes = views.all().map(TrainView::size);
-        renderer.reserve_sizes(model.count(), model.capacity(), sizes)
-    }
-
-    fn report(&self, step: u64, losses: &StepLosses, milliseconds: f64) -> StepReport {
-        let config = self.config.loss();
-        let value = |term| (term, f64::from(losses.get(term)));
-        StepReport {
-            step,
-            view: self.view_of(step).name.clone(),
-            loss: config.total(losses),
-            terms: config.terms().into_iter().map(value).collect(),
-            gaussians: self.model.count(),
-            milliseconds,
-        }
     }
 }

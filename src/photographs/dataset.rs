@@ -17,6 +17,7 @@ mod pixels;
 mod place;
 mod points;
 mod similarity;
+mod source;
 mod split;
 mod stamp;
 pub mod synthetic;
@@ -41,8 +42,8 @@ use members::with_held_out;
 pub use options::{DOWNSCALE, DepthOptions, LoadOptions, MeasuredSize};
 pub(crate) use pixels::Look;
 pub use pixels::Original;
-use pixels::Source;
 use points::points;
+use source::Source;
 use split::{TEST_EVERY, say_whose_split_gives_way, split};
 
 /// Photographs with cameras, and points of the scene they show.

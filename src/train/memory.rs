@@ -6,6 +6,7 @@
 use glam::UVec2;
 use serde::Serialize;
 
+use super::views::TrainView;
 use super::{CacheSize, Trainer};
 use crate::Result;
 use crate::camera::Patch;
@@ -43,6 +44,13 @@ pub struct MemoryEstimate {
 }
 
 impl Trainer {
+    /// Room on the renderer for every view.
+    pub(super) fn reserve(&mut self) -> Result<()> {
+        let Self { model, views, renderer, .. } = self;
+        let sizes = views.all().map(TrainView::size);
+        renderer.reserve_sizes(model.count(), model.capacity(), sizes)
+    }
+
     /// What the training is going to take, by what it takes now and what its largest view shows.
     ///
     /// # Errors

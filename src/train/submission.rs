@@ -8,6 +8,7 @@ use std::collections::VecDeque;
 use std::ops::RangeInclusive;
 use std::time::{Duration, Instant};
 
+use super::views::TrainView;
 use super::{NotFinite, StepReport, Trainer};
 use crate::gpu::Download;
 use crate::loss::{LossLogDownload, StepLosses};
@@ -264,5 +265,22 @@ impl Trainer {
             Ok(())
         })?;
         Ok(true)
+    }
+
+    pub(super) fn view_of(&self, step: u64) -> &TrainView {
+        self.views.of_step(self.config.seed, step, self.config.schedule.resolution_level(step))
+    }
+
+    fn report(&self, step: u64, losses: &StepLosses, milliseconds: f64) -> StepReport {
+        let config = self.config.loss();
+        let value = |term| (term, f64::from(losses.get(term)));
+        StepReport {
+            step,
+            view: self.view_of(step).name.clone(),
+            loss: config.total(losses),
+            terms: config.terms().into_iter().map(value).collect(),
+            gaussians: self.model.count(),
+            milliseconds,
+        }
     }
 }

@@ -9,6 +9,7 @@ use glam::{DAffine3, UVec2};
 use rayon::prelude::*;
 
 use super::packed::Packed;
+use super::source::{MOST_READ, Source};
 use super::undistort::{Undistortion, WIDEST};
 use super::{LoadOptions, MeasuredSize, Split, View, masks};
 use crate::base::hash::Hasher;
@@ -22,56 +23,6 @@ const MIN_SIDE: u32 = 16;
 
 /// Of a decoded photograph.
 const BYTES_PER_PIXEL: u64 = 12;
-
-/// What a view is made of.
-#[derive(Clone, Debug)]
-pub(super) struct Source {
-    pub(super) name: String,
-    pub(super) split: Split,
-    /// As listed; fitted to the photograph's size here.
-    pub(super) lens: Lens,
-    pub(super) view_from_world: DAffine3,
-    pub(super) input: Option<PathBuf>,
-    pub(super) reference: Option<PathBuf>,
-    pub(super) mask: Option<PathBuf>,
-    pub(super) depth: Option<PathBuf>,
-    /// Photograph and reference image, where they are read already.
-    read: [Option<Arc<PictureFile>>; 2],
-}
-
-impl Source {
-    /// Of the files of the photograph, its reference image, its mask and its depth.
-    pub(super) fn new(
-        (name, split): (String, Split),
-        (lens, view_from_world): (Lens, DAffine3),
-        [input, reference, mask, depth]: [Option<PathBuf>; 4],
-    ) -> Self {
-        let read = [None, None];
-        Self { name, split, lens, view_from_world, input, reference, mask, depth, read }
-    }
-
-    /// Reads the files of the photograph and of the reference image; gives the size of each as it is stored, where its header
-    /// is readable, and keeps what is read while `room`, bytes, is left.
-    fn sized(&mut self, room: &AtomicI64) -> [Option<(u32, u32)>; 2] {
-        let paths = [self.input.as_deref(), self.reference.as_deref()];
-        let mut sizes = [None; 2];
-        for ((path, read), size) in paths.into_iter().zip(&mut self.read).zip(&mut sizes) {
-            let Some(path) = path else { continue };
-            let bytes = path.metadata().map_or(i64::MAX, |there| there.len().cast_signed());
-            if room.fetch_sub(bytes, Ordering::Relaxed) < bytes {
-                room.fetch_add(bytes, Ordering::Relaxed);
-                *size = Image::size_of(path).ok();
-            } else if let Ok(file) = PictureFile::open(path) {
-                *size = file.size().ok();
-                *read = Some(Arc::new(file));
-            }
-        }
-        sizes
-    }
-}
-
-/// What files may take that are read before they are decoded, bytes: those beyond are opened once for their size, and again.
-const MOST_READ: i64 = 1 << 28;
 
 /// Sees a training photograph as it is stored, with its mask, while it is decoded; from any thread.
 pub(crate) type Look<'a> = &'a (dyn Fn(&str, &Image, Option<&Mask>) + Sync);

@@ -1,0 +1,61 @@
+//! The files of a view.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicI64, Ordering};
+
+use glam::DAffine3;
+
+use super::Split;
+use crate::camera::Lens;
+use crate::photographs::image::{Image, PictureFile};
+
+/// What a view is made of.
+#[derive(Clone, Debug)]
+pub(super) struct Source {
+    pub(super) name: String,
+    pub(super) split: Split,
+    /// As listed; fitted to the photograph's size here.
+    pub(super) lens: Lens,
+    pub(super) view_from_world: DAffine3,
+    pub(super) input: Option<PathBuf>,
+    pub(super) reference: Option<PathBuf>,
+    pub(super) mask: Option<PathBuf>,
+    pub(super) depth: Option<PathBuf>,
+    /// Photograph and reference image, where they are read already.
+    pub(super) read: [Option<Arc<PictureFile>>; 2],
+}
+
+impl Source {
+    /// Of the files of the photograph, its reference image, its mask and its depth.
+    pub(super) fn new(
+        (name, split): (String, Split),
+        (lens, view_from_world): (Lens, DAffine3),
+        [input, reference, mask, depth]: [Option<PathBuf>; 4],
+    ) -> Self {
+        let read = [None, None];
+        Self { name, split, lens, view_from_world, input, reference, mask, depth, read }
+    }
+
+    /// Reads the files of the photograph and of the reference image; gives the size of each as it is stored, where its header
+    /// is readable, and keeps what is read while `room`, bytes, is left.
+    pub(super) fn sized(&mut self, room: &AtomicI64) -> [Option<(u32, u32)>; 2] {
+        let paths = [self.input.as_deref(), self.reference.as_deref()];
+        let mut sizes = [None; 2];
+        for ((path, read), size) in paths.into_iter().zip(&mut self.read).zip(&mut sizes) {
+            let Some(path) = path else { continue };
+            let bytes = path.metadata().map_or(i64::MAX, |there| there.len().cast_signed());
+            if room.fetch_sub(bytes, Ordering::Relaxed) < bytes {
+                room.fetch_add(bytes, Ordering::Relaxed);
+                *size = Image::size_of(path).ok();
+            } else if let Ok(file) = PictureFile::open(path) {
+                *size = file.size().ok();
+                *read = Some(Arc::new(file));
+            }
+        }
+        sizes
+    }
+}
+
+/// What files may take that are read before they are decoded, bytes: those beyond are opened once for their size, and again.
+pub(super) const MOST_READ: i64 = 1 << 28;
