@@ -16,6 +16,7 @@ mod packed;
 mod pixels;
 mod place;
 mod points;
+mod prepare;
 mod similarity;
 mod source;
 mod split;

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use super::listed::ListedView;
-use super::pixels::prepared;
+use super::prepare::prepared;
 use super::undistort::Undistortion;
 use crate::Result;
 use crate::camera::Lens;

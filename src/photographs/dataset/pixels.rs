@@ -9,6 +9,7 @@ use glam::{DAffine3, UVec2};
 use rayon::prelude::*;
 
 use super::packed::Packed;
+use super::prepare::{disagreement, prepared};
 use super::source::{MOST_READ, Source};
 use super::undistort::{Undistortion, WIDEST};
 use super::{LoadOptions, MeasuredSize, Split, View, masks};
@@ -261,20 +262,6 @@ fn check_excess(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Result
         return Err(Error::input(path, problem));
     }
     Ok(())
-}
-
-fn disagreement(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Error {
-    let (w, h) = (lens.width, lens.height);
-    let (seen_width, seen_height) = Orientation::of(path).size((width, height));
-    let seen = if seen_width == width {
-        String::new()
-    } else {
-        format!(" (upright {seen_width}x{seen_height})")
-    };
-    let problem = format!(
-        "is {width}x{height}{seen} but its camera is {w}x{h}; use the photographs that the cameras were made with"
-    );
-    Error::input(path, problem)
 }
 
 /// Views of one lens share its undistortion map.
@@ -547,28 +534,4 @@ fn depth_map(
         depth.iter_mut().for_each(|value| *value = -*value);
     }
     Ok(depth)
-}
-
-pub(super) fn prepared(
-    image: Image,
-    path: &Path,
-    lens: &Lens,
-    undistortion: Option<&Undistortion>,
-    size: (u32, u32),
-) -> Result<Image> {
-    let (width, height) = (image.width, image.height);
-    if lens.fitted(width, height).is_none() {
-        return Err(disagreement(path, (width, height), lens));
-    }
-    // A reference image may be of another resolution than the input.
-    let image = if (width, height) == (lens.width, lens.height) {
-        image
-    } else {
-        image.resized(lens.width, lens.height)
-    };
-    let image = match undistortion {
-        Some(undistortion) => undistortion.apply(&image),
-        None => image,
-    };
-    Ok(if (image.width, image.height) == size { image } else { image.resized(size.0, size.1) })
 }
