@@ -208,7 +208,10 @@ fn bound(family: &Family, t: f32, exact: f64) -> f64 {
 #[test]
 fn the_device_follows_every_family_in_double_precision() {
     let grid: Vec<f32> = grid().into_iter().map(|t| t as f32).collect();
-    for family in FAMILIES.iter().filter(|family| family.white != White::ChannelMeans) {
+    let is_of_one_value = |family: &&Family| {
+        family.white != White::ChannelMeans && family.curve != ToneCurve::LumPreserve
+    };
+    for family in FAMILIES.iter().filter(is_of_one_value) {
         let constants = ToneSettings::new(family.curve).constants;
         let mut padded = [0.0; 8];
         for (padded, constant) in padded.iter_mut().zip(&constants) {

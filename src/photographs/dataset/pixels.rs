@@ -12,7 +12,7 @@ use super::packed::Packed;
 use super::prepare::{disagreement, prepared};
 use super::source::{MOST_READ, Source};
 use super::undistort::{Undistortion, WIDEST};
-use super::{LoadOptions, MeasuredSize, Split, View, masks};
+use super::{LoadOptions, MeasuredSize, Split, View};
 use crate::base::hash::Hasher;
 use crate::camera::{Camera, CameraModel, Lens};
 use crate::photographs::image::{Image, Mask, Orientation, PictureFile};
@@ -458,7 +458,7 @@ fn load_view(source: Source, lens: &Prepared<'_>, loading: &Loading<'_>) -> Resu
     }
     let Prepared { lens: own, undistortion, size } = *lens;
     let mask = stored_mask.map(|(stored, path, orientation)| {
-        masks::seen(&stored, &path, (own, orientation), undistortion, size)
+        seen_mask(&stored, &path, (own, orientation), undistortion, size)
     });
     let camera = Camera { view_from_world, ..native_camera(own) };
     let camera = match undistortion {
@@ -498,6 +498,18 @@ fn load_view(source: Source, lens: &Prepared<'_>, loading: &Loading<'_>) -> Resu
     let view = View { original, reference, reference_file, mask, depth, ..view };
     let view = (split == Split::Test || view.has_photograph()).then_some(view);
     Ok(Loaded { name, view, problems })
+}
+
+/// Which pixels of a view count, as its camera sees them, of its mask as its photograph is stored; none where all do.
+fn seen_mask(
+    stored: &Mask,
+    photograph: &Path,
+    (lens, orientation): (&Lens, Orientation),
+    undistortion: Option<&Undistortion>,
+    size: (u32, u32),
+) -> Result<Option<Mask>> {
+    let plane = stored.to_image().turned(orientation);
+    Ok(Mask::of_plane(&prepared(plane, photograph, lens, undistortion, size)?))
 }
 
 /// The depth map as the view's camera sees it, larger is farther.
