@@ -9,14 +9,13 @@ use std::error::Error;
 use std::f64::consts::TAU;
 use std::ffi::c_void;
 
-use ash::vk::Handle as _;
-use ash::{khr, vk};
-use glam::{DAffine3, DVec2, DVec3, Vec3};
-use nightsplat::camera::{Camera, CameraModel};
-use nightsplat::gpu::{Gpu, HostDevice, HostRecording, required_device_features};
-use nightsplat::photographs::image::Image;
-use nightsplat::splats::render::{RenderOptions, RenderSettings, Renderer, Status};
-use nightsplat::splats::scene::{Gaussians, init};
+use nightsplat::ash::vk::Handle as _;
+use nightsplat::ash::{self, khr, vk};
+use nightsplat::glam::{DAffine3, DVec3, Vec3};
+use nightsplat::{
+    Camera, Gaussians, Gpu, HostDevice, HostRecording, Image, RenderOptions, RenderSettings,
+    Renderer, Start, Status, required_device_features,
+};
 
 const OPTIONS: RenderOptions = RenderOptions { sh_degree: 0, background: [0.05, 0.05, 0.1] };
 
@@ -34,7 +33,8 @@ fn main() -> Result<(), Box<dyn Error>> {
 }
 
 fn render(host: &Host, gpu: &Gpu) -> Result<Image, Box<dyn Error>> {
-    let (camera, gaussians) = (camera(), ring()?);
+    let camera = Camera::perspective(DAffine3::IDENTITY, 0.87, [320, 240]);
+    let gaussians = ring()?;
     let on_device = gaussians.upload(gpu)?;
     let settings = RenderSettings { shape: gaussians.shape, ..RenderSettings::default() };
     let mut renderer = Renderer::new(gpu, settings)?;
@@ -73,21 +73,10 @@ fn ring() -> nightsplat::Result<Gaussians> {
         |angle: f64| [0.0, 1.0, 2.0].map(|third| 0.5 + 0.5 * (angle + third * TAU / 3.0).cos());
     let positions: Vec<DVec3> = angles.clone().map(position).collect();
     let colors: Vec<Vec3> = angles.map(|angle| DVec3::from(hue(angle)).as_vec3()).collect();
-    let mut gaussians = init::from_points(&positions, &colors, 0, &init::Start::default(), 0)?;
+    let mut gaussians = Gaussians::from_points(&positions, &colors, 0, &Start::default(), 0)?;
     gaussians.raw_opacities_mut().fill(2.0);
     gaussians.log_scales_mut().fill(Vec3::splat(-3.0));
     Ok(gaussians)
-}
-
-fn camera() -> Camera {
-    Camera {
-        width: 320,
-        height: 240,
-        focal: DVec2::splat(260.0),
-        principal_point: DVec2::new(160.0, 120.0),
-        model: CameraModel::Pinhole,
-        view_from_world: DAffine3::IDENTITY,
-    }
 }
 
 // ---------------------------------------------------------------------------

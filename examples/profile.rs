@@ -4,9 +4,7 @@
 
 use std::io::Write;
 
-use nightsplat::gpu::{DeviceChoice, Gpu, PassTime};
-use nightsplat::photographs::dataset::Dataset;
-use nightsplat::train::{TrainConfig, Trainer};
+use nightsplat::{Dataset, DeviceChoice, Gpu, PassTime, TrainConfig, Trainer};
 
 /// Steps that are measured.
 const REPEATS: u64 = 9;

@@ -6,13 +6,9 @@
 
 use std::path::PathBuf;
 
-use nightsplat::gpu::{DeviceChoice, Gpu};
-use nightsplat::photographs::dataset::Dataset;
-use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
-use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
-use nightsplat::results::eval;
-use nightsplat::results::run::{self, Event, HeldRun};
-use nightsplat::train::TrainConfig;
+use nightsplat::run::{self, Event, HeldRun};
+use nightsplat::synthetic::{self, SyntheticOptions};
+use nightsplat::{Dataset, DeviceChoice, Gpu, ToneCurve, ToneSettings, TrainConfig};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let folder: PathBuf = std::env::args_os().nth(1).ok_or("usage: train FOLDER")?.into();
@@ -40,7 +36,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                 println!("step {}, view {}: loss {:.4}", report.step, report.view, report.loss);
             }
             Event::Evaluated { step, scored } => {
-                if let (Some(mean), _) = eval::means(scored) {
+                if let (Some(mean), _) = run::means(scored) {
                     println!("step {step}: {:.2} dB on {} test views", mean.psnr, scored.len());
                 }
             }

@@ -6,8 +6,11 @@
 //! - [`random`]: counter-based random numbers
 //! - [`settings`]: a row for each setting: key, default, rule, unit, help, option
 
+#[cfg(feature = "io")]
 pub mod hash;
 pub mod input;
 pub mod output;
+#[cfg(feature = "io")]
 pub mod random;
+#[cfg(feature = "io")]
 pub mod settings;

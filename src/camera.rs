@@ -2,18 +2,22 @@
 //!
 //! Axes are those of `OpenCV` (x right, y down, z forward); pixel units, the image's corner at (0, 0), pixel centres at +0.5.
 
+#[cfg(feature = "io")]
 pub mod frame;
 mod model;
 mod patch;
 mod path;
+#[cfg(feature = "io")]
 mod places;
 
 use glam::{DAffine3, DVec2, DVec3};
 
+#[cfg(feature = "io")]
 pub use frame::Frame;
 pub use model::{CameraModel, KannalaBrandt};
 pub use patch::Patch;
 pub use path::CameraPath;
+#[cfg(feature = "io")]
 pub(crate) use places::Places;
 
 /// A camera with its pose: a pinhole, or a fisheye as it is.
@@ -34,6 +38,23 @@ pub struct Camera {
 }
 
 impl Camera {
+    /// A pinhole with square pixels that looks through the middle of its image, of `size` (width, height), pixels; `fov_y` is the
+    /// angle from the image's top to its bottom, radians.
+    ///
+    /// An engine whose views look along -z with y up has `view_from_world` = `DAffine3::from_scale(DVec3::new(1.0, -1.0, -1.0)) *
+    /// view`.
+    pub fn perspective(view_from_world: DAffine3, fov_y: f64, [width, height]: [u32; 2]) -> Self {
+        let size = DVec2::new(width.into(), height.into());
+        Self {
+            width,
+            height,
+            focal: DVec2::splat(0.5 * size.y / (0.5 * fov_y).tan()),
+            principal_point: 0.5 * size,
+            model: CameraModel::Pinhole,
+            view_from_world,
+        }
+    }
+
     /// The camera's position in world space.
     pub fn center(&self) -> DVec3 {
         self.view_from_world.inverse().translation
@@ -48,24 +69,27 @@ impl Camera {
 
     /// The point of the view (x right, y down, z forward) that is seen at a pixel and a depth, as
     /// [`CameraModel::depth`] counts it; `None` where a fisheye sees nothing.
-    pub fn in_view(&self, pixel: DVec2, depth: f64) -> Option<DVec3> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn in_view(&self, pixel: DVec2, depth: f64) -> Option<DVec3> {
         self.model.point((pixel - self.principal_point) / self.focal, depth)
     }
 
     /// The depth of a world-space point, as [`CameraModel::depth`].
-    pub fn depth(&self, point: DVec3) -> Option<f64> {
+    pub(crate) fn depth(&self, point: DVec3) -> Option<f64> {
         self.model.depth(self.view_from_world.transform_point3(point))
     }
 
     /// As [`Camera::project`], inside the image alone.
-    pub fn sees(&self, point: DVec3) -> Option<DVec2> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn sees(&self, point: DVec3) -> Option<DVec2> {
         let size = DVec2::new(self.width.into(), self.height.into());
         self.project(point)
             .filter(|pixel| pixel.cmpge(DVec2::ZERO).all() && pixel.cmplt(size).all())
     }
 
     /// The pixels of which a part shows nothing, as indices into a plane, ascending: outside the circle of a fisheye.
-    pub fn unseen(&self) -> Vec<usize> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn unseen(&self) -> Vec<usize> {
         let CameraModel::Fisheye(lens) = self.model else { return vec![] };
         let reach = lens.radius(lens.largest_angle());
         let size = DVec2::new(self.width.into(), self.height.into());
@@ -275,6 +299,15 @@ mod tests {
 
     fn in_world(in_view: DVec3) -> DVec3 {
         camera().view_from_world.inverse().transform_point3(in_view)
+    }
+
+    #[test]
+    fn a_perspective_shows_half_its_angle_from_the_middle_to_the_top() {
+        let camera = Camera::perspective(DAffine3::IDENTITY, 1.2, [640, 480]);
+        let top = camera.project(DVec3::new(0.0, -(0.6_f64.tan()), 1.0)).unwrap();
+        assert!((top - DVec2::new(320.0, 0.0)).length() < 1e-9, "{top}");
+        let side = camera.project(DVec3::new(0.6_f64.tan(), 0.0, 1.0)).unwrap();
+        assert!((side - DVec2::new(560.0, 240.0)).length() < 1e-9, "{side}");
     }
 
     #[test]

@@ -175,12 +175,12 @@ pub enum Error {
 
 impl Error {
     /// An [`Error::Input`]. What the file holds may be a part of the problem: it becomes one line of a length that can be read.
-    pub fn input(path: impl AsRef<Path>, problem: impl Into<String>) -> Self {
+    pub(crate) fn input(path: impl AsRef<Path>, problem: impl Into<String>) -> Self {
         Self::Input { path: path.as_ref().to_owned(), problem: in_a_line(problem.into()) }
     }
 
     /// An [`Error::Output`].
-    pub fn output(path: impl AsRef<Path>, problem: impl Into<String>) -> Self {
+    pub(crate) fn output(path: impl AsRef<Path>, problem: impl Into<String>) -> Self {
         Self::Output { path: path.as_ref().to_owned(), problem: in_a_line(problem.into()) }
     }
 

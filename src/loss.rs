@@ -54,7 +54,7 @@ pub struct Weights {
 
 impl Weights {
     /// Those of LITA-GS.
-    pub fn paper() -> Self {
+    pub(crate) fn paper() -> Self {
         Self { total_variation: 1.0, ..Self::default() }
     }
 }
@@ -101,7 +101,7 @@ pub struct Term {
     /// A likeness enters the loss as 1 - value, a distance as it is.
     pub is_likeness: bool,
     /// What it weighs.
-    pub weight: fn(&LossConfig) -> f64,
+    pub(crate) weight: fn(&LossConfig) -> f64,
     /// The setting that the weight follows from.
     pub setting: &'static str,
 }
@@ -113,7 +113,8 @@ impl Term {
     }
 
     /// Its place among the columns.
-    pub fn index(self) -> usize {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn index(self) -> usize {
         Self::all().position(|term| term == self).unwrap_or_default()
     }
 }
@@ -171,7 +172,7 @@ impl LossConfig {
 }
 
 /// A training view as the terms see it before the first step.
-#[expect(missing_debug_implementations, reason = "it holds a closure")]
+#[allow(missing_debug_implementations, reason = "it holds a closure")]
 pub struct ViewSource<'a> {
     /// Width and height in pixels.
     pub size: UVec2,

@@ -9,17 +9,14 @@
 
 mod conv;
 mod denoiser;
-#[cfg(feature = "io")]
 mod file;
 mod half;
 mod inner;
-#[cfg(feature = "io")]
 pub mod lpips;
 mod norm;
 mod parameters;
 mod relu;
 mod tonemapper;
-#[cfg(feature = "io")]
 mod trunk;
 pub mod window;
 
@@ -31,15 +28,11 @@ use crate::{Error, Result};
 
 pub use conv::Precision;
 pub use denoiser::{Denoiser, DenoiserSettings};
-#[cfg(feature = "io")]
 pub(crate) use file::TensorFile;
-#[cfg(feature = "io")]
 pub use file::{load, save};
 pub use parameters::{Parameters, Tensor};
 pub use tonemapper::Tonemapper;
-#[cfg(feature = "io")]
 pub use trunk::Network;
-#[cfg(feature = "io")]
 pub(crate) use trunk::{Trunk, published};
 
 /// How a network begins and ends.

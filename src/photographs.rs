@@ -15,7 +15,11 @@ pub mod dataset;
 #[cfg(feature = "fit")]
 pub mod fit;
 pub mod image;
+#[cfg(feature = "io")]
 pub mod metrics;
+#[cfg(feature = "io")]
 pub mod pseudo_gt;
+#[cfg(feature = "io")]
 pub mod structure;
+#[cfg(feature = "io")]
 pub mod tone;

@@ -14,8 +14,10 @@
 
 pub mod attributes;
 pub mod batches;
+#[cfg(feature = "io")]
 pub mod densify;
 pub mod halves;
+#[cfg(feature = "io")]
 pub mod optimizer;
 pub mod render;
 pub mod scene;

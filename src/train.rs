@@ -25,6 +25,7 @@ mod paths;
 mod planned;
 mod precision;
 mod preset;
+#[cfg(feature = "testing")]
 mod reference;
 mod rendered;
 pub mod settings;
@@ -72,6 +73,7 @@ use passes::{Kernels, background, first_sh_degree, learnables};
 pub use planned::{Planned, Planning, Said, diagnosed};
 pub use precision::{PhotographBits, PrecisionConfig};
 pub use preset::Preset;
+#[cfg(feature = "testing")]
 pub use reference::reference;
 pub use rendered::Rendered;
 use submission::{MOST_STEPS, Pace};
@@ -125,9 +127,7 @@ impl StepReport {
 /// A model in training, and all that its steps need; [`crate::results::run::train`] drives one into a run directory.
 ///
 /// ```no_run
-/// use nightsplat::photographs::dataset::Dataset;
-/// use nightsplat::gpu::{DeviceChoice, Gpu};
-/// use nightsplat::train::{TrainConfig, Trainer};
+/// use nightsplat::{Dataset, DeviceChoice, Gpu, TrainConfig, Trainer};
 ///
 /// let config = TrainConfig { steps: 500, ..TrainConfig::default() };
 /// let gpu = Gpu::new(&DeviceChoice::Best)?;
@@ -138,7 +138,7 @@ impl StepReport {
 ///         println!("step {}: loss {:.4}", report.step, report.loss);
 ///     }
 /// }
-/// nightsplat::splats::scene::ply::save(&trainer.gaussians()?, "model.ply")?;
+/// trainer.gaussians()?.save("model.ply")?;
 /// # Ok::<(), nightsplat::Error>(())
 /// ```
 #[derive(Debug)]
@@ -385,17 +385,19 @@ impl Trainer {
     ///
     /// # Errors
     /// The device was lost.
-    pub fn gaussians_in_frame(&self) -> Result<Gaussians> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn gaussians_in_frame(&self) -> Result<Gaussians> {
         self.model.download(&self.gpu)
     }
 
     /// What is trained on.
-    pub fn fingerprint(&self) -> &Fingerprint {
+    pub(crate) fn fingerprint(&self) -> &Fingerprint {
         &self.fingerprint
     }
 
     /// Where the Gaussians are trained.
-    pub fn frame(&self) -> &Frame {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn frame(&self) -> &Frame {
         &self.frame
     }
 
@@ -403,6 +405,7 @@ impl Trainer {
     ///
     /// # Errors
     /// The device is out of memory.
+    #[cfg(feature = "testing")]
     pub fn set_intersection_capacity(&mut self, intersections: u32) -> Result<()> {
         self.renderer.set_intersection_capacity(intersections)
     }
@@ -562,12 +565,14 @@ impl Trainer {
     }
 
     /// The networks; none where the model has none.
-    pub fn networks(&mut self) -> Option<&mut Networks> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn networks(&mut self) -> Option<&mut Networks> {
         self.networks.as_mut().map(|terms| &mut terms.networks)
     }
 
     /// The learning rates of a step, before the settling phase or in it.
-    pub fn learning_rates(&self, step: u64) -> LearningRates {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn learning_rates(&self, step: u64) -> LearningRates {
         let rates = self.config.schedule.learning_rates(step, self.extent);
         rates.scaled(self.settling_rate(step))
     }

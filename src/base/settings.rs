@@ -252,7 +252,7 @@ macro_rules! settings {
 
         impl $name {
             /// A row for each setting but those of sections within.
-            pub const SETTINGS: &'static [$crate::base::settings::Setting] = $crate::base::settings::settings! {
+            pub(crate) const SETTINGS: &'static [$crate::base::settings::Setting] = $crate::base::settings::settings! {
                 rows $section
                 $($(#[doc = $help])+ $field $(, $absent)? => $rule $(, in $unit)? $(, $option)?;)*
             };
@@ -261,7 +261,7 @@ macro_rules! settings {
             ///
             /// # Errors
             /// [`Error::Setting`](crate::Error::Setting).
-            pub fn check_rows(&self) -> $crate::Result<()> {
+            pub(crate) fn check_rows(&self) -> $crate::Result<()> {
                 let values = [$(&self.$field as &dyn std::any::Any),*];
                 let mut rows = Self::SETTINGS.iter().zip(values);
                 rows.try_for_each(|(row, value)| row.check(value))

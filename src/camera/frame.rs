@@ -44,10 +44,12 @@ const OUTLIER: f64 = 32.0;
 
 impl Frame {
     /// The world itself.
-    pub const WORLD: Self = Self { center: [0.0; 3], scale: 1.0 };
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) const WORLD: Self = Self { center: [0.0; 3], scale: 1.0 };
 
     /// The frame of cameras around `center` that are `extent` world units wide.
-    pub fn new(center: DVec3, extent: f64) -> Self {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn new(center: DVec3, extent: f64) -> Self {
         // The power of two that brings the extent to 0.75 to 1.5 times the frame's; within what has an inverse.
         let octave = (0.75 * FRAME_EXTENT / extent).log2().ceil().clamp(-900.0, 900.0);
         let scale = octave.exp2();
@@ -61,17 +63,20 @@ impl Frame {
     }
 
     /// A position in the world, in the frame.
-    pub fn from_world(&self, position: DVec3) -> DVec3 {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn from_world(&self, position: DVec3) -> DVec3 {
         (position - self.center()) * self.scale
     }
 
     /// A position in the frame, in the world.
-    pub fn to_world(&self, position: DVec3) -> DVec3 {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn to_world(&self, position: DVec3) -> DVec3 {
         position / self.scale + self.center()
     }
 
     /// The same camera before the frame; its view space is scaled alike.
-    pub fn camera(&self, camera: &Camera) -> Camera {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn camera(&self, camera: &Camera) -> Camera {
         if *self == Self::WORLD {
             return *camera;
         }
@@ -81,7 +86,8 @@ impl Frame {
     }
 
     /// What files hold positions relative to: the world's origin, or the frame's where f32 is too coarse for that.
-    pub fn file_origin(&self) -> DVec3 {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn file_origin(&self) -> DVec3 {
         let center = self.center();
         let is_far = center.abs().max_element() * self.scale > FAR_FROM_ORIGIN * FRAME_EXTENT;
         if is_far { center } else { DVec3::ZERO }

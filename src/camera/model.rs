@@ -24,21 +24,23 @@ pub struct KannalaBrandt {
 
 impl KannalaBrandt {
     /// The distance from the principal point, in focal lengths, of what is seen at an angle off the axis, in radians.
-    pub fn radius(&self, angle: f64) -> f64 {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn radius(&self, angle: f64) -> f64 {
         let [k1, k2, k3, k4] = self.coefficients;
         let t2 = angle * angle;
         angle * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
     }
 
     /// Its derivative.
-    pub fn slope(&self, angle: f64) -> f64 {
+    pub(crate) fn slope(&self, angle: f64) -> f64 {
         let [k1, k2, k3, k4] = self.coefficients;
         let t2 = angle * angle;
         1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)))
     }
 
     /// The angle below which the camera sees, in radians: 90 degrees, or less where the radius stops to rise.
-    pub fn largest_angle(&self) -> f64 {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn largest_angle(&self) -> f64 {
         const STEPS: u32 = 4096;
         let at = |step: u32| FRAC_PI_2 * f64::from(step) / f64::from(STEPS);
         // Positive phrasing: a NaN rises no more.
@@ -53,7 +55,8 @@ impl KannalaBrandt {
     }
 
     /// The angle of what is seen at a distance from the principal point, in focal lengths; `None` beyond the largest.
-    pub fn angle(&self, radius: f64) -> Option<f64> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn angle(&self, radius: f64) -> Option<f64> {
         let (mut low, mut high) = (0.0, self.largest_angle());
         if !(0.0..self.radius(high)).contains(&radius) {
             return None;
@@ -70,7 +73,7 @@ impl KannalaBrandt {
 impl CameraModel {
     /// The depth of a point of the view (x right, y down, z forward), by which it is sorted and which the near plane cuts: z
     /// of a pinhole, the distance of a fisheye. `None` where the model does not see it.
-    pub fn depth(&self, point: DVec3) -> Option<f64> {
+    pub(crate) fn depth(&self, point: DVec3) -> Option<f64> {
         match self {
             Self::Pinhole => Some(point.z).filter(|&z| z > 0.0),
             Self::Fisheye(lens) => {
@@ -81,7 +84,7 @@ impl CameraModel {
     }
 
     /// Where a point of the view is seen, focal lengths from the principal point; `None` where the model does not see it.
-    pub fn place(&self, point: DVec3) -> Option<DVec2> {
+    pub(crate) fn place(&self, point: DVec3) -> Option<DVec2> {
         self.depth(point)?;
         Some(match self {
             Self::Pinhole => point.truncate() / point.z,
@@ -95,7 +98,7 @@ impl CameraModel {
 
     /// The point of the view that is seen at a place, focal lengths from the principal point, at a depth; `None` where the
     /// model sees nothing.
-    pub fn point(&self, place: DVec2, depth: f64) -> Option<DVec3> {
+    pub(crate) fn point(&self, place: DVec2, depth: f64) -> Option<DVec3> {
         match self {
             Self::Pinhole => Some(place.extend(1.0) * depth),
             Self::Fisheye(lens) => {

@@ -37,7 +37,7 @@ impl From<&Camera> for Patch {
 impl Camera {
     /// The view in rows of patches of about one size: as few as there can be of a size that fits. Where not even small ones
     /// do, there is no remedy in cutting, and the view stays whole.
-    pub fn patches(&self, fits: impl Fn(UVec2) -> bool) -> Vec<Patch> {
+    pub(crate) fn patches(&self, fits: impl Fn(UVec2) -> bool) -> Vec<Patch> {
         let whole = UVec2::new(self.width, self.height);
         let mut counts = UVec2::ONE;
         loop {

@@ -56,7 +56,7 @@ impl Camera {
     ///
     /// The cameras are divided into that many groups of about one size: again and again in two, across the direction in
     /// which a group differs most. Of each group the camera nearest to its mean is picked.
-    pub fn covering(cameras: &[Self], count: usize) -> Vec<usize> {
+    pub(crate) fn covering(cameras: &[Self], count: usize) -> Vec<usize> {
         let Places { places, .. } = Places::new(cameras);
         let mut picked = vec![];
         pick(&places, (0..cameras.len()).collect(), count.min(cameras.len()), &mut picked);

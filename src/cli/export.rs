@@ -13,8 +13,8 @@ use crate::gpu::DeviceChoice;
 use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::image::Image;
 use crate::results::export::page::{Bookmark, Page};
-use crate::results::export::{Provenance, glb, sog, spz};
-use crate::splats::scene::{Gaussians, ply};
+use crate::results::export::{Format, Provenance, spz};
+use crate::splats::scene::Gaussians;
 use crate::train::TrainConfig;
 use crate::{Error, results::run};
 
@@ -30,7 +30,7 @@ pub struct ExportArgs {
     pub run: PathBuf,
     /// The format
     #[arg(long, value_enum, value_name = "FORMAT")]
-    pub to: Format,
+    pub to: To,
     /// The file to write; one of that name is replaced [default: model with the format's ending, in the run]
     #[arg(long, value_name = "FILE")]
     pub out: Option<PathBuf>,
@@ -48,9 +48,9 @@ pub struct ExportArgs {
     pub device: Option<DeviceChoice>,
 }
 
-/// What a model can be written as.
+/// What `--to` names.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-pub enum Format {
+pub enum To {
     /// The layout that every viewer opens, with a header that says where it comes from.
     Ply,
     /// A tenth of the size; eight bits a number.
@@ -63,7 +63,7 @@ pub enum Format {
     Html,
 }
 
-impl Format {
+impl To {
     const fn extension(self) -> &'static str {
         match self {
             Self::Ply => "ply",
@@ -83,7 +83,7 @@ impl Format {
 pub fn run(args: &ExportArgs) -> Result<()> {
     let (gaussians, config, own) = opened(args)?;
     let out = args.out.as_ref().unwrap_or(&own);
-    if args.to == Format::Ply && is_same(out, &own) {
+    if args.to == To::Ply && is_same(out, &own) {
         let problem =
             "is the model itself, which has its header already; name another file with --out";
         return Err(Error::output(out, problem).into());
@@ -98,21 +98,17 @@ pub fn run(args: &ExportArgs) -> Result<()> {
         );
     }
     let provenance = provenance(args, &config);
-    match args.to {
-        Format::Ply => {
-            let lines = provenance.lines();
-            let lines: Vec<&str> = lines.iter().map(String::as_str).collect();
-            ply::save_with_comments(&gaussians, out, &lines)?;
-        }
-        Format::Spz => {
-            let version = if args.spz == 3 { spz::Version::V3 } else { spz::Version::V4 };
-            write_whole(out, &spz::encode(&gaussians, version)?)?;
-        }
-        Format::Glb => write_whole(out, &glb::encode(&gaussians, &provenance)?)?,
-        Format::Sog => write_whole(out, &sog::encode(&gaussians, &provenance)?)?,
-        Format::Html => {
-            write_whole(out, page(args, &config, &gaussians, provenance)?.as_bytes())?;
-        }
+    let format = match args.to {
+        To::Ply => Some(Format::Ply),
+        To::Spz if args.spz == 3 => Some(Format::Spz(spz::Version::V3)),
+        To::Spz => Some(Format::Spz(spz::Version::V4)),
+        To::Glb => Some(Format::Glb),
+        To::Sog => Some(Format::Sog),
+        To::Html => None,
+    };
+    match format {
+        Some(format) => format.write(&gaussians, &provenance, out)?,
+        None => write_whole(out, page(args, &config, &gaussians, provenance)?.as_bytes())?,
     }
     let (shown, count) = (out.display().to_string(), gaussians.count);
     let kib = std::fs::metadata(out).map_or(0, |file| file.len()).div_ceil(1024);
@@ -125,7 +121,7 @@ pub fn run(args: &ExportArgs) -> Result<()> {
 fn opened(args: &ExportArgs) -> crate::Result<(Gaussians, TrainConfig, PathBuf)> {
     let (from, extension) = (&args.run, args.to.extension());
     if is_model(from) {
-        if args.to == Format::Html && args.dataset.is_none() {
+        if args.to == To::Html && args.dataset.is_none() {
             return Err(needs_photographs(from));
         }
         let (gaussians, config) = load_model(from, args.dataset.as_deref())?;

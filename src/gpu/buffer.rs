@@ -2,7 +2,7 @@
 
 use std::marker::PhantomData;
 
-use ash::vk;
+use ash::vk::Handle as _;
 use gpu_allocator::MemoryLocation;
 use gpu_allocator::vulkan::Allocation;
 
@@ -35,24 +35,26 @@ impl<T: bytemuck::Pod> Buffer<T> {
         self.memory.name()
     }
 
-    /// The Vulkan buffer, for a host application that binds it itself.
-    pub fn handle(&self) -> vk::Buffer {
-        self.memory.handle()
+    /// The `VkBuffer`, for a host application that binds it itself.
+    pub fn handle(&self) -> u64 {
+        self.memory.handle().as_raw()
     }
 
     /// All of it, to read.
-    pub fn slice(&self) -> Slice<'_, T> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn slice(&self) -> Slice<'_, T> {
         Slice::new(&self.memory, self.len)
     }
 
     /// All of it, to read and write.
-    pub fn slice_mut(&mut self) -> SliceMut<'_, T> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn slice_mut(&mut self) -> SliceMut<'_, T> {
         SliceMut::new(&self.memory, self.len)
     }
 
     /// All of it, for copies.
     pub(super) fn bound(&self) -> Bound {
-        Bound { raw: self.handle(), offset: 0, size: (self.len * size_of::<T>()) as u64 }
+        Bound { raw: self.memory.handle(), offset: 0, size: (self.len * size_of::<T>()) as u64 }
     }
 }
 
@@ -73,7 +75,8 @@ impl Gpu {
     ///
     /// # Errors
     /// The buffer exceeds the binding limit or the memory of the device.
-    pub fn uninit<T: bytemuck::Pod>(&self, name: &str, len: usize) -> Result<Buffer<T>> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn uninit<T: bytemuck::Pod>(&self, name: &str, len: usize) -> Result<Buffer<T>> {
         let bytes = (len as u64).saturating_mul(size_of::<T>() as u64);
         let Properties { name: device, max_storage_buffer_range: limit, .. } = self.properties();
         if bytes > *limit {
@@ -132,7 +135,8 @@ impl Gpu {
     ///
     /// # Errors
     /// `data` is longer than the buffer, or the device is out of memory or lost.
-    pub fn write<'a, T: bytemuck::Pod>(
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn write<'a, T: bytemuck::Pod>(
         &self,
         buffer: impl Into<SliceMut<'a, T>>,
         data: &[T],

@@ -40,7 +40,8 @@ impl Recorder<'_> {
     ///
     /// # Errors
     /// The device is out of memory, or the recording is [`Gpu::record_into`]'s: only the host knows when the copy is there.
-    pub fn download<'a, T: bytemuck::Pod>(
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn download<'a, T: bytemuck::Pod>(
         &mut self,
         buffer: impl Into<Slice<'a, T>>,
     ) -> Result<Download<T>> {

@@ -83,7 +83,8 @@ impl Gpu {
     }
 
     /// Counts the peak anew, from what is in use now.
-    pub fn reset_peak_memory(&self) {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn reset_peak_memory(&self) {
         self.free_unused();
         let MemoryUsage { now, peak, .. } = &self.shared.usage;
         peak.store(now.load(Ordering::Acquire), Ordering::Release);

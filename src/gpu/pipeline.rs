@@ -31,7 +31,8 @@ impl Gpu {
     ///
     /// # Errors
     /// The driver refuses the kernel.
-    pub fn pipeline<K: Kernel>(&self, constants: &K::Constants) -> Result<Pipeline<K>> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn pipeline<K: Kernel>(&self, constants: &K::Constants) -> Result<Pipeline<K>> {
         let objects = self.objects(K::INTERFACE, K::constants(constants))?;
         Ok(Pipeline { constants: *constants, objects })
     }

@@ -17,13 +17,11 @@ use crate::{Error, Result};
 
 /// How many invocations a dispatch needs; the kernel knows its workgroup size.
 #[derive(Clone, Copy, Debug)]
-pub enum Threads<'a> {
+pub enum Threads {
     /// At least so many threads; a one-dimensional extent is folded where the device takes fewer workgroups along x.
     Exactly([u32; 3]),
     /// So many workgroups, folded alike.
     Workgroups([u32; 3]),
-    /// The workgroups that the first element says, written by an earlier kernel.
-    Indirect(&'a Buffer<[u32; 3]>),
 }
 
 /// A command buffer being filled. Passes run in order; each sees the results of those before it.
@@ -73,7 +71,7 @@ pub(super) struct ObservedPass<'a> {
     pub(super) objects: &'a Objects,
     pub(super) params: &'a [u8],
     pub(super) bound: &'a [Bound],
-    pub(super) threads: Threads<'a>,
+    pub(super) threads: Threads,
     pub(super) reference: &'a ReferenceOf<'a>,
 }
 
@@ -126,12 +124,13 @@ impl<'g> Recorder<'g> {
     ///
     /// # Errors
     /// The extent exceeds what the device can launch.
-    pub fn dispatch<K: Recordable>(
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn dispatch<K: Recordable>(
         &mut self,
         pipeline: &Pipeline<K>,
         params: &K::Params,
         buffers: K::Buffers<'_>,
-        threads: Threads<'_>,
+        threads: Threads,
     ) -> Result<()> {
         let bound = K::bound(&buffers);
         let words = bytemuck::bytes_of(params);
@@ -161,37 +160,27 @@ impl<'g> Recorder<'g> {
         pipeline: &Objects,
         params: &[u8],
         bound: &[Bound],
-        threads: Threads<'_>,
+        threads: Threads,
     ) -> Result<()> {
         let Interface { name, bindings, .. } = *pipeline.interface;
         self.check_sizes(bindings, bound)?;
         let uses = bindings.iter().zip(bound).map(|(b, bound)| (bound.raw, b.writable));
-        let indirect = match threads {
-            Threads::Indirect(arguments) => Some((arguments.handle(), false)),
-            _ => None,
-        };
-        self.synchronize(uses.chain(indirect));
-        let groups = match threads {
-            Threads::Indirect(_) => [0; 3],
-            _ => self.fold(name, self.workgroups(pipeline.interface, threads))?,
-        };
+        self.synchronize(uses);
+        let groups = self.fold(name, self.workgroups(pipeline.interface, threads))?;
         self.begin_label(name);
         self.sets.bind(self.commands, pipeline, params, bound)?;
-        let device = &self.shared.device;
-        // SAFETY: recording; a retired buffer outlives this submission.
-        unsafe {
-            match indirect {
-                Some((arguments, _)) => device.cmd_dispatch_indirect(self.commands, arguments, 0),
-                None if groups.contains(&0) => {}
-                None => device.cmd_dispatch(self.commands, groups[0], groups[1], groups[2]),
-            }
+        if !groups.contains(&0) {
+            let [x, y, z] = groups;
+            // SAFETY: recording; a retired buffer outlives this submission.
+            unsafe { self.shared.device.cmd_dispatch(self.commands, x, y, z) };
         }
         self.end_label(name);
         Ok(())
     }
 
     /// Sets every 32-bit word of `buffer` to `word`.
-    pub fn fill<T: bytemuck::Pod>(&mut self, buffer: &mut Buffer<T>, word: u32) {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn fill<T: bytemuck::Pod>(&mut self, buffer: &mut Buffer<T>, word: u32) {
         if buffer.is_empty() {
             return;
         }
@@ -208,7 +197,11 @@ impl<'g> Recorder<'g> {
     ///
     /// # Errors
     /// `data` is longer than the buffer, or than the 64 KiB that Vulkan takes.
-    pub fn update<T: bytemuck::Pod>(&mut self, buffer: &mut Buffer<T>, data: &[T]) -> Result<()> {
+    pub(crate) fn update<T: bytemuck::Pod>(
+        &mut self,
+        buffer: &mut Buffer<T>,
+        data: &[T],
+    ) -> Result<()> {
         let bytes: &[u8] = bytemuck::cast_slice(data);
         let Bound { raw, offset, size } = buffer.bound();
         if bytes.len() as u64 > size || bytes.len() > MAX_UPDATE {
@@ -224,7 +217,8 @@ impl<'g> Recorder<'g> {
     }
 
     /// Copies the first elements of `source` to `target`, as many as both hold.
-    pub fn copy<T: bytemuck::Pod>(&mut self, source: &Buffer<T>, target: &mut Buffer<T>) {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn copy<T: bytemuck::Pod>(&mut self, source: &Buffer<T>, target: &mut Buffer<T>) {
         let (source, target) = (source.bound(), target.bound());
         let bytes = source.size.min(target.size);
         if bytes > 0 {
@@ -290,8 +284,8 @@ impl<'g> Recorder<'g> {
         self.pending.clear();
     }
 
-    /// The workgroups of a dispatch; none where the device alone knows.
-    pub(super) fn workgroups(&self, interface: &Interface, threads: Threads<'_>) -> [u32; 3] {
+    /// The workgroups of a dispatch.
+    pub(super) fn workgroups(&self, interface: &Interface, threads: Threads) -> [u32; 3] {
         match threads {
             Threads::Exactly(n) => {
                 let mut size = interface.workgroup_size;
@@ -301,7 +295,6 @@ impl<'g> Recorder<'g> {
                 std::array::from_fn(|i| n[i].div_ceil(size[i]))
             }
             Threads::Workgroups(n) => n,
-            Threads::Indirect(_) => [0; 3],
         }
     }
 

@@ -81,7 +81,7 @@ impl<'a, T: bytemuck::Pod> Slice<'a, T> {
     }
 
     /// The name of the buffer.
-    pub fn name(&self) -> &str {
+    pub(crate) fn name(&self) -> &str {
         self.memory.name()
     }
 
@@ -89,7 +89,7 @@ impl<'a, T: bytemuck::Pod> Slice<'a, T> {
     ///
     /// # Errors
     /// They are out of range, or begin at no multiple of 256 bytes, where every device lets a binding begin.
-    pub fn range(self, range: Range<usize>) -> Result<Self> {
+    pub(crate) fn range(self, range: Range<usize>) -> Result<Self> {
         let first = self.first + offset_of::<T>(self.memory, self.len, &range)?;
         Ok(Self { first, len: range.len(), ..self })
     }
@@ -107,13 +107,8 @@ impl<'a, T: bytemuck::Pod> SliceMut<'a, T> {
     }
 
     /// The number of elements.
-    pub fn len(&self) -> usize {
+    pub(crate) fn len(&self) -> usize {
         self.len
-    }
-
-    /// True for a slice of no elements.
-    pub fn is_empty(&self) -> bool {
-        self.len == 0
     }
 
     /// The name of the buffer.
@@ -172,7 +167,7 @@ impl<'a, T: bytemuck::Pod> SliceMut<'a, T> {
 
 impl<'a> Slice<'a, f32> {
     /// The bits of the same elements, for a kernel that stores other numbers than floats in them.
-    pub fn words(self) -> Slice<'a, u32> {
+    pub(crate) fn words(self) -> Slice<'a, u32> {
         let Self { memory, first, len, .. } = self;
         Slice { memory, first, len, element: PhantomData }
     }

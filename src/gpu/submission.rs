@@ -34,7 +34,8 @@ impl Submission {
     ///
     /// # Errors
     /// The device was lost.
-    pub fn wait(&self) -> Result<()> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn wait(&self) -> Result<()> {
         self.shared.wait(self.value)
     }
 }
@@ -73,7 +74,8 @@ impl Gpu {
     ///
     /// # Errors
     /// What `record` returns (nothing is submitted then), this thread is recording already, or the device was lost.
-    pub fn submit(
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn submit(
         &self,
         label: &str,
         record: impl FnOnce(&mut Recorder<'_>) -> Result<()>,
@@ -97,7 +99,8 @@ impl Gpu {
     ///
     /// # Errors
     /// As [`Gpu::submit`]; [`Error::MissingFeature`] where the device's queue has no timestamps.
-    pub fn profile(
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn profile(
         &self,
         label: &str,
         record: impl FnOnce(&mut Recorder<'_>) -> Result<()>,

@@ -89,7 +89,8 @@ struct Tuning {
 
 impl Properties {
     /// Whether subgroups can own such tiles: every part has 1 to 32 rows of lanes, and all lanes make one workgroup.
-    pub fn suits_tile(&self, tile: impl Into<Tile>) -> bool {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn suits_tile(&self, tile: impl Into<Tile>) -> bool {
         let tile = tile.into();
         let lanes = u64::from(self.subgroup_size);
         tile.part().is_some_and(|[width, height]| {
@@ -103,7 +104,7 @@ impl Properties {
 impl Gpu {
     /// The tile that was fastest on this device and driver for the nearest number of channels; none where nothing was
     /// measured, or the device is lent or opened to be validated.
-    pub fn tuned_tile(&self, channels: usize) -> Option<Tile> {
+    pub(crate) fn tuned_tile(&self, channels: usize) -> Option<Tile> {
         let path = self.tuning_path()?;
         let tiles = self.shared.tuned_tiles.get_or_init(|| load(path, self.properties()));
         let far = |tuned: &&TunedTile| tuned.channels.abs_diff(channels);
@@ -114,7 +115,7 @@ impl Gpu {
     ///
     /// # Errors
     /// The file cannot be written.
-    pub fn keep_tuned_tiles(&self, tiles: &[TunedTile]) -> Result<Option<PathBuf>> {
+    pub(crate) fn keep_tuned_tiles(&self, tiles: &[TunedTile]) -> Result<Option<PathBuf>> {
         let Some(path) = self.tuning_path() else { return Ok(None) };
         let Properties { name, driver, .. } = self.properties();
         let tuning = Tuning { device: name.clone(), driver: driver.clone(), tiles: tiles.to_vec() };

@@ -5,7 +5,6 @@
 //! that of biases 0, exactly ([`Exposures::center`]), so that a view shows the model as it is where its exposure is the mean.
 
 mod affine;
-#[cfg(feature = "io")]
 pub mod table;
 
 use glam::{UVec2, Vec2};
@@ -36,7 +35,7 @@ pub struct ExposureRates {
 
 impl ExposureRates {
     /// The rate of a step, counted from 1.
-    pub fn at(&self, step: u64) -> f64 {
+    pub(crate) fn at(&self, step: u64) -> f64 {
         let done = (step as f64 / self.steps.max(1) as f64).min(1.0);
         self.initial * (self.last / self.initial).powf(done)
     }

@@ -316,7 +316,7 @@ impl Ssim {
     fn record(
         &self,
         pass: &mut Recorder<'_>,
-        threads: Threads<'_>,
+        threads: Threads,
         LossInputs { size, interior, render, target }: LossInputs<'_>,
         d_render: &mut Buffer<f32>,
         [l1_partials, ssim_partials]: [&mut Buffer<f32>; 2],

@@ -55,7 +55,8 @@ pub struct DenoiserSettings {
 
 impl DenoiserSettings {
     /// LITA-GS's.
-    pub fn paper() -> Self {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn paper() -> Self {
         Self {
             stages: 3,
             repeats: 6,
@@ -67,7 +68,7 @@ impl DenoiserSettings {
 
     /// # Errors
     /// A number is out of its range.
-    pub fn check(&self) -> Result<()> {
+    pub(crate) fn check(&self) -> Result<()> {
         self.check_rows()
     }
 
@@ -186,7 +187,7 @@ impl Denoiser {
     pub fn become_identity(&mut self) -> Result<()> {
         let mut values = self.gpu.read(&self.parameters.values)?;
         for tensor in self.parameters.tensors().iter().filter(|of| of.name.contains("conv_out")) {
-            values[tensor.offset..][..tensor.len()].fill(0.0);
+            values[tensor.offset..][..tensor.element_count()].fill(0.0);
         }
         self.gpu.write(&mut self.parameters.values, &values)
     }
@@ -197,11 +198,13 @@ impl Denoiser {
     }
 
     /// The memory that [`Denoiser::reserve`] takes for a view.
+    #[cfg(feature = "testing")]
     pub fn bytes(settings: DenoiserSettings, size: UVec2) -> u64 {
         Extent::of(settings, size).bytes(settings)
     }
 
     /// The memory that [`Denoiser::keep_activations`] takes for a view beside it.
+    #[cfg(feature = "testing")]
     pub fn kept_bytes(settings: DenoiserSettings, size: UVec2) -> u64 {
         Earlier::bytes(settings, Extent::of(settings, size))
     }

@@ -88,7 +88,7 @@ pub fn save(path: &Path, networks: &[&Parameters], gpu: &Gpu) -> Result<()> {
     let mut views = vec![];
     for (parameters, values) in networks.iter().zip(&values) {
         for tensor in parameters.tensors() {
-            let bytes = bytemuck::cast_slice(&values[tensor.offset..][..tensor.len()]);
+            let bytes = bytemuck::cast_slice(&values[tensor.offset..][..tensor.element_count()]);
             let view = TensorView::new(Dtype::F32, tensor.shape.clone(), bytes);
             views.push((
                 format!("{}.{}", parameters.name, tensor.name),

@@ -180,7 +180,7 @@ impl Norm {
     }
 
     /// One workgroup per chunk and channel, and one per channel.
-    fn threads(&self, of: Use) -> (Threads<'static>, Threads<'static>) {
+    fn threads(&self, of: Use) -> (Threads, Threads) {
         let per_chunk = [of.pixel_count.div_ceil(CHUNK), self.channels, 1];
         (Threads::Workgroups(per_chunk), Threads::Workgroups([1, self.channels, 1]))
     }

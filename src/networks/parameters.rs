@@ -18,13 +18,8 @@ pub struct Tensor {
 
 impl Tensor {
     /// The number of elements.
-    pub fn len(&self) -> usize {
+    pub fn element_count(&self) -> usize {
         self.shape.iter().product()
-    }
-
-    /// True for a tensor of no elements.
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
     }
 }
 
@@ -119,7 +114,7 @@ impl Layout {
     fn tensor(&mut self, name: String, shape: Vec<usize>, value: impl Fn(usize) -> f32) -> u32 {
         let offset = self.values.len();
         let tensor = Tensor { name, shape, offset };
-        self.values.extend((offset..offset + tensor.len()).map(value));
+        self.values.extend((offset..offset + tensor.element_count()).map(value));
         self.tensors.push(tensor);
         offset as u32
     }

@@ -109,12 +109,13 @@ impl View {
     }
 
     /// Whether it is for training, be it that it is kept from it to tell when it has converged.
-    pub fn is_for_training(&self) -> bool {
+    pub(crate) fn is_for_training(&self) -> bool {
         self.split != Split::Test
     }
 
     /// The planes of one of its images, of any size, without the pixels that do not count.
-    pub fn counted<'a>(&self, image: &'a Image) -> Cow<'a, [f32]> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn counted<'a>(&self, image: &'a Image) -> Cow<'a, [f32]> {
         match &self.mask {
             Some(mask) => mask.counted(image).into(),
             None => (&image.data).into(),
@@ -122,7 +123,7 @@ impl View {
     }
 
     /// One of its images, of any size, of which the pixels that do not count are black.
-    pub fn blacked_out(&self, image: Image) -> Image {
+    pub(crate) fn blacked_out(&self, image: Image) -> Image {
         match &self.mask {
             Some(mask) => mask.blacked_out(image),
             None => image,
@@ -130,12 +131,12 @@ impl View {
     }
 
     /// Whether there is a photograph, kept or to be read anew.
-    pub fn has_photograph(&self) -> bool {
+    pub(crate) fn has_photograph(&self) -> bool {
         self.image.is_some() || self.original.is_some()
     }
 
     /// Whether there is a reference image, kept or to be read anew.
-    pub fn has_reference(&self) -> bool {
+    pub(crate) fn has_reference(&self) -> bool {
         self.reference.is_some() || self.reference_file.is_some()
     }
 
@@ -169,7 +170,7 @@ impl View {
     }
 
     /// Width and height of what [`View::photograph`] gives; none where the view has no photograph.
-    pub fn own_size(&self) -> Option<UVec2> {
+    pub(crate) fn own_size(&self) -> Option<UVec2> {
         let kept = self.image.as_ref().map(|image| UVec2::new(image.width, image.height));
         self.original.as_ref().map(Original::size).or(kept)
     }
@@ -295,7 +296,7 @@ impl Dataset {
     }
 
     /// What says which views are held out, in words.
-    pub fn split_rule(root: &Path, options: &LoadOptions) -> String {
+    pub(crate) fn split_rule(root: &Path, options: &LoadOptions) -> String {
         let has_test = transforms::find(root).iter().any(|(_, split)| *split == Some(Split::Test));
         match options.test_every {
             Some(0) => "none, as asked for".to_owned(),
@@ -307,7 +308,7 @@ impl Dataset {
     }
 
     /// Whether `root` is a folder that [`Dataset::load`] finds cameras in.
-    pub fn is_at(root: &Path) -> bool {
+    pub(crate) fn is_at(root: &Path) -> bool {
         !transforms::find(root).is_empty() || !colmap::find(root, &["cameras", "images"]).is_empty()
     }
 
@@ -315,7 +316,7 @@ impl Dataset {
     ///
     /// # Errors
     /// [`Error::Input`] where a model is damaged.
-    pub fn largest_model(folder: &Path) -> Result<Option<(PathBuf, Vec<String>)>> {
+    pub(crate) fn largest_model(folder: &Path) -> Result<Option<(PathBuf, Vec<String>)>> {
         let models = colmap::models_in(folder, &["cameras", "images", "points3D"]);
         let Some((model, _)) = colmap::largest(&models, |_| true)? else { return Ok(None) };
         let names = colmap::read_images(model)?.into_iter().map(|image| image.name);
@@ -326,7 +327,7 @@ impl Dataset {
     ///
     /// # Errors
     /// As [`Dataset::load`], but for what is wrong with pixels.
-    pub fn photographs(root: &Path, options: &LoadOptions) -> Result<Vec<Photograph>> {
+    pub(crate) fn photographs(root: &Path, options: &LoadOptions) -> Result<Vec<Photograph>> {
         let (photographs, skipped, remarks) = Self::listed(root, options)?;
         warn(&remarks);
         for line in &skipped {

@@ -16,6 +16,7 @@ mod exr_file;
 pub(crate) mod files;
 #[cfg(feature = "io")]
 mod jpeg;
+#[cfg(feature = "io")]
 mod mask;
 #[cfg(feature = "io")]
 mod orientation;
@@ -32,6 +33,7 @@ pub(crate) use codec::openings;
 pub use exif::exposure_value;
 #[cfg(feature = "io")]
 pub use jpeg::exif_segment;
+#[cfg(feature = "io")]
 pub use mask::Mask;
 #[cfg(feature = "io")]
 pub use orientation::Orientation;

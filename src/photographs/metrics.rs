@@ -39,7 +39,12 @@ impl Scores {
     ///
     /// # Errors
     /// As [`Scores::of`]; no pixel counts.
-    pub fn of_counted(render: &Image, reference: &Image, mask: Option<&Mask>) -> Result<Self> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn of_counted(
+        render: &Image,
+        reference: &Image,
+        mask: Option<&Mask>,
+    ) -> Result<Self> {
         let Some(mask) = mask else { return Self::of(render, reference) };
         let mask = mask.resized(render.width, render.height);
         let errors = weighted_errors(render, reference, &mask)?;
@@ -58,7 +63,8 @@ impl Scores {
     }
 
     /// The mean of each score; none of nothing.
-    pub fn mean(scores: &[Self]) -> Option<Self> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn mean(scores: &[Self]) -> Option<Self> {
         let mean =
             |score: fn(&Self) -> f64| scores.iter().map(score).sum::<f64>() / scores.len() as f64;
         (!scores.is_empty()).then(|| Self {

@@ -344,6 +344,7 @@ impl PseudoGt {
     ///
     /// # Errors
     /// The device was lost.
+    #[cfg(feature = "testing")]
     pub fn measured(&self) -> Result<Statistics> {
         let read = self.gpu.read(&self.measured)?;
         Ok(Statistics::from(read[0]))
@@ -353,6 +354,7 @@ impl PseudoGt {
     ///
     /// # Errors
     /// The device was lost.
+    #[cfg(feature = "testing")]
     pub fn luminance_histogram(&self) -> Result<LuminanceHistogram> {
         let counts = self.gpu.read(&self.counts)?;
         Ok(LuminanceHistogram::from_counts(&counts, self.pixel_count.into()))

@@ -19,7 +19,6 @@
 
 mod exposure;
 mod families;
-#[cfg(feature = "io")]
 mod file;
 mod histogram;
 mod law;
@@ -30,14 +29,9 @@ mod settings;
 mod statistics;
 mod table;
 
-use std::fmt;
-use std::str::FromStr;
-
-#[cfg(feature = "io")]
 pub(crate) use self::exposure::all_black;
 pub use self::exposure::{Exposure, exposed_anew, is_black, soft};
 pub use self::families::{Constant, FAMILIES, Family, Law, ToneCurve, White};
-#[cfg(feature = "io")]
 pub use self::file::CurveChoice;
 pub use self::histogram::LuminanceHistogram;
 pub(crate) use self::histogram::{BIN_SHIFT, FIRST_PREFIX};
@@ -51,18 +45,18 @@ pub(crate) use self::profile::profiled;
 #[cfg(feature = "fit")]
 pub(crate) use self::real::Dual;
 pub use self::real::Real;
-#[cfg(feature = "io")]
 pub(crate) use self::settings::OF_CURVE;
 pub use self::settings::{GainChoice, ToneSettings};
 pub(crate) use self::statistics::Rank;
 pub use self::statistics::{Statistics, percentile};
-#[cfg(any(feature = "io", feature = "check"))]
 pub(crate) use self::statistics::{luminance, measurable};
 #[cfg(feature = "check")]
 pub(crate) use self::table::interpolate;
 pub use self::table::{Table, TableInput};
 pub use crate::kernels::ToneParameters;
 use crate::{Error, Result};
+use std::fmt;
+use std::str::FromStr;
 
 /// The name of the curve that a table of values makes.
 const TABLE_NAME: &str = "table";
@@ -76,7 +70,8 @@ const PROFILE_NAME: &str = "profile";
 impl ToneCurve {
     /// The curve's row in the table; of a [`Table`] or a [`Profile`] that of `none`, as it has no formula, and of the
     /// automatic curve that of `ase`, which is its formula on grey.
-    pub fn family(self) -> &'static Family {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn family(self) -> &'static Family {
         &FAMILIES[match self {
             Self::Table | Self::Profile => Self::None,
             Self::Auto => Self::Ase,
@@ -95,20 +90,23 @@ impl ToneCurve {
     }
 
     /// The curve's number in `include/curves.glsl`: the specialization constant `TONE_CURVE`.
-    pub fn constant(self) -> u32 {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn constant(self) -> u32 {
         self as u32
     }
 
     /// The curve at t = x / white, in [0, 1], as exact as f64 allows.
     ///
     /// `lum_preserve` and `per_channel` are straight lines here: what they do depends on more than one value.
-    pub fn value(self, t: f64, offset: f64, gain: f64, constants: &[f64]) -> f64 {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn value(self, t: f64, offset: f64, gain: f64, constants: &[f64]) -> f64 {
         let constants = families::padded(constants);
         clamped(curve_at(self.constant(), t, [offset, gain], &constants))
     }
 
     /// The curve at the sRGB-encoded value `x`, in the arithmetic of the kernels.
-    pub fn apply(self, x: f32, parameters: &ToneParameters) -> f32 {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn apply(self, x: f32, parameters: &ToneParameters) -> f32 {
         tone_curve(self.constant(), x, parameters)
     }
 
@@ -121,7 +119,7 @@ impl ToneCurve {
     }
 
     /// All names, for help texts and errors.
-    pub fn names() -> String {
+    pub(crate) fn names() -> String {
         let families = Self::ALL.map(Self::name).join(", ");
         format!("{AUTO_NAME}, {families}")
     }

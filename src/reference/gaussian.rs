@@ -44,13 +44,8 @@ impl Planes {
     }
 
     /// Floats of the whole array.
-    pub fn len(self) -> usize {
+    pub fn float_count(self) -> usize {
         self.count * column_count(self.feature_count, self.sh_degree)
-    }
-
-    /// True where there is no Gaussian.
-    pub fn is_empty(self) -> bool {
-        self.count == 0
     }
 
     /// Where Gaussian `i` has its floats, in the order of [`Gaussian`].

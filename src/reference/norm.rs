@@ -23,6 +23,7 @@ pub struct Affine<T = f64> {
     pub beta: T,
 }
 
+#[cfg(feature = "testing")]
 impl Statistics {
     /// Those of a channel's values.
     pub fn of(values: &[f64]) -> Self {
@@ -71,6 +72,7 @@ pub fn backward_terms<T: Gated>(
 }
 
 /// The sums over the values of `d_y` and of `d_y` n: the gradients of beta and of gamma.
+#[cfg(feature = "testing")]
 pub fn backward_sums(
     statistics: Statistics,
     affine: Affine,

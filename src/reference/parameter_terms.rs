@@ -18,6 +18,7 @@ fn scale<T: Real>(log_scale: T) -> [T; 2] {
 }
 
 /// `weights[0]` mean opacity + `weights[1]` mean standard deviation of so many Gaussians with these planes, and its gradient.
+#[cfg(feature = "testing")]
 pub fn parameter_terms(
     planes: &[f64],
     gaussian_count: usize,

@@ -210,7 +210,7 @@ impl Reference for Kernel {
         let before = status[0];
         let scene = Scene::new(params, constants, slices.cameras);
         let parameters = scene.planes.floats(parameters, constants.half_rest);
-        gradients[..scene.planes.len()].fill(0.0);
+        gradients[..scene.planes.float_count()].fill(0.0);
         for i in (0..scene.planes.count).filter(|&i| tile_counts[i] > 0) {
             let record = summed_record(constants.channels, emitted[i], records);
             let d_splat = scene.d_splat(colors, &values(&record), i);
@@ -239,11 +239,11 @@ impl Reference for Kernel {
         let one = Planes { count: 1, ..scene.planes };
         let far = scene.camera.center().length();
         let [mut gradients, mut grad_norm_sums] =
-            [scene.planes.len(), scene.planes.count].map(|len| vec![0.0; len]);
+            [scene.planes.float_count(), scene.planes.count].map(|len| vec![0.0; len]);
         for i in (0..scene.planes.count).filter(|&i| slices.tile_counts[i] > 0) {
             let gaussian = scene.planes.load(&parameters, i);
             let splat = Splat::from(&slices.splats[i]);
-            let mut inputs = vec![0.0; one.len()];
+            let mut inputs = vec![0.0; one.float_count()];
             one.store(&gaussian, 0, |at, value| inputs[at] = value);
             inputs.extend(splat.conic.to_array());
             let record = summed_record(constants.channels, slices.emitted[i], slices.records);
@@ -251,19 +251,24 @@ impl Reference for Kernel {
             let mut errors: Vec<f64> = (0..inputs.len())
                 .map(|at| {
                     let beside = if at < 3 { far } else { 0.0 };
-                    OFF * (inputs[at].abs() + beside + if at < one.len() { 1.0 } else { 0.0 })
+                    OFF * (inputs[at].abs()
+                        + beside
+                        + if at < one.float_count() { 1.0 } else { 0.0 })
                 })
                 .collect();
-            errors[one.len() + 3..].iter_mut().zip(&record).for_each(|(e, sum)| *e += sum.error);
+            errors[one.float_count() + 3..]
+                .iter_mut()
+                .zip(&record)
+                .for_each(|(e, sum)| *e += sum.error);
             let bounds = sensitivity(&inputs, &errors, |inputs| {
-                let (own, rest) = inputs.split_at(one.len());
+                let (own, rest) = inputs.split_at(one.float_count());
                 let splat = Splat { conic: DVec3::from_slice(rest), ..splat };
                 let (gaussian, d_splat) =
                     (one.load(own, 0), scene.d_splat(slices.colors, &rest[3..], i));
                 let gradient = scene.backward(&gaussian, &splat, &d_splat);
-                let mut numbers = vec![0.0; one.len() + 1];
+                let mut numbers = vec![0.0; one.float_count() + 1];
                 one.store(&gradient, 0, |at, value| numbers[at] = value);
-                numbers[one.len()] = scene.damped_norm(&gaussian, &d_splat);
+                numbers[one.float_count()] = scene.damped_norm(&gaussian, &d_splat);
                 numbers
             });
             let d_splat = scene.d_splat(slices.colors, &values(&record), i);
@@ -277,7 +282,7 @@ impl Reference for Kernel {
             scene.planes.store(&moved, i, |at, bound| gradients[at] += bound);
             let norm = scene.damped_norm(&gaussian, &d_splat);
             let sum = f64::from(slices.grad_norm_sums[i].abs()) + norm;
-            grad_norm_sums[i] = bounds[one.len()] + 16.0 * UNIT * norm + 2.0 * UNIT * sum;
+            grad_norm_sums[i] = bounds[one.float_count()] + 16.0 * UNIT * norm + 2.0 * UNIT * sum;
         }
         Tolerances {
             gradients: Tolerance::Each(gradients),

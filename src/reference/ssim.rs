@@ -40,6 +40,7 @@ pub fn blur(width: usize, height: usize, plane: &[f64]) -> Vec<f64> {
 }
 
 /// SSIM of every pixel of one channel, `a` against `b`.
+#[cfg(feature = "testing")]
 pub fn ssim(width: usize, height: usize, a: &[f64], b: &[f64]) -> Vec<Ssim> {
     let moment = |of: fn(f64, f64) -> f64| {
         let plane: Vec<f64> = a.iter().zip(b).map(|(&a, &b)| of(a, b)).collect();
@@ -65,6 +66,7 @@ fn ssim_of_moments<T: Real>(a: T, b: T, aa: T, bb: T, ab: T) -> Ssim<T> {
 
 /// The gradient of `l1_scale` sum|a - b| - `ssim_scale` sum SSIM with respect to one channel of the render `a`, sums over
 /// the pixels from `begin` to before `end`.
+#[cfg(feature = "testing")]
 pub fn gradient(
     [width, height]: [usize; 2],
     interior: [UVec2; 2],

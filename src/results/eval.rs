@@ -52,7 +52,7 @@ impl Against {
     }
 
     /// In a word or two, within a line.
-    pub fn name(self) -> &'static str {
+    pub(crate) fn name(self) -> &'static str {
         match self {
             Self::References => "reference images",
             Self::PseudoGt => "pseudo-GT",
@@ -345,7 +345,7 @@ impl Layer {
     }
 
     /// Whether its values are colour, sRGB-encoded, rather than numbers.
-    pub fn is_color(self) -> bool {
+    pub(crate) fn is_color(self) -> bool {
         matches!(self, Self::Rgb | Self::Denoised)
     }
 }

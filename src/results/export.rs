@@ -11,12 +11,83 @@ pub mod sog;
 pub mod spz;
 
 use std::io::Write as _;
+use std::path::Path;
 
 use flate2::{Compression, GzBuilder};
 use glam::{DVec3, Vec3};
 
-use crate::splats::scene::Gaussians;
+use crate::base::output::write_whole;
+use crate::splats::scene::{Gaussians, ply};
 use crate::{Error, Result};
+
+/// What a model can be written as.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Format {
+    /// The layout that every viewer opens, with a header that says where it comes from.
+    Ply,
+    /// A tenth of the size; eight bits a number.
+    Spz(spz::Version),
+    /// glTF with `KHR_gaussian_splatting`.
+    Glb,
+    /// A fifteenth of the size; `PlayCanvas`.
+    Sog,
+}
+
+impl Format {
+    /// The format that a file's extension names.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] where it names none.
+    pub fn of(path: &Path) -> Result<Self> {
+        let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+        match extension.as_str() {
+            "ply" => Ok(Self::Ply),
+            "spz" => Ok(Self::Spz(spz::Version::default())),
+            "glb" => Ok(Self::Glb),
+            "sog" => Ok(Self::Sog),
+            _ => {
+                let problem = "has the extension of no model; name it .ply, .spz, .glb or .sog";
+                Err(Error::Usage(format!("{} {problem}", path.display())))
+            }
+        }
+    }
+
+    /// Writes a model; the file appears under its name only once it is complete.
+    pub(crate) fn write(
+        self,
+        gaussians: &Gaussians,
+        provenance: &Provenance,
+        path: &Path,
+    ) -> Result<()> {
+        let bytes = match self {
+            Self::Ply => return ply::save_with_comments(gaussians, path, &provenance.lines()),
+            Self::Spz(version) => spz::encode(gaussians, version)?,
+            Self::Glb => glb::encode(gaussians, provenance)?,
+            Self::Sog => sog::encode(gaussians, provenance)?,
+        };
+        write_whole(path, &bytes)
+    }
+}
+
+impl Gaussians {
+    /// Writes the model in the format that the file's extension names: `.ply`, `.spz`, `.glb` or `.sog`.
+    ///
+    /// # Errors
+    /// The extension names none, the model does not fit the format, or the file cannot be written; nothing half-written is
+    /// left.
+    pub fn save(&self, path: impl AsRef<Path>) -> Result<()> {
+        let path = path.as_ref();
+        self.save_as(path, Format::of(path)?)
+    }
+
+    /// Writes the model in a format, whatever the file is called.
+    ///
+    /// # Errors
+    /// As [`Gaussians::save`].
+    pub fn save_as(&self, path: impl AsRef<Path>, format: Format) -> Result<()> {
+        format.write(self, &Provenance::default(), path.as_ref())
+    }
+}
 
 /// Where a model comes from: what a file says of itself.
 #[derive(Clone, Debug, Default)]
@@ -124,6 +195,21 @@ pub(crate) mod tests {
         gaussians.raw_opacities_mut().iter_mut().for_each(|opacity| *opacity *= 4.0);
         gaussians.rest_mut().iter_mut().for_each(|value| *value *= 0.3);
         gaussians
+    }
+
+    #[test]
+    fn a_model_is_saved_in_the_format_of_its_extension() {
+        let (model, folder) = (drawn(4, 1), tempfile::tempdir().unwrap());
+        for (name, magic) in
+            [("a.ply", "ply"), ("a.spz", "NGSP"), ("a.glb", "glTF"), ("A.SOG", "PK")]
+        {
+            let path = folder.path().join(name);
+            model.save(&path).unwrap();
+            assert!(std::fs::read(&path).unwrap().starts_with(magic.as_bytes()), "{name}");
+        }
+        assert_eq!(Gaussians::open(folder.path().join("a.ply")).unwrap(), model);
+        let refused = model.save(folder.path().join("a.splat")).unwrap_err().to_string();
+        assert!(refused.contains("a.splat") && refused.contains(".spz"), "{refused}");
     }
 
     #[test]

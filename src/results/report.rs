@@ -7,9 +7,7 @@ use crate::photographs::image::Image;
 pub use self::bars::{Bar, bars};
 pub(crate) use self::data_uri::{base64, jpeg};
 pub use self::distribution::{Distribution, distributions};
-pub use self::plot::{
-    Mark, Series, VerticalLine, plot, plot_in_groups, plot_points, plot_with_lines, svg_file,
-};
+pub use self::plot::{Mark, Series, VerticalLine, plot, plot_in_groups, plot_points, svg_file};
 pub use self::table::{Best, Column, Table};
 pub use self::traces::{Trace, traces};
 

@@ -154,13 +154,8 @@ pub struct PlaneCounts {
 
 impl PlaneCounts {
     /// Numbers of all planes.
-    pub fn len(self) -> usize {
+    pub fn total(self) -> usize {
         self.gaussians * self.columns
-    }
-
-    /// True where there is no number.
-    pub fn is_empty(self) -> bool {
-        self.len() == 0
     }
 
     /// Numbers of each Gaussian before its SH coefficients above degree 0.

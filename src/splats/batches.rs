@@ -57,6 +57,7 @@ impl Batches {
     ///
     /// # Errors
     /// The device is out of memory or lost.
+    #[cfg(feature = "testing")]
     pub fn upload(&self, gpu: &Gpu, name: &str, planes: &[f32]) -> Result<Buffer<f32>> {
         let mut buffer = self.uninit(gpu, name)?;
         self.write(gpu, &mut buffer, planes)?;
@@ -68,7 +69,7 @@ impl Batches {
     /// # Errors
     /// The device is out of memory.
     pub fn uninit(&self, gpu: &Gpu, name: &str) -> Result<Buffer<f32>> {
-        gpu.uninit_in_windows(name, self.planes.len())
+        gpu.uninit_in_windows(name, self.planes.total())
     }
 
     /// A buffer of planes of zeros.
@@ -102,7 +103,7 @@ impl Batches {
     /// The device was lost.
     pub fn read<'a>(&self, gpu: &Gpu, buffer: impl Into<Slice<'a, f32>>) -> Result<Vec<f32>> {
         let mut batched = gpu.read(buffer)?;
-        batched.truncate(self.planes.len());
+        batched.truncate(self.planes.total());
         if self.planes.gaussians <= self.size {
             return Ok(batched);
         }

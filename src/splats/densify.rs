@@ -247,7 +247,6 @@ impl Densifier {
     }
 
     /// What a round takes beside the Gaussians, for each, in bytes.
-    #[cfg(feature = "io")]
     pub(crate) fn bytes_per_gaussian(&self) -> usize {
         5 * size_of::<u32>() + self.sort.bytes_per_item()
     }
@@ -502,7 +501,7 @@ fn report(count: usize, tally: &[u32]) -> DensifyReport {
 fn check(gaussians: &DeviceGaussians, inputs: &DensifyInputs<'_>) -> Result<()> {
     let DeviceGaussians { layout, parameters, .. } = gaussians;
     let DensifyInputs { moments, grad_norm_sums, visit_counts, .. } = inputs;
-    let (count, floats) = (layout.count, layout.floats().len());
+    let (count, floats) = (layout.count, layout.floats().total());
     let parameters = iter::once((parameters.name(), parameters.len(), count * layout.words()));
     let moments = moments.planes().into_iter().map(|(name, plane)| (name, plane.len(), floats));
     let per_gaussian = [

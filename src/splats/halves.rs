@@ -20,7 +20,7 @@ pub enum StorageFormat {
 
 impl StorageFormat {
     /// Words of each Gaussian whose SH coefficients above degree 0 are stored so.
-    pub fn words(self, planes: PlaneCounts) -> usize {
+    pub(crate) fn words(self, planes: PlaneCounts) -> usize {
         match self {
             Self::Single => planes.columns,
             Self::Half => Halves::new(planes).columns(),

@@ -101,7 +101,6 @@ impl<P> Moments<P> {
     }
 
     /// Their planes, by name.
-    #[cfg(feature = "io")]
     pub(crate) fn into_planes(self) -> Vec<(&'static str, P)> {
         match self {
             Self::Single { first, second } => {
@@ -205,7 +204,7 @@ impl Adam {
         AdamBuffers { parameters, gradients, moments }: AdamBuffers<'_>,
         status: &Buffer<u32>,
     ) -> Result<()> {
-        let len = planes.len();
+        let len = planes.total();
         check(step, status, [(parameters.as_slice(), len), (gradients, len)], (&moments, len))?;
         let half_moments = moments.bits() == StorageFormat::Half;
         let constants = adam::Constants { half_moments };
@@ -248,8 +247,8 @@ impl Adam {
         status: &Buffer<u32>,
     ) -> Result<()> {
         let words = planes.gaussians * StorageFormat::Half.words(planes);
-        let buffers = [(parameters.as_slice(), words), (gradients, planes.len())];
-        check(step, status, buffers, (&moments, planes.len()))?;
+        let buffers = [(parameters.as_slice(), words), (gradients, planes.total())];
+        check(step, status, buffers, (&moments, planes.total()))?;
         let [gaussian_count, first_column, coefficient_count] =
             [planes.gaussians, planes.before_rest(), planes.rest()].map(|n| n as u32);
         let half_moments = moments.bits() == StorageFormat::Half;

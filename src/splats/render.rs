@@ -31,8 +31,9 @@ use crate::splats::scene::{GaussianSlice, Layout, Shape};
 use crate::splats::sort::{Count, RadixSort};
 use crate::{Error, Result};
 
-pub use cameras::{CameraGradient, Viewpoint, Viewpoints};
-#[doc(hidden)]
+#[cfg(feature = "testing")]
+pub use cameras::CameraGradient;
+pub use cameras::{Viewpoint, Viewpoints};
 pub use frame::Frame;
 pub use frame::Status;
 use frame::{RANKS_PER_PARTITION, color_vectors};
@@ -69,24 +70,6 @@ pub struct Gradients<'a> {
 }
 
 /// Renders Gaussians, forward and backward. Holds the memory of one view.
-///
-/// ```no_run
-/// use nightsplat::photographs::dataset::{Dataset, LoadOptions};
-/// use nightsplat::gpu::{DeviceChoice, Gpu};
-/// use nightsplat::splats::render::{RenderOptions, RenderSettings, Renderer};
-/// use nightsplat::splats::scene::ply;
-///
-/// let gpu = Gpu::new(&DeviceChoice::Best)?;
-/// let camera = Dataset::load("photos", &LoadOptions::default())?.views[0].camera;
-/// let gaussians = ply::load("run/model.ply")?;
-/// let settings = RenderSettings { shape: gaussians.shape, ..RenderSettings::default() };
-/// let mut renderer = Renderer::new(&gpu, settings)?;
-/// let on_device = gaussians.upload(&gpu)?;
-/// renderer.reserve(gaussians.count, [&camera])?;
-/// let options = RenderOptions { sh_degree: gaussians.shape.sh_degree, background: [0.0; 3] };
-/// renderer.render_image(&on_device, &camera, &options)?.save_png8("view.png")?;
-/// # Ok::<(), nightsplat::Error>(())
-/// ```
 #[derive(Debug)]
 pub struct Renderer {
     gpu: Gpu,
@@ -156,7 +139,7 @@ impl Renderer {
     ///
     /// # Errors
     /// The driver refuses a kernel; the renderer is as it was.
-    pub fn set_sh_degree(&mut self, sh_degree: u32) -> Result<()> {
+    pub(crate) fn set_sh_degree(&mut self, sh_degree: u32) -> Result<()> {
         if sh_degree == self.settings.shape.sh_degree {
             return Ok(());
         }
@@ -174,7 +157,8 @@ impl Renderer {
     ///
     /// # Errors
     /// The device was lost.
-    pub fn intersections(&self) -> Result<u32> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn intersections(&self) -> Result<u32> {
         Ok(self.gpu.read(&self.frame.counts)?[0])
     }
 
@@ -192,7 +176,7 @@ impl Renderer {
     ///
     /// # Errors
     /// The driver refuses a kernel.
-    pub fn blend_statistics(&self) -> Result<Option<[Vec<Statistic>; 2]>> {
+    pub(crate) fn blend_statistics(&self) -> Result<Option<[Vec<Statistic>; 2]>> {
         let forward = self.blend_forward.statistics()?;
         Ok(forward.zip(self.blend_backward.statistics()?).map(<[_; 2]>::from))
     }
@@ -209,12 +193,13 @@ impl Renderer {
     }
 
     /// The last render and the status words, for a loss that reads the one and raises flags in the other.
-    pub fn render_and_status(&mut self) -> (&Buffer<f32>, &mut Buffer<u32>) {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn render_and_status(&mut self) -> (&Buffer<f32>, &mut Buffer<u32>) {
         (&self.frame.render, &mut self.frame.status)
     }
 
     /// What to say of a view whose [`Status::crowd`] is too large for this device.
-    pub fn too_crowded(&self, view: String, splats: u32) -> Error {
+    pub(crate) fn too_crowded(&self, view: String, splats: u32) -> Error {
         let [width, height] = self.tile.size;
         let (tile, device) = (format!("{width}x{height}"), self.gpu.properties().name.clone());
         Error::Crowded { view, splats, tile, device, limit: self.longest_run }

@@ -13,6 +13,7 @@ pub mod init;
 mod neighbours;
 pub mod ply;
 
+#[cfg(feature = "io")]
 use crate::camera::Frame;
 pub use crate::splats::attributes::{ATTRIBUTES, Attribute, PlaneCounts, rest_coefficients};
 use crate::splats::attributes::{column_count, planes};
@@ -45,7 +46,7 @@ impl fmt::Display for Shape {
 /// Colour alone.
 impl Shape {
     /// Whether Gaussians of `other` are Gaussians of this shape without its highest SH degrees.
-    pub fn holds(self, other: Self) -> bool {
+    pub(crate) fn holds(self, other: Self) -> bool {
         self.features == other.features && other.sh_degree <= self.sh_degree
     }
 }
@@ -83,7 +84,8 @@ impl Gaussians {
     }
 
     /// Where an attribute lies in [`Gaussians::parameters`].
-    pub fn plane(&self, attribute: Attribute) -> Range<usize> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn plane(&self, attribute: Attribute) -> Range<usize> {
         let (column, width) = self.columns(attribute);
         column * self.count..(column + width) * self.count
     }
@@ -94,7 +96,8 @@ impl Gaussians {
     }
 
     /// The same Gaussians out of a frame, relative to an origin that lets f32 hold them: [`Frame::file_origin`].
-    pub fn to_world(&self, frame: &Frame) -> Self {
+    #[cfg(feature = "io")]
+    pub(crate) fn to_world(&self, frame: &Frame) -> Self {
         let origin = frame.file_origin();
         if *frame == Frame::WORLD {
             return self.clone();
@@ -105,7 +108,8 @@ impl Gaussians {
     }
 
     /// Gaussians of the world in a frame: what [`Gaussians::to_world`] gave comes back.
-    pub fn from_world(&self, frame: &Frame) -> Self {
+    #[cfg(feature = "io")]
+    pub(crate) fn from_world(&self, frame: &Frame) -> Self {
         if *frame == Frame::WORLD && self.origin == DVec3::ZERO {
             return self.clone();
         }
@@ -128,7 +132,7 @@ impl Gaussians {
     }
 
     /// The same with these features: those that come are zero, others go.
-    pub fn with_features(&self, features: Features) -> Self {
+    pub(crate) fn with_features(&self, features: Features) -> Self {
         let mut other = Self::zeros(self.count, Shape { features, ..self.shape });
         other.origin = self.origin;
         let kept = |attribute: &Attribute| *attribute != Attribute::Features;
@@ -150,7 +154,6 @@ impl Gaussians {
     }
 
     /// The least SH degree that there has to be room for.
-    #[cfg(feature = "io")]
     pub(crate) fn sh_degree_in_use(&self) -> u32 {
         let own = rest_coefficients(self.shape.sh_degree);
         let used = |rest: &[Vec3]| rest.iter().rposition(|c| *c != Vec3::ZERO).map_or(0, |k| k + 1);
@@ -172,7 +175,8 @@ impl Gaussians {
     }
 
     /// Adds a constant to the colour from every direction.
-    pub fn shift_colors(&mut self, by: f32) {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn shift_colors(&mut self, by: f32) {
         for dc in self.dc_mut() {
             *dc += by / SH_C0;
         }

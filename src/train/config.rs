@@ -206,6 +206,7 @@ impl DensityConfig {
     }
 
     /// Those of LITA-GS.
+    #[cfg(feature = "testing")]
     pub fn paper() -> Self {
         Self {
             control: DensityControl::Paper,
@@ -264,7 +265,7 @@ impl TrainConfig {
     }
 
     /// Switches off the depth part where no training view has a depth map, and says so.
-    pub fn leave_out_what_is_missing(&mut self, dataset: &Dataset) {
+    pub(crate) fn leave_out_what_is_missing(&mut self, dataset: &Dataset) {
         if !self.model.depth {
             return;
         }
@@ -283,7 +284,7 @@ impl TrainConfig {
     }
 
     /// The same run of another copy of its dataset; what lay in its folder lies there, too.
-    pub fn move_dataset(&mut self, dataset: &Path) {
+    pub(crate) fn move_dataset(&mut self, dataset: &Path) {
         let from = std::mem::replace(&mut self.dataset, dataset.to_owned());
         let inside = [&mut self.reference, &mut self.model.depth_folder, &mut self.exposure.start];
         for folder in inside.into_iter().flatten() {
@@ -294,7 +295,8 @@ impl TrainConfig {
     }
 
     /// What the rasteriser is specialised for.
-    pub fn render_settings(&self) -> RenderSettings {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn render_settings(&self) -> RenderSettings {
         RenderSettings {
             shape: Shape { sh_degree: self.sh_degree, features: self.model.features() },
             raw_colors: self.model.raw_colors,
@@ -307,7 +309,7 @@ impl TrainConfig {
     }
 
     /// What the loss terms of the model are built from.
-    pub fn loss(&self) -> LossConfig {
+    pub(crate) fn loss(&self) -> LossConfig {
         LossConfig {
             ssim_weight: self.ssim_weight,
             weights: self.model.effective_weights(),

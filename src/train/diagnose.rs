@@ -80,7 +80,7 @@ pub struct ViewDiagnosis {
 /// What is known of all training photographs together, those that are as good as black left out; without another word the
 /// mean over the views.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
-#[expect(missing_docs, reason = "as in `ViewDiagnosis`")]
+#[allow(missing_docs, reason = "as in `ViewDiagnosis`")]
 pub struct SceneDiagnosis {
     pub p10: f64,
     pub p90: f64,

@@ -35,7 +35,7 @@ impl TrainConfig {
     /// 0.12`. Left out is what changes no step beyond its rounding: how long the run is, where the photographs lie, when it
     /// is scored and saved, on which device and by which tiles. A lower limit of the Gaussians is no difference either: a
     /// run that outgrows its machine goes on with what it has.
-    pub fn difference(&self, other: &Self) -> Option<String> {
+    pub(crate) fn difference(&self, other: &Self) -> Option<String> {
         const ALSO: [&str; 5] = ["steps", "reference", "stop.every", "stop.gain", "stop.margin"];
         let values = [self, other].map(values);
         let [own, others] = match &values {
@@ -61,7 +61,7 @@ impl TrainConfig {
     ///
     /// # Errors
     /// None for a configuration that [`TrainConfig::check`] accepts.
-    pub fn checksum(&self) -> Result<String> {
+    pub(crate) fn checksum(&self) -> Result<String> {
         let own = self.clone().with_absolute_paths();
         let mut hasher = Hasher::default();
         for (key, value) in values(&own)? {

@@ -71,13 +71,15 @@ impl Trainer {
     }
 
     /// Whether the run may end before its last step.
-    pub fn may_end_early(&self) -> bool {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn may_end_early(&self) -> bool {
         let is_open = self.converged().is_none() && !self.decisions.goes_on;
         is_open && self.step < self.settles_after() && !self.held_out.is_empty()
     }
 
     /// The step after which the model settles: there is no density control any more, and learning rates decay.
-    pub fn settles_after(&self) -> u64 {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn settles_after(&self) -> u64 {
         let planned = self.config.steps - self.config.settling_steps();
         self.converged().map_or(planned, |converged| converged.min(planned))
     }

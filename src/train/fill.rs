@@ -18,7 +18,7 @@ use crate::photographs::image::Image;
 use crate::splats::attributes::planes;
 use crate::splats::halves::StorageFormat;
 use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
-use crate::splats::scene::init::{self, Start};
+use crate::splats::scene::init::Start;
 use crate::splats::scene::{Gaussians, SH_C0, width};
 
 /// Views that are looked at, at most.
@@ -185,7 +185,7 @@ fn joined(old: &Gaussians, new: &[Sight], start: &Start) -> Result<Gaussians> {
     let positions: Vec<DVec3> = means.chain(new.iter().map(|sight| sight.position)).collect();
     let colors = std::iter::repeat_n(Vec3::ZERO, old.count);
     let colors: Vec<Vec3> = colors.chain(new.iter().map(|sight| sight.color)).collect();
-    let mut all = init::from_points(&positions, &colors, old.shape, start, 0)?;
+    let mut all = Gaussians::from_points(&positions, &colors, old.shape, start, 0)?;
     let features = old.shape.features.width();
     for (column, width) in planes(features, width(old.shape)) {
         let (from, to) = (column * old.count, column * all.count);

@@ -196,7 +196,7 @@ impl Settings {
     ///
     /// # Errors
     /// [`Error::Usage`] for a curve that is not whole.
-    pub fn config(&self) -> Result<TrainConfig> {
+    pub(crate) fn config(&self) -> Result<TrainConfig> {
         let mut table = Table::new();
         for (key, (value, _)) in &self.0 {
             let mut path: Vec<&str> = key.split('.').collect();
@@ -222,7 +222,7 @@ impl Settings {
     ///
     /// # Errors
     /// None for a configuration that [`TrainConfig::check`] accepts.
-    pub fn explained(&self, config: &TrainConfig) -> Result<String> {
+    pub(crate) fn explained(&self, config: &TrainConfig) -> Result<String> {
         let values = values(config)?;
         let line = |row: &Setting| {
             let value = values.get(row.key.as_ref()).map(Value::to_string);
@@ -242,7 +242,7 @@ impl Settings {
     ///
     /// # Errors
     /// None for a configuration that [`TrainConfig::check`] accepts.
-    pub fn written(&self, config: &TrainConfig) -> Result<String> {
+    pub(crate) fn written(&self, config: &TrainConfig) -> Result<String> {
         let (mut written, mut section) = (String::new(), String::new());
         for line in config.to_toml()?.lines() {
             if let Some(name) = line.strip_prefix('[').and_then(|line| line.strip_suffix(']')) {

@@ -17,7 +17,7 @@ impl Trainer {
     ///
     /// # Errors
     /// The device was lost.
-    pub fn gradients(&self) -> Result<Gaussians> {
+    pub(crate) fn gradients(&self) -> Result<Gaussians> {
         let Model { gaussians, gradients, .. } = &self.model;
         let planes = gaussians.layout.batches(&self.gpu).read(&self.gpu, gradients)?;
         Ok(self.model.host(planes))

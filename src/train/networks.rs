@@ -31,7 +31,12 @@ impl Networks {
     ///
     /// # Errors
     /// The Gaussians lack what a network takes, or the device is out of memory.
-    pub fn new(gpu: &Gpu, model: &ModelConfig, features: Features, seed: u64) -> Result<Self> {
+    pub(crate) fn new(
+        gpu: &Gpu,
+        model: &ModelConfig,
+        features: Features,
+        seed: u64,
+    ) -> Result<Self> {
         let takes = [
             (model.features().noise, Feature::Noise, "denoiser", "noise"),
             (model.tonemapper, Feature::Illumination, "tonemapper", "illumination"),
@@ -63,7 +68,7 @@ impl Networks {
     }
 
     /// Whether there is a denoiser.
-    pub fn has_denoiser(&self) -> bool {
+    pub(crate) fn has_denoiser(&self) -> bool {
         self.denoiser.is_some()
     }
 
@@ -115,7 +120,7 @@ impl Networks {
     ///
     /// # Errors
     /// The device is out of memory or lost.
-    pub fn denoised_image(&mut self, render: &[f32], size: UVec2) -> Result<Image> {
+    pub(crate) fn denoised_image(&mut self, render: &[f32], size: UVec2) -> Result<Image> {
         self.reserve(size)?;
         let gpu = self.gpu.clone();
         let render = gpu.buffer("render", render)?;
@@ -140,7 +145,7 @@ impl Networks {
     ///
     /// # Errors
     /// The file cannot be written, or the device was lost.
-    pub fn save(&self, path: &Path) -> Result<()> {
+    pub(crate) fn save(&self, path: &Path) -> Result<()> {
         let denoiser = self.denoiser.as_ref().map(Denoiser::parameters);
         let tonemapper = self.tonemapper.as_ref().map(Tonemapper::parameters);
         let parameters: Vec<&Parameters> = denoiser.into_iter().chain(tonemapper).collect();
@@ -151,7 +156,7 @@ impl Networks {
     ///
     /// # Errors
     /// The file is missing or damaged, or holds networks of another configuration.
-    pub fn load(&mut self, path: &Path) -> Result<()> {
+    pub(crate) fn load(&mut self, path: &Path) -> Result<()> {
         let gpu = self.gpu.clone();
         let mut parameters: Vec<&mut Parameters> = self.parameters_mut().collect();
         networks::load(path, &mut parameters, &gpu)

@@ -120,7 +120,7 @@ pub struct NetworkRates {
 
 impl NetworkRates {
     /// Those of LITA-GS.
-    pub fn paper() -> Self {
+    pub(crate) fn paper() -> Self {
         Self { denoiser: Denoiser::LEARNING_RATE, tonemapper: Tonemapper::LEARNING_RATE }
     }
 }
@@ -159,7 +159,7 @@ impl ModelConfig {
     }
 
     /// Whether a part is on.
-    pub fn has(&self, part: Part) -> bool {
+    pub(crate) fn has(&self, part: Part) -> bool {
         match part {
             Part::Denoiser => self.denoiser,
             Part::Tonemapper => self.tonemapper,
@@ -170,7 +170,8 @@ impl ModelConfig {
 
     /// Sets what of the parts' constants is LITA-GS's own: how large the networks are, that they begin at random, how fast
     /// they learn, and the denoiser's smoothness.
-    pub fn follow_paper(&mut self) {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn follow_paper(&mut self) {
         let precision = self.network.precision;
         self.network = DenoiserSettings { precision, ..DenoiserSettings::paper() };
         self.rates = NetworkRates::paper();
@@ -178,7 +179,8 @@ impl ModelConfig {
     }
 
     /// Switches exactly these parts on.
-    pub fn set_parts(&mut self, parts: &[Part]) {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn set_parts(&mut self, parts: &[Part]) {
         self.denoiser = parts.contains(&Part::Denoiser);
         self.tonemapper = parts.contains(&Part::Tonemapper);
         self.structure = parts.contains(&Part::Structure);
@@ -186,7 +188,7 @@ impl ModelConfig {
     }
 
     /// What the Gaussians carry for the parts that are on.
-    pub fn features(&self) -> Features {
+    pub(crate) fn features(&self) -> Features {
         Features {
             depth: self.depth,
             structure: self.structure,

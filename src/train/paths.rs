@@ -6,7 +6,7 @@ use super::TrainConfig;
 
 impl TrainConfig {
     /// The same with absolute paths, as a run records it.
-    pub fn with_absolute_paths(mut self) -> Self {
+    pub(crate) fn with_absolute_paths(mut self) -> Self {
         for path in self.paths() {
             // Without a current folder there is nothing that it could be below.
             if let Ok(absolute) = std::path::absolute(&*path) {

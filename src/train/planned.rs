@@ -127,9 +127,20 @@ fn planned(diagnosis: &Diagnosis, config: &TrainConfig, gpu: &Gpu) -> Plan {
     Plan::new(diagnosis, config, gpu.properties().memory)
 }
 
+impl Preset {
+    /// How `nightsplat train --preset` loads a dataset, and [`Trainer::planned`] wants it.
+    ///
+    /// # Errors
+    /// None for the presets that there are.
+    pub fn load_options(self) -> Result<LoadOptions> {
+        let config = Said { preset: Some(self), ..Said::default() }.settings(None)?.config()?;
+        Ok(if self.is_planned() { diagnosed(&config) } else { config.load_options() })
+    }
+}
+
 impl Trainer {
     /// A trainer of what `nightsplat train --preset` trains: the photographs are diagnosed, unless the preset states it all.
-    /// `dataset` is what [`TrainConfig::load_options`] loads.
+    /// `dataset` is what [`Preset::load_options`] loads.
     ///
     /// # Errors
     /// The dataset cannot be used, or the device is out of memory or lost.

@@ -62,7 +62,7 @@ impl Preset {
 
     /// The settings of a preset that trades time for quality, as TOML, in which it differs from the defaults; a benchmark has
     /// those of the paper and more, which depend on curve and scene.
-    pub fn toml(self) -> &'static str {
+    pub(crate) fn toml(self) -> &'static str {
         match self {
             Self::Draft => include_str!("presets/draft.toml"),
             Self::Fast => include_str!("presets/fast.toml"),
@@ -75,12 +75,12 @@ impl Preset {
     }
 
     /// Whether a run with this preset is planned by a diagnosis of its photographs.
-    pub fn is_planned(self) -> bool {
+    pub(crate) fn is_planned(self) -> bool {
         matches!(self, Self::Draft | Self::Fast | Self::Balanced | Self::Best)
     }
 
     /// Whether it has the constants of one of the paper's benchmarks.
-    pub fn is_benchmark(self) -> bool {
+    pub(crate) fn is_benchmark(self) -> bool {
         matches!(self, Self::Lom | Self::RealX3d | Self::Mip360Varying)
     }
 

@@ -24,7 +24,8 @@ impl Rendered {
     ///
     /// # Errors
     /// As [`Renderer::render_image`]; the device is out of memory for the view or the networks.
-    pub fn new<'a>(
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn new<'a>(
         renderer: &mut Renderer,
         gaussians: impl Into<GaussianSlice<'a>>,
         camera: &Camera,

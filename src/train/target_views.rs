@@ -188,12 +188,13 @@ impl TestTargets {
 
 impl Trainer {
     /// What the curves of the training photographs have in common, for [`TestTargets::in_scene`].
-    pub fn scene(&self) -> &Scene {
+    pub(crate) fn scene(&self) -> &Scene {
         &self.scene
     }
 
     /// How bright the targets are; none where the curve's constants say that.
-    pub fn target_exposure(&self) -> Option<&TargetExposure> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn target_exposure(&self) -> Option<&TargetExposure> {
         self.target_exposure.as_ref()
     }
 
@@ -201,7 +202,8 @@ impl Trainer {
     ///
     /// # Errors
     /// The device is out of memory or lost.
-    pub fn held_out_psnr(&mut self) -> Result<Option<f64>> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn held_out_psnr(&mut self) -> Result<Option<f64>> {
         self.held_out_psnr_of_degree(self.sh_degree(self.step))
     }
 
@@ -223,7 +225,7 @@ impl Trainer {
     ///
     /// # Errors
     /// The device is out of memory or lost.
-    pub fn leave_out_what_gains_nothing(&mut self) -> Result<()> {
+    pub(crate) fn leave_out_what_gains_nothing(&mut self) -> Result<()> {
         /// Less on few views, dB, is chance.
         const LEAST_GAIN: f64 = 0.05;
         if !self.networks.as_ref().is_some_and(NetworkTerms::follow_target) {

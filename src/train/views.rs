@@ -404,7 +404,8 @@ impl Views {
             kept.iter().map(|point| frame.from_world(point.position)).collect();
         let seed = Stream::new(config.seed, streams::FEATURES).bits(0);
         let shape = Shape { sh_degree: config.sh_degree, features: config.model.features() };
-        let mut gaussians = init::from_points(&positions, &colors, shape, &config.start, seed)?;
+        let mut gaussians =
+            Gaussians::from_points(&positions, &colors, shape, &config.start, seed)?;
         if config.model.network.form == Form::Identity {
             let low = if shape.features.illumination {
                 let mut photographs = Pictures::new(self, gpu, pseudo_gt, Shown::Photographs);

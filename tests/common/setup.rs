@@ -72,7 +72,7 @@ impl Setup {
         let settings = RenderSettings { shape, ..RenderSettings::default() };
         let options = RenderOptions { sh_degree: shape.sh_degree, background: [0.0, 0.1, 0.2] };
         let mut setup = Self { count, parameters: vec![], camera, settings, options };
-        setup.parameters = vec![0.0; setup.planes().len()];
+        setup.parameters = vec![0.0; setup.planes().float_count()];
         let mut random = Random::new(seed);
         for i in 0..count {
             let gaussian = setup.random_gaussian(&mut random);

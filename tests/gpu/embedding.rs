@@ -136,7 +136,7 @@ fn render_into(host: &Host, gpu: &Gpu, memory: &mut Memory) {
         };
         held = Some(recorded.unwrap());
         let region = [vk::BufferCopy { size: memory.size(), ..Default::default() }];
-        let render = vk::Buffer::from_raw(renderer.render().handle().as_raw());
+        let render = vk::Buffer::from_raw(renderer.render().handle());
         // SAFETY: both buffers are live and hold `size` bytes.
         unsafe { host.device.cmd_copy_buffer(commands, render, memory.buffer, &region) };
     });

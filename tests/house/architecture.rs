@@ -105,6 +105,10 @@ fn the_list_of_layers_names_every_module_once() {
     let layers = layers(&lib);
     assert_eq!(layers.iter().copied().collect::<BTreeSet<_>>(), declared);
     assert_eq!(layers.len(), declared.len(), "a module is listed twice");
+    // For hosts each is private, but for the command.
+    let private = lib.lines().filter_map(|line| line.strip_prefix("mod ")?.strip_suffix(';'));
+    let hidden: BTreeSet<&str> = private.chain(["cli"]).collect();
+    assert_eq!(hidden, declared);
 }
 
 #[test]

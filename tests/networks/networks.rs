@@ -77,7 +77,7 @@ pub(crate) fn assert_gradients(
     assert_eq!(actual.len(), expected.len(), "{what}");
     let tensors = parameters.tensors();
     for pair in tensors.chunks(2) {
-        let range = pair[0].offset..pair[1].offset + pair[1].len();
+        let range = pair[0].offset..pair[1].offset + pair[1].element_count();
         let bound = 1e-4 * largest(&expected[range.clone()]) + 1e-9;
         let what = format!("{what}, {}", pair[0].name);
         assert_close(&what, &actual[range.clone()], &expected[range], |_, _| bound);
@@ -375,14 +375,14 @@ fn weights_begin_as_in_pytorch_and_follow_the_seed() {
         ("0.conv_out.weight", 1.0 / 12.0),
     ] {
         let tensor = find(name);
-        let values = &first[tensor.offset..][..tensor.len()];
+        let values = &first[tensor.offset..][..tensor.element_count()];
         let most = largest(values);
         assert!(most <= bound && most > 0.8 * bound, "{name}: {most} of {bound}");
         assert!(values.iter().any(|x| *x > 0.0) && values.iter().any(|x| *x < 0.0), "{name}");
     }
     let all = |name: &str, value: f32| {
         let tensor = find(name);
-        first[tensor.offset..][..tensor.len()].iter().all(|x| *x == value)
+        first[tensor.offset..][..tensor.element_count()].iter().all(|x| *x == value)
     };
     assert!(all("0.norm.weight", 1.0) && all("1.norm.bias", 0.0));
 }

@@ -42,7 +42,7 @@ impl Learned {
     fn new(gpu: &Gpu, count: usize, shape: Shape, [rest, moments]: [StorageFormat; 2]) -> Self {
         let layout = Layout::new(count, shape, rest);
         let mut gaussians = DeviceGaussians::uninit(gpu, layout).unwrap();
-        let len = layout.floats().len();
+        let len = layout.floats().total();
         gaussians.write(gpu, &wave(len, 0.7, 0.0)).unwrap();
         let moments = match moments {
             StorageFormat::Single => Moments::zeros(gpu, len).unwrap(),

@@ -492,6 +492,7 @@ fn the_library_plans_and_trains_what_the_command_does() {
         }
         trainer.gaussians().unwrap()
     };
-    let planned = Trainer::planned(&gpu, &dataset, Preset::Draft).unwrap();
+    let loaded = Dataset::load(set.path(), &Preset::Draft.load_options().unwrap()).unwrap();
+    let planned = Trainer::planned(&gpu, &loaded, Preset::Draft).unwrap();
     assert!(trained(planned) == trained(Trainer::new(&gpu, config, &dataset).unwrap()));
 }

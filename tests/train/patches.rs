@@ -104,7 +104,7 @@ fn the_gradients_of_the_patches_add_up_to_that_of_the_view() {
     let [expected, norms, visits] = gradients(&whole, &weights);
     let [sums, own_norms, own_visits] = gradients(&setup(Some(2500)), &weights);
     let planes = whole.planes();
-    for column in 0..planes.len() / planes.count {
+    for column in 0..planes.float_count() / planes.count {
         let plane = column * planes.count..(column + 1) * planes.count;
         let largest = expected[plane.clone()].iter().fold(0.0, |a: f32, b| a.max(b.abs()));
         for i in plane {

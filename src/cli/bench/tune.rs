@@ -232,7 +232,7 @@ impl Pass {
         Ok(Self {
             camera,
             d_render: gpu.buffer("d_render", &vec![1e-3; values])?,
-            gradients: gpu.zeros("gradients", gaussians.layout.floats().len())?,
+            gradients: gpu.zeros("gradients", gaussians.layout.floats().total())?,
             grad_norm_sums: gpu.zeros("grad_norm_sums", count)?,
             visit_counts: gpu.zeros("visit_counts", count)?,
             gaussians,

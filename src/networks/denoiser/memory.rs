@@ -62,6 +62,7 @@ impl Extent {
     }
 
     /// What [`Memory::new`] takes.
+    #[cfg(feature = "testing")]
     pub(super) fn bytes(self, settings: DenoiserSettings) -> u64 {
         let images = settings.stages as usize + 3;
         let per_pixel = 2 * settings.channels() + images * RGB as usize;

@@ -82,14 +82,14 @@ impl Default for LoadOptions {
 
 impl LoadOptions {
     /// The size at which a photograph of this size is loaded.
-    pub fn loaded_size(&self, width: u32, height: u32) -> (u32, u32) {
+    pub(crate) fn loaded_size(&self, width: u32, height: u32) -> (u32, u32) {
         let beyond = self.beyond(width, height);
         let side = |pixels: u32| (f64::from(pixels) / self.downscale / beyond).round() as u32;
         (side(width), side(height))
     }
 
     /// Pixels of a photograph of this size to a pixel of it as loaded, each way.
-    pub fn shrink(&self, width: u32, height: u32) -> f64 {
+    pub(crate) fn shrink(&self, width: u32, height: u32) -> f64 {
         self.downscale * self.beyond(width, height)
     }
 

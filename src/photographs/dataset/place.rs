@@ -8,12 +8,14 @@ use crate::camera::{Frame, frame};
 impl Dataset {
     /// The scene's size as 3DGS takes it: 1.1 times the largest distance of a training camera to their mean, world units.
     /// Where all stand in one spot, half of the points are within it; without points it is 1.
-    pub fn extent(&self) -> f64 {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn extent(&self) -> f64 {
         self.place().1
     }
 
     /// Where the scene is trained.
-    pub fn frame(&self) -> Frame {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn frame(&self) -> Frame {
         let (center, extent) = self.place();
         Frame::new(center, extent)
     }

@@ -17,7 +17,7 @@ impl Dataset {
     ///
     /// # Errors
     /// As [`Dataset::photographs`].
-    pub fn stamp(root: &Path, options: &LoadOptions) -> Result<String> {
+    pub(crate) fn stamp(root: &Path, options: &LoadOptions) -> Result<String> {
         options.check()?;
         let files = Files::default();
         let Listing { mut frames, mut skipped, .. } = list(root, &files)?;

@@ -57,6 +57,7 @@ impl Default for Capture {
 
 impl Capture {
     /// Well lit, and without noise.
+    #[cfg(feature = "testing")]
     pub fn clean() -> Self {
         Self { darkening: 1.0, full_well: f64::INFINITY, read_noise: 0.0, ..Self::default() }
     }

@@ -161,7 +161,8 @@ impl Image {
     ///
     /// # Errors
     /// As [`Image::load`].
-    pub fn load_as_stored(path: impl AsRef<Path>) -> Result<Self> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn load_as_stored(path: impl AsRef<Path>) -> Result<Self> {
         let PictureFile { path, bytes } = PictureFile::open(path.as_ref())?;
         Ok(decode(&path, bytes, Some)?.0)
     }
@@ -190,7 +191,7 @@ impl Image {
     ///
     /// # Errors
     /// None but for what no memory is left for.
-    pub fn to_png8(&self) -> Result<Vec<u8>> {
+    pub(crate) fn to_png8(&self) -> Result<Vec<u8>> {
         let mut file = Vec::new();
         PngEncoder::new(&mut file)
             .write_image(&self.to_rgb8(), self.width, self.height, ExtendedColorType::Rgb8)
@@ -199,7 +200,7 @@ impl Image {
     }
 
     /// Red, green and blue of every pixel in 8 bits: values clamped to [0, 1], rounded to nearest.
-    pub fn to_rgb8(&self) -> Vec<u8> {
+    pub(crate) fn to_rgb8(&self) -> Vec<u8> {
         self.interleaved().map(|value| (value.clamp(0.0, 1.0) * 255.0).round() as u8).collect()
     }
 
@@ -207,7 +208,7 @@ impl Image {
     ///
     /// # Errors
     /// [`Error::Output`] where the image has no pixels, or more to a side than JPEG counts.
-    pub fn to_jpeg(&self, quality: u8) -> Result<Vec<u8>> {
+    pub(crate) fn to_jpeg(&self, quality: u8) -> Result<Vec<u8>> {
         let mut file = Vec::new();
         JpegEncoder::new_with_quality(&mut file, quality)
             .write_image(&self.to_rgb8(), self.width, self.height, ExtendedColorType::Rgb8)
@@ -219,7 +220,7 @@ impl Image {
     ///
     /// # Errors
     /// [`Error::Output`] names the file; nothing half-written is left under its name.
-    pub fn save_jpeg(&self, path: impl AsRef<Path>, exif: Option<&[u8]>) -> Result<()> {
+    pub(crate) fn save_jpeg(&self, path: impl AsRef<Path>, exif: Option<&[u8]>) -> Result<()> {
         const QUALITY: u8 = 97;
         let file = self.to_jpeg(QUALITY)?;
         let (start, rest) = file.split_at(jpeg::MAGIC.len());
@@ -249,7 +250,8 @@ impl Image {
     ///
     /// # Errors
     /// As [`Image::save_exr`].
-    pub fn save_exr_as_stored(&self, path: impl AsRef<Path>) -> Result<()> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn save_exr_as_stored(&self, path: impl AsRef<Path>) -> Result<()> {
         exr_file::save(self, path.as_ref(), |value| value)
     }
 

@@ -1,13 +1,10 @@
 //! Which pixels of a photograph count: numbers that its alpha channel and its mask show.
 
 use std::borrow::Cow;
-#[cfg(feature = "io")]
 use std::path::Path;
 
 use super::Image;
-#[cfg(feature = "io")]
 use super::{Orientation, codec::PictureFile};
-#[cfg(feature = "io")]
 use crate::{Error, Result};
 
 /// A weight for every pixel of an image: 1 where it counts, 0 where it is hidden. A pixel that shows something hidden, be it
@@ -41,7 +38,6 @@ impl Mask {
     ///
     /// # Errors
     /// [`Error::Input`] names a file that cannot be read, or a mask of another shape than its photograph.
-    #[cfg(feature = "io")]
     pub fn load(photograph: &Path, file: Option<&Path>, inverted: bool) -> Result<Option<Self>> {
         let (image, alpha) = PictureFile::open(photograph)?.decode()?;
         Self::over(photograph, (&image, alpha.as_ref()), file, inverted)
@@ -51,7 +47,6 @@ impl Mask {
     ///
     /// # Errors
     /// As [`Mask::load`].
-    #[cfg(feature = "io")]
     pub(crate) fn over(
         photograph: &Path,
         (image, alpha): (&Image, Option<&Image>),
@@ -90,14 +85,13 @@ impl Mask {
     }
 
     /// The mask that hides some pixels of an image; none of none.
-    pub fn hiding(image: &Image, pixels: &[usize]) -> Option<Self> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn hiding(image: &Image, pixels: &[usize]) -> Option<Self> {
         let mut weights = vec![1.0; image.pixel_count()];
         pixels.iter().for_each(|&pixel| weights[pixel] = 0.0);
         let Image { width, height, .. } = *image;
         (!pixels.is_empty()).then_some(Self { width, height, weights })
     }
-
-    #[cfg(feature = "io")]
     /// A mask of an image of this size that hides these pixels beside those that `own` hides; none of none.
     pub(crate) fn hiding_too(
         own: Option<Self>,
@@ -114,7 +108,7 @@ impl Mask {
     }
 
     /// The mask of an image of another size.
-    pub fn resized(&self, width: u32, height: u32) -> Cow<'_, Self> {
+    pub(crate) fn resized(&self, width: u32, height: u32) -> Cow<'_, Self> {
         if (width, height) == (self.width, self.height) {
             return Cow::Borrowed(self);
         }
@@ -124,18 +118,19 @@ impl Mask {
     }
 
     /// Whether no pixel counts.
-    pub fn hides_all(&self) -> bool {
+    pub(crate) fn hides_all(&self) -> bool {
         self.hidden().len() == self.weights.len()
     }
 
     /// The pixels that do not count: indices into a plane, ascending.
-    pub fn hidden(&self) -> Vec<usize> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn hidden(&self) -> Vec<usize> {
         let hides = |&(_, &weight): &(usize, &f32)| weight < 0.5;
         self.weights.iter().enumerate().filter(hides).map(|(pixel, _)| pixel).collect()
     }
 
     /// An image whose hidden pixels are black: of what they showed nothing is left, not even where windows reach.
-    pub fn blacked_out(&self, mut image: Image) -> Image {
+    pub(crate) fn blacked_out(&self, mut image: Image) -> Image {
         let pixels = image.pixel_count();
         for pixel in self.resized(image.width, image.height).hidden() {
             (0..3).for_each(|plane| image.data[plane * pixels + pixel] = 0.0);
@@ -144,7 +139,7 @@ impl Mask {
     }
 
     /// Whether one of the four pixels around a place, in pixels, is hidden in part.
-    pub fn hides_around(&self, place: glam::DVec2) -> bool {
+    pub(crate) fn hides_around(&self, place: glam::DVec2) -> bool {
         let [column, row] = (place - 0.5).floor().to_array();
         let at = |value: f64, side: u32| (value.max(0.0) as u32).min(side - 1) as usize;
         [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)].into_iter().any(|(x, y)| {
@@ -154,7 +149,7 @@ impl Mask {
     }
 
     /// The planes of an image without the pixels that do not count.
-    pub fn counted(&self, image: &Image) -> Vec<f32> {
+    pub(crate) fn counted(&self, image: &Image) -> Vec<f32> {
         let own = self.resized(image.width, image.height);
         let pixels = image.pixel_count().max(1);
         let values = image.data.iter().enumerate();

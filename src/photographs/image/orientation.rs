@@ -54,13 +54,14 @@ impl Image {
     ///
     /// # Errors
     /// As there.
-    pub fn load_upright(path: impl AsRef<Path>) -> Result<Self> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn load_upright(path: impl AsRef<Path>) -> Result<Self> {
         let path = path.as_ref();
         Ok(Self::load(path)?.turned(Orientation::of(path)))
     }
 
     /// The image as it is seen.
-    pub fn turned(self, orientation: Orientation) -> Self {
+    pub(crate) fn turned(self, orientation: Orientation) -> Self {
         if orientation == Orientation::UPRIGHT {
             return self;
         }

@@ -11,6 +11,7 @@ impl PseudoGt {
     ///
     /// # Errors
     /// There are no pixels, or the device is out of memory or lost.
+    #[cfg(feature = "testing")]
     pub fn measure(&mut self, planes: &[f32]) -> Result<Measured> {
         let tiles = self.tiles(planes)?;
         let tiles: Vec<&Buffer<f32>> = tiles.iter().collect();

@@ -266,7 +266,6 @@ impl From<Exposure> for Written {
 }
 
 /// Says that nothing can be lifted.
-#[cfg(feature = "io")]
 pub(crate) fn all_black(path: &std::path::Path) -> crate::Error {
     let problem = "every photograph is as good as black (99 % of its pixels are below 2 of 255); expose longer, or name \
                    a curve with --curve";

@@ -62,12 +62,14 @@ pub struct Family {
     /// The constants in the formula's order.
     pub constants: &'static [Constant],
     /// The values of t between which the formula acts; beyond, the curve is constant.
+    #[cfg_attr(not(feature = "testing"), expect(dead_code, reason = "what tests hold a curve to"))]
     pub domain: [f64; 2],
     /// With its default constants the clamped curve never falls.
     pub monotone: bool,
     /// With its default constants the curve never passes 1, so nothing clips.
     pub bounded: bool,
     /// Data determine the constants one by one; otherwise a fit finds one of many that are alike.
+    #[cfg_attr(not(feature = "testing"), expect(dead_code, reason = "what tests hold a curve to"))]
     pub identifiable: bool,
     /// How black level and gain join the shape.
     pub law: Law,
@@ -91,12 +93,14 @@ impl Family {
     }
 
     /// df/dt, exact; at a knee that of one of the sides.
+    #[cfg(feature = "testing")]
     pub fn derivative(&self, t: f64, constants: &[f64]) -> f64 {
         let constants = padded(constants).map(Dual::of);
         curve_shape(self.curve as u32, within(Dual::variable(t)), &constants).derivative
     }
 
     /// df/dc of every constant, exact.
+    #[cfg(feature = "testing")]
     pub fn gradient(&self, t: f64, constants: &[f64]) -> Vec<f64> {
         let derivative = |index: usize| {
             let mut constants = padded(constants).map(Dual::of);

@@ -55,7 +55,8 @@ pub struct Lift {
 impl ToneSettings {
     /// What the training photographs of a scene decide together; none where their exposure is asked for and all are as
     /// good as black, or there are none.
-    pub fn scene(&self, training: &[Measured]) -> Option<Scene> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn scene(&self, training: &[Measured]) -> Option<Scene> {
         let exposure = if self.takes_exposure() {
             let found = Exposure::of(training.iter().map(|one| &one.luminance), self.brightness)?;
             let seen = training.iter().map(|one| Some((&one.luminance, one.camera?)));
@@ -73,7 +74,8 @@ impl ToneSettings {
     }
 
     /// How a photograph of the scene is lifted.
-    pub fn lift(&self, scene: &Scene, photograph: &Measured) -> Lift {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn lift(&self, scene: &Scene, photograph: &Measured) -> Lift {
         let statistics = scene.statistics.as_ref().unwrap_or(&photograph.statistics);
         let parameters = self.parameters(statistics);
         let Some(exposure) = &scene.exposure else {

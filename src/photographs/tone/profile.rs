@@ -42,7 +42,8 @@ impl Profile {
     ///
     /// # Errors
     /// A number is not finite or beyond reason, the rows of the matrix do not keep grey, or a channel falls.
-    pub fn check(&self) -> Result<(), String> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn check(&self) -> Result<(), String> {
         if self.pairs == 0 {
             return Err("it was fitted to 0 pairs; it takes one at least".to_owned());
         }
@@ -84,19 +85,21 @@ impl Profile {
     }
 
     /// What a score of its results is to be called.
-    pub fn label(&self) -> String {
+    pub(crate) fn label(&self) -> String {
         let Self { reference, pairs, .. } = self;
         let pairs = if *pairs == 1 { "a pair".to_owned() } else { format!("{pairs} pairs") };
         format!("a camera profile of {pairs} of {reference}")
     }
 
     /// The colour, in [0, 1], of k x.
-    pub fn value(&self, t: [f64; 3]) -> [f64; 3] {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn value(&self, t: [f64; 3]) -> [f64; 3] {
         profiled(t, &self.numbers())
     }
 
     /// (3, `PROFILE_WIDTH`) numbers as the kernel takes them.
-    pub fn rows(&self) -> Vec<f32> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn rows(&self) -> Vec<f32> {
         self.numbers().into_iter().map(|number| number as f32).collect()
     }
 

@@ -104,6 +104,7 @@ pub(crate) struct Dual {
 
 impl Dual {
     /// The variable itself.
+    #[cfg(feature = "testing")]
     pub(crate) fn variable(value: f64) -> Self {
         Self { value, derivative: 1.0 }
     }

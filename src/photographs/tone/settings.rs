@@ -63,7 +63,6 @@ pub struct ToneSettings {
 const MOST: f64 = 1e30;
 
 /// Settings that belong to a curve: they do not outlast the choice of another one.
-#[cfg(feature = "io")]
 pub(crate) const OF_CURVE: [&str; 8] =
     ["gain_c", "alpha", "auto_gain", "colour", "lift_first", "constants", "table", "profile"];
 
@@ -82,7 +81,7 @@ impl<T: Real> From<&ToneSettings> for Numbers<T> {
 
 impl ToneSettings {
     /// A row for each setting.
-    pub const SETTINGS: &'static [Setting] = settings::settings! { rows "tone."
+    pub(crate) const SETTINGS: &'static [Setting] = settings::settings! { rows "tone."
         /// The tone curve: a name that `nightsplat curves` lists.
         curve => Rule::Text("a curve that `nightsplat curves` lists", |name| name.parse::<ToneCurve>().is_ok()), "--curve NAME|FILE";
         /// c: how much a brighter photograph raises the curve's gain.
@@ -140,7 +139,8 @@ impl ToneSettings {
     /// Another curve with its own constants, c and alpha; theta, beta, g0, brightness and the choice of statistics stay. The
     /// same curve keeps everything.
     #[must_use]
-    pub fn with_curve(&self, curve: ToneCurve) -> Self {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn with_curve(&self, curve: ToneCurve) -> Self {
         if curve == self.curve {
             return self.clone();
         }
@@ -150,7 +150,8 @@ impl ToneSettings {
 
     /// The same curve with another gain. One that the photographs ask for belongs to photographs at their own size.
     #[must_use]
-    pub fn with_gain(self, gain: GainChoice) -> Self {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn with_gain(self, gain: GainChoice) -> Self {
         match gain {
             GainChoice::Auto => Self { auto_gain: true, lift_first: true, ..self },
             GainChoice::C(gain_c) if self.auto_gain => {
@@ -162,7 +163,8 @@ impl ToneSettings {
 
     /// The same with every number as the shortest decimal that is the same number to the kernels, which compute in 32 bits.
     #[must_use]
-    pub fn rounded(self) -> Self {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn rounded(self) -> Self {
         let round = |value: f64| {
             let single = value as f32;
             // Of no consequence to a kernel, and hundreds of digits long.
@@ -178,22 +180,24 @@ impl ToneSettings {
     }
 
     /// Whether the gain follows from the photographs' [`super::Exposure`].
-    pub fn takes_exposure(&self) -> bool {
+    pub(crate) fn takes_exposure(&self) -> bool {
         self.auto_gain || self.curve == ToneCurve::Auto
     }
 
     /// The curve of a table of values.
-    pub fn of_table(table: Table) -> Self {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn of_table(table: Table) -> Self {
         Self { table: Some(table), ..Self::new(ToneCurve::Table) }
     }
 
     /// The curve of a camera profile, which follows the exposure of the photographs as the automatic curve does.
-    pub fn of_profile(profile: Profile) -> Self {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn of_profile(profile: Profile) -> Self {
         Self { profile: Some(profile), ..Self::new(ToneCurve::Profile) }
     }
 
     /// What the targets know of reference images, where they know any: results are labelled with it.
-    pub fn knows_references(&self) -> Option<String> {
+    pub(crate) fn knows_references(&self) -> Option<String> {
         self.profile.as_ref().map(Profile::label)
     }
 
@@ -201,7 +205,8 @@ impl ToneSettings {
     ///
     /// # Errors
     /// [`Error::Setting`], and [`Error::Usage`] for what does not go together.
-    pub fn check(&self) -> Result<()> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn check(&self) -> Result<()> {
         let values: [(&str, &dyn Any); 7] = [
             ("tone.gain_c", &self.gain_c),
             ("tone.theta", &self.theta),
@@ -298,7 +303,8 @@ impl ToneSettings {
 
     /// delta0 = alpha (1 - r)^beta: the black level of a photograph with r = p10 / p90. The automatic curve has alpha for
     /// every photograph.
-    pub fn offset(&self, ratio: f64) -> f64 {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn offset(&self, ratio: f64) -> f64 {
         if self.curve == ToneCurve::Auto {
             self.alpha
         } else {
@@ -308,7 +314,8 @@ impl ToneSettings {
 
     /// The curve that these settings give a photograph with these statistics; where the gain follows from the exposure, it
     /// is another ([`Self::lift`]).
-    pub fn parameters(&self, statistics: &Statistics) -> ToneParameters {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn parameters(&self, statistics: &Statistics) -> ToneParameters {
         if self.curve == ToneCurve::Profile {
             return ToneParameters {
                 white: 1.0,
@@ -335,7 +342,7 @@ impl ToneSettings {
     }
 
     /// The value that t = 1 stands for.
-    pub fn white(&self) -> White {
+    pub(crate) fn white(&self) -> White {
         match &self.table {
             Some(table) => table.input.white(),
             None if matches!(self.curve, ToneCurve::Auto | ToneCurve::Profile) => White::One,
@@ -346,7 +353,8 @@ impl ToneSettings {
     /// The curve at t = x / p90, in [0, 1], for a photograph with these statistics; of a table of three channels, and of a
     /// profile, green.
     /// `lum_preserve` and `per_channel` are shown as they map grey.
-    pub fn value(&self, t: f64, statistics: &Statistics) -> f64 {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn value(&self, t: f64, statistics: &Statistics) -> f64 {
         let grey = Statistics { channel_means: [statistics.mean; 3], ..*statistics };
         let ToneParameters { mut white, offset, gain, constants, .. } = self.parameters(&grey);
         if self.white() == White::ChannelMeans {
@@ -365,7 +373,8 @@ impl ToneSettings {
     }
 
     /// Statistics that leave a curve as its formula has it: no black level, gain 1, and t = 1 where it has white.
-    pub fn plain_statistics(&self) -> Statistics {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn plain_statistics(&self) -> Statistics {
         let theta = self.theta as f32;
         let means = Statistics { mean: theta, channel_means: [theta; 3], ..Statistics::default() };
         Statistics { p10: 1.0, p80: theta, p90: 1.0, ..means }

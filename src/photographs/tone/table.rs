@@ -47,7 +47,8 @@ impl Table {
     ///
     /// # Errors
     /// What is wrong, with the line.
-    pub fn from_csv(text: &str) -> Result<Self, String> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn from_csv(text: &str) -> Result<Self, String> {
         let mut rows = Rows::default();
         let mut input = TableInput::T;
         for (line, text) in content(text) {
@@ -73,7 +74,8 @@ impl Table {
     ///
     /// # Errors
     /// What is wrong, with the line.
-    pub fn from_cube(text: &str) -> Result<Self, String> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn from_cube(text: &str) -> Result<Self, String> {
         let mut rows = Rows::default();
         let (mut size, mut low, mut high) = (0, 0.0, 1.0);
         for (line, text) in content(text) {
@@ -133,7 +135,8 @@ impl Table {
     }
 
     /// (3, K) knots (x, y, slope) as the kernel takes them.
-    pub fn knots(&self) -> Vec<Vec3> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn knots(&self) -> Vec<Vec3> {
         let channels = (0..3).map(|channel| self.channel(channel));
         channels
             .flatten()
@@ -142,7 +145,8 @@ impl Table {
     }
 
     /// The table at `x`, in [0, 1], of a channel from 0 to 2.
-    pub fn value(&self, x: f64, channel: usize) -> f64 {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn value(&self, x: f64, channel: usize) -> f64 {
         clamped(interpolate(&self.channel(channel), x))
     }
 

@@ -99,6 +99,7 @@ impl Fisheye {
     }
 
     /// By k1 to k4.
+    #[cfg(feature = "testing")]
     pub(super) fn distortion_backward(
         &self,
         point: DVec3,

@@ -25,7 +25,8 @@ pub struct Leftover {
 
 impl Leftover {
     /// That of a view's render, over the pixels that its mask shows; none where there are none, or it is no render.
-    pub fn of(rendered: &Rendered, view: &View) -> Option<Self> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn of(rendered: &Rendered, view: &View) -> Option<Self> {
         let mut counted = rendered.transmittances.clone()?;
         if let Some(mask) = &view.mask {
             let mask = mask.resized(rendered.colors.width, rendered.colors.height);
@@ -44,7 +45,7 @@ impl Leftover {
     }
 
     /// The mean of each over several views; none of none.
-    pub fn mean(views: impl Iterator<Item = Self>) -> Option<Self> {
+    pub(crate) fn mean(views: impl Iterator<Item = Self>) -> Option<Self> {
         let (mut sum, mut count) = (Self { mean: 0.0, q99: 0.0 }, 0);
         for Self { mean, q99 } in views {
             (sum.mean, sum.q99, count) = (sum.mean + mean, sum.q99 + q99, count + 1);

@@ -57,23 +57,13 @@ pub fn plot(x_name: &str, y_name: &str, series: &[Series]) -> String {
     draw(x_name, y_name, series, &Extras::default())
 }
 
-/// As [`plot`], with `lines` where they lie within the x axis.
-pub fn plot_with_lines(
-    x_name: &str,
-    y_name: &str,
-    series: &[Series],
-    lines: &[VerticalLine],
-) -> String {
-    draw(x_name, y_name, series, &Extras { lines, ..Extras::default() })
-}
-
 /// As [`plot`], for few points (PSNR against a setting, say): each has a dot, and `marks` are drawn as stars.
 pub fn plot_points(x_name: &str, y_name: &str, series: &[Series], marks: &[Mark]) -> String {
     draw(x_name, y_name, series, &Extras { dot: 3.5, marks, ..Extras::default() })
 }
 
-/// As [`plot_with_lines`], for more series than one plot tells apart: a plot for every few of them, one below the other, all
-/// with the same axes.
+/// As [`plot`], with `lines` where they lie within the x axis, and for more series than one plot tells apart: a plot for every
+/// few of them, one below the other, all with the same axes.
 pub fn plot_in_groups(
     x_name: &str,
     y_name: &str,

@@ -107,16 +107,10 @@ impl RunDirectory {
         Ok(lock)
     }
 
-    /// Makes the directory and writes the configuration. A run that was there before stays until [`RunDirectory::settle`].
+    /// Writes the configuration into a directory that is locked. A run that was there before stays until [`RunDirectory::settle`].
     ///
     /// # Errors
-    /// It holds a run already and `overwrite` is false, or somebody else's files; another process trains there; or it cannot
-    /// be written.
-    pub fn create(path: &Path, config: &TrainConfig, overwrite: bool) -> Result<Self> {
-        Self::check(path, overwrite)?;
-        Self::create_locked(path, Self::lock(path)?, config, overwrite)
-    }
-
+    /// It holds a run already and `overwrite` is false, or it cannot be written.
     pub(super) fn create_locked(
         path: &Path,
         lock: RunLock,
@@ -418,15 +412,20 @@ mod tests {
     use super::*;
     use crate::results::run::{load_config, load_model};
 
+    fn create(path: &Path, config: &TrainConfig, overwrite: bool) -> Result<RunDirectory> {
+        RunDirectory::check(path, overwrite)?;
+        RunDirectory::create_locked(path, RunDirectory::lock(path)?, config, overwrite)
+    }
+
     #[test]
     fn a_run_is_only_replaced_when_asked() {
         let folder = tempfile::tempdir().unwrap();
         let config = TrainConfig::default();
-        drop(RunDirectory::create(folder.path(), &config, false).unwrap());
+        drop(create(folder.path(), &config, false).unwrap());
         std::fs::write(folder.path().join("notes.txt"), "mine").unwrap();
-        let error = RunDirectory::create(folder.path(), &config, false).unwrap_err();
+        let error = create(folder.path(), &config, false).unwrap_err();
         assert!(error.to_string().contains("--overwrite"), "{error}");
-        drop(RunDirectory::create(folder.path(), &config, true).unwrap());
+        drop(create(folder.path(), &config, true).unwrap());
         assert!(folder.path().join("notes.txt").exists());
         assert_eq!(load_config(folder.path()).unwrap(), config);
     }
@@ -435,7 +434,7 @@ mod tests {
     fn an_unfinished_run_has_no_model() {
         let folder = tempfile::tempdir().unwrap();
         assert!(load_config(folder.path()).unwrap_err().to_string().contains("config.toml"));
-        drop(RunDirectory::create(folder.path(), &TrainConfig::default(), false).unwrap());
+        drop(create(folder.path(), &TrainConfig::default(), false).unwrap());
         assert!(
             load_model(folder.path(), false).unwrap_err().to_string().contains("did not finish")
         );
@@ -444,7 +443,7 @@ mod tests {
     #[test]
     fn a_run_that_goes_on_keeps_its_progress_up_to_there() {
         let folder = tempfile::tempdir().unwrap();
-        let run = RunDirectory::create(folder.path(), &TrainConfig::default(), false).unwrap();
+        let run = create(folder.path(), &TrainConfig::default(), false).unwrap();
         assert!(run.progress(9).is_empty());
         let progress = |step, seconds, joules| Progress {
             step,
@@ -468,8 +467,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("file");
         std::fs::write(&file, "").unwrap();
-        let error =
-            RunDirectory::create(&file.join("run"), &TrainConfig::default(), false).unwrap_err();
+        let error = create(&file.join("run"), &TrainConfig::default(), false).unwrap_err();
         assert!(error.to_string().contains("file"), "{error}");
     }
 }

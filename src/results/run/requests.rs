@@ -17,17 +17,19 @@ const STOPS: [Stop; 3] = [Stop::Interrupted, Stop::Terminated, Stop::TimeUp];
 
 impl Requests {
     /// Asks to save and stop.
+    #[cfg(feature = "testing")]
     pub fn stop(&self, cause: Stop) {
         self.stop.store(Self::code(cause), Ordering::Relaxed);
     }
 
     /// Asks to save and go on.
+    #[cfg(feature = "testing")]
     pub fn save(&self) {
         self.save.store(true, Ordering::Relaxed);
     }
 
     /// What asked to stop, if anything did.
-    pub fn stops(&self) -> Option<Stop> {
+    pub(crate) fn stops(&self) -> Option<Stop> {
         let place = self.stop.load(Ordering::Relaxed).checked_sub(1)?;
         STOPS.get(place).copied()
     }
@@ -38,17 +40,17 @@ impl Requests {
     }
 
     /// For signal handlers, which may store a number and nothing more: where, and the number of a cause.
-    pub fn stop_flag(&self) -> &Arc<AtomicUsize> {
+    pub(crate) fn stop_flag(&self) -> &Arc<AtomicUsize> {
         &self.stop
     }
 
     /// The number that stands for a cause in [`Requests::stop_flag`].
-    pub fn code(cause: Stop) -> usize {
+    pub(crate) fn code(cause: Stop) -> usize {
         STOPS.iter().position(|&stop| stop == cause).map_or(0, |place| place + 1)
     }
 
     /// As [`Requests::stop_flag`], of [`Requests::save`].
-    pub fn save_flag(&self) -> &Arc<AtomicBool> {
+    pub(crate) fn save_flag(&self) -> &Arc<AtomicBool> {
         &self.save
     }
 }

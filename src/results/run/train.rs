@@ -52,10 +52,8 @@ pub struct Session<'a> {
 /// ```no_run
 /// use std::path::Path;
 ///
-/// use nightsplat::photographs::dataset::Dataset;
-/// use nightsplat::gpu::{DeviceChoice, Gpu};
-/// use nightsplat::results::run::{self, Event, HeldRun};
-/// use nightsplat::train::TrainConfig;
+/// use nightsplat::run::{self, Event, HeldRun};
+/// use nightsplat::{Dataset, DeviceChoice, Gpu, TrainConfig};
 ///
 /// let config = TrainConfig { dataset: "photos".into(), steps: 2000, ..TrainConfig::default() };
 /// let gpu = Gpu::new(&DeviceChoice::Best)?;

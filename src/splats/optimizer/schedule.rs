@@ -16,12 +16,13 @@ pub struct LearningRates(pub [f64; ATTRIBUTES.len()]);
 
 impl LearningRates {
     /// One rate for every column.
-    pub const fn uniform(rate: f64) -> Self {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) const fn uniform(rate: f64) -> Self {
         Self([rate; ATTRIBUTES.len()])
     }
 
     /// Every rate times `factor`.
-    pub fn scaled(self, factor: f64) -> Self {
+    pub(crate) fn scaled(self, factor: f64) -> Self {
         Self(self.0.map(|rate| factor * rate))
     }
 }
@@ -110,7 +111,7 @@ const MOST_RATE: f64 = 100.0;
 
 impl LearningRates {
     /// A row for each rate.
-    pub fn settings() -> impl Iterator<Item = Setting> {
+    pub(crate) fn settings() -> impl Iterator<Item = Setting> {
         ATTRIBUTES.iter().map(|spec| Setting {
             key: format!("schedule.initial_rates.{}", spec.name).into(),
             rule: match spec.attribute {
@@ -131,7 +132,7 @@ impl Schedule {
     ///
     /// # Errors
     /// [`Error::Setting`](crate::Error::Setting).
-    pub fn check(&self) -> Result<()> {
+    pub(crate) fn check(&self) -> Result<()> {
         self.check_rows()?;
         LearningRates::settings()
             .zip(&self.initial_rates.0)
@@ -139,7 +140,7 @@ impl Schedule {
     }
 
     /// Density control acts between steps 500 and 5 000, every 200 steps, and every step sees whole views (LITA-GS).
-    pub fn paper() -> Self {
+    pub(crate) fn paper() -> Self {
         Self {
             boost: 1.0,
             boost_steps: 0,
@@ -153,7 +154,8 @@ impl Schedule {
     }
 
     /// The rates of `step` in a scene of `extent`: the means' decay log-linearly, the others stay.
-    pub fn learning_rates(&self, step: u64, extent: f64) -> LearningRates {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn learning_rates(&self, step: u64, extent: f64) -> LearningRates {
         let done = (step as f64 / self.means_rate_steps.max(1) as f64).min(1.0);
         let mut rates = self.initial_rates;
         let decay = (self.final_means_rate / rates[Attribute::Means]).powf(done);
@@ -169,31 +171,31 @@ impl Schedule {
     }
 
     /// The SH degree that `step` trains, at most `max`.
-    pub fn sh_degree(&self, step: u64, max: u32) -> u32 {
+    pub(crate) fn sh_degree(&self, step: u64, max: u32) -> u32 {
         let degree = step / self.sh_degree_interval.max(1);
         degree.min(u64::from(max)) as u32
     }
 
     /// Whether density control acts at the end of `step`.
-    pub fn densifies_at(&self, step: u64) -> bool {
+    pub(crate) fn densifies_at(&self, step: u64) -> bool {
         step > self.densify_after
             && step < self.densify_before
             && step.is_multiple_of(self.densify_interval.max(1))
     }
 
     /// The step behind which density control acts first, if it ever does.
-    pub fn first_round(&self) -> u64 {
+    pub(crate) fn first_round(&self) -> u64 {
         let interval = self.densify_interval.max(1);
         (self.densify_after / interval).saturating_add(1).saturating_mul(interval)
     }
 
     /// What learning rates are multiplied by after this share of the settling phase.
-    pub fn settling_rate(&self, done: f64) -> f64 {
+    pub(crate) fn settling_rate(&self, done: f64) -> f64 {
         self.settle_rate.powf(done.clamp(0.0, 1.0))
     }
 
     /// How often the views of `step` are halved.
-    pub fn resolution_level(&self, step: u64) -> usize {
+    pub(crate) fn resolution_level(&self, step: u64) -> usize {
         match self.resolution_steps {
             [quarter, _] if step < quarter => 2,
             [_, half] if step < half => 1,
@@ -202,20 +204,20 @@ impl Schedule {
     }
 
     /// How many levels of resolution the steps use.
-    pub fn resolution_levels(&self) -> usize {
+    pub(crate) fn resolution_levels(&self) -> usize {
         1 + self.resolution_level(1)
     }
 
     /// The number of rounds of density control from the end of `step` on, one there included, where none comes after
     /// step `last`.
-    pub fn rounds_left(&self, step: u64, last: u64) -> u64 {
+    pub(crate) fn rounds_left(&self, step: u64, last: u64) -> u64 {
         let interval = self.densify_interval.max(1);
         self.densify_before.saturating_sub(1).min(last).saturating_sub(step) / interval + 1
     }
 
     /// The weight w of the near-camera damping of the screen gradients that density control reads: they are
     /// multiplied by w min(1, (z / extent)^2) + 1 - w (Pixel-GS).
-    pub fn damping_weight(&self, step: u64) -> f32 {
+    pub(crate) fn damping_weight(&self, step: u64) -> f32 {
         match self.damping_steps {
             [full, _] if step < full => 1.0,
             [_, half] if step < half => 0.5,

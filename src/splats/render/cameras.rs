@@ -55,6 +55,7 @@ impl Viewpoints {
 }
 
 /// What the gradient of a camera takes. Nothing learns a camera yet.
+#[cfg(feature = "testing")]
 #[derive(Debug)]
 pub struct CameraGradient {
     model: CameraModel,
@@ -64,6 +65,7 @@ pub struct CameraGradient {
     shares: Buffer<f32>,
 }
 
+#[cfg(feature = "testing")]
 impl CameraGradient {
     /// Numbers of the gradient: of a shift of the view, world units, and of a turn about the camera, radians, (x, y, z) each in
     /// the view; of focal lengths, principal point and the four coefficients of a fisheye.

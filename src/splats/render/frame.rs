@@ -47,7 +47,7 @@ impl Status {
 
 /// What the passes hand each other; buffers by what their length follows. Public for tests alone.
 #[derive(Debug)]
-#[expect(missing_docs, reason = "each is declared in the kernels that write and read it")]
+#[allow(missing_docs, reason = "each is declared in the kernels that write and read it")]
 pub struct Frame {
     /// Values per pixel.
     channels: usize,
@@ -162,7 +162,6 @@ impl Frame {
     }
 
     /// What each Gaussian takes, in bytes.
-    #[cfg(feature = "io")]
     pub(super) fn bytes_per_gaussian(&self) -> usize {
         let color = color_vectors(self.channels) * size_of::<Vec3>();
         let numbers = 4 * size_of::<f32>() + size_of::<UVec2>();
@@ -170,7 +169,6 @@ impl Frame {
     }
 
     /// What each intersection takes, in bytes.
-    #[cfg(feature = "io")]
     pub(super) fn bytes_per_intersection(&self) -> usize {
         3 * size_of::<u32>() + self.record_vectors() * size_of::<Vec3>()
     }

@@ -23,7 +23,8 @@ impl RenderSettings {
 
     /// The most Gaussians that this device can render and train: some passes read the splat and the colour of any of them,
     /// which one binding has to hold. What else there is of them is bound in [`Batches`](crate::splats::batches::Batches).
-    pub fn most_gaussians(&self, gpu: &Gpu) -> usize {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn most_gaussians(&self, gpu: &Gpu) -> usize {
         let color = color_vectors(self.channels()) * size_of::<Vec3>();
         let bytes = size_of::<ProjectedSplat>().max(color) as u64;
         (gpu.properties().max_storage_buffer_range / bytes).min(u32::MAX.into()) as usize
@@ -34,7 +35,8 @@ impl RenderSettings {
     ///
     /// # Errors
     /// As there.
-    pub fn tile_for(
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn tile_for(
         &self,
         gpu: &Gpu,
         sizes: impl Iterator<Item = [u32; 2]> + Clone,
@@ -63,7 +65,13 @@ impl RenderSettings {
     ///
     /// # Errors
     /// [`Error::Usage`] names the view, the limit, and the longest side that it leaves; the tile does not suit the device.
-    pub fn check_size(&self, gpu: &Gpu, view: &str, [width, height]: [u32; 2]) -> Result<()> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn check_size(
+        &self,
+        gpu: &Gpu,
+        view: &str,
+        [width, height]: [u32; 2],
+    ) -> Result<()> {
         let Properties { name: device, max_storage_buffer_range: bindable, .. } = gpu.properties();
         let [tile_width, tile_height] = self.tile_for(gpu, std::iter::once([width, height]))?.size;
         let bytes_per_pixel = (self.channels() * size_of::<f32>()) as u64;

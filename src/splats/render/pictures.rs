@@ -10,7 +10,8 @@ use crate::splats::scene::GaussianSlice;
 
 impl Renderer {
     /// What a view is rendered in: all of it where the device takes that at once, else patches that it takes.
-    pub fn patches(&self, camera: &Camera) -> Vec<Patch> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn patches(&self, camera: &Camera) -> Vec<Patch> {
         self.patches_with_margin(camera, 0, |_| true)
     }
 
@@ -67,7 +68,8 @@ impl Renderer {
     ///
     /// # Errors
     /// As [`Renderer::render_image`].
-    pub fn render_planes<'a>(
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn render_planes<'a>(
         &mut self,
         gaussians: impl Into<GaussianSlice<'a>>,
         camera: &Camera,
@@ -99,7 +101,6 @@ impl Renderer {
     ///
     /// # Errors
     /// The image exceeds what was reserved, or the device is lost.
-    #[cfg(feature = "io")]
     pub(crate) fn count_intersections(
         &mut self,
         gaussians: GaussianSlice<'_>,
@@ -132,7 +133,7 @@ impl Renderer {
     ///
     /// # Errors
     /// As [`Renderer::render_image`].
-    pub fn render_patch<'a>(
+    pub(crate) fn render_patch<'a>(
         &mut self,
         gaussians: impl Into<GaussianSlice<'a>>,
         patch: &Patch,

@@ -28,7 +28,8 @@ impl Renderer {
     ///
     /// # Errors
     /// The device is out of memory, or cannot follow so many tiles.
-    pub fn reserve_sizes(
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn reserve_sizes(
         &mut self,
         gaussian_count: usize,
         capacity: usize,
@@ -58,19 +59,18 @@ impl Renderer {
     }
 
     /// The most intersections of a view whose records the device can bind at once.
-    pub fn most_intersections(&self) -> u32 {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn most_intersections(&self) -> u32 {
         self.frame.most_intersections(&self.gpu)
     }
 
     /// What each Gaussian takes beside its own numbers, in bytes.
-    #[cfg(feature = "io")]
     pub(crate) fn bytes_per_gaussian(&self) -> usize {
         self.frame.bytes_per_gaussian() + self.depth_sort.bytes_per_item()
     }
 
     /// What the buffers take that follow the numbers of Gaussians and intersections, those of the sorts left out, which come
     /// with the first render; in bytes.
-    #[cfg(feature = "io")]
     pub(crate) fn reserved_bytes(&self) -> usize {
         let frame = &self.frame;
         frame.splats.len() * frame.bytes_per_gaussian()
@@ -78,13 +78,11 @@ impl Renderer {
     }
 
     /// What each intersection of a view takes, in bytes.
-    #[cfg(feature = "io")]
     pub(crate) fn bytes_per_intersection(&self) -> usize {
         self.frame.bytes_per_intersection() + self.tile_sort.bytes_per_item()
     }
 
     /// How many intersections there is room for.
-    #[cfg(feature = "io")]
     pub(crate) fn intersection_capacity(&self) -> u32 {
         self.frame.intersection_capacity()
     }
@@ -93,7 +91,8 @@ impl Renderer {
     ///
     /// # Errors
     /// The device is out of memory.
-    pub fn set_intersection_capacity(&mut self, intersections: u32) -> Result<()> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn set_intersection_capacity(&mut self, intersections: u32) -> Result<()> {
         self.frame.set_intersection_capacity(&self.gpu, intersections)
     }
 

@@ -56,7 +56,8 @@ impl RenderSettings {
     ///
     /// # Errors
     /// A subgroup's part has no whole number of rows of lanes, or more than 32.
-    pub fn tile_on(&self, gpu: &Gpu) -> Result<Tile> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn tile_on(&self, gpu: &Gpu) -> Result<Tile> {
         let built_in = match self.channels() {
             _ if !gpu.properties().is_cpu => GPU_TILE,
             0..=CPU_TILE_CHANNELS => CPU_TILE,
@@ -77,7 +78,8 @@ impl RenderSettings {
     }
 
     /// Values per pixel of a render: RGB and the features.
-    pub fn channels(&self) -> usize {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn channels(&self) -> usize {
         self.shape.features.channels()
     }
 

@@ -24,28 +24,31 @@ pub struct Layout {
 
 impl Layout {
     /// Of `count` Gaussians, with memory for no more.
-    pub fn new(count: usize, shape: impl Into<Shape>, sh_rest: StorageFormat) -> Self {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn new(count: usize, shape: impl Into<Shape>, sh_rest: StorageFormat) -> Self {
         Self { count, capacity: count, shape: shape.into(), sh_rest }
     }
 
     /// What planes of one float for each parameter are made of, as gradients and moments are.
-    pub fn floats(&self) -> PlaneCounts {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn floats(&self) -> PlaneCounts {
         let features = self.shape.features.width();
         PlaneCounts { gaussians: self.count, columns: width(self.shape), features }
     }
 
     /// Words of each Gaussian's parameters.
-    pub fn words(&self) -> usize {
+    pub(crate) fn words(&self) -> usize {
         self.sh_rest.words(self.floats())
     }
 
     /// How planes of one float for each parameter lie in a buffer.
-    pub fn batches(&self, gpu: &Gpu) -> Batches {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn batches(&self, gpu: &Gpu) -> Batches {
         Batches::new(gpu, self.floats())
     }
 
     /// How the parameters do.
-    pub fn parameter_batches(&self, gpu: &Gpu) -> Batches {
+    pub(crate) fn parameter_batches(&self, gpu: &Gpu) -> Batches {
         self.batches(gpu).with_columns(self.words())
     }
 }
@@ -81,14 +84,15 @@ impl DeviceGaussians {
     ///
     /// # Errors
     /// The device is out of memory.
-    pub fn uninit(gpu: &Gpu, layout: Layout) -> Result<Self> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn uninit(gpu: &Gpu, layout: Layout) -> Result<Self> {
         let len = layout.capacity.max(layout.count) * layout.words();
         let parameters = gpu.uninit_in_windows("parameters", len)?;
         Ok(Self { layout, parameters, origin: DVec3::ZERO })
     }
 
     /// To be drawn.
-    pub fn slice(&self) -> GaussianSlice<'_> {
+    pub(crate) fn slice(&self) -> GaussianSlice<'_> {
         GaussianSlice { layout: self.layout, parameters: self.parameters.slice() }
     }
 
@@ -96,7 +100,8 @@ impl DeviceGaussians {
     ///
     /// # Errors
     /// The device is out of memory or lost.
-    pub fn write(&mut self, gpu: &Gpu, floats: &[f32]) -> Result<()> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn write(&mut self, gpu: &Gpu, floats: &[f32]) -> Result<()> {
         let batches = self.layout.parameter_batches(gpu);
         match self.layout.sh_rest {
             StorageFormat::Single => batches.write(gpu, &mut self.parameters, floats),
@@ -111,7 +116,8 @@ impl DeviceGaussians {
     ///
     /// # Errors
     /// The device was lost.
-    pub fn read(&self, gpu: &Gpu) -> Result<Vec<f32>> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn read(&self, gpu: &Gpu) -> Result<Vec<f32>> {
         let words = self.layout.parameter_batches(gpu).read(gpu, &self.parameters)?;
         Ok(match self.layout.sh_rest {
             StorageFormat::Single => words,
@@ -142,7 +148,8 @@ impl Gaussians {
     ///
     /// # Errors
     /// The device is out of memory or lost.
-    pub fn upload_as(&self, gpu: &Gpu, sh_rest: StorageFormat) -> Result<DeviceGaussians> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn upload_as(&self, gpu: &Gpu, sh_rest: StorageFormat) -> Result<DeviceGaussians> {
         let mut gaussians =
             DeviceGaussians::uninit(gpu, Layout::new(self.count, self.shape, sh_rest))?;
         gaussians.origin = self.origin;

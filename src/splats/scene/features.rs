@@ -66,7 +66,7 @@ impl Features {
     pub const ALL: Self = Self { depth: true, structure: true, noise: true, illumination: true };
 
     /// Whether the feature is there.
-    pub const fn has(self, feature: Feature) -> bool {
+    pub(crate) const fn has(self, feature: Feature) -> bool {
         match feature {
             Feature::Depth => self.depth,
             Feature::Structure => self.structure,
@@ -76,22 +76,24 @@ impl Features {
     }
 
     /// The rows of [`FEATURES`] that are there.
-    pub fn specs(self) -> impl Iterator<Item = &'static FeatureSpec> {
+    pub(crate) fn specs(self) -> impl Iterator<Item = &'static FeatureSpec> {
         FEATURES.iter().filter(move |spec| self.has(spec.feature))
     }
 
     /// Floats per Gaussian.
-    pub fn width(self) -> usize {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn width(self) -> usize {
         self.specs().map(|spec| spec.width).sum()
     }
 
     /// Channels of a render: RGB and the features.
-    pub fn channels(self) -> usize {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn channels(self) -> usize {
         COLOR_CHANNELS + self.width()
     }
 
     /// The channels of a render that show the feature; none where the scene does not have it.
-    pub fn channels_of(self, feature: Feature) -> Option<Range<usize>> {
+    pub(crate) fn channels_of(self, feature: Feature) -> Option<Range<usize>> {
         let mut begin = COLOR_CHANNELS;
         for spec in self.specs() {
             if spec.feature == feature {

@@ -37,13 +37,14 @@ pub struct Start {
 
 impl Start {
     /// 3DGS's, and the paper's.
+    #[cfg(feature = "testing")]
     pub const PAPER: Self = Self { opacity: 0.1, scale: 1.0, thinnest: 1.0 };
 
     /// Refuses values that make no Gaussian, naming the field.
     ///
     /// # Errors
     /// [`Error::Usage`].
-    pub fn check(&self) -> Result<()> {
+    pub(crate) fn check(&self) -> Result<()> {
         self.check_rows()
     }
 }
@@ -54,58 +55,60 @@ const LEAST_SQUARED_DISTANCE: f64 = 1e-7;
 /// The standard deviation of a Gaussian that has no neighbour at all, world units.
 const LONE_SCALE: f64 = 0.01;
 
-/// One Gaussian per point, in the points' order.
-///
-/// SH degree 0 is such that the colour is `colors[i]` (sRGB-encoded, [0, 1]), nothing above it. Scales are those of `start`
-/// times the root of the mean squared distance to the three nearest other positions (3DGS); coincident points count as one
-/// position, so duplicates do not shrink to nothing. With fewer than four positions the mean goes over those there are; a
-/// single position has the standard deviation 0.01. Features are uniform in [0, 1), drawn from `seed` (LITA-GS).
-///
-/// # Errors
-/// [`Error::Usage`] where a position or colour is not finite or their numbers differ, or [`Start::check`] refuses.
-pub fn from_points(
-    positions: &[DVec3],
-    colors: &[Vec3],
-    shape: impl Into<Shape>,
-    start: &Start,
-    seed: u64,
-) -> Result<Gaussians> {
-    start.check()?;
-    if positions.len() != colors.len() {
-        return Err(Error::Usage(format!(
-            "{} points have {} colours",
-            positions.len(),
-            colors.len()
-        )));
-    }
-    let finite = |(position, color): (&DVec3, &Vec3)| position.is_finite() && color.is_finite();
-    if let Some(point) = positions.iter().zip(colors).position(|pair| !finite(pair)) {
-        return Err(Error::Usage(format!(
-            "point {point} has a position or colour that is not finite"
-        )));
-    }
+impl Gaussians {
+    /// One Gaussian per point, in the points' order.
+    ///
+    /// SH degree 0 is such that the colour is `colors[i]` (sRGB-encoded, [0, 1]), nothing above it. Scales are those of `start`
+    /// times the root of the mean squared distance to the three nearest other positions (3DGS); coincident points count as one
+    /// position, so duplicates do not shrink to nothing. With fewer than four positions the mean goes over those there are; a
+    /// single position has the standard deviation 0.01. Features are uniform in [0, 1), drawn from `seed` (LITA-GS).
+    ///
+    /// # Errors
+    /// [`Error::Usage`] where a position or colour is not finite or their numbers differ, or [`Start::check`] refuses.
+    pub fn from_points(
+        positions: &[DVec3],
+        colors: &[Vec3],
+        shape: impl Into<Shape>,
+        start: &Start,
+        seed: u64,
+    ) -> Result<Self> {
+        start.check()?;
+        if positions.len() != colors.len() {
+            return Err(Error::Usage(format!(
+                "{} points have {} colours",
+                positions.len(),
+                colors.len()
+            )));
+        }
+        let finite = |(position, color): (&DVec3, &Vec3)| position.is_finite() && color.is_finite();
+        if let Some(point) = positions.iter().zip(colors).position(|pair| !finite(pair)) {
+            return Err(Error::Usage(format!(
+                "point {point} has a position or colour that is not finite"
+            )));
+        }
 
-    let mut gaussians = Gaussians::zeros(positions.len(), shape);
-    for (mean, position) in gaussians.means_mut().iter_mut().zip(positions) {
-        *mean = position.as_vec3();
+        let mut gaussians = Self::zeros(positions.len(), shape);
+        for (mean, position) in gaussians.means_mut().iter_mut().zip(positions) {
+            *mean = position.as_vec3();
+        }
+        let ellipsoids = ellipsoids(positions, start);
+        for (quat, ellipsoid) in gaussians.quats_mut().iter_mut().zip(&ellipsoids) {
+            let [x, y, z, w] = ellipsoid.rotation.to_array().map(|part| part as f32);
+            *quat = [w, x, y, z];
+        }
+        for (log_scale, ellipsoid) in gaussians.log_scales_mut().iter_mut().zip(&ellipsoids) {
+            *log_scale = ellipsoid.scales.map(f64::ln).as_vec3();
+        }
+        gaussians.raw_opacities_mut().fill((start.opacity / (1.0 - start.opacity)).ln() as f32);
+        for (dc, color) in gaussians.dc_mut().iter_mut().zip(colors) {
+            *dc = (color - 0.5) / SH_C0;
+        }
+        let draws = Stream::new(seed, 0);
+        for (i, feature) in gaussians.features_mut().iter_mut().enumerate() {
+            *feature = draws.uniform(i as u64) as f32;
+        }
+        Ok(gaussians)
     }
-    let ellipsoids = ellipsoids(positions, start);
-    for (quat, ellipsoid) in gaussians.quats_mut().iter_mut().zip(&ellipsoids) {
-        let [x, y, z, w] = ellipsoid.rotation.to_array().map(|part| part as f32);
-        *quat = [w, x, y, z];
-    }
-    for (log_scale, ellipsoid) in gaussians.log_scales_mut().iter_mut().zip(&ellipsoids) {
-        *log_scale = ellipsoid.scales.map(f64::ln).as_vec3();
-    }
-    gaussians.raw_opacities_mut().fill((start.opacity / (1.0 - start.opacity)).ln() as f32);
-    for (dc, color) in gaussians.dc_mut().iter_mut().zip(colors) {
-        *dc = (color - 0.5) / SH_C0;
-    }
-    let draws = Stream::new(seed, 0);
-    for (i, feature) in gaussians.features_mut().iter_mut().enumerate() {
-        *feature = draws.uniform(i as u64) as f32;
-    }
-    Ok(gaussians)
 }
 
 /// Standard deviations along axes of its own, world units.

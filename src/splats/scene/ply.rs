@@ -65,12 +65,23 @@ fn properties(shape: Shape) -> Vec<Property> {
     specs.into_iter().flat_map(of_attribute).collect()
 }
 
+impl Gaussians {
+    /// Reads a model: a PLY in the INRIA layout, from whichever trainer, told by its content and not by its name.
+    ///
+    /// # Errors
+    /// [`Error::Input`] where the file is missing, of another format, cut short, longer than its header says, or where a
+    /// needed property is missing or not finite.
+    pub fn open(path: impl AsRef<Path>) -> Result<Self> {
+        load(path)
+    }
+}
+
 /// Writes `gaussians` to `path`; the file appears under its name only once it is complete.
 ///
 /// # Errors
 /// [`Error::Output`] where the file cannot be written.
 pub fn save(gaussians: &Gaussians, path: impl AsRef<Path>) -> Result<()> {
-    save_with_comments(gaussians, path, &[])
+    save_with_comments(gaussians, path, &[""; 0])
 }
 
 /// As [`save`], with lines of the header that readers skip.
@@ -80,12 +91,12 @@ pub fn save(gaussians: &Gaussians, path: impl AsRef<Path>) -> Result<()> {
 pub fn save_with_comments(
     gaussians: &Gaussians,
     path: impl AsRef<Path>,
-    comments: &[&str],
+    comments: &[impl AsRef<str>],
 ) -> Result<()> {
     write_whole_with(path.as_ref(), |partial| write(gaussians, partial, comments))
 }
 
-fn write(gaussians: &Gaussians, path: &Path, comments: &[&str]) -> std::io::Result<()> {
+fn write(gaussians: &Gaussians, path: &Path, comments: &[impl AsRef<str>]) -> std::io::Result<()> {
     const NORMALS: [&str; 3] = ["nx", "ny", "nz"];
     let properties = properties(gaussians.shape);
     let (means, others) = properties.split_at(3);
@@ -96,7 +107,7 @@ fn write(gaussians: &Gaussians, path: &Path, comments: &[&str]) -> std::io::Resu
         writeln!(file, "comment {ORIGIN}{x} {y} {z}")?;
     }
     for comment in comments {
-        writeln!(file, "comment {comment}")?;
+        writeln!(file, "comment {}", comment.as_ref())?;
     }
     writeln!(file, "element vertex {}", gaussians.count)?;
     let names = means.iter().map(|property| property.name.as_str());
@@ -216,7 +227,7 @@ impl Header {
     fn parse(bytes: &[u8]) -> Result<Self, String> {
         const END: &[u8] = b"end_header";
         if !bytes.starts_with(b"ply") {
-            return Err("is not a PLY file".to_owned());
+            return Err("is not a PLY file; Gaussians are read from PLY alone".to_owned());
         }
         let end = bytes
             .windows(END.len())

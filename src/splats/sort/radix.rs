@@ -40,7 +40,6 @@ struct Scratch {
 
 impl RadixSort {
     /// What its scratch memory takes for each pair, in bytes.
-    #[cfg(feature = "io")]
     pub(crate) fn bytes_per_item(&self) -> usize {
         2 * size_of::<u32>() + (size_of::<u32>() << MAX_DIGIT_BITS) / self.partition_size as usize
     }

@@ -43,7 +43,7 @@ pub enum NotFinite {
 
 impl StopConfig {
     /// Whether a run with these scores, in order, has converged.
-    pub fn has_converged(&self, scores: &[f64]) -> bool {
+    pub(crate) fn has_converged(&self, scores: &[f64]) -> bool {
         const PATIENCE: usize = 2;
         let Some(before) = scores.len().checked_sub(PATIENCE).filter(|&before| before > 0) else {
             return false;
@@ -66,7 +66,7 @@ impl StopConfig {
 
 impl TrainConfig {
     /// The length of the settling phase: that of the schedule, or a third of a run that is short for it.
-    pub fn settling_steps(&self) -> u64 {
+    pub(crate) fn settling_steps(&self) -> u64 {
         self.schedule.settle_steps.min(self.steps / 3)
     }
 }

@@ -118,7 +118,8 @@ pub struct Plan {
 impl Plan {
     /// The plan for a capture under a configuration, whose steps, schedule and limits it keeps to, on a device with so many
     /// bytes of memory.
-    pub fn new(diagnosis: &Diagnosis, config: &TrainConfig, memory: u64) -> Self {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn new(diagnosis: &Diagnosis, config: &TrainConfig, memory: u64) -> Self {
         let scene = &diagnosis.scene;
         let sh_degree = sh_degree(scene, config);
         let curve = curve(scene);
@@ -162,7 +163,8 @@ impl Plan {
     }
 
     /// Every decision: its name, what was decided, and why.
-    pub fn decisions(&self) -> Vec<(&'static str, String, &str)> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn decisions(&self) -> Vec<(&'static str, String, &str)> {
         let switch = |name, switch: &'_ Switch| {
             let on = if switch.on { "on" } else { "off" };
             (name, on.to_owned())
@@ -185,7 +187,8 @@ impl Plan {
     ///
     /// # Errors
     /// None for a plan that was made or read.
-    pub fn to_toml(&self) -> Result<String> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn to_toml(&self) -> Result<String> {
         const HEAD: &str = "# What this capture needs, and why. Change what you know better and pass it to \
                             `nightsplat train --plan FILE`.\n\n";
         let text = toml::to_string(self).map_err(|error| Error::Usage(error.to_string()))?;
@@ -196,7 +199,8 @@ impl Plan {
     ///
     /// # Errors
     /// [`Error::Input`]: the file cannot be read, holds no plan, or that of another dataset.
-    pub fn load(path: &Path, dataset: &Dataset) -> Result<Self> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn load(path: &Path, dataset: &Dataset) -> Result<Self> {
         let plan = Self::read(path)?;
         let own = PlannedViews::of(dataset);
         if plan.dataset != own {
@@ -214,7 +218,7 @@ impl Plan {
     ///
     /// # Errors
     /// [`Error::Input`]: the file cannot be read or holds no plan.
-    pub fn read(path: &Path) -> Result<Self> {
+    pub(crate) fn read(path: &Path) -> Result<Self> {
         let text = input::text(path)?;
         toml::from_str(&text).map_err(|error| {
             let line = error.span().map(|span| text[..span.start].matches('\n').count() + 1);

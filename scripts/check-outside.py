@@ -1,0 +1,53 @@
+#!/usr/bin/env python3
+"""Compiles the examples and the programs of the crate's first page as a host does: without what tests alone see.
+
+Within the repository, examples and documentation are compiled with the features that tests switch on.
+"""
+
+import os
+import re
+import subprocess
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+
+MANIFEST = """\
+[package]
+name = "outside"
+version = "0.0.0"
+edition = "2024"
+publish = false
+
+[dependencies]
+nightsplat = {{ path = "{root}", default-features = false, features = ["io"] }}
+
+[workspace]
+
+{profile}"""
+
+PAGE = "fn main() -> nightsplat::Result<()> {{\n{code}\n}}\n"
+
+
+def main() -> None:
+    target = Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target"))
+    package = target / "outside"
+    programs = package / "src/bin"
+    programs.mkdir(parents=True, exist_ok=True)
+    for old in programs.iterdir():
+        old.unlink()
+    # What is compiled already is compiled like this.
+    profile = re.search(r"^\[profile\.dev\].*?(?=^\[profile\.release\])", (ROOT / "Cargo.toml").read_text(), re.M | re.S)
+    (package / "Cargo.toml").write_text(MANIFEST.format(root=ROOT, profile=profile[0]))
+    (package / "Cargo.lock").write_bytes((ROOT / "Cargo.lock").read_bytes())
+    for example in (ROOT / "examples").glob("*.rs"):
+        (programs / example.name).write_text(example.read_text())
+    page = "\n".join(line.removeprefix("//!") for line in (ROOT / "src/lib.rs").read_text().splitlines() if line.startswith("//!"))
+    for number, code in enumerate(re.findall(r"```no_run\n(.*?)```", page, re.DOTALL)):
+        # Lines that the page hides are part of the program.
+        code = "\n".join(line.strip().removeprefix("# ") for line in code.splitlines())
+        (programs / f"page{number}.rs").write_text(PAGE.format(code=code))
+    subprocess.run(["cargo", "check", "--bins"], cwd=package, env=os.environ | {"CARGO_TARGET_DIR": str(target)}, check=True)
+
+
+if __name__ == "__main__":
+    main()

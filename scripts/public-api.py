@@ -1,0 +1,278 @@
+#!/usr/bin/env python3
+"""The public API of the library, one line an item: what hosts and trainers may rely on.
+
+    scripts/public-api.py            compares it with docs/public-api.txt
+    scripts/public-api.py --write    writes that file anew
+    scripts/public-api.py --count    prints how much is public, also in the build that a host embeds
+
+Reads the JSON that rustdoc makes of a build without features for tests. Fields, variants and the implementations of traits
+stand with their type and are no items of their own.
+"""
+
+import difflib
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+SNAPSHOT = ROOT / "docs/public-api.txt"
+# The version of rustdoc's JSON that this reads; another one moves names.
+FORMAT = 57
+BUILDS = {"embedded": [], "with files": ["--features", "io"]}
+
+
+def documented(features: list[str]) -> dict:
+    """What rustdoc knows of the library."""
+    command = ["cargo", "rustdoc", "--quiet", "--lib", "--no-default-features", *features]
+    options = ["-Z", "unstable-options", "--output-format", "json", "--cap-lints", "allow"]
+    # The output is unstable; the compiler that makes it is the project's own.
+    environment = os.environ | {"RUSTC_BOOTSTRAP": "1"}
+    subprocess.run([*command, "--", *options], cwd=ROOT, env=environment, check=True)
+    metadata = subprocess.run(
+        ["cargo", "metadata", "--no-deps", "--format-version", "1"], cwd=ROOT, check=True, capture_output=True
+    )
+    target = Path(json.loads(metadata.stdout)["target_directory"])
+    crate = json.loads((target / "doc/nightsplat.json").read_text())
+    if crate["format_version"] != FORMAT:
+        sys.exit(f"rustdoc writes JSON of version {crate['format_version']}; {__file__} reads {FORMAT}: adapt it")
+    return crate
+
+
+# ---------------------------------------------------------------------------
+# Types, as Rust writes them
+
+
+def arguments(args: dict | None) -> str:
+    if not args:
+        return ""
+    if "parenthesized" in args:
+        inner = args["parenthesized"]
+        output = f" -> {typed(inner['output'])}" if inner["output"] else ""
+        return f"({', '.join(map(typed, inner['inputs']))}){output}"
+    inner = args["angle_bracketed"]
+    given = [next(iter(arg.values())) if "lifetime" in arg else value(arg) for arg in inner["args"]]
+    bound = [f"{one['name']} = {value(one['binding']['equality'])}" for one in inner["constraints"] if "equality" in one["binding"]]
+    return f"<{', '.join(given + bound)}>" if given or bound else ""
+
+
+def value(term: dict) -> str:
+    if "type" in term:
+        return typed(term["type"])
+    return term["constant"]["expr"] if "constant" in term else next(iter(term))
+
+
+def bounds(all_bounds: list) -> str:
+    return " + ".join(map(bound, all_bounds))
+
+
+def bound(one: dict) -> str:
+    if "outlives" in one:
+        return one["outlives"]
+    if "use" in one:
+        return "use<..>"
+    inner = one["trait_bound"]
+    maybe = "?" if inner["modifier"] == "maybe" else ""
+    return maybe + named(inner["trait"])
+
+
+NAMED: set[int] = set()
+
+
+def named(path: dict) -> str:
+    """By its last name, as code that imports it does."""
+    NAMED.add(path["id"])
+    return path["path"].split("::")[-1] + arguments(path["args"])
+
+
+def typed(kind: dict | None) -> str:
+    if kind is None:
+        return "()"
+    (name, inner), = kind.items()
+    match name:
+        case "primitive" | "generic":
+            return inner
+        case "resolved_path":
+            return named(inner)
+        case "borrowed_ref":
+            lifetime = f"{inner['lifetime']} " if inner["lifetime"] else ""
+            return f"&{lifetime}{'mut ' if inner['is_mutable'] else ''}{typed(inner['type'])}"
+        case "raw_pointer":
+            return f"*{'mut' if inner['is_mutable'] else 'const'} {typed(inner['type'])}"
+        case "slice":
+            return f"[{typed(inner)}]"
+        case "array":
+            return f"[{typed(inner['type'])}; {inner['len']}]"
+        case "tuple":
+            return f"({', '.join(map(typed, inner))})"
+        case "impl_trait":
+            return f"impl {bounds(inner)}"
+        case "dyn_trait":
+            return f"dyn {' + '.join(named(one['trait']) for one in inner['traits'])}"
+        case "qualified_path":
+            return f"{typed(inner['self_type'])}::{inner['name']}"
+        case "function_pointer":
+            return f"fn{signature(inner['sig'])}"
+    return name
+
+
+def generics(declared: dict) -> str:
+    shown = []
+    for one in declared["params"]:
+        (kind, inner), = one["kind"].items()
+        if kind == "type" and not inner["is_synthetic"]:
+            shown.append(one["name"] + (f": {bounds(inner['bounds'])}" if inner["bounds"] else ""))
+        elif kind == "lifetime":
+            shown.append(one["name"])
+        elif kind == "const":
+            shown.append(f"const {one['name']}: {typed(inner['type'])}")
+    return f"<{', '.join(shown)}>" if shown else ""
+
+
+def signature(sig: dict) -> str:
+    def parameter(name: str, kind: dict) -> str:
+        if name != "self":
+            return f"{name}: {typed(kind)}"
+        return typed(kind).replace("Self", "self")
+
+    output = f" -> {typed(sig['output'])}" if sig["output"] else ""
+    return f"({', '.join(parameter(*one) for one in sig['inputs'])}){output}"
+
+
+# ---------------------------------------------------------------------------
+# Items
+
+
+class Api:
+    """The lines of a crate, and how much it has of what."""
+
+    def __init__(self, crate: dict):
+        self.index = crate["index"]
+        self.lines: list[str] = []
+        self.items = 0
+        self.parts = 0
+        self.seen: set[int] = set()
+        NAMED.clear()
+        self.module(self.index[str(crate["root"])], "nightsplat")
+        own = {number for number in NAMED if str(number) in self.index and self.index[str(number)]["crate_id"] == 0}
+        self.hidden = sorted(self.index[str(number)]["name"] for number in own - self.seen)
+        self.lines.sort(key=lambda line: line.split(" ", 1)[1])
+
+    def add(self, kind: str, path: str, rest: str = "") -> None:
+        self.items += kind not in ("field", "variant", "impl")
+        self.parts += kind in ("field", "variant")
+        self.lines.append(f"{kind} {path}{rest}")
+
+    def module(self, module: dict, path: str) -> None:
+        for number in module["inner"]["module"]["items"]:
+            item = self.index[str(number)]
+            (kind, inner), = item["inner"].items()
+            if kind != "use":
+                self.item(item, f"{path}::{item['name']}")
+            elif str(inner["id"]) in self.index:
+                target = self.index[str(inner["id"])]
+                if inner["is_glob"]:
+                    self.module(target, path)
+                else:
+                    self.item(target, f"{path}::{inner['name']}")
+            else:
+                self.add("use", f"{path}::{inner['name']}", f" = {inner['source']}")
+
+    def item(self, item: dict, path: str) -> None:
+        (kind, inner), = item["inner"].items()
+        if item["id"] in self.seen:
+            return self.add("use", path)
+        self.seen.add(item["id"])
+        match kind:
+            case "module":
+                self.add("mod", path)
+                self.module(item, path)
+            case "struct" | "enum" | "union":
+                self.add(kind, path, generics(inner["generics"]))
+                self.members(inner, path)
+                self.implementations(inner["impls"], path)
+            case "trait":
+                supers = f": {bounds(inner['bounds'])}" if inner["bounds"] else ""
+                self.add("trait", path, generics(inner["generics"]) + supers)
+                for number in inner["items"]:
+                    self.associated(self.index[str(number)], path)
+            case "function":
+                self.add("fn", path, generics(inner["generics"]) + signature(inner["sig"]))
+            case "constant" | "static":
+                self.add("const", path, f": {typed(inner['type'])}")
+            case "type_alias":
+                self.add("type", path, f" = {typed(inner['type'])}")
+            case _:
+                self.add(kind, path)
+
+    def members(self, inner: dict, path: str) -> None:
+        """The fields of a struct, the variants of an enum."""
+        for number in inner.get("variants", []):
+            variant = self.index[str(number)]
+            kind = variant["inner"]["variant"]["kind"]
+            self.add("variant", f"{path}::{variant['name']}", self.held(kind))
+        kind = inner.get("kind", "unit")
+        if kind != "unit":
+            fields = kind["plain"]["fields"] if "plain" in kind else kind["tuple"]
+            for number in fields:
+                if number is not None and str(number) in self.index:
+                    field = self.index[str(number)]
+                    self.add("field", f"{path}::{field['name']}", f": {typed(field['inner']['struct_field'])}")
+
+    def held(self, kind: dict | str) -> str:
+        """What a variant holds."""
+        def field(number: int) -> str:
+            return typed(self.index[str(number)]["inner"]["struct_field"])
+
+        if kind == "plain":
+            return ""
+        if "tuple" in kind:
+            return f"({', '.join(field(number) for number in kind['tuple'] if number is not None)})"
+        named_fields = kind["struct"]["fields"]
+        return f" {{ {', '.join(self.index[str(number)]['name'] + ': ' + field(number) for number in named_fields)} }}"
+
+    def implementations(self, numbers: list[int], path: str) -> None:
+        traits = []
+        for number in numbers:
+            block = self.index[str(number)]["inner"]["impl"]
+            if block["trait"] is None:
+                for one in block["items"]:
+                    self.associated(self.index[str(one)], path)
+            elif not block["is_synthetic"] and block["blanket_impl"] is None and not block["is_negative"]:
+                if block["trait"]["path"] != "StructuralPartialEq":
+                    traits.append(named(block["trait"]))
+        if traits:
+            self.add("impl", path, f": {', '.join(sorted(set(traits)))}")
+
+    def associated(self, item: dict, path: str) -> None:
+        (kind, inner), = item["inner"].items()
+        path = f"{path}::{item['name']}"
+        match kind:
+            case "function":
+                self.add("fn", path, generics(inner["generics"]) + signature(inner["sig"]))
+            case "assoc_const":
+                self.add("const", path, f": {typed(inner['type'])}")
+            case "assoc_type":
+                self.add("type", path)
+
+
+def main() -> None:
+    mode = sys.argv[1] if len(sys.argv) > 1 else ""
+    apis = {name: Api(documented(features)) for name, features in BUILDS.items() if name == "with files" or mode == "--count"}
+    for name, api in apis.items():
+        print(f"{name}: {api.items} public items, {api.parts} fields and variants")
+        if api.hidden:
+            sys.exit(f"the API names types that are no part of it: {', '.join(api.hidden)}")
+    text = "\n".join(apis["with files"].lines) + "\n"
+    if mode == "--write":
+        SNAPSHOT.write_text(text)
+        return
+    before = SNAPSHOT.read_text() if SNAPSHOT.exists() else ""
+    if text != before:
+        sys.stdout.writelines(difflib.unified_diff(before.splitlines(True), text.splitlines(True), str(SNAPSHOT), "now", n=0))
+        sys.exit("the public API is another one; where that is meant: scripts/public-api.py --write, and a line in CHANGELOG.md")
+
+
+if __name__ == "__main__":
+    main()
