@@ -85,7 +85,7 @@ pub enum Error {
     DeviceLost {
         /// The device's name.
         device: String,
-        /// The label of the submission, as [`crate::gpu::Gpu::submit`] takes it.
+        /// The label of the submission.
         submission: String,
     },
     /// A Vulkan call failed for a reason not named above.

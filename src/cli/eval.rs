@@ -52,7 +52,7 @@ pub struct EvalArgs {
     pub device: Option<DeviceChoice>,
 }
 
-/// [`Range`] on the command line.
+/// `Range` on the command line.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
 pub enum LpipsRange {
     /// Stretched to [-1, 1], for which the measure was made: `normalize=True` in lpips and torchmetrics, gsplat's AlexNet

@@ -108,7 +108,7 @@ impl std::fmt::Display for FamilyChoice {
     }
 }
 
-/// [`Channels`] on the command line.
+/// `Channels` on the command line.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
 pub enum ChannelChoice {
     /// Red, green and blue
@@ -118,7 +118,7 @@ pub enum ChannelChoice {
     Luminance,
 }
 
-/// [`Weighting`] on the command line.
+/// `Weighting` on the command line.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
 pub enum WeightingChoice {
     /// Every pixel the same

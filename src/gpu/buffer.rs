@@ -11,7 +11,7 @@ use super::{Bound, Gpu, Properties, Slice, SliceMut};
 use crate::{Error, Result};
 
 /// An array of `T` in device memory, and its only owner: passes bind [`Slice`](super::Slice)s and
-/// [`SliceMut`](super::SliceMut)s that borrow it. Dropping it frees the memory once no submission uses it.
+/// `SliceMut`s that borrow it. Dropping it frees the memory once no submission uses it.
 #[derive(Debug)]
 pub struct Buffer<T> {
     memory: Memory,
@@ -103,7 +103,7 @@ impl Gpu {
     /// A buffer of `len` elements of zero bits.
     ///
     /// # Errors
-    /// As [`Gpu::uninit`], or the device was lost.
+    /// The buffer exceeds the binding limit or the memory of the device, or the device was lost.
     pub fn zeros<T: bytemuck::Pod>(&self, name: &str, len: usize) -> Result<Buffer<T>> {
         self.zeroed(self.uninit(name, len)?)
     }

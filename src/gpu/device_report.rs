@@ -36,7 +36,7 @@ pub struct DeviceReport {
     pub limits: DeviceLimits,
     /// The matrices that `--denoiser-precision half` builds on, where the device offers any.
     pub cooperative_matrix: Option<CooperativeMatrix>,
-    /// Every requirement, in the order of [`REQUIREMENTS`].
+    /// Every requirement.
     pub requirements: Vec<RequirementReport>,
 }
 

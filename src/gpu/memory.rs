@@ -72,7 +72,7 @@ impl Gpu {
         self.shared.usage.now.load(Ordering::Acquire)
     }
 
-    /// The most that [`Gpu::memory_in_use`] has been since [`Gpu::reset_peak_memory`].
+    /// The most that [`Gpu::memory_in_use`] has been.
     pub fn peak_memory(&self) -> u64 {
         self.shared.usage.peak.load(Ordering::Acquire)
     }

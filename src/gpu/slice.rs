@@ -8,7 +8,7 @@ use super::Bound;
 use super::allocated::Memory;
 use crate::{Error, Result};
 
-/// Elements of a buffer to read. While it lives, no [`SliceMut`] of them can be made:
+/// Elements of a buffer to read. While it lives, no `SliceMut` of them can be made:
 ///
 /// ```compile_fail,E0502
 /// # use nightsplat::gpu::{Buffer, Gpu};

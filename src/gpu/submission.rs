@@ -86,7 +86,7 @@ impl Gpu {
     /// Records passes, submits them and waits.
     ///
     /// # Errors
-    /// As [`Gpu::submit`].
+    /// What `record` returns (nothing is submitted then), this thread is recording already, or the device was lost.
     pub fn run(
         &self,
         label: &str,

@@ -10,13 +10,13 @@ use crate::{Error, Result};
 /// What one render scores, or the mean over several.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct Scores {
-    /// PSNR of the mean squared error over all channels, dB; see [`psnr`].
+    /// PSNR of the mean squared error over all channels, dB.
     pub psnr: f64,
-    /// The mean of the three channels' PSNRs, dB; see [`psnr_channel_mean`].
+    /// The mean of the three channels' PSNRs, dB.
     pub psnr_channel_mean: f64,
-    /// Mean structural similarity; see [`ssim`].
+    /// Mean structural similarity.
     pub ssim: f64,
-    /// The distance to a network's eye, where its weights are at hand: `lpips::Lpips` adds it.
+    /// The distance to a network's eye, where its weights are at hand.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub lpips: Option<f64>,
 }

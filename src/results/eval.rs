@@ -149,7 +149,7 @@ pub struct ViewScore {
     pub scores: Scores,
     /// Those of R_0, where the model has a denoiser.
     pub r0: Option<Scores>,
-    /// Those of [`Compared::aligned`], where it was asked.
+    /// Those behind the gain and bias of each channel that bring the render nearest to what it should be, where it was asked.
     pub aligned: Option<Scores>,
     /// How much of the background shows; none of what is no render.
     pub leftover: Option<Leftover>,

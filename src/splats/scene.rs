@@ -28,7 +28,7 @@ pub const SH_C0: f32 = 0.282_094_79;
 /// What the Gaussians of a scene are made of, beside the ellipsoid and its opacity.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Shape {
-    /// The SH degree that there is room for, 0 to [`MAX_SH_DEGREE`].
+    /// The SH degree that there is room for, 0 to 3.
     pub sh_degree: u32,
     /// What is blended beside colour.
     pub features: Features,
@@ -63,7 +63,7 @@ pub fn width(shape: impl Into<Shape>) -> usize {
     column_count(features.width(), sh_degree)
 }
 
-/// 3D Gaussians, stored as planes: all means, then all quats, and so on in the order of [`ATTRIBUTES`].
+/// 3D Gaussians, stored as planes: all means, then all quats, and so on in the order of `ATTRIBUTES`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Gaussians {
     /// The number of Gaussians.
@@ -214,6 +214,6 @@ accessors! {
     Dc: dc, dc_mut -> Vec3,
     /// What is blended beside colour, (count, features).
     Features: features, features_mut -> f32,
-    /// SH coefficients above degree 0, RGB, (count, [`rest_coefficients`]).
+    /// SH coefficients above degree 0, RGB, (count, (degree + 1)^2 - 1).
     Rest: rest, rest_mut -> Vec3,
 }

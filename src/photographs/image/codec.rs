@@ -143,7 +143,7 @@ fn size_of_reader(path: &Path, reader: ImageReader<Box<dyn Source + '_>>) -> Res
 }
 
 impl Image {
-    /// Reads an 8- or 16-bit PNG or TIFF, a JPEG, a WebP or an EXR file as it is stored ([`Image::load_upright`] turns it);
+    /// Reads an 8- or 16-bit PNG or TIFF, a JPEG, a WebP or an EXR file as it is stored (`Image::load_upright` turns it);
     /// the content decides, not the file's name.
     ///
     /// Alpha is dropped, grey is repeated, camera RAW (feature `raw`) is linear light. Of an EXR file the first layer's R, G and B

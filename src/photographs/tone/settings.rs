@@ -20,7 +20,7 @@ const COLOUR: f64 = 1.0 / 3.0;
 /// A shape that passes this near p90 has a pole there.
 const LARGEST_SHAPE: f64 = 1e8;
 
-/// A curve and its constants; what a photograph adds to them are its [`Statistics`].
+/// A curve and its constants; what a photograph adds to them are its percentiles and means.
 ///
 /// In TOML everything but `curve` may be left out; where there are `[constants]`, all of the family's must be there.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -41,7 +41,7 @@ pub struct ToneSettings {
     /// Whether one curve serves a scene: its statistics are the means over the training views, its gain that of all of
     /// them together.
     pub scene_statistics: bool,
-    /// Whether the gain is solved for the brightness that [`super::Exposure`] finds: t is k x then, in place of x / white,
+    /// Whether the gain is solved for the brightness that the photographs ask for: t is k x then, in place of x / white,
     /// and c and g0 have no say. The automatic curve has no other.
     pub auto_gain: bool,
     /// The mean luminance of the targets, in place of the one that is found.
@@ -51,7 +51,7 @@ pub struct ToneSettings {
     /// Whether a photograph is lifted at its own size and shrunk behind that. References were shrunk behind their own tone
     /// curve, and the mean of a curve is not the curve of a mean.
     pub lift_first: bool,
-    /// The family's constants in the order of [`super::Family::constants`].
+    /// The family's constants in the order of its formula.
     pub constants: Vec<f64>,
     /// The values of [`ToneCurve::Table`].
     pub table: Option<Table>,

@@ -9,7 +9,7 @@ use crate::splats::attributes::PlaneCounts;
 use crate::splats::batches::Batches;
 use crate::splats::halves::{Halves, StorageFormat};
 
-/// How Gaussians lie on the device: as planes (include/gaussian.glsl) in [`Batches`].
+/// How Gaussians lie on the device: as planes (include/gaussian.glsl), in batches where one binding does not hold them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Layout {
     /// The number of Gaussians.

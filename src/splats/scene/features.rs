@@ -48,13 +48,13 @@ pub const FEATURES: [FeatureSpec; 4] = [
 /// The features that the Gaussians of a scene have.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Features {
-    /// [`Feature::Depth`].
+    /// A free scalar that the depth loss shapes; not the distance to the camera.
     pub depth: bool,
-    /// [`Feature::Structure`].
+    /// Edge strength, compared with the colour invariant of the target.
     pub structure: bool,
-    /// [`Feature::Noise`].
+    /// RGB: what the denoiser begins with.
     pub noise: bool,
-    /// [`Feature::Illumination`].
+    /// RGB: what takes the denoised render back to the dark photograph.
     pub illumination: bool,
 }
 

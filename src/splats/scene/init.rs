@@ -64,7 +64,7 @@ impl Gaussians {
     /// single position has the standard deviation 0.01. Features are uniform in [0, 1), drawn from `seed` (LITA-GS).
     ///
     /// # Errors
-    /// [`Error::Usage`] where a position or colour is not finite or their numbers differ, or [`Start::check`] refuses.
+    /// [`Error::Usage`] where a position or colour is not finite or their numbers differ, or `Start::check` refuses.
     pub fn from_points(
         positions: &[DVec3],
         colors: &[Vec3],

@@ -34,7 +34,7 @@ impl FromStr for Learning {
 
 settings! {
 "exposure."
-/// Gain and bias of each channel of each training view, [`crate::loss::exposure`].
+/// Gain and bias of each channel of each training view.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ExposureConfig {
     /// on: learn gain and bias of each channel of each training view, where photographs are not equally bright; off.

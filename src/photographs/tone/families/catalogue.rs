@@ -66,7 +66,7 @@ macro_rules! families {
             $(#[doc = $formula] $variant = $number,)*
             /// What a [`crate::photographs::tone::Table`] makes.
             Table = CURVE_TABLE,
-            /// The curve whose gain [`crate::photographs::tone::Exposure`] finds: (1 - lambda) soft(x) + lambda x soft(Y) / Y.
+            /// The curve whose gain follows from all photographs: (1 - lambda) soft(x) + lambda x soft(Y) / Y.
             Auto = CURVE_AUTO,
             /// What a [`crate::photographs::tone::Profile`] makes.
             Profile = CURVE_PROFILE,
