@@ -265,12 +265,12 @@ impl Trainer {
             gpu.limit_memory(bytes);
         }
         let settings = config.render_settings();
-        let mut pseudo_gt = PseudoGt::new(gpu, &config.tone)?;
+        let pseudo_gt = PseudoGt::new(gpu, &config.tone)?;
         let frame = config.frame.unwrap_or_default();
         let (views, scene, target_exposure) =
-            Views::upload(gpu, &mut pseudo_gt, dataset, &frame, &config)?;
+            Views::upload(gpu, &pseudo_gt, dataset, &frame, &config)?;
         let held_out = dataset.views.iter().filter(|view| view.split == Split::HeldOut);
-        let held_out = TargetViews::new(&mut pseudo_gt, held_out, &frame, &scene)?;
+        let held_out = TargetViews::new(&pseudo_gt, held_out, &frame, &scene)?;
         if config.stop.views > 0 && held_out.is_empty() {
             tracing::info!("no held-out view shows anything: the run takes all its steps");
         }
@@ -279,7 +279,7 @@ impl Trainer {
         let pixels = largest.unwrap_or_default().min(MOST_PROBE_PIXELS);
         let probes = match config.density.control {
             DensityControl::Conserving => {
-                TargetViews::probes(&mut pseudo_gt, dataset, &frame, &scene, [PROBES, pixels])?
+                TargetViews::probes(&pseudo_gt, dataset, &frame, &scene, [PROBES, pixels])?
             }
             DensityControl::Paper => TargetViews::default(),
         };
@@ -288,7 +288,7 @@ impl Trainer {
         }
         let sizes = views.sizes();
         config.model.say_what_parts_see(&sizes);
-        let starts = views.exposures(&mut pseudo_gt, dataset, &scene, &config)?;
+        let starts = views.exposures(&pseudo_gt, dataset, &scene, &config)?;
         let gaussians = match gaussians {
             // A run that ended before its highest SH degree was in use has a model without it.
             Some(gaussians) if settings.shape.holds(gaussians.shape) => {

@@ -44,7 +44,7 @@ impl Views {
     /// The table cannot be read or names a view that there is not; the device is out of memory or lost.
     pub(super) fn exposures(
         &self,
-        pseudo_gt: &mut PseudoGt,
+        pseudo_gt: &PseudoGt,
         dataset: &Dataset,
         scene: &Scene,
         config: &TrainConfig,
@@ -133,7 +133,7 @@ impl Views {
 
 /// Makes targets of photographs that are not in the dataset, as those of it are made.
 struct Targets<'a> {
-    pseudo_gt: &'a mut PseudoGt,
+    pseudo_gt: &'a PseudoGt,
     dataset: &'a Dataset,
     scene: &'a Scene,
 }

@@ -146,10 +146,10 @@ mod tests {
         let gpu = gpu();
         let dataset = Dataset::load(&config.dataset, &config.load_options()).unwrap();
         let frame = dataset.frame();
-        let mut pseudo_gt = PseudoGt::new(&gpu, &config.tone).unwrap();
+        let pseudo_gt = PseudoGt::new(&gpu, &config.tone).unwrap();
         let (scene, _) = measured(pseudo_gt.settings(), &dataset).unwrap();
         let all = [usize::MAX; 2];
-        let views = TargetViews::probes(&mut pseudo_gt, &dataset, &frame, &scene, all).unwrap();
+        let views = TargetViews::probes(&pseudo_gt, &dataset, &frame, &scene, all).unwrap();
         let mut trainer = Trainer::new(&gpu, config.clone(), &dataset).unwrap();
         let psnr = |trainer: &mut Trainer| {
             let (degree, affines) = (trainer.sh_degree_in_use(), trainer.affines().unwrap());

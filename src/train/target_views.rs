@@ -39,7 +39,7 @@ impl TargetViews {
     /// # Errors
     /// A photograph can no longer be read, or the device is out of memory or lost.
     pub(super) fn new<'a>(
-        pseudo_gt: &mut PseudoGt,
+        pseudo_gt: &PseudoGt,
         views: impl IntoIterator<Item = &'a View>,
         frame: &Frame,
         scene: &Scene,
@@ -68,7 +68,7 @@ impl TargetViews {
     /// # Errors
     /// As [`TargetViews::new`].
     pub(super) fn probes(
-        pseudo_gt: &mut PseudoGt,
+        pseudo_gt: &PseudoGt,
         dataset: &Dataset,
         frame: &Frame,
         scene: &Scene,
@@ -137,7 +137,7 @@ fn clamped(image: &Image) -> Image {
 
 /// The target that a view's photograph becomes, made as those of the training views are.
 fn target_of(
-    pseudo_gt: &mut PseudoGt,
+    pseudo_gt: &PseudoGt,
     view: &View,
     photograph: &Image,
     scene: &Scene,
