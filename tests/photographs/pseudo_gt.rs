@@ -384,7 +384,7 @@ fn what_cannot_be_measured_or_mapped_is_refused() {
     refused("no such view", &mut |pass| pseudo_gt.map(pass, &image, &parameters, 1, &mut short));
     refused("short target", &mut |pass| pseudo_gt.map(pass, &image, &parameters, 0, &mut short));
     let bad = ToneSettings { theta: 0.0, ..ToneSettings::new(ToneCurve::Ap3) };
-    assert!(matches!(PseudoGt::new(&gpu, &bad), Err(Error::Usage(_))));
+    assert!(matches!(PseudoGt::new(&gpu, &bad), Err(Error::Setting { .. })));
 }
 
 #[test]
