@@ -19,8 +19,8 @@ impl Trainer {
     /// # Errors
     /// The device was lost.
     pub fn exposures(&self) -> Result<Option<Vec<(String, Affine)>>> {
-        let Some(exposures) = &self.exposures else { return Ok(None) };
-        let names = self.views.names().map(str::to_owned);
+        let Some(exposures) = &self.supervision.exposures else { return Ok(None) };
+        let names = self.supervision.views.names().map(str::to_owned);
         Ok(Some(names.zip(exposures.affines()?).collect()))
     }
 }

@@ -236,9 +236,9 @@ fn with_wrong_param(gpu: &Gpu, kernel: &'static str, word: usize, bits: u32) -> 
 #[test]
 fn a_wrong_wiring_is_named_where_it_arises() {
     let gpu = gpu();
-    // Focal length along x, the tile's columns, the scale of L1, Adam's rate of the means.
+    // The near plane, the tile's columns, the scale of L1, Adam's rate of the means.
     for (kernel, word, bits, buffer) in [
-        ("project", 12, 0x0040_0000, "splats"),
+        ("project", 1, 0x4000_0000, "splats"),
         ("blend_forward", 2, 1, "render"),
         ("ssim", 6, 0x0080_0000, "d_render"),
         ("adam", 5, 0x0080_0000, "parameters"),
