@@ -192,6 +192,15 @@ mod tests {
     }
 
     #[test]
+    fn bytes_between_the_picture_and_its_end_do_no_harm() {
+        let whole = fixture("420.jpg");
+        let (picture, end) = whole.split_at(whole.len() - 2);
+        let padded = [picture, &[0; 8], end].concat();
+        let load = |bytes: &[u8]| load(Path::new("420.jpg"), bytes).unwrap().unwrap();
+        assert!(load(&padded) == load(&whole));
+    }
+
+    #[test]
     fn a_jpeg_cut_short_anywhere_is_refused() {
         for (name, _) in PICTURES {
             let whole = fixture(name);
