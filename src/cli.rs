@@ -10,11 +10,8 @@ use crate::base::settings::Setting;
 use crate::photographs::image::Image;
 use crate::train::settings::setting;
 
-pub mod ablate;
-mod batch;
 pub mod bench;
 pub mod check;
-mod comparison;
 pub mod completions;
 pub mod curves;
 mod defaults;
@@ -35,7 +32,6 @@ pub mod sweep;
 pub mod synth;
 mod table;
 pub mod tone;
-pub mod tradeoff;
 pub mod train;
 
 /// 3D Gaussian Splatting from dark photographs, on any Vulkan device.
@@ -60,7 +56,7 @@ const EXAMPLES: &str = "Start with:
   nightsplat render run --split all --out pictures  see the model from every camera
   nightsplat export run --to html                   a page with the splat to fly through
   nightsplat sweep photos --out sweep --curves all  train with every curve, and rank them
-  nightsplat tradeoff photos --out tradeoff         what time and memory buy
+  nightsplat sweep photos --out s --table presets   what time and memory buy
 
 Exit codes:
   0 done; 1 failed; 2 misuse; 3 data that cannot be used; 4 no device, or not enough memory;
@@ -77,20 +73,34 @@ enum Command {
     Tone(tone::ToneArgs),
     Curves(curves::CurvesArgs),
     Sweep(Box<sweep::SweepArgs>),
-    Tradeoff(Box<tradeoff::TradeoffArgs>),
     #[cfg(feature = "fit")]
     Fit(fit::FitArgs),
     /// Fit a curve to pairs of photographs: not in this build
     #[cfg(not(feature = "fit"))]
     Fit(Absent),
     Synth(synth::SynthArgs),
-    Ablate(Box<ablate::AblateArgs>),
     Demo(demo::DemoArgs),
     Doctor(doctor::DoctorArgs),
     Bench(bench::BenchArgs),
     Check(Box<check::CheckArgs>),
     Completions(completions::CompletionsArgs),
     Man(man::ManArgs),
+    #[command(hide = true, disable_help_flag = true)]
+    Ablate(Moved),
+    #[command(hide = true, disable_help_flag = true)]
+    Tradeoff(Moved),
+}
+
+/// Whatever is given to a command under its old name.
+#[derive(Debug, clap::Args)]
+struct Moved {
+    #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+    _arguments: Vec<std::ffi::OsString>,
+}
+
+/// What is said of an old name.
+fn moved(old: &str, new: &str) -> Result<()> {
+    Err(crate::Error::Usage(format!("`nightsplat {old}` is now `nightsplat {new}`")).into())
 }
 
 /// Whatever is given to a subcommand that this build lacks.
@@ -129,15 +139,15 @@ impl Cli {
                 Err(crate::Error::Usage(format!("this build has no `fit`; {remedy}")).into())
             }
             Command::Sweep(args) => sweep::run(&args),
-            Command::Tradeoff(args) => tradeoff::run(&args),
             Command::Synth(args) => Ok(synth::run(args)?),
-            Command::Ablate(args) => ablate::run(&args),
             Command::Demo(args) => demo::run(&args),
             Command::Doctor(args) => doctor::run(&args),
             Command::Bench(args) => bench::run(&args),
             Command::Check(args) => check::run(&args),
             Command::Completions(args) => completions::run(args),
             Command::Man(args) => Ok(man::run(&args)?),
+            Command::Ablate(_) => moved("ablate", "sweep DATASET --out DIR --table parts"),
+            Command::Tradeoff(_) => moved("tradeoff", "sweep DATASET --out DIR --table presets"),
         }
     }
 }

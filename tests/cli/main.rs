@@ -21,7 +21,6 @@ mod refusals;
 mod stress;
 mod sweep;
 mod tone_command;
-mod tradeoff;
 mod tuning;
 use common::command::{refused, succeed};
 
@@ -374,10 +373,23 @@ fn demo_touches_no_folder_of_somebody_else() {
 }
 
 #[test]
+fn demo_is_a_sweep_of_three_curves_that_goes_on() {
+    let folder = tempfile::tempdir().unwrap();
+    let demo = format!("demo --out {}", folder.path().display());
+    let table = succeed(&demo);
+    for curve in ["linear", "ase", "ap3"] {
+        assert!(folder.path().join(format!("curve={curve}/model.ply")).is_file(), "{table}");
+    }
+    let page = fs::read_to_string(folder.path().join("index.html")).unwrap();
+    assert!(page.contains("exposed") && page.contains("data:image/png"));
+    assert_eq!(succeed(&demo), table, "nothing is trained twice");
+}
+
+#[test]
 fn help_teaches_every_command_in_lines_that_fit() {
     let commands = [
-        "", "train", "diagnose", "eval", "render", "tone", "curves", "fit", "sweep", "ablate",
-        "synth", "demo", "doctor", "bench", "check",
+        "", "train", "diagnose", "eval", "render", "tone", "curves", "fit", "sweep", "synth",
+        "demo", "doctor", "bench", "check",
     ];
     for command in commands {
         let help = succeed(&format!("{command} --help"));

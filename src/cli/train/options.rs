@@ -132,11 +132,6 @@ impl TrainOptions {
         options
     }
 
-    /// Whether the command line says which parts the model has.
-    pub(in crate::cli) fn picks_parts(&self) -> bool {
-        self.several.model.is_some() || self.several.parts.is_some()
-    }
-
     /// A line for each option that says something of what `config` has not.
     pub(super) fn idle(&self, config: &TrainConfig) -> Vec<String> {
         let of_parts = |key: &str| -> &[Part] {
