@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use nightsplat::cli::fit::{ChannelChoice, FamilyChoice, FitArgs, WeightingChoice, apply};
+use nightsplat::cli::tone::fit::{ChannelChoice, FamilyChoice, FitArgs, WeightingChoice, apply};
 use nightsplat::photographs::tone::CurveChoice;
 
 use super::*;
