@@ -40,7 +40,6 @@ pub use self::families::{Constant, FAMILIES, Family, Law, ToneCurve, White};
 #[cfg(feature = "io")]
 pub use self::file::CurveChoice;
 pub use self::histogram::LuminanceHistogram;
-pub(crate) use self::histogram::{BIN_SHIFT, FIRST_PREFIX};
 #[cfg(feature = "fit")]
 pub(crate) use self::law::{Numbers, PhotographCurve, law};
 pub(crate) use self::law::{clamped, curve_at, tone_curve};
@@ -54,7 +53,6 @@ pub use self::real::Real;
 #[cfg(feature = "io")]
 pub(crate) use self::settings::OF_CURVE;
 pub use self::settings::{GainChoice, ToneSettings};
-pub(crate) use self::statistics::Rank;
 pub use self::statistics::{Statistics, percentile};
 #[cfg(any(feature = "io", feature = "check"))]
 pub(crate) use self::statistics::{luminance, measurable};

@@ -317,5 +317,5 @@ fn the_bits_are_settings_like_any_other() {
     assert_eq!([config.precision.rest, config.precision.moments], [StorageFormat::Half; 2]);
     assert_eq!(TrainConfig::from_toml(&config.to_toml().unwrap()).unwrap(), config);
     let refused = with("precision.moments=8").unwrap_err().to_string();
-    assert!(refused.contains("precision.moments=8") && refused.contains("16"), "{refused}");
+    assert!(refused.contains("precision.moments is") && refused.contains("16"), "{refused}");
 }
