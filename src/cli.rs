@@ -56,6 +56,12 @@ const EXAMPLES: &str = "Start with:
   nightsplat sweep photos --out sweep --curves all  train with every curve, and rank them
   nightsplat sweep photos --out s --table presets   what time and memory buy
 
+For developers:
+  check        hold every pass of a training step to its CPU reference, on this device
+  synth        write a small dark set with known references
+  completions  print what a shell completes
+  man          write the man pages
+
 Exit codes:
   0 done; 1 failed; 2 misuse; 3 data that cannot be used; 4 no device, or not enough memory;
   75 saved, run it again (train --max-minutes); 130 and 143 saved (SIGINT and SIGTERM)";
@@ -70,12 +76,16 @@ enum Command {
     Export(export::ExportArgs),
     Tone(tone::ToneArgs),
     Sweep(Box<sweep::SweepArgs>),
+    #[command(hide = true)]
     Synth(synth::SynthArgs),
     Demo(demo::DemoArgs),
     Doctor(doctor::DoctorArgs),
     Bench(bench::BenchArgs),
+    #[command(hide = true)]
     Check(Box<check::CheckArgs>),
+    #[command(hide = true)]
     Completions(completions::CompletionsArgs),
+    #[command(hide = true)]
     Man(man::ManArgs),
 }
 

@@ -413,6 +413,17 @@ fn help_teaches_every_command_in_lines_that_fit() {
         commands.iter().all(|command| help.contains(command.split(' ').next().unwrap())),
         "{help}"
     );
+    // The first two columns are names; what is for developers stands below.
+    let listed = help.lines().skip_while(|line| *line != "Commands:").skip(1);
+    let listed = listed.take_while(|line| !line.is_empty());
+    let names: Vec<&str> = listed
+        .filter(|line| line.starts_with("  ") && !line.starts_with("   "))
+        .filter_map(|line| line.split_whitespace().next())
+        .collect();
+    assert!(
+        names.len() <= 12 && names.contains(&"train") && !names.contains(&"synth"),
+        "{names:?}"
+    );
     let train = succeed("train --help");
     for option in "--curve --gain --theta --steps --downscale --seed --sh-degree --ssim-weight --max-gaussians \
                    --background --reference --device --config --eval-every --out --overwrite --max-resolution --cache \

@@ -1,4 +1,4 @@
-//! `nightsplat fit`, in process.
+//! `nightsplat tone fit`, in process.
 
 use std::path::{Path, PathBuf};
 
