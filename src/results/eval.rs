@@ -73,7 +73,7 @@ pub struct Yardstick {
 }
 
 impl Yardstick {
-    /// The reference images where a test view has one; without any, the targets that `tone` gives the test views in the
+    /// The reference images where a test view has one; without any, the targets that `tone apply` gives the test views in the
     /// scene of the training photographs.
     ///
     /// # Errors

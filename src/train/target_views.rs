@@ -148,7 +148,7 @@ fn target_of(
     Ok(target.resized(view.camera.width, view.camera.height))
 }
 
-/// The targets that the test views would have were they trained on: what `tone` makes of their photographs in the scene of
+/// The targets that the test views would have were they trained on: what `tone apply` makes of their photographs in the scene of
 /// the training photographs.
 #[derive(Debug)]
 pub struct TestTargets {

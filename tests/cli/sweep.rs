@@ -379,6 +379,9 @@ fn old_names_say_the_new_ones() {
     for (old, new) in [
         ("ablate photos --out out --steps 2", "sweep DATASET --out DIR --table parts"),
         ("tradeoff --help", "sweep DATASET --out DIR --table presets"),
+        ("curves --table", "nightsplat tone list"),
+        ("fit pairs --family ase", "nightsplat tone fit"),
+        ("tone photos --curve ase", "nightsplat tone apply photos"),
     ] {
         refused(old, 2, &[new]);
     }
