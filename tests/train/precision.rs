@@ -2,8 +2,9 @@
 
 #![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
 
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 
+use nightsplat::gpu::Gpu;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::photographs::dataset::Dataset;
 use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
@@ -22,8 +23,9 @@ fn config(tone: ToneSettings, photographs: PhotographBits) -> TrainConfig {
 
 /// The losses of the steps and the parameters after them, and the peak of the memory.
 fn train(config: &TrainConfig, dataset: &Dataset) -> (Vec<f64>, Vec<f32>, u64) {
-    let gpu = gpu();
-    let mut trainer = Trainer::new(&gpu, config.clone(), dataset).unwrap();
+    static OWN: OnceLock<Gpu> = OnceLock::new();
+    let gpu = OWN.get_or_init(crate::common::own_gpu);
+    let mut trainer = Trainer::new(gpu, config.clone(), dataset).unwrap();
     gpu.reset_peak_memory();
     let reports = crate::common::train::advance(&mut trainer, config.steps);
     let losses = reports.into_iter().map(|report| report.loss).collect();
