@@ -188,7 +188,7 @@ impl Trainer {
     }
 
     /// How the run has ended, with the best of its models: where the held-out views score lower at the end than before by
-    /// more than [`StopConfig::margin`], the model of the best score is restored. No steps follow: a run that is to go on
+    /// more than [`margin`](super::StopConfig::margin), the model of the best score is restored. No steps follow: a run that is to go on
     /// from its end goes on from a checkpoint that was saved before.
     ///
     /// # Errors
