@@ -181,7 +181,7 @@ impl TestTargets {
     /// The photograph can no longer be read, or the device is out of memory or lost.
     pub fn of(&mut self, view: &View) -> Result<Option<Image>> {
         let photograph = lifted_from(view, self.pseudo_gt.settings().lift_first)?;
-        let target = |photograph| target_of(&mut self.pseudo_gt, view, photograph, &self.scene);
+        let target = |photograph| target_of(&self.pseudo_gt, view, photograph, &self.scene);
         photograph.as_deref().map(target).transpose()
     }
 }
