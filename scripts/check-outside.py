@@ -11,6 +11,9 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 
+# Examples that measure what is no API.
+INSTRUMENTS = ["growth"]
+
 MANIFEST = """\
 [package]
 name = "outside"
@@ -40,7 +43,8 @@ def main() -> None:
     (package / "Cargo.toml").write_text(MANIFEST.format(root=ROOT, profile=profile[0]))
     (package / "Cargo.lock").write_bytes((ROOT / "Cargo.lock").read_bytes())
     for example in (ROOT / "examples").glob("*.rs"):
-        (programs / example.name).write_text(example.read_text())
+        if example.stem not in INSTRUMENTS:
+            (programs / example.name).write_text(example.read_text())
     page = "\n".join(line.removeprefix("//!") for line in (ROOT / "src/lib.rs").read_text().splitlines() if line.startswith("//!"))
     for number, code in enumerate(re.findall(r"```no_run\n(.*?)```", page, re.DOTALL)):
         # Lines that the page hides are part of the program.

@@ -47,17 +47,17 @@ def synth(folder, side, views):
 
 def table(_):
     """Hostile inputs, each against the references."""
-    run(command(), "bench", "--stress")
+    run("cargo", "test", "--release", "--test", "cli", "--", "--ignored", "--nocapture", "whole_table")
 
 
 def conditioning(_):
-    """Adam over 100 000 steps, percentiles and means of 33 megapixels."""
-    run("cargo", "test", "--release", "--test", "conditioning", "--", "--include-ignored", "--nocapture")
+    """Adam over 100 000 steps."""
+    run("cargo", "test", "--release", "--test", "splats", "conditioning::", "--", "--include-ignored", "--nocapture")
 
 
 def cameras(_):
     """COLMAP on real dark photographs, and a training with what it finds."""
-    run("cargo", "test", "--release", "--test", "formats", "--", "--ignored", "--nocapture", "real_dark_photographs")
+    run("cargo", "test", "--release", "--test", "photographs", "--", "--ignored", "--nocapture", "real_dark_photographs")
 
 
 def resident(pid):

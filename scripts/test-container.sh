@@ -33,6 +33,6 @@ inside() {
 }
 inside doctor
 inside demo --out demo
-inside eval demo/ap3
+inside eval demo/curve=ap3
 buildah rm "$container" > /dev/null
 echo "the image builds, and trains the demo's scene"

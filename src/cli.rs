@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use anyhow::Result;
+use clap::error::{ContextKind, ContextValue};
 use clap::{Parser, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
 
@@ -10,13 +11,9 @@ use crate::base::settings::Setting;
 use crate::photographs::image::Image;
 use crate::train::settings::setting;
 
-pub mod ablate;
-mod batch;
 pub mod bench;
 pub mod check;
-mod comparison;
 pub mod completions;
-pub mod curves;
 mod defaults;
 pub mod demo;
 pub mod diagnose;
@@ -24,8 +21,6 @@ pub mod doctor;
 pub mod eval;
 pub mod export;
 mod finished_run;
-#[cfg(feature = "fit")]
-pub mod fit;
 pub mod man;
 pub mod pose;
 pub mod progress;
@@ -35,7 +30,6 @@ pub mod sweep;
 pub mod synth;
 mod table;
 pub mod tone;
-pub mod tradeoff;
 pub mod train;
 
 /// 3D Gaussian Splatting from dark photographs, on any Vulkan device.
@@ -60,7 +54,13 @@ const EXAMPLES: &str = "Start with:
   nightsplat render run --split all --out pictures  see the model from every camera
   nightsplat export run --to html                   a page with the splat to fly through
   nightsplat sweep photos --out sweep --curves all  train with every curve, and rank them
-  nightsplat tradeoff photos --out tradeoff         what time and memory buy
+  nightsplat sweep photos --out s --table presets   what time and memory buy
+
+For developers:
+  check        hold every pass of a training step to its CPU reference, on this device
+  synth        write a small dark set with known references
+  completions  print what a shell completes
+  man          write the man pages
 
 Exit codes:
   0 done; 1 failed; 2 misuse; 3 data that cannot be used; 4 no device, or not enough memory;
@@ -75,30 +75,35 @@ enum Command {
     Render(render::RenderArgs),
     Export(export::ExportArgs),
     Tone(tone::ToneArgs),
-    Curves(curves::CurvesArgs),
     Sweep(Box<sweep::SweepArgs>),
-    Tradeoff(Box<tradeoff::TradeoffArgs>),
-    #[cfg(feature = "fit")]
-    Fit(fit::FitArgs),
-    /// Fit a curve to pairs of photographs: not in this build
-    #[cfg(not(feature = "fit"))]
-    Fit(Absent),
+    #[command(hide = true)]
     Synth(synth::SynthArgs),
-    Ablate(Box<ablate::AblateArgs>),
     Demo(demo::DemoArgs),
     Doctor(doctor::DoctorArgs),
     Bench(bench::BenchArgs),
+    #[command(hide = true)]
     Check(Box<check::CheckArgs>),
+    #[command(hide = true)]
     Completions(completions::CompletionsArgs),
+    #[command(hide = true)]
     Man(man::ManArgs),
 }
 
-/// Whatever is given to a subcommand that this build lacks.
-#[cfg(not(feature = "fit"))]
-#[derive(Debug, clap::Args)]
-struct Absent {
-    #[arg(hide = true, trailing_var_arg = true, allow_hyphen_values = true)]
-    arguments: Vec<String>,
+/// Commands that have another name now, and that name.
+const RENAMED: [(&str, &str); 4] = [
+    ("ablate", "sweep DATASET --out DIR --table parts"),
+    ("tradeoff", "sweep DATASET --out DIR --table presets"),
+    ("curves", "tone list"),
+    ("fit", "tone fit"),
+];
+
+/// The new name of the command that a command line gives by its old one.
+pub fn renamed(error: &clap::Error) -> Option<String> {
+    let Some(ContextValue::String(name)) = error.get(ContextKind::InvalidSubcommand) else {
+        return None;
+    };
+    let (old, new) = RENAMED.iter().find(|(old, _)| old == name)?;
+    Some(format!("`nightsplat {old}` is now `nightsplat {new}`"))
 }
 
 impl Cli {
@@ -119,19 +124,9 @@ impl Cli {
             Command::Eval(args) => eval::run(&args),
             Command::Render(args) => render::run(&args),
             Command::Export(args) => export::run(&args),
-            Command::Tone(args) => Ok(tone::run(&args)?),
-            Command::Curves(args) => curves::run(&args),
-            #[cfg(feature = "fit")]
-            Command::Fit(args) => Ok(fit::run(&args)?),
-            #[cfg(not(feature = "fit"))]
-            Command::Fit(Absent { .. }) => {
-                let remedy = "install nightsplat with the feature `fit`, which is on by default";
-                Err(crate::Error::Usage(format!("this build has no `fit`; {remedy}")).into())
-            }
+            Command::Tone(args) => tone::run(&args),
             Command::Sweep(args) => sweep::run(&args),
-            Command::Tradeoff(args) => tradeoff::run(&args),
             Command::Synth(args) => Ok(synth::run(args)?),
-            Command::Ablate(args) => ablate::run(&args),
             Command::Demo(args) => demo::run(&args),
             Command::Doctor(args) => doctor::run(&args),
             Command::Bench(args) => bench::run(&args),
@@ -213,7 +208,8 @@ mod without_fit {
 
     #[test]
     fn fit_says_which_feature_has_it() {
-        let cli = Cli::try_parse_from(["nightsplat", "fit", "pairs", "--family", "ase"]).unwrap();
+        let cli =
+            Cli::try_parse_from(["nightsplat", "tone", "fit", "pairs", "--family", "ase"]).unwrap();
         let message = cli.run().unwrap_err().to_string();
         assert!(message.contains("feature `fit`"), "{message}");
     }

@@ -180,6 +180,7 @@ impl Error {
     }
 
     /// An [`Error::Output`].
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn output(path: impl AsRef<Path>, problem: impl Into<String>) -> Self {
         Self::Output { path: path.as_ref().to_owned(), problem: in_a_line(problem.into()) }
     }

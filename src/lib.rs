@@ -65,7 +65,7 @@
 //! The names on this page are the API; `docs/public-api.txt` lists them with what belongs to them. They live in folders,
 //! which are no part of it. Data flows one way: a folder uses only folders above it in this list, which
 //! `tests/house/architecture.rs` reads and asserts. The first page of each folder says what flows in and out, and lists its
-//! modules (`cargo doc --document-private-items`).
+//! modules (`cargo doc --features testing`).
 //!
 //! - `error`: what can go wrong, sorted by what the user can do about it
 //! - `base`: files read and written whole, hashes, random numbers

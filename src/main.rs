@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use clap::Parser;
 use nightsplat::Error;
 use nightsplat::base::output::printable;
-use nightsplat::cli::{Cli, message};
+use nightsplat::cli::{Cli, message, renamed};
 use tracing_subscriber::filter::LevelFilter;
 
 fn main() -> ExitCode {
@@ -52,6 +52,7 @@ fn misuse(error: &clap::Error) -> ExitCode {
     let told =
         lines.take_while(|line| !line.starts_with("Usage:") && !line.starts_with("For more"));
     let line = told.collect::<Vec<_>>().join(" ").replace(" tip: ", "; ");
+    let line = renamed(error).map_or(line, |line| format!("error: {line}"));
     // A closed stderr leaves nobody to tell.
     let _ = writeln!(std::io::stderr(), "{}; --help says more", in_one_line(&line));
     ExitCode::from(2)

@@ -20,7 +20,6 @@ mod ciconv_columns;
 mod ciconv_moments;
 mod ciconv_normalize;
 mod ciconv_rows;
-mod compensated_sum;
 pub mod conv3x3;
 mod conv3x3_half;
 pub mod conv3x3_weight_gradient;
@@ -45,8 +44,6 @@ pub mod gaussian;
 mod l1;
 mod largest_magnitude;
 mod loss_log;
-mod luminance;
-mod luminance_histogram;
 mod mask_gradient;
 mod mask_render;
 mod max_pool;
@@ -62,7 +59,6 @@ mod pack_map;
 mod pack_weights;
 mod packed;
 pub mod parameter_terms;
-mod percentile_select;
 mod product;
 mod product_backward;
 pub mod project;
@@ -84,11 +80,9 @@ mod sort_upsweep;
 pub mod splat;
 pub mod ssim;
 mod structure_l1;
-mod tone_statistics;
 mod window_gather;
 mod window_scatter;
 
-use compensated_sum::CompensatedSum;
 use glam::UVec2;
 
 /// Value `i` of planes of `width` x `height` lies in the columns and rows from `begin` to before `end`.

@@ -1,5 +1,8 @@
 // The pinhole: focal * (x / z, y / z) + principal point. Included by camera.glsl.
 
+// The Jacobian is taken no farther outside the view than this fraction of its width and height.
+const float JACOBIAN_MARGIN = 0.15;
+
 float pinhole_depth(vec3 point) { return point.z; }
 
 vec2 pinhole_project(vec3 point, Camera camera) {

@@ -1,6 +1,7 @@
-// Real spherical harmonics to degree 3, in the order and with the signs that splat viewers use.
+// Real spherical harmonics to degree 3, in the order and with the signs that splat viewers use. The viewer of exported pages
+// includes this too: it is GLSL ES 3.00 as well.
 
-const uint MAX_SH_DEGREE = 3;
+const uint MAX_SH_DEGREE = 3u;
 
 const float SH_C0 = 0.28209479177387814;  // 1 / (2 sqrt(pi)): the constant basis function
 const float SH_C1 = 0.4886025119029199;
@@ -12,26 +13,26 @@ const float SH_C3[7] = float[](
     -0.4570457994644658, 1.445305721320277, -0.5900435899266435
 );
 
-uint sh_count(uint degree) { return (degree + 1) * (degree + 1); }
+uint sh_count(uint degree) { return (degree + 1u) * (degree + 1u); }
 
 // The basis in the unit direction d; entries above `degree` are zero.
 void sh_basis(uint degree, vec3 d, out float basis[16]) {
-    for (uint k = 0; k < 16; k++) basis[k] = 0.0;
+    for (uint k = 0u; k < 16u; k++) basis[k] = 0.0;
     float x = d.x, y = d.y, z = d.z;
     basis[0] = SH_C0;
-    if (degree > 0) {
+    if (degree > 0u) {
         basis[1] = -SH_C1 * y;
         basis[2] = SH_C1 * z;
         basis[3] = -SH_C1 * x;
     }
-    if (degree > 1) {
+    if (degree > 1u) {
         basis[4] = SH_C2[0] * x * y;
         basis[5] = SH_C2[1] * y * z;
         basis[6] = SH_C2[2] * (2.0 * z * z - x * x - y * y);
         basis[7] = SH_C2[3] * x * z;
         basis[8] = SH_C2[4] * (x * x - y * y);
     }
-    if (degree > 2) {
+    if (degree > 2u) {
         basis[9]  = SH_C3[0] * y * (3.0 * x * x - y * y);
         basis[10] = SH_C3[1] * x * y * z;
         basis[11] = SH_C3[2] * y * (4.0 * z * z - x * x - y * y);
@@ -44,21 +45,21 @@ void sh_basis(uint degree, vec3 d, out float basis[16]) {
 
 // The derivative of the basis with respect to x, y, z of the direction.
 void sh_basis_gradient(uint degree, vec3 d, out vec3 gradient[16]) {
-    for (uint k = 0; k < 16; k++) gradient[k] = vec3(0.0);
+    for (uint k = 0u; k < 16u; k++) gradient[k] = vec3(0.0);
     float x = d.x, y = d.y, z = d.z;
-    if (degree > 0) {
+    if (degree > 0u) {
         gradient[1] = vec3(0.0, -SH_C1, 0.0);
         gradient[2] = vec3(0.0, 0.0, SH_C1);
         gradient[3] = vec3(-SH_C1, 0.0, 0.0);
     }
-    if (degree > 1) {
+    if (degree > 1u) {
         gradient[4] = SH_C2[0] * vec3(y, x, 0.0);
         gradient[5] = SH_C2[1] * vec3(0.0, z, y);
         gradient[6] = SH_C2[2] * vec3(-2.0 * x, -2.0 * y, 4.0 * z);
         gradient[7] = SH_C2[3] * vec3(z, 0.0, x);
         gradient[8] = SH_C2[4] * vec3(2.0 * x, -2.0 * y, 0.0);
     }
-    if (degree > 2) {
+    if (degree > 2u) {
         gradient[9]  = SH_C3[0] * vec3(6.0 * x * y, 3.0 * (x * x - y * y), 0.0);
         gradient[10] = SH_C3[1] * vec3(y * z, x * z, x * y);
         gradient[11] = SH_C3[2] * vec3(-2.0 * x * y, 4.0 * z * z - x * x - 3.0 * y * y, 8.0 * y * z);

@@ -227,7 +227,8 @@ void main() {
         [[unroll]] for (uint x = 0; x < COLUMNS; ++x) {
             float d[DERIVATIVES];
             [[unroll]] for (uint m = 0; m < DERIVATIVES; ++m) d[m] = march(d_pending[m][x], blur(d_row[m], x));
-            float d_ssim = d[0] + 2.0 * a[x] * d[1] + b[x] * d[2];
+            // A value that no window asks of passes nothing on, were it NaN.
+            float d_ssim = d[0] + (d[1] == 0.0 ? 0.0 : 2.0 * a[x] * d[1]) + b[x] * d[2];
             float difference = is_inside(uint(strip.x) + x, uint(done)) ? a[x] - b[x] : 0.0;
             gradient[x] = l1_scale * sign(difference) - ssim_scale * d_ssim;
             l1_sum += done >= strip.y && has_output(strip, x) ? abs(difference) : 0.0;

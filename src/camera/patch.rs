@@ -8,9 +8,7 @@ use glam::{DAffine3, DVec2, UVec2, Vec2};
 use super::{Camera, CameraModel};
 use crate::kernels;
 use crate::kernels::camera::{CAMERA_FISHEYE, CAMERA_PINHOLE};
-
-/// The Jacobian of a pinhole's projection is taken no farther outside the view than this fraction of its width and height.
-const JACOBIAN_MARGIN: f32 = 0.15;
+use crate::kernels::camera_pinhole::JACOBIAN_MARGIN;
 
 /// Patches of which both sides would be shorter are no patches, pixels: what compares them looks at 11 x 11.
 const SMALLEST: u32 = 16;
@@ -155,7 +153,7 @@ impl From<&Patch> for kernels::Camera {
         let [focal, principal_point] =
             [patch.camera.focal, patch.camera.principal_point].map(|at: DVec2| at.as_vec2());
         let whole = Patch::from(&patch.camera).size.as_vec2();
-        let margin = JACOBIAN_MARGIN * whole;
+        let margin = JACOBIAN_MARGIN as f32 * whole;
         let (distortion, largest_angle) = match patch.camera.model {
             CameraModel::Pinhole => ([0.0; 4], 0.0),
             CameraModel::Fisheye(lens) => {

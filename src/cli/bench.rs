@@ -1,10 +1,8 @@
 //! `nightsplat bench`: check a step against the CPU references pass by pass, then time its kernels and stages; or find the
-//! fastest tiles, how the cost grows, or what comes of hostile inputs.
+//! fastest tiles.
 
-mod growth;
-mod scene;
+pub mod scene;
 mod stages;
-pub mod stress;
 mod tune;
 
 use std::collections::BTreeMap;
@@ -32,14 +30,6 @@ pub struct BenchArgs {
     /// Find the fastest tiles of the device, for 3 and 11 channels, and keep them
     #[arg(long)]
     pub tune: bool,
-    /// Show how milliseconds and memory grow with Gaussians, pixels and channels, to 25 and 40 times the scene, and with the
-    /// photographs and points of a capture, with fitted exponents
-    #[arg(long, conflicts_with = "tune")]
-    pub growth: bool,
-    /// Train on hostile inputs instead, every pass checked, and show what comes of each and the largest errors against the
-    /// references in f64
-    #[arg(long, conflicts_with_all = ["tune", "growth"])]
-    pub stress: bool,
     /// The device: uuid:, pci: or index of `nightsplat doctor`, a part of its name, or cpu [default: the best]
     #[arg(long, value_name = "DEVICE")]
     pub device: Option<DeviceChoice>,
@@ -108,12 +98,6 @@ pub fn run(args: &BenchArgs) -> Result<()> {
         let is_sized = args.width.is_some() || args.height.is_some();
         let sizes = if is_sized { &[[width, height]][..] } else { &TUNED_SIZES };
         return tune::run(&bench, sizes, args.gaussians, args.json);
-    }
-    if args.stress {
-        return stress::run(&bench.gpu, args.json);
-    }
-    if args.growth {
-        return growth::run(&bench, [width, height], args.gaussians, args.json);
     }
     let scene = Scene::new(width, height, args.gaussians);
     let mut trainers = scene::trainers(&bench.gpu, &scene)?;
@@ -208,12 +192,6 @@ impl Bench {
         once()?;
         let times = (0..self.repeats).map(|_| once()).collect::<crate::Result<Vec<_>>>()?;
         Ok(median(times))
-    }
-
-    /// The least of the milliseconds that `once` reports, after a run that does not count.
-    fn least(&self, mut once: impl FnMut() -> crate::Result<f64>) -> crate::Result<f64> {
-        once()?;
-        (0..self.repeats).try_fold(f64::INFINITY, |least, _| Ok(least.min(once()?)))
     }
 }
 

@@ -48,7 +48,9 @@ mod tests {
     #[test]
     fn the_help_names_no_setting_that_there_is_not() {
         let command = Cli::command();
-        for arg in command.get_subcommands().flat_map(Command::get_arguments) {
+        let nested = command.get_subcommands().flat_map(Command::get_subcommands);
+        let commands = command.get_subcommands().chain(nested);
+        for arg in commands.flat_map(Command::get_arguments) {
             let help = arg.get_help().map(ToString::to_string).unwrap_or_default();
             assert!(!help.contains('{'), "{}: {help}", arg.get_id());
         }

@@ -10,7 +10,7 @@ use super::Cli;
 use crate::base::output::write_whole;
 use crate::{Error, Result};
 
-/// Write the man pages into a folder: nightsplat.1, and one for each subcommand
+/// Write the man pages into a folder: nightsplat.1, and one for each command
 #[derive(Clone, Debug, clap::Args)]
 pub struct ManArgs {
     /// The folder, such as ~/.local/share/man/man1; it is created
@@ -26,7 +26,8 @@ pub fn run(args: &ManArgs) -> Result<()> {
     std::fs::create_dir_all(&args.dir).map_err(problem)?;
     let mut command = Cli::command().disable_help_subcommand(true);
     command.build();
-    for command in iter::once(&command).chain(command.get_subcommands()) {
+    let nested = command.get_subcommands().flat_map(clap::Command::get_subcommands);
+    for command in iter::once(&command).chain(command.get_subcommands()).chain(nested) {
         let page = Man::new(command.clone());
         let mut text = vec![];
         page.render(&mut text).map_err(problem)?;

@@ -150,7 +150,7 @@ pub fn run(args: &PoseArgs) -> Result<()> {
 fn by_hand(photos: &Path, out: &Path) -> String {
     let (photos, out) = (photos.display(), out.display());
     format!(
-        "nightsplat tone {photos} --scene-statistics --out lifted && mkdir -p {out}/sparse && \
+        "nightsplat tone apply {photos} --scene-statistics --out lifted && mkdir -p {out}/sparse && \
          colmap feature_extractor --database_path {out}/database.db --image_path lifted --ImageReader.single_camera 1 && \
          colmap exhaustive_matcher --database_path {out}/database.db && \
          colmap mapper --database_path {out}/database.db --image_path lifted --output_path {out}/sparse && \

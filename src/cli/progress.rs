@@ -1,17 +1,14 @@
 //! What a run says while it trains.
 
 use std::io::{IsTerminal, Write};
-use std::path::Path;
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::{Value, json};
 
-use crate::gpu::Gpu;
-use crate::photographs::dataset::Dataset;
 use crate::results::eval::{self, Against, ViewScore};
-use crate::results::run::{self, Event, HeldRun, Session, Trained};
-use crate::train::{MemoryEstimate, StepReport, TrainConfig};
+use crate::results::run::Event;
+use crate::train::{MemoryEstimate, StepReport};
 
 /// How a run says what it does.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -35,35 +32,6 @@ impl ProgressForm {
 
 /// How long a run is silent.
 const SILENCE: Duration = Duration::from_secs(10);
-
-/// Trains, and says so as suits whoever reads standard error.
-///
-/// # Errors
-/// Those of [`run::train`].
-pub(crate) fn train(
-    gpu: &Gpu,
-    config: &TrainConfig,
-    dataset: &Dataset,
-    out: &Path,
-    held: HeldRun,
-) -> crate::Result<Trained> {
-    train_in(gpu, config, dataset, out, &Session { held, ..Session::default() })
-}
-
-/// The same in a session.
-///
-/// # Errors
-/// Those of [`run::train_in`].
-pub(crate) fn train_in(
-    gpu: &Gpu,
-    config: &TrainConfig,
-    dataset: &Dataset,
-    out: &Path,
-    session: &Session<'_>,
-) -> crate::Result<Trained> {
-    let mut progress = Reporter::new(ProgressForm::of_terminal());
-    run::train_in(gpu, config, dataset, out, session, |event| progress.observe(event))
-}
 
 /// What a run is going to take, in a line.
 fn foreseen(memory: &MemoryEstimate) -> String {

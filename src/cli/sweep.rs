@@ -4,14 +4,21 @@
 //! OUT/sweep.toml        what is swept here; another sweep needs another folder
 //!     NAME/             a run directory per point, with log.txt beside what `train` writes
 //!     leaderboard.csv   a row per point, seeds averaged; .md the same
-//!     timings.csv       seconds per point
-//!     index.html        the leaderboard with plots
+//!     index.html        the leaderboard with plots and pictures
+//!     costs.csv         time, energy and memory of each point
+//!     costs.html        scores against them, with fronts
 //! ```
 //!
-//! Nothing but `timings.csv` depends on how fast a point was trained, or on how often the sweep was interrupted.
+//! Nothing but the costs depends on how fast a point was trained, or on how often the sweep was interrupted.
 
+mod costs;
 mod grid;
 mod leaderboard;
+mod options;
+mod point;
+mod rows;
+mod run;
+mod runner;
 
 use std::io::Write;
 use std::path::PathBuf;
@@ -20,29 +27,36 @@ use anyhow::Result;
 use clap::Args;
 use serde::Serialize;
 
-use self::grid::PaperTable;
+use self::grid::Grid;
 use self::leaderboard::Leaderboard;
-use super::batch::options::{Lists, Options};
-use super::batch::point::{ADAPTIVE, Axis, OFFSET};
-use super::batch::{self, Common, Run, absolute, runner};
+use self::options::Options;
+use self::point::{ADAPTIVE, Axis, OFFSET, PARTS};
+use self::rows::Rows;
+pub(super) use self::run::parsed;
+use self::run::{Common, Run, absolute, difference};
 use super::progress_bar;
 use crate::Error;
+use crate::base::input;
+use crate::base::output::write_whole;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::Dataset;
 use crate::photographs::tone::Statistics;
-use crate::train::TrainConfig;
+use crate::train::{Part, TrainConfig, diagnosed};
 
 /// Train over a grid of settings, each point in its own run directory, and rank the results.
 ///
 /// A point is one `nightsplat train` command, run as a process of its own. Interrupt the sweep at any time and give the
 /// same command again: finished points stay, those under way go on from what they saved. A point that fails is reported, and the
 /// others go on. More values may join a list later; another base or another set of lists needs another --out.
+///
+/// OUT/index.html ranks the points, OUT/costs.html draws their scores against time, energy and memory, and with --eval-every how
+/// each came there.
 #[derive(Clone, Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub struct SweepArgs {
     /// The dataset, as for `train`
     pub dataset: PathBuf,
-    /// The folder of the sweep: a run directory per point, leaderboard.csv, leaderboard.md, index.html
+    /// The folder of the sweep: a run directory per point, index.html, leaderboard.csv, leaderboard.md, costs.html, costs.csv
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
     /// Trainings at once; they share the device
@@ -51,9 +65,12 @@ pub struct SweepArgs {
     /// Print the command line of every point that is left, and train nothing
     #[arg(long)]
     pub dry_run: bool,
-    /// The grid of one of the paper's tables; the lists below replace its own or add to them
+    /// Print every figure as JSON instead of tables
+    #[arg(long)]
+    pub json: bool,
+    /// A grid that has a name; the lists below replace its own or add to them
     #[arg(long, value_enum, help_heading = "The grid")]
-    table: Option<PaperTable>,
+    table: Option<Grid>,
     /// Values of alpha, the highest black level
     #[arg(long, value_name = "LIST", help_heading = "The grid")]
     alpha: Option<String>,
@@ -67,42 +84,28 @@ pub struct SweepArgs {
     #[arg(long, value_name = "KEY=LIST", help_heading = "The grid")]
     grid: Vec<String>,
     #[command(flatten, next_help_heading = "What every point is trained with")]
-    options: Options<SweepLists>,
+    options: Options,
 }
 
 const EXAMPLES: &str = "A LIST is comma-separated. Examples:
   nightsplat sweep photos --out sweep --curves all --downscale 4 --steps 300
-  nightsplat sweep photos --out offsets --table offset --seeds 1,2,3
+  nightsplat sweep photos --out parts --table parts --seeds 1,2,3
+  nightsplat sweep photos --out presets --table presets --eval-every 50
   nightsplat sweep photos --out density --grid density.gradient_threshold=1e-4,2e-4 --jobs 2";
 
-/// What a sweep takes as lists.
-#[derive(Clone, Copy, Debug)]
-struct SweepLists;
-
-impl Lists for SweepLists {
-    const LISTS: &'static [(&'static str, &'static str, &'static str)] = &[
-        ("curve", "curves", "Tone curves by name or file, or `all` [default: {tone.curve}]"),
-        (
-            "gain",
-            "gain",
-            "Values of c: how much a brighter photograph raises the curve's gain, or auto",
-        ),
-        ("theta", "theta", "Means that the linear curve aims at"),
-        (
-            "seed",
-            "seeds",
-            "Seeds; the leaderboard has the mean over them, and their standard deviation",
-        ),
-    ];
-}
-
-/// Trains what is left of the grid and writes the leaderboard.
+/// Trains what is left of the grid and writes what it found.
 ///
 /// # Errors
 /// A grid, an option or a dataset that makes no sense, before anything is trained; a folder that holds another sweep;
 /// points that failed, after the others are finished.
 pub fn run(args: &SweepArgs) -> Result<()> {
-    let runs = plan(args)?;
+    let dataset = args.dataset.display();
+    run_titled(args, &format!("Sweep of {dataset}"), &[])
+}
+
+/// The same with a title and first paragraphs of the page.
+pub(super) fn run_titled(args: &SweepArgs, title: &str, intro: &[String]) -> Result<()> {
+    let (runs, dataset) = plan(args)?;
     let mut left = vec![];
     for run in &runs {
         if !run.is_finished()? {
@@ -110,11 +113,10 @@ pub fn run(args: &SweepArgs) -> Result<()> {
         }
     }
     let first = &runs[0].config;
-    let dataset = Dataset::load(&first.dataset, &first.load_options())?;
     if !args.dry_run && !left.is_empty() {
         open(first)?;
     }
-    batch::claim(&args.out, "sweep", &manifest(args, &runs)?, &leaderboard::FILES, !args.dry_run)?;
+    claim(args, &runs)?;
     let mut out = std::io::stdout().lock();
     if args.dry_run {
         for run in left {
@@ -125,9 +127,15 @@ pub fn run(args: &SweepArgs) -> Result<()> {
     let bar = progress_bar(left.len());
     let failures = runner::train(&left, args.jobs.into(), &bar, (&args.out, runs.len()))?;
 
-    let baseline = args.table.and_then(PaperTable::baseline);
-    let shared = &args.options.shared;
-    let leaderboard = Leaderboard::new(&runs, baseline, adaptive_offset(&runs, &dataset), shared);
+    let rows = Rows::new(&runs, args.table.and_then(Grid::baseline));
+    let settings = settings(&runs, &rows.seeds, &args.options.shared);
+    let leaderboard = Leaderboard {
+        rows: &rows,
+        title: title.to_owned(),
+        intro: intro.iter().cloned().chain([settings]).collect(),
+        adaptive_offset: adaptive_offset(&runs, &dataset),
+        failures: &failures,
+    };
     // Scores do not need the device that the runs had; pictures do.
     let pictures = match open(first) {
         Ok(gpu) => leaderboard.pictures(&runs, &dataset, &gpu)?,
@@ -136,13 +144,14 @@ pub fn run(args: &SweepArgs) -> Result<()> {
             None
         }
     };
-    leaderboard.save(&args.out, &failures, pictures)?;
-    writeln!(
-        out,
-        "{}{}",
-        super::table::of(&leaderboard.table()),
-        args.out.join("index.html").display()
-    )?;
+    leaderboard.save(&args.out, pictures)?;
+    rows.save_costs(&args.out, title, &leaderboard.notes())?;
+    if args.json {
+        writeln!(out, "{:#}", rows.json(&dataset.root, &failures))?;
+    } else {
+        let tables = [leaderboard.table(), rows.costs()].map(|table| super::table::of(&table));
+        writeln!(out, "{}\n{}", tables.join("\n"), args.out.join("index.html").display())?;
+    }
     if let Some(failure) = failures.first() {
         let (failed, all) = (failures.len(), runs.len());
         anyhow::bail!("{failed} of {all} points failed; the first: {}", failure.reason);
@@ -154,8 +163,8 @@ fn open(config: &TrainConfig) -> crate::Result<Gpu> {
     Gpu::new(&config.device.parse::<DeviceChoice>()?)
 }
 
-/// The points of the grid, each checked as `train` would.
-fn plan(args: &SweepArgs) -> crate::Result<Vec<Run>> {
+/// The points of the grid, each checked as `train` would, and their dataset.
+fn plan(args: &SweepArgs) -> crate::Result<(Vec<Run>, Dataset)> {
     let lists = [("alpha", &args.alpha), ("beta", &args.beta), (OFFSET, &args.offset)];
     let mut axes = vec![];
     for (key, list) in lists {
@@ -165,23 +174,73 @@ fn plan(args: &SweepArgs) -> crate::Result<Vec<Run>> {
         axes.push(Axis::new(key, list)?);
     }
     for list in &args.grid {
-        axes.push(Axis::parse("grid", list)?);
+        axes.push(Axis::parse(list)?);
+    }
+    let shared = &args.options.shared;
+    if args.table == Some(Grid::Parts) && shared.iter().any(|it| it == "--model" || it == "--parts")
+    {
+        let problem = "--table parts trains every part by itself; leave out --model and --parts \
+                       (lita's L1 alone is --ssim-weight 0)";
+        return Err(Error::Usage(problem.to_owned()));
     }
     let points = grid::points(&axes, args.table)?;
     let (dataset, out) = (absolute(&args.dataset)?, absolute(&args.out)?);
-    let common = Common { dataset: &dataset, shared: &args.options.shared, out: &out };
+    let common = Common { dataset: &dataset, shared, out: &out };
     let mut runs: Vec<Run> = vec![];
     for point in points {
-        // Points are to differ by what the grid says alone: no plan.
-        let run = Run::new(point, common, None)?;
-        if let Some(other) = runs.iter().find(|other| other.config == run.config) {
-            let problem =
-                format!("{} and {} are the same run; leave one out", other.name, run.name);
-            return Err(Error::Usage(problem));
+        let run = Run::new(point, common)?;
+        match runs.iter().find(|other| other.config == run.config) {
+            None => runs.push(run),
+            Some(other) if args.table.is_some() => {
+                tracing::info!("{} is left out: it is the same run as {}", run.name, other.name);
+            }
+            Some(other) => {
+                let (one, other) = (&other.name, &run.name);
+                let problem = format!("{one} and {other} are the same run; leave one out");
+                return Err(Error::Usage(problem));
+            }
         }
-        runs.push(run);
     }
-    Ok(runs)
+    let first = &runs[0].config;
+    let dataset = Dataset::load(&first.dataset, &diagnosed(first))?;
+    if !dataset.test_views().any(|view| view.has_reference() || view.has_photograph()) {
+        let problem = "has no held-out view to score; list one in transforms_test.json or test.txt, or add photographs: \
+                       of eight, one is held out";
+        return Err(Error::input(&dataset.root, problem));
+    }
+    if !dataset.train_views().any(|view| view.depth.is_some()) {
+        runs.retain(|run| run.point.value(PARTS) != Some(Part::Depth.name()));
+    }
+    Ok((runs, dataset))
+}
+
+/// Takes a folder that is empty, holds this sweep or holds nothing that a sweep would replace.
+///
+/// # Errors
+/// The folder is taken, or cannot be written.
+fn claim(args: &SweepArgs, runs: &[Run]) -> crate::Result<()> {
+    let (folder, manifest) = (&args.out, manifest(args, runs)?);
+    let path = folder.join("sweep.toml");
+    if path.exists() {
+        let found = input::text(&path)?;
+        if found != manifest {
+            let differs = difference(&found, &manifest);
+            let problem = format!("holds another sweep ({differs}); choose another --out");
+            return Err(Error::output(folder, problem));
+        }
+        return Ok(());
+    }
+    let files = leaderboard::FILES.iter().chain(&costs::FILES);
+    if let Some(file) = files.into_iter().find(|file| folder.join(file).exists()) {
+        let problem = format!("holds {file}, which no sweep wrote; choose another --out");
+        return Err(Error::output(folder, problem));
+    }
+    if args.dry_run {
+        return Ok(());
+    }
+    std::fs::create_dir_all(folder)
+        .map_err(|error| Error::output(folder, format!("cannot be made: {error}")))?;
+    write_whole(&path, manifest.as_bytes())
 }
 
 /// What `sweep.toml` says: the sweep without the values of its lists.
@@ -199,6 +258,25 @@ fn manifest(args: &SweepArgs, runs: &[Run]) -> crate::Result<String> {
     let manifest =
         Manifest { dataset: absolute(&args.dataset)?, train: &args.options.shared, lists };
     toml::to_string(&manifest).map_err(|error| Error::Usage(error.to_string()))
+}
+
+/// A sentence on what the runs are, and what all were given.
+fn settings(runs: &[Run], seeds: &[String], shared: &[String]) -> String {
+    let mut steps: Vec<u64> = runs.iter().map(|run| run.config.steps).collect();
+    steps.sort_unstable();
+    steps.dedup();
+    let steps: Vec<String> = steps.iter().map(u64::to_string).collect();
+    let mut text = format!("{} runs of {} steps", runs.len(), steps.join(" or "));
+    if seeds.len() > 1 {
+        let seeds = seeds.join(", ");
+        text += &format!(
+            "; scores are means over the seeds {seeds}, and bars their least and greatest"
+        );
+    }
+    if !shared.is_empty() {
+        text += &format!("; all with {}", shared.join(" "));
+    }
+    text + ". The folder of each run has its config.toml."
 }
 
 /// delta0, the mean over the training views, where the sweep has the adaptive black level.

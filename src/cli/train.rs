@@ -166,6 +166,6 @@ fn planning<'a>(args: &TrainArgs, file: Option<&'a Path>, is_resumed: bool) -> P
 }
 
 /// What `--overwrite` says.
-pub(crate) fn held_unless(overwrite: bool) -> HeldRun {
+fn held_unless(overwrite: bool) -> HeldRun {
     if overwrite { HeldRun::Replace } else { HeldRun::Refuse }
 }

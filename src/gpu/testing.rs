@@ -35,6 +35,14 @@ pub fn gpu_that_binds(bytes: u64) -> Gpu {
     open(|shared| shared.properties.max_storage_buffer_range = bytes)
 }
 
+/// Another device with validation, which takes it that a dispatch has no more workgroups along either dimension.
+///
+/// # Panics
+/// As [`gpu`].
+pub fn gpu_that_launches(workgroups: u32) -> Gpu {
+    open(|shared| shared.properties.max_workgroups = workgroups)
+}
+
 #[expect(clippy::panic, reason = "a test without a device must fail")]
 fn open(adapt: impl FnOnce(&mut Shared)) -> Gpu {
     super::validation::fail_at_exit();

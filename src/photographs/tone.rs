@@ -34,7 +34,6 @@ pub use self::exposure::{Exposure, exposed_anew, is_black, soft};
 pub use self::families::{Constant, FAMILIES, Family, Law, ToneCurve, White};
 pub use self::file::CurveChoice;
 pub use self::histogram::LuminanceHistogram;
-pub(crate) use self::histogram::{BIN_SHIFT, FIRST_PREFIX};
 #[cfg(feature = "fit")]
 pub(crate) use self::law::{Numbers, PhotographCurve, law};
 pub(crate) use self::law::{clamped, curve_at, tone_curve};
@@ -47,7 +46,6 @@ pub(crate) use self::real::Dual;
 pub use self::real::Real;
 pub(crate) use self::settings::OF_CURVE;
 pub use self::settings::{GainChoice, ToneSettings};
-pub(crate) use self::statistics::Rank;
 pub use self::statistics::{Statistics, percentile};
 pub(crate) use self::statistics::{luminance, measurable};
 #[cfg(feature = "check")]

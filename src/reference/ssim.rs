@@ -88,9 +88,10 @@ pub fn gradient(
     (0..a.len()).map(at).collect()
 }
 
-/// dSSIM/da at one pixel, from the blurred derivatives.
+/// dSSIM/da at one pixel, from the blurred derivatives. A value that no window asks of passes nothing on, were it NaN.
 fn d_ssim<T: Real>(a: T, b: T, [mean, square, product]: [T; 3]) -> T {
-    mean + T::of(2.0) * a * square + b * product
+    let own = if square == T::of(0.0) { square } else { T::of(2.0) * a * square };
+    mean + own + b * product
 }
 
 /// One channel, blurred: each number is a sum of 11 sums of 11 products with rounded taps.

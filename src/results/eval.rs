@@ -73,7 +73,7 @@ pub struct Yardstick {
 }
 
 impl Yardstick {
-    /// The reference images where a test view has one; without any, the targets that `tone` gives the test views in the
+    /// The reference images where a test view has one; without any, the targets that `tone apply` gives the test views in the
     /// scene of the training photographs.
     ///
     /// # Errors
@@ -366,6 +366,7 @@ impl FromStr for Layer {
 ///
 /// # Errors
 /// Those of `render`; a reference image that is not kept can no longer be read.
+#[cfg(feature = "testing")]
 pub fn score(
     dataset: &Dataset,
     render: impl FnMut(&View) -> Result<Rendered>,

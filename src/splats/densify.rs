@@ -352,13 +352,10 @@ impl Densifier {
             first_gaussian: from.first_gaussian(),
             first_new_gaussian: to.first_gaussian(),
         };
-        let target = match &mut room.words {
-            Some(words) => words,
-            None => {
-                take(&mut room.planes, inputs.gradients);
-                &mut *inputs.gradients
-            }
-        };
+        if room.words.is_none() {
+            room.widen(inputs.gradients);
+        }
+        let target = room.words.as_mut().unwrap_or(inputs.gradients);
         let Scratch { fates, offsets, .. } = &self.scratch;
         let pairs = self.pairs(&gaussians.layout, report);
         self.gpu.run("densify_scatter", |pass| {
@@ -382,7 +379,7 @@ impl Densifier {
         &self,
         gaussians: &mut DeviceGaussians,
         inputs: DensifyInputs<'_>,
-        Room { mut planes, mut words, statistics }: Room,
+        mut room: Room,
         report: &DensifyReport,
     ) -> Result<()> {
         let PlaneCounts { columns, features, .. } = gaussians.layout.floats();
@@ -396,10 +393,10 @@ impl Densifier {
         let DensifyInputs { moments, grad_norm_sums, visit_counts, gradients: spare } = inputs;
         let Scratch { fates, offsets, .. } = &self.scratch;
         let pairs = self.pairs(&gaussians.layout, report);
-        std::mem::swap(&mut gaussians.parameters, words.as_mut().unwrap_or(spare));
+        std::mem::swap(&mut gaussians.parameters, room.words.as_mut().unwrap_or(spare));
         self.gpu.run("densify_moments", |pass| {
             for (_, moments) in moments.planes_mut() {
-                take(&mut planes, spare);
+                room.widen(spare);
                 for &(from, to) in &pairs {
                     let buffers = densify_moments::Buffers {
                         moments: from.planes(&*moments)?.words(),
@@ -412,10 +409,10 @@ impl Densifier {
                 }
                 std::mem::swap(moments, spare);
             }
-            take(&mut planes, spare);
+            room.widen(spare);
             Ok(())
         })?;
-        if let Some((sums, counts)) = statistics {
+        if let Some((sums, counts)) = room.statistics {
             (*grad_norm_sums, *visit_counts) = (sums, counts);
         }
         gaussians.layout.count = report.count;
@@ -430,7 +427,7 @@ impl Densifier {
         old.iter().flat_map(|from| new.iter().map(move |to| (from, to))).collect()
     }
 
-    /// What takes the place of buffers that are too short for `count` Gaussians, all of it before one of them goes.
+    /// What takes the place of all buffers where one is too short for `count` Gaussians, allocated before one of them goes.
     fn room(
         &self,
         gaussians: &DeviceGaussians,
@@ -446,37 +443,37 @@ impl Densifier {
             StorageFormat::Single => (Some(parameters), None),
             StorageFormat::Half => (None, Some(buffer(layout.words())?)),
         };
-        // In the order in which they are free.
-        let planes = iter::once(&*inputs.gradients).chain(turns);
-        let planes = planes.chain(inputs.moments.planes().into_iter().map(|(_, plane)| plane));
-        let planes = planes.map(|plane| {
-            let is_short = plane.len() < count * columns;
-            is_short.then(|| buffer(columns)).transpose()
-        });
-        let planes = planes.collect::<Result<Vec<_>>>()?.into_iter();
-        let statistics = if inputs.grad_norm_sums.len() < count {
-            let sums = self.gpu.uninit("grad_norm_sums", capacity)?;
-            Some((sums, self.gpu.uninit("visit_counts", capacity)?))
-        } else {
-            None
-        };
-        Ok(Room { planes, words, statistics })
+        let moments = inputs.moments.planes().into_iter().map(|(_, plane)| plane);
+        let held: Vec<_> = moments.chain(turns).chain([&*inputs.gradients]).collect();
+        let is_short = inputs.grad_norm_sums.len() < count
+            || held.iter().any(|plane| plane.len() < count * columns);
+        if !is_short {
+            return Ok(Room { planes: vec![], words, statistics: None });
+        }
+        let sums = self.gpu.uninit("grad_norm_sums", capacity)?;
+        Ok(Room {
+            planes: held.iter().map(|_| buffer(columns)).collect::<Result<_>>()?,
+            words,
+            statistics: Some((sums, self.gpu.uninit("visit_counts", capacity)?)),
+        })
     }
 }
 
 /// Buffers for more Gaussians.
 struct Room {
-    /// Those that a plane set is to take in turn, where its own is too short.
-    planes: std::vec::IntoIter<Option<Buffer<f32>>>,
+    /// One for each plane set, the gradients among them, or none where their own take turns.
+    planes: Vec<Buffer<f32>>,
     /// What parameters with halves go to.
     words: Option<Buffer<f32>>,
     statistics: Option<(Buffer<f32>, Buffer<u32>)>,
 }
 
-/// Puts the next of `planes` in the place of `spare`, which goes once the device is done with it.
-fn take(planes: &mut impl Iterator<Item = Option<Buffer<f32>>>, spare: &mut Buffer<f32>) {
-    if let Some(longer) = planes.next().flatten() {
-        *spare = longer;
+impl Room {
+    /// Puts a longer buffer in the place of `spare`, which goes once the device is done with it; none where there is room.
+    fn widen(&mut self, spare: &mut Buffer<f32>) {
+        if let Some(longer) = self.planes.pop() {
+            *spare = longer;
+        }
     }
 }
 

@@ -121,6 +121,7 @@ impl<P> Moments<P> {
 
 impl<'a> Moments<SliceMut<'a, f32>> {
     /// The same for one use.
+    #[cfg(feature = "io")]
     fn reborrow(&mut self) -> Moments<SliceMut<'_, f32>> {
         match self {
             Self::Single { first, second } => {
@@ -159,6 +160,7 @@ pub struct AdamBuffers<'a> {
 
 impl AdamBuffers<'_> {
     /// The same for one step of two.
+    #[cfg(feature = "io")]
     pub(crate) fn reborrow(&mut self) -> AdamBuffers<'_> {
         let Self { parameters, gradients, moments } = self;
         AdamBuffers {

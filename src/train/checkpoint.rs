@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 use super::best::{Snapshot, Tensor};
 use super::decisions::Decisions;
 use super::model::Model;
-use super::{TrainConfig, Trainer, learnables};
+use super::{TrainConfig, Trainer};
 use crate::base::hash::{self, Hasher};
 use crate::base::input;
 use crate::base::output::write_whole_with;
@@ -137,8 +137,8 @@ impl Trainer {
             format: FORMAT.to_owned(),
             step: self.step,
             config: self.config.to_toml()?,
-            decisions: self.decisions.clone(),
-            left_out: self.views.left_out(),
+            decisions: self.convergence.decisions.clone(),
+            left_out: self.supervision.views.left_out(),
             dataset: Some(self.fingerprint.clone()),
             checksum: None,
         };
@@ -147,7 +147,8 @@ impl Trainer {
             self.refuse_values(name, values)?;
         }
         let own = downloads.iter().map(|tensor| (tensor.0.clone(), tensor));
-        let best = self.best.iter().map(|tensor| (format!("{BEST}{}", tensor.0), tensor));
+        let best =
+            self.convergence.best.iter().map(|tensor| (format!("{BEST}{}", tensor.0), tensor));
         let named: Vec<(String, &Tensor)> = own.chain(best).collect();
         let mut visits = gpu.read(&self.model.visit_counts)?;
         visits.truncate(self.model.count());
@@ -219,9 +220,10 @@ impl Trainer {
             self.model = fresh;
             return Err(error);
         }
-        self.views.set_left_out(&header.left_out);
-        (self.step, self.decisions, self.best) = (header.step, header.decisions, best);
-        self.decisions.goes_on |= begun.steps != self.config.steps;
+        self.supervision.views.set_left_out(&header.left_out);
+        (self.step, self.convergence.decisions, self.convergence.best) =
+            (header.step, header.decisions, best);
+        self.convergence.decisions.goes_on |= begun.steps != self.config.steps;
         if let Some(change) = begun.stop.change(&self.config.stop) {
             tracing::warn!("{change}: it decides from step {} on", self.step);
         }
@@ -357,7 +359,7 @@ impl Trainer {
                 State { name, shape: shape.clone(), buffer, batches: Some(*batches) }
             },
         ));
-        for learnable in learnables(&mut self.networks, &mut self.exposures) {
+        for learnable in self.supervision.learnables() {
             let name = learnable.name();
             let AdamBuffers { parameters, moments, .. } = learnable.buffers();
             let shape = vec![parameters.len()];

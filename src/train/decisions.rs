@@ -75,7 +75,7 @@ impl Decisions {
 impl Trainer {
     /// The SH degree that a step trains.
     pub(super) fn sh_degree(&self, step: u64) -> u32 {
-        let highest = self.decisions.sh_degree.unwrap_or(self.config.sh_degree);
+        let highest = self.convergence.decisions.sh_degree.unwrap_or(self.config.sh_degree);
         self.config.sh_degree_at(step, highest)
     }
 
@@ -110,19 +110,21 @@ impl Trainer {
         let growth_gain = self.config.stop.growth_gain;
         let [_, whole] = self.config.schedule.resolution_steps;
         // What was scored before the memory was out is not scored twice.
-        let is_scored = self.decisions.rounds.last().is_some_and(|round| round.step == self.step);
-        if growth_gain > 0.0 && self.decisions.gaussians.is_none() && self.step >= whole {
+        let is_scored =
+            self.convergence.decisions.rounds.last().is_some_and(|round| round.step == self.step);
+        if growth_gain > 0.0 && self.convergence.decisions.gaussians.is_none() && self.step >= whole
+        {
             let psnr = if is_scored { None } else { self.held_out_psnr()? };
             if let Some(psnr) = psnr {
                 let (step, gaussians) = (self.step, self.model.count());
-                self.decisions.rounds.push(Round {
+                self.convergence.decisions.rounds.push(Round {
                     step,
                     score: (1e3 * psnr).round() as i64,
                     gaussians,
                 });
             }
-            if self.decisions.gains_too_little(growth_gain) {
-                self.decisions.gaussians = Some(self.model.count());
+            if self.convergence.decisions.gains_too_little(growth_gain) {
+                self.convergence.decisions.gaussians = Some(self.model.count());
                 tracing::info!(
                     "step {}: growth ends at {} Gaussians: {PATIENCE} rounds gained less on the held-out views than \
                      {growth_gain} dB for each doubling",
@@ -131,7 +133,7 @@ impl Trainer {
                 );
             }
         }
-        Ok(self.decisions.gaussians.unwrap_or(usize::MAX))
+        Ok(self.convergence.decisions.gaussians.unwrap_or(usize::MAX))
     }
 
     /// Whether it is decided after this step if the SH degree in use has paid: the next step would raise it, or would if
@@ -139,7 +141,7 @@ impl Trainer {
     pub(super) fn decides_degree_at(&self, step: u64) -> bool {
         let interval = self.config.schedule.sh_degree_interval.max(1);
         self.config.stop.degree_gain > 0.0
-            && self.decisions.sh_degree.is_none()
+            && self.convergence.decisions.sh_degree.is_none()
             && (step + 1).is_multiple_of(interval)
             && step < self.config.steps
             && self.config.schedule.sh_degree(step, self.config.sh_degree) > 0
@@ -166,7 +168,7 @@ impl Trainer {
             degree - 1
         );
         self.set_sh_degree(degree - 1)?;
-        self.decisions.sh_degree = Some(degree - 1);
+        self.convergence.decisions.sh_degree = Some(degree - 1);
         Ok(())
     }
 }

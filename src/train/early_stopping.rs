@@ -9,9 +9,14 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::Trainer;
-use super::decisions::Score;
+use super::best::Snapshot;
+use super::decisions::{Decisions, Score};
+use super::target_views::TargetViews;
+use super::{TrainConfig, Trainer};
 use crate::Result;
+use crate::photographs::dataset::{Dataset, Split};
+use crate::photographs::pseudo_gt::PseudoGt;
+use crate::photographs::tone::Scene;
 
 /// Steps after a round of density control in which the held-out views are not scored: the model has settled by then.
 const SETTLING_DISTANCE: u64 = 50;
@@ -53,6 +58,36 @@ impl std::fmt::Display for Ended {
     }
 }
 
+/// What tells when a run ends, and with which model.
+#[derive(Debug)]
+pub(super) struct Convergence {
+    pub(super) held_out: TargetViews,
+    pub(super) decisions: Decisions,
+    /// The model with the best score of the held-out views; empty where there is none.
+    pub(super) best: Snapshot,
+}
+
+impl Convergence {
+    /// That of a run before its first step, with the targets of the views that are held out.
+    ///
+    /// # Errors
+    /// A photograph cannot be read again, or the device is out of memory or lost.
+    pub(super) fn new(
+        pseudo_gt: &PseudoGt,
+        dataset: &Dataset,
+        config: &TrainConfig,
+        scene: &Scene,
+    ) -> Result<Self> {
+        let frame = config.frame.unwrap_or_default();
+        let held_out = dataset.views.iter().filter(|view| view.split == Split::HeldOut);
+        let held_out = TargetViews::new(pseudo_gt, held_out, &frame, scene)?;
+        if config.stop.views > 0 && held_out.is_empty() {
+            tracing::info!("no held-out view shows anything: the run takes all its steps");
+        }
+        Ok(Self { held_out, decisions: Decisions::default(), best: vec![] })
+    }
+}
+
 impl Trainer {
     /// The step that ends the run, as far as that is known now: fewer than its steps once it has converged.
     pub fn last_step(&self) -> u64 {
@@ -62,7 +97,7 @@ impl Trainer {
 
     /// The step at which the run has converged, if it ends for that.
     fn converged(&self) -> Option<u64> {
-        self.decisions.converged.filter(|_| !self.decisions.goes_on)
+        self.convergence.decisions.converged.filter(|_| !self.convergence.decisions.goes_on)
     }
 
     /// Whether the last step is done.
@@ -73,8 +108,8 @@ impl Trainer {
     /// Whether the run may end before its last step.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn may_end_early(&self) -> bool {
-        let is_open = self.converged().is_none() && !self.decisions.goes_on;
-        is_open && self.step < self.settles_after() && !self.held_out.is_empty()
+        let is_open = self.converged().is_none() && !self.convergence.decisions.goes_on;
+        is_open && self.step < self.settles_after() && !self.convergence.held_out.is_empty()
     }
 
     /// The step after which the model settles: there is no density control any more, and learning rates decay.
@@ -97,13 +132,13 @@ impl Trainer {
 
     /// The scores of the held-out views so far: step, PSNR in dB.
     pub fn held_out_scores(&self) -> impl DoubleEndedIterator<Item = (u64, f64)> {
-        self.decisions.scores.iter().map(|score| (score.step, score.score as f64 / 1e3))
+        self.convergence.decisions.scores.iter().map(|score| (score.step, score.score as f64 / 1e3))
     }
 
     /// Whether the held-out views are scored after this step: at the end, and every few steps but not right after a round
     /// of density control.
     pub(super) fn scores_at(&self, step: u64) -> bool {
-        if self.held_out.is_empty() {
+        if self.convergence.held_out.is_empty() {
             return false;
         }
         let due = step - step % self.config.stop.every;
@@ -128,16 +163,16 @@ impl Trainer {
         let score = Score { step: self.step, score: (1e3 * psnr).round() as i64 };
         let is_best = self.best_score().is_none_or(|best| score.score > best.score);
         if is_best && self.step >= whole {
-            self.best = self.snapshot()?;
+            self.convergence.best = self.snapshot()?;
         }
-        self.decisions.scores.push(score);
+        self.convergence.decisions.scores.push(score);
         let scores: Vec<f64> = self
             .held_out_scores()
             .filter(|(step, _)| *step >= whole)
             .map(|(_, psnr)| psnr)
             .collect();
         if self.may_end_early() && self.config.stop.has_converged(&scores) {
-            self.decisions.converged = Some(self.step);
+            self.convergence.decisions.converged = Some(self.step);
             tracing::info!(
                 "step {}: the held-out views have converged; the run ends at step {}",
                 self.step,
@@ -150,26 +185,26 @@ impl Trainer {
     /// The best score since views have their full size, the first of equals: that of [`Trainer::best`].
     fn best_score(&self) -> Option<Score> {
         let [_, whole] = self.config.schedule.resolution_steps;
-        let scores = self.decisions.scores.iter().filter(|score| score.step >= whole);
+        let scores = self.convergence.decisions.scores.iter().filter(|score| score.step >= whole);
         scores.copied().reduce(|best, next| if next.score > best.score { next } else { best })
     }
 
     /// How the run has ended, with the best of its models: where the held-out views score lower at the end than before by
-    /// more than `StopConfig::margin`, the model of the best score is restored. No steps follow: a run that is to go on
+    /// more than [`StopConfig::margin`](super::StopConfig::margin), the model of the best score is restored. No steps follow: a run that is to go on
     /// from its end goes on from a checkpoint that was saved before.
     ///
     /// # Errors
     /// The device is out of memory or lost.
     pub fn end(&mut self) -> Result<Ended> {
-        if std::mem::take(&mut self.decisions.score_due) {
+        if std::mem::take(&mut self.convergence.decisions.score_due) {
             self.score_held_out()?;
         }
         let step = self.step;
         let reason = self.converged().map_or(EndReason::Steps, |_| EndReason::Converged);
-        let last = self.decisions.scores.last().filter(|last| last.step == step);
+        let last = self.convergence.decisions.scores.last().filter(|last| last.step == step);
         let lost = |best: &Score| last.map_or(0.0, |last| (best.score - last.score) as f64 / 1e3);
         let better = self.best_score().filter(|best| lost(best) > self.config.stop.margin);
-        let best = std::mem::take(&mut self.best);
+        let best = std::mem::take(&mut self.convergence.best);
         if better.is_some() {
             self.restore_snapshot(&best)?;
         }
@@ -183,7 +218,7 @@ mod tests {
     use crate::gpu::testing::gpu;
     use crate::photographs::dataset::Dataset;
     use crate::photographs::dataset::synthetic::{self, SyntheticOptions};
-    use crate::train::{StopConfig, TrainConfig};
+    use crate::train::StopConfig;
 
     #[test]
     fn a_run_ends_once_two_scores_in_a_row_gain_too_little() {
@@ -256,10 +291,13 @@ mod tests {
         train_until(&mut trainer, 16);
         trainer.save_checkpoint(file.path()).unwrap();
         let mut restored = scored(0.25);
-        restored.best.clear();
+        restored.convergence.best.clear();
         restored.restore(file.path()).unwrap();
-        assert_eq!((restored.step, restored.best.len()), (16, trainer.best.len()));
-        let kept = restored.best.clone();
+        assert_eq!(
+            (restored.step, restored.convergence.best.len()),
+            (16, trainer.convergence.best.len())
+        );
+        let kept = restored.convergence.best.clone();
         restored.restore_snapshot(&kept).unwrap();
         assert!(restored.gaussians().unwrap() == best);
     }

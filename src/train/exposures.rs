@@ -20,8 +20,8 @@ impl Trainer {
     /// The device was lost.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn exposures(&self) -> Result<Option<Vec<(String, Affine)>>> {
-        let Some(exposures) = &self.exposures else { return Ok(None) };
-        let names = self.views.names().map(str::to_owned);
+        let Some(exposures) = &self.supervision.exposures else { return Ok(None) };
+        let names = self.supervision.views.names().map(str::to_owned);
         Ok(Some(names.zip(exposures.affines()?).collect()))
     }
 }
@@ -45,7 +45,7 @@ impl Views {
     /// The table cannot be read or names a view that there is not; the device is out of memory or lost.
     pub(super) fn exposures(
         &self,
-        pseudo_gt: &mut PseudoGt,
+        pseudo_gt: &PseudoGt,
         dataset: &Dataset,
         scene: &Scene,
         config: &TrainConfig,
@@ -134,7 +134,7 @@ impl Views {
 
 /// Makes targets of photographs that are not in the dataset, as those of it are made.
 struct Targets<'a> {
-    pseudo_gt: &'a mut PseudoGt,
+    pseudo_gt: &'a PseudoGt,
     dataset: &'a Dataset,
     scene: &'a Scene,
 }

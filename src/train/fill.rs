@@ -49,7 +49,7 @@ impl Trainer {
     /// As many as there are to be behind that round.
     pub(super) fn filled_count(&self) -> usize {
         let pixels = |view: &TrainView| Patch::from(&view.patch.camera).pixel_count();
-        let most = self.views.photographs().map(pixels).max().unwrap_or_default();
+        let most = self.supervision.views.photographs().map(pixels).max().unwrap_or_default();
         self.config.density.fill.min(most / LEAST_PIXELS_EACH)
     }
 
@@ -100,15 +100,19 @@ impl Trainer {
             ..self.config.render_settings()
         };
         let mut renderer = Renderer::new(&self.gpu, settings)?;
-        let exposures = self.exposures.as_ref().map(Exposures::affines).transpose()?;
-        let count = self.views.photographs().count();
-        let views = self.views.photographs().step_by(count.div_ceil(VIEWS).max(1));
+        let exposures = self.supervision.exposures.as_ref().map(Exposures::affines).transpose()?;
+        let count = self.supervision.views.photographs().count();
+        let views = self.supervision.views.photographs().step_by(count.div_ceil(VIEWS).max(1));
         let pixels = PIXELS_EACH * more / count.clamp(1, VIEWS);
         let mut sights = vec![];
         for view in views {
             let camera = coarse(&view.patch.camera, pixels);
             let depths = self.depths(&mut renderer, gaussians, &camera)?;
-            let target = self.views.picture(&self.gpu, &self.pseudo_gt, view.place)?;
+            let target = self.supervision.views.picture(
+                &self.gpu,
+                &self.supervision.pseudo_gt,
+                view.place,
+            )?;
             let exposure = exposures.as_ref().and_then(|exposures| exposures.get(view.place));
             let neutral = exposure.map(Affine::inverse).map(|inverse| inverse.applied(&target));
             let target = neutral.unwrap_or(target).resized(camera.width, camera.height);
@@ -141,12 +145,13 @@ impl Trainer {
 
     /// The mask of a view's photograph, as an image of three equal channels.
     fn mask_of(&self, view: &TrainView) -> Result<Option<Image>> {
-        if self.masks.of_view(view.number).is_none() {
+        if self.supervision.masks.of_view(view.number).is_none() {
             return Ok(None);
         }
-        let views = self.views.of_places(view.place..view.place + 1);
+        let views = self.supervision.views.of_places(view.place..view.place + 1);
         let weights = |view: &TrainView| {
-            let weights = self.masks.of_view(view.number).map(|weights| self.gpu.read(weights));
+            let weights =
+                self.supervision.masks.of_view(view.number).map(|weights| self.gpu.read(weights));
             Ok(weights.transpose()?.unwrap_or_default().repeat(3))
         };
         let parts = views.iter().map(weights).collect::<Result<_>>()?;

@@ -4,6 +4,7 @@ use glam::UVec2;
 
 use super::memory::MARGIN;
 use super::rendered::Rendered;
+use super::target_views::TargetViews;
 use super::{TrainConfig, Trainer, streams};
 use crate::Result;
 use crate::base::random::Stream;
@@ -16,6 +17,16 @@ use crate::splats::scene::GaussianSlice;
 
 /// dB. A round that costs the probes more is tried again with fewer splits. All training views may lose somewhat more.
 const MOST_LOST: f64 = 0.2;
+
+/// What makes Gaussians more and fewer.
+#[derive(Debug)]
+pub(super) struct Growth {
+    pub(super) densifier: Densifier,
+    /// Training views that tell what a round costs; none where nothing is done about it.
+    pub(super) probes: TargetViews,
+    /// That there is no room to grow was said.
+    pub(super) has_said_room: bool,
+}
 
 impl Trainer {
     /// Density control acts after this step: never in the settling phase, nor so late that the run ends before what it
@@ -39,14 +50,14 @@ impl Trainer {
         let most = room.min(grown);
         if self.fills_at(self.step) {
             self.fill(self.filled_count().min(most))?;
-            self.decisions.density_due = None;
+            self.convergence.decisions.density_due = None;
             return self.reserve();
         }
         let round = Round { step: self.step, rounds_left, most };
         let report = self.densify(round)?;
-        self.decisions.density_due = None;
-        if report.refused > 0 && room < self.config.max_gaussians && !self.has_said_room {
-            self.has_said_room = true;
+        self.convergence.decisions.density_due = None;
+        if report.refused > 0 && room < self.config.max_gaussians && !self.growth.has_said_room {
+            self.growth.has_said_room = true;
             tracing::warn!("growth stops at {room} Gaussians, {why}");
         }
         self.reserve()
@@ -59,7 +70,7 @@ impl Trainer {
     fn densify(&mut self, round: Round) -> Result<DensifyReport> {
         let options = RenderOptions { sh_degree: self.sh_degree(self.step), background: [0.0; 3] };
         let affines = self.affines()?;
-        let Self { gpu, model, densifier, renderer, probes, .. } = self;
+        let Self { gpu, model, renderer, growth: Growth { densifier, probes, .. }, .. } = self;
         let mut psnr = |gaussians: GaussianSlice<'_>| {
             let show = |camera: &Camera| Rendered::new(renderer, gaussians, camera, &options, None);
             Ok(probes.mean_psnr(&affines, show)?.map_or(0.0, |[colors, _]| colors))
@@ -78,7 +89,7 @@ impl Trainer {
     /// twice as many intersections for each Gaussian as the last one had.
     fn room(&self, intersections: u32) -> (usize, &'static str) {
         let pixels = |size: UVec2| f64::from(size.x) * f64::from(size.y);
-        let largest = self.views.sizes().into_iter().map(pixels).fold(0.0, f64::max);
+        let largest = self.supervision.views.sizes().into_iter().map(pixels).fold(0.0, f64::max);
         let shrunk = largest / pixels(self.view_of(self.step).size());
         let met = MARGIN * shrunk * f64::from(intersections.max(1));
         let count = self.model.count();
@@ -146,10 +157,10 @@ mod tests {
         let gpu = gpu();
         let dataset = Dataset::load(&config.dataset, &config.load_options()).unwrap();
         let frame = dataset.frame();
-        let mut pseudo_gt = PseudoGt::new(&gpu, &config.tone).unwrap();
+        let pseudo_gt = PseudoGt::new(&gpu, &config.tone).unwrap();
         let (scene, _) = measured(pseudo_gt.settings(), &dataset).unwrap();
         let all = [usize::MAX; 2];
-        let views = TargetViews::probes(&mut pseudo_gt, &dataset, &frame, &scene, all).unwrap();
+        let views = TargetViews::probes(&pseudo_gt, &dataset, &frame, &scene, all).unwrap();
         let mut trainer = Trainer::new(&gpu, config.clone(), &dataset).unwrap();
         let psnr = |trainer: &mut Trainer| {
             let (degree, affines) = (trainer.sh_degree_in_use(), trainer.affines().unwrap());
@@ -160,7 +171,7 @@ mod tests {
         let mut losses = vec![];
         while !trainer.has_ended() {
             trainer.train_steps(config.steps, &mut vec![]).unwrap();
-            let is_round = trainer.decisions.density_due.is_some();
+            let is_round = trainer.convergence.decisions.density_due.is_some();
             let before = is_round.then(|| psnr(&mut trainer));
             trainer.control().unwrap();
             losses.extend(before.map(|before| (trainer.step, before - psnr(&mut trainer))));

@@ -46,8 +46,8 @@ pub struct MemoryEstimate {
 impl Trainer {
     /// Room on the renderer for every view.
     pub(super) fn reserve(&mut self) -> Result<()> {
-        let Self { model, views, renderer, .. } = self;
-        let sizes = views.all().map(TrainView::size);
+        let Self { model, supervision, renderer, .. } = self;
+        let sizes = supervision.views.all().map(TrainView::size);
         renderer.reserve_sizes(model.count(), model.capacity(), sizes)
     }
 
@@ -87,7 +87,8 @@ impl Trainer {
 
     /// How many intersections the first Gaussians have in the largest view; there is room for them then.
     fn intersections_of_largest_view(&mut self) -> Result<u32> {
-        let largest = self.views.all().map(|view| view.patch).max_by_key(Patch::pixel_count);
+        let largest =
+            self.supervision.views.all().map(|view| view.patch).max_by_key(Patch::pixel_count);
         let Some(patch) = largest else { return Ok(0) };
         let options = RenderOptions { sh_degree: 0, background: [0.0; 3] };
         self.renderer.render_patch(&self.model.gaussians, &patch, &options)?;
@@ -113,7 +114,7 @@ impl Trainer {
     /// the rest is the model's.
     pub(super) fn keep_activations(&mut self, sizes: &[UVec2]) -> Result<()> {
         let most = (ACTIVATIONS * self.most_bytes()) as u64;
-        match &mut self.networks {
+        match &mut self.supervision.networks {
             Some(terms) => terms.keep_activations(sizes, most),
             None => Ok(()),
         }
@@ -189,8 +190,8 @@ impl Trainer {
         PerGaussian {
             plane,
             model: parameters + planes as f64 * plane + STATISTICS,
-            working: (self.renderer.bytes_per_gaussian() + self.densifier.bytes_per_gaussian())
-                as f64,
+            working: (self.renderer.bytes_per_gaussian()
+                + self.growth.densifier.bytes_per_gaussian()) as f64,
         }
     }
 }

@@ -17,10 +17,12 @@ impl Trainer {
     ///
     /// # Errors
     /// The device was lost.
-    pub(crate) fn gradients(&self) -> Result<Gaussians> {
+    #[cfg(feature = "testing")]
+    pub fn gradients(&self) -> Result<Gaussians> {
         let Model { gaussians, gradients, .. } = &self.model;
-        let planes = gaussians.layout.batches(&self.gpu).read(&self.gpu, gradients)?;
-        Ok(self.model.host(planes))
+        let parameters = gaussians.layout.batches(&self.gpu).read(&self.gpu, gradients)?;
+        let Layout { count, shape, .. } = gaussians.layout;
+        Ok(Gaussians { count, shape, parameters, origin: gaussians.origin })
     }
 }
 
@@ -94,12 +96,6 @@ impl Model {
     /// What the Gaussians are made of wherever they are seen.
     pub(super) fn whole_shape(&self) -> Shape {
         Shape { sh_degree: self.sh_degree, ..self.shape() }
-    }
-
-    /// Gaussians of planes as they are on the device: with the SH degree that was in use so far.
-    fn host(&self, parameters: Vec<f32>) -> Gaussians {
-        let DeviceGaussians { layout: Layout { count, shape, .. }, origin, .. } = self.gaussians;
-        Gaussians { count, shape, parameters, origin }
     }
 
     /// Makes room for another SH degree; coefficients beyond it go, with what Adam keeps of them.

@@ -1,15 +1,13 @@
 //! The passes of a step, and what they work on beside the Gaussians.
 
-use super::terms::NetworkTerms;
 use super::{Background, TrainConfig, growth, streams};
 use crate::Result;
 use crate::base::random::Stream;
 use crate::gpu::Gpu;
 use crate::loss::Losses;
-use crate::loss::exposure::Exposures;
 use crate::photographs::dataset::Dataset;
 use crate::splats::densify::Densifier;
-use crate::splats::optimizer::{Adam, FiniteCheck, Learnable};
+use crate::splats::optimizer::{Adam, FiniteCheck};
 use crate::splats::render::{RenderSettings, Renderer};
 use crate::splats::scene::Shape;
 
@@ -39,16 +37,6 @@ impl Kernels {
 /// The SH degree of the first step.
 pub(super) fn first_sh_degree(config: &TrainConfig) -> u32 {
     config.sh_degree_at(1, config.sh_degree)
-}
-
-/// Everything that is learned beside the Gaussians: Adam trains it, and checkpoints keep it.
-pub(super) fn learnables<'a>(
-    networks: &'a mut Option<NetworkTerms>,
-    exposures: &'a mut Option<Exposures>,
-) -> impl Iterator<Item = &'a mut dyn Learnable> {
-    let networks = networks.iter_mut().flat_map(|terms| terms.networks.parameters_mut());
-    let networks = networks.map(|parameters| parameters as &mut dyn Learnable);
-    networks.chain(exposures.iter_mut().map(|exposures| exposures as &mut dyn Learnable))
 }
 
 /// The background of a step.

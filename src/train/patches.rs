@@ -39,7 +39,7 @@ impl Trainer {
     /// not, or smaller ones are no remedy.
     pub(super) fn fewer_patch_pixels(&mut self) -> Result<Option<u64>> {
         let of_photograph = |patch: &Patch| Patch::from(&patch.camera).pixel_count();
-        let patches = || self.views.whole().iter().map(|view| (view.place, view.patch));
+        let patches = || self.supervision.views.whole().iter().map(|view| (view.place, view.patch));
         let largest = patches().max_by_key(|(_, patch)| of_photograph(patch));
         let Some((largest, _)) = largest else { return Ok(None) };
         let patches: Vec<Patch> =

@@ -1,8 +1,30 @@
-//! The model that a training begins with, where one is given.
+//! From a configuration and a dataset to a trainer before its first step.
 
-use super::{TrainConfig, Trainer};
+use std::panic::resume_unwind;
+use std::thread::{self, ScopedJoinHandle};
+
+use glam::UVec2;
+
+use super::cache::CacheSize;
+use super::early_stopping::Convergence;
+use super::growth::Growth;
+use super::masks::Masks;
+use super::measuring::TargetExposure;
+use super::model::Model;
+use super::passes::{Kernels, first_sh_degree};
+use super::submission::{MOST_STEPS, Submissions};
+use super::supervision::Supervision;
+use super::target_views::TargetViews;
+use super::terms::NetworkTerms;
+use super::views::Views;
+use super::{Optimizer, TrainConfig, Trainer};
 use crate::gpu::Gpu;
-use crate::photographs::dataset::Dataset;
+use crate::loss::exposure::Exposures;
+use crate::loss::{LossLog, ParameterTerms};
+use crate::photographs::dataset::{Dataset, Fingerprint, Original};
+use crate::photographs::pseudo_gt::PseudoGt;
+use crate::photographs::tone::Scene;
+use crate::splats::densify::DensityControl;
 use crate::splats::scene::{FEATURES, Gaussians, Shape, ply};
 use crate::{Error, Result};
 
@@ -51,4 +73,162 @@ impl Trainer {
     pub(crate) fn to_restore(gpu: &Gpu, config: TrainConfig, dataset: &Dataset) -> Result<Self> {
         Self::on_patches(gpu, config, dataset, None)
     }
+
+    /// Begins anew on smaller patches where the first Gaussians show that the device could not follow them on these.
+    pub(super) fn on_patches(
+        gpu: &Gpu,
+        mut config: TrainConfig,
+        dataset: &Dataset,
+        gaussians: Option<&Gaussians>,
+    ) -> Result<Self> {
+        loop {
+            let mut trainer = Self::begin(gpu, config.clone(), dataset, gaussians)?;
+            config.patch_pixels = match trainer.fewer_patch_pixels()? {
+                None => {
+                    trainer.supervision.views.say_what_is_cut(gpu);
+                    break Ok(trainer);
+                }
+                fewer => fewer,
+            };
+            drop(trainer);
+            gpu.free_unused();
+        }
+    }
+
+    fn begin(
+        gpu: &Gpu,
+        mut config: TrainConfig,
+        dataset: &Dataset,
+        gaussians: Option<&Gaussians>,
+    ) -> Result<Self> {
+        config.check()?;
+        config.leave_out_what_is_missing(dataset);
+        config.frame.get_or_insert_with(|| dataset.frame());
+        thread::scope(|scope| {
+            // The driver compiles on another thread while the views are uploaded and looked at.
+            let own = config.clone();
+            let beside = scope
+                .spawn(move || Ok((Kernels::new(gpu, &own, dataset)?, Fingerprint::of(dataset)?)));
+            Self::assemble(gpu, config, dataset, gaussians, beside)
+        })
+    }
+
+    fn assemble(
+        gpu: &Gpu,
+        config: TrainConfig,
+        dataset: &Dataset,
+        gaussians: Option<&Gaussians>,
+        beside: ScopedJoinHandle<'_, Result<(Kernels, Fingerprint)>>,
+    ) -> Result<Self> {
+        if let Some(CacheSize(bytes)) = config.max_vram {
+            gpu.limit_memory(bytes);
+        }
+        let frame = config.frame.unwrap_or_default();
+        let pseudo_gt = PseudoGt::new(gpu, &config.tone)?;
+        let (views, scene, target_exposure) =
+            Views::upload(gpu, &pseudo_gt, dataset, &frame, &config)?;
+        let sizes = views.sizes();
+        let probes = probes(&pseudo_gt, dataset, &config, &scene, &sizes)?;
+        let convergence = Convergence::new(&pseudo_gt, dataset, &config, &scene)?;
+        if let Some(TargetExposure { scene, .. }) = &target_exposure {
+            tracing::info!("{}", scene.reason());
+        }
+        config.model.say_what_parts_see(&sizes);
+        let starts = views.exposures(&pseudo_gt, dataset, &scene, &config)?;
+        let gaussians = match gaussians {
+            Some(gaussians) => given(gaussians, &config)?,
+            None => {
+                views.initial_gaussians(gpu, &pseudo_gt, dataset, &config, starts.as_deref())?
+            }
+        };
+        views.say_what_shows_nothing(&gaussians);
+        let masks = Masks::new(gpu, dataset, &views)?;
+        let exposures = starts.map(|starts| Exposures::new(gpu, config.exposure.rates, &starts));
+        let mut exposures = exposures.transpose()?;
+        if let Some(exposures) = &mut exposures {
+            sizes.iter().try_for_each(|&size| exposures.reserve(size))?;
+        }
+        dataset.views.iter().filter_map(|view| view.original.as_ref()).for_each(Original::release);
+        let (Kernels { renderer, mut losses, adam, finite, densifier }, fingerprint) =
+            beside.join().unwrap_or_else(|panic| resume_unwind(panic))?;
+        losses.prepare(&views.sources(gpu, &pseudo_gt, dataset))?;
+        let networks = NetworkTerms::new(gpu, &config, &sizes, !masks.is_empty())?;
+        let pixels = sizes.iter().map(|size| size.x as usize * size.y as usize).max();
+        let values = config.render_settings().channels() * pixels.unwrap_or_default();
+        let pictures = views.most_values();
+        // Beside the target only networks look at the photograph.
+        let photographs = if networks.is_some() { pictures } else { 0 };
+        let supervision = Supervision {
+            views,
+            scene,
+            target_exposure,
+            pseudo_gt,
+            target: gpu.uninit("target", pictures)?,
+            photograph: gpu.uninit("low", photographs)?,
+            masks,
+            exposures,
+            networks,
+            losses,
+            parameter_terms: ParameterTerms::new(gpu, config.loss)?,
+            d_render: gpu.uninit("d_render", values)?,
+            log: LossLog::new(gpu, MOST_STEPS as usize)?,
+        };
+        let mut trainer = Self {
+            gpu: gpu.clone(),
+            fingerprint,
+            frame,
+            extent: dataset.extent() * frame.scale,
+            step: 0,
+            supervision,
+            model: Model::upload(gpu, &gaussians, first_sh_degree(&config), &config.precision)?,
+            renderer,
+            optimizer: Optimizer { adam, finite, checked: 0 },
+            growth: Growth { densifier, probes, has_said_room: false },
+            convergence,
+            submissions: Submissions::default(),
+            fixed_bytes: 0.0,
+            config,
+        };
+        // Gaussians that are given may have what the first step does not use.
+        trainer.renderer.set_sh_degree(trainer.model.shape().sh_degree)?;
+        trainer.reserve()?;
+        trainer.keep_activations(&sizes)?;
+        trainer.fixed_bytes = trainer.measure_fixed_bytes();
+        Ok(trainer)
+    }
+}
+
+/// Gaussians to begin with, in the frame. A run that ended before its highest SH degree was in use has a model without it.
+///
+/// # Errors
+/// They are not made of what the configuration's model is.
+fn given(gaussians: &Gaussians, config: &TrainConfig) -> Result<Gaussians> {
+    let shape = config.render_settings().shape;
+    if !shape.holds(gaussians.shape) {
+        let own = gaussians.shape;
+        return Err(Error::Usage(format!("Gaussians of {own:?} make no model of {shape:?}")));
+    }
+    Ok(gaussians.with_sh_degree(shape.sh_degree).from_world(&config.frame.unwrap_or_default()))
+}
+
+/// Training views that tell what a round of density control costs.
+const PROBES: usize = 8;
+/// The pixels of one: all take 100 MB of the host at the most.
+const MOST_PROBE_PIXELS: usize = 1 << 20;
+
+fn probes(
+    pseudo_gt: &PseudoGt,
+    dataset: &Dataset,
+    config: &TrainConfig,
+    scene: &Scene,
+    sizes: &[UVec2],
+) -> Result<TargetViews> {
+    if config.density.control == DensityControl::Paper {
+        return Ok(TargetViews::default());
+    }
+    // No larger than what steps render.
+    let largest = sizes.iter().map(|size| size.element_product() as usize).max();
+    let pixels = largest.unwrap_or_default().min(MOST_PROBE_PIXELS);
+    let frame = config.frame.unwrap_or_default();
+    TargetViews::probes(pseudo_gt, dataset, &frame, scene, [PROBES, pixels])
 }

@@ -57,6 +57,14 @@ impl Pace {
     }
 }
 
+/// How steps reach the device, and what became of the last that did.
+#[derive(Debug, Default)]
+pub(super) struct Submissions {
+    pub(super) pace: Pace,
+    /// What ended the last call after steps that were done.
+    pub(super) failed: Option<Error>,
+}
+
 /// Steps on their way through the device.
 struct Submitted {
     steps: RangeInclusive<u64>,
@@ -69,7 +77,7 @@ impl Trainer {
     /// Has always so many submissions in flight, of so many steps each; none: as long as suits the device.
     #[doc(hidden)]
     pub fn set_pace(&mut self, in_flight: usize, steps: Option<u64>) {
-        self.pace = Pace { in_flight: in_flight.max(1), steps, ..Pace::default() };
+        self.submissions.pace = Pace { in_flight: in_flight.max(1), steps, ..Pace::default() };
     }
 
     /// Trains up to `until`, to the next step of density control, or for about half a second.
@@ -77,16 +85,16 @@ impl Trainer {
     /// Where that fails behind steps that are done, these are reported first and the next call says why: what is reported
     /// is what the model has.
     pub(super) fn submit_steps(&mut self, until: u64) -> Result<Vec<StepReport>> {
-        if let Some(error) = self.failed.take() {
+        if let Some(error) = self.submissions.failed.take() {
             return Err(error);
         }
         let mut reports = vec![];
         match self.train_stretch(until, &mut reports) {
-            Err(error) if !reports.is_empty() => self.failed = Some(error),
+            Err(error) if !reports.is_empty() => self.submissions.failed = Some(error),
             done => done?,
         }
         // A model that is broken is nobody's, and neither are its steps.
-        if self.step >= self.checked + FINITE_STEPS {
+        if self.step >= self.optimizer.checked + FINITE_STEPS {
             self.check_finite()?;
         }
         Ok(reports)
@@ -115,12 +123,13 @@ impl Trainer {
         let last = (next..until).find(changes).unwrap_or(until);
         let (mut in_flight, mut sent) = (VecDeque::new(), Ok(()));
         loop {
-            while sent.is_ok() && next <= last && in_flight.len() < self.pace.in_flight {
+            while sent.is_ok() && next <= last && in_flight.len() < self.submissions.pace.in_flight
+            {
                 let has_news = !(reports.is_empty() && in_flight.is_empty());
                 if has_news && begin.elapsed() > STRETCH {
                     break;
                 }
-                let steps = next..=last.min(next + self.pace.steps() - 1);
+                let steps = next..=last.min(next + self.submissions.pace.steps() - 1);
                 // Where one cannot be sent, those before it still change the model.
                 sent = self.bring_and_submit(steps).map(|submitted| {
                     next = submitted.steps.end() + 1;
@@ -133,37 +142,41 @@ impl Trainer {
                 break;
             }
         }
-        self.decisions.score_due = !reports.is_empty() && self.scores_at(self.step);
-        self.decisions.degree_due = !reports.is_empty() && self.decides_degree_at(self.step);
+        self.convergence.decisions.score_due = !reports.is_empty() && self.scores_at(self.step);
+        self.convergence.decisions.degree_due =
+            !reports.is_empty() && self.decides_degree_at(self.step);
         if !reports.is_empty() && self.densifies_at(self.step) {
             // Due whether or not there is memory to ask.
-            self.decisions.density_due = Some(0);
-            self.decisions.density_due = Some(self.renderer.intersections()?);
+            self.convergence.decisions.density_due = Some(0);
+            self.convergence.decisions.density_due = Some(self.renderer.intersections()?);
         }
         sent
     }
 
     /// Does what is due behind the last step: each is done, or the model is as it was and it stays due.
     pub(super) fn control(&mut self) -> Result<()> {
-        if self.decisions.score_due {
+        if self.convergence.decisions.score_due {
             self.score_held_out()?;
-            self.decisions.score_due = false;
+            self.convergence.decisions.score_due = false;
             // A run that has just converged grows no more.
-            self.decisions.density_due.take_if(|_| self.decisions.converged == Some(self.step));
+            self.convergence
+                .decisions
+                .density_due
+                .take_if(|_| self.convergence.decisions.converged == Some(self.step));
         }
-        if let Some(intersections) = self.decisions.density_due {
+        if let Some(intersections) = self.convergence.decisions.density_due {
             self.control_density(intersections)?;
         }
-        if self.decisions.degree_due {
+        if self.convergence.decisions.degree_due {
             self.decide_degree()?;
-            self.decisions.degree_due = false;
+            self.convergence.decisions.degree_due = false;
         }
         Ok(())
     }
 
     fn bring_and_submit(&mut self, steps: RangeInclusive<u64>) -> Result<Submitted> {
         let first = *steps.start();
-        let fitting = self.views.bring(&self.config, steps)?;
+        let fitting = self.supervision.views.bring(&self.config, steps)?;
         self.submit(first..=fitting)
     }
 
@@ -172,8 +185,8 @@ impl Trainer {
     /// # Errors
     /// [`Error::ParameterNotFinite`] names the last step and the plane.
     fn check_finite(&mut self) -> Result<()> {
-        self.checked = self.step;
-        match self.model.first_not_finite(&self.gpu, &mut self.finite)? {
+        self.optimizer.checked = self.step;
+        match self.model.first_not_finite(&self.gpu, &mut self.optimizer.finite)? {
             Some(at) => Err(self.not_finite("gaussians.parameters", at)),
             None => Ok(()),
         }
@@ -183,11 +196,14 @@ impl Trainer {
         let gpu = self.gpu.clone();
         let (first, mut downloads) = (*steps.start(), None);
         gpu.submit("steps", |pass| {
-            self.log.clear(pass);
+            self.supervision.log.clear(pass);
             for step in steps.clone() {
                 self.record_step(pass, step, (step - first) as u32)?;
             }
-            downloads = Some((self.log.download(pass)?, pass.download(self.renderer.status())?));
+            downloads = Some((
+                self.supervision.log.download(pass)?,
+                pass.download(self.renderer.status())?,
+            ));
             Ok(())
         })?;
         let Some((log, status)) = downloads else {
@@ -203,12 +219,13 @@ impl Trainer {
         let Submitted { steps, at, log, status } = submitted;
         let (log, status) = (log.wait()?, Status::from_words(&status.wait()?));
         let count = steps.end() - steps.start() + 1;
-        self.pace.measure(at, count);
+        self.submissions.pace.measure(at, count);
         // The steps from the first failed one on have changed nothing.
         let done = log.iter().take(count as usize).take_while(|losses| losses.status == 0).count();
         // That flag goes up behind the loss: of the step before the first that saw it.
         let done = if status.gradient_not_finite { done.saturating_sub(1) } else { done };
-        let milliseconds = self.pace.step.as_secs_f64() * 1e3 * count as f64 / done.max(1) as f64;
+        let milliseconds =
+            self.submissions.pace.step.as_secs_f64() * 1e3 * count as f64 / done.max(1) as f64;
         let losses = steps.zip(&log[..done]);
         reports.extend(losses.map(|(step, losses)| self.report(step, losses, milliseconds)));
         self.step += done as u64;
@@ -253,7 +270,7 @@ impl Trainer {
     /// Trains on the view of a step no more, as if that had never begun; false where it is the last view.
     fn leave_out_view_of(&mut self, step: u64) -> Result<bool> {
         let place = self.view_of(step).place;
-        if !self.views.leave_out(place) {
+        if !self.supervision.views.leave_out(place) {
             return Ok(false);
         }
         let Self { model, renderer, .. } = self;
@@ -268,7 +285,11 @@ impl Trainer {
     }
 
     pub(super) fn view_of(&self, step: u64) -> &TrainView {
-        self.views.of_step(self.config.seed, step, self.config.schedule.resolution_level(step))
+        self.supervision.views.of_step(
+            self.config.seed,
+            step,
+            self.config.schedule.resolution_level(step),
+        )
     }
 
     fn report(&self, step: u64, losses: &StepLosses, milliseconds: f64) -> StepReport {

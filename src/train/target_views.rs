@@ -39,7 +39,7 @@ impl TargetViews {
     /// # Errors
     /// A photograph can no longer be read, or the device is out of memory or lost.
     pub(super) fn new<'a>(
-        pseudo_gt: &mut PseudoGt,
+        pseudo_gt: &PseudoGt,
         views: impl IntoIterator<Item = &'a View>,
         frame: &Frame,
         scene: &Scene,
@@ -68,7 +68,7 @@ impl TargetViews {
     /// # Errors
     /// As [`TargetViews::new`].
     pub(super) fn probes(
-        pseudo_gt: &mut PseudoGt,
+        pseudo_gt: &PseudoGt,
         dataset: &Dataset,
         frame: &Frame,
         scene: &Scene,
@@ -137,7 +137,7 @@ fn clamped(image: &Image) -> Image {
 
 /// The target that a view's photograph becomes, made as those of the training views are.
 fn target_of(
-    pseudo_gt: &mut PseudoGt,
+    pseudo_gt: &PseudoGt,
     view: &View,
     photograph: &Image,
     scene: &Scene,
@@ -148,7 +148,7 @@ fn target_of(
     Ok(target.resized(view.camera.width, view.camera.height))
 }
 
-/// The targets that the test views would have were they trained on: what `tone` makes of their photographs in the scene of
+/// The targets that the test views would have were they trained on: what `tone apply` makes of their photographs in the scene of
 /// the training photographs.
 #[derive(Debug)]
 pub struct TestTargets {
@@ -181,7 +181,7 @@ impl TestTargets {
     /// The photograph can no longer be read, or the device is out of memory or lost.
     pub fn of(&mut self, view: &View) -> Result<Option<Image>> {
         let photograph = lifted_from(view, self.pseudo_gt.settings().lift_first)?;
-        let target = |photograph| target_of(&mut self.pseudo_gt, view, photograph, &self.scene);
+        let target = |photograph| target_of(&self.pseudo_gt, view, photograph, &self.scene);
         photograph.as_deref().map(target).transpose()
     }
 }
@@ -189,13 +189,13 @@ impl TestTargets {
 impl Trainer {
     /// What the curves of the training photographs have in common, for [`TestTargets::in_scene`].
     pub(crate) fn scene(&self) -> &Scene {
-        &self.scene
+        &self.supervision.scene
     }
 
     /// How bright the targets are; none where the curve's constants say that.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn target_exposure(&self) -> Option<&TargetExposure> {
-        self.target_exposure.as_ref()
+        self.supervision.target_exposure.as_ref()
     }
 
     /// The mean PSNR, dB, of what the Gaussians show of the held-out views against their targets; none where there are none.
@@ -214,9 +214,9 @@ impl Trainer {
 
     /// The mean PSNR, dB, of R_0 and of the output, R_K where the model has a denoiser; `None` if no view is held out.
     fn psnr_of_held_out(&mut self, sh_degree: u32) -> Result<Option<[f64; 2]>> {
-        let views = std::mem::take(&mut self.held_out);
+        let views = std::mem::take(&mut self.convergence.held_out);
         let scores = views.mean_psnr(&[], |camera| self.render_of_degree(camera, sh_degree));
-        self.held_out = views;
+        self.convergence.held_out = views;
         scores
     }
 
@@ -228,7 +228,7 @@ impl Trainer {
     pub(crate) fn leave_out_what_gains_nothing(&mut self) -> Result<()> {
         /// Less on few views, dB, is chance.
         const LEAST_GAIN: f64 = 0.05;
-        if !self.networks.as_ref().is_some_and(NetworkTerms::follow_target) {
+        if !self.supervision.networks.as_ref().is_some_and(NetworkTerms::follow_target) {
             return Ok(());
         }
         let sh_degree = self.sh_degree(self.step);
@@ -248,7 +248,8 @@ impl Trainer {
             return Ok(());
         }
         tracing::info!("the denoiser gains nothing on targets ({gain:.2} dB): it is left out");
-        match self.networks.as_mut().and_then(|terms| terms.networks.denoiser.as_mut()) {
+        match self.supervision.networks.as_mut().and_then(|terms| terms.networks.denoiser.as_mut())
+        {
             Some(denoiser) => denoiser.become_identity(),
             None => Ok(()),
         }
@@ -257,10 +258,15 @@ impl Trainer {
     /// Training views, evenly spread, with their targets.
     fn some_training_views(&self) -> Result<TargetViews> {
         const MOST: usize = 8;
-        let views = self.views.whole();
+        let views = self.supervision.views.whole();
         let some = views.iter().step_by(views.len().div_ceil(MOST).max(1)).map(|view| {
             let views = std::slice::from_ref(view);
-            let target = self.views.read(&self.gpu, &self.pseudo_gt, views, Shown::Targets)?;
+            let target = self.supervision.views.read(
+                &self.gpu,
+                &self.supervision.pseudo_gt,
+                views,
+                Shown::Targets,
+            )?;
             let UVec2 { x: width, y: height } = view.size();
             let target = Image { width, height, data: target.concat() };
             let (camera, place) = (view.patch.own_camera(), Some(view.place));
@@ -274,6 +280,6 @@ impl Trainer {
     /// # Errors
     /// The device was lost.
     pub(super) fn affines(&self) -> Result<Vec<Affine>> {
-        self.exposures.as_ref().map_or_else(|| Ok(vec![]), Exposures::affines)
+        self.supervision.exposures.as_ref().map_or_else(|| Ok(vec![]), Exposures::affines)
     }
 }

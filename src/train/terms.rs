@@ -210,25 +210,23 @@ impl NetworkTerms {
             crop => Window::random(inputs.size, crop, self.margin(), &self.crops, inputs.step),
         };
         self.networks.denoise(pass, inputs.render, inputs.size, &window)?;
-        let mask = photographs.mask.zip(self.masking.as_mut());
-        let is_masked = mask.is_some();
-        let low = (photographs.low, is_masked);
-        if let Some((mask, WindowMask { weights, .. })) = mask {
+        if let Some((mask, WindowMask { weights, .. })) =
+            photographs.mask.zip(self.masking.as_mut())
+        {
             self.networks.windows.gather(pass, mask, inputs.size, 0..1, &window, weights)?;
         }
         match self.form {
             Form::Identity => {
                 // What the denoiser learns is its own: the render stays what it would be without it.
-                let target = Some(photographs.target);
-                self.record_denoising(pass, &window, (target, is_masked), inputs.size, log)?;
+                self.record_denoising(pass, &window, photographs, inputs.size, log)?;
                 self.denoise_backward(pass, &window, inputs, d_render)?;
                 pass.fill(&mut self.d_colors, 0);
-                self.record_low(pass, &window, inputs, low, d_render, log)?;
+                self.record_low(pass, &window, inputs, photographs, d_render, log)?;
             }
             Form::Paper => {
                 pass.fill(&mut self.d_colors, 0);
-                self.record_denoising(pass, &window, (None, is_masked), inputs.size, log)?;
-                self.record_low(pass, &window, inputs, low, d_render, log)?;
+                self.record_denoising(pass, &window, photographs, inputs.size, log)?;
+                self.record_low(pass, &window, inputs, photographs, d_render, log)?;
                 self.denoise_backward(pass, &window, inputs, d_render)?;
             }
         }
@@ -236,12 +234,12 @@ impl NetworkTerms {
         windows.scatter(pass, &self.d_colors, &window, 0..COLOR_CHANNELS, inputs.size, d_render)
     }
 
-    /// R_K against the target; without one against R_0, as in the paper.
+    /// R_K against the target, in the paper's form against R_0.
     fn record_denoising(
         &mut self,
         pass: &mut Recorder<'_>,
         window: &Window,
-        (target, is_masked): (Option<&Buffer<f32>>, bool),
+        photographs: Photographs<'_>,
         size: UVec2,
         log: &mut LogSlot<'_>,
     ) -> Result<()> {
@@ -253,12 +251,16 @@ impl NetworkTerms {
             pass.fill(&mut self.d_colors, 0);
             return Ok(());
         }
-        if let Some(target) = target {
-            let own = &mut self.photograph;
-            windows.gather(pass, target, size, 0..COLOR_CHANNELS, window, own)?;
-        }
-        let held_to = if target.is_some() { &self.photograph } else { colors };
-        let mut mask = self.masking.as_mut().filter(|_| is_masked);
+        let held_to = match self.form {
+            Form::Identity => {
+                let own = &mut self.photograph;
+                let target = photographs.target;
+                windows.gather(pass, target, size, 0..COLOR_CHANNELS, window, own)?;
+                &*own
+            }
+            Form::Paper => colors,
+        };
+        let mut mask = self.masking.as_mut().filter(|_| photographs.mask.is_some());
         let denoised = match &mut mask {
             Some(mask) => mask.shown(pass, window.size, denoiser.denoised(), held_to)?,
             None => denoiser.denoised(),
@@ -311,7 +313,7 @@ impl NetworkTerms {
         pass: &mut Recorder<'_>,
         window: &Window,
         &TermInputs { size: whole, features, render, .. }: &TermInputs<'_>,
-        (low, is_masked): (&Buffer<f32>, bool),
+        Photographs { mask, low, .. }: Photographs<'_>,
         d_render: &mut Buffer<f32>,
         log: &mut LogSlot<'_>,
     ) -> Result<()> {
@@ -331,7 +333,7 @@ impl NetworkTerms {
             _ => (&*colors, &mut self.d_colors),
         };
         tonemapper.forward(pass, size, &self.illumination, denoised)?;
-        let mut mask = self.masking.as_mut().filter(|_| is_masked);
+        let mut mask = self.masking.as_mut().filter(|_| mask.is_some());
         let output = match &mut mask {
             Some(mask) => mask.shown(pass, size, tonemapper.output(), &self.photograph)?,
             None => tonemapper.output(),

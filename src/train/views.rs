@@ -77,7 +77,7 @@ impl Views {
     /// device is out of memory or lost.
     pub(super) fn upload(
         gpu: &Gpu,
-        pseudo_gt: &mut PseudoGt,
+        pseudo_gt: &PseudoGt,
         dataset: &Dataset,
         frame: &Frame,
         config: &TrainConfig,

@@ -1,20 +1,20 @@
-//! `nightsplat curves`, in process.
+//! `nightsplat tone list`, in process.
 #![cfg(feature = "cli")]
 #![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
 
 use clap::Parser;
-use nightsplat::cli::curves::{CurvesArgs, text};
+use nightsplat::cli::tone::list::{ListArgs, text};
 use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
 use nightsplat::photographs::tone::FAMILIES;
 
 #[derive(Debug, Parser)]
 struct Command {
     #[command(flatten)]
-    curves: CurvesArgs,
+    curves: ListArgs,
 }
 
-fn parse(arguments: &str) -> Result<CurvesArgs, clap::Error> {
-    let words = std::iter::once("curves").chain(arguments.split_whitespace());
+fn parse(arguments: &str) -> Result<ListArgs, clap::Error> {
+    let words = std::iter::once("list").chain(arguments.split_whitespace());
     Command::try_parse_from(words).map(|command| command.curves)
 }
 

@@ -21,7 +21,6 @@ mod refusals;
 mod stress;
 mod sweep;
 mod tone_command;
-mod tradeoff;
 mod tuning;
 use common::command::{refused, succeed};
 
@@ -299,7 +298,7 @@ fn tone_maps_a_folder_and_prints_its_statistics() {
     let fixture = fixture();
     let out = fixture.path("toned");
     let arguments =
-        format!("tone {}/low --curve ase --out {} --json", fixture.set(), out.display());
+        format!("tone apply {}/low --curve ase --out {} --json", fixture.set(), out.display());
     let printed: Value = serde_json::from_str(&succeed(&arguments)).unwrap();
     assert_eq!(keys(&printed["views"]).len(), 9);
     assert_eq!(file_names(&out).len(), 9);
@@ -374,17 +373,57 @@ fn demo_touches_no_folder_of_somebody_else() {
 }
 
 #[test]
+fn demo_is_a_sweep_of_three_curves_that_goes_on() {
+    let folder = tempfile::tempdir().unwrap();
+    let demo = format!("demo --out {}", folder.path().display());
+    let table = succeed(&demo);
+    for curve in ["linear", "ase", "ap3"] {
+        assert!(folder.path().join(format!("curve={curve}/model.ply")).is_file(), "{table}");
+    }
+    let page = fs::read_to_string(folder.path().join("index.html")).unwrap();
+    assert!(page.contains("exposed") && page.contains("data:image/png"));
+    assert_eq!(succeed(&demo), table, "nothing is trained twice");
+}
+
+#[test]
 fn help_teaches_every_command_in_lines_that_fit() {
     let commands = [
-        "", "train", "diagnose", "eval", "render", "tone", "curves", "fit", "sweep", "ablate",
-        "synth", "demo", "doctor", "bench", "check",
+        "",
+        "train",
+        "diagnose",
+        "eval",
+        "render",
+        "tone",
+        "tone list",
+        "tone apply",
+        "tone fit",
+        "sweep",
+        "synth",
+        "demo",
+        "doctor",
+        "bench",
+        "check",
     ];
     for command in commands {
         let help = succeed(&format!("{command} --help"));
         assert!(help.lines().all(|line| line.chars().count() < 100), "{help}");
     }
     let help = succeed("--help");
-    assert!(commands.iter().all(|command| help.contains(command)), "{help}");
+    assert!(
+        commands.iter().all(|command| help.contains(command.split(' ').next().unwrap())),
+        "{help}"
+    );
+    // The first two columns are names; what is for developers stands below.
+    let listed = help.lines().skip_while(|line| *line != "Commands:").skip(1);
+    let listed = listed.take_while(|line| !line.is_empty());
+    let names: Vec<&str> = listed
+        .filter(|line| line.starts_with("  ") && !line.starts_with("   "))
+        .filter_map(|line| line.split_whitespace().next())
+        .collect();
+    assert!(
+        names.len() <= 12 && names.contains(&"train") && !names.contains(&"synth"),
+        "{names:?}"
+    );
     let train = succeed("train --help");
     for option in "--curve --gain --theta --steps --downscale --seed --sh-degree --ssim-weight --max-gaussians \
                    --background --reference --device --config --eval-every --out --overwrite --max-resolution --cache \

@@ -231,7 +231,7 @@ fn what_validation_says_fails_the_command() {
     let advice = "VK_VALIDATION_FEATURE_ENABLE_BEST_PRACTICES_EXT";
     let photograph = crate::common::fixture("lom/low/000.png");
     let out = tempfile::tempdir().unwrap();
-    let arguments = format!("tone {} --out {}", photograph.display(), out.path().display());
+    let arguments = format!("tone apply {} --out {}", photograph.display(), out.path().display());
     let output = command(&arguments).env("VK_LAYER_ENABLES", advice).output().unwrap();
     let stderr = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(101), "{stderr}");

@@ -8,6 +8,8 @@ use std::process::{Command, Stdio};
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
+use serde_json::Value;
+
 use crate::common::command::{command, refused, run};
 
 /// The smallest set with views to score.
@@ -28,9 +30,13 @@ struct Sweep {
 
 impl Sweep {
     fn new(options: &str) -> Self {
+        Self::of(set(), &format!("--sh-degree 0 {options}"))
+    }
+
+    fn of(set: &Path, options: &str) -> Self {
         let folder = tempfile::tempdir().unwrap();
-        let (set, out) = (set().display(), folder.path().display());
-        Self { arguments: format!("sweep {set} --out {out} --sh-degree 0 {options}"), folder }
+        let (set, out) = (set.display(), folder.path().display());
+        Self { arguments: format!("sweep {set} --out {out} {options}"), folder }
     }
 
     fn path(&self, name: &str) -> PathBuf {
@@ -44,6 +50,15 @@ impl Sweep {
     /// What must not depend on how the sweep came to its end.
     fn leaderboard(&self) -> [String; 3] {
         ["leaderboard.csv", "leaderboard.md", "index.html"].map(|name| self.read(name))
+    }
+
+    /// The names of the points that are left.
+    fn names(&self) -> Vec<String> {
+        let name = |line: &String| {
+            let out = line.split("--out ").nth(1).unwrap().split(' ').next().unwrap();
+            out.rsplit('/').next().unwrap().to_owned()
+        };
+        self.left().iter().map(name).collect()
     }
 
     /// The command lines of the points that are left.
@@ -99,11 +114,12 @@ fn a_finished_point_is_never_trained_twice_and_a_killed_one_is() {
     assert!(lines.len() == 3 && psnr(lines[1]) >= psnr(lines[2]), "{csv}");
     assert!(markdown.contains("| curve | PSNR, dB | sd |"), "{markdown}");
     assert_eq!(html.matches("<rect").count(), 2, "a bar per curve");
-    assert_eq!(sweep.read("timings.csv").lines().count(), 5);
+    let costs = sweep.read("costs.csv");
+    assert!(costs.lines().count() == 3 && costs.contains(",2,"), "{costs}");
     // The mean over the seeds and their spread are those of the runs.
     let scores = [1, 2].map(|seed| {
         let text = sweep.read(&format!("curve=ase,seed={seed}/metrics.json"));
-        let metrics: serde_json::Value = serde_json::from_str(&text).unwrap();
+        let metrics: Value = serde_json::from_str(&text).unwrap();
         metrics["mean"]["psnr"].as_f64().unwrap()
     });
     let ase: Vec<&str> =
@@ -201,13 +217,15 @@ fn the_offset_sweep_marks_the_adaptive_black_level() {
 }
 
 #[test]
-fn the_paper_s_tables_and_all_curves_are_grids() {
+fn tables_and_all_curves_are_grids() {
     let lines = |options: &str| Sweep::new(options).left();
     let curves = nightsplat::photographs::tone::ToneCurve::ALL.len();
     assert_eq!(lines("--curves all").len(), curves);
     assert_eq!(lines("--table leaderboard --seeds 1,2").len(), 2 * curves);
     assert_eq!(lines("--table offset").len(), 10);
     assert_eq!(lines("--table alpha").len(), 7);
+    assert_eq!(lines("--table presets").len(), 4);
+    assert_eq!(lines("--table changes").len(), 14, "degree 0 is what all have");
     let gain = lines("--table gain --ssim-weight 0.3 --config /dev/null");
     assert_eq!(gain.len(), 9);
     // The options of `train` in its own order, then the point's.
@@ -226,6 +244,10 @@ fn more_values_may_join_and_another_sweep_may_not() {
     refused(&arguments.replace("--steps 1", "--steps 2"), 1, &run_differs);
     let sweep_differs = ["another sweep", "lists = [\"curve\"]", "--out"];
     refused(&format!("{arguments} --alpha 0.1"), 1, &sweep_differs);
+    let two = tempfile::tempdir().unwrap();
+    run(&format!("synth {} --views 9 --width 24 --height 16", two.path().display()), 0);
+    let other = arguments.replace(set().to_str().unwrap(), two.path().to_str().unwrap());
+    refused(&other, 1, &["another", "--out"]);
     // A folder of something else.
     fs::remove_file(wider.path("sweep.toml")).unwrap();
     refused(arguments, 1, &["leaderboard.csv", "no sweep wrote", "--out"]);
@@ -241,6 +263,9 @@ fn misuse_is_refused_before_anything_is_trained() {
     refused("", 2, &["grid is empty", "--curves"]);
     refused("--alpha 0.1,,0.2", 2, &["alpha", "empty"]);
     refused("--grid tone.alhpa=0.1", 2, &["tone.alhpa", "tone.alpha"]);
+    refused("--grid downscale=2,4", 2, &["downscale", "resolution_steps"]);
+    refused("--presets fast,slow", 2, &["slow", "draft"]);
+    refused("--table parts --model lita", 2, &["leave out --model"]);
     refused("--grid steps", 2, &["--grid steps", "KEY=V1,V2"]);
     refused("--grid steps=many", 2, &["steps (--steps) is \"many\"", "a whole number"]);
     refused("--curves ap3,sepia", 2, &["curve=sepia", "unknown curve", "linear"]);
@@ -255,13 +280,118 @@ fn misuse_is_refused_before_anything_is_trained() {
     let arguments = format!("sweep {0} --out {0}/out --curves all", nowhere.display());
     let (_, said) = run(&arguments, 3);
     assert!(said.contains("is not a folder") && !nowhere.exists(), "{said}");
+
+    // A set of one photograph has none to score.
+    let one = tempfile::tempdir().unwrap();
+    run(&format!("synth {} --views 2 --width 24 --height 16", one.path().display()), 0);
+    for name in ["transforms_test.json", "transforms_val.json"] {
+        let path = one.path().join(name);
+        let mut list: Value = serde_json::from_str(&fs::read_to_string(&path).unwrap()).unwrap();
+        list["frames"] = Value::Array(vec![]);
+        fs::write(path, list.to_string()).unwrap();
+    }
+    let sweep = Sweep::of(one.path(), "--steps 2 --curves ap3");
+    let (_, said) = run(&sweep.arguments, 3);
+    let line = said.lines().last().unwrap();
+    assert!(line.contains(one.path().to_str().unwrap()), "{line}");
+    assert!(line.contains("no held-out view to score"), "{line}");
+    assert!(!sweep.path("sweep.toml").exists());
+}
+
+/// What `train --preset` does, with every figure on every page.
+#[test]
+fn presets_are_trained_by_their_plans_scored_on_the_way_and_compared() {
+    let sweep =
+        Sweep::of(set(), "--table presets --presets draft,paper,balanced --steps 6 --eval-every 2");
+    let points = ["preset=draft", "preset=paper", "preset=balanced"];
+    assert_eq!(sweep.names(), points);
+    let (shown, _) = run(&sweep.arguments, 0);
+    for part in ["PSNR, dB", "processor time, s", "device, MiB", "balanced", "index.html"] {
+        assert!(shown.contains(part), "no `{part}` in: {shown}");
+    }
+    let csv = sweep.read("costs.csv");
+    assert!(csv.starts_with("preset,runs,psnr,psnr_sd,") && csv.lines().count() == 4, "{csv}");
+    let way = sweep.read("preset=draft/evals.csv");
+    let seconds: Vec<f64> =
+        way.lines().skip(1).map(|line| line.split(',').nth(5).unwrap().parse().unwrap()).collect();
+    assert!(seconds.len() == 3 && seconds.is_sorted() && seconds[0] > 0.0, "{way}");
+    let metrics: Value = serde_json::from_str(&sweep.read("preset=draft/metrics.json")).unwrap();
+    let whole = metrics["seconds"].as_f64().unwrap();
+    assert!((whole - seconds[2]).abs() < 1e-3, "{whole} {way}");
+    assert!(metrics["spent"]["device_bytes"].as_u64().unwrap() > 1000, "{metrics}");
+    let html = sweep.read("costs.html");
+    assert!(html.contains("on the way") && html.contains("the difference to preset balanced"));
+    for outside in ["http:", "https:", "<script", "<link", "@import", "url("] {
+        assert!(!html.contains(outside), "{outside}");
+    }
+    let at = |what: &str| html.find(what).unwrap();
+    assert!(at("<svg") < at("<table"), "plots before tables");
+    assert!(sweep.read("preset=paper/log.txt").contains("--plan none"));
+    assert!(sweep.path("preset=draft/plan.toml").is_file());
+
+    // As if it had been killed while a point was trained: that one is trained anew, to the same bits.
+    let model = |point: &str| fs::read(sweep.path(point).join("model.ply")).unwrap();
+    let trained = |point: &str| {
+        fs::metadata(sweep.path(point).join("model.ply")).unwrap().modified().unwrap()
+    };
+    let (bits, before, leaderboard) = (model(points[0]), points.map(trained), sweep.leaderboard());
+    fs::remove_file(sweep.path(points[0]).join("metrics.json")).unwrap();
+    assert_eq!(sweep.names(), points[..1]);
+    let (json, _) = run(&format!("{} --json", sweep.arguments), 0);
+    let again: Vec<bool> =
+        points.iter().zip(before).map(|(point, before)| trained(point) != before).collect();
+    assert_eq!(again, [true, false, false]);
+    assert!(bits == model(points[0]), "the same seed, the same bits");
+    assert_eq!(sweep.leaderboard(), leaderboard);
+    let json: Value = serde_json::from_str(&json).unwrap();
+    let points = json["points"].as_array().unwrap();
+    let find = |name: &str| points.iter().find(|point| point["point"] == name).unwrap();
+    let psnr = |name: &str| find(name)["mean"]["psnr"].as_f64().unwrap();
+    let difference = find("preset=draft")["difference"]["psnr"].as_f64().unwrap();
+    let expected = psnr("preset=draft") - psnr("preset=balanced");
+    assert!((difference - expected).abs() < 1e-9, "{json}");
+    assert!(points.iter().any(|point| point["on_front"] == true), "{json}");
+    assert!(points.iter().all(|point| point["scored"] == "against reference images"), "{json}");
+    assert!(sweep.left().is_empty());
+}
+
+#[test]
+fn without_references_the_held_out_views_own_targets_are_what_is_scored_against() {
+    let copy = tempfile::tempdir().unwrap();
+    let status = Command::new("cp").arg("-r").arg(set()).arg(copy.path()).status().unwrap();
+    assert!(status.success());
+    let root = copy.path().join(set().file_name().unwrap());
+    fs::remove_dir_all(root.join("high")).unwrap();
+    let sweep = Sweep::of(&root, "--presets draft --steps 2 --json");
+    let (json, _) = run(&sweep.arguments, 0);
+    let json: Value = serde_json::from_str(&json).unwrap();
+    let point = &json["points"][0];
+    assert!(point["scored"].as_str().unwrap().contains("pseudo-GT"), "{json}");
+    assert!(point["mean"]["psnr"].as_f64().unwrap() > 3.0, "{json}");
+    for page in ["index.html", "costs.html"] {
+        assert!(sweep.read(page).contains("pseudo-GT"), "{page}");
+    }
+    assert!(sweep.left().is_empty());
+}
+
+#[test]
+fn old_names_say_the_new_ones() {
+    for (old, new) in [
+        ("ablate photos --out out --steps 2", "sweep DATASET --out DIR --table parts"),
+        ("tradeoff --help", "sweep DATASET --out DIR --table presets"),
+        ("curves --table", "nightsplat tone list"),
+        ("fit pairs --family ase", "nightsplat tone fit"),
+        ("tone photos --curve ase", "nightsplat tone apply photos"),
+    ] {
+        refused(old, 2, &[new]);
+    }
 }
 
 #[test]
 fn help_names_the_lists_and_fits_its_lines() {
     let (help, _) = run("sweep --help", 0);
     assert!(help.lines().all(|line| line.chars().count() < 100), "{help}");
-    for option in "--curves --alpha --beta --gain --theta --offset --grid --seeds --table --jobs --dry-run --steps --set"
+    for option in "--curves --alpha --beta --gain --theta --offset --grid --seeds --presets --json --table --jobs --dry-run --steps --set"
         .split_whitespace()
     {
         assert!(help.contains(option), "{option}");

@@ -6,13 +6,13 @@ use std::path::{Path, PathBuf};
 
 use nightsplat::Error;
 use nightsplat::cli::ImageFormat;
-use nightsplat::cli::tone::{ToneArgs, ToneReport, apply};
+use nightsplat::cli::tone::apply::{ApplyArgs, ToneReport, apply};
 use nightsplat::photographs::image::{Image, srgb_from_linear};
 use nightsplat::photographs::metrics::psnr;
 use nightsplat::photographs::tone::{GainChoice, Statistics, ToneCurve, ToneSettings};
 
-fn args(input: &Path, out: PathBuf) -> ToneArgs {
-    ToneArgs {
+fn args(input: &Path, out: PathBuf) -> ApplyArgs {
+    ApplyArgs {
         input: input.to_owned(),
         curve: ToneCurve::Ap3.into(),
         profile: None,
@@ -49,7 +49,7 @@ fn a_folder_is_mapped_by_name_and_what_cannot_be_read_is_left_out() {
     std::fs::write(photographs.join("notes.txt"), b"no image either").unwrap();
     for curve in [ToneCurve::Linear, ToneCurve::Ase, ToneCurve::Ap3, ToneCurve::Hybrid] {
         let out = dir.path().join(curve.name());
-        let args = ToneArgs {
+        let args = ApplyArgs {
             curve: curve.into(),
             gain: Some(GainChoice::C(2.0)),
             theta: Some(0.4),
@@ -84,7 +84,7 @@ fn exr_keeps_what_8_bits_round_and_clipping_is_counted() {
     image.data[..30].fill(1.0);
     image.save_png8(&photograph).unwrap();
     let image = Image::load(&photograph).unwrap();
-    let linear = ToneArgs {
+    let linear = ApplyArgs {
         curve: ToneCurve::Linear.into(),
         format: ImageFormat::Exr,
         ..args(&photograph, dir.path().join("out"))
@@ -109,7 +109,7 @@ fn bad_input_is_named_in_one_line() {
     let dir = tempfile::tempdir().unwrap();
     let path = |name: &str| dir.path().join(name);
     let out = path("out");
-    let fails = |args: ToneArgs, part: &str, code: u8| {
+    let fails = |args: ApplyArgs, part: &str, code: u8| {
         let error = apply(&args).unwrap_err();
         let message = error.to_string();
         assert!(message.contains(part) && !message.contains('\n'), "{message}");
@@ -141,11 +141,11 @@ fn bad_input_is_named_in_one_line() {
 
     fails(args(&path("good.png"), path("broken.png")), "cannot be made", 1);
     fails(
-        ToneArgs { gain: Some(GainChoice::C(-1.0)), ..args(&path("good.png"), out.clone()) },
+        ApplyArgs { gain: Some(GainChoice::C(-1.0)), ..args(&path("good.png"), out.clone()) },
         "tone.gain_c",
         2,
     );
-    fails(ToneArgs { theta: Some(f64::NAN), ..args(&path("good.png"), out) }, "tone.theta", 2);
+    fails(ApplyArgs { theta: Some(f64::NAN), ..args(&path("good.png"), out) }, "tone.theta", 2);
 }
 
 #[test]
@@ -161,7 +161,8 @@ fn a_photograph_that_exceeds_a_binding_is_mapped_in_tiles() {
     image.data[..4_000_000].fill(0.02);
     image.save_png8(&photograph).unwrap();
     let image = Image::load(&photograph).unwrap();
-    let args = ToneArgs { format: ImageFormat::Png16, ..args(&photograph, dir.path().join("out")) };
+    let args =
+        ApplyArgs { format: ImageFormat::Png16, ..args(&photograph, dir.path().join("out")) };
     let view = apply(&args).unwrap().views["vast"];
     let statistics = Statistics::of(&image.data);
     assert_eq!([view.before.p10, view.before.p90], statistics.percentiles());
@@ -191,7 +192,7 @@ fn references_give_scores_and_the_page_draws_the_distributions() {
     let dir = tempfile::tempdir().unwrap();
     let [low, high] = pairs(dir.path());
     let page = dir.path().join("page.html");
-    let args = ToneArgs {
+    let args = ApplyArgs {
         reference: Some(high.clone()),
         report: Some(page.clone()),
         compare: vec![ToneCurve::Linear.into(), ToneCurve::LumPreserve.into()],
@@ -243,7 +244,7 @@ fn scene_statistics_give_every_photograph_one_curve() {
     let out = dir.path().join("out");
     for scene_statistics in [false, true] {
         let args =
-            ToneArgs { scene_statistics, format: ImageFormat::Exr, ..args(&low, out.clone()) };
+            ApplyArgs { scene_statistics, format: ImageFormat::Exr, ..args(&low, out.clone()) };
         let output = apply(&args).unwrap();
         let statistics = ["a", "b", "c"].map(|name| {
             Statistics::of(&Image::load(low.join(name).with_extension("png")).unwrap().data)
@@ -333,7 +334,7 @@ fn degenerate_photographs_have_defined_results_under_every_kind_of_curve() {
         ToneCurve::PerChannel,
     ];
     for curve in named.map(Into::into).into_iter().chain([table]) {
-        let args = ToneArgs { curve, ..args(&photographs, dir.path().join("out")) };
+        let args = ApplyArgs { curve, ..args(&photographs, dir.path().join("out")) };
         let output = apply(&args).unwrap();
         let text = serde_json::to_string(&output).unwrap();
         assert!(!text.contains("null"), "{text}");
@@ -347,7 +348,7 @@ fn an_unknown_curve_is_misuse_and_lists_the_curves() {
     #[derive(Debug, clap::Parser)]
     struct Command {
         #[command(flatten)]
-        tone: ToneArgs,
+        tone: ApplyArgs,
     }
     let parse = |curve: &str| {
         <Command as clap::Parser>::try_parse_from(["tone", "in", "--out", "out", "--curve", curve])
@@ -360,8 +361,8 @@ fn an_unknown_curve_is_misuse_and_lists_the_curves() {
 }
 
 /// What the automatic curve makes of a folder.
-fn automatic(input: &Path) -> ToneArgs {
-    ToneArgs { curve: ToneCurve::Auto.into(), out: None, ..args(input, PathBuf::new()) }
+fn automatic(input: &Path) -> ApplyArgs {
+    ApplyArgs { curve: ToneCurve::Auto.into(), out: None, ..args(input, PathBuf::new()) }
 }
 
 #[test]
@@ -391,13 +392,13 @@ fn the_automatic_curve_says_how_bright_and_why_and_lends_its_brightness() {
     // Every curve with a gain takes the same brightness, or another that is asked for.
     for curve in [ToneCurve::Ase, ToneCurve::Ap3, ToneCurve::Linear, ToneCurve::Gamma] {
         let lent =
-            ToneArgs { curve: curve.into(), gain: Some(GainChoice::Auto), ..automatic(&low) };
+            ApplyArgs { curve: curve.into(), gain: Some(GainChoice::Auto), ..automatic(&low) };
         let views = apply(&lent).unwrap().views;
         for (view, mean) in views.values().zip(&means) {
             let found = view.after.mean_luminance;
             assert!((found - mean).abs() < 0.006, "{curve}: {found}, not {mean}");
         }
-        let brighter = apply(&ToneArgs { brightness: Some(0.6), ..lent }).unwrap();
+        let brighter = apply(&ApplyArgs { brightness: Some(0.6), ..lent }).unwrap();
         let found = brighter.scene.after.mean_luminance;
         assert!((found - 0.6).abs() < 0.02, "{curve}: {found}");
     }
@@ -416,7 +417,7 @@ fn linear_light_of_a_known_exposure_comes_out_as_bright_as_of_any_other() {
             Image::from_fn(40, 30, |x, y| [srgb_from_linear(exposure * light(x, y)); 3]);
         photograph.save_exr(folder.join("a.exr")).unwrap();
         let args =
-            ToneArgs { out: Some(out.clone()), format: ImageFormat::Exr, ..automatic(&folder) };
+            ApplyArgs { out: Some(out.clone()), format: ImageFormat::Exr, ..automatic(&folder) };
         let report = apply(&args).unwrap();
         (report.exposure.unwrap(), Image::load(out.join("a.exr")).unwrap())
     };
@@ -440,7 +441,7 @@ fn a_well_lit_folder_stays_as_it_is_and_a_black_one_is_refused() {
     let bright = Image::from_fn(40, 30, |x, y| [x, y, x + y].map(|v| 0.3 + v as f32 / 120.0));
     bright.save_png8(folder.join("a.png")).unwrap();
     let out = dir.path().join("out");
-    let args = ToneArgs { out: Some(out.clone()), ..automatic(&folder) };
+    let args = ApplyArgs { out: Some(out.clone()), ..automatic(&folder) };
     assert!(apply(&args).unwrap().exposure.unwrap().reason().contains("well lit"));
     let stored = Image::load(folder.join("a.png")).unwrap();
     assert_eq!(Image::load(out.join("a.png")).unwrap(), stored);
@@ -449,17 +450,17 @@ fn a_well_lit_folder_stays_as_it_is_and_a_black_one_is_refused() {
     let error = apply(&args).unwrap_err();
     assert!(error.to_string().contains("as good as black"), "{error}");
     assert_eq!(error.exit_code(), 3);
-    let refused = |args: ToneArgs, part: &str| {
+    let refused = |args: ApplyArgs, part: &str| {
         let message = apply(&args).unwrap_err().to_string();
         assert!(message.contains(part) && !message.contains('\n'), "{message}");
     };
     let auto = Some(GainChoice::Auto);
-    let of = |curve: ToneCurve| ToneArgs { curve: curve.into(), ..automatic(&folder) };
-    refused(ToneArgs { gain: Some(GainChoice::C(2.0)), ..of(ToneCurve::Auto) }, "tone.brightness");
-    refused(ToneArgs { brightness: Some(0.5), ..of(ToneCurve::Ap3) }, "tone.brightness");
-    refused(ToneArgs { brightness: Some(2.0), ..of(ToneCurve::Auto) }, "tone.brightness");
-    refused(ToneArgs { colour: Some(-0.5), ..of(ToneCurve::Auto) }, "tone.colour");
-    refused(ToneArgs { gain: auto, ..of(ToneCurve::LumPreserve) }, "no gain");
+    let of = |curve: ToneCurve| ApplyArgs { curve: curve.into(), ..automatic(&folder) };
+    refused(ApplyArgs { gain: Some(GainChoice::C(2.0)), ..of(ToneCurve::Auto) }, "tone.brightness");
+    refused(ApplyArgs { brightness: Some(0.5), ..of(ToneCurve::Ap3) }, "tone.brightness");
+    refused(ApplyArgs { brightness: Some(2.0), ..of(ToneCurve::Auto) }, "tone.brightness");
+    refused(ApplyArgs { colour: Some(-0.5), ..of(ToneCurve::Auto) }, "tone.colour");
+    refused(ApplyArgs { gain: auto, ..of(ToneCurve::LumPreserve) }, "no gain");
 }
 
 /// PSNR of the curve alone on the test views; ASE and AP3 with constants have 23.4 and 23.0 dB on the mean.

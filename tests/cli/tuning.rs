@@ -1,4 +1,4 @@
-//! `bench --tune`, the file it leaves, and the tiles that training takes from there; `bench --growth`.
+//! `bench --tune`, the file it leaves, and the tiles that training takes from there.
 
 #![cfg(feature = "cli")]
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
@@ -153,37 +153,4 @@ fn a_tile_that_does_not_suit_the_device_is_refused_with_the_remedy() {
         refused(&arguments, 2, &["tiles do not suit", "lanes", "take a tile of"]);
         assert!(!Path::new(&out).exists());
     }
-}
-
-#[test]
-fn growth_has_its_axes_exponents_and_memory_and_says_what_does_not_fit() {
-    let arguments = "bench --growth --json --width 64 --height 48 --gaussians 300 --repeats 1";
-    let printed: Value = serde_json::from_str(&Place::new().run(arguments).0).unwrap();
-    let axes = printed["axes"].as_array().unwrap();
-    let quantities: Vec<_> = axes.iter().map(|axis| axis["quantity"].as_str().unwrap()).collect();
-    assert_eq!(quantities, ["Gaussians", "pixels", "channels", "photographs", "points"]);
-    for axis in axes {
-        for point in axis["points"].as_array().unwrap() {
-            assert!(point["ms"].as_f64().unwrap() > 0.0, "{point}");
-            assert!(point["bytes"].as_u64().unwrap() > 0, "{point}");
-        }
-        assert!(axis["time_exponent"].is_f64() && axis["memory_exponent"].is_f64(), "{axis}");
-    }
-    for axis in &axes[3..] {
-        let exponent = axis["time_exponent"].as_f64().unwrap();
-        assert!(exponent < 1.3, "loading is linear in views and points: {axis:#}");
-    }
-    // Each scene is gone before the next is measured.
-    let bytes = |axis: usize, point: usize| axes[axis]["points"][point]["bytes"].as_u64().unwrap();
-    assert!(2 * bytes(1, 0) < bytes(0, 4) && bytes(2, 0) < bytes(2, 4), "{printed:#}");
-    let values = |axis: usize| -> Vec<f64> {
-        axes[axis]["points"]
-            .as_array()
-            .unwrap()
-            .iter()
-            .map(|p| p["value"].as_f64().unwrap())
-            .collect()
-    };
-    assert_eq!(values(0), [150.0, 450.0, 1500.0, 3750.0, 7500.0]);
-    assert_eq!((values(2)[0], values(2)[4]), (3.0, 11.0));
 }

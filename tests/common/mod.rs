@@ -18,6 +18,13 @@ use std::panic::Location;
 use std::path::PathBuf;
 
 use nightsplat::base::random::Stream;
+use nightsplat::gpu::Gpu;
+use nightsplat::gpu::testing::{gpu, gpu_that_binds};
+
+/// A device that no other test shares: the memory and the passes that it counts are the caller's alone.
+pub(crate) fn own_gpu() -> Gpu {
+    gpu_that_binds(gpu().properties().max_storage_buffer_range)
+}
 
 /// Runs a kernel on the device over host vectors named like its buffers, checks what it leaves against its reference, and
 /// gives back what it writes.

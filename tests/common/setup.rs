@@ -4,6 +4,7 @@ use glam::{DAffine3, DMat3, DVec2, DVec3, UVec2, Vec2};
 use nightsplat::camera::{self, CameraModel, KannalaBrandt};
 use nightsplat::gpu::Tile;
 use nightsplat::gpu::testing::gpu;
+use nightsplat::kernels::camera_pinhole::JACOBIAN_MARGIN;
 use nightsplat::photographs::tone::Profile;
 use nightsplat::reference::camera::fisheye::Fisheye;
 use nightsplat::reference::camera::pinhole::Pinhole;
@@ -117,8 +118,7 @@ impl Setup {
             self.camera;
         let size = UVec2::new(width, height).as_dvec2();
         let DAffine3 { matrix3: rotation, translation } = view_from_world;
-        // As far outside the view as a fraction of its size.
-        let margin = 0.15 * size;
+        let margin = JACOBIAN_MARGIN * size;
         let model = match model {
             CameraModel::Pinhole => Model::Pinhole(Pinhole {
                 least_slope: -(principal_point + margin) / focal,

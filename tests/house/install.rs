@@ -49,6 +49,9 @@ fn every_subcommand_has_a_man_page() {
         assert!(main.contains(&format!("nightsplat\\-{name}(1)")), "nightsplat.1 lacks {name}");
         assert!(page(&format!("nightsplat-{name}.1")).contains(".SH OPTIONS"), "{name}");
     }
+    for name in ["tone-list", "tone-apply", "check", "synth", "completions", "man"] {
+        assert!(page(&format!("nightsplat-{name}.1")).contains(".SH OPTIONS"), "{name}");
+    }
     assert!(page("nightsplat-train.1").contains("\\-\\-max\\-gaussians"));
     // A file is no folder.
     refused(&format!("man {}/nightsplat.1", dir.display()), 1, &["nightsplat.1"]);

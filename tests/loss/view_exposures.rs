@@ -403,7 +403,7 @@ fn a_denoiser_on_crops_sees_the_neutral_exposure_and_a_tonemapper_is_refused() {
     checked.agree().unwrap();
     config.model.set_parts(&Part::ALL);
     let error = Trainer::new(&gpu, config, &dataset).unwrap_err().to_string();
-    assert!(error.contains("tonemapper") && error.contains("ExposureConfig::learn"), "{error}");
+    assert!(error.contains("tonemapper") && error.contains("exposure.learn"), "{error}");
 }
 
 #[test]

@@ -173,7 +173,7 @@ fn settings_that_leave_a_curve_undefined_are_refused() {
         ToneSettings { beta: -0.1, ..good.clone() },
         ToneSettings { base_gain: 0.0, ..good.clone() },
     ] {
-        assert!(matches!(bad.check(), Err(Error::Usage(_))), "{bad:?}");
+        assert!(matches!(bad.check(), Err(Error::Setting { .. })), "{bad:?}");
     }
 }
 

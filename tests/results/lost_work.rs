@@ -277,7 +277,7 @@ fn names_from_elsewhere_break_no_table_and_reach_no_terminal() {
 
 #[test]
 fn who_has_read_enough_ends_a_command_quietly() {
-    for arguments in ["curves --table", "curves"] {
+    for arguments in ["tone list --table", "tone list"] {
         let mut child =
             command(arguments).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
         drop(child.stdout.take());

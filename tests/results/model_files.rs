@@ -61,7 +61,7 @@ fn a_model_that_a_run_cannot_begin_with_is_one_line_that_names_file_and_rule() {
     file("points.ply", &header("property float opacity\n", "property float alpha\n"));
     file("origin.ply", &header("element", "comment world = position + 1 2\nelement"));
     for (name, rule) in [
-        ("degree.ply", "has SH degree 2, more than the 1 of"),
+        ("degree.ply", "has SH degree 2, more than sh_degree, which is 1"),
         ("ascii.ply", "of format ascii; save it as binary_little_endian"),
         ("big.ply", "of format binary_big_endian; save it as binary_little_endian"),
         ("points.ply", "has no property `opacity`"),

@@ -24,22 +24,23 @@ fn a_profile_is_fitted_frozen_used_and_named_with_every_result() {
     let (set, file, out) = (path("set"), path("profile.toml"), path("run"));
     succeed(&format!("synth {set} --views 9 --width 64 --height 48"));
 
-    let told = succeed(&format!("fit {set} --profile --out {file} --cross-validate"));
+    let told = succeed(&format!("tone fit {set} --profile --out {file} --cross-validate"));
     assert!(told.contains("held out: set 5/5") && told.contains(LABEL), "{told}");
     let text = fs::read_to_string(&file).unwrap();
     assert!(text.contains("reference = \"set\"") && text.contains("matrix = ["), "{text}");
-    succeed(&format!("fit {set} --profile --out {file}.again"));
+    succeed(&format!("tone fit {set} --profile --out {file}.again"));
     assert_eq!(fs::read_to_string(format!("{file}.again")).unwrap(), text);
 
-    let (auto, plain) = psnr(&format!("tone {set} --json"));
+    let (auto, plain) = psnr(&format!("tone apply {set} --json"));
     let page = path("page.html");
-    let (profiled, told) = psnr(&format!("tone {set} --profile {file} --json --report {page}"));
+    let (profiled, told) =
+        psnr(&format!("tone apply {set} --profile {file} --json --report {page}"));
     assert!(profiled > auto + 3.0, "{profiled} dB, the automatic curve {auto} dB");
     assert_eq!(
         (told["with_reference"].as_str(), &plain["with_reference"]),
         (Some(LABEL), &Value::Null)
     );
-    assert!(succeed(&format!("tone {set} --profile {file}")).contains(LABEL));
+    assert!(succeed(&format!("tone apply {set} --profile {file}")).contains(LABEL));
     assert!(fs::read_to_string(page).unwrap().contains(LABEL));
 
     let train = format!("train {set} --steps 2 --sh-degree 0");
@@ -78,11 +79,11 @@ fn a_profile_that_is_none_is_refused_in_one_line() {
     let path = |name: &str| folder.path().join(name).display().to_string();
     let (set, file) = (path("set"), path("profile.toml"));
     succeed(&format!("synth {set} --views 3 --width 32 --height 24"));
-    succeed(&format!("fit {set} --profile --out {file}"));
+    succeed(&format!("tone fit {set} --profile --out {file}"));
     let good = fs::read_to_string(&file).unwrap();
 
     let train = format!("train {set} --out {} --steps 2", path("run"));
-    let tone = format!("tone {set}");
+    let tone = format!("tone apply {set}");
     for command in [&train, &tone] {
         refused(&format!("{command} --profile {file} --curve ap3"), 2, &["--profile", "--curve"]);
         refused(&format!("{command} --profile {file} --gain 2"), 2, &["--profile", "--gain"]);
@@ -108,9 +109,9 @@ fn a_profile_that_is_none_is_refused_in_one_line() {
     fs::write(&file, lines.join("\n")).unwrap();
     refused(&format!("{tone} --profile {file}"), 3, &["segments of red fall from 0.9 to 0.1"]);
 
-    refused(&format!("fit {set} --profile --family ase"), 2, &["--profile", "--family"]);
+    refused(&format!("tone fit {set} --profile --family ase"), 2, &["--profile", "--family"]);
     fs::remove_dir_all(folder.path().join("set/high")).unwrap();
-    refused(&format!("fit {set} --profile --out {file}"), 3, &["holds no pairs"]);
+    refused(&format!("tone fit {set} --profile --out {file}"), 3, &["holds no pairs"]);
     fs::create_dir(folder.path().join("set/high")).unwrap();
-    refused(&format!("fit {set} --profile --out {file}"), 3, &["set/"]);
+    refused(&format!("tone fit {set} --profile --out {file}"), 3, &["set/"]);
 }

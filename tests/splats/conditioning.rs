@@ -9,8 +9,7 @@ use glam::{DVec2, DVec3, Vec3};
 use nightsplat::base::random::Stream;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::adam::{LOG_SCALE_MAX, LOG_SCALE_MIN};
-use nightsplat::photographs::pseudo_gt::PseudoGt;
-use nightsplat::photographs::tone::{Statistics, ToneCurve, ToneSettings};
+use nightsplat::photographs::tone::{Statistics, percentile};
 use nightsplat::reference::blend_backward::blend_pixel_backward;
 use nightsplat::reference::blend_forward::blend_pixel;
 use nightsplat::reference::gaussian::Gaussian;
@@ -240,38 +239,19 @@ fn adam_stays_with_f64_over_a_hundred_thousand_steps() {
     assert_adam_stays_with_f64(100_000);
 }
 
-/// Percentiles to the bit, means to roundings.
-fn assert_statistics_are_exact(pixels: usize) {
-    let mut state = 14u64;
-    let mut noise = || {
-        state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
-        (state >> 40) as f32 / (1u64 << 24) as f32
-    };
-    let image: Vec<f32> = (0..3 * pixels).map(|_| 0.4 * noise() * noise()).collect();
-    let mut pseudo_gt = PseudoGt::new(&gpu(), &ToneSettings::new(ToneCurve::Ap3)).unwrap();
-    let device = pseudo_gt.measure(&image).unwrap().statistics;
-    let host = Statistics::of(&image);
-    assert_eq!(
-        (device.p10.to_bits(), device.p90.to_bits()),
-        (host.p10.to_bits(), host.p90.to_bits())
-    );
-    let means = |of: &Statistics| {
-        let [red, green, blue] = of.channel_means;
-        [of.mean_luminance, of.mean, red, green, blue]
-    };
-    for (device, host) in means(&device).into_iter().zip(means(&host)) {
-        assert!((device - host).abs() <= 4.0 * f32::EPSILON * host, "{device} is not {host}");
-    }
-}
-
 /// Ranks beyond 2^24 are whole numbers that f32 does not have.
 #[test]
 fn percentiles_and_means_of_more_than_sixteen_million_pixels_are_exact() {
-    assert_statistics_are_exact((1 << 24) + 12_345);
-}
-
-#[test]
-#[ignore = "a gigabyte: of `make stress`"]
-fn percentiles_and_means_of_33_megapixels_are_exact() {
-    assert_statistics_are_exact(7680 * 4320);
+    let pixels = (1 << 24) + 12_346;
+    let weight = (8 * (pixels - 1) % 10) as f32 / 10.0;
+    let lower = 8 * (pixels - 1) / 10;
+    assert!(weight > 0.0, "the percentile lies between two ranks");
+    let plane = (0..pixels).map(|i| if pixels - 1 - i <= lower { 0.25 } else { 0.5 });
+    let mut luminances: Vec<f32> = plane.collect();
+    assert_eq!(percentile(&mut luminances, 8), 0.25 + 0.25 * weight);
+    let statistics = Statistics::of(&luminances.repeat(3));
+    let mean = 0.25 * (1.0 + (pixels - 1 - lower) as f64 / pixels as f64);
+    for found in [statistics.mean, statistics.mean_luminance] {
+        assert!((f64::from(found) / mean - 1.0).abs() < 1e-7, "{found}, not {mean}");
+    }
 }

@@ -13,6 +13,7 @@ use nightsplat::splats::render::{Damping, Gradients, RenderOptions, RenderSettin
 use nightsplat::splats::scene::{DeviceGaussians, Layout, Shape, width};
 use nightsplat::train::{PrecisionConfig, TrainConfig, Trainer};
 
+use crate::common::own_gpu;
 use crate::common::setup::{Setup, features};
 use crate::common::train::{advance, dataset};
 
@@ -253,8 +254,8 @@ fn config([rest, moments]: [StorageFormat; 2]) -> TrainConfig {
 fn runs_in_fewer_bits_are_near_those_of_floats_in_less_memory_and_the_same_every_time() {
     let _alone = alone();
     let dataset = dataset(8, [40, 30]);
+    let gpu = own_gpu();
     let run = |bits| {
-        let gpu = gpu();
         let mut trainer = Trainer::new(&gpu, config(bits), &dataset).unwrap();
         let losses: Vec<f64> = advance(&mut trainer, 40).iter().map(|step| step.loss).collect();
         let late = losses[30..].iter().sum::<f64>();
@@ -317,5 +318,5 @@ fn the_bits_are_settings_like_any_other() {
     assert_eq!([config.precision.rest, config.precision.moments], [StorageFormat::Half; 2]);
     assert_eq!(TrainConfig::from_toml(&config.to_toml().unwrap()).unwrap(), config);
     let refused = with("precision.moments=8").unwrap_err().to_string();
-    assert!(refused.contains("precision.moments=8") && refused.contains("16"), "{refused}");
+    assert!(refused.contains("precision.moments is") && refused.contains("16"), "{refused}");
 }

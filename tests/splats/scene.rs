@@ -283,7 +283,7 @@ mod colors {
     use super::*;
 
     fn view(split: Split, position: DVec3) -> View {
-        View::new("", split, camera(position), None)
+        View::new("", split, camera(position), Some(Image::filled(8, 6, [0.0; 3])))
     }
 
     fn point(position: DVec3, views: &[u32]) -> Point {

@@ -7,7 +7,7 @@ use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
 use nightsplat::photographs::dataset::{Dataset, LoadOptions};
 use nightsplat::photographs::image::Image;
 use nightsplat::photographs::pseudo_gt::PseudoGt;
-use nightsplat::photographs::tone::{GainChoice, Table, ToneCurve, ToneSettings};
+use nightsplat::photographs::tone::{GainChoice, Measured, Table, ToneCurve, ToneSettings};
 use nightsplat::train::{TargetExposure, TrainConfig, Trainer};
 
 /// The losses of the first steps, and the parameters after them.
@@ -154,15 +154,14 @@ fn photographs_are_lifted_before_they_are_shrunk() {
 
     let settings = ToneSettings::default();
     let own = train(&config(settings.clone()), &shrunk).0;
-    let mut pseudo_gt = PseudoGt::new(&gpu(), &settings).unwrap();
+    let pseudo_gt = PseudoGt::new(&gpu(), &settings).unwrap();
     let photographs = shrunk
         .train_views()
         .map(|view| (view.name.clone(), view.photograph().unwrap().unwrap().into_owned()));
     let photographs: Vec<(String, Image)> = photographs.collect();
     let seen = photographs.iter().zip(shrunk.train_views());
-    let measured: Vec<_> = seen
-        .map(|((_, image), view)| pseudo_gt.measure(&image.data).unwrap().seen_by(&view.camera))
-        .collect();
+    let measured: Vec<_> =
+        seen.map(|((_, image), view)| Measured::of(&image.data).seen_by(&view.camera)).collect();
     let scene = settings.scene(&measured).unwrap();
     for ((name, photograph), measured) in photographs.iter().zip(&measured) {
         let lifted = pseudo_gt.lifted(photograph, &settings.lift(&scene, measured)).unwrap();

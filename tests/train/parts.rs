@@ -383,31 +383,33 @@ fn a_model_without_the_depth_it_asked_for_scores_the_same_afterwards() {
 }
 
 #[test]
-fn ablate_trains_every_model_and_leaves_a_page() {
+fn a_sweep_of_parts_trains_every_model_and_leaves_pages() {
     let folder = tempfile::tempdir().unwrap();
     let set = folder.path().join("set");
     make_set(&set, true);
-    let (set, out) = (set.display(), folder.path().join("ablation"));
-    let at = out.display();
-    let table = succeed(&format!("ablate {set} --out {at} {SMALL}"));
-    for (name, title) in [
-        ("plain", "plain"),
-        ("denoiser", "+ denoiser"),
-        ("tonemapper", "+ tonemapper"),
-        ("structure", "+ structure"),
-        ("depth", "+ depth"),
-        ("lita", "all parts"),
-    ] {
-        assert!(out.join(name).join("metrics.json").is_file(), "{name}");
-        assert!(table.contains(title), "{table}");
+    let (set, out) = (set.display(), folder.path().join("parts"));
+    let sweep = format!("sweep {set} --out {} --table parts {SMALL}", out.display());
+    let table = succeed(&sweep);
+    for name in ["plain", "denoiser", "tonemapper", "structure", "depth", "all"] {
+        assert!(out.join(format!("parts={name}/metrics.json")).is_file(), "{name}");
+        assert!(table.contains(name), "{table}");
     }
-    let markdown = std::fs::read_to_string(out.join("table.md")).unwrap();
-    assert!(markdown.contains("peak, MiB") && markdown.contains("Gaussians"), "{markdown}");
+    assert!(table.contains("PSNR, dB of R_0") && table.contains("gain"), "{table}");
     let page = std::fs::read_to_string(out.join("index.html")).unwrap();
-    assert!(page.contains("all parts") && page.contains("data:image/png"));
-    refused(&format!("ablate {set} --out {at} {SMALL}"), 1, &["--overwrite"]);
-    let picked = format!("ablate {set} --out {at} --overwrite --model lita");
-    refused(&picked, 2, &["leave out --model"]);
+    assert!(page.contains("the row of parts plain") && page.contains("data:image/png"));
+    let costs = std::fs::read_to_string(out.join("costs.html")).unwrap();
+    assert!(costs.contains("device, MiB") && costs.contains("Gaussians"), "{costs}");
+}
+
+#[test]
+fn a_sweep_of_parts_leaves_out_the_depth_that_the_dataset_has_not() {
+    let folder = tempfile::tempdir().unwrap();
+    let set = folder.path().join("set");
+    make_set(&set, false);
+    let out = folder.path().join("parts");
+    let sweep = format!("sweep {} --out {} --table parts --dry-run", set.display(), out.display());
+    let lines = succeed(&sweep);
+    assert!(lines.lines().count() == 5 && !lines.contains("parts=depth"), "{lines}");
 }
 
 #[test]

@@ -16,11 +16,14 @@ use crate::splats::scene::{Gaussians, SH_C0, Shape};
 use crate::train::{Part, TrainConfig, Trainer};
 
 /// Gaussians before a camera that looks along z from the origin.
-pub(super) struct Scene {
-    pub(super) camera: Camera,
-    pub(super) gaussians: Gaussians,
+#[derive(Clone, Debug)]
+pub struct Scene {
+    /// At the origin.
+    pub camera: Camera,
+    /// In the camera's view.
+    pub gaussians: Gaussians,
     /// A dark photograph of the camera's size.
-    pub(super) low: Image,
+    pub low: Image,
 }
 
 /// The natural logarithm of a Gaussian's standard deviation in pixels: mean and deviation. With them 20 000 Gaussians
@@ -31,7 +34,8 @@ const LOG_PIXELS: [f64; 2] = [0.545, 0.8];
 const DRAWS: u64 = 32;
 
 impl Scene {
-    pub(super) fn new(width: u32, height: u32, count: usize) -> Self {
+    /// As many Gaussians in a view of these pixels.
+    pub fn new(width: u32, height: u32, count: usize) -> Self {
         let camera = camera(width, height);
         Self { low: dark(width, height), gaussians: gaussians(&camera, count, 3), camera }
     }
@@ -63,14 +67,14 @@ pub(super) struct Trainers {
 /// # Errors
 /// The device is out of memory or lost.
 pub(super) fn trainers(gpu: &Gpu, scene: &Scene) -> Result<Trainers> {
-    let plain = plain(gpu, scene, ToneCurve::Ap3)?;
+    let plain = plain(gpu, scene)?;
     let (lita, lita_begins) = gpu.checked(|| lita(gpu));
     Ok(Trainers { plain, lita: lita?, lita_begins, intersections: intersections(gpu, scene)? })
 }
 
 /// A configuration whose steps all do the same work, behind those that the SH take to come into use.
-fn config(curve: ToneCurve) -> TrainConfig {
-    let mut config = TrainConfig { tone: ToneSettings::new(curve), ..TrainConfig::bare() };
+fn config() -> TrainConfig {
+    let mut config = TrainConfig { tone: ToneSettings::new(ToneCurve::Ap3), ..TrainConfig::bare() };
     config.schedule.sh_degree_interval = 1;
     config.schedule.boost = 1.0;
     config.schedule.densify_after = i64::MAX as u64;
@@ -82,9 +86,9 @@ fn config(curve: ToneCurve) -> TrainConfig {
 ///
 /// # Errors
 /// The device is out of memory or lost.
-pub(super) fn plain(gpu: &Gpu, scene: &Scene, curve: ToneCurve) -> Result<Trainer> {
+pub fn plain(gpu: &Gpu, scene: &Scene) -> Result<Trainer> {
     let dataset = scene.dataset();
-    let mut trainer = Trainer::from_gaussians(gpu, config(curve), &dataset, &scene.gaussians)?;
+    let mut trainer = Trainer::from_gaussians(gpu, config(), &dataset, &scene.gaussians)?;
     while trainer.steps_done() < 3 {
         trainer.advance(3)?;
     }
@@ -93,7 +97,7 @@ pub(super) fn plain(gpu: &Gpu, scene: &Scene, curve: ToneCurve) -> Result<Traine
 
 /// Every part on a small scene, density control in every step.
 fn lita(gpu: &Gpu) -> Result<Trainer> {
-    let mut config = config(ToneCurve::Ap3);
+    let mut config = config();
     config.model.follow_paper();
     config.model.set_parts(&Part::ALL);
     config.ssim_weight = 0.0;
@@ -116,7 +120,7 @@ fn intersections(gpu: &Gpu, Scene { camera, gaussians, .. }: &Scene) -> Result<u
 }
 
 /// At the origin, looking along z.
-pub(super) fn camera(width: u32, height: u32) -> Camera {
+pub fn camera(width: u32, height: u32) -> Camera {
     Camera {
         width,
         height,
@@ -128,7 +132,7 @@ pub(super) fn camera(width: u32, height: u32) -> Camera {
 }
 
 /// Spread over the camera's view, of the same sizes in pixels whatever its size.
-pub(super) fn gaussians(camera: &Camera, count: usize, shape: impl Into<Shape>) -> Gaussians {
+pub fn gaussians(camera: &Camera, count: usize, shape: impl Into<Shape>) -> Gaussians {
     let stream = Stream::new(65, 0);
     let uniform = |gaussian: usize, draw: u64| stream.uniform(gaussian as u64 * DRAWS + draw);
     let normal =
@@ -163,7 +167,7 @@ pub(super) fn gaussians(camera: &Camera, count: usize, shape: impl Into<Shape>) 
 }
 
 /// Smooth and dark, with noise.
-pub(super) fn dark(width: u32, height: u32) -> Image {
+pub fn dark(width: u32, height: u32) -> Image {
     let noise = Stream::new(65, 2);
     Image::from_fn(width, height, |x, y| {
         [0_u32, 1, 2].map(|channel| {

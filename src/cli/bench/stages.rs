@@ -88,14 +88,15 @@ pub(super) fn time(bench: &Bench, trainers: &mut Trainers) -> Result<Stages> {
     let steps = repeated(bench, || trainers.plain.profile_step())?;
     let of_step = |names: &[&str]| median(steps.iter().map(|t| of_kernels(t, names)).collect());
     let loss_kernels = ["ssim", "loss_log"];
-    let (tone_statistics, whole_pseudo_gt) = pseudo_gt(bench)?;
+    let mut photograph = Photograph::new(&bench.gpu)?;
+    let times = repeated(bench, || photograph.profile(&bench.gpu))?;
+    let full_hd = median(times.iter().map(|times| total(times)).collect());
     let group = |name, milliseconds, bound| Timing { name, milliseconds, bound };
     let groups = vec![
         group("blend_forward", of_step(&["blend_forward"]), Some(60.0)),
         group("blend_backward", of_step(&["blend_backward"]), Some(130.0)),
         group("sort_65000_pairs", sort(bench)?, Some(10.0)),
-        group("tone_statistics_1920x1080", tone_statistics, Some(60.0)),
-        group("pseudo_gt_1920x1080", whole_pseudo_gt, Some(80.0)),
+        group("pseudo_gt_1920x1080", full_hd, Some(20.0)),
         group("loss", of_step(&loss_kernels), None),
         group("target", of_step(&["pseudo_gt"]), None),
     ];
@@ -134,7 +135,7 @@ fn sort(bench: &Bench) -> Result<f64> {
     })
 }
 
-/// A Full-HD photograph, its statistics, and its pseudo-GT.
+/// A Full-HD photograph and its pseudo-GT.
 struct Photograph {
     image: Buffer<f32>,
     pseudo_gt: PseudoGt,
@@ -156,20 +157,10 @@ impl Photograph {
 
     fn record(&mut self, pass: &mut crate::gpu::Recorder<'_>) -> Result<()> {
         let Self { image, pseudo_gt, parameters, target } = self;
-        pseudo_gt.statistics(pass, image, [1920, 1080])?;
         pseudo_gt.map(pass, image, parameters, 0, target)
     }
 
     fn profile(&mut self, gpu: &Gpu) -> Result<Vec<PassTime>> {
         gpu.profile("pseudo-GT", |pass| self.record(pass))
     }
-}
-
-/// The statistics alone, and with the curve over every value.
-fn pseudo_gt(bench: &Bench) -> Result<(f64, f64)> {
-    let mut photograph = Photograph::new(&bench.gpu)?;
-    let times = repeated(bench, || photograph.profile(&bench.gpu))?;
-    let map = |times: &Vec<PassTime>| of_kernels(times, &["pseudo_gt"]);
-    let statistics = times.iter().map(|times| total(times) - map(times)).collect();
-    Ok((median(statistics), median(times.iter().map(|times| total(times)).collect())))
 }

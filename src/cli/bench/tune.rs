@@ -208,11 +208,10 @@ impl Case {
     }
 }
 
-pub(super) const OPTIONS: RenderOptions =
-    RenderOptions { sh_degree: MAX_SH_DEGREE, background: [0.0; 3] };
+const OPTIONS: RenderOptions = RenderOptions { sh_degree: MAX_SH_DEGREE, background: [0.0; 3] };
 
 /// All that a pass of the rasteriser reads and writes beside the memory of its renderer.
-pub(super) struct Pass {
+struct Pass {
     camera: Camera,
     gaussians: DeviceGaussians,
     d_render: Buffer<f32>,
@@ -222,7 +221,7 @@ pub(super) struct Pass {
 }
 
 impl Pass {
-    pub(super) fn new(
+    fn new(
         Bench { gpu, .. }: &Bench,
         camera: Camera,
         gaussians: DeviceGaussians,
@@ -240,11 +239,7 @@ impl Pass {
     }
 
     /// Milliseconds of blending forward and backward, and of all passes.
-    pub(super) fn profile(
-        &mut self,
-        bench: &Bench,
-        renderer: &mut Renderer,
-    ) -> crate::Result<[f64; 3]> {
+    fn profile(&mut self, bench: &Bench, renderer: &mut Renderer) -> crate::Result<[f64; 3]> {
         let Self { camera, gaussians, d_render, .. } = self;
         let times = bench.gpu.profile("tune", |pass| {
             renderer.forward(pass, &*gaussians, &*camera, &OPTIONS)?;

@@ -1,31 +1,63 @@
-//! The points of a sweep: every combination of the values of its axes, and the grids of the paper's tables.
+//! The points of a sweep: every combination of the values of its axes, and the grids that have a name.
 
-use crate::cli::batch::point::{ADAPTIVE, Axis, OFFSET, Point, all_curves};
+use super::point::{ADAPTIVE, ALL_PARTS, Axis, OFFSET, PARTS, PLAIN, PRESET, Point, all_curves};
+use crate::train::{Part, Preset};
 use crate::{Error, Result};
 
-/// The grids of the paper's tables.
+/// The grids that have a name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-pub(super) enum PaperTable {
-    /// Every curve
+pub(super) enum Grid {
+    /// The paper's: every curve
     Leaderboard,
-    /// AP3 with fixed black levels from 0 to 0.2, and the adaptive one
+    /// The paper's: AP3 with fixed black levels from 0 to 0.2, and the adaptive one
     Offset,
-    /// AP3 with alpha from 0.04 to 0.3, and linear
+    /// The paper's: AP3 with alpha from 0.04 to 0.3, and linear
     Alpha,
-    /// ASE with g0 from 1 to 4 at c = 0 and c from 1 to 4 at g0 = 1, and linear
+    /// The paper's: ASE with g0 from 1 to 4 at c = 0 and c from 1 to 4 at g0 = 1, and linear
     Gain,
+    /// Colour alone, each part of LITA-GS alone beside it, and all of them
+    Parts,
+    /// The presets draft, fast, balanced and best
+    Presets,
+    /// The preset balanced, and single changes of it that trade time for quality
+    Changes,
 }
 
-impl PaperTable {
-    /// The curve that the others are compared with.
-    pub(super) fn baseline(self) -> Option<&'static str> {
+/// The changes of balanced.
+const CHANGES: [(&str, &[&str]); 8] = [
+    ("steps", &["500", "1000"]),
+    ("stop.gain", &["0.02", "0.1"]),
+    // Steps at a quarter and at half the size of the views; the schedule of `balanced` has 0 and 200.
+    ("schedule.resolution_steps", &["[0,0]", "[0,1000]"]),
+    ("schedule.boost", &["1"]),
+    ("max_gaussians", &["2000", "4000"]),
+    ("sh_degree", &["0", "1"]),
+    ("density.gradient_threshold", &["2e-4", "8e-4"]),
+    ("ssim_weight", &["0"]),
+];
+
+/// Settings that change what is scored, or against what.
+const FIXED: [(&str, &str); 3] = [
+    (
+        "downscale",
+        "changes what is scored; smaller views of the same scores are --grid schedule.resolution_steps=[0,1000]",
+    ),
+    ("dataset", "is one for all points"),
+    ("reference", "is what is scored against"),
+];
+
+impl Grid {
+    /// Axis and value of the point that the others are compared with.
+    pub(super) fn baseline(self) -> Option<(&'static str, &'static str)> {
         match self {
             // The paper's, where the library has it.
             Self::Leaderboard if all_curves().iter().any(|name| name == "softexp") => {
-                Some("softexp")
+                Some(("curve", "softexp"))
             }
-            Self::Leaderboard | Self::Alpha | Self::Gain => Some("linear"),
+            Self::Leaderboard | Self::Alpha | Self::Gain => Some(("curve", "linear")),
             Self::Offset => None,
+            Self::Parts => Some((PARTS, PLAIN)),
+            Self::Presets | Self::Changes => Some((PRESET, Preset::Balanced.name())),
         }
     }
 
@@ -49,22 +81,39 @@ impl PaperTable {
                 };
                 vec![gains(&["0"], &["1", "2", "3", "4"]), gains(&["1", "2", "3", "4"], &["1"])]
             }
+            Self::Parts => {
+                let [a, b, c, d] = Part::ALL.map(Part::name);
+                vec![vec![Axis::of(PARTS, &[PLAIN, a, b, c, d, ALL_PARTS])]]
+            }
+            Self::Presets => {
+                let presets = [Preset::Draft, Preset::Fast, Preset::Balanced, Preset::Best];
+                vec![vec![Axis::of(PRESET, &presets.map(Preset::name))]]
+            }
+            Self::Changes => {
+                let base = || Axis::of(PRESET, &[Preset::Balanced.name()]);
+                let changes =
+                    CHANGES.iter().map(|(key, values)| vec![base(), Axis::of(key, values)]);
+                std::iter::once(vec![base()]).chain(changes).collect()
+            }
         }
     }
 }
 
-/// The points of the axes, the first varying slowest; those of a paper's table, where `given` replaces its axes of the
+/// The points of the axes, the first varying slowest; those of a grid with a name, where `given` replaces its axes of the
 /// same key and adds to the others.
 ///
 /// # Errors
 /// [`Error::Usage`] where there is no axis, one is given twice, or a fixed black level meets alpha or beta.
-pub(super) fn points(given: &[Axis], table: Option<PaperTable>) -> Result<Vec<Point>> {
+pub(super) fn points(given: &[Axis], table: Option<Grid>) -> Result<Vec<Point>> {
     for (index, axis) in given.iter().enumerate() {
         if given[..index].iter().any(|other| other.key == axis.key) {
             return Err(Error::Usage(format!("{} is given twice; give one list", axis.key)));
         }
+        if let Some((key, why)) = FIXED.iter().find(|(key, _)| *key == axis.key) {
+            return Err(Error::Usage(format!("--grid {key}: it {why}")));
+        }
     }
-    let mut grids = table.map_or_else(|| vec![vec![]], PaperTable::grids);
+    let mut grids = table.map_or_else(|| vec![vec![]], Grid::grids);
     for grid in &mut grids {
         grid.retain(|axis| given.iter().all(|own| own.key != axis.key));
         grid.extend(given.iter().cloned());
@@ -73,7 +122,8 @@ pub(super) fn points(given: &[Axis], table: Option<PaperTable>) -> Result<Vec<Po
         let mut axes = grids.iter().flatten().filter(|axis| axis.key == "curve");
         axes.any(|axis| axis.values.iter().any(|value| value == curve))
     };
-    if let Some(curve) = table.and_then(PaperTable::baseline).filter(|curve| !has(curve)) {
+    let baseline = table.and_then(Grid::baseline).filter(|(key, _)| *key == "curve");
+    if let Some((_, curve)) = baseline.filter(|(_, curve)| !has(curve)) {
         // What shapes the other curves is nothing to the baseline.
         let of_others = ["curve", "alpha", "beta", "gain", "base_gain", OFFSET];
         let shared = given.iter().filter(|axis| !of_others.contains(&axis.key.as_str())).cloned();
@@ -123,8 +173,9 @@ fn product(axes: &[Axis]) -> Vec<Vec<(String, String)>> {
 mod tests {
     use super::*;
     use crate::photographs::tone::ToneCurve;
+    use crate::train::TrainConfig;
 
-    fn names(given: &[(&str, &str)], table: Option<PaperTable>) -> Vec<String> {
+    fn names(given: &[(&str, &str)], table: Option<Grid>) -> Vec<String> {
         let axes: Vec<Axis> =
             given.iter().map(|(key, list)| Axis::new(key, list).unwrap()).collect();
         points(&axes, table).unwrap().iter().map(Point::name).collect()
@@ -177,18 +228,36 @@ mod tests {
         refused(&[("seed", "1,2,1")], "1 is there twice");
         refused(&[("alpha", "0.1"), ("tone.alpha", "0.2")], "alpha is given twice");
         refused(&[("alpha", "0.1"), ("offset", "0.2")], "--offset");
+        refused(&[("downscale", "2,4")], "resolution_steps");
     }
 
     #[test]
-    fn the_paper_s_tables_have_their_points() {
-        let leaderboard = names(&[], Some(PaperTable::Leaderboard));
+    fn grids_with_a_name_have_their_points() {
+        let leaderboard = names(&[], Some(Grid::Leaderboard));
         assert_eq!(leaderboard.len(), ToneCurve::ALL.len());
-        let offset = names(&[("seed", "1")], Some(PaperTable::Offset));
+        let offset = names(&[("seed", "1")], Some(Grid::Offset));
         assert_eq!(offset.last().unwrap(), "curve=ap3,offset=adaptive,seed=1");
-        let alpha = names(&[("curve", "ase"), ("alpha", "0.1")], Some(PaperTable::Alpha));
+        let alpha = names(&[("curve", "ase"), ("alpha", "0.1")], Some(Grid::Alpha));
         assert_eq!(alpha, ["curve=ase,alpha=0.1", "curve=linear"]);
-        let gain = names(&[], Some(PaperTable::Gain));
+        let gain = names(&[], Some(Grid::Gain));
         assert_eq!(gain.len(), 9);
         assert!(gain.contains(&"curve=ase,gain=0,base_gain=2".to_owned()), "{gain:?}");
+        let parts = names(&[("seed", "2")], Some(Grid::Parts));
+        assert_eq!((parts.len(), parts[5].as_str()), (6, "parts=all,seed=2"));
+        assert_eq!(names(&[], Some(Grid::Presets))[3], "preset=best");
+    }
+
+    #[test]
+    fn every_change_is_a_setting_and_changes_the_base() {
+        let mut base = TrainConfig::default();
+        Preset::Balanced.apply(&mut base).unwrap();
+        let points = points(&[], Some(Grid::Changes)).unwrap();
+        assert_eq!((points.len(), points[0].name().as_str()), (15, "preset=balanced"));
+        for point in &points[1..] {
+            let (key, value) = point.values.last().unwrap();
+            let config = base.with(&[format!("{key}={value}")]).unwrap();
+            config.check().unwrap();
+            assert_ne!(config, base, "{key}={value}");
+        }
     }
 }

@@ -26,10 +26,10 @@ pub(crate) struct TrainOptions {
 #[expect(clippy::doc_markdown, reason = "in help, {setting} stands for its default")]
 #[derive(Clone, Debug, Default, Args)]
 struct SeveralSettings {
-    /// The tone curve: a name that `nightsplat curves` lists, or a .toml, .csv or .cube file [default: {tone.curve}]
+    /// The tone curve: a name that `nightsplat tone list` lists, or a .toml, .csv or .cube file [default: {tone.curve}]
     #[arg(long, value_name = "NAME|FILE")]
     curve: Option<CurveChoice>,
-    /// A camera profile that `nightsplat fit --profile` made, in place of a curve; results are labelled: they know its references
+    /// A camera profile that `nightsplat tone fit --profile` made, in place of a curve; results are labelled: they know its references
     #[arg(long, value_name = "FILE", conflicts_with_all = ["curve", "gain", "brightness", "colour", "theta"])]
     profile: Option<PathBuf>,
     /// c: how much a brighter photograph raises the curve's gain, or auto: the gain that the photographs ask for, as the curve auto has it [default: {tone.gain_c of ase} for ase, {tone.gain_c of ap3} for ap3, else {tone.gain_c of linear}]
@@ -130,11 +130,6 @@ impl TrainOptions {
         let mut options = self.clone();
         options.single.0.retain(|(row, _)| row.key != key);
         options
-    }
-
-    /// Whether the command line says which parts the model has.
-    pub(in crate::cli) fn picks_parts(&self) -> bool {
-        self.several.model.is_some() || self.several.parts.is_some()
     }
 
     /// A line for each option that says something of what `config` has not.

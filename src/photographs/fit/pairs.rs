@@ -154,7 +154,7 @@ fn subfolders(folder: &Path) -> Result<(PathBuf, PathBuf)> {
         |names: &[&str]| names.iter().map(|name| folder.join(name)).find(|path| path.is_dir());
     first(&DARK_FOLDERS).zip(first(&NORMAL_FOLDERS)).ok_or_else(|| {
         let problem = if folder.is_dir() {
-            "holds no pairs: it needs folders `low` and `high` (or `normal`, or `images`), or the folder in normal light by itself, `Scene::normal`"
+            "holds no pairs: it needs folders `low` and `high` (or `normal`, or `images`), or the folder in normal light by itself, named with --normal"
         } else {
             "is not a folder; name the folder of the pairs"
         };

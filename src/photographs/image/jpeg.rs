@@ -2,8 +2,8 @@
 //!
 //! Other decoders round otherwise, by fractions of a code value; a tone curve multiplies that by ten.
 
-mod coded;
 mod structure;
+mod warnings;
 
 use std::panic::catch_unwind;
 use std::path::Path;
@@ -72,15 +72,20 @@ fn set_upright(tiff: &mut [u8]) -> Option<()> {
     Some(())
 }
 
-/// The image of a file of sound structure.
+/// The image of a file of sound structure, whose coded data has to be whole; what lies between it and the end does not matter.
 fn decode(bytes: &[u8]) -> std::io::Result<Option<Image>> {
-    let file = Decompress::new_mem(bytes)?;
+    let file = Decompress::with_err(warnings::counting()).from_mem(bytes)?;
     if matches!(file.color_space(), ColorSpace::JCS_CMYK | ColorSpace::JCS_YCCK) {
         return Ok(None);
     }
+    // Of the segments before the picture: none of its pixels.
+    warnings::take();
     let mut file = file.rgb()?;
     let (width, height) = (file.width() as u32, file.height() as u32);
     let interleaved: Vec<u8> = file.read_scanlines()?;
+    if warnings::take() > 0 {
+        return Err(std::io::ErrorKind::InvalidData.into());
+    }
     file.finish()?;
     let values: Vec<f32> = interleaved.into_iter().map(|value| f32::from(value) / 255.0).collect();
     Ok(Some(from_interleaved(width, height, &values)))
@@ -184,6 +189,15 @@ mod tests {
                 assert!(message.contains("photo.jpg: this JPEG is cut short"), "{name}: {message}");
             }
         }
+    }
+
+    #[test]
+    fn bytes_between_the_picture_and_its_end_do_no_harm() {
+        let whole = fixture("420.jpg");
+        let (picture, end) = whole.split_at(whole.len() - 2);
+        let padded = [picture, &[0; 8], end].concat();
+        let load = |bytes: &[u8]| load(Path::new("420.jpg"), bytes).unwrap().unwrap();
+        assert!(load(&padded) == load(&whole));
     }
 
     #[test]

@@ -4,23 +4,9 @@ use super::PseudoGt;
 use crate::Result;
 use crate::gpu::{Buffer, Download};
 use crate::photographs::image::Image;
-use crate::photographs::tone::{Lift, Measured};
+use crate::photographs::tone::Lift;
 
 impl PseudoGt {
-    /// Measures the planes (3, pixels) of a photograph.
-    ///
-    /// # Errors
-    /// There are no pixels, or the device is out of memory or lost.
-    #[cfg(feature = "testing")]
-    pub fn measure(&mut self, planes: &[f32]) -> Result<Measured> {
-        let tiles = self.tiles(planes)?;
-        let tiles: Vec<&Buffer<f32>> = tiles.iter().collect();
-        let gpu = self.gpu.clone();
-        gpu.run("tone statistics", |pass| self.statistics_of_tiles(pass, &tiles))?;
-        let (statistics, luminance) = (self.measured()?, self.luminance_histogram()?);
-        Ok(Measured { statistics, luminance, camera: None })
-    }
-
     /// The target that a photograph becomes, of its own size.
     ///
     /// # Errors

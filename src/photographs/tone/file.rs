@@ -88,7 +88,7 @@ impl ToneSettings {
 }
 
 impl Profile {
-    /// Reads a profile that `nightsplat fit --profile` wrote.
+    /// Reads a profile that `nightsplat tone fit --profile` wrote.
     ///
     /// # Errors
     /// [`Error::Input`] names the file and what is wrong in it.

@@ -1,15 +1,15 @@
 //! How often each luminance occurs in a photograph, or in several.
 
-use crate::kernels::rank_search::{BINS, DIGIT_BITS, SEARCHES};
-
 use super::statistics::{luminance, measurable};
 
 /// The bits of a luminance to the right of its bin's number: 128 bins an octave are left.
-pub(crate) const BIN_SHIFT: u32 = 16;
+const BIN_SHIFT: u32 = 16;
 
-/// The first bin's number is this and [`DIGIT_BITS`] zeros: 2^-15, a hundredth of a code value of 8 bits. The bins reach
-/// to 2^17.
-pub(crate) const FIRST_PREFIX: u32 = 14;
+/// The number of the first bin: 2^-15, a hundredth of a code value of 8 bits.
+const FIRST_BIN: u32 = 14 << 10;
+
+/// The bins reach to 2^17.
+const BINS: usize = 4096;
 
 /// How many pixels have which luminance, in bins a 128th of an octave wide; everything below 2^-15 counts as 0.
 ///
@@ -26,23 +26,18 @@ impl LuminanceHistogram {
     pub fn of(planes: &[f32]) -> Self {
         let (red, rest) = planes.split_at(planes.len() / 3);
         let (green, blue) = rest.split_at(red.len());
-        let mut counts = vec![0; (SEARCHES * BINS) as usize];
+        let mut counts = vec![0_u32; BINS];
         for ((&r, &g), &b) in red.iter().zip(green).zip(blue) {
             let number = luminance([r, g, b].map(measurable)).to_bits() >> BIN_SHIFT;
-            let bin = number.checked_sub(FIRST_PREFIX << DIGIT_BITS);
+            let bin = number.checked_sub(FIRST_BIN);
             if let Some(count) = bin.and_then(|bin| counts.get_mut(bin as usize)) {
                 *count += 1;
             }
         }
-        Self::from_counts(&counts, red.len() as u64)
-    }
-
-    /// What the bins of a photograph with so many pixels hold.
-    pub(crate) fn from_counts(counts: &[u32], pixel_count: u64) -> Self {
-        let bins = (0..).zip(counts).filter(|(_, count)| **count > 0);
-        let counts: Vec<(u32, u64)> = bins.map(|(bin, &count)| (bin, count.into())).collect();
+        let bins = (0..).zip(counts).filter(|(_, count)| *count > 0);
+        let counts: Vec<(u32, u64)> = bins.map(|(bin, count)| (bin, count.into())).collect();
         let lit: u64 = counts.iter().map(|(_, count)| count).sum();
-        Self { black: pixel_count - lit, counts }
+        Self { black: red.len() as u64 - lit, counts }
     }
 
     /// Adds the pixels of another photograph.
@@ -97,7 +92,7 @@ impl LuminanceHistogram {
     /// The luminances that occur, ascending, with the number of their pixels: 0 and the middles of the bins.
     fn levels(&self) -> impl Iterator<Item = (f64, u64)> + '_ {
         let middle = |bin: u32| {
-            let number = (FIRST_PREFIX << DIGIT_BITS) + bin;
+            let number = FIRST_BIN + bin;
             f64::from(f32::from_bits((number << BIN_SHIFT) | 1 << (BIN_SHIFT - 1)))
         };
         let bins = self.counts.iter().map(move |&(bin, count)| (middle(bin), count));

@@ -82,8 +82,8 @@ impl<T: Real> From<&ToneSettings> for Numbers<T> {
 impl ToneSettings {
     /// A row for each setting.
     pub(crate) const SETTINGS: &'static [Setting] = settings::settings! { rows "tone."
-        /// The tone curve: a name that `nightsplat curves` lists.
-        curve => Rule::Text("a curve that `nightsplat curves` lists", |name| name.parse::<ToneCurve>().is_ok()), "--curve NAME|FILE";
+        /// The tone curve: a name that `nightsplat tone list` lists.
+        curve => Rule::Text("a curve that `nightsplat tone list` lists", |name| name.parse::<ToneCurve>().is_ok()), "--curve NAME|FILE";
         /// c: how much a brighter photograph raises the curve's gain.
         gain_c, "the curve's" => Rule::from_to(0.0, MOST), "--gain C|auto";
         /// theta: the mean over all channels that the linear curve aims at, before clipping.

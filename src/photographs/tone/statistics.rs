@@ -1,7 +1,5 @@
 //! What a curve knows of a photograph: percentiles and means.
 
-use crate::kernels::ToneStatistics;
-
 /// Added to both percentiles, so that a black photograph divides by something.
 const EPSILON: f32 = 1e-6;
 
@@ -12,7 +10,7 @@ const EPSILON: f32 = 1e-6;
 pub struct Statistics {
     /// The 10th percentile of the BT.601 luminance, plus 1e-6.
     pub p10: f32,
-    /// The 80th percentile of the luminance, plus 1e-6; the device takes it for the curve `p80` only, else it is 0.
+    /// The 80th percentile of the luminance, plus 1e-6.
     pub p80: f32,
     /// The 90th percentile of the luminance, plus 1e-6.
     pub p90: f32,
@@ -82,14 +80,7 @@ impl Statistics {
     }
 }
 
-impl From<ToneStatistics> for Statistics {
-    fn from(found: ToneStatistics) -> Self {
-        let ToneStatistics { p10, p80, p90, mean_luminance, mean, channel_means } = found;
-        Self { p10, p80, p90, mean_luminance, mean, channel_means: channel_means.into() }
-    }
-}
-
-/// BT.601 luminance of an RGB value, in the kernels' order of operations.
+/// BT.601 luminance of an RGB value, of the values as they are.
 pub(crate) fn luminance([r, g, b]: [f32; 3]) -> f32 {
     0.299 * r + 0.587 * g + 0.114 * b
 }
@@ -100,31 +91,13 @@ pub(crate) fn measurable(x: f32) -> f32 {
     if x > 0.0 { x.min(65504.0) } else { 0.0 }
 }
 
-/// Where a quantile lies among sorted values: `weight` of the way from one rank to the next.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Rank {
-    pub(crate) lower: usize,
-    pub(crate) upper: usize,
-    pub(crate) weight: f32,
-}
-
-impl Rank {
-    /// The rank q (n - 1), q = `tenths` / 10, split in integers: in f32 it is wrong beyond 2^24 values.
-    pub(crate) fn of(tenths: usize, count: usize) -> Self {
-        let last = count.saturating_sub(1);
-        let lower = tenths * last / 10;
-        Self { lower, upper: last.min(lower + 1), weight: (tenths * last % 10) as f32 / 10.0 }
-    }
-}
-
 /// The `tenths` / 10 quantile of non-negative values, linear between the two neighbours of its rank
 /// as `torch.quantile` has it; reorders the values. 0 of no values.
 pub fn percentile(values: &mut [f32], tenths: usize) -> f32 {
-    if values.is_empty() {
-        return 0.0;
-    }
-    let rank = Rank::of(tenths, values.len());
-    let (_, &mut lower, above) = values.select_nth_unstable_by(rank.lower, f32::total_cmp);
+    let Some(last) = values.len().checked_sub(1) else { return 0.0 };
+    // The rank q (n - 1) is split in integers: in f32 it is wrong beyond 2^24 values.
+    let (rank, weight) = (tenths * last / 10, (tenths * last % 10) as f32 / 10.0);
+    let (_, &mut lower, above) = values.select_nth_unstable_by(rank, f32::total_cmp);
     let upper = above.iter().copied().min_by(f32::total_cmp).unwrap_or(lower);
-    lower + rank.weight * (upper - lower)
+    lower + weight * (upper - lower)
 }

@@ -8,8 +8,11 @@ use serde_json::json;
 
 use super::{GENERATOR, Provenance, gzip};
 use crate::camera::{Camera, CameraModel};
+use crate::kernels::camera_pinhole::JACOBIAN_MARGIN;
+use crate::kernels::splat::{ALPHA_MIN, DILATION};
 use crate::photographs::image::Image;
 use crate::results::report::{base64, escape, jpeg};
+use crate::splats::render::RenderSettings;
 use crate::splats::scene::Gaussians;
 use crate::{Error, Result};
 
@@ -65,8 +68,8 @@ impl Page<'_> {
             ("@STYLE@", include_str!("viewer/style.css").to_owned()),
             // No text of ours may end the script that holds it.
             ("@SCENE@", scene.to_string().replace('<', "\\u003c")),
-            ("@VERTEX@", include_str!("viewer/splat.vert").to_owned()),
-            ("@FRAGMENT@", include_str!("viewer/splat.frag").to_owned()),
+            ("@VERTEX@", shader(include_str!("viewer/splat.vert"))),
+            ("@FRAGMENT@", shader(include_str!("viewer/splat.frag"))),
             ("@VIEWER@", include_str!("viewer/viewer.js").to_owned()),
             ("@MODEL@", base64(&gzip(&model(gaussians))?)),
         ];
@@ -83,6 +86,19 @@ impl Page<'_> {
         }
         Ok(html + rest)
     }
+}
+
+/// The shader with what it has in common with the kernels.
+fn shader(text: &str) -> String {
+    let constants = [
+        ("ALPHA_MIN", ALPHA_MIN),
+        ("ALPHA_MAX", RenderSettings::default().max_alpha.into()),
+        ("DILATION", DILATION),
+        ("JACOBIAN_MARGIN", JACOBIAN_MARGIN),
+    ];
+    let constants = constants.map(|(name, value)| format!("const float {name} = {value:?};"));
+    let harmonics = include_str!("../../../shaders-glsl/include/sh.glsl");
+    text.replace("@CONSTANTS@", &constants.join("\n")).replace("@HARMONICS@", harmonics)
 }
 
 fn view(bookmark: &Bookmark) -> serde_json::Value {
@@ -150,6 +166,9 @@ mod tests {
         let refused = of_fisheye.html().unwrap_err().to_string();
         assert!(refused.contains("fisheye") && refused.contains("undistort"), "{refused}");
         assert!(!html.contains("<b>"));
+        let constant = |name: &str, value: f64| format!("const float {name} = {value:?};");
+        assert!(html.contains(&constant("DILATION", DILATION)) && html.contains("void sh_basis("));
+        assert_eq!(html.matches(&constant("ALPHA_MIN", ALPHA_MIN)).count(), 2);
         assert_eq!(html.matches("<script").count(), html.matches("</script>").count());
         for outside in ["http://", "https://", "src=\"/", "@import"] {
             assert!(!html.contains(outside), "{outside}");

@@ -140,6 +140,7 @@ impl Schedule {
     }
 
     /// Density control acts between steps 500 and 5 000, every 200 steps, and every step sees whole views (LITA-GS).
+    #[cfg(test)]
     pub(crate) fn paper() -> Self {
         Self {
             boost: 1.0,
@@ -171,6 +172,7 @@ impl Schedule {
     }
 
     /// The SH degree that `step` trains, at most `max`.
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn sh_degree(&self, step: u64, max: u32) -> u32 {
         let degree = step / self.sh_degree_interval.max(1);
         degree.min(u64::from(max)) as u32

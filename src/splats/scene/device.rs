@@ -92,6 +92,7 @@ impl DeviceGaussians {
     }
 
     /// To be drawn.
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn slice(&self) -> GaussianSlice<'_> {
         GaussianSlice { layout: self.layout, parameters: self.parameters.slice() }
     }

@@ -52,6 +52,9 @@ impl Start {
 /// The least mean squared distance to the neighbours, world units squared (3DGS).
 const LEAST_SQUARED_DISTANCE: f64 = 1e-7;
 
+/// A point that no track says the views of is looked for in no more.
+pub const MOST_VIEWS: usize = 64;
+
 /// The standard deviation of a Gaussian that has no neighbour at all, world units.
 const LONE_SCALE: f64 = 0.01;
 
@@ -176,7 +179,8 @@ fn spread(directions: impl Iterator<Item = DVec3>) -> (DQuat, DVec3) {
 ///
 /// Each lies at a uniform place of a random camera's image, at a depth that is log-uniform between half the
 /// capture's radius and five times it (radius: the greatest distance of a camera from the cameras' mean; 1 where all
-/// cameras are in one place). A position that a second camera sees is preferred: its depth can be learned.
+/// cameras are in one place). A position that a second camera sees is preferred: its depth can be learned. No more than
+/// [`MOST_VIEWS`] cameras are asked, so that the time is proportional to `count`.
 pub fn random(cameras: &[Camera], count: usize, seed: u64) -> Vec<DVec3> {
     const TRIES: u64 = 16;
     const DRAWS_PER_TRY: u64 = 4;
@@ -203,7 +207,7 @@ pub fn random(cameras: &[Camera], count: usize, seed: u64) -> Vec<DVec3> {
         // Views that follow each other show the same: the second camera is found among the first ones most often.
         let seen_twice = |(place, position): &(usize, DVec3)| {
             let (before, from) = cameras.split_at(*place);
-            let seen = from.iter().chain(before.iter().rev());
+            let seen = from.iter().chain(before.iter().rev()).take(MOST_VIEWS);
             seen.filter(|camera| camera.sees(*position).is_some()).nth(1).is_some()
         };
         let (_, position) =
@@ -225,11 +229,12 @@ fn radius(cameras: &[Camera]) -> f64 {
 
 /// The colour of each point: the mean of what the training views that see it show in their targets, RGB.
 ///
-/// A point is seen by the training views of its track; without any, by every training view that it lies inside of. A
-/// point that no training view sees gets the mean grey of the targets. `target` gives the target of a view (an index
+/// A point is seen by the training views of its track; without any, by the training views that it lies inside of, of
+/// [`MOST_VIEWS`] that cover the scene ([`Camera::covering`]). A point that none of them sees gets the mean grey of the targets. `target` gives the target of a view (an index
 /// into `views`), or nothing where there is none; it is asked once per training view, in order, so it may compute.
 ///
-/// The time is proportional to the length of all tracks, and for points without a track to points times views.
+/// The time is proportional to the pixels of the views and the length of all tracks; a point without a track counts as one of
+/// [`MOST_VIEWS`] views.
 ///
 /// # Errors
 /// Those of `target`.
@@ -238,7 +243,7 @@ pub fn colors_from_views<I: Borrow<Image>>(
     views: &[View],
     mut target: impl FnMut(usize) -> Result<Option<I>>,
 ) -> Result<Vec<Vec3>> {
-    let Candidates { of_view, untracked } = Candidates::of(points, views);
+    let candidates = Candidates::of(points, views);
     let mut colors = vec![Mean::default(); points.len()];
     let mut grey = Mean::default();
     for (index, view) in views.iter().enumerate().filter(|(_, view)| view.split == Split::Train) {
@@ -249,7 +254,8 @@ pub fn colors_from_views<I: Borrow<Image>>(
             let pixel = shown(view, &points[point as usize])?;
             Some((point, bilinear(target, pixel)))
         };
-        let own = of_view[index].par_iter().chain(&untracked).filter_map(color);
+        let [tracked, untracked] = candidates.of_view(index);
+        let own = tracked.par_iter().chain(untracked).filter_map(color);
         for (point, color) in own.collect::<Vec<_>>() {
             colors[point as usize].add(color);
         }
@@ -269,8 +275,10 @@ fn shown(view: &View, point: &Point) -> Option<DVec2> {
 struct Candidates {
     /// Of each view the points whose track has it, ascending.
     of_view: Vec<Vec<u32>>,
-    /// The points that no training view of their track shows: any view may.
+    /// The points that no training view of their track shows.
     untracked: Vec<u32>,
+    /// Whether each view is one that these are looked for in.
+    covers: Vec<bool>,
 }
 
 impl Candidates {
@@ -284,7 +292,18 @@ impl Candidates {
             track.any(|&view| shown(&views[view as usize], point).is_some())
         };
         let is_tracked: Vec<bool> = points.par_iter().map(is_shown).collect();
-        let mut own = Self { of_view: vec![vec![]; views.len()], untracked: vec![] };
+        let (training, cameras): (Vec<usize>, Vec<Camera>) = (0..views.len())
+            .filter(|&view| is_training(&&(view as u32)))
+            .map(|view| (view, views[view].camera))
+            .unzip();
+        let mut own = Self {
+            of_view: vec![vec![]; views.len()],
+            untracked: vec![],
+            covers: vec![false; views.len()],
+        };
+        for place in Camera::covering(&cameras, MOST_VIEWS) {
+            own.covers[training[place]] = true;
+        }
         for (number, (point, is_tracked)) in (0..).zip(points.iter().zip(is_tracked)) {
             if !is_tracked {
                 own.untracked.push(number);
@@ -298,6 +317,11 @@ impl Candidates {
             }
         }
         own
+    }
+
+    /// The points that a view is asked for: those with a track, and those without.
+    fn of_view(&self, view: usize) -> [&[u32]; 2] {
+        [&self.of_view[view], if self.covers[view] { &self.untracked } else { &[] }]
     }
 }
 
@@ -339,4 +363,50 @@ fn bilinear(image: &Image, pixel: DVec2) -> Vec3 {
         row(y0) + ty * (row(y1) - row(y0))
     };
     Vec3::new(channel(0), channel(1), channel(2))
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::DAffine3;
+
+    use super::*;
+    use crate::camera::CameraModel;
+
+    /// Views side by side that look along z, 10 wide where they are 1 away.
+    fn views(count: usize) -> Vec<View> {
+        let view = |i: usize| {
+            let camera = Camera {
+                width: 10,
+                height: 10,
+                focal: DVec2::splat(1.0),
+                principal_point: DVec2::splat(5.0),
+                model: CameraModel::Pinhole,
+                view_from_world: DAffine3::from_translation(DVec3::NEG_X * 0.01 * i as f64),
+            };
+            let image = Image::from_fn(10, 10, |_, _| [0.5; 3]);
+            View::new(&i.to_string(), Split::Train, camera, Some(image))
+        };
+        (0..count).map(view).collect()
+    }
+
+    #[test]
+    fn a_point_is_looked_for_in_its_track_or_in_no_more_views_than_there_is_a_bound_for() {
+        let point = |views: Vec<u32>| Point { position: DVec3::Z, views };
+        let points: Vec<Point> =
+            (0..30).map(|i| point(if i % 3 == 0 { vec![0, 7] } else { vec![] })).collect();
+        let pairs = |count: usize| -> usize {
+            let candidates = Candidates::of(&points, &views(count));
+            (0..count).flat_map(|view| candidates.of_view(view)).map(<[u32]>::len).sum()
+        };
+        assert_eq!(pairs(20), 10 * 2 + 20 * 20, "all views of a small set");
+        for count in [100, 300] {
+            assert_eq!(pairs(count), 10 * 2 + 20 * MOST_VIEWS, "{count} views");
+        }
+        let colors = colors_from_views(&points, &views(300), |index| {
+            Ok(Some(Image::from_fn(10, 10, |_, _| [index as f32; 3])))
+        });
+        let colors = colors.unwrap();
+        assert_eq!(colors[0], Vec3::splat(3.5), "the mean over its track");
+        assert!((colors[1].x - 149.5).abs() < 5.0, "the views cover the set: {}", colors[1].x);
+    }
 }

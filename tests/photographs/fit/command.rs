@@ -1,8 +1,8 @@
-//! `nightsplat fit`, in process.
+//! `nightsplat tone fit`, in process.
 
 use std::path::{Path, PathBuf};
 
-use nightsplat::cli::fit::{ChannelChoice, FamilyChoice, FitArgs, WeightingChoice, apply};
+use nightsplat::cli::tone::fit::{ChannelChoice, FamilyChoice, FitArgs, WeightingChoice, apply};
 use nightsplat::photographs::tone::CurveChoice;
 
 use super::*;

@@ -12,9 +12,9 @@ use super::synthetic::*;
 use super::{load, names, view};
 use crate::common::command::run;
 
-/// What `tone` says on standard error of a dataset; one line for each remark.
+/// What `tone apply` says on standard error of a dataset; one line for each remark.
 fn said_of(root: &Path) -> String {
-    run(&format!("tone {} --json", root.display()), 0).1
+    run(&format!("tone apply {} --json", root.display()), 0).1
 }
 
 #[test]

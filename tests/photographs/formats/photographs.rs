@@ -117,11 +117,11 @@ fn heic_is_refused_with_what_converts_it_and_listed_where_it_is_not_read() {
     fs::write(root.join("a.heic"), b"\0\0\0\x18ftypheic\0\0\0\0mif1heic").unwrap();
     photograph(&root.join("b.png"), SIZE, 0.1);
     refused(
-        &format!("tone {}/a.heic", root.display()),
+        &format!("tone apply {}/a.heic", root.display()),
         3,
         &["a.heic", "HEIC", "heif-convert", "sips"],
     );
-    let (_, said) = run(&format!("tone {}", root.display()), 0);
+    let (_, said) = run(&format!("tone apply {}", root.display()), 0);
     assert!(said.contains("not read: 1 .heic") && said.contains("heif-convert"), "{said}");
 }
 
@@ -255,7 +255,7 @@ fn what_is_hidden_is_in_no_measure_of_tone() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
     let measured = |more: &str| -> serde_json::Value {
-        let (stdout, _) = run(&format!("tone {} --json{more}", root.display()), 0);
+        let (stdout, _) = run(&format!("tone apply {} --json{more}", root.display()), 0);
         serde_json::from_str(&stdout).unwrap()
     };
     let halves = |x: u32, _| [if 2 * x < SIZE.0 { 0.1 } else { 0.9 }; 3];

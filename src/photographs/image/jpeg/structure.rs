@@ -1,26 +1,21 @@
 //! The grammar of a JPEG file (ITU-T T.81, annex B), as far as libjpeg reads it.
 //!
 //! libjpeg leaves what it cannot read by unwinding through C, which ends a host that aborts on panics. Each rule here
-//! stands for such an error, so that none is left to it. libjpeg makes do with any coded data; here it has to be whole.
+//! stands for such an error, so that none is left to it. Coded data it only warns of ([`super::warnings`]).
 
 use super::MAGIC;
-use super::coded::{self, Coded, Codes, Part};
 
 /// What the segments of a file have defined so far.
 #[derive(Default)]
 struct Definitions {
     quantization: [bool; 4],
     /// Huffman codes: those of the DC coefficients, then of the others.
-    codes: [[Option<Codes>; 4]; 2],
-    /// Units between restart markers; 0: there are none.
-    restart_interval: usize,
+    codes: [[bool; 4]; 2],
     frame: Option<Frame>,
 }
 
 struct Frame {
     is_progressive: bool,
-    /// Units of a scan of several components.
-    units: usize,
     components: Vec<Component>,
 }
 
@@ -30,10 +25,6 @@ struct Component {
     sampling: [usize; 2],
     quantization: u8,
     has_scan: bool,
-    /// Of each block, in a progressive picture: which coefficients are not zero so far.
-    seen: Vec<u64>,
-    /// Blocks without those that only fill units.
-    block_count: usize,
 }
 
 /// Whether libjpeg reads the file from its first marker to its last without an error.
@@ -66,10 +57,8 @@ impl Definitions {
                 0xC0..=0xC2 => self.start_frame(segment, marker == 0xC2, bytes.len())?,
                 0xC4 => self.define_codes(segment)?,
                 0xDB => self.define_quantization(segment)?,
-                0xDA => self.start_scan(segment, rest)?,
-                0xDD if segment.len() == 2 => {
-                    self.restart_interval = u16::from_be_bytes([segment[0], segment[1]]).into();
-                }
+                0xDA => self.start_scan(segment)?,
+                0xDD if segment.len() == 2 => {}
                 // DNL, APP and COM hold nothing that is read.
                 0xDC | 0xE0..=0xEF | 0xFE => {}
                 _ => return None,
@@ -105,8 +94,7 @@ impl Definitions {
             if count > 256 || class == 0 && symbols.iter().any(|&bits| bits > 11) {
                 return None;
             }
-            let known = self.codes.get_mut(class)?.get_mut(usize::from(place & 15))?;
-            *known = Some(Codes::new(counts, symbols));
+            *self.codes.get_mut(class)?.get_mut(usize::from(place & 15))? = true;
             segment = rest;
         }
         Some(())
@@ -117,15 +105,13 @@ impl Definitions {
         let [8, y1, y0, x1, x0, count, components @ ..] = segment else { return None };
         let size = [[*x1, *x0], [*y1, *y0]].map(|side| usize::from(u16::from_be_bytes(side)));
         let (specifications, []) = components.as_chunks() else { return None };
-        let mut components: Vec<Component> = specifications
+        let components: Vec<Component> = specifications
             .iter()
             .map(|&[id, factors, quantization]| Component {
                 id,
                 sampling: [factors >> 4, factors & 15].map(usize::from),
                 quantization,
                 has_scan: false,
-                seen: vec![],
-                block_count: 0,
             })
             .collect();
         let most = |axis: usize| components.iter().map(|c| c.sampling[axis]).max();
@@ -151,21 +137,13 @@ impl Definitions {
         {
             return None;
         }
-        for component in &mut components {
-            let own =
-                |i: usize| (size[i] * component.sampling[i]).div_ceil(sampling[i]).div_ceil(8);
-            component.block_count = own(0) * own(1);
-            if is_progressive {
-                component.seen = vec![0; component.block_count];
-            }
-        }
-        self.frame = Some(Frame { is_progressive, units, components });
+        self.frame = Some(Frame { is_progressive, components });
         Some(())
     }
 
-    /// SOS: what the coded data behind it brings, and whether it does.
-    fn start_scan(&mut self, segment: &[u8], data: &[u8]) -> Option<()> {
-        let Frame { is_progressive, units, components } = self.frame.as_mut()?;
+    /// SOS: which components the coded data after it brings, and how far.
+    fn start_scan(&mut self, segment: &[u8]) -> Option<()> {
+        let Frame { is_progressive, components } = self.frame.as_mut()?;
         let (&count, rest) = segment.split_first()?;
         let (selected, &[first, last, bits]) = rest.split_at_checked(2 * usize::from(count))?
         else {
@@ -180,48 +158,28 @@ impl Definitions {
         }
         let reads =
             if *is_progressive { [first == 0 && before == 0, first > 0] } else { [true; 2] };
-        let part = match (*is_progressive, first, before) {
-            (false, ..) => Part::Whole,
-            (true, 0, 0) => Part::Mean,
-            (true, 0, _) => Part::MeanBit,
-            (true, _, 0) => Part::Band(first.into(), last.into()),
-            (true, ..) => Part::BandBit(first.into(), last.into()),
-        };
-        let (mut blocks, mut coded, mut seen) = (0, vec![], vec![]);
-        let mut units = *units;
+        let mut blocks = 0;
         let mut behind = components.iter_mut();
         for &[id, codes] in selected.as_chunks().0 {
             // In the order of the frame.
             let component = behind.find(|component| component.id == id)?;
             let places = [codes >> 4, codes & 15].map(usize::from);
-            let codes = [0, 1].map(|class| self.codes[class].get(places[class])?.as_ref());
             let is_quantized = self.quantization.get(usize::from(component.quantization));
             if !*is_progressive && component.has_scan
                 || is_quantized != Some(&true)
-                || (0..2).any(|class| reads[class] && codes[class].is_none())
+                || (0..2).any(|class| {
+                    reads[class] && self.codes[class].get(places[class]) != Some(&true)
+                })
             {
                 return None;
             }
             component.has_scan = true;
             blocks += component.blocks();
-            // Alone, a component has no units but its blocks.
-            let alone = count == 1;
-            if alone {
-                units = component.block_count;
-                seen = std::mem::take(&mut component.seen);
-            }
-            coded.push(Coded { blocks: if alone { 1 } else { component.blocks() }, codes });
         }
         if count > 1 && !(1..=10).contains(&blocks) {
             return None;
         }
-        let is_whole = coded::is_whole(data, part, &coded, units, self.restart_interval, &mut seen);
-        if let Some(&[id, _]) = selected.as_chunks().0.first().filter(|_| count == 1)
-            && let Some(component) = components.iter_mut().find(|component| component.id == id)
-        {
-            component.seen = seen;
-        }
-        is_whole.then_some(())
+        Some(())
     }
 }
 

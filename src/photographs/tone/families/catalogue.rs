@@ -1,6 +1,6 @@
 //! The one table of curves: numbers, names, formulas, constants, properties and sources.
 //!
-//! A curve is a row here and a function in `include/curves.glsl`. The command line, the help texts, `nightsplat curves`,
+//! A curve is a row here and a function in `include/curves.glsl`. The command line, the help texts, `nightsplat tone list`,
 //! TOML files and fitting all read this table; a row's formula is also the kernels' reference.
 
 use std::f64::consts::FRAC_PI_2;

@@ -8,10 +8,12 @@ flat in vec4 color;
 
 out vec4 fragment;
 
+@CONSTANTS@
+
 void main() {
     vec2 d = fromMean;
     float sigma = 0.5 * (conic.x * d.x * d.x + conic.z * d.y * d.y) + conic.y * d.x * d.y;
-    float alpha = min(0.99, color.a * exp(-sigma));
-    if (!(sigma >= 0.0 && alpha >= 1.0 / 255.0)) discard;
+    float alpha = min(ALPHA_MAX, color.a * exp(-sigma));
+    if (!(sigma >= 0.0 && alpha >= ALPHA_MIN)) discard;
     fragment = vec4(color.rgb * alpha, alpha);
 }

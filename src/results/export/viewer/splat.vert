@@ -1,5 +1,5 @@
 #version 300 es
-// One corner of a splat: the projection of the kernels (EWA), on textures of three and of (degree + 1)^2 texels a Gaussian.
+// One corner of a splat: the projection of the kernels (EWA), with their constants and harmonics, on textures of three and of (degree + 1)^2 texels a Gaussian.
 precision highp float;
 precision highp int;
 precision highp sampler2D;
@@ -11,7 +11,7 @@ uniform vec3 eye;
 uniform vec2 focal, principalPoint, size;  // pixels of the view
 uniform vec2 offset, scale;                // pixels of the view to clip space
 uniform float near;
-uniform int coefficients;
+uniform uint degree;  // of the harmonics
 
 in vec2 corner;
 in uint id;
@@ -20,27 +20,19 @@ out vec2 fromMean;  // pixels
 flat out vec3 conic;
 flat out vec4 color;
 
-const float DILATION = 0.3;
-const float MARGIN = 0.15;
+@CONSTANTS@
+@HARMONICS@
 
 vec4 texel(sampler2D plane, int index) {
     int width = textureSize(plane, 0).x;
     return texelFetch(plane, ivec2(index % width, index / width), 0);
 }
 
-vec3 shaded(int first, vec3 d) {
-    float x = d.x, y = d.y, z = d.z;
-    float basis[16] = float[](
-        0.28209479177387814, -0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x,
-        1.0925484305920792 * x * y, -1.0925484305920792 * y * z, 0.31539156525252005 * (2.0 * z * z - x * x - y * y),
-        -1.0925484305920792 * x * z, 0.5462742152960396 * (x * x - y * y),
-        -0.5900435899266435 * y * (3.0 * x * x - y * y), 2.890611442640554 * x * y * z,
-        -0.4570457994644658 * y * (4.0 * z * z - x * x - y * y),
-        0.3731763325901154 * z * (2.0 * z * z - 3.0 * x * x - 3.0 * y * y),
-        -0.4570457994644658 * x * (4.0 * z * z - x * x - y * y), 1.445305721320277 * z * (x * x - y * y),
-        -0.5900435899266435 * x * (x * x - 3.0 * y * y));
+vec3 shaded(int first, vec3 direction) {
+    float basis[16];
+    sh_basis(degree, direction, basis);
     vec3 sum = vec3(0.5);
-    for (int k = 0; k < coefficients; k++) sum += basis[k] * texel(harmonics, first + k).rgb;
+    for (uint k = 0u; k < sh_count(degree); k++) sum += basis[k] * texel(harmonics, first + int(k)).rgb;
     return max(sum, vec3(0.0));
 }
 
@@ -49,9 +41,9 @@ void main() {
     int i = int(id);
     vec4 a = texel(geometry, 3 * i), b = texel(geometry, 3 * i + 1), c = texel(geometry, 3 * i + 2);
     vec3 mean = (viewFromWorld * vec4(a.xyz, 1.0)).xyz;
-    if (!(mean.z > near && a.w > 1.0 / 255.0)) return;
+    if (!(mean.z > near && a.w > ALPHA_MIN)) return;
 
-    vec2 margin = MARGIN * size;
+    vec2 margin = JACOBIAN_MARGIN * size;
     vec2 slope = clamp(mean.xy / mean.z, -(principalPoint + margin) / focal, (size - principalPoint + margin) / focal);
     mat3 covariance = mat3(b.x, b.y, b.z, b.y, b.w, c.x, b.z, c.x, c.y);
     mat3 turn = mat3(viewFromWorld);
@@ -62,9 +54,9 @@ void main() {
     if (!(determinant > 0.0)) return;
     conic = vec3(yy, -xy, xx) / determinant;
 
-    vec2 reach = sqrt(2.0 * log(255.0 * a.w) * vec2(xx, yy)) + 0.5;
+    vec2 reach = sqrt(2.0 * log(a.w / ALPHA_MIN) * vec2(xx, yy)) + 0.5;
     fromMean = corner * reach;
     vec2 pixel = focal * mean.xy / mean.z + principalPoint + fromMean;
-    color = vec4(shaded(coefficients * i, normalize(a.xyz - eye)), a.w);
+    color = vec4(shaded(int(sh_count(degree)) * i, normalize(a.xyz - eye)), a.w);
     gl_Position = vec4((pixel + offset) * scale + vec2(-1.0, 1.0), 0.0, 1.0);
 }

@@ -112,7 +112,7 @@
     const uniform = (name) => places[name] ??= gl.getUniformLocation(built, name);
     gl.uniform1i(uniform('geometry'), 0);
     gl.uniform1i(uniform('harmonics'), 1);
-    gl.uniform1i(uniform('coefficients'), coefficients);
+    gl.uniform1ui(uniform('degree'), shDegree);
     gl.uniform1f(uniform('near'), scene.near);
 
     const attribute = (name, data, width, isId) => {

@@ -3,29 +3,29 @@
 use glam::Vec3;
 
 use super::hostile::{Hostile, camera_of_focal};
-use crate::Result;
-use crate::base::random::Stream;
-use crate::gpu::Gpu;
-use crate::photographs::tone::{ToneCurve, ToneSettings};
-use crate::splats::render::RenderSettings;
-use crate::splats::scene::Gaussians;
+use nightsplat::Result;
+use nightsplat::base::random::Stream;
+use nightsplat::gpu::Gpu;
+use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
+use nightsplat::splats::render::RenderSettings;
+use nightsplat::splats::scene::Gaussians;
 
 /// An input, and what is to come of it.
 #[derive(Debug)]
-pub struct Case {
+pub(super) struct Case {
     /// The input.
-    pub name: &'static str,
+    pub(super) name: &'static str,
     /// What is to come of it, in words.
-    pub outcome: &'static str,
+    pub(super) outcome: &'static str,
     /// What it takes.
-    pub effort: Effort,
+    pub(super) effort: Effort,
     pub(super) expect: Expect,
     pub(super) build: fn(&Gpu) -> Result<Hostile>,
 }
 
 /// What a case takes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Effort {
+pub(super) enum Effort {
     /// Seconds, and one of those that stand for all in the tests.
     Quick,
     /// Seconds.
@@ -205,7 +205,7 @@ const fn large(mut case: Case) -> Case {
 use Expect::{Learns, NoTrace, Refusal, Trains};
 
 /// Every input.
-pub const CASES: &[Case] = &[
+pub(super) const CASES: &[Case] = &[
     case("scales 1e-20", "a dot as wide as the dilation; Adam lifts them to e^-30", Trains, |_| {
         scales([-20.0; 3])
     }),

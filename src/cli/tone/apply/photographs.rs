@@ -1,9 +1,9 @@
-//! Which photographs `tone` reads, and where each goes.
+//! Which photographs `tone apply` reads, and where each goes.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use super::{ToneArgs, is_same_file};
+use super::{ApplyArgs, is_same_file};
 use crate::cli::ImageFormat;
 use crate::photographs::dataset::{Dataset, LoadOptions, Photograph, Split};
 use crate::photographs::image::files::{photographs_in, unread_in};
@@ -55,7 +55,7 @@ impl Listed {
 }
 
 /// The photographs of the input: itself, those of a folder by name, or a dataset's.
-pub(super) fn listed(args: &ToneArgs) -> Result<Vec<Listed>> {
+pub(super) fn listed(args: &ApplyArgs) -> Result<Vec<Listed>> {
     let input = &args.input;
     let unreadable =
         |error: std::io::Error| Error::input(input, format!("cannot be read: {error}"));

@@ -1,8 +1,8 @@
 //! Trains the points that are left, each in a process of its own.
 //!
 //! That process holds a lock on the file `lock` of its run directory, inherited as its standard input, until it ends:
-//! a batch that is killed may leave a process at work, and the next one waits for it instead of writing beside it. Two
-//! batches in one folder share its points in the same way. A batch that is asked to stop asks its processes, and waits
+//! a sweep that is killed may leave a process at work, and the next one waits for it instead of writing beside it. Two
+//! sweeps in one folder share its points in the same way. A sweep that is asked to stop asks its processes, and waits
 //! until they have saved.
 
 use std::fs::{File, TryLockError};
@@ -15,25 +15,25 @@ use std::time::Duration;
 
 use indicatif::ProgressBar;
 
-use super::Run;
+use super::run::Run;
 use crate::cli::signals;
 use crate::results::run::Requests;
 use crate::{Error, Result, Stop};
 
 /// A point that did not finish, and why.
 #[derive(Clone, Debug)]
-pub(in crate::cli) struct Failure {
+pub(super) struct Failure {
     /// The point's name.
-    pub(in crate::cli) name: String,
+    pub(super) name: String,
     /// What its process said last.
-    pub(in crate::cli) reason: String,
+    pub(super) reason: String,
 }
 
 /// Trains every run that is not finished, `jobs` at once; what failed, in the order of `runs`.
 ///
 /// # Errors
 /// [`Error::BatchStopped`] where that was asked for, or the time of a run was up: `all` runs are to be in `folder`.
-pub(in crate::cli) fn train(
+pub(super) fn train(
     runs: &[&Run],
     jobs: usize,
     bar: &ProgressBar,
@@ -114,7 +114,7 @@ fn attempt(run: &Run, waits: bool, requests: &Requests) -> Result<Outcome> {
     match lock.try_lock() {
         Err(TryLockError::WouldBlock) if waits => lock.lock().map_err(unusable)?,
         Err(TryLockError::WouldBlock) => return Ok(Outcome::Busy),
-        // A file system without locks: one batch at a time is all that it can have.
+        // A file system without locks: one sweep at a time is all that it can have.
         Err(TryLockError::Error(_)) | Ok(()) => {}
     }
     if run.is_finished()? {

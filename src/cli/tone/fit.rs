@@ -1,4 +1,4 @@
-//! `nightsplat fit`: fit a tone curve to pairs of photographs.
+//! `nightsplat tone fit`: fit a tone curve to pairs of photographs.
 
 use std::io::Write;
 use std::path::PathBuf;
@@ -6,8 +6,8 @@ use std::path::PathBuf;
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::table::aligned;
 use crate::base::output::write_whole;
+use crate::cli::table::aligned;
 use crate::photographs::fit::{
     Channels, Estimate, Fit, FitOptions, HeldOut, Pair, Scene, Scores, Weighting, cross_validate,
     fit,
@@ -27,7 +27,7 @@ pub struct FitArgs {
     /// The folder of the normal-light photographs; PAIRS is then that of the dark ones
     #[arg(long, value_name = "DIR")]
     pub normal: Option<PathBuf>,
-    /// The curve, by a name that `nightsplat curves` lists, or `all`
+    /// The curve, by a name that `nightsplat tone list` lists, or `all`
     #[arg(long, value_name = "NAME|all", default_value_t = FamilyChoice::One(ToneCurve::FittedCubic))]
     pub family: FamilyChoice,
     /// Write the curve to a file that --curve takes, of several families the best; with --profile, the profile
@@ -63,7 +63,7 @@ pub struct FitArgs {
     /// Draw the pairs and the curves
     #[arg(long, value_name = "FILE.svg")]
     pub plot: Option<PathBuf>,
-    /// Fit a camera profile in place of a curve (a 3x3 matrix, gain, bias and 16 segments a channel), which `--profile FILE` of `train` and `tone` takes
+    /// Fit a camera profile in place of a curve (a 3x3 matrix, gain, bias and 16 segments a channel), which `--profile FILE` of `train` and `tone apply` takes
     #[arg(long, conflicts_with_all = ["family", "channels", "weigh", "prior", "bins", "bounded", "adapt", "plot"])]
     pub profile: bool,
     /// Print JSON

@@ -1,9 +1,9 @@
-//! The page of `tone`: measurements, distributions of luminance, pictures side by side.
+//! The page of `tone apply`: measurements, distributions of luminance, pictures side by side.
 
 use std::path::Path;
 
 use super::photographs::Listed;
-use super::{CurveOnSet, Mapped, Measures, ToneArgs, ToneOutput, settings, without};
+use super::{ApplyArgs, CurveOnSet, Mapped, Measures, ToneOutput, settings, without};
 use crate::Result;
 use crate::base::output::write_whole;
 use crate::gpu::Gpu;
@@ -30,7 +30,7 @@ pub(super) struct Page {
 }
 
 impl Page {
-    pub(super) fn new(gpu: &Gpu, args: &ToneArgs, photographs: &[Listed]) -> Result<Self> {
+    pub(super) fn new(gpu: &Gpu, args: &ApplyArgs, photographs: &[Listed]) -> Result<Self> {
         let compared = args.compare.iter().map(|curve| {
             let set = CurveOnSet::new(
                 gpu,

@@ -1,7 +1,5 @@
-//! The options of `train` as `sweep` and `tradeoff` take them: checked like there, kept as text for the command lines of
-//! the points.
+//! The options of `train` as `sweep` takes them: checked like there, kept as text for the command lines of the points.
 
-use std::marker::PhantomData;
 use std::path::{Path, PathBuf};
 
 use clap::builder::ValueParser;
@@ -11,33 +9,37 @@ use clap::{Arg, ArgMatches, Args, Command, Error, FromArgMatches, ValueHint};
 
 use crate::cli::train::TrainOptions;
 
-/// The options of `train` that take a list in a command of its own: their name there, their name here, what the list holds.
-pub(in crate::cli) trait Lists {
-    const LISTS: &'static [(&'static str, &'static str, &'static str)];
-}
+/// The options of `train` that take a list here: their name there, their name here, what the list holds.
+const LISTS: [(&str, &str, &str); 5] = [
+    ("preset", "presets", "Presets, each with the plan that it makes for the photographs"),
+    ("curve", "curves", "Tone curves by name or file, or `all` [default: {tone.curve}]"),
+    (
+        "gain",
+        "gain",
+        "Values of c: how much a brighter photograph raises the curve's gain, or auto",
+    ),
+    ("theta", "theta", "Means that the linear curve aims at"),
+    ("seed", "seeds", "Seeds; scores are means over them, with their standard deviation"),
+];
 
 /// What the command line says of the options of `train`.
 #[derive(Clone, Debug)]
-pub(in crate::cli) struct Options<L> {
+pub(super) struct Options {
     /// What every point is trained with, as arguments in the order of `train --help`.
-    pub(in crate::cli) shared: Vec<String>,
+    pub(super) shared: Vec<String>,
     /// The option's name in `train` and the list that was given for it.
-    pub(in crate::cli) lists: Vec<(&'static str, String)>,
-    of: PhantomData<L>,
+    pub(super) lists: Vec<(&'static str, String)>,
 }
 
-impl<L: Lists> Args for Options<L> {
+impl Args for Options {
     fn augment_args(command: Command) -> Command {
-        L::LISTS.iter().fold(
-            TrainOptions::augment_args(command),
-            |command, &(option, name, help)| {
-                command.mut_arg(option, |arg| {
-                    let arg = arg.long(name).value_name("LIST").help(help).help_heading("The grid");
-                    let arg = if name == option { arg } else { arg.visible_alias(option) };
-                    arg.value_parser(ValueParser::string())
-                })
-            },
-        )
+        LISTS.iter().fold(TrainOptions::augment_args(command), |command, &(option, name, help)| {
+            command.mut_arg(option, |arg| {
+                let arg = arg.long(name).value_name("LIST").help(help).help_heading("The grid");
+                let arg = if name == option { arg } else { arg.visible_alias(option) };
+                arg.value_parser(ValueParser::string())
+            })
+        })
     }
 
     fn augment_args_for_update(command: Command) -> Command {
@@ -45,16 +47,16 @@ impl<L: Lists> Args for Options<L> {
     }
 }
 
-impl<L: Lists> FromArgMatches for Options<L> {
+impl FromArgMatches for Options {
     fn from_arg_matches(matches: &ArgMatches) -> Result<Self, Error> {
-        let mut options = Self { shared: vec![], lists: vec![], of: PhantomData };
+        let mut options = Self { shared: vec![], lists: vec![] };
         let train = TrainOptions::augment_args(Command::new("train"));
         for arg in train.get_arguments() {
             let id = arg.get_id().as_str();
             if matches.value_source(id) != Some(ValueSource::CommandLine) {
                 continue;
             }
-            let list = L::LISTS.iter().find(|(option, ..)| *option == id);
+            let list = LISTS.iter().find(|(option, ..)| *option == id);
             for value in matches.get_raw(id).unwrap_or_default() {
                 let value = text(value.as_ref())?;
                 match list {
@@ -72,7 +74,7 @@ impl<L: Lists> FromArgMatches for Options<L> {
     }
 }
 
-impl<L> Options<L> {
+impl Options {
     fn push(&mut self, arg: &Arg, value: String) -> Result<(), Error> {
         let long = arg.get_long().unwrap_or_default();
         if !arg.get_action().takes_values() {
@@ -88,7 +90,7 @@ impl<L> Options<L> {
 }
 
 /// An option with its value, as arguments; a value that looks like an option itself is joined to it.
-pub(in crate::cli) fn pair(long: &str, value: &str) -> Vec<String> {
+pub(super) fn pair(long: &str, value: &str) -> Vec<String> {
     if value.starts_with('-') {
         vec![format!("--{long}={value}")]
     } else {

@@ -1,10 +1,10 @@
-//! `nightsplat curves`: the table of tone curves, their values and their plots.
+//! `nightsplat tone list`: the table of tone curves, their values and their plots.
 
 use std::io::Write;
 use std::path::PathBuf;
 
-use super::table;
 use crate::base::output::write_whole;
+use crate::cli::table;
 use crate::photographs::dataset::{Dataset, LoadOptions, Split};
 use crate::photographs::image::Image;
 use crate::photographs::tone::{
@@ -15,7 +15,7 @@ use crate::{Error, Result};
 
 /// List the tone curves, print their values or plot them.
 #[derive(Clone, Debug, clap::Args)]
-pub struct CurvesArgs {
+pub struct ListArgs {
     /// Which: names, or .toml, .csv and .cube files [default: all of the table]
     #[arg(value_name = "NAME|FILE")]
     pub curves: Vec<CurveChoice>,
@@ -52,7 +52,7 @@ struct Curve {
 ///
 /// # Errors
 /// As [`text`], or standard output cannot be written to.
-pub fn run(args: &CurvesArgs) -> anyhow::Result<()> {
+pub fn run(args: &ListArgs) -> anyhow::Result<()> {
     Ok(write!(std::io::stdout().lock(), "{}", text(args)?)?)
 }
 
@@ -60,7 +60,7 @@ pub fn run(args: &CurvesArgs) -> anyhow::Result<()> {
 ///
 /// # Errors
 /// A file cannot be read or written, or a value of t makes no sense.
-pub fn text(args: &CurvesArgs) -> Result<String> {
+pub fn text(args: &ListArgs) -> Result<String> {
     if let Some(t) = args.at.iter().find(|&&t| t.is_nan() || t < 0.0) {
         return Err(Error::Usage(format!("--at {t}: t must be 0 or more")));
     }

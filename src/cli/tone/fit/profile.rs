@@ -1,4 +1,4 @@
-//! `nightsplat fit --profile`: a camera profile in place of a curve.
+//! `nightsplat tone fit --profile`: a camera profile in place of a curve.
 
 use serde::Serialize;
 

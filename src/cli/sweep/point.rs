@@ -1,23 +1,31 @@
-//! A point of a batch: what distinguishes one run from the others.
+//! A point of a sweep: what distinguishes one run from the others.
 
 use std::path::Path;
 
 use super::options::pair;
 use crate::photographs::tone::ToneCurve;
+use crate::train::Part;
 use crate::{Error, Result};
 
 /// The axis of presets, over which the other settings win.
-pub(in crate::cli) const PRESET: &str = "preset";
+pub(super) const PRESET: &str = "preset";
+/// The axis of the model's parts: [`PLAIN`], [`ALL_PARTS`], or parts by name.
+pub(super) const PARTS: &str = "parts";
+/// On that axis: colour alone.
+pub(super) const PLAIN: &str = "plain";
+/// On that axis: every part.
+pub(super) const ALL_PARTS: &str = "all";
 /// The axis whose points are averaged.
-pub(in crate::cli) const SEED: &str = "seed";
+pub(super) const SEED: &str = "seed";
 /// The axis of fixed black levels.
-pub(in crate::cli) const OFFSET: &str = "offset";
+pub(super) const OFFSET: &str = "offset";
 /// On that axis: the black level of alpha and beta.
-pub(in crate::cli) const ADAPTIVE: &str = "adaptive";
+pub(super) const ADAPTIVE: &str = "adaptive";
 
 /// The axes with a name of their own, in the order of a point's name, and the setting behind each.
-const AXES: [(&str, &str); 9] = [
+const AXES: [(&str, &str); 10] = [
     (PRESET, PRESET),
+    (PARTS, PARTS),
     ("curve", "tone.curve"),
     ("alpha", "tone.alpha"),
     ("beta", "tone.beta"),
@@ -30,10 +38,10 @@ const AXES: [(&str, &str); 9] = [
 
 /// A setting and the values it takes.
 #[derive(Clone, Debug, PartialEq)]
-pub(in crate::cli) struct Axis {
+pub(super) struct Axis {
     /// A name of [`AXES`], or the dotted path of any other setting.
-    pub(in crate::cli) key: String,
-    pub(in crate::cli) values: Vec<String>,
+    pub(super) key: String,
+    pub(super) values: Vec<String>,
 }
 
 impl Axis {
@@ -41,7 +49,7 @@ impl Axis {
     ///
     /// # Errors
     /// [`Error::Usage`] for a value that is empty or there twice.
-    pub(in crate::cli) fn new(key: &str, list: &str) -> Result<Self> {
+    pub(super) fn new(key: &str, list: &str) -> Result<Self> {
         let key = key.trim();
         let name = AXES.iter().find(|(_, setting)| *setting == key).map_or(key, |(name, _)| name);
         let mut axis = Self { key: name.to_owned(), values: vec![] };
@@ -64,23 +72,23 @@ impl Axis {
         Ok(axis)
     }
 
-    pub(in crate::cli) fn of(key: &str, values: &[&str]) -> Self {
+    pub(super) fn of(key: &str, values: &[&str]) -> Self {
         Self { key: key.to_owned(), values: values.iter().map(|&value| value.to_owned()).collect() }
     }
 
-    /// The axis of `KEY=LIST`, as `--option` takes it.
+    /// The axis of `KEY=LIST`, as `--grid` takes it.
     ///
     /// # Errors
     /// As [`Self::new`]; the list is missing.
-    pub(in crate::cli) fn parse(option: &str, text: &str) -> Result<Self> {
-        let (key, list) = text.split_once('=').ok_or_else(|| {
-            Error::Usage(format!("--{option} {text} has no values; write KEY=V1,V2"))
-        })?;
+    pub(super) fn parse(text: &str) -> Result<Self> {
+        let (key, list) = text
+            .split_once('=')
+            .ok_or_else(|| Error::Usage(format!("--grid {text} has no values; write KEY=V1,V2")))?;
         Self::new(key, list)
     }
 
     /// Where its values stand in a point's name: those of [`AXES`] first, the seed last.
-    pub(in crate::cli) fn order(&self) -> (usize, &str) {
+    pub(super) fn order(&self) -> (usize, &str) {
         let named = AXES.iter().position(|(name, _)| *name == self.key && *name != SEED);
         (named.unwrap_or(AXES.len() + usize::from(self.key == SEED)), &self.key)
     }
@@ -109,7 +117,7 @@ fn split(list: &str) -> Vec<String> {
 }
 
 /// The names of all curves.
-pub(in crate::cli) fn all_curves() -> Vec<String> {
+pub(super) fn all_curves() -> Vec<String> {
     ToneCurve::ALL.iter().map(|curve| curve.name().to_owned()).collect()
 }
 
@@ -122,19 +130,25 @@ fn curve(name: &str) -> String {
 
 /// What distinguishes a run from the others.
 #[derive(Clone, Debug, PartialEq)]
-pub(in crate::cli) struct Point {
+pub(super) struct Point {
     /// Axis and value, in the order of the name.
-    pub(in crate::cli) values: Vec<(String, String)>,
+    pub(super) values: Vec<(String, String)>,
 }
 
 impl Point {
-    pub(in crate::cli) fn value(&self, key: &str) -> Option<&str> {
+    pub(super) fn value(&self, key: &str) -> Option<&str> {
         self.values.iter().find(|(own, _)| own == key).map(|(_, value)| value.as_str())
+    }
+
+    /// The same without its seed.
+    pub(super) fn seedless(&self) -> Self {
+        let values = self.values.iter().filter(|(key, _)| key != SEED);
+        Self { values: values.cloned().collect() }
     }
 
     /// The name of its run directory, such as `curve=ap3,seed=10`: the same in every sweep that has the point, and no
     /// other point's.
-    pub(in crate::cli) fn name(&self) -> String {
+    pub(super) fn name(&self) -> String {
         const LONGEST: usize = 120;
         let pairs: Vec<String> =
             self.values.iter().map(|(key, value)| format!("{key}={value}")).collect();
@@ -153,11 +167,13 @@ impl Point {
     }
 
     /// What it adds to the arguments of `train`.
-    pub(in crate::cli) fn arguments(&self) -> Vec<String> {
+    pub(super) fn arguments(&self) -> Vec<String> {
         let set = |key: &str, value: &str| pair("set", &format!("{key}={value}"));
         let of = |(key, value): &(String, String)| match key.as_str() {
             "curve" => pair(key, &curve(value)),
-            PRESET | "gain" | "theta" | SEED => pair(key, value),
+            PARTS if value == PLAIN => pair("model", PLAIN),
+            PARTS if value == ALL_PARTS => pair(key, &Part::ALL.map(Part::name).join(",")),
+            PRESET | PARTS | "gain" | "theta" | SEED => pair(key, value),
             OFFSET if value == ADAPTIVE => vec![],
             OFFSET => [set("tone.alpha", value), set("tone.beta", "0")].concat(),
             key => {

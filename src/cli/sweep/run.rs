@@ -1,14 +1,12 @@
-//! Many runs of one dataset, each a `nightsplat train` process with a run directory of its own: what `sweep` and
-//! `tradeoff` share.
+//! A run of a sweep: a `nightsplat train` process with a run directory of its own.
 
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
-use clap::{Args, FromArgMatches};
+use clap::Args;
 
-use self::point::Point;
-use super::train::TrainArgs;
-use crate::base::input;
-use crate::base::output::write_whole;
+use super::point::{PRESET, Point};
+use crate::cli::train::TrainArgs;
 use crate::gpu::Gpu;
 use crate::photographs::dataset::View;
 use crate::photographs::image::Image;
@@ -18,12 +16,6 @@ use crate::train::TrainConfig;
 use crate::train::diagnose::Plan;
 use crate::{Error, Result};
 
-pub(super) mod csv;
-pub(super) mod options;
-pub(super) mod point;
-pub(super) mod runner;
-pub(super) mod sample;
-
 /// A point with everything that training it takes.
 #[derive(Clone, Debug)]
 pub(super) struct Run {
@@ -32,11 +24,12 @@ pub(super) struct Run {
     pub(super) folder: PathBuf,
     /// Of `nightsplat`.
     pub(super) arguments: Vec<String>,
-    /// What these arguments come to.
+    /// What these arguments come to, without a plan.
     pub(super) config: TrainConfig,
+    args: TrainArgs,
 }
 
-/// What the points of a batch have in common.
+/// What the points of a sweep have in common.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Common<'a> {
     /// An absolute path.
@@ -48,26 +41,26 @@ pub(super) struct Common<'a> {
 }
 
 impl Run {
-    /// The run of a point, by a plan where there is one: its file, and what that says.
+    /// The run of a point. One with a preset trains as `train --preset` does, by the plan that this makes for the photographs;
+    /// others differ by what their points say alone.
     ///
     /// # Errors
-    /// What `train` would say of these options, behind the point's name.
-    pub(super) fn new(
-        point: Point,
-        common: Common<'_>,
-        plan: Option<(&str, &Plan)>,
-    ) -> Result<Self> {
+    /// What `train` would say of these options, after the point's name.
+    pub(super) fn new(point: Point, common: Common<'_>) -> Result<Self> {
         let name = point.name();
         let folder = Path::new(common.out).join(&name);
         let mut arguments = vec!["train".to_owned(), common.dataset.to_owned()];
         arguments.extend_from_slice(common.shared);
         arguments.extend(point.arguments());
-        let file = plan.map_or("none", |(file, _)| file);
-        arguments.extend(["--plan", file].map(str::to_owned));
-        arguments.extend(["--out".to_owned(), unicode(&folder)?, "--resume".to_owned()]);
-        let args = train_args(&name, &arguments)?;
-        let config = args.options.config(&args.dataset, plan.map(|(_, plan)| plan))?;
-        Ok(Self { name, point, folder, arguments, config })
+        let end = ["--out".to_owned(), unicode(&folder)?, "--resume".to_owned()];
+        let mut args: TrainArgs = parsed(&name, arguments.iter().chain(&end))?;
+        if point.value(PRESET).is_none() || !args.options.wants_a_plan() {
+            arguments.extend(["--plan", "none"].map(str::to_owned));
+            args.plan = Some("none".into());
+        }
+        arguments.extend(end);
+        let config = args.options.config(&args.dataset, None)?;
+        Ok(Self { name, point, folder, arguments, config, args })
     }
 
     /// Whether the run directory holds this run to its end.
@@ -77,10 +70,13 @@ impl Run {
             return Ok(false);
         }
         let found = run::load_config(&self.folder)?;
+        let plan = if self.args.plan.is_none() { run::plan_of(&self.folder) } else { None };
+        let plan = plan.map(|path| Plan::read(&path)).transpose()?;
+        let own = self.args.options.config(&self.args.dataset, plan.as_ref())?;
+        let own = own.with_absolute_paths();
         // A run records the tile and the frame that it took; where none is asked for, any is right.
-        let (tile, frame) = (self.config.tile.and(found.tile), self.config.frame.and(found.frame));
+        let (tile, frame) = (own.tile.and(found.tile), own.frame.and(found.frame));
         let found = TrainConfig { tile, frame, ..found };
-        let own = self.config.clone().with_absolute_paths();
         if found != own {
             let differs = difference(&found.to_toml()?, &own.to_toml()?);
             let problem = format!("holds another run ({differs}); choose another --out");
@@ -117,58 +113,24 @@ impl Run {
     }
 }
 
-/// What `train` makes of its arguments, the first of which is its name.
+/// What a command makes of its arguments, the first of which is its name.
 ///
 /// # Errors
-/// What it says of them, behind the name of the run.
-pub(super) fn train_args(name: &str, arguments: &[String]) -> Result<TrainArgs> {
-    let train = TrainArgs::augment_args(clap::Command::new("train"));
-    let parsed = train
-        .try_get_matches_from(arguments)
-        .and_then(|matches| TrainArgs::from_arg_matches(&matches));
-    parsed.map_err(|error| {
+/// What it says of them, after `what` they are for.
+pub(in crate::cli) fn parsed<A: Args>(
+    what: &str,
+    arguments: impl IntoIterator<Item: Into<OsString> + Clone>,
+) -> Result<A> {
+    let matches = A::augment_args(clap::Command::new("")).try_get_matches_from(arguments);
+    matches.and_then(|matches| A::from_arg_matches(&matches)).map_err(|error| {
         let text = error.to_string();
         let line = text.lines().next().unwrap_or_default();
-        Error::Usage(format!("{name}: {}", line.trim_start_matches("error: ")))
+        Error::Usage(format!("{what}: {}", line.trim_start_matches("error: ")))
     })
 }
 
-/// Takes a folder that is empty, holds this batch or holds nothing that a batch would replace. `what` it is
-/// called, in messages and in the file that says which one it is; `files` are those that it leaves.
-///
-/// # Errors
-/// The folder is taken, or cannot be written.
-pub(super) fn claim(
-    folder: &Path,
-    what: &str,
-    manifest: &str,
-    files: &[&str],
-    writes: bool,
-) -> Result<()> {
-    let path = folder.join(format!("{what}.toml"));
-    if path.exists() {
-        let found = input::text(&path)?;
-        if found != manifest {
-            let differs = difference(&found, manifest);
-            let problem = format!("holds another {what} ({differs}); choose another --out");
-            return Err(Error::output(folder, problem));
-        }
-        return Ok(());
-    }
-    if let Some(file) = files.iter().find(|file| folder.join(file).exists()) {
-        let problem = format!("holds {file}, which no {what} wrote; choose another --out");
-        return Err(Error::output(folder, problem));
-    }
-    if !writes {
-        return Ok(());
-    }
-    std::fs::create_dir_all(folder)
-        .map_err(|error| Error::output(folder, format!("cannot be made: {error}")))?;
-    write_whole(&path, manifest.as_bytes())
-}
-
 /// The first line in which two files differ.
-fn difference(found: &str, wanted: &str) -> String {
+pub(super) fn difference(found: &str, wanted: &str) -> String {
     let wanted: Vec<&str> = wanted.lines().collect();
     let is_new = |line: &&str| !wanted.contains(line);
     let line = found.lines().find(is_new).unwrap_or("its configuration lacks a setting");

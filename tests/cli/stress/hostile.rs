@@ -5,17 +5,17 @@ use std::path::PathBuf;
 
 use glam::{DVec2, DVec3, Vec3};
 
-use crate::base::random::Stream;
-use crate::camera::{Camera, Frame};
-use crate::cli::bench::scene;
-use crate::loss::exposure::{Affine, table};
-use crate::photographs::dataset::synthetic::{self, SyntheticOptions};
-use crate::photographs::dataset::{Dataset, Point, Split, View};
-use crate::photographs::image::{Image, linear_from_srgb};
-use crate::photographs::tone::{ToneCurve, ToneSettings};
-use crate::splats::scene::Gaussians;
-use crate::train::{Learning, TrainConfig};
-use crate::{Error, Result};
+use nightsplat::base::random::Stream;
+use nightsplat::camera::{Camera, Frame};
+use nightsplat::cli::bench::scene;
+use nightsplat::loss::exposure::{Affine, table};
+use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
+use nightsplat::photographs::dataset::{Dataset, Point, Split, View};
+use nightsplat::photographs::image::{Image, linear_from_srgb};
+use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
+use nightsplat::splats::scene::Gaussians;
+use nightsplat::train::{Learning, TrainConfig};
+use nightsplat::{Error, Result};
 
 /// A dataset, the first Gaussians where it does not say them, and which of these the case is about.
 pub(super) struct Hostile {

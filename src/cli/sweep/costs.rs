@@ -1,0 +1,386 @@
+//! What the points cost: time, energy and memory against their scores, and who is on the front.
+
+use std::path::Path;
+
+use serde_json::{Map, Value, json};
+
+use super::rows::{Row, Rows, number, place};
+use super::runner::Failure;
+use crate::Result;
+use crate::base::output::{csv_field, write_whole};
+use crate::results::report::{Best, Column, Report, Table, Trace, traces};
+use crate::results::run::{Progress, energy_counters};
+
+/// The files of the costs.
+pub(super) const FILES: [&str; 2] = ["costs.csv", "costs.html"];
+
+/// Points on the way this much worse than the best are left out: they would flatten all others.
+const SHOWN_DECIBELS: f64 = 3.0;
+
+/// More rows than this are numbered in drawings, where their names would not fit.
+const MAX_NAMES: usize = 8;
+
+/// A figure of a run: its column in CSV and JSON, its place in `metrics.json`, its heading, the digits and the unit shown.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Measure {
+    key: &'static str,
+    place: &'static str,
+    name: &'static str,
+    digits: usize,
+    unit: f64,
+}
+
+const fn measure(
+    key: &'static str,
+    place: &'static str,
+    name: &'static str,
+    digits: usize,
+    unit: f64,
+) -> Measure {
+    Measure { key, place, name, digits, unit }
+}
+
+const MIB: f64 = 1_048_576.0;
+const PSNR: Measure = measure("psnr", "/mean/psnr", "PSNR, dB", 2, 1.0);
+const SSIM: Measure = measure("ssim", "/mean/ssim", "SSIM", 3, 1.0);
+const SECONDS: Measure = measure("seconds", "/seconds", "time, s", 1, 1.0);
+const PROCESSOR: Measure =
+    measure("processor_seconds", "/spent/processor_seconds", "processor time, s", 1, 1.0);
+const JOULES: Measure = measure("joules", "/spent/joules", "energy, J", 0, 1.0);
+const DEVICE: Measure = measure("device_bytes", "/spent/device_bytes", "device, MiB", 1, MIB);
+const HOST: Measure = measure("host_bytes", "/spent/host_bytes", "host, MiB", 0, MIB);
+const ALL: [Measure; 9] = [
+    PSNR,
+    SSIM,
+    SECONDS,
+    PROCESSOR,
+    JOULES,
+    measure("steps", "/steps", "steps", 0, 1.0),
+    measure("gaussians", "/gaussians", "Gaussians", 0, 1.0),
+    DEVICE,
+    HOST,
+];
+
+/// What is drawn: cost and gain.
+const FRONTS: [(Measure, Measure); 8] = [
+    (SECONDS, PSNR),
+    (SECONDS, SSIM),
+    (PROCESSOR, PSNR),
+    (PROCESSOR, SSIM),
+    (JOULES, PSNR),
+    (JOULES, SSIM),
+    (DEVICE, PSNR),
+    (HOST, PSNR),
+];
+
+/// The fronts of PSNR that CSV and JSON name.
+const NAMED_FRONTS: [(&str, Measure); 2] =
+    [("on_front", SECONDS), ("on_processor_front", PROCESSOR)];
+
+impl Measure {
+    /// The mean as tables and drawings show it.
+    fn shown(self, row: &Row) -> Option<f64> {
+        Some(row.mean(self.place)? / self.unit)
+    }
+}
+
+/// The indices of the points (cost, gain) that no other beats, the cheapest first: none is as cheap and as good but for one
+/// that is just the same, of which the first is taken.
+fn front(points: &[(f64, f64)]) -> Vec<usize> {
+    let mut order: Vec<usize> = (0..points.len())
+        .filter(|&index| points[index].0.is_finite() && points[index].1.is_finite())
+        .collect();
+    // Stable: of equals, the first stays first.
+    order.sort_by(|&a, &b| {
+        points[a].0.total_cmp(&points[b].0).then(points[b].1.total_cmp(&points[a].1))
+    });
+    let mut best = f64::NEG_INFINITY;
+    order.retain(|&index| {
+        let gains = points[index].1 > best;
+        best = best.max(points[index].1);
+        gains
+    });
+    order
+}
+
+impl Rows {
+    /// Writes [`FILES`] to `folder`; `notes` are paragraphs of the page.
+    ///
+    /// # Errors
+    /// The folder cannot be written.
+    pub(super) fn save_costs(&self, folder: &Path, title: &str, notes: &[String]) -> Result<()> {
+        let counters = energy_counters();
+        let energy = if counters.is_empty() {
+            "No counter of energy can be read here.".to_owned()
+        } else {
+            format!("Energy is that of {}, idling included.", counters.join(", "))
+        };
+        let time = "Time is that of the steps, without loading and scoring. The dotted line is the front: the most that can \
+                    be had for this cost. A disc is a point on it, a ring one that is not.";
+        let mut intro = vec![format!("{time} {energy}")];
+        let on_front = self.front_of(SECONDS, PSNR);
+        let names = on_front.into_iter().map(|index| self.label(&self.rows[index], None));
+        let names = names.collect::<Vec<_>>().join("; ");
+        if !names.is_empty() {
+            intro.push(format!("On the front of PSNR against time: {names}."));
+        }
+        intro.extend_from_slice(notes);
+        let report = Report {
+            title: format!("{title}: time and quality"),
+            intro,
+            tables: std::iter::once(self.costs()).chain(self.differences()).collect(),
+            plots: self.cost_plots(),
+            ..Report::default()
+        };
+        let [csv, html] = FILES.map(|file| folder.join(file));
+        write_whole(&csv, self.costs_csv().as_bytes())?;
+        write_whole(&html, report.html_plots_first().as_bytes())
+    }
+
+    fn front_of(&self, cost: Measure, gain: Measure) -> Vec<usize> {
+        let value = |row: &Row, of: Measure| row.mean(of.place).unwrap_or(f64::NAN);
+        let points = self.rows.iter().map(|row| (value(row, cost), value(row, gain)));
+        front(&points.collect::<Vec<_>>())
+    }
+
+    /// The measures that any row has.
+    fn measures(&self) -> Vec<Measure> {
+        let has = |of: &Measure| self.rows.iter().any(|row| row.mean(of.place).is_some());
+        ALL.into_iter().filter(has).collect()
+    }
+
+    /// Every row with every figure.
+    pub(super) fn costs(&self) -> Table {
+        let measures = self.measures();
+        let is_score = |of: &Measure| [PSNR, SSIM].contains(of);
+        let column = |of: &Measure| Column {
+            name: of.name.to_owned(),
+            digits: of.digits,
+            best: if is_score(of) { Best::Greatest } else { Best::Unmarked },
+        };
+        let row = |(index, row): (usize, &Row)| {
+            let values = measures.iter().map(|of| of.shown(row)).collect();
+            (format!("{}  {}", index + 1, self.label(row, None)), values)
+        };
+        Table {
+            title: "Every point".to_owned(),
+            label: "point".to_owned(),
+            columns: measures.iter().map(column).collect(),
+            rows: self.rows.iter().enumerate().map(row).collect(),
+        }
+    }
+
+    /// What each row gains and costs beside the baseline; none where there is no baseline, or it is not finished.
+    fn differences(&self) -> Option<Table> {
+        let (base, name) = self.baseline().filter(|(row, _)| !row.metrics.is_empty())?;
+        let measures = self.measures();
+        let row = |row: &Row| {
+            let values = measures.iter().map(|of| Some(of.shown(row)? - of.shown(base)?));
+            (self.label(row, None), values.collect())
+        };
+        let others = self.rows.iter().filter(|row| row.point != base.point);
+        let column = |of: &Measure| Column {
+            name: of.name.to_owned(),
+            digits: of.digits,
+            best: Best::Unmarked,
+        };
+        let table = Table {
+            title: format!("What each point gains and costs: the difference to {name}"),
+            label: "point".to_owned(),
+            columns: measures.iter().map(column).collect(),
+            rows: others.map(row).collect(),
+        };
+        (!table.rows.is_empty()).then_some(table)
+    }
+
+    fn cost_plots(&self) -> Vec<String> {
+        let fronts = FRONTS.into_iter().filter_map(|(cost, gain)| self.front_plot(cost, gain));
+        fronts.chain(self.on_the_way()).collect()
+    }
+
+    /// Where each row ended up; none where nobody knows the cost.
+    fn front_plot(&self, cost: Measure, gain: Measure) -> Option<String> {
+        let point = |row: &Row| Some((cost.shown(row)?, gain.shown(row)?));
+        let front = self.front_of(cost, gain);
+        let trace = |(index, row): (usize, &Row)| Trace {
+            points: point(row).into_iter().collect(),
+            is_minor: !front.contains(&index),
+            ..self.trace(index)
+        };
+        let drawn: Vec<Trace> = self.rows.iter().enumerate().map(trace).collect();
+        let steps: Vec<(f64, f64)> =
+            front.iter().filter_map(|&index| point(&self.rows[index])).collect();
+        (!steps.is_empty()).then(|| traces(cost.name, gain.name, &drawn, &steps))
+    }
+
+    /// How the best rows came to where they are; none where test views were scored at the end alone.
+    fn on_the_way(&self) -> Option<String> {
+        let all = || self.rows.iter().flat_map(|row| &row.progress);
+        let least = all().map(|one| one.psnr).fold(f64::NEG_INFINITY, f64::max) - SHOWN_DECIBELS;
+        let trace = |(index, row): (usize, &Row)| {
+            let shown = row.progress.iter().filter(|one| one.psnr >= least);
+            let points = shown.map(|one: &Progress| (one.seconds, one.psnr)).collect();
+            Trace { points, ..self.trace(index) }
+        };
+        let drawn: Vec<Trace> = self.rows.iter().enumerate().take(MAX_NAMES).map(trace).collect();
+        let y_name = format!("{} on the way", PSNR.name);
+        let has_lines = drawn.iter().any(|trace| trace.points.len() > 1);
+        has_lines.then(|| traces(SECONDS.name, &y_name, &drawn, &[]))
+    }
+
+    /// What a row looks like in every drawing, without its points.
+    fn trace(&self, index: usize) -> Trace {
+        let (number, label) = (index + 1, self.label(&self.rows[index], None));
+        let title = format!("{number}  {label}");
+        let name = if self.rows.len() > MAX_NAMES { number.to_string() } else { label };
+        Trace { name, title, color: index, ..Trace::default() }
+    }
+
+    /// A line per row: its settings, mean and standard deviation of every figure, and whether it is on the fronts of PSNR
+    /// against time on the wall and on the processors.
+    fn costs_csv(&self) -> String {
+        let mut header = self.keys.clone();
+        header.push("runs".to_owned());
+        header.extend(ALL.iter().flat_map(|of| [of.key.to_owned(), format!("{}_sd", of.key)]));
+        header.extend(NAMED_FRONTS.iter().map(|(name, _)| (*name).to_owned()));
+        let fronts = NAMED_FRONTS.map(|(_, cost)| self.front_of(cost, PSNR));
+        let line = |(index, row): (usize, &Row)| {
+            let values = self.keys.iter().map(|key| row.point.value(key).unwrap_or_default());
+            let mut cells: Vec<String> = values.map(|value| csv_field(value).to_string()).collect();
+            cells.push(row.metrics.len().to_string());
+            for Measure { place, .. } in ALL {
+                cells.extend([number(row.mean(place)), number(row.deviation(place))]);
+            }
+            cells.extend(fronts.iter().map(|front| front.contains(&index).to_string()));
+            cells.join(",")
+        };
+        let lines = std::iter::once(header.join(",")).chain(self.rows.iter().enumerate().map(line));
+        lines.map(|line| line + "\n").collect()
+    }
+
+    /// Every figure as JSON, with the differences to the baseline.
+    pub(super) fn json(&self, dataset: &Path, failures: &[Failure]) -> Value {
+        let scores = self.scores.iter().map(|score| (score.clone(), place(score)));
+        let costs = ALL.iter().map(|of| (of.key.to_owned(), of.place.to_owned()));
+        let figures: Vec<(String, String)> = costs.chain(scores).collect();
+        let of = |value: &dyn Fn(&str) -> Option<f64>| {
+            let figure = |(key, place): &(String, String)| (key.clone(), json!(value(place)));
+            figures.iter().map(figure).collect::<Map<_, _>>()
+        };
+        let fronts = NAMED_FRONTS.map(|(name, cost)| (name, self.front_of(cost, PSNR)));
+        let baseline = self.baseline();
+        let point = |(index, row): (usize, &Row)| {
+            let mut entry = json!({
+                "point": row.point.name(),
+                "settings": row.point.values.iter().cloned().collect::<std::collections::BTreeMap<_, _>>(),
+                "runs": row.metrics.len(),
+                "scored": row.against().unwrap_or("against reference images"),
+                "mean": of(&|place| row.mean(place)),
+            });
+            if let Some((base, _)) = baseline.as_ref().filter(|(base, _)| base.point != row.point) {
+                entry["difference"] =
+                    of(&|place| Some(row.mean(place)? - base.mean(place)?)).into();
+            }
+            for (name, front) in &fronts {
+                entry[*name] = front.contains(&index).into();
+            }
+            entry
+        };
+        let failed = |Failure { name, reason }: &Failure| json!({"point": name, "reason": reason});
+        json!({
+            "dataset": dataset.display().to_string(),
+            "energy_counters": energy_counters(),
+            "points": self.rows.iter().enumerate().map(point).collect::<Vec<_>>(),
+            "failed": failures.iter().map(failed).collect::<Vec<_>>(),
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cli::sweep::point::Point;
+
+    #[test]
+    fn the_front_has_what_nothing_beats_the_cheapest_first() {
+        let points =
+            [(10.0, 24.0), (5.0, 22.0), (20.0, 23.9), (5.0, 21.0), (40.0, 26.0), (f64::NAN, 99.0)];
+        assert_eq!(front(&points), [1, 0, 4]);
+        assert_eq!(front(&[(1.0, 2.0), (1.0, 2.0)]), [0]);
+        assert_eq!(front(&[(2.0, 2.0), (1.0, 2.0)]), [1]);
+        assert!(front(&[]).is_empty());
+    }
+
+    fn row(values: &[(&str, &str)], figures: &[(f64, f64, f64)]) -> Row {
+        let metrics = |&(psnr, seconds, bytes): &(f64, f64, f64)| {
+            json!({"mean": {"psnr": psnr, "ssim": 0.5}, "seconds": seconds, "steps": 10, "gaussians": 7,
+                "spent": {"processor_seconds": 2.0 * seconds, "joules": null, "device_bytes": bytes}})
+        };
+        let values = values.iter().map(|(key, value)| ((*key).to_owned(), (*value).to_owned()));
+        Row {
+            point: Point { values: values.collect() },
+            metrics: figures.iter().map(metrics).collect(),
+            progress: vec![],
+        }
+    }
+
+    fn rows() -> Rows {
+        let balanced = ("preset", "balanced");
+        let rows = vec![
+            row(&[balanced], &[(25.0, 20.0, 3.0 * MIB), (26.0, 40.0, 3.0 * MIB)]),
+            row(&[("preset", "fast")], &[(24.0, 10.0, MIB)]),
+            row(&[balanced, ("steps", "5")], &[(23.5, 15.0, 2.0 * MIB)]),
+            row(&[balanced, ("steps", "9")], &[]),
+        ];
+        Rows::of(rows, vec!["psnr".to_owned()], vec![], Some(balanced))
+    }
+
+    #[test]
+    fn a_point_costs_and_gains_its_difference_to_the_baseline() {
+        let table = rows().differences().unwrap();
+        let names: Vec<&str> = table.columns.iter().map(|column| column.name.as_str()).collect();
+        let expected = [
+            "PSNR, dB",
+            "SSIM",
+            "time, s",
+            "processor time, s",
+            "steps",
+            "Gaussians",
+            "device, MiB",
+        ];
+        assert_eq!(names, expected, "what nothing has is no column");
+        let values = [-2.0, 0.0, -15.0, -30.0, 0.0, 0.0, -1.0].map(Some).to_vec();
+        assert_eq!(table.rows[1], ("balanced, steps 5".to_owned(), values));
+        assert_eq!(table.rows[2], ("balanced, steps 9".to_owned(), vec![None; 7]));
+        let mut lost = rows();
+        lost.rows[0].metrics.clear();
+        assert!(lost.differences().is_none(), "there is nothing to differ from");
+    }
+
+    #[test]
+    fn the_files_have_a_line_per_point_with_means_spreads_and_fronts() {
+        let rows = rows();
+        let csv = rows.costs_csv();
+        let lines: Vec<&str> = csv.lines().collect();
+        assert_eq!(
+            lines[0],
+            "preset,steps,runs,psnr,psnr_sd,ssim,ssim_sd,seconds,seconds_sd,processor_seconds,processor_seconds_sd,\
+             joules,joules_sd,steps,steps_sd,gaussians,gaussians_sd,device_bytes,device_bytes_sd,host_bytes,host_bytes_sd,\
+             on_front,on_processor_front"
+        );
+        assert!(
+            lines[1].starts_with("balanced,,2,25.5,0.7071") && lines[1].ends_with("true,true"),
+            "{csv}"
+        );
+        assert!(lines[2].starts_with("fast,,1,24,,0.5,,10,,20,,"), "{csv}");
+        assert!(
+            lines[3].starts_with("balanced,5,1,23.5") && lines[3].ends_with("false,false"),
+            "{csv}"
+        );
+        let json = rows.json(Path::new("photos"), &[]);
+        let point = |index: usize, key: &str| &json["points"][index][key];
+        assert_eq!(point(2, "difference")["psnr"], -2.0);
+        assert_eq!((point(0, "on_front"), point(0, "difference")), (&json!(true), &Value::Null));
+        assert_eq!(rows.costs().rows[2].0, "3  balanced, steps 5");
+    }
+}

@@ -1,0 +1,197 @@
+//! The points of a sweep with what their finished runs came to: seeds together, the best PSNR first.
+
+use serde_json::Value;
+
+use super::point::{PARTS, PRESET, Point, SEED};
+use super::run::Run;
+use crate::results::eval::{AGAINST, WITH_REFERENCE};
+use crate::results::run::{Progress, load_progress};
+
+/// What a sweep found.
+#[derive(Clone, Debug)]
+pub(super) struct Rows {
+    /// The axes along which points differ, in the order of the names; never the seed.
+    pub(super) keys: Vec<String>,
+    /// The best PSNR first, points without a score last.
+    pub(super) rows: Vec<Row>,
+    /// Names of the scores, as `metrics.json` has them below `mean`.
+    pub(super) scores: Vec<String>,
+    /// Every seed.
+    pub(super) seeds: Vec<String>,
+    /// Axis and value of the row that the others are compared with.
+    baseline: Option<(&'static str, &'static str)>,
+}
+
+/// A point over its seeds.
+#[derive(Clone, Debug)]
+pub(super) struct Row {
+    /// The point without its seed.
+    pub(super) point: Point,
+    /// `metrics.json` of every finished run.
+    pub(super) metrics: Vec<Value>,
+    /// Scores on the way of the first run that finished.
+    pub(super) progress: Vec<Progress>,
+}
+
+impl Rows {
+    /// Reads what the finished ones of `runs` came to; a point without any has a row, too.
+    pub(super) fn new(runs: &[Run], baseline: Option<(&'static str, &'static str)>) -> Self {
+        let (mut rows, mut scores, mut seeds): (Vec<Row>, Vec<String>, Vec<String>) =
+            Default::default();
+        for run in runs {
+            let point = run.point.seedless();
+            let seed = run.point.value(SEED).map(str::to_owned);
+            seeds.extend(seed.filter(|seed| !seeds.contains(seed)));
+            let index = rows.iter().position(|row| row.point == point).unwrap_or_else(|| {
+                rows.push(Row { point, metrics: vec![], progress: vec![] });
+                rows.len() - 1
+            });
+            let Some(metrics) = run.metrics() else { continue };
+            for name in score_names(&metrics["mean"]) {
+                if !scores.contains(&name) {
+                    scores.push(name);
+                }
+            }
+            let row = &mut rows[index];
+            if row.metrics.is_empty() {
+                row.progress = load_progress(&run.folder);
+            }
+            row.metrics.push(metrics);
+        }
+        Self::of(rows, scores, seeds, baseline)
+    }
+
+    /// Sorts the rows.
+    pub(super) fn of(
+        mut rows: Vec<Row>,
+        scores: Vec<String>,
+        seeds: Vec<String>,
+        baseline: Option<(&'static str, &'static str)>,
+    ) -> Self {
+        // Stable: equals keep the order of the grid.
+        let psnr = |row: &Row| row.score("psnr").unwrap_or(f64::NEG_INFINITY);
+        rows.sort_by(|a, b| psnr(b).total_cmp(&psnr(a)));
+        Self { keys: differing(&rows), rows, scores, seeds, baseline }
+    }
+
+    pub(super) fn has_seeds(&self) -> bool {
+        self.seeds.len() > 1
+    }
+
+    /// What distinguishes the row, but for `except`.
+    pub(super) fn label(&self, row: &Row, except: Option<&str>) -> String {
+        let speaks = |key: &str| {
+            ["curve", PRESET, PARTS].contains(&key) || (except.is_none() && self.keys.len() == 1)
+        };
+        let word = |key: &String| {
+            let value = row.point.value(key)?;
+            Some(if speaks(key) { value.to_owned() } else { format!("{key} {value}") })
+        };
+        let keys = self.keys.iter().filter(|key| Some(key.as_str()) != except);
+        let words: Vec<String> = keys.filter_map(word).collect();
+        // What has no setting of its own is what the others change.
+        let whole = || row.point.values.last().map_or("all", |(_, value)| value).to_owned();
+        let label = if words.is_empty() && except.is_none() { whole() } else { words.join(", ") };
+        if row.knows_references() { format!("{label} (with reference)") } else { label }
+    }
+
+    /// The row that others are compared with, and what it is called: of those with the value of the baseline the one with
+    /// the fewest settings. None where there are several such.
+    pub(super) fn baseline(&self) -> Option<(&Row, String)> {
+        let (key, value) = self.baseline?;
+        let matching = || self.rows.iter().filter(|row| row.point.value(key) == Some(value));
+        let fewest = matching().map(|row| row.point.values.len()).min()?;
+        let mut rows = matching().filter(|row| row.point.values.len() == fewest);
+        let row = rows.next().filter(|_| rows.next().is_none())?;
+        Some((row, format!("{key} {value}")))
+    }
+}
+
+impl Row {
+    /// The mean over the finished runs of the number at `place` in `metrics.json`.
+    pub(super) fn mean(&self, place: &str) -> Option<f64> {
+        mean(&self.values(place))
+    }
+
+    /// The standard deviation of a sample of at least two.
+    pub(super) fn deviation(&self, place: &str) -> Option<f64> {
+        let values = self.values(place);
+        let mean = mean(&values).filter(|_| values.len() > 1)?;
+        let squares = values.iter().map(|value| (value - mean) * (value - mean));
+        Some((squares.sum::<f64>() / (values.len() - 1) as f64).sqrt())
+    }
+
+    /// The mean of a score.
+    pub(super) fn score(&self, name: &str) -> Option<f64> {
+        self.mean(&place(name))
+    }
+
+    /// The least and the greatest of a score of at least two runs.
+    pub(super) fn extremes(&self, name: &str) -> Option<[f64; 2]> {
+        let values = self.values(&place(name));
+        let least = values.iter().copied().min_by(f64::total_cmp)?;
+        let greatest = values.iter().copied().max_by(f64::total_cmp)?;
+        (values.len() > 1).then_some([least, greatest])
+    }
+
+    /// Whether a run's targets knew references.
+    pub(super) fn knows_references(&self) -> bool {
+        self.metrics.iter().any(|metrics| metrics.get(WITH_REFERENCE).is_some())
+    }
+
+    /// What its scores are against, where that is no reference image.
+    pub(super) fn against(&self) -> Option<&str> {
+        self.metrics.iter().find_map(|metrics| metrics.get(AGAINST)?.as_str())
+    }
+
+    fn values(&self, place: &str) -> Vec<f64> {
+        // Without a denoiser what is scored is R_0.
+        let value = |metrics: &Value| {
+            let found =
+                metrics.pointer(place).or_else(|| metrics.pointer(&place.replace("/r0", "")));
+            found?.as_f64()
+        };
+        self.metrics.iter().filter_map(value).collect()
+    }
+}
+
+/// Where a score stands in `metrics.json`.
+pub(super) fn place(score: &str) -> String {
+    format!("/mean/{score}")
+}
+
+/// `psnr` of a score, `r0/psnr` of one of R_0.
+fn score_names(mean: &Value) -> Vec<String> {
+    let names = |(name, value): (&String, &Value)| match value.as_object() {
+        Some(inner) => inner.keys().map(|key| format!("{name}/{key}")).collect(),
+        None => vec![name.clone()],
+    };
+    mean.as_object().into_iter().flatten().flat_map(names).collect()
+}
+
+/// The axes along which the points differ; all of them where there is one point.
+fn differing(rows: &[Row]) -> Vec<String> {
+    let mut keys: Vec<&String> = vec![];
+    // The point with the most axes has them in order.
+    let mut points: Vec<&Point> = rows.iter().map(|row| &row.point).collect();
+    points.sort_by_key(|point| std::cmp::Reverse(point.values.len()));
+    for (key, _) in points.iter().flat_map(|point| &point.values) {
+        if !keys.contains(&key) {
+            keys.push(key);
+        }
+    }
+    let differs =
+        |key: &&&String| points.windows(2).any(|pair| pair[0].value(key) != pair[1].value(key));
+    let differing: Vec<String> = keys.iter().filter(differs).map(|key| (*key).clone()).collect();
+    if differing.is_empty() { keys.into_iter().cloned().collect() } else { differing }
+}
+
+/// The mean; `None` if empty.
+fn mean(values: &[f64]) -> Option<f64> {
+    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
+}
+
+/// A number of a CSV file, all of its digits; empty where there is none.
+pub(super) fn number(value: Option<f64>) -> String {
+    value.map(|value| value.to_string()).unwrap_or_default()
+}

@@ -1,0 +1,166 @@
+//! What the render of a training view is compared with: from the stored photograph to the gradient of the loss with respect
+//! to the render.
+//!
+//! ```text
+//! stored photograph -> pseudo-GT pass -> target ┐
+//! render -> exposure -> mask ------------------ ┴-> colour terms -> mask -> exposure, backwards -> d_render
+//! render and features -> networks -> their terms -------------------------------------------------^
+//! ```
+
+use super::masks::Masks;
+use super::measuring::TargetExposure;
+use super::model::Model;
+use super::networks::Networks;
+use super::terms::{NetworkTerms, Photographs};
+use super::views::{TrainView, Views};
+use crate::Result;
+use crate::gpu::{Buffer, Gpu, Recorder};
+use crate::loss::exposure::Exposures;
+use crate::loss::{LogSlot, LossLog, Losses, ParameterTerms, TermInputs};
+use crate::photographs::pseudo_gt::PseudoGt;
+use crate::photographs::tone::Scene;
+use crate::splats::optimizer::{Adam, Learnable};
+use crate::splats::render::{Renderer, Viewpoint};
+use crate::splats::scene::{COLOR_CHANNELS, Features};
+
+/// The training views with their targets, and the terms of the loss.
+#[derive(Debug)]
+pub(super) struct Supervision {
+    pub(super) views: Views,
+    /// What the curves of the photographs have in common.
+    pub(super) scene: Scene,
+    pub(super) target_exposure: Option<TargetExposure>,
+    pub(super) pseudo_gt: PseudoGt,
+    /// The target of a step's view, (3, H, W),
+    pub(super) target: Buffer<f32>,
+    /// and its dark photograph, where a network sees that.
+    pub(super) photograph: Buffer<f32>,
+    pub(super) masks: Masks,
+    pub(super) exposures: Option<Exposures>,
+    pub(super) networks: Option<NetworkTerms>,
+    pub(super) losses: Losses,
+    pub(super) parameter_terms: Option<ParameterTerms>,
+    /// The gradient with respect to the render, (channels, H, W).
+    pub(super) d_render: Buffer<f32>,
+    pub(super) log: LossLog,
+}
+
+/// What decides which view a step trains on.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct ViewOf {
+    pub(super) seed: u64,
+    pub(super) step: u64,
+    /// Of resolution.
+    pub(super) level: usize,
+}
+
+impl Supervision {
+    /// The view of a step.
+    pub(super) fn view(&self, ViewOf { seed, step, level }: ViewOf) -> &TrainView {
+        self.views.of_step(seed, step, level)
+    }
+
+    /// The camera of a step's view, on the device.
+    pub(super) fn viewpoint(&self, of: ViewOf) -> Viewpoint<'_> {
+        self.views.viewpoint(self.view(of))
+    }
+
+    /// The networks, where the model has any.
+    pub(super) fn networks(&mut self) -> Option<&mut Networks> {
+        self.networks.as_mut().map(|terms| &mut terms.networks)
+    }
+
+    /// Records the terms of the loss of a step, in a slot of the log, and their gradient with respect to what was rendered.
+    ///
+    /// # Errors
+    /// A pass exceeds what the device launches.
+    pub(super) fn compare(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        of: ViewOf,
+        features: Features,
+        renderer: &mut Renderer,
+        slot: u32,
+    ) -> Result<()> {
+        let Self { views, pseudo_gt, masks, d_render, losses, .. } = self;
+        let view = views.of_step(of.seed, of.step, of.level);
+        let (render, status) = renderer.render_and_status();
+        let (size, number) = (view.size(), view.number);
+        let channels = COLOR_CHANNELS + features.width();
+        let target = views.record_target(pass, pseudo_gt, view, &mut self.target)?;
+        let log = &mut LogSlot { log: &mut self.log, slot, status };
+        let step = of.step;
+        let inputs =
+            &TermInputs { step, view: number, size, features, render, colors: render, target };
+        let exposed = match &mut self.exposures {
+            Some(exposures) => {
+                exposures.expose(pass, view.place, size, render)?;
+                exposures.exposed()
+            }
+            None => render,
+        };
+        let colors = masks.shown(pass, number, size, exposed, target)?;
+        losses.record(pass, &TermInputs { colors, ..*inputs }, d_render, log)?;
+        masks.hide(pass, number, (size, channels), d_render)?;
+        if let Some(exposures) = &mut self.exposures {
+            exposures.backward(pass, view.place, size, render, d_render)?;
+        }
+        let Some(networks) = &mut self.networks else { return Ok(()) };
+        let low = views.record_photograph(pass, pseudo_gt, view, &mut self.photograph)?;
+        // Networks see the model at the neutral exposure.
+        let target = match &mut self.exposures {
+            Some(exposures) if networks.follow_target() => {
+                exposures.neutralize(pass, view.place, size, target)?;
+                exposures.exposed()
+            }
+            _ => target,
+        };
+        let photographs = Photographs { mask: masks.of_view(number), low, target };
+        networks.record(pass, inputs, photographs, d_render, log)?;
+        masks.hide(pass, number, (size, channels), d_render)
+    }
+
+    /// Records the terms on parameters, which add to the gradients of the model.
+    ///
+    /// # Errors
+    /// As [`Supervision::compare`].
+    pub(super) fn regularise(
+        &mut self,
+        (gpu, pass): (&Gpu, &mut Recorder<'_>),
+        model: &mut Model,
+        renderer: &mut Renderer,
+        slot: u32,
+    ) -> Result<()> {
+        let Some(terms) = &mut self.parameter_terms else { return Ok(()) };
+        let (_, status) = renderer.render_and_status();
+        model.record_terms((gpu, pass), terms, &mut LogSlot { log: &mut self.log, slot, status })
+    }
+
+    /// Records Adam's step of what is learned beside the Gaussians.
+    ///
+    /// # Errors
+    /// As [`Supervision::compare`].
+    pub(super) fn update(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        adam: &Adam,
+        step: u64,
+        settling_rate: f64,
+        status: &Buffer<u32>,
+    ) -> Result<()> {
+        self.learnables()
+            .try_for_each(|learnable| adam.update(pass, step, settling_rate, learnable, status))?;
+        match &mut self.exposures {
+            Some(exposures) => exposures.center(pass, status),
+            None => Ok(()),
+        }
+    }
+
+    /// Everything that is learned beside the Gaussians: Adam trains it, and checkpoints keep it.
+    pub(super) fn learnables(&mut self) -> impl Iterator<Item = &mut dyn Learnable> {
+        let networks = self.networks.iter_mut().flat_map(|terms| terms.networks.parameters_mut());
+        let networks = networks.map(|parameters| parameters as &mut dyn Learnable);
+        let exposures = self.exposures.iter_mut();
+        networks.chain(exposures.map(|exposures| exposures as &mut dyn Learnable))
+    }
+}
