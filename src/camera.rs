@@ -68,7 +68,7 @@ impl Camera {
     }
 
     /// The point of the view (x right, y down, z forward) that is seen at a pixel and a depth, as
-    /// [`CameraModel::depth`] counts it; `None` where a fisheye sees nothing.
+    /// `CameraModel::depth` counts it; `None` where a fisheye sees nothing.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn in_view(&self, pixel: DVec2, depth: f64) -> Option<DVec3> {
         self.model.point((pixel - self.principal_point) / self.focal, depth)

@@ -7,6 +7,7 @@ use clap::error::{ContextKind, ContextValue};
 use clap::{Parser, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
 
+use crate::base::output::printable;
 use crate::base::settings::Setting;
 use crate::photographs::image::Image;
 use crate::train::settings::setting;
@@ -145,6 +146,11 @@ pub fn message(error: &anyhow::Error) -> String {
         Some((option, _)) => message.replacen(key, &format!("{key} (--{option})"), 1),
         None => message,
     }
+}
+
+/// A message as it is printed, whatever the names in it hold.
+pub fn in_one_line(message: &str) -> String {
+    printable(&message.replace('\n', "\\n")).into_owned()
 }
 
 /// The picture files that a command writes.

@@ -58,11 +58,6 @@ fn misuse(error: &clap::Error) -> ExitCode {
     ExitCode::from(2)
 }
 
-/// A message as it is printed, whatever the names in it hold.
-fn in_one_line(message: &str) -> String {
-    printable(&message.replace('\n', "\\n")).into_owned()
-}
-
 /// Whoever reads our output has seen enough, as in `nightsplat doctor | head`.
 fn is_broken_pipe(error: &anyhow::Error) -> bool {
     let is_broken = |io: &std::io::Error| io.kind() == std::io::ErrorKind::BrokenPipe;

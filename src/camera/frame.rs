@@ -64,13 +64,13 @@ impl Frame {
 
     /// A position in the world, in the frame.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn from_world(&self, position: DVec3) -> DVec3 {
+    pub(crate) fn framed(&self, position: DVec3) -> DVec3 {
         (position - self.center()) * self.scale
     }
 
     /// A position in the frame, in the world.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn to_world(&self, position: DVec3) -> DVec3 {
+    pub(crate) fn unframed(&self, position: DVec3) -> DVec3 {
         position / self.scale + self.center()
     }
 
@@ -157,10 +157,10 @@ mod tests {
             for x in [-0.3, 0.0, 0.2] {
                 let position = center + extent * DVec3::new(x, 0.1, -0.2);
                 let there = camera.project(position).unwrap();
-                let here = frame.camera(&camera).project(frame.from_world(position)).unwrap();
+                let here = frame.camera(&camera).project(frame.framed(position)).unwrap();
                 // An offset of 1e7 extents leaves nine digits of a pixel's position.
                 assert!(here.distance(there) < 1e-5, "{extent} {offset}: {here} {there}");
-                let back = frame.to_world(frame.from_world(position));
+                let back = frame.unframed(frame.framed(position));
                 assert!(back.distance(position) <= 1e-8 * extent.max(offset), "{back}");
             }
         }

@@ -131,7 +131,7 @@ impl<'a, T: bytemuck::Pod> SliceMut<'a, T> {
     /// Some of its elements.
     ///
     /// # Errors
-    /// As [`Slice::range`].
+    /// As `Slice::range`.
     pub fn range(self, range: Range<usize>) -> Result<Self> {
         let first = self.first + offset_of::<T>(self.memory, self.len, &range)?;
         Ok(Self { first, len: range.len(), ..self })
@@ -140,7 +140,7 @@ impl<'a, T: bytemuck::Pod> SliceMut<'a, T> {
     /// Several parts of it, for a pass that binds each on its own. Parts may be empty, in any order and with gaps between.
     ///
     /// # Errors
-    /// Two parts overlap, or as [`Slice::range`].
+    /// Two parts overlap, or as `Slice::range`.
     pub fn split<const N: usize>(self, ranges: [Range<usize>; N]) -> Result<[Self; N]> {
         for (i, a) in ranges.iter().enumerate() {
             offset_of::<T>(self.memory, self.len, a)?;

@@ -234,7 +234,7 @@ impl Player {
         let tile = own.tile.filter(|&tile| gpu.properties().suits_tile(tile));
         let settings = RenderSettings { shape, tile, ..own };
         let frame = config.frame.unwrap_or_default();
-        let gaussians = gaussians.from_world(&frame);
+        let gaussians = gaussians.to_frame(&frame);
         Ok(Self {
             frame,
             gaussians: gaussians.upload(gpu)?,

@@ -109,7 +109,7 @@ impl Gaussians {
 
     /// Gaussians of the world in a frame: what [`Gaussians::to_world`] gave comes back.
     #[cfg(feature = "io")]
-    pub(crate) fn from_world(&self, frame: &Frame) -> Self {
+    pub(crate) fn to_frame(&self, frame: &Frame) -> Self {
         if *frame == Frame::WORLD && self.origin == DVec3::ZERO {
             return self.clone();
         }

@@ -208,7 +208,7 @@ fn given(gaussians: &Gaussians, config: &TrainConfig) -> Result<Gaussians> {
         let own = gaussians.shape;
         return Err(Error::Usage(format!("Gaussians of {own:?} make no model of {shape:?}")));
     }
-    Ok(gaussians.with_sh_degree(shape.sh_degree).from_world(&config.frame.unwrap_or_default()))
+    Ok(gaussians.with_sh_degree(shape.sh_degree).to_frame(&config.frame.unwrap_or_default()))
 }
 
 /// Training views that tell what a round of density control costs.

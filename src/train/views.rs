@@ -366,7 +366,7 @@ impl Views {
         let seed = Stream::new(config.seed, streams::POINTS).bits(0);
         let found = if own.is_empty() { "no".to_owned() } else { own.len().to_string() };
         tracing::info!("{found} points in the dataset: {count} random ones");
-        let point = |position| Point { position: frame.to_world(position), views: vec![] };
+        let point = |position| Point { position: frame.unframed(position), views: vec![] };
         let random = init::random(&cameras, count, seed).into_iter().map(point);
         own.iter().cloned().chain(random).collect()
     }
@@ -400,8 +400,7 @@ impl Views {
             let exposure = exposures.and_then(|exposures| exposures.get(place));
             Ok(Some(exposure.map_or_else(|| target.clone(), |own| own.inverse().applied(&target))))
         })?;
-        let positions: Vec<DVec3> =
-            kept.iter().map(|point| frame.from_world(point.position)).collect();
+        let positions: Vec<DVec3> = kept.iter().map(|point| frame.framed(point.position)).collect();
         let seed = Stream::new(config.seed, streams::FEATURES).bits(0);
         let shape = Shape { sh_degree: config.sh_degree, features: config.model.features() };
         let mut gaussians =

@@ -107,11 +107,11 @@ proptest! {
     ) {
         let frame = Frame::new(center, extent);
         let world = center + extent * at;
-        let back = frame.to_world(frame.from_world(world));
+        let back = frame.unframed(frame.framed(world));
         prop_assert!(back.distance(world) <= 1e-9 * (world.length() + extent), "{back}, not {world}");
         let view_from_world = camera.view_from_world * DAffine3::from_translation(-center);
         let camera = Camera { view_from_world, ..camera };
-        let (own, framed) = (camera.project(world), frame.camera(&camera).project(frame.from_world(world)));
+        let (own, framed) = (camera.project(world), frame.camera(&camera).project(frame.framed(world)));
         prop_assert_eq!(own.is_some(), framed.is_some());
         if let Some((own, framed)) = own.zip(framed) {
             let depth = camera.view_from_world.transform_point3(world).z;

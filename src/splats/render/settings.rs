@@ -52,7 +52,7 @@ const CPU_SMALL_TILE: [u32; 2] = [8, 8];
 
 impl RenderSettings {
     /// The tile on this device, in pixels: that of these settings, else the one that was measured to be the fastest
-    /// there ([`Gpu::tuned_tile`]), else what such devices are known to like.
+    /// there (`Gpu::tuned_tile`), else what such devices are known to like.
     ///
     /// # Errors
     /// A subgroup's part has no whole number of rows of lanes, or more than 32.

@@ -230,7 +230,7 @@ fn radius(cameras: &[Camera]) -> f64 {
 /// The colour of each point: the mean of what the training views that see it show in their targets, RGB.
 ///
 /// A point is seen by the training views of its track; without any, by the training views that it lies inside of, of
-/// [`MOST_VIEWS`] that cover the scene ([`Camera::covering`]). A point that none of them sees gets the mean grey of the targets. `target` gives the target of a view (an index
+/// [`MOST_VIEWS`] that cover the scene (`Camera::covering`). A point that none of them sees gets the mean grey of the targets. `target` gives the target of a view (an index
 /// into `views`), or nothing where there is none; it is asked once per training view, in order, so it may compute.
 ///
 /// The time is proportional to the pixels of the views and the length of all tracks; a point without a track counts as one of
