@@ -1,9 +1,8 @@
 #!/usr/bin/env python3
 """The public API of the library, one line an item: what hosts and trainers may rely on.
 
-    scripts/public-api.py            compares it with docs/public-api.txt
+    scripts/public-api.py            compares it with docs/public-api.txt, and says how much a host embeds that needs no files
     scripts/public-api.py --write    writes that file anew
-    scripts/public-api.py --count    prints how much is public, also in the build that a host embeds
 
 Reads the JSON that rustdoc makes of a build without features for tests. Fields, variants and the implementations of traits
 stand with their type and are no items of their own.
@@ -53,7 +52,8 @@ def arguments(args: dict | None) -> str:
         return f"({', '.join(map(typed, inner['inputs']))}){output}"
     inner = args["angle_bracketed"]
     given = [next(iter(arg.values())) if "lifetime" in arg else value(arg) for arg in inner["args"]]
-    bound = [f"{one['name']} = {value(one['binding']['equality'])}" for one in inner["constraints"] if "equality" in one["binding"]]
+    constraints = [one for one in inner["constraints"] if "equality" in one["binding"]]
+    bound = [f"{one['name']} = {value(one['binding']['equality'])}" for one in constraints]
     return f"<{', '.join(given + bound)}>" if given or bound else ""
 
 
@@ -258,19 +258,21 @@ class Api:
 
 
 def main() -> None:
-    mode = sys.argv[1] if len(sys.argv) > 1 else ""
-    apis = {name: Api(documented(features)) for name, features in BUILDS.items() if name == "with files" or mode == "--count"}
-    for name, api in apis.items():
+    is_written = sys.argv[1:] == ["--write"]
+    for name, features in BUILDS.items():
+        if is_written and name != "with files":
+            continue
+        api = Api(documented(features))
         print(f"{name}: {api.items} public items, {api.parts} fields and variants")
         if api.hidden:
             sys.exit(f"the API names types that are no part of it: {', '.join(api.hidden)}")
-    text = "\n".join(apis["with files"].lines) + "\n"
-    if mode == "--write":
+    text = "\n".join(api.lines) + "\n"
+    if is_written:
         SNAPSHOT.write_text(text)
-        return
-    before = SNAPSHOT.read_text() if SNAPSHOT.exists() else ""
-    if text != before:
-        sys.stdout.writelines(difflib.unified_diff(before.splitlines(True), text.splitlines(True), str(SNAPSHOT), "now", n=0))
+    elif text != (before := SNAPSHOT.read_text()):
+        sys.stdout.writelines(
+            difflib.unified_diff(before.splitlines(True), text.splitlines(True), "docs/public-api.txt", "now", n=0)
+        )
         sys.exit("the public API is another one; where that is meant: scripts/public-api.py --write, and a line in CHANGELOG.md")
 
 

@@ -5,8 +5,7 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use nightsplat::Error;
-use nightsplat::base::output::printable;
-use nightsplat::cli::{Cli, message, renamed};
+use nightsplat::cli::{Cli, in_one_line, message, renamed};
 use tracing_subscriber::filter::LevelFilter;
 
 fn main() -> ExitCode {
