@@ -45,7 +45,8 @@ def main() -> None:
     for example in (ROOT / "examples").glob("*.rs"):
         if example.stem not in INSTRUMENTS:
             (programs / example.name).write_text(example.read_text())
-    page = "\n".join(line.removeprefix("//!") for line in (ROOT / "src/lib.rs").read_text().splitlines() if line.startswith("//!"))
+    lines = (ROOT / "src/lib.rs").read_text().splitlines()
+    page = "\n".join(line.removeprefix("//!") for line in lines if line.startswith("//!"))
     for number, code in enumerate(re.findall(r"```no_run\n(.*?)```", page, re.DOTALL)):
         # Lines that the page hides are part of the program.
         code = "\n".join(line.strip().removeprefix("# ") for line in code.splitlines())

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """The public API of the library, one line an item: what hosts and trainers may rely on.
 
-    scripts/public-api.py            compares it with docs/public-api.txt, and says how much a host embeds that needs no files
+    scripts/public-api.py            compares it with docs/public-api.txt, and says how much is embedded
     scripts/public-api.py --write    writes that file anew
 
 Reads the JSON that rustdoc makes of a build without features for tests. Fields, variants and the implementations of traits
@@ -273,7 +273,8 @@ def main() -> None:
         sys.stdout.writelines(
             difflib.unified_diff(before.splitlines(True), text.splitlines(True), "docs/public-api.txt", "now", n=0)
         )
-        sys.exit("the public API is another one; where that is meant: scripts/public-api.py --write, and a line in CHANGELOG.md")
+        remedy = "where that is meant: scripts/public-api.py --write, and a line in CHANGELOG.md"
+        sys.exit(f"the public API is another one; {remedy}")
 
 
 if __name__ == "__main__":

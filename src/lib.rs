@@ -156,7 +156,7 @@ pub use error::{Error, Result, Stop};
 pub use gpu::{
     Buffer, CooperativeMatrix, DeviceChoice, DeviceLimits, DeviceReport, Gpu, HostDevice,
     HostRecording, MemoryBudget, PassTime, PciAddress, Properties, Recorder, Requirement,
-    RequirementReport, Slice, Submission, Tile, devices, required_device_features,
+    RequirementReport, Slice, Tile, devices, required_device_features,
 };
 #[cfg(feature = "check")]
 pub use gpu::{CheckReport, CheckedPass, Difference, Tolerance};

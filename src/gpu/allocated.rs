@@ -29,7 +29,6 @@ impl Memory {
         location: MemoryLocation,
     ) -> Result<Self> {
         let usage = vk::BufferUsageFlags::STORAGE_BUFFER
-            | vk::BufferUsageFlags::INDIRECT_BUFFER
             | vk::BufferUsageFlags::TRANSFER_SRC
             | vk::BufferUsageFlags::TRANSFER_DST;
         let size = whole_quads(bytes);

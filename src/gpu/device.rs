@@ -55,7 +55,7 @@ impl Gpu {
     /// No loader, no such device, or one that lacks a requirement.
     ///
     /// ```no_run
-    /// use nightsplat::gpu::{DeviceChoice, Gpu};
+    /// use nightsplat::{DeviceChoice, Gpu};
     ///
     /// let gpu = Gpu::new(&DeviceChoice::Best)?;
     /// let squares = gpu.buffer("squares", &[0u32, 1, 4, 9])?;

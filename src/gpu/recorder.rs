@@ -270,13 +270,12 @@ impl<'g> Recorder<'g> {
         let barrier = [vk::MemoryBarrier2::default()
             .src_stage_mask(stages)
             .src_access_mask(vk::AccessFlags2::SHADER_WRITE | vk::AccessFlags2::TRANSFER_WRITE)
-            .dst_stage_mask(stages | vk::PipelineStageFlags2::DRAW_INDIRECT)
+            .dst_stage_mask(stages)
             .dst_access_mask(
                 vk::AccessFlags2::SHADER_READ
                     | vk::AccessFlags2::SHADER_WRITE
                     | vk::AccessFlags2::TRANSFER_READ
-                    | vk::AccessFlags2::TRANSFER_WRITE
-                    | vk::AccessFlags2::INDIRECT_COMMAND_READ,
+                    | vk::AccessFlags2::TRANSFER_WRITE,
             )];
         let info = vk::DependencyInfo::default().memory_barriers(&barrier);
         // SAFETY: recording.

@@ -8,7 +8,18 @@ use super::Bound;
 use super::allocated::Memory;
 use crate::{Error, Result};
 
-/// Elements of a buffer to read. While it lives, no `SliceMut` of them can be made:
+/// Elements of a buffer to read.
+#[derive(Clone, Copy, Debug)]
+pub struct Slice<'a, T> {
+    memory: &'a Memory,
+    /// Where it begins in the memory, in elements.
+    first: usize,
+    len: usize,
+    element: PhantomData<&'a T>,
+}
+
+/// Elements of a buffer to read and write; while it lives, nothing else reads or writes them. None can be made while a [`Slice`] of
+/// them lives:
 ///
 /// ```compile_fail,E0502
 /// # use nightsplat::gpu::{Buffer, Gpu};
@@ -43,16 +54,6 @@ use crate::{Error, Result};
 ///     window_gather::Buffers { image: image.slice(), content: content.slice_mut() }
 /// }
 /// ```
-#[derive(Clone, Copy, Debug)]
-pub struct Slice<'a, T> {
-    memory: &'a Memory,
-    /// Where it begins in the memory, in elements.
-    first: usize,
-    len: usize,
-    element: PhantomData<&'a T>,
-}
-
-/// Elements of a buffer to read and write; while it lives, nothing else reads or writes them.
 #[derive(Debug)]
 pub struct SliceMut<'a, T> {
     memory: &'a Memory,

@@ -240,7 +240,7 @@ impl Dataset {
     /// or a photograph whose size contradicts its camera.
     ///
     /// ```no_run
-    /// use nightsplat::photographs::dataset::{Dataset, LoadOptions};
+    /// use nightsplat::{Dataset, LoadOptions};
     ///
     /// let options = LoadOptions { downscale: 4.0, ..LoadOptions::default() };
     /// let dataset = Dataset::load("photos", &options)?;

@@ -50,13 +50,11 @@ macro_rules! families {
         /// A tone curve, by its number in `include/curves.glsl`.
         ///
         /// ```
-        /// use nightsplat::photographs::tone::{Statistics, ToneCurve, ToneSettings};
+        /// use nightsplat::{ToneCurve, ToneSettings, TrainConfig};
         ///
         /// let curve: ToneCurve = "ase".parse()?;
-        /// // Three planes of four pixels each, sRGB-encoded.
-        /// let photograph = [0.02, 0.04, 0.05, 0.1, 0.01, 0.03, 0.05, 0.1, 0.01, 0.02, 0.04, 0.06];
-        /// let parameters = ToneSettings::new(curve).parameters(&Statistics::of(&photograph));
-        /// assert!(curve.apply(0.05, &parameters) > 0.2);
+        /// let config = TrainConfig { tone: ToneSettings::new(curve), ..TrainConfig::default() };
+        /// config.check()?;
         /// # Ok::<(), nightsplat::Error>(())
         /// ```
         #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize)]
