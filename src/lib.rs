@@ -86,7 +86,7 @@
     allow(unreachable_pub, unused_imports, reason = "what is no API is public to tests")
 )]
 #![cfg_attr(
-    not(feature = "cli"),
+    not(any(feature = "testing", all(feature = "cli", feature = "fit"))),
     expect(dead_code, reason = "the command, and training, use more")
 )]
 
