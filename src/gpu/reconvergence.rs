@@ -6,7 +6,7 @@
 
 use ash::{khr, vk};
 
-use super::offered::Offered;
+use super::supported::Supported;
 
 /// The extension a device is created with to be asked.
 pub(super) const EXTENSION: &std::ffi::CStr = khr::shader_subgroup_uniform_control_flow::NAME;
@@ -20,12 +20,12 @@ const OP_EXECUTION_MODE: u32 = 16;
 const HEADER: usize = 5;
 
 /// Whether the device makes the promise.
-pub(super) fn offered(
+pub(super) fn supported(
     instance: &ash::Instance,
     physical: vk::PhysicalDevice,
-    offered: &Offered,
+    supported: &Supported,
 ) -> bool {
-    if !offered.has(EXTENSION) {
+    if !supported.has(EXTENSION) {
         return false;
     }
     let mut feature = vk::PhysicalDeviceShaderSubgroupUniformControlFlowFeaturesKHR::default();

@@ -7,7 +7,7 @@ use glam::{DVec3, Vec3};
 use nightsplat::gpu::Gpu;
 use nightsplat::gpu::testing::{gpu, gpu_that_binds};
 use nightsplat::photographs::dataset::Dataset;
-use nightsplat::splats::halves::StorageFormat;
+use nightsplat::splats::packed_sh::StorageFormat;
 use nightsplat::splats::render::{RenderOptions, RenderSettings, Renderer};
 use nightsplat::splats::scene::{Gaussians, Layout, Shape, width};
 use nightsplat::train::{TrainConfig, Trainer};
@@ -173,7 +173,7 @@ fn what_lies_beyond_a_binding_is_rendered() {
 fn what_a_device_cannot_bind_is_refused_and_growth_ends_before_it() {
     let gpu = gpu_that_binds(LITTLE);
     let settings = RenderSettings::default();
-    assert_eq!(settings.most_gaussians(&gpu), 16_384);
+    assert_eq!(settings.peak_gaussians(&gpu), 16_384);
     let mut renderer = Renderer::new(&gpu, settings).unwrap();
     let camera = Setup::new(1, [32, 24], 0, 1).camera;
     let refused = renderer.reserve(16_385, [&camera]).unwrap_err().to_string();

@@ -14,7 +14,7 @@ mod coverage;
 mod densify;
 mod fisheye;
 mod gradients;
-mod halves;
+mod packed_sh;
 mod limits;
 mod not_finite;
 mod optimizer;

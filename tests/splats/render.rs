@@ -14,7 +14,7 @@ use nightsplat::kernels::splat::ALPHA_MIN;
 use nightsplat::kernels::status::{STATUS_NOT_FINITE, STATUS_OVERFLOWED};
 use nightsplat::reference::gaussian::Gaussian;
 use nightsplat::reference::splat::{Splat, splat_columns};
-use nightsplat::splats::halves::StorageFormat;
+use nightsplat::splats::packed_sh::StorageFormat;
 use nightsplat::splats::render::{RenderSettings, Renderer, Status};
 use nightsplat::splats::scene::{Attribute, Features, Gaussians, Shape};
 
@@ -172,10 +172,10 @@ fn needles(count: usize) -> Setup {
 /// Every intersection of a render: the tile and the Gaussian.
 fn intersections(rendered: &Rendered<'_>) -> Vec<(u32, u32)> {
     let frame = rendered.renderer.frame();
-    let [tiles, slots, owners, counts] = [&frame.tiles, &frame.slots, &frame.owners, &frame.counts]
+    let [tiles, intersection_ids, gaussian_ids, counts] = [&frame.tiles, &frame.intersection_ids, &frame.gaussian_ids, &frame.counts]
         .map(|buffer| gpu().read(buffer).unwrap());
-    let owners = slots[..counts[0] as usize].iter().map(|&slot| owners[slot as usize]);
-    tiles.into_iter().zip(owners).collect()
+    let gaussian_ids = intersection_ids[..counts[0] as usize].iter().map(|&slot| gaussian_ids[slot as usize]);
+    tiles.into_iter().zip(gaussian_ids).collect()
 }
 
 /// Those of the tiles that subgroups of this device can own.

@@ -115,7 +115,7 @@ fn injected_darkening_is_found_within_a_tenth() {
     for darkening in [4.0, 25.0] {
         let dark = diagnosis(&Capture { darkening, ..Capture::clean() }).scene;
         close(dark.darkening / light.darkening, darkening, "darkening");
-        assert!(dark.lift > light.lift && dark.code_values < light.code_values);
+        assert!(dark.brightening > light.brightening && dark.code_values < light.code_values);
     }
     let noisy = diagnosis(&Capture::default()).scene;
     close(noisy.darkening / light.darkening, Capture::default().darkening, "darkening with noise");
@@ -335,7 +335,7 @@ fn a_run_without_a_length_ends_when_held_out_views_have_converged() {
     let (root, out) = (set.path().display(), set.path().join("run"));
     // Whatever is learned is too little.
     let options = "--preset draft --set stop.views=1 --set stop.every=5 --set stop.gain=90 \
-                   --set schedule.resolution_steps=[0,0] --set schedule.settle_steps=5 --set checkpoint_every=10";
+                   --set schedule.resolution_steps=[0,0] --set schedule.cooldown_steps=5 --set checkpoint_every=10";
     let train = format!("train {root} --out {} {options}", out.display());
     succeed(&train);
     let scores = fs::read_to_string(out.join("held_out.csv")).unwrap();
@@ -377,7 +377,7 @@ fn a_run_that_has_ended_early_goes_on_from_its_end() {
     let set = written(&Capture::default());
     let (root, out) = (set.path().display(), set.path().join("run"));
     let options = "--preset draft --set stop.views=1 --set stop.every=5 --set stop.gain=90 \
-                   --set schedule.resolution_steps=[0,0] --set schedule.settle_steps=6";
+                   --set schedule.resolution_steps=[0,0] --set schedule.cooldown_steps=6";
     let train = |more: &str| {
         succeed(&format!("train {root} --out {} {options} --progress json {more}", out.display()))
     };

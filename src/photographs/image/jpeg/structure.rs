@@ -11,10 +11,10 @@ struct Definitions {
     quantization: [bool; 4],
     /// Huffman codes: those of the DC coefficients, then of the others.
     codes: [[bool; 4]; 2],
-    frame: Option<Frame>,
+    frame: Option<FrameHeader>,
 }
 
-struct Frame {
+struct FrameHeader {
     is_progressive: bool,
     components: Vec<Component>,
 }
@@ -137,13 +137,13 @@ impl Definitions {
         {
             return None;
         }
-        self.frame = Some(Frame { is_progressive, components });
+        self.frame = Some(FrameHeader { is_progressive, components });
         Some(())
     }
 
     /// SOS: which components the coded data after it brings, and how far.
     fn start_scan(&mut self, segment: &[u8]) -> Option<()> {
-        let Frame { is_progressive, components } = self.frame.as_mut()?;
+        let FrameHeader { is_progressive, components } = self.frame.as_mut()?;
         let (&count, rest) = segment.split_first()?;
         let (selected, &[first, last, bits]) = rest.split_at_checked(2 * usize::from(count))?
         else {

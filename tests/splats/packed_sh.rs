@@ -7,7 +7,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use nightsplat::gpu::testing::{gpu, gpu_that_binds};
 use nightsplat::gpu::{Buffer, Gpu};
 use nightsplat::splats::attributes::PlaneCounts;
-use nightsplat::splats::halves::StorageFormat;
+use nightsplat::splats::packed_sh::StorageFormat;
 use nightsplat::splats::optimizer::{Adam, AdamBuffers, LearningRates, Moments};
 use nightsplat::splats::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer};
 use nightsplat::splats::scene::{DeviceGaussians, Layout, Shape, width};
