@@ -258,9 +258,9 @@ mod tests {
 
     #[test]
     fn what_a_file_says_becomes_one_line_that_ends() {
-        let said = |problem: &str| Error::input("file", problem).to_string();
-        assert_eq!(said("is no\nnumber"), r"file: is no\nnumber");
-        let endless = said(&"ö\n".repeat(5000));
+        let printed = |problem: &str| Error::input("file", problem).to_string();
+        assert_eq!(printed("is no\nnumber"), r"file: is no\nnumber");
+        let endless = printed(&"ö\n".repeat(5000));
         assert!(endless.chars().count() < 1020 && endless.ends_with(" ..."), "{endless}");
     }
 }

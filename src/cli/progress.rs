@@ -290,11 +290,12 @@ mod tests {
             gaussians: 2400,
             milliseconds: 480.0,
         };
-        let said = "step 200 of 400: loss 0.0432, 2400 Gaussians, 500 ms a step, 1 min 40 s left";
-        assert_eq!(progress.line(&report), said);
+        let expected =
+            "step 200 of 400: loss 0.0432, 2400 Gaussians, 500 ms a step, 1 min 40 s left";
+        assert_eq!(progress.line(&report), expected);
         progress.may_end_early = true;
-        let said = "step 200 of at most 400: loss 0.0432, 2400 Gaussians, 500 ms a step, at most 1 min 40 s left";
-        assert_eq!(progress.line(&report), said);
+        let expected = "step 200 of at most 400: loss 0.0432, 2400 Gaussians, 500 ms a step, at most 1 min 40 s left";
+        assert_eq!(progress.line(&report), expected);
         assert!(!progress.is_due());
         progress.last_line -= SILENCE;
         assert!(progress.is_due() && !progress.is_due());
@@ -302,7 +303,7 @@ mod tests {
 
     #[test]
     fn a_duration_has_two_units_at_most() {
-        let said = [0.4, 59.4, 60.0, 156.0, 3600.0, 9000.0].map(duration);
-        assert_eq!(said, ["0 s", "59 s", "1 min 0 s", "2 min 36 s", "1 h 0 min", "2 h 30 min"]);
+        let expected = [0.4, 59.4, 60.0, 156.0, 3600.0, 9000.0].map(duration);
+        assert_eq!(expected, ["0 s", "59 s", "1 min 0 s", "2 min 36 s", "1 h 0 min", "2 h 30 min"]);
     }
 }

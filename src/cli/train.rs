@@ -16,9 +16,9 @@ use super::signals;
 use crate::base::output::printable;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::results::eval;
-use crate::results::run::{self, IfExists, RunDirectory, Session, RunSummary};
+use crate::results::run::{self, IfExists, RunDirectory, RunSummary, Session};
 use crate::train::diagnose::Plan;
-use crate::train::{Origin, PlannedRun, PlanSource, RequestedSettings};
+use crate::train::{Origin, PlanSource, PlannedRun, RequestedSettings};
 
 /// Train a 3D Gaussian Splatting model from dark photographs.
 ///
@@ -60,8 +60,8 @@ pub struct TrainArgs {
 /// # Errors
 /// Whatever keeps the run from its end, in one line.
 pub fn run(args: &TrainArgs) -> Result<()> {
-    let mut said = args.options.said(&args.dataset)?;
-    said.settings(None)?.config()?.check()?;
+    let mut requested = args.options.requested(&args.dataset)?;
+    requested.settings(None)?.config()?.check()?;
     match args.resume {
         true => RunDirectory::check_resumed(&args.out)?,
         false => RunDirectory::check(&args.out, args.overwrite)?,
@@ -70,20 +70,20 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     if is_resumed && args.options.gives("steps") {
         // The views that it began with stay held out.
         let views = i64::try_from(run::load_config(&args.out)?.stop.views)?;
-        said.options.push("stop.views", views.into(), Origin::Run)?;
+        requested.options.push("stop.views", views.into(), Origin::Run)?;
     }
     let given = args.plan.clone().filter(|path| path != Path::new("none"));
     let file = given.or_else(|| run::plan_of(&args.out).filter(|_| is_resumed));
     if is_resumed
         && !args.explain
-        && let Some(steps) = done_by_stamp(args, &said, file.as_deref())?
+        && let Some(steps) = done_by_stamp(args, &requested, file.as_deref())?
     {
         return print_done(args, steps);
     }
-    let device = said.settings(None)?.config()?.device;
+    let device = requested.settings(None)?.config()?.device;
     let gpu = Gpu::new(&device.parse::<DeviceChoice>()?)?;
     let planning = planning(args, file.as_deref(), is_resumed);
-    let PlannedRun { config, settings, plan, dataset } = said.planned(planning, &gpu)?;
+    let PlannedRun { config, settings, plan, dataset } = requested.planned(planning, &gpu)?;
     if args.explain {
         return Ok(write!(std::io::stdout(), "{}", printable(&settings.explained(&config)?))?);
     }
@@ -106,7 +106,8 @@ pub fn run(args: &TrainArgs) -> Result<()> {
             plan.as_ref().map(diagnose::decisions).unwrap_or_default()
         )?;
     }
-    let if_exists = if args.resume { IfExists::Resume } else { overwrite_or_refuse(args.overwrite) };
+    let if_exists =
+        if args.resume { IfExists::Resume } else { overwrite_or_refuse(args.overwrite) };
     let mut progress = Reporter::new(form).with_facts(serde_json::json!(facts));
     let session = Session {
         plan: plan.as_ref(),
@@ -149,9 +150,13 @@ fn print_done(args: &TrainArgs, steps: u64) -> Result<()> {
 
 /// The steps of the run that is to go on, if it is done and the files of its dataset are as they were: nothing is decoded for
 /// that.
-fn done_by_stamp(args: &TrainArgs, said: &RequestedSettings, file: Option<&Path>) -> crate::Result<Option<u64>> {
+fn done_by_stamp(
+    args: &TrainArgs,
+    requested: &RequestedSettings,
+    file: Option<&Path>,
+) -> crate::Result<Option<u64>> {
     let plan = file.map(Plan::read).transpose()?;
-    run::done_steps_by_stamp(&args.out, &said.settings(plan.as_ref())?.config()?)
+    run::done_steps_by_stamp(&args.out, &requested.settings(plan.as_ref())?.config()?)
 }
 
 /// What decides what no option says: a plan where one is named, a run keeps to, or the photographs ask for.

@@ -41,11 +41,11 @@ pub(super) fn unasked(code: &[u32]) -> Vec<u32> {
     let mut kept = header.to_vec();
     while let Some(&first) = rest.first() {
         let length = (first >> 16) as usize;
-        let (instruction, behind) = rest.split_at(length.clamp(1, rest.len()));
+        let (instruction, after) = rest.split_at(length.clamp(1, rest.len()));
         if !asks(instruction) {
             kept.extend_from_slice(instruction);
         }
-        rest = behind;
+        rest = after;
     }
     kept
 }

@@ -1,9 +1,9 @@
 use crate::gpu::Reference;
-use crate::kernels::densify_decide::{Constants, Kernel, Params, Slices};
 use crate::kernels::densify_action::{
-    ACTION_CLONE, ACTION_KEEP, ACTION_PRUNE, ACTION_SPLIT, KEY_KEEP, KEY_PRUNE, COUNTER_CANDIDATES,
-    COUNTER_CLONED, COUNTER_PRUNED, COUNTER_SPLIT,
+    ACTION_CLONE, ACTION_KEEP, ACTION_PRUNE, ACTION_SPLIT, COUNTER_CANDIDATES, COUNTER_CLONED,
+    COUNTER_PRUNED, COUNTER_SPLIT, KEY_KEEP, KEY_PRUNE,
 };
+use crate::kernels::densify_decide::{Constants, Kernel, Params, Slices};
 use crate::splats::attributes::Attribute;
 
 impl Reference for Kernel {
@@ -12,13 +12,13 @@ impl Reference for Kernel {
         let (first, of_batch) = (params.first_gaussian as usize, params.batch_count as usize);
         let log_scales = Attribute::LogScales.column(0) * of_batch;
         let kept = params.gaussian_count - slices.counters[COUNTER_PRUNED as usize];
-        let room = params
+        let available = params
             .max_gaussians
             .saturating_sub(kept)
             .div_ceil(params.rounds_left)
             .min(params.max_added);
-        let end = if slices.counters[COUNTER_CANDIDATES as usize] > room {
-            slices.sorted_keys[room as usize]
+        let end = if slices.counters[COUNTER_CANDIDATES as usize] > available {
+            slices.sorted_keys[available as usize]
         } else {
             KEY_KEEP
         };

@@ -21,8 +21,8 @@ use crate::kernels::densify_action::{
 use crate::kernels::{self, densify_decide, densify_moments, densify_scatter, densify_score};
 use crate::splats::attributes::PlaneCounts;
 use crate::splats::batches::Batch;
-use crate::splats::packed_sh::StorageFormat;
 use crate::splats::optimizer::Moments;
+use crate::splats::packed_sh::StorageFormat;
 use crate::splats::scene::{DeviceGaussians, GaussianSlice, Layout};
 use crate::splats::sort::{Count, RadixSort, Scan};
 use crate::{Error, Result};
@@ -230,14 +230,14 @@ impl Densifier {
             if added + report.pruned == 0 {
                 return Ok(report);
             }
-            let mut room = self.room(gaussians, &inputs, report.count, limit)?;
-            self.scatter(gaussians, &mut inputs, &mut room, &report, round.step)?;
-            let parameters = room.words.as_ref().unwrap_or(inputs.gradients).slice();
+            let mut spare_buffers = self.spare_buffers(gaussians, &inputs, report.count, limit)?;
+            self.scatter(gaussians, &mut inputs, &mut spare_buffers, &report, round.step)?;
+            let parameters = spare_buffers.words.as_ref().unwrap_or(inputs.gradients).slice();
             let layout = Layout { count: report.count, ..gaussians.layout };
             let new = GaussianSlice { layout, parameters };
             let share = if added == 0 { 1.0 } else { keeps(new)? };
             if share >= 1.0 {
-                self.commit(gaussians, inputs, room, &report)?;
+                self.commit(gaussians, inputs, spare_buffers, &report)?;
                 return Ok(report);
             }
             tracing::debug!("step {}: of {added} splits, {share:.3} may stay", round.step);
@@ -330,12 +330,12 @@ impl Densifier {
         download.map_or_else(|| Ok(vec![]), |counters| counters.wait())
     }
 
-    /// Writes the new parameters beside the old ones: to the words of `room`, or the gradients.
+    /// Writes the new parameters beside the old ones: to the words of `spare_buffers`, or the gradients.
     fn scatter(
         &self,
         gaussians: &DeviceGaussians,
         inputs: &mut DensifyInputs<'_>,
-        room: &mut SpareBuffers,
+        spare_buffers: &mut SpareBuffers,
         report: &DensifyReport,
         step: u64,
     ) -> Result<()> {
@@ -352,10 +352,10 @@ impl Densifier {
             first_gaussian: from.first_gaussian(),
             first_new_gaussian: to.first_gaussian(),
         };
-        if room.words.is_none() {
-            room.widen(inputs.gradients);
+        if spare_buffers.words.is_none() {
+            spare_buffers.widen(inputs.gradients);
         }
-        let target = room.words.as_mut().unwrap_or(inputs.gradients);
+        let target = spare_buffers.words.as_mut().unwrap_or(inputs.gradients);
         let Scratch { actions, offsets, .. } = &self.scratch;
         let pairs = self.pairs(&gaussians.layout, report);
         self.gpu.run("densify_scatter", |pass| {
@@ -379,7 +379,7 @@ impl Densifier {
         &self,
         gaussians: &mut DeviceGaussians,
         inputs: DensifyInputs<'_>,
-        mut room: SpareBuffers,
+        mut spare_buffers: SpareBuffers,
         report: &DensifyReport,
     ) -> Result<()> {
         let PlaneCounts { columns, features, .. } = gaussians.layout.floats();
@@ -393,10 +393,10 @@ impl Densifier {
         let DensifyInputs { moments, grad_norm_sums, visit_counts, gradients: spare } = inputs;
         let Scratch { actions, offsets, .. } = &self.scratch;
         let pairs = self.pairs(&gaussians.layout, report);
-        std::mem::swap(&mut gaussians.parameters, room.words.as_mut().unwrap_or(spare));
+        std::mem::swap(&mut gaussians.parameters, spare_buffers.words.as_mut().unwrap_or(spare));
         self.gpu.run("densify_moments", |pass| {
             for (_, moments) in moments.planes_mut() {
-                room.widen(spare);
+                spare_buffers.widen(spare);
                 for &(from, to) in &pairs {
                     let buffers = densify_moments::Buffers {
                         moments: from.planes(&*moments)?.words(),
@@ -409,10 +409,10 @@ impl Densifier {
                 }
                 std::mem::swap(moments, spare);
             }
-            room.widen(spare);
+            spare_buffers.widen(spare);
             Ok(())
         })?;
-        if let Some((sums, counts)) = room.statistics {
+        if let Some((sums, counts)) = spare_buffers.statistics {
             (*grad_norm_sums, *visit_counts) = (sums, counts);
         }
         gaussians.layout.count = report.count;
@@ -428,7 +428,7 @@ impl Densifier {
     }
 
     /// What takes the place of all buffers where one is too short for `count` Gaussians, allocated before one of them goes.
-    fn room(
+    fn spare_buffers(
         &self,
         gaussians: &DeviceGaussians,
         inputs: &DensifyInputs<'_>,
@@ -484,7 +484,8 @@ pub(crate) fn capacity(count: usize, limit: usize) -> usize {
 
 fn report(count: usize, counters: &[u32]) -> DensifyReport {
     let counters = |place: u32| counters.get(place as usize).map_or(0, |&count| count as usize);
-    let (cloned, split, pruned) = (counters(COUNTER_CLONED), counters(COUNTER_SPLIT), counters(COUNTER_PRUNED));
+    let (cloned, split, pruned) =
+        (counters(COUNTER_CLONED), counters(COUNTER_SPLIT), counters(COUNTER_PRUNED));
     DensifyReport {
         cloned,
         split,

@@ -343,7 +343,7 @@ mod tests {
 
     #[test]
     fn sizes_are_read_as_people_write_them() {
-        for (text, bytes, said) in [
+        for (text, bytes, printed) in [
             ("4G", 4 << 30, "4G"),
             ("512m", 512 << 20, "512M"),
             ("1.5 GiB", 3 << 29, "1536M"),
@@ -352,7 +352,7 @@ mod tests {
             ("0", 0, "0"),
         ] {
             let size: CacheSize = text.parse().unwrap();
-            assert_eq!((size.0, size.to_string().as_str()), (bytes, said), "{text}");
+            assert_eq!((size.0, size.to_string().as_str()), (bytes, printed), "{text}");
             assert_eq!(size.to_string().parse::<CacheSize>().unwrap(), size);
         }
         for text in ["", "G", "-1G", "much", "4X", "NaN"] {

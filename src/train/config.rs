@@ -21,8 +21,8 @@ use crate::networks::NetworkVariant;
 use crate::photographs::dataset::{DOWNSCALE, Dataset, DepthOptions, LoadOptions, MeasuredSize};
 use crate::photographs::tone::ToneSettings;
 use crate::splats::densify::DensityControl;
-use crate::splats::packed_sh::StorageFormat;
 use crate::splats::optimizer::Schedule;
+use crate::splats::packed_sh::StorageFormat;
 use crate::splats::render::RenderSettings;
 use crate::splats::scene::init::Initialization;
 use crate::splats::scene::{MAX_SH_DEGREE, Shape};
@@ -253,7 +253,11 @@ impl TrainConfig {
             reference: self.reference.clone(),
             invert_masks: self.invert_masks,
             undistort: self.undistort,
-            measured: if self.tone.full_resolution { MeasuredSize::Own } else { MeasuredSize::Loaded },
+            measured: if self.tone.full_resolution {
+                MeasuredSize::Own
+            } else {
+                MeasuredSize::Loaded
+            },
             hold_out: self.stop.views,
             depth: DepthOptions {
                 load: self.model.depth,

@@ -29,7 +29,7 @@ use crate::{Error, Result};
 use geometry::Shared;
 pub use noise::Noise;
 use photograph::PhotographStatistics;
-pub use plan::{PlannedNumber, Plan, PlannedViews, PlannedPart};
+pub use plan::{Plan, PlannedNumber, PlannedPart, PlannedViews};
 
 /// A view this many times as blurred as the median is named, and at least so many pixels more.
 const BLURRED: [f64; 2] = [1.6, 0.7];

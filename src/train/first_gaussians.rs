@@ -8,7 +8,7 @@ use glam::{DVec3, Vec3};
 use super::views::{ImageKind, TrainView, Views};
 use super::{TrainConfig, streams};
 use crate::base::random::Stream;
-use crate::camera::{Camera, TrainingFrame, Patch};
+use crate::camera::{Camera, Patch, TrainingFrame};
 use crate::gpu::Gpu;
 use crate::loss::exposure::Affine;
 use crate::networks::NetworkVariant;
@@ -27,7 +27,8 @@ impl Views {
         frame: &TrainingFrame,
     ) -> Cow<'a, [Point]> {
         let own = &dataset.points;
-        let wanted = if own.is_empty() { config.random_points } else { config.density.sparse_threshold() };
+        let wanted =
+            if own.is_empty() { config.random_points } else { config.density.sparse_threshold() };
         let count = wanted.min(config.max_gaussians).saturating_sub(own.len());
         if count == 0 {
             return own.into();
@@ -78,7 +79,8 @@ impl Views {
             Gaussians::from_points(&positions, &colors, shape, &config.start, seed)?;
         if config.model.network.variant == NetworkVariant::Identity {
             let low = if shape.features.illumination {
-                let mut photographs = ImageBatches::new(self, gpu, pseudo_gt, ImageKind::Photographs);
+                let mut photographs =
+                    ImageBatches::new(self, gpu, pseudo_gt, ImageKind::Photographs);
                 init::colors_from_views(kept, &dataset.views, |index| {
                     places[index].map(|place| photographs.next(place)).transpose()
                 })?

@@ -46,8 +46,8 @@ impl Trainer {
             DensityControl::Paper => 1,
         };
         let grown = self.growth_limit()?.max(self.model.count());
-        let (room, why) = self.room(intersections);
-        let most = room.min(grown);
+        let (capacity, why) = self.capacity(intersections);
+        let most = capacity.min(grown);
         if self.seeds_at(self.step) {
             self.seed_depths(self.seeded_count().min(most))?;
             self.convergence.decisions.density_due = None;
@@ -56,9 +56,12 @@ impl Trainer {
         let round = Round { step: self.step, rounds_left, most };
         let report = self.densify(round)?;
         self.convergence.decisions.density_due = None;
-        if report.refused > 0 && room < self.config.max_gaussians && !self.growth.has_logged_capacity {
+        if report.refused > 0
+            && capacity < self.config.max_gaussians
+            && !self.growth.has_logged_capacity
+        {
             self.growth.has_logged_capacity = true;
-            tracing::warn!("growth stops at {room} Gaussians, {why}");
+            tracing::warn!("growth stops at {capacity} Gaussians, {why}");
         }
         self.reserve()
     }
@@ -87,7 +90,7 @@ impl Trainer {
 
     /// How many Gaussians there is room for, at least as many as there are, and what there is no more of. A view may have
     /// twice as many intersections for each Gaussian as the last one had.
-    fn room(&self, intersections: u32) -> (usize, &'static str) {
+    fn capacity(&self, intersections: u32) -> (usize, &'static str) {
         let pixels = |size: UVec2| f64::from(size.x) * f64::from(size.y);
         let largest = self.supervision.views.sizes().into_iter().map(pixels).fold(0.0, f64::max);
         let shrunk = largest / pixels(self.view_of(self.step).size());
@@ -101,8 +104,9 @@ impl Trainer {
             (self.fitting_in_vram(each), "all that fits into max_vram"),
             (self.fitting_in_ram(each), "all that fits into max_ram"),
         ];
-        let (room, why) = bounds.into_iter().min_by_key(|(room, _)| *room).unwrap_or(bounds[0]);
-        (room.max(count), why)
+        let (capacity, why) =
+            bounds.into_iter().min_by_key(|(capacity, _)| *capacity).unwrap_or(bounds[0]);
+        (capacity.max(count), why)
     }
 
     /// The most Gaussians there may be, by the setting and by what passes of the renderer bind.

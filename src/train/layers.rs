@@ -10,8 +10,8 @@ use std::path::{Path, PathBuf};
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
 
-use super::TrainConfig;
 use super::settings::{SETTINGS, flat, number, setting, takes, unknown, value};
+use super::{TrainConfig, old_keys};
 use crate::base::input;
 use crate::base::settings::Setting;
 use crate::photographs::tone::{OF_CURVE, ToneCurve};
@@ -112,7 +112,7 @@ impl SettingsLayer {
     /// # Errors
     /// The key is no setting, or the setting does not take the value.
     pub fn push(&mut self, key: &str, value: Value, origin: Origin) -> Result<()> {
-        let key = if key == "tone.family" { "tone.curve" } else { key };
+        let key = old_keys::current(key);
         // The constants of a curve can be set one by one.
         let is_part = key.strip_prefix("tone.constants.").is_some_and(|name| !name.contains('.'));
         match setting(key) {
@@ -155,9 +155,9 @@ impl Settings {
             "tone.auto_gain" => 1,
             _ => 2,
         };
-        let mut said: Vec<_> = layer.0.iter().collect();
-        said.sort_by_key(|(key, ..)| order(key));
-        for (key, value, origin) in said {
+        let mut stated: Vec<_> = layer.0.iter().collect();
+        stated.sort_by_key(|(key, ..)| order(key));
+        for (key, value, origin) in stated {
             self.set(key, value.clone(), origin.clone());
         }
     }
@@ -213,8 +213,9 @@ impl Settings {
 
     /// Where a value comes from, in words.
     fn origin(&self, row: &Setting) -> String {
-        let said = self.0.get(row.key.as_ref()).map(|(_, origin)| origin.to_string());
-        said.or_else(|| row.absent.map(str::to_owned))
+        let stated = self.0.get(row.key.as_ref()).map(|(_, origin)| origin.to_string());
+        stated
+            .or_else(|| row.absent.map(str::to_owned))
             .unwrap_or_else(|| Origin::Default.to_string())
     }
 
@@ -423,7 +424,8 @@ mod tests {
     fn a_written_configuration_says_who_says_each_value_and_reads_as_it_is() {
         let mut settings = Settings::default();
         settings.merge(
-            &SettingsLayer::of_toml("steps = 700\n[stop]\nviews = 0", &Origin::Preset("fast")).unwrap(),
+            &SettingsLayer::of_toml("steps = 700\n[stop]\nviews = 0", &Origin::Preset("fast"))
+                .unwrap(),
         );
         let mut set = SettingsLayer::default();
         set.assign("steps=9").unwrap();

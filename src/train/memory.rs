@@ -223,9 +223,9 @@ impl PerGaussian {
         while count >= 1.0 && count < most {
             count = (2.0 * count).min(most);
             if count > capacity {
-                let room = (HEADROOM * count).min(most).max(count);
-                peak = peak.max(self.growing(capacity, room));
-                capacity = room;
+                let grown = (HEADROOM * count).min(most).max(count);
+                peak = peak.max(self.growing(capacity, grown));
+                capacity = grown;
             }
         }
         peak.max(self.saving(capacity))

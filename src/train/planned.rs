@@ -5,7 +5,7 @@ use std::path::Path;
 use toml::Value;
 
 use super::diagnose::{Diagnosis, Plan};
-use super::layers::{SettingsLayer, Origin, Settings};
+use super::layers::{Origin, Settings, SettingsLayer};
 use super::{Preset, TrainConfig, Trainer};
 use crate::gpu::Gpu;
 use crate::photographs::dataset::{Dataset, LoadOptions};
@@ -54,8 +54,8 @@ impl RequestedSettings {
     /// # Errors
     /// A plan that was written by hand has a number out of its range.
     pub fn settings(&self, plan: Option<&Plan>) -> Result<Settings> {
-        let said = [&self.file, &self.options, &self.set];
-        let get = |key: &str| said.iter().rev().find_map(|layer| layer.get(key));
+        let requested = [&self.file, &self.options, &self.set];
+        let get = |key: &str| requested.iter().rev().find_map(|layer| layer.get(key));
         let mut settings = Settings::default();
         if let Some(preset) = self.preset {
             let curve = get("tone.curve").and_then(|name| name.as_str()?.parse().ok());
@@ -64,7 +64,7 @@ impl RequestedSettings {
         }
         if let Some(plan) = plan {
             // Whoever says anything of how photographs are brightened has decided that.
-            let names_a_curve = said.iter().any(|layer| layer.names("tone."));
+            let names_a_curve = requested.iter().any(|layer| layer.names("tone."));
             // Exposures and the tonemapper exclude each other, and a plan never asks for both.
             let has_tonemapper = get("model.tonemapper") == Some(&Value::Boolean(true));
             let mut layer = plan.layer()?;
@@ -75,7 +75,7 @@ impl RequestedSettings {
             });
             settings.merge(&layer);
         }
-        for layer in said {
+        for layer in requested {
             settings.merge(layer);
         }
         Ok(settings)
@@ -133,7 +133,9 @@ impl Preset {
     /// # Errors
     /// None for the presets that there are.
     pub fn load_options(self) -> Result<LoadOptions> {
-        let config = RequestedSettings { preset: Some(self), ..RequestedSettings::default() }.settings(None)?.config()?;
+        let config = RequestedSettings { preset: Some(self), ..RequestedSettings::default() }
+            .settings(None)?
+            .config()?;
         Ok(if self.is_planned() { diagnosed(&config) } else { config.load_options() })
     }
 }
@@ -145,18 +147,19 @@ impl Trainer {
     /// # Errors
     /// The dataset cannot be used, or the device is out of memory or lost.
     pub fn planned(gpu: &Gpu, dataset: &Dataset, preset: Preset) -> Result<Self> {
-        let mut said = RequestedSettings { preset: Some(preset), ..RequestedSettings::default() };
+        let mut requested =
+            RequestedSettings { preset: Some(preset), ..RequestedSettings::default() };
         let root = dataset.root.to_str().ok_or_else(|| {
             Error::input(&dataset.root, "is not Unicode; move it to a path that is")
         })?;
-        said.options.push("dataset", root.into(), Origin::Option("dataset"))?;
-        let config = said.settings(None)?.config()?;
+        requested.options.push("dataset", root.into(), Origin::Option("dataset"))?;
+        let config = requested.settings(None)?.config()?;
         if !preset.is_planned() {
             return Self::new(gpu, config, dataset);
         }
         let plan = planned(&Diagnosis::of(dataset, &diagnosed(&config))?, &config, gpu);
         let mut dataset = dataset.clone();
         dataset.leave_out(&plan.left_out);
-        Self::new(gpu, said.settings(Some(&plan))?.config()?, &dataset)
+        Self::new(gpu, requested.settings(Some(&plan))?.config()?, &dataset)
     }
 }

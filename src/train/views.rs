@@ -12,7 +12,7 @@ use super::epochs::Epochs;
 use super::measuring::{TargetExposure, measured, photographs};
 use super::precision::Encoder;
 use crate::Result;
-use crate::camera::{TrainingFrame, Patch};
+use crate::camera::{Patch, TrainingFrame};
 use crate::gpu::{Buffer, Download, Gpu, Recorder};
 use crate::kernels::ToneParameters;
 use crate::loss::ViewSource;
@@ -108,7 +108,8 @@ impl Views {
             let own = view.own_size().filter(|_| settings.full_resolution);
             let is_larger = own.filter(|own| sizes.iter().any(|size| size != own));
             let whole = if is_larger.is_some() { view.photograph()? } else { None };
-            let whole = whole.map(|whole| pseudo_gt.tone_mapped(&whole, &tone_mapping)).transpose()?;
+            let whole =
+                whole.map(|whole| pseudo_gt.tone_mapped(&whole, &tone_mapping)).transpose()?;
             for (views, size) in views.iter_mut().zip(sizes) {
                 let resized = |whole: &Image| view.blacked_out(whole.resized(size.x, size.y));
                 let camera = frame.camera(&view.camera).resized(size.x, size.y);

@@ -98,7 +98,16 @@ fn a_run_directory_has_its_four_files_and_metrics_their_shape() {
     assert!(file_names(&run).iter().all(|name| !name.ends_with(".partial")));
     let metrics = json(run.join("metrics.json"));
     let residual_transmittance = "residual_transmittance";
-    let known = ["mean", "views", "seconds", "gaussians", "steps", residual_transmittance, "spent", "ended"];
+    let known = [
+        "mean",
+        "views",
+        "seconds",
+        "gaussians",
+        "steps",
+        residual_transmittance,
+        "spent",
+        "ended",
+    ];
     assert_eq!(keys(&metrics), known);
     assert_eq!(keys(&metrics[residual_transmittance]), ["mean", "views"]);
     assert_eq!(keys(&metrics[residual_transmittance]["views"]["008"]), ["mean", "q99"]);

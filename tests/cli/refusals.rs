@@ -204,7 +204,8 @@ fn every_setting_is_explained_with_who_says_it_and_nothing_is_trained() {
     let message = explained(&format!("--preset draft --config {} --steps 5", file.display()));
     assert!(message.contains(&format!("near = 0.2  ({})\n", file.display())), "{message}");
     assert!(
-        message.contains("steps = 5  (--steps)\n") && message.contains("sh_degree = 0  (preset draft)"),
+        message.contains("steps = 5  (--steps)\n")
+            && message.contains("sh_degree = 0  (preset draft)"),
         "{message}"
     );
     assert!(!run.exists());

@@ -148,7 +148,8 @@ impl<'a> Chain<'a> {
         }
         let planes = self.setup.planes();
         for (j, &i) in ids.iter().enumerate() {
-            let d_splat = self.d_splat(&gradient_records[record * j..][..record], &colors[channels * j..]);
+            let d_splat =
+                self.d_splat(&gradient_records[record * j..][..record], &colors[channels * j..]);
             let gaussian = planes.load(parameters, i);
             let degree = self.setup.options.sh_degree;
             let d = project_gaussian_backward(&camera, degree, &gaussian, &splats[j], &d_splat);

@@ -85,9 +85,9 @@ fn what_validation_says_fails_the_process_and_names_the_test() {
         [&output.stdout, &output.stderr].map(|text| String::from_utf8_lossy(text));
     assert!(stdout.contains("1 passed"), "the test itself must not notice: {stdout}");
     assert_eq!(output.status.code(), Some(101), "{stderr}");
-    let said = format!("{NAME}: ");
+    let prefix = format!("{NAME}: ");
     // Newer layers take more than a line.
-    let message = stderr.split_once(&said).unwrap_or_default().1;
+    let message = stderr.split_once(&prefix).unwrap_or_default().1;
     assert!(message.contains("VUID-VkBufferCreateInfo-size-00912"), "{stderr}");
 }
 

@@ -194,7 +194,8 @@ fn the_same_step_leaves_the_same_bits() {
     let values = 3 * size.element_product() as usize;
     let (denoised, render) = (noise(1, values, 0.0, 1.0), noise(2, values, 0.0, 1.0));
     let step = || {
-        let outcome = evaluate(&gpu, WEIGHTS, (size, LossRegion::whole(size)), [&denoised, &render]);
+        let outcome =
+            evaluate(&gpu, WEIGHTS, (size, LossRegion::whole(size)), [&denoised, &render]);
         let terms = [Term::DENOISING, Term::TOTAL_VARIATION];
         let values = terms.map(|term| outcome.logged.losses.get(term));
         (bits(&values), bits(&outcome.d_denoised), bits(&outcome.d_render))

@@ -4,7 +4,7 @@ use glam::UVec2;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::gpu::{Gpu, Reference, Threads};
 use nightsplat::kernels::{l1, ssim};
-use nightsplat::loss::{Gradient, LossRegion, Loss, LossInputs, LossSettings, Term};
+use nightsplat::loss::{Gradient, Loss, LossInputs, LossRegion, LossSettings, Term};
 use nightsplat::reference::ssim::{gradient, ssim};
 
 use super::{NOT_FINITE, Torch, assert_close, bits, central_differences, largest, log_step};
@@ -285,7 +285,8 @@ fn outside_the_interior_the_value_ignores_the_render_but_ssim_does_not() {
 #[test]
 fn a_nan_beyond_every_window_of_the_interior_changes_nothing() {
     let gpu = gpu();
-    let (size, loss_region) = ([40, 40], LossRegion { origin: UVec2::splat(8), size: UVec2::splat(10) });
+    let (size, loss_region) =
+        ([40, 40], LossRegion { origin: UVec2::splat(8), size: UVec2::splat(10) });
     let images = images(size);
     let mut spoilt = images.clone();
     spoilt[0][39 * 40 + 39] = f32::NAN;

@@ -184,9 +184,9 @@ fn the_gradient_through_exposure_and_renderer_is_its_central_difference() {
     assert!(gradients[..WIDTH].iter().chain(&gradients[2 * WIDTH..]).all(|&d| d == 0.0));
 
     // Of the Gaussians: the chain behind the gradient that the exposure passes on, against differences of all of it.
-    let mut behind = Chain::new(&setup);
-    behind.d_render = d_render;
-    let gradient = behind.run(&parameters).gradient;
+    let mut downstream = Chain::new(&setup);
+    downstream.d_render = d_render;
+    let gradient = downstream.run(&parameters).gradient;
     let mut exposed = Chain::new(&setup);
     for (i, weight) in exposed.d_render.iter_mut().enumerate() {
         *weight *= own.gain[i / pixels];

@@ -5,7 +5,7 @@ use nightsplat::base::random::Stream;
 use nightsplat::gpu::Reference;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::{crop_gather, crop_scatter};
-use nightsplat::networks::crop::{PaddedCrop, CropKernels};
+use nightsplat::networks::crop::{CropKernels, PaddedCrop};
 
 #[test]
 fn a_crop_is_a_cell_of_the_view_and_its_margin_is_cut_off_there() {
@@ -66,7 +66,11 @@ fn gathering_and_scattering_match_their_references() {
     let crops = CropKernels::new(&gpu).unwrap();
     for (size, crop, planes) in [
         (UVec2::ONE, PaddedCrop::whole(UVec2::ONE), 0..1),
-        (UVec2::new(33, 17), PaddedCrop::random(UVec2::new(33, 17), 9, 2, &Stream::new(3, 0), 1), 2..5),
+        (
+            UVec2::new(33, 17),
+            PaddedCrop::random(UVec2::new(33, 17), 9, 2, &Stream::new(3, 0), 1),
+            2..5,
+        ),
         (UVec2::new(64, 5), PaddedCrop::whole(UVec2::new(64, 5)), 1..4),
     ] {
         let pixels = size.element_product() as usize;
@@ -97,14 +101,7 @@ fn gathering_and_scattering_match_their_references() {
         let mut device_content = gpu.zeros("content", content.len()).unwrap();
         gpu.run("windows", |pass| {
             let planes = planes.clone();
-            crops.gather(
-                pass,
-                &device_image,
-                size,
-                planes.clone(),
-                &crop,
-                &mut device_content,
-            )?;
+            crops.gather(pass, &device_image, size, planes.clone(), &crop, &mut device_content)?;
             crops.scatter(pass, &device_content, &crop, planes, size, &mut device_sum)
         })
         .unwrap();
@@ -121,9 +118,8 @@ fn a_window_beyond_the_view_or_its_buffers_is_refused() {
     let image = gpu.zeros("image", 3 * 64).unwrap();
     let mut content = gpu.zeros("content", 3 * 64).unwrap();
     let mut problem = |crop: PaddedCrop, planes| {
-        let gathered = gpu.run("window", |pass| {
-            crops.gather(pass, &image, view, planes, &crop, &mut content)
-        });
+        let gathered =
+            gpu.run("window", |pass| crops.gather(pass, &image, view, planes, &crop, &mut content));
         gathered.unwrap_err().to_string()
     };
     let beyond = PaddedCrop { origin: UVec2::ONE, ..PaddedCrop::whole(view) };

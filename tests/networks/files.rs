@@ -3,7 +3,9 @@
 use std::path::Path;
 
 use nightsplat::gpu::testing::gpu;
-use nightsplat::networks::{Denoiser, DenoiserSettings, NetworkVariant, Precision, Tonemapper, load, save};
+use nightsplat::networks::{
+    Denoiser, DenoiserSettings, NetworkVariant, Precision, Tonemapper, load, save,
+};
 use safetensors::SafeTensors;
 
 const SMALL: DenoiserSettings = DenoiserSettings {

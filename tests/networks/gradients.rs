@@ -42,7 +42,9 @@ fn check_all(forward: Forward<'_>, gradients: &Gradients, [values, first, second
 fn the_gradient_of_the_denoiser_is_that_of_finite_differences() {
     let sizes = [([4, 3], 1), ([3, 5], 2), ([4, 4], 3)];
     let variants = [NetworkVariant::Identity, NetworkVariant::Paper];
-    for ((size, stages), variant) in sizes.into_iter().flat_map(|s| variants.map(|variant| (s, variant))) {
+    for ((size, stages), variant) in
+        sizes.into_iter().flat_map(|s| variants.map(|variant| (s, variant)))
+    {
         let settings =
             DenoiserSettings { stages, repeats: 2, channels: 4, variant, ..Default::default() };
         let denoiser = Denoiser { settings, size };

@@ -5,7 +5,7 @@ use nightsplat::reference::conv3x3::{activate, conv3x3, data_gradient};
 use nightsplat::reference::conv3x3_weight_gradient::weight_gradient;
 use nightsplat::reference::norm::{self, Affine, Statistics};
 use nightsplat::reference::residual::residual;
-use nightsplat::reference::residual_backward::behind_clamp;
+use nightsplat::reference::residual_backward::clamp_backward;
 
 /// A convolution in the flat array of a network's parameters.
 #[derive(Clone, Copy)]
@@ -156,7 +156,7 @@ impl Denoiser {
             let is_paper = self.settings.variant == NetworkVariant::Paper;
             if is_paper {
                 for i in 0..d.len() {
-                    d[i] = behind_clamp(render[i] - (stage.input[i] + stage.update[i]), d[i]);
+                    d[i] = clamp_backward(render[i] - (stage.input[i] + stage.update[i]), d[i]);
                 }
                 add(&mut d_render, &d);
             }

@@ -3,7 +3,9 @@
 use glam::UVec2;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::gpu::{CheckReport, DeviceChoice, Gpu};
-use nightsplat::networks::{Denoiser, DenoiserSettings, NetworkVariant, Parameters, Precision, Tonemapper};
+use nightsplat::networks::{
+    Denoiser, DenoiserSettings, NetworkVariant, Parameters, Precision, Tonemapper,
+};
 
 use super::model;
 use super::{largest, narrow, widen};

@@ -10,7 +10,7 @@ mod profile;
 use nightsplat::Error;
 use nightsplat::base::random::Stream;
 use nightsplat::photographs::fit::{
-    Channels, Fit, FitOptions, Pair, FitScene, Weighting, cross_validate, fit, psnr,
+    Channels, Fit, FitOptions, FitScene, Pair, Weighting, cross_validate, fit, psnr,
 };
 use nightsplat::photographs::image::Image;
 use nightsplat::photographs::tone::{FAMILIES, Family, Statistics, ToneCurve, ToneSettings, White};

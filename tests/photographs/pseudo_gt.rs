@@ -6,7 +6,9 @@ use nightsplat::gpu::testing::{gpu, gpu_that_binds};
 use nightsplat::kernels::ToneParameters;
 use nightsplat::photographs::image::Image;
 use nightsplat::photographs::pseudo_gt::PseudoGt;
-use nightsplat::photographs::tone::{ToneMapping, MeasuredPhotograph, SceneTone, ToneCurve, ToneSettings};
+use nightsplat::photographs::tone::{
+    MeasuredPhotograph, SceneTone, ToneCurve, ToneMapping, ToneSettings,
+};
 
 use crate::common::{assert_close, fixture, shared};
 
@@ -42,7 +44,8 @@ fn a_curve_follows_the_host_from_tiny_to_huge_values() {
 
 /// The lift of one photograph of its own, and the target on the device.
 fn tone_mapped(gpu: &Gpu, settings: &ToneSettings, photograph: &Image) -> (ToneMapping, Image) {
-    let tone_mapping = settings.tone_mapping(&SceneTone::default(), &MeasuredPhotograph::of(&photograph.data));
+    let tone_mapping =
+        settings.tone_mapping(&SceneTone::default(), &MeasuredPhotograph::of(&photograph.data));
     let pseudo_gt = PseudoGt::new(gpu, settings).unwrap();
     (tone_mapping, pseudo_gt.tone_mapped(photograph, &tone_mapping).unwrap())
 }
@@ -71,9 +74,11 @@ fn a_photograph_maps_on_the_device_as_on_the_host() {
     for path in committed.into_iter().chain(shared("data/lom/chair/low/1.JPG")) {
         let photograph = Image::load(path).unwrap();
         for curve in [ToneCurve::Linear, ToneCurve::Ase, ToneCurve::Ap3, ToneCurve::Hybrid] {
-            let (tone_mapping, target) = tone_mapped(&gpu(), &ToneSettings::new(curve), &photograph);
+            let (tone_mapping, target) =
+                tone_mapped(&gpu(), &ToneSettings::new(curve), &photograph);
             let values = photograph.data.iter();
-            let mapped: Vec<f32> = values.map(|&x| curve.apply(x, &tone_mapping.parameters)).collect();
+            let mapped: Vec<f32> =
+                values.map(|&x| curve.apply(x, &tone_mapping.parameters)).collect();
             assert_close(curve.name(), &target.data, &mapped, |_, _| 5e-6);
         }
     }

@@ -119,7 +119,10 @@ fn a_run_says_at_its_start_what_it_trains_and_why() {
     }
     assert!(message.contains("ended at step 30: all steps are done"), "{message}");
     let message = start("e", "--progress none --preset balanced --set steps=3 --test-every 3");
-    assert!(message.contains("no early end: 6 training views are too few to hold one out"), "{message}");
+    assert!(
+        message.contains("no early end: 6 training views are too few to hold one out"),
+        "{message}"
+    );
     let message = start("b", "--steps 1 --progress none --plan none --curve AP3 --test-every 5");
     assert!(message.contains("curve ap3: as asked for"), "{message}");
     assert!(message.contains("2 test views (every 5th by name, as asked for)"), "{message}");
@@ -135,7 +138,10 @@ fn another_split_is_asked_for_said_and_kept() {
     let folder = folder();
     let path = |name: &str| folder.path().join(name);
     let (_, message) = run(&train(folder.path(), "run", "--steps 2 --test-every 3"), 0);
-    assert!(message.contains("its transforms files split the views") && message.contains("3"), "{message}");
+    assert!(
+        message.contains("its transforms files split the views") && message.contains("3"),
+        "{message}"
+    );
     let views = |run: &str| -> Vec<String> {
         let metrics = json(path(run).join("metrics.json"));
         metrics["views"].as_object().unwrap().keys().cloned().collect()
@@ -372,7 +378,10 @@ fn large_photographs_shrink_to_a_limit_that_is_said_and_recorded() {
     // Behind another factor, which does more by itself.
     let (_, message) =
         run(&train(folder.path(), "both", "--steps 2 --max-resolution 40 --downscale 2"), 0);
-    assert!(!message.contains("trained on at") && views("both").contains("001,train,24,16"), "{message}");
+    assert!(
+        !message.contains("trained on at") && views("both").contains("001,train,24,16"),
+        "{message}"
+    );
     succeed(&train(folder.path(), "none", "--steps 2 --max-resolution none"));
     assert!(views("none").contains("001,train,48,32"));
     let config = fs::read_to_string(path("none/config.toml")).unwrap();

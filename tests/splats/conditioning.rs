@@ -84,7 +84,16 @@ fn errors_of(count: usize) -> [f64; 2] {
             let error = (f64::from(rendered.render[c * pixels + at]) - value).abs();
             forward = forward.max(error / largest_color);
         }
-        blend_pixel_backward(&splats, &colors, &values, &d, center, alpha_max, 3, &mut gradient_records);
+        blend_pixel_backward(
+            &splats,
+            &colors,
+            &values,
+            &d,
+            center,
+            alpha_max,
+            3,
+            &mut gradient_records,
+        );
     }
     let backward = (0..RECORD).map(|k| {
         let own = |values: &dyn Fn(usize) -> f64| {

@@ -10,8 +10,8 @@ use nightsplat::gpu::testing::gpu;
 use nightsplat::splats::densify::{
     Densifier, DensifyInputs, DensifyReport, DensifySettings, DensityControl, Round,
 };
-use nightsplat::splats::packed_sh::StorageFormat;
 use nightsplat::splats::optimizer::Moments;
+use nightsplat::splats::packed_sh::StorageFormat;
 use nightsplat::splats::render::{RenderOptions, RenderSettings, Renderer};
 use nightsplat::splats::scene::{DeviceGaussians, Layout};
 

@@ -260,7 +260,10 @@ fn a_view_has_at_most_the_tiles_that_a_subgroup_of_gaussians_that_cover_them_all
     let tiles = most - 64 - 2 * lanes;
     let intersection_ids = (tiles * lanes) as usize;
     let intersection_ranges: Vec<_> = (0..lanes).map(|i| UVec2::new(i, i + 1) * tiles).collect();
-    assert_eq!(sums(intersection_ranges, &vec![[Vec3::ONE; 4]; intersection_ids]), vec![tiles as f32; lanes as usize]);
+    assert_eq!(
+        sums(intersection_ranges, &vec![[Vec3::ONE; 4]; intersection_ids]),
+        vec![tiles as f32; lanes as usize]
+    );
 }
 
 /// What the refusal of a view names as the longest side is one that fits, and not much less than could.

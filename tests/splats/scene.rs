@@ -97,7 +97,8 @@ mod from_points {
 
     fn scales(positions: &[DVec3]) -> Vec<f32> {
         let colors = vec![Vec3::ZERO; positions.len()];
-        let gaussians = Gaussians::from_points(positions, &colors, 0, &Initialization::PAPER, 0).unwrap();
+        let gaussians =
+            Gaussians::from_points(positions, &colors, 0, &Initialization::PAPER, 0).unwrap();
         gaussians.log_scales().iter().map(|log_scale| log_scale.x.exp()).collect()
     }
 
@@ -105,7 +106,8 @@ mod from_points {
     fn every_attribute_begins_as_in_3dgs() {
         let positions = [DVec3::ZERO, DVec3::X, DVec3::Y * 2.0, DVec3::Z * 3.0];
         let colors = [Vec3::new(0.1, 0.5, 0.9); 4];
-        let gaussians = Gaussians::from_points(&positions, &colors, 2, &Initialization::PAPER, 0).unwrap();
+        let gaussians =
+            Gaussians::from_points(&positions, &colors, 2, &Initialization::PAPER, 0).unwrap();
         assert_eq!((gaussians.count, gaussians.shape), (4, 2.into()));
         assert_eq!(gaussians.means()[2], Vec3::new(0.0, 2.0, 0.0));
         assert_eq!(gaussians.quats(), [[1.0, 0.0, 0.0, 0.0]; 4]);
@@ -163,7 +165,10 @@ mod from_points {
         for (start, name) in [
             (Initialization { opacity: 1.0, ..Initialization::PAPER }, "start.opacity"),
             (Initialization { scale: 0.0, ..Initialization::PAPER }, "start.scale"),
-            (Initialization { min_axis_ratio: f64::NAN, ..Initialization::PAPER }, "start.min_axis_ratio"),
+            (
+                Initialization { min_axis_ratio: f64::NAN, ..Initialization::PAPER },
+                "start.min_axis_ratio",
+            ),
         ] {
             let message = Gaussians::from_points(&[], &[], 0, &start, 0).unwrap_err().to_string();
             assert!(message.contains(name), "{message}");

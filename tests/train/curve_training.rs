@@ -7,7 +7,9 @@ use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
 use nightsplat::photographs::dataset::{Dataset, LoadOptions};
 use nightsplat::photographs::image::Image;
 use nightsplat::photographs::pseudo_gt::PseudoGt;
-use nightsplat::photographs::tone::{GainChoice, MeasuredPhotograph, Table, ToneCurve, ToneSettings};
+use nightsplat::photographs::tone::{
+    GainChoice, MeasuredPhotograph, Table, ToneCurve, ToneSettings,
+};
 use nightsplat::train::{TargetExposure, TrainConfig, Trainer};
 
 /// The losses of the first steps, and the parameters after them.
@@ -160,11 +162,13 @@ fn photographs_are_lifted_before_they_are_shrunk() {
         .map(|view| (view.name.clone(), view.photograph().unwrap().unwrap().into_owned()));
     let photographs: Vec<(String, Image)> = photographs.collect();
     let seen = photographs.iter().zip(shrunk.train_views());
-    let measured: Vec<_> =
-        seen.map(|((_, image), view)| MeasuredPhotograph::of(&image.data).seen_by(&view.camera)).collect();
+    let measured: Vec<_> = seen
+        .map(|((_, image), view)| MeasuredPhotograph::of(&image.data).seen_by(&view.camera))
+        .collect();
     let scene = settings.scene(&measured).unwrap();
     for ((name, photograph), measured) in photographs.iter().zip(&measured) {
-        let tone_mapped = pseudo_gt.tone_mapped(photograph, &settings.tone_mapping(&scene, measured)).unwrap();
+        let tone_mapped =
+            pseudo_gt.tone_mapped(photograph, &settings.tone_mapping(&scene, measured)).unwrap();
         tone_mapped.save_png16(folder.path().join("low").join(format!("{name}.png"))).unwrap();
     }
     let elsewhere = train(&config(ToneSettings::new(ToneCurve::None)), &load()).0;

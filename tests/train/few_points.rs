@@ -81,8 +81,11 @@ fn the_views_are_shown_better_after_as_many_steps() {
 #[test]
 fn many_points_the_papers_control_and_a_setting_of_zero_change_nothing() {
     let with = |fill: usize, density: DensityConfig, points: usize| {
-        let config =
-            TrainConfig { steps: 40, density: DensityConfig { depth_seeding: fill, ..density }, ..config() };
+        let config = TrainConfig {
+            steps: 40,
+            density: DensityConfig { depth_seeding: fill, ..density },
+            ..config()
+        };
         train(&config, &dataset(points).1).1
     };
     let default = DensityConfig::default();

@@ -12,7 +12,9 @@ use nightsplat::photographs::dataset::synthetic::{self, Capture, SyntheticOption
 use nightsplat::photographs::dataset::{Dataset, View};
 use nightsplat::photographs::image::{Image, Mask};
 use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
-use nightsplat::results::eval::{self, ResidualTransmittance, MAX_RESIDUAL_TRANSMITTANCE, ModelRenderer};
+use nightsplat::results::eval::{
+    self, MAX_RESIDUAL_TRANSMITTANCE, ModelRenderer, ResidualTransmittance,
+};
 use nightsplat::train::{Background, Part, TrainConfig, Trainer};
 
 use serde_json::Value;
@@ -81,7 +83,8 @@ fn left_over(background: Background, dataset: &Dataset) -> (Vec<f64>, Option<Str
     let mut trainer = Trainer::new(&gpu(), config.clone(), dataset).unwrap();
     advance(&mut trainer, config.steps);
     let scored = eval::score(dataset, |view| trainer.render(&view.camera)).unwrap();
-    let views = scored.iter().map(|view| (view.name.as_str(), view.residual_transmittance.unwrap()));
+    let views =
+        scored.iter().map(|view| (view.name.as_str(), view.residual_transmittance.unwrap()));
     let warning = eval::hole_warning(views.clone(), background);
     (views.map(|(_, residual_transmittance)| residual_transmittance.mean).collect(), warning)
 }
@@ -181,8 +184,8 @@ fn holes_are_said_by_train_eval_and_diagnose() {
     let (_, warned) = command::run(&all, 0);
     assert!(warning(&warned) == 1 && warned.contains("of 6 views"), "{warned}");
 
-    let (said, _) = command::run(&format!("diagnose {set} --run {run}"), 0);
-    assert!(said.contains("note: view ") && warning(&said) == 1, "{said}");
+    let (message, _) = command::run(&format!("diagnose {set} --run {run}"), 0);
+    assert!(message.contains("note: view ") && warning(&message) == 1, "{message}");
     let json: Value =
         serde_json::from_str(&succeed(&format!("diagnose {set} --run {run} --json"))).unwrap();
     let views = json["residual_transmittance"].as_object().unwrap();

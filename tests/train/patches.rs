@@ -230,8 +230,8 @@ fn a_run_on_patches_says_so_is_resumed_to_the_same_bits_and_scored() {
     let place = Place::new();
     let output =
         command(&place.train("straight", "--steps 30 --patch-pixels 600")).output().unwrap();
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert!(said.contains("40x30, in 2 of about 20x30"), "{said}");
+    let message = String::from_utf8_lossy(&output.stderr);
+    assert!(message.contains("40x30, in 2 of about 20x30"), "{message}");
     let config = String::from_utf8(place.read("straight/config.toml")).unwrap();
     assert!(config.contains("patch_pixels = 600"));
     let stopped = "--steps 30 --patch-pixels 600 --hash-every 7 --max-minutes 1e-7";

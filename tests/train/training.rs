@@ -35,7 +35,8 @@ fn config() -> TrainConfig {
 }
 
 fn mean_psnr(dataset: &Dataset, gaussians: &Gaussians) -> f64 {
-    let mut model_renderer = ModelRenderer::new(&gpu(), gaussians, &TrainConfig::bare(), None).unwrap();
+    let mut model_renderer =
+        ModelRenderer::new(&gpu(), gaussians, &TrainConfig::bare(), None).unwrap();
     let scored = eval::score(dataset, |view| model_renderer.render(view)).unwrap();
     let scores: Vec<Scores> = scored.iter().map(|view| view.scores).collect();
     Scores::mean(&scores).unwrap().psnr
@@ -333,6 +334,7 @@ fn a_render_shows_what_its_model_was_trained_to() {
     let view = &dataset.views[0];
     let in_training = trainer.render(&view.camera).unwrap();
     let mut model_renderer =
-        ModelRenderer::new(&gpu(), &trainer.gaussians().unwrap(), &TrainConfig::bare(), None).unwrap();
+        ModelRenderer::new(&gpu(), &trainer.gaussians().unwrap(), &TrainConfig::bare(), None)
+            .unwrap();
     assert_eq!(in_training.colors.data, model_renderer.render(view).unwrap().colors.data);
 }

@@ -140,9 +140,9 @@ fn a_resumed_run_stays_in_its_frame_and_an_old_one_in_its_world() {
     // As a version wrote it that knew no frames.
     let path = out.join("config.toml");
     let text = std::fs::read_to_string(&path).unwrap();
-    let (before, behind) = text.split_once("[frame]\n").unwrap();
-    let behind = behind.split_once("\n[").map_or("", |(_, behind)| behind);
-    std::fs::write(&path, format!("{before}[{behind}")).unwrap();
+    let (before, after) = text.split_once("[frame]\n").unwrap();
+    let after = after.split_once("\n[").map_or("", |(_, after)| after);
+    std::fs::write(&path, format!("{before}[{after}")).unwrap();
     let longer = TrainConfig { steps: 9, ..longer };
     let old = run::train(&gpu(), &longer, &dataset, &out, IfExists::Resume, |_| {}).unwrap();
     assert_eq!(*old.trainer.frame(), TrainingFrame::WORLD);

@@ -29,10 +29,10 @@ layout(binding = 1) readonly  buffer SortedKeys { uint sorted_keys[]; };      //
 layout(binding = 2) readonly  buffer SortedIds  { uint sorted_ids[]; };       // (gaussian_count)
 layout(binding = 3) buffer Counters { uint counters[]; };                           // TALLY_*
 layout(binding = 4) writeonly buffer Actions      { uint actions[]; };            // (gaussian_count), FATE_*
-layout(binding = 5) writeonly buffer Offspring  { uint child_counts[]; }; // (gaussian_count)
+layout(binding = 5) writeonly buffer ChildCounts  { uint child_counts[]; }; // (gaussian_count)
 
 // How many may multiply; each adds one Gaussian.
-uint room() {
+uint available() {
     uint kept = gaussian_count - counters[COUNTER_PRUNED];
     uint free = max(max_gaussians, kept) - kept;
     return min(max_added, free / rounds_left + (free % rounds_left > 0 ? 1 : 0));
@@ -50,7 +50,7 @@ void main() {
     uint i = sorted_ids[place], key = sorted_keys[place];
     // Unsigned: what lies before the batch wraps beyond its end.
     if (i - first_gaussian >= batch_count) return;
-    uint first_without = room();
+    uint first_without = available();
     uint end = counters[COUNTER_CANDIDATES] > first_without ? sorted_keys[first_without] : KEY_KEEP;
     uint action = key == KEY_PRUNE ? ACTION_PRUNE : ACTION_KEEP;
     if (key < end) action = is_small(i) ? ACTION_CLONE : ACTION_SPLIT;

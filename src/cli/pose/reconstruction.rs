@@ -114,7 +114,7 @@ impl<'a> Reconstruction<'a> {
         say("features matched")?;
         // It fails where it found nothing to begin with, which is said of the photographs.
         match self.place(tone_mapped) {
-            Err(_) if NOTHING.iter().any(|words| self.colmap.said(words)) => {}
+            Err(_) if NOTHING.iter().any(|words| self.colmap.printed(words)) => {}
             outcome => outcome?,
         }
         say("cameras placed")

@@ -31,7 +31,8 @@ pub(super) fn write(gpu: &Gpu, photographs: &[PathBuf], folder: &Path) -> Result
     let root = photographs.first().and_then(|path| path.parent()).unwrap_or(folder);
     let scene = settings.scene(&measured).ok_or_else(|| all_black(root))?;
     for (path, measured) in photographs.iter().zip(&measured) {
-        let image = pseudo_gt.tone_mapped(&Image::load(path)?, &settings.tone_mapping(&scene, measured))?;
+        let image =
+            pseudo_gt.tone_mapped(&Image::load(path)?, &settings.tone_mapping(&scene, measured))?;
         let name = path.file_name().unwrap_or_default();
         if is_jpeg(path) {
             image.save_jpeg(folder.join(name), exif_of(path)?.as_deref())?;

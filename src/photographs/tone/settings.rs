@@ -428,6 +428,7 @@ struct SerializedToneSettings {
     #[serde(skip_serializing_if = "Option::is_none")]
     brightness: Option<f64>,
     colour: Option<f64>,
+    #[serde(alias = "lift_first")]
     full_resolution: Option<bool>,
     #[serde(skip_serializing_if = "Option::is_none")]
     constants: Option<BTreeMap<String, f64>>,
@@ -447,8 +448,8 @@ impl TryFrom<SerializedToneSettings> for ToneSettings {
             (None, None) => ToneCurve::Auto,
         };
         if written.family.is_some() {
-            static SAID: std::sync::Once = std::sync::Once::new();
-            SAID.call_once(|| {
+            static WARNED: std::sync::Once = std::sync::Once::new();
+            WARNED.call_once(|| {
                 tracing::warn!("`family` of a curve is called `curve` now; the old name is read");
             });
             if written.curve.is_some() {

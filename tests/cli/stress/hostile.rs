@@ -35,7 +35,8 @@ const NEIGHBOURS: usize = 12;
 
 /// Steps that do the same work, in the world, without density control.
 fn config() -> TrainConfig {
-    let mut config = TrainConfig { steps: STEPS, frame: Some(TrainingFrame::WORLD), ..TrainConfig::bare() };
+    let mut config =
+        TrainConfig { steps: STEPS, frame: Some(TrainingFrame::WORLD), ..TrainConfig::bare() };
     config.tone = ToneSettings::new(ToneCurve::Ap3);
     config.schedule.sh_degree_interval = 1;
     config.schedule.initial_rate_factor = 1.0;

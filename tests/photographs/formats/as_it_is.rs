@@ -33,7 +33,10 @@ fn of_several_models_the_one_that_places_the_most_photographs_is_taken_and_said(
     assert_eq!(dataset.points.len(), 20);
     assert!(dataset.points[0].views.len() > 2);
     let message = message_of(root);
-    assert!(message.contains("3 models, of 2, 9, 0 photographs; sparse/1, the largest"), "{message}");
+    assert!(
+        message.contains("3 models, of 2, 9, 0 photographs; sparse/1, the largest"),
+        "{message}"
+    );
 }
 
 #[test]
@@ -53,7 +56,10 @@ fn photographs_without_a_pose_and_pictures_that_are_not_read_are_counted() {
         "1 .heic, 1 .mp4",
         "heif-convert",
     ];
-    assert!(parts.iter().all(|part| message.contains(part)) && !message.contains("txt"), "{message}");
+    assert!(
+        parts.iter().all(|part| message.contains(part)) && !message.contains("txt"),
+        "{message}"
+    );
     // Where all have one, there is nothing to say.
     model(9).write_text(&root.join("sparse/0"));
     fs::remove_file(root.join("images/IMG_1.HEIC")).unwrap();

@@ -8,8 +8,8 @@ use nightsplat::kernels::{self, densify_decide, densify_moments, densify_scatter
 use nightsplat::splats::densify::{
     Densifier, DensifyInputs, DensifyReport, DensifySettings, DensityControl, LARGEST_CHANGE, Round,
 };
-use nightsplat::splats::packed_sh::StorageFormat;
 use nightsplat::splats::optimizer::Moments;
+use nightsplat::splats::packed_sh::StorageFormat;
 use nightsplat::splats::scene::{DeviceGaussians, Features, GaussianSlice, Layout, Shape, width};
 
 /// Four features and SH of degree 1.
