@@ -7,5 +7,6 @@ mod common;
 
 mod architecture;
 mod circles;
+mod documents;
 mod install;
 mod settings;
