@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Runs every command of README.md's `sh` blocks, in order, in a copy of this checkout; `cargo install` goes first. What is
-# left out is named by a comment of the README, `<!-- follow: ... -->`, and by a line of the output, `not run: COMMAND`.
+# Runs every command of README.md's `sh` blocks, in order, in a copy of this checkout; `cargo install` goes first. A
+# command that is left out is named by a comment of the README, `<!-- follow: ... -->`, and printed as `not run`.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 root=$PWD

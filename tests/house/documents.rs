@@ -4,6 +4,8 @@ use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use super::architecture::files;
+
 const ROOT: &str = env!("CARGO_MANIFEST_DIR");
 
 /// The longest that a document may be, in bytes.
@@ -129,6 +131,32 @@ fn settings_that_the_guide_and_the_internals_name_exist() {
                 "{}: there is no setting {key}",
                 path.display()
             );
+        }
+    }
+}
+
+#[test]
+fn files_and_tests_that_documents_name_exist() {
+    let folders = ["src/", "tests/", "scripts/", "examples/", "docs/", "shaders-glsl/", "build/"];
+    let sources = [files("src", "rs"), files("tests", "rs")].concat();
+    for (path, page) in documents() {
+        let words = prose(&page)
+            .flat_map(|line| line.split('`').skip(1).step_by(2))
+            .flat_map(str::split_whitespace);
+        for word in words.filter(|word| !word.contains(char::is_uppercase)) {
+            if folders.iter().any(|folder| word.starts_with(folder)) {
+                assert!(
+                    Path::new(ROOT).join(word).exists(),
+                    "{}: there is no {word}",
+                    path.display()
+                );
+            }
+            // The name of a test is a sentence; shorter ones are modules.
+            let test = word.rsplit("::").next().unwrap();
+            if word.contains("::") && test.matches('_').count() > 4 {
+                let is_test = |(_, text): &(PathBuf, String)| text.contains(&format!("fn {test}("));
+                assert!(sources.iter().any(is_test), "{}: there is no test {test}", path.display());
+            }
         }
     }
 }
