@@ -10,3 +10,4 @@ mod circles;
 mod documents;
 mod install;
 mod settings;
+mod words;
