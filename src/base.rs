@@ -1,4 +1,4 @@
-//! What every other module stands on and none of it knows splatting: files read and written whole, hashes, random numbers.
+//! The base of all other modules, independent of splatting: files read and written whole, hashes, random numbers.
 //!
 //! - [`input`]: files that users name, read whole
 //! - [`output`]: files that are never seen half-written

@@ -29,13 +29,13 @@ fn main() -> ExitCode {
     if is_broken_pipe(&error) {
         return ExitCode::SUCCESS;
     }
-    // A closed stderr leaves nobody to tell.
+    // A closed stderr leaves no way to report it.
     let message = message(&error);
     let _ = writeln!(std::io::stderr(), "error: {}", in_one_line(&message));
     ExitCode::from(error.downcast_ref::<Error>().map_or(1, Error::exit_code))
 }
 
-/// Help is printed as it is; what is wrong with a command line is said in one line, as every other error.
+/// Help is printed as it is; errors of the command line are one line, like all others.
 fn misuse(error: &clap::Error) -> ExitCode {
     use clap::error::ErrorKind;
     let help = [
@@ -52,12 +52,12 @@ fn misuse(error: &clap::Error) -> ExitCode {
         lines.take_while(|line| !line.starts_with("Usage:") && !line.starts_with("For more"));
     let line = told.collect::<Vec<_>>().join(" ").replace(" tip: ", "; ");
     let line = renamed(error).map_or(line, |line| format!("error: {line}"));
-    // A closed stderr leaves nobody to tell.
+    // A closed stderr leaves no way to report it.
     let _ = writeln!(std::io::stderr(), "{}; --help says more", in_one_line(&line));
     ExitCode::from(2)
 }
 
-/// Whoever reads our output has seen enough, as in `nightsplat doctor | head`.
+/// Our output has a closed reader, as in `nightsplat doctor | head`.
 fn is_broken_pipe(error: &anyhow::Error) -> bool {
     let is_broken = |io: &std::io::Error| io.kind() == std::io::ErrorKind::BrokenPipe;
     error.chain().any(|cause| cause.downcast_ref().is_some_and(is_broken))

@@ -31,8 +31,8 @@ impl RenderSettings {
         (gpu.properties().max_storage_buffer_range / bytes).min(u32::MAX.into()) as usize
     }
 
-    /// The tile for views of these sizes: that of [`RenderSettings::tile_on`], of multiples of its height where the
-    /// settings name none and the device could not process so small tiles.
+    /// The tile for views of these sizes: that of [`RenderSettings::tile_on`], or a multiple of its height where the
+    /// settings name none and a view would have too many tiles.
     ///
     /// # Errors
     /// As [`RenderSettings::tile_on`].
