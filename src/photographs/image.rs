@@ -36,6 +36,8 @@ pub use jpeg::exif_segment;
 #[cfg(feature = "io")]
 pub use mask::Mask;
 #[cfg(feature = "io")]
+pub(crate) use mask::MaskFile;
+#[cfg(feature = "io")]
 pub use orientation::Orientation;
 use rayon::prelude::*;
 

@@ -4,6 +4,9 @@
 
 mod as_it_is;
 mod bad_input;
+mod keys;
+mod layouts;
+mod models;
 mod photographs;
 #[cfg(feature = "cli")]
 mod pose;

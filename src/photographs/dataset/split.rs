@@ -6,7 +6,7 @@ use std::path::Path;
 use super::listed::ListedView;
 use super::{LoadOptions, Split, names};
 use crate::Result;
-use crate::base::input;
+use crate::base::{input, tree};
 use crate::photographs::image::files::Files;
 
 /// Every eighth of the name-sorted views is held out where nothing else says which.
@@ -27,7 +27,7 @@ pub(super) fn split(
     let path = root.join("test.txt");
     let mut undecided: Vec<&mut ListedView> =
         frames.iter_mut().filter(|frame| frame.split.is_none()).collect();
-    if undecided.is_empty() || !path.is_file() {
+    if undecided.is_empty() || !tree::is_file(&path) {
         for (index, frame) in undecided.into_iter().enumerate() {
             frame.split = Some(if index % TEST_EVERY == 0 { Split::Test } else { Split::Train });
         }
@@ -61,7 +61,7 @@ pub(super) fn say_whose_split_gives_way(root: &Path, frames: &[ListedView], opti
     let own = if frames.iter().any(|frame| frame.split.is_some()) {
         Some("its transforms files")
     } else {
-        Some("its test.txt").filter(|_| root.join("test.txt").is_file())
+        Some("its test.txt").filter(|_| tree::is_file(&root.join("test.txt")))
     };
     if let Some((own, every)) = own.zip(options.test_every) {
         tracing::warn!(

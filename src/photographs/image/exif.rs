@@ -1,16 +1,17 @@
 //! What a camera writes of its exposure.
 
-use std::fs::File;
 use std::io::BufReader;
 use std::path::Path;
 
 use ::exif::{Exif, In, Reader, Tag, Value};
 
+use crate::base::tree;
+
 /// The stops of a photograph's exposure, log2(t S / N^2) of its exposure time t in seconds, ISO speed S and f-number N: of
 /// two photographs of one thing that of one more stop shows twice the linear light. None where the file does not say all
 /// three.
 pub fn exposure_value(path: &Path) -> Option<f64> {
-    let file = File::open(path).ok()?;
+    let file = tree::open(path).ok()?;
     let exif = Reader::new().read_from_container(&mut BufReader::new(file)).ok()?;
     let number = |tag| positive(&exif, tag);
     let (time, aperture) = (number(Tag::ExposureTime)?, number(Tag::FNumber)?);
