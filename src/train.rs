@@ -11,6 +11,7 @@ mod early_stopping;
 mod epochs;
 mod exposures;
 mod fill;
+mod first_gaussians;
 mod growth;
 mod layers;
 mod masks;
