@@ -90,7 +90,8 @@ pub(crate) fn archive_of(path: &Path) -> Option<&Path> {
 /// # Errors
 /// The archive is damaged, or expands to too much.
 pub(crate) fn check(path: &Path) -> io::Result<()> {
-    archive_of(path).map_or(Ok(()), |path| Archive::open(path, [MOST_OF_ENTRY, MOST_OF_ALL]).map(drop))
+    archive_of(path)
+        .map_or(Ok(()), |path| Archive::open(path, [MOST_OF_ENTRY, MOST_OF_ALL]).map(drop))
 }
 
 /// An archive's folders and files by path with slashes; the root is "".
@@ -113,7 +114,9 @@ impl Archive {
         for place in 0..zip.len() {
             let entry = zip.by_index_raw(place).map_err(io::Error::other)?;
             // Names that lead out of the archive are none of its files.
-            let Some(name) = entry.enclosed_name().and_then(|name| slashed(&name)) else { continue };
+            let Some(name) = entry.enclosed_name().and_then(|name| slashed(&name)) else {
+                continue;
+            };
             expanded = expanded.saturating_add(entry.size());
             if entry.size() > of_entry || expanded > of_all {
                 return Err(io::Error::other(format!(
@@ -124,9 +127,13 @@ impl Archive {
             }
             let is_folder = entry.is_dir();
             let mut child = name.as_str();
-            while let Some((folder, own)) = child.rsplit_once('/').or(Some(("", child))).filter(|_| !child.is_empty())
+            while let Some((folder, own)) =
+                child.rsplit_once('/').or(Some(("", child))).filter(|_| !child.is_empty())
             {
-                folders.entry(folder.to_owned()).or_insert_with(BTreeSet::new).insert(own.to_owned());
+                folders
+                    .entry(folder.to_owned())
+                    .or_insert_with(BTreeSet::new)
+                    .insert(own.to_owned());
                 child = folder;
             }
             if is_folder {
@@ -245,7 +252,12 @@ mod tests {
         let zip = archive(folder.path(), &[("a", b"old")]);
         assert!(is_file(&zip.join("a")));
         archive(folder.path(), &[("b", b"new")]);
-        File::options().append(true).open(&zip).unwrap().set_modified(SystemTime::UNIX_EPOCH).unwrap();
+        File::options()
+            .append(true)
+            .open(&zip)
+            .unwrap()
+            .set_modified(SystemTime::UNIX_EPOCH)
+            .unwrap();
         assert!(is_file(&zip.join("b")) && !is_file(&zip.join("a")));
         std::fs::write(&zip, "no archive").unwrap();
         assert!(check(&zip).is_err());

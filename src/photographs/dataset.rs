@@ -40,8 +40,8 @@ use std::path::{Path, PathBuf};
 
 use glam::{DVec3, UVec2};
 
-use crate::camera::Camera;
 use crate::base::tree;
+use crate::camera::{Camera, Lens};
 use crate::photographs::image::files::Files;
 use crate::photographs::image::{Image, Mask, MaskFile};
 use crate::{Error, Result};
@@ -49,6 +49,8 @@ pub use fingerprint::Fingerprint;
 use layout::Layout;
 use listed::{ListedView, Listing};
 use listing::{list, warn};
+#[cfg(feature = "cli")]
+pub(crate) use masks::is_beside as is_mask;
 use members::with_held_out;
 pub use options::{DOWNSCALE, DepthOptions, LoadOptions, MeasuredSize};
 pub use original::Original;
@@ -336,6 +338,24 @@ impl Dataset {
         let Some((model, _)) = colmap::largest(&models, |_| true)? else { return Ok(None) };
         let names = colmap::read_images(model)?.into_iter().map(|image| image.name);
         Ok(Some((model.to_owned(), names.collect())))
+    }
+
+    /// The calibrated lenses of a COLMAP model.
+    ///
+    /// # Errors
+    /// [`Error::Input`] where the model is damaged.
+    #[cfg(feature = "cli")]
+    pub(crate) fn lenses(model: &Path) -> Result<Vec<Lens>> {
+        Ok(colmap::read_cameras(model)?.into_values().collect())
+    }
+
+    /// The folder that holds what an archive holds: its one folder where there is nothing beside.
+    ///
+    /// # Errors
+    /// [`Error::Input`] where it is no archive that can be read.
+    #[cfg(feature = "cli")]
+    pub(crate) fn folder_of(archive: &Path) -> Result<PathBuf> {
+        Ok(Layout::of(archive)?.root)
     }
 
     /// The files of the views below `root`, sorted by name, without reading a pixel.

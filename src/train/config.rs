@@ -293,7 +293,12 @@ impl TrainConfig {
     /// The same run of another copy of its dataset; what lay in its folder lies there, too.
     pub(crate) fn move_dataset(&mut self, dataset: &Path) {
         let from = std::mem::replace(&mut self.dataset, dataset.to_owned());
-        let inside = [&mut self.images, &mut self.reference, &mut self.model.depth_folder, &mut self.exposure.start];
+        let inside = [
+            &mut self.images,
+            &mut self.reference,
+            &mut self.model.depth_folder,
+            &mut self.exposure.start,
+        ];
         for folder in inside.into_iter().flatten() {
             if let Ok(place) = folder.strip_prefix(&from) {
                 *folder = dataset.join(place);

@@ -216,7 +216,11 @@ mod tests {
     const SIZE: (u32, u32) = (60, 40);
 
     /// Photographs of a scene that moves by `shift` pixels a view, black outside a circle.
-    fn views(shift: u32, scene: impl Fn(u32, u32) -> f32, radius: f64) -> impl Iterator<Item = Image> {
+    fn views(
+        shift: u32,
+        scene: impl Fn(u32, u32) -> f32,
+        radius: f64,
+    ) -> impl Iterator<Item = Image> {
         (0..5).map(move |view| {
             Image::from_fn(SIZE.0, SIZE.1, |x, y| {
                 let (from_x, from_y) = (f64::from(x) - 29.5, f64::from(y) - 19.5);

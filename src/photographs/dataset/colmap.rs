@@ -99,8 +99,9 @@ enum Encoded {
 }
 
 fn file(folder: &Path, stem: &str) -> Option<Encoded> {
-    let path =
-        |extension| Some(folder.join(stem).with_extension(extension)).filter(|path| tree::is_file(path));
+    let path = |extension| {
+        Some(folder.join(stem).with_extension(extension)).filter(|path| tree::is_file(path))
+    };
     path("bin").map(Encoded::Binary).or_else(|| path("txt").map(Encoded::Text))
 }
 
@@ -191,10 +192,7 @@ fn lens(model: &str, width: u64, height: u64, parameters: &[f64]) -> Result<Lens
             ));
         }
         _ => {
-            return Err(format!(
-                "has the unsupported model {model}; {}",
-                remedy(model)
-            ));
+            return Err(format!("has the unsupported model {model}; {}", remedy(model)));
         }
     };
     let [focal, principal_point] = [focal, principal_point].map(DVec2::from_array);

@@ -10,7 +10,8 @@ const BRIGHTER: f32 = 1.3;
 
 /// Takes reference images that are as dark as the photographs for photographs, and says so.
 pub(super) fn drop_from(loaded: &mut [Loaded], options: &LoadOptions) {
-    let is_trained_on = |own: &&Loaded| own.view.as_ref().is_some_and(|view| view.split == Split::Train);
+    let is_trained_on =
+        |own: &&Loaded| own.view.as_ref().is_some_and(|view| view.split == Split::Train);
     let photographs = loaded.iter().filter(is_trained_on).filter_map(|own| own.brightness[0]);
     let references = loaded.iter().filter_map(|own| own.brightness[1]);
     let (photographs, references) = (median(photographs.collect()), median(references.collect()));

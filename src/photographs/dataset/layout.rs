@@ -37,7 +37,8 @@ impl Layout {
     /// # Errors
     /// [`Error::Input`] where it is neither, or an archive that cannot be read.
     pub(super) fn of(given: &Path) -> Result<Self> {
-        tree::check(given).map_err(|error| Error::input(given, format!("cannot be read: {error}")))?;
+        tree::check(given)
+            .map_err(|error| Error::input(given, format!("cannot be read: {error}")))?;
         let ending = given.extension().unwrap_or_default().to_ascii_lowercase();
         if tree::is_file(given) && ending == "json" {
             let root = given.parent().unwrap_or(Path::new(".")).to_owned();
@@ -94,8 +95,11 @@ impl Layout {
     /// Of a model that was named itself the layout of the dataset around it.
     fn above_model(&self) -> Option<Self> {
         let given = &self.root;
-        let is_model = self.listings().is_empty() && !colmap::models_in(given, &CAMERAS).is_empty();
-        if !is_model || has_photographs(given) {
+        let folders = folders_in(given);
+        let is_model = |folder: &Path| colmap::model_in(folder, &CAMERAS).is_some();
+        let holds_models = !folders.is_empty() && folders.iter().all(|folder| is_model(folder));
+        let is_named = self.listings().is_empty() && (is_model(given) || holds_models);
+        if !is_named || has_photographs(given) {
             return None;
         }
         let given = given.canonicalize().unwrap_or_else(|_| given.clone());

@@ -49,7 +49,9 @@ fn list_colmap(
     let root = layout.root.as_path();
     let models = layout.models(&CAMERAS);
     let folders = [root.to_owned(), root.join("images")];
-    let exists = |name: &str| folders.iter().any(|folder| files.find(folder, &name.replace('\\', "/")).is_some());
+    let exists = |name: &str| {
+        folders.iter().any(|folder| files.find(folder, &name.replace('\\', "/")).is_some())
+    };
     let Some((folder, counts)) = colmap::largest(&models, exists)? else {
         return Err(Error::input(root, layout.no_dataset()));
     };
@@ -71,8 +73,7 @@ fn list_colmap(
         places: folders.to_vec(),
         is_test: false,
     });
-    let found =
-        locate::photographs((root, images), wanted.collect(), files, &mut listing.remarks);
+    let found = locate::photographs((root, images), wanted.collect(), files, listing);
     for (image, found) in placed.into_iter().zip(found) {
         let name = image.name.replace('\\', "/");
         let lens = lenses.get(&image.camera).copied().ok_or_else(|| {

@@ -31,8 +31,18 @@ pub(super) struct Found {
 }
 
 /// Folders that tools put photographs into, by which one is taken where several hold all names: the last ones are shrunk.
-const PREFERRED: [&str; 10] =
-    ["low", "images_low", "images", "input", "rgb", "color", "images_2", "images_4", "images_8", "image"];
+const PREFERRED: [&str; 10] = [
+    "low",
+    "images_low",
+    "images",
+    "input",
+    "rgb",
+    "color",
+    "images_2",
+    "images_4",
+    "images_8",
+    "image",
+];
 /// Beginnings of folders that hold other things under the photographs' names.
 const OTHERS: [&str; 8] =
     ["mask", "depth", "normal", "segment", "semantic", "dynamic_mask", "high", "flow"];
@@ -41,12 +51,12 @@ const MOST_DEEP: usize = 3;
 const MOST_FOLDERS: usize = 1000;
 
 /// Finds the photographs: in `images` where that is given; at their paths; or those that are absent under the same names
-/// in the one folder that holds most of them, which `remarks` tells.
+/// in the one folder that holds most of them, which is a remark.
 pub(super) fn photographs(
     (root, images): (&Path, Option<&Path>),
     wanted: Vec<Wanted>,
     files: &Files,
-    remarks: &mut Vec<String>,
+    listing: &mut Listing,
 ) -> Vec<Found> {
     if let Some(folder) = images {
         return wanted.into_iter().map(|wanted| in_folder(root, folder, &wanted, files)).collect();
@@ -59,7 +69,7 @@ pub(super) fn photographs(
         let used: HashSet<PathBuf> = found.iter().filter_map(|found| found.file.clone()).collect();
         match elsewhere(root, &paths, &used, files) {
             Elsewhere::In(folder, rests) => {
-                remarks.push(format!(
+                listing.remarks.push(format!(
                     "{}: {} of its photographs are not where it lists them ({} the first); those of the same names in {} are taken",
                     root.display(),
                     rests.iter().filter(|(_, file)| file.is_some()).count(),
@@ -72,7 +82,7 @@ pub(super) fn photographs(
                     }
                 }
             }
-            Elsewhere::InSeveral(folders) => remarks.push(format!(
+            Elsewhere::InSeveral(folders) => listing.skipped.push(format!(
                 "{}: {} photographs are not where it lists them ({} the first), and {} hold files of their names; choose one with --images",
                 root.display(),
                 paths.len(),
@@ -112,7 +122,8 @@ pub(super) fn beside(root: &Path, files: &Files, listing: &mut Listing) {
             file
         };
         let mask = frame.mask.take();
-        frame.mask = mask.and_then(|mask| Some(MaskFile { path: resolved("mask", &mask.path)?, ..mask }));
+        frame.mask =
+            mask.and_then(|mask| Some(MaskFile { path: resolved("mask", &mask.path)?, ..mask }));
         let depth = frame.depth.take();
         frame.depth = depth.and_then(|listed| resolved("depth", &listed));
     }
@@ -130,8 +141,11 @@ fn at_path(root: &Path, wanted: &Wanted, files: &Files) -> Found {
     for place in &wanted.places {
         if let Some(file) = files.find(place, &wanted.path) {
             let folder = relative(root, place);
-            let listed =
-                if folder == "." { wanted.path.clone() } else { format!("{folder}/{}", wanted.path) };
+            let listed = if folder == "." {
+                wanted.path.clone()
+            } else {
+                format!("{folder}/{}", wanted.path)
+            };
             return Found { below: below(wanted), listed, file: Some(file) };
         }
     }
@@ -226,7 +240,8 @@ fn best(
         for folder in folders {
             let find = |rest: &String| files.find(folder, rest).filter(|file| !used.contains(file));
             let found: Rests = way.iter().map(|rest| (rest.clone(), find(rest))).collect();
-            let distinct: HashSet<&PathBuf> = found.iter().filter_map(|(_, file)| file.as_ref()).collect();
+            let distinct: HashSet<&PathBuf> =
+                found.iter().filter_map(|(_, file)| file.as_ref()).collect();
             let count = distinct.len();
             if count > most {
                 candidates.clear();
@@ -270,7 +285,8 @@ fn folders_below(root: &Path, without: &[&str]) -> Vec<PathBuf> {
         for folder in &level {
             let mut own = tree::entries(folder).unwrap_or_default();
             own.retain(|path| {
-                let name = path.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
+                let name =
+                    path.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
                 let is_other = without.iter().any(|beginning| name.starts_with(beginning));
                 !is_hidden(path) && !is_other && tree::is_dir(path)
             });

@@ -34,6 +34,6 @@ fn moving(frame: &ListedView, files: &Files) -> Option<MaskFile> {
 }
 
 /// Whether a file is a mask that lies among photographs.
-pub(super) fn is_beside(file: &Path) -> bool {
+pub(crate) fn is_beside(file: &Path) -> bool {
     file.file_name().is_some_and(|name| name.to_string_lossy().starts_with(MOVING))
 }

@@ -25,13 +25,22 @@ pub(super) fn possible(path: &str) -> [String; 3] {
 }
 
 /// Puts folders into every name where two photographs in different folders have one: those below the folder of all
-/// photographs, or where these are equal as well (`train/r_0`, `test/r_0`) all of the path.
+/// photographs, or where these are equal as well (`train/r_0`, `test/r_0`) all of the path. Of one pose they are one photograph
+/// that is listed twice (`low/0`, `high/0`), and nothing is renamed.
 pub(super) fn tell_apart(frames: &mut [ListedView]) {
-    for path in [|frame: &ListedView| flat(&frame.below), |frame: &ListedView| flat(&frame.listed)] {
+    let mut views = BTreeSet::new();
+    let view = |frame: &ListedView| {
+        (frame.name.clone(), frame.view_from_world.to_cols_array().map(f64::to_bits))
+    };
+    let is_listed_twice = !frames.iter().all(|frame| views.insert(view(frame)));
+    for path in [|frame: &ListedView| flat(&frame.below), |frame: &ListedView| flat(&frame.listed)]
+    {
         let mut names = BTreeSet::new();
-        if frames.iter().all(|frame| names.insert(frame.name.as_str())) {
+        if is_listed_twice || frames.iter().all(|frame| names.insert(frame.name.as_str())) {
             return;
         }
-        frames.iter_mut().for_each(|frame| frame.name = path(frame));
+        for frame in &mut *frames {
+            frame.name = path(frame);
+        }
     }
 }

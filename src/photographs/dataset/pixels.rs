@@ -270,8 +270,8 @@ impl ViewLoader<'_> {
         let mask = stored_mask
             .map(|(stored, path, orientation)| preparation.mask(&stored, &path, orientation));
         let mask = Mask::hiding_too(mask.transpose()?.flatten(), preparation.size, unseen);
-        let brightness =
-            [&photograph, &reference].map(|decoded| decoded.as_ref().map(|decoded| mean(&decoded.image)));
+        let brightness = [&photograph, &reference]
+            .map(|decoded| decoded.as_ref().map(|decoded| mean(&decoded.image)));
         let reference_original = reference.as_ref().map(|decoded| {
             Original::new(decoded.path.clone(), *preparation.lens, options.undistort)
         });

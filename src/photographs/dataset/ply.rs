@@ -90,7 +90,8 @@ struct Header {
 /// [`Error::Input`] where it cannot be read, is no PLY file of points or is cut short; a model of Gaussians is none.
 pub(super) fn points(path: &Path) -> Result<Vec<DVec3>> {
     let bytes = input::bytes(path)?;
-    let no_points = |problem: &str| Error::input(path, format!("{problem}; its points are not read"));
+    let no_points =
+        |problem: &str| Error::input(path, format!("{problem}; its points are not read"));
     const END: &[u8] = b"end_header";
     let end = bytes
         .windows(END.len())
@@ -129,7 +130,9 @@ fn header(text: &str) -> Result<Header, &'static str> {
                 count = number.parse().ok();
                 is_vertex = true;
             }
-            ["element", ..] if count.is_none() => return Err("has other elements before its vertices"),
+            ["element", ..] if count.is_none() => {
+                return Err("has other elements before its vertices");
+            }
             ["element", ..] => is_vertex = false,
             ["property", "list", ..] if is_vertex => return Err("has vertices of varying length"),
             ["property", kind, name] if is_vertex => {
@@ -163,9 +166,8 @@ fn of_bytes(body: &[u8], header: &Header) -> Option<Vec<DVec3>> {
         }
         kind.value(bytes)
     };
-    let point = |vertex: &[u8]| {
-        DVec3::from_array(header.axes.map(|(_, property)| value(vertex, property)))
-    };
+    let point =
+        |vertex: &[u8]| DVec3::from_array(header.axes.map(|(_, property)| value(vertex, property)));
     Some(body.chunks_exact(header.stride.max(1)).map(point).collect())
 }
 
@@ -228,7 +230,10 @@ mod tests {
             ("no ply".to_owned(), "is no PLY file"),
             (head("element vertex 1\nproperty float x"), "has no x, y and z"),
             (head(&format!("element face 1\nelement vertex 1\n{xyz}")), "other elements before"),
-            (head(&format!("element vertex 1\n{xyz}\nproperty float f_dc_0")), "a model of Gaussians"),
+            (
+                head(&format!("element vertex 1\n{xyz}\nproperty float f_dc_0")),
+                "a model of Gaussians",
+            ),
             (head(&format!("element vertex 2\n{xyz}")), "cut short"),
             (head(&format!("element vertex 99999999999999\n{xyz}")), "cut short"),
         ];
@@ -236,7 +241,9 @@ mod tests {
             let error = read(&text, b"1 2 3\n").unwrap_err().to_string();
             assert!(error.contains(expected), "{expected}: {error}");
         }
-        let binary = format!("ply\nformat binary_little_endian 1.0\nelement vertex 18446744073709551615\n{xyz}\nend_header\n");
+        let binary = format!(
+            "ply\nformat binary_little_endian 1.0\nelement vertex 18446744073709551615\n{xyz}\nend_header\n"
+        );
         assert!(read(&binary, &[0; 24]).is_err());
         let nan = read(&head(&format!("element vertex 2\n{xyz}")), b"1 2 3\nnan 0 0\n").unwrap();
         assert_eq!(nan, [DVec3::new(1.0, 2.0, 3.0)]);

@@ -89,13 +89,17 @@ fn placed(cloud: &Cloud, points: Vec<DVec3>, views: &[View]) -> Vec<Point> {
         let step = points.len().div_ceil(1000);
         let some: Vec<DVec3> =
             points.iter().step_by(step).map(|point| to_views.transform_point3(*point)).collect();
-        let by_view = |view: &View| some.iter().filter(|point| view.camera.sees(**point).is_some()).count();
+        let by_view =
+            |view: &View| some.iter().filter(|point| view.camera.sees(**point).is_some()).count();
         views.iter().map(by_view).sum::<usize>() as f64
     };
     let as_stored = seen(DAffine3::IDENTITY);
     let applied = cloud.applied.filter(|applied| seen(*applied) > CLEARLY_MORE * as_stored);
     if applied.is_some() {
-        tracing::info!("{}: brought into the views' world by applied_transform", cloud.file.display());
+        tracing::info!(
+            "{}: brought into the views' world by applied_transform",
+            cloud.file.display()
+        );
     }
     let to_views = applied.unwrap_or(DAffine3::IDENTITY);
     let point = |position| Point { position: to_views.transform_point3(position), views: vec![] };

@@ -24,7 +24,8 @@ impl Dataset {
         let files = Files::default();
         let layout = Layout::of(root)?;
         let root = layout.root.as_path();
-        let Listing { mut frames, mut skipped, .. } = list(&layout, options.images.as_deref(), &files)?;
+        let Listing { mut frames, mut skipped, .. } =
+            list(&layout, options.images.as_deref(), &files)?;
         split(root, &mut frames, options.test_every, &files)?;
         let mut hasher = Hasher::default();
         for source in sources(root, &frames, options, &files, &mut skipped) {

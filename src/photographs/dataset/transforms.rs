@@ -106,7 +106,7 @@ pub(super) fn read(
         path: listed_path(&frame.listed.file_path),
         places: vec![root.to_owned()],
     });
-    let found = locate::photographs((root, images), wanted.collect(), files, &mut listing.remarks);
+    let found = locate::photographs((root, images), wanted.collect(), files, listing);
     for ((file, frame), found) in frames.into_iter().zip(found) {
         let Read { path, transforms } = &read[file];
         let listed = frame.listed;
@@ -200,9 +200,9 @@ fn usable_frames(
             continue;
         }
         match matrix::pose(&listed.transform_matrix, is_transposed) {
-            Err(problem) => listing
-                .skipped
-                .push(format!("{name}: its transform_matrix {problem}; export it right-handed, in OpenGL axes")),
+            Err(problem) => listing.skipped.push(format!(
+                "{name}: its transform_matrix {problem}; export it right-handed, in OpenGL axes"
+            )),
             Ok(pose) => {
                 mended.add(&pose);
                 let split = stated.split().or(split);
@@ -252,7 +252,10 @@ impl Mended {
             ));
         }
         if self.rounded > 0 {
-            parts.push(format!("are rounded ({} of them): the nearest rotation is taken", self.rounded));
+            parts.push(format!(
+                "are rounded ({} of them): the nearest rotation is taken",
+                self.rounded
+            ));
         }
         (!parts.is_empty())
             .then(|| format!("{}: its matrices {}", path.display(), parts.join("; ")))
@@ -286,7 +289,8 @@ impl StatedSplits {
             Some("test" | "val" | "eval") => return Stated::As(Split::Test),
             _ => {}
         }
-        let filled = |list: &Option<Vec<String>>| list.as_ref().is_some_and(|list| !list.is_empty());
+        let filled =
+            |list: &Option<Vec<String>>| list.as_ref().is_some_and(|list| !list.is_empty());
         let lists = [&self.train_filenames, &self.val_filenames, &self.test_filenames];
         if !lists.into_iter().any(filled) {
             return Stated::Nothing;
@@ -308,7 +312,12 @@ impl StatedSplits {
 }
 
 /// The points that a listing names.
-fn cloud(root: &Path, path: &Path, transforms: &Transforms, remarks: &mut Vec<String>) -> Option<Cloud> {
+fn cloud(
+    root: &Path,
+    path: &Path,
+    transforms: &Transforms,
+    remarks: &mut Vec<String>,
+) -> Option<Cloud> {
     let named = listed_path(transforms.ply_file_path.as_ref()?);
     let name = named.rsplit('/').next().unwrap_or(&named);
     let places = [root.join(&named), path.with_file_name(name)];
@@ -322,7 +331,8 @@ fn cloud(root: &Path, path: &Path, transforms: &Transforms, remarks: &mut Vec<St
             row?.try_into().ok()
         };
         let [x, y, z] = [row(0)?, row(1)?, row(2)?];
-        let matrix3 = DMat3::from_cols_array(&[x[0], x[1], x[2], y[0], y[1], y[2], z[0], z[1], z[2]]);
+        let matrix3 =
+            DMat3::from_cols_array(&[x[0], x[1], x[2], y[0], y[1], y[2], z[0], z[1], z[2]]);
         let translation = DVec3::new(x[3], y[3], z[3]);
         Some(DAffine3 { matrix3: matrix3.transpose(), translation })
     });
@@ -341,4 +351,3 @@ fn nan_as_null(text: &str) -> String {
     }
     text.split('"').enumerate().map(quoted).collect::<Vec<_>>().join("\"")
 }
-

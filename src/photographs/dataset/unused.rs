@@ -27,7 +27,8 @@ pub(super) fn remarks(root: &Path, frames: &[ListedView]) -> Vec<String> {
     };
     let photographs: Vec<PathBuf> =
         folders.iter().flat_map(|folder| photographs_in(folder).unwrap_or_default()).collect();
-    let without_pose: Vec<&PathBuf> = photographs.iter().filter(|file| !is_used(file) && !masks::is_beside(file)).collect();
+    let without_pose: Vec<&PathBuf> =
+        photographs.iter().filter(|file| !is_used(file) && !masks::is_beside(file)).collect();
     let mut remarks = vec![];
     let (count, of) = (without_pose.len(), photographs.len());
     if let Some(first) = without_pose.first().filter(|_| 2 * count > of) {

@@ -18,6 +18,22 @@ pub fn exposure_value(path: &Path) -> Option<f64> {
     Some((time * number(Tag::PhotographicSensitivity)? / aperture.powi(2)).log2())
 }
 
+/// Camera, lens and focal length as a file names them, where it names any: of a phone with several lenses the numbers alone
+/// differ.
+#[cfg(feature = "cli")]
+pub(crate) fn lens_name(path: &Path) -> Option<String> {
+    let file = tree::open(path).ok()?;
+    let exif = Reader::new().read_from_container(&mut BufReader::new(file)).ok()?;
+    let tags =
+        [Tag::Make, Tag::Model, Tag::LensModel, Tag::FocalLength, Tag::FocalLengthIn35mmFilm];
+    let shown = tags.map(|tag| {
+        let field = exif.get_field(tag, In::PRIMARY)?;
+        Some(field.display_value().to_string())
+    });
+    let named: Vec<String> = shown.into_iter().flatten().collect();
+    (!named.is_empty()).then(|| named.join(", "))
+}
+
 /// The first number of a tag, where it is above 0 and finite.
 fn positive(exif: &Exif, tag: Tag) -> Option<f64> {
     let field = exif.get_field(tag, In::PRIMARY)?;

@@ -175,21 +175,6 @@ fn spread(directions: impl Iterator<Item = DVec3>) -> (DQuat, DVec3) {
     (DQuat::from_mat3(&axes).normalize(), spread.max(DVec3::ZERO).map(f64::sqrt))
 }
 
-/// `count` of the indices below `of`, ascending, spread evenly: one at random of each of `count` stretches of equal length. A scan
-/// lists neighbours in rows, and a fixed stride would meet the same place of each row.
-pub fn even_sample(of: usize, count: usize, seed: u64) -> Vec<usize> {
-    if count >= of {
-        return (0..of).collect();
-    }
-    let draws = Stream::new(seed, 0);
-    let begin = |stretch: usize| (stretch as u128 * of as u128 / count as u128) as usize;
-    let index = |stretch: usize| {
-        let (first, end) = (begin(stretch), begin(stretch + 1));
-        first + (draws.uniform(stretch as u64) * (end - first) as f64) as usize
-    };
-    (0..count).map(index).collect()
-}
-
 /// `count` random positions inside what the cameras see, for captures without points; none without cameras.
 ///
 /// Each lies at a uniform place of a random camera's image, at a depth that is log-uniform between half the

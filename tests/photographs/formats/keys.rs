@@ -24,7 +24,8 @@ fn single(root: &Path, edit: impl FnOnce(&mut Value)) {
     write_json(root.join("transforms.json"), &listing);
 }
 
-const POINTS: [[f32; 3]; 4] = [[0.5, 0.0, 0.25], [-0.5, 0.25, 0.0], [0.0, 0.5, -0.25], [0.125, 0.0, 0.5]];
+const POINTS: [[f32; 3]; 4] =
+    [[0.5, 0.0, 0.25], [-0.5, 0.25, 0.0], [0.0, 0.5, -0.25], [0.125, 0.0, 0.5]];
 
 fn write_points(path: &Path, points: &[[f32; 3]]) {
     let mut text = format!(
@@ -92,8 +93,11 @@ fn a_file_of_points_that_is_not_read_is_named() {
     fs::write(folder.path().join("scan.las"), "LASF").unwrap();
     fs::write(folder.path().join("points3d.ply"), "no ply").unwrap();
     let lines = warnings(|| drop(load(folder.path())));
-    for part in ["absent.ply, its ply_file_path, is absent", "points3d.ply: is no PLY file", "points3d.ply: is not read"]
-    {
+    for part in [
+        "absent.ply, its ply_file_path, is absent",
+        "points3d.ply: is no PLY file",
+        "points3d.ply: is not read",
+    ] {
         assert!(lines.contains(part), "no `{part}` in: {lines}");
     }
 }
@@ -130,7 +134,10 @@ fn masks_that_the_listing_names_hide_and_those_of_what_moves_do_so_inverted() {
         let options = LoadOptions { invert_masks: true, ..LoadOptions::default() };
         assert_eq!(hidden(&Dataset::load(root, &options).unwrap(), "v04"), Some((0.0, 1.0)));
     });
-    assert!(lines.contains("1 mask files that it names are absent, absent.png the first"), "{lines}");
+    assert!(
+        lines.contains("1 mask files that it names are absent, absent.png the first"),
+        "{lines}"
+    );
 }
 
 #[test]
@@ -205,7 +212,9 @@ fn keys_that_are_not_supported_are_named_in_one_line() {
     let lines = warnings(|| drop(load(folder.path())));
     assert_eq!(lines.lines().count(), 1, "{lines}");
     assert!(
-        lines.contains("normal_path (9 times, normals/0.png the first), semantics_file (classes.json)"),
+        lines.contains(
+            "normal_path (9 times, normals/0.png the first), semantics_file (classes.json)"
+        ),
         "{lines}"
     );
 }
@@ -224,7 +233,10 @@ fn with_matrices(root: &Path, change: impl Fn([[f64; 4]; 4]) -> [[f64; 4]; 4]) {
 fn scaled_rounded_and_transposed_matrices_are_read_and_told() {
     let cases: [(&str, fn([[f64; 4]; 4]) -> [[f64; 4]; 4]); 2] = [
         ("hold a scale (9 of them, 0.2500 the last)", |mut matrix| {
-            matrix.iter_mut().take(3).for_each(|row| row[..3].iter_mut().for_each(|entry| *entry *= 0.25));
+            matrix
+                .iter_mut()
+                .take(3)
+                .for_each(|row| row[..3].iter_mut().for_each(|entry| *entry *= 0.25));
             matrix
         }),
         ("are transposed", |matrix| std::array::from_fn(|row| matrix.map(|other| other[row]))),

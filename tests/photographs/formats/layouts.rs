@@ -73,12 +73,10 @@ fn shrunk_copies_scale_the_camera_and_the_largest_is_taken() {
     let folder = tempfile::tempdir().unwrap();
     for (name, size) in [("images_4", (10, 8)), ("images_2", (20, 15))] {
         (0..9).for_each(|index| {
-            photograph(&folder.path().join(name).join(format!("v0{index}.jpg.png")), size, 0.1);
+            photograph(&folder.path().join(name).join(format!("v0{index}.png")), size, 0.1);
         });
     }
-    let mut written = model(9);
-    written.images.iter_mut().for_each(|(.., name)| *name = name.replace(".png", ".jpg"));
-    written.write_binary(&folder.path().join("sparse/0"));
+    model(9).write_binary(&folder.path().join("sparse/0"));
     let lines = warnings(|| {
         let dataset = load(folder.path());
         let camera = view(&dataset, "v01").camera;
@@ -115,13 +113,9 @@ fn where_two_folders_hold_the_names_none_is_guessed() {
     photographs(folder.path(), "monday", 0..9, 1.0);
     photographs(folder.path(), "tuesday", 0..9, 1.0);
     model(9).write_binary(&folder.path().join("sparse/0"));
-    let mut error = String::new();
-    let lines = warnings(|| {
-        error = Dataset::load(folder.path(), &LoadOptions::default()).unwrap_err().to_string();
-    });
-    let said = format!("{error}{lines}");
-    assert!(said.contains("monday and tuesday hold files of their names"), "{said}");
-    assert!(said.contains("--images"), "{said}");
+    let error = Dataset::load(folder.path(), &LoadOptions::default()).unwrap_err().to_string();
+    assert!(error.contains("monday and tuesday hold files of their names"), "{error}");
+    assert!(error.contains("--images"), "{error}");
 }
 
 #[test]
@@ -130,7 +124,7 @@ fn paths_of_another_machine_lead_to_the_files_of_their_names_and_that_is_said_on
         "/home/user/scan/images/",
         "C:\\Users\\user\\scan\\images\\",
         "./..\\datasets\\scan\\images/",
-        "../images/",
+        "../elsewhere/",
         "input/",
         "scan/deep/er/",
     ] {
@@ -301,8 +295,75 @@ fn a_dataset_below_or_above_is_named() {
     let root = folder.path().join("a/scan");
     photographs(&root, "images", 0..9, 1.0);
     model(9).write_binary(&root.join("sparse/0"));
-    for (given, named) in [(folder.path().to_owned(), "a/scan does"), (root.join("images"), "scan does")] {
+    for (given, named) in
+        [(folder.path().to_owned(), "a/scan does"), (root.join("images"), "scan does")]
+    {
         let error = Dataset::load(&given, &LoadOptions::default()).unwrap_err().to_string();
         assert!(error.contains(named) && error.contains("name that"), "{error}");
     }
+}
+
+#[test]
+fn black_borders_of_undistorted_photographs_are_masked_and_those_of_a_dark_scene_are_not() {
+    let folder = tempfile::tempdir().unwrap();
+    let paint = |corner: f64, shift: u32| {
+        for index in 0..9 {
+            let image = Image::from_fn(SIZE.0, SIZE.1, |x, y| {
+                let (from_x, from_y) = (f64::from(x) - 19.5, f64::from(y) - 14.5);
+                let value = 0.04 + 0.05 * ((x + 3 * y + shift * index) % 7) as f32 / 7.0;
+                [if from_x.hypot(from_y) < corner { value } else { 0.0 }; 3]
+            });
+            image.save_png8(folder.path().join(format!("images/v0{index}.png"))).unwrap();
+        }
+    };
+    fs::create_dir_all(folder.path().join("images")).unwrap();
+    model(9).write_binary(&folder.path().join("sparse/0"));
+    paint(20.0, 2);
+    let lines = warnings(|| {
+        for view in &load(folder.path()).views {
+            let mask = view.mask.as_ref().unwrap();
+            assert_eq!((mask.weights[0], mask.weights[15 * 40 + 20]), (0.0, 1.0), "{}", view.name);
+        }
+    });
+    assert!(
+        lines.contains("black in the same place at the border") && lines.contains("masked"),
+        "{lines}"
+    );
+    let options = LoadOptions { mask_borders: false, ..LoadOptions::default() };
+    assert!(
+        Dataset::load(folder.path(), &options)
+            .unwrap()
+            .views
+            .iter()
+            .all(|view| view.mask.is_none())
+    );
+    paint(100.0, 2);
+    assert!(load(folder.path()).views.iter().all(|view| view.mask.is_none()));
+}
+
+#[test]
+fn references_as_dark_as_the_photographs_are_photographs() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    for (split, views) in [("train", 0..7), ("test", 7..9)] {
+        photographs(root, split, views.clone(), if split == "test" { 0.8 } else { 1.0 });
+        let frames = views.map(|index| frame(index, &format!("{split}/{}.png", name(index))));
+        write_json(root.join(format!("transforms_{split}.json")), &transforms(frames.collect()));
+    }
+    let lines = warnings(|| {
+        let dataset = load(root);
+        for view in dataset.test_views() {
+            assert!(view.image.is_some() && view.reference.is_none(), "{}", view.name);
+        }
+        let options = LoadOptions { keep: Some(0), downscale: 2.0, ..LoadOptions::default() };
+        let dataset = Dataset::load(root, &options).unwrap();
+        assert!(dataset.test_views().all(|view| view.loaded().unwrap().is_some()));
+    });
+    assert!(lines.contains("2 reference images are as dark as the photographs"), "{lines}");
+    // Bright ones are references, and so are those of bright photographs.
+    photographs(root, "test", 7..9, 4.0);
+    assert!(load(root).test_views().all(|view| view.reference.is_some()));
+    photographs(root, "test", 7..9, 12.0);
+    photographs(root, "train", 0..7, 12.0);
+    assert!(load(root).test_views().all(|view| view.reference.is_some()));
 }

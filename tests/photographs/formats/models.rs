@@ -19,7 +19,8 @@ fn images_of_one_line_each_are_all_read() {
     (0..9).for_each(|index| {
         let images = folder.path().join("images");
         let name = name(index);
-        fs::rename(images.join(format!("{name}.png")), images.join(format!("{name} b.png"))).unwrap();
+        fs::rename(images.join(format!("{name}.png")), images.join(format!("{name} b.png")))
+            .unwrap();
     });
     written.write_text(&place);
     let text = fs::read_to_string(place.join("images.txt")).unwrap();

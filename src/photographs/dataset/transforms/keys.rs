@@ -7,8 +7,8 @@ use serde_json::{Map, Value};
 
 /// Endings of files that a key may name.
 const ENDINGS: [&str; 17] = [
-    "png", "jpg", "jpeg", "exr", "tif", "tiff", "webp", "npy", "npz", "pt", "bin", "ply", "pcd", "obj", "las", "mp4",
-    "json",
+    "png", "jpg", "jpeg", "exr", "tif", "tiff", "webp", "npy", "npz", "pt", "bin", "ply", "pcd",
+    "obj", "las", "mp4", "json",
 ];
 /// Keys that change what other trainers make of a frame.
 const MEANT: [&str; 4] = ["rolling_shutter", "k5", "k6", "time"];
@@ -38,8 +38,9 @@ impl Unsupported {
             _ => format!("{key} ({count} times, {value} the first)"),
         };
         let keys: Vec<String> = self.keys.iter().map(named).collect();
-        (!keys.is_empty())
-            .then(|| format!("{}: not supported, without effect: {}", path.display(), keys.join(", ")))
+        (!keys.is_empty()).then(|| {
+            format!("{}: not supported, without effect: {}", path.display(), keys.join(", "))
+        })
     }
 }
 
@@ -50,7 +51,8 @@ pub(super) fn is_marked_bad(frame: &Map<String, Value>) -> bool {
     let says = |keys: &[&str], value: bool| {
         let mut is_said = false;
         for key in keys {
-            let own = frame.get(*key).and_then(|own| own.as_bool().or(own.as_u64().map(|own| own != 0)));
+            let own =
+                frame.get(*key).and_then(|own| own.as_bool().or(own.as_u64().map(|own| own != 0)));
             is_said |= own == Some(value);
         }
         is_said
