@@ -319,7 +319,7 @@ impl Dataset {
             Some(0) => "none, as asked for".to_owned(),
             Some(every) => format!("every {every}th by name, as asked for"),
             None if has_test => "as the transforms files say".to_owned(),
-            None if tree::is_file(&root.join("test.txt")) => "as test.txt says".to_owned(),
+            None if split::test_list(root).is_some() => "as test.txt says".to_owned(),
             None => format!("every {TEST_EVERY}th by name"),
         }
     }

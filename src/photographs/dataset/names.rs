@@ -28,19 +28,23 @@ pub(super) fn possible(path: &str) -> [String; 3] {
 /// photographs, or where these are equal as well (`train/r_0`, `test/r_0`) all of the path. Of one pose they are one photograph
 /// that is listed twice (`low/0`, `high/0`), and nothing is renamed.
 pub(super) fn tell_apart(frames: &mut [ListedView]) {
+    let are_distinct =
+        |names: &[String]| names.iter().collect::<BTreeSet<_>>().len() == names.len();
+    let own: Vec<String> = frames.iter().map(|frame| frame.name.clone()).collect();
     let mut views = BTreeSet::new();
-    let view = |frame: &ListedView| {
-        (frame.name.clone(), frame.view_from_world.to_cols_array().map(f64::to_bits))
+    let mut view = |frame: &ListedView| {
+        let pose = frame.view_from_world.to_cols_array().map(f64::to_bits);
+        views.insert((frame.name.clone(), pose))
     };
-    let is_listed_twice = !frames.iter().all(|frame| views.insert(view(frame)));
+    if are_distinct(&own) || !frames.iter().all(&mut view) {
+        return;
+    }
     for path in [|frame: &ListedView| flat(&frame.below), |frame: &ListedView| flat(&frame.listed)]
     {
-        let mut names = BTreeSet::new();
-        if is_listed_twice || frames.iter().all(|frame| names.insert(frame.name.as_str())) {
+        let names: Vec<String> = frames.iter().map(path).collect();
+        if are_distinct(&names) {
+            frames.iter_mut().zip(names).for_each(|(frame, name)| frame.name = name);
             return;
-        }
-        for frame in &mut *frames {
-            frame.name = path(frame);
         }
     }
 }

@@ -53,6 +53,7 @@ struct StatedSplits {
 #[derive(Deserialize)]
 struct ListedFrame {
     file_path: String,
+    #[serde(deserialize_with = "matrix::rows")]
     transform_matrix: Rows,
     #[serde(flatten)]
     own: Intrinsics,

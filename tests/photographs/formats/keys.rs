@@ -231,6 +231,18 @@ fn with_matrices(root: &Path, change: impl Fn([[f64; 4]; 4]) -> [[f64; 4]; 4]) {
 
 #[test]
 fn scaled_rounded_and_transposed_matrices_are_read_and_told() {
+    // The numbers of a matrix may stand one after the other.
+    let folder = tempfile::tempdir().unwrap();
+    single(folder.path(), |listing| {
+        for frame in listing["frames"].as_array_mut().unwrap() {
+            let rows: [[f64; 4]; 4] =
+                serde_json::from_value(frame["transform_matrix"].clone()).unwrap();
+            frame["transform_matrix"] = json!(rows.concat());
+        }
+    });
+    let dataset = load(folder.path());
+    (0..9).for_each(|index| assert_camera_is_view(&dataset.views[index], index));
+
     let cases: [(&str, fn([[f64; 4]; 4]) -> [[f64; 4]; 4]); 2] = [
         ("hold a scale (9 of them, 0.2500 the last)", |mut matrix| {
             matrix

@@ -1,9 +1,24 @@
 //! `transform_matrix` as exporters write it: transposed, scaled or rounded ones are mended, left-handed ones are named.
 
 use glam::{DAffine3, DMat3, DVec3};
+use serde::{Deserialize, Deserializer};
 
 /// Rows as listed; `None` stands for NaN.
 pub(super) type Rows = Vec<Vec<Option<f64>>>;
+
+/// Rows, or the same numbers one after the other.
+pub(super) fn rows<'de, D: Deserializer<'de>>(matrix: D) -> Result<Rows, D::Error> {
+    #[derive(Deserialize)]
+    #[serde(untagged)]
+    enum Listed {
+        Rows(Rows),
+        Flat(Vec<Option<f64>>),
+    }
+    Ok(match Listed::deserialize(matrix)? {
+        Listed::Rows(rows) => rows,
+        Listed::Flat(numbers) => numbers.chunks(4).map(<[_]>::to_vec).collect(),
+    })
+}
 
 /// A pose, and what was wrong with its matrix.
 #[derive(Debug)]
