@@ -2,9 +2,9 @@
 
 mod cameras;
 mod clip;
-mod lifted;
 mod reconstruction;
 mod stages;
+mod tone_mapped;
 mod tool;
 
 use std::collections::BTreeMap;
@@ -116,10 +116,10 @@ pub fn run(args: &PoseArgs) -> Result<()> {
         photographs(&folder)?
     };
     let gpu = Gpu::new(&args.device.clone().unwrap_or_default())?;
-    let lifted = out.work.join("lifted");
-    let gain = lifted::write(&gpu, &mut photographs, &lifted)?;
+    let tone_mapped = out.work.join("tone-mapped");
+    let gain = tone_mapped::write(&gpu, &mut photographs, &tone_mapped)?;
     say(begin, &format!("{} photographs lifted (gain {gain:.1})", photographs.len()))?;
-    let models = reconstruction.models((&lifted, &photographs), |what| say(begin, what))?;
+    let models = reconstruction.models((&tone_mapped, &photographs), |what| say(begin, what))?;
     let (model, placed) = Dataset::largest_model(&models)?.filter(|(_, placed)| placed.len() >= FEWEST).ok_or_else(|| {
         let problem = format!(
             "COLMAP found no cameras for these {} photographs: they show too little in common or no texture; take more of them, closer together, or expose longer ({} has its output)",

@@ -57,7 +57,7 @@ pub use original::Original;
 pub(crate) use pixels::Look;
 use points::points;
 use source::Source;
-use split::{TEST_EVERY, say_whose_split_gives_way, split};
+use split::{TEST_EVERY, log_split, split};
 
 /// Photographs with cameras, and points of the scene they show.
 #[derive(Clone, Debug)]
@@ -277,7 +277,7 @@ impl Dataset {
         let layout = Layout::of(root)?;
         let Listing { mut frames, mut skipped, remarks, clouds } =
             list(&layout, options.images.as_deref(), &files)?;
-        say_whose_split_gives_way(&layout.root, &frames, options);
+        log_split(&layout.root, &frames, options);
         split(&layout.root, &mut frames, options.test_every, &files)?;
 
         let sources = sources(&layout.root, &frames, options, &files, &mut skipped);
@@ -305,7 +305,7 @@ impl Dataset {
         );
         let mut dataset = Self { root: root.to_owned(), views, points, skipped };
         dataset.leave_out_far_points();
-        dataset.say_what_stands_elsewhere();
+        dataset.warn_of_other_worlds();
         Ok(dataset)
     }
 

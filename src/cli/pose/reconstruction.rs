@@ -7,7 +7,7 @@ use anyhow::Result;
 
 use super::stages::Stage;
 use super::tool::Tool;
-use super::{PoseArgs, cameras, create, lifted};
+use super::{PoseArgs, cameras, create, tone_mapped};
 use crate::Error;
 use crate::photographs::dataset::Dataset;
 
@@ -134,10 +134,10 @@ impl<'a> Reconstruction<'a> {
     /// A program fails.
     pub(super) fn models(
         mut self,
-        (lifted, photographs): (&Path, &[PathBuf]),
+        (tone_mapped, photographs): (&Path, &[PathBuf]),
         say: impl Fn(&str) -> Result<()>,
     ) -> Result<PathBuf> {
-        self.extract((lifted, photographs), &say)?;
+        self.extract((tone_mapped, photographs), &say)?;
         // COLMAP compares no pair twice: another comparison begins with the features alone.
         let features = self.work.join("guided.db");
         if self.database.is_file() {
@@ -145,7 +145,7 @@ impl<'a> Reconstruction<'a> {
                 .map_err(|error| Error::output(&features, format!("cannot be written: {error}")))?;
         }
         self.compare(photographs.len(), &say)?;
-        self.place(lifted, &say)?;
+        self.place(tone_mapped, &say)?;
         let all = photographs.len();
         let mut placed = placed_in(&self.models)?;
         let mut best = self.models.clone();
@@ -156,7 +156,7 @@ impl<'a> Reconstruction<'a> {
         self.is_guided = true;
         self.into_folder("guided")?;
         self.database = features;
-        match self.compare(all, &say).and_then(|()| self.place(lifted, &say)) {
+        match self.compare(all, &say).and_then(|()| self.place(tone_mapped, &say)) {
             // What the first comparison came to is there.
             Err(error) if placed > 0 => {
                 tracing::warn!("{error}; the cameras are those of the first comparison");
@@ -174,7 +174,7 @@ impl<'a> Reconstruction<'a> {
                 ))?;
                 self.relaxed = relaxed;
                 self.into_folder(&format!("relaxed{step}"))?;
-                self.place(lifted, &say)?;
+                self.place(tone_mapped, &say)?;
             }
             let found = placed_in(&self.models)?;
             if found > placed {
@@ -193,7 +193,7 @@ impl<'a> Reconstruction<'a> {
     /// Features of each photograph. Photographs of one lens share a camera; each of a lens of its own has its own.
     fn extract(
         &self,
-        (lifted, photographs): (&Path, &[PathBuf]),
+        (tone_mapped, photographs): (&Path, &[PathBuf]),
         say: &impl Fn(&str) -> Result<()>,
     ) -> Result<()> {
         let command = "feature_extractor";
@@ -208,7 +208,7 @@ impl<'a> Reconstruction<'a> {
         }
         let use_gpu = self.named(command, ["FeatureExtraction", "SiftExtraction"], "use_gpu");
         for (at, (group, is_one_camera)) in runs.iter().enumerate() {
-            let mut options = self.files(lifted);
+            let mut options = self.files(tone_mapped);
             options.extend([
                 ("ImageReader.single_camera".to_owned(), (*is_one_camera).into()),
                 ("ImageReader.camera_model".to_owned(), self.args.camera_model.as_str().into()),
@@ -216,7 +216,7 @@ impl<'a> Reconstruction<'a> {
             ]);
             if runs.len() > 1 {
                 let list = self.work.join(format!("camera{at}.txt"));
-                let names = group.iter().map(|path| lifted::name(path)).collect::<Vec<_>>();
+                let names = group.iter().map(|path| tone_mapped::name(path)).collect::<Vec<_>>();
                 std::fs::write(&list, names.join("\n") + "\n")
                     .map_err(|error| Error::output(&list, format!("cannot be written: {error}")))?;
                 options.push(("image_list_path".to_owned(), list.into()));
@@ -249,8 +249,8 @@ impl<'a> Reconstruction<'a> {
         say("features matched")
     }
 
-    fn place(&self, lifted: &Path, say: &impl Fn(&str) -> Result<()>) -> Result<()> {
-        let mut files = self.files(lifted);
+    fn place(&self, tone_mapped: &Path, say: &impl Fn(&str) -> Result<()>) -> Result<()> {
+        let mut files = self.files(tone_mapped);
         files.push(("output_path".to_owned(), self.models.clone().into()));
         let stage = ("placing", say);
         let placed = match (self.args.mapper, &self.glomap) {
@@ -270,7 +270,7 @@ impl<'a> Reconstruction<'a> {
         };
         // It fails where it found nothing to begin with, which is said of the photographs.
         match placed {
-            Err(_) if NOTHING.iter().any(|words| self.colmap.said(words)) => {}
+            Err(_) if NOTHING.iter().any(|words| self.colmap.printed(words)) => {}
             outcome => outcome?,
         }
         say("cameras placed")
@@ -293,18 +293,18 @@ impl<'a> Reconstruction<'a> {
         let arguments: Vec<&OsStr> = options.iter().flatten().map(OsString::as_os_str).collect();
         let mut stage = Stage::new(what);
         let mut told = Ok(());
-        tool.run_and_watch(command, &arguments, |said| {
-            if let Some(line) = stage.due(said) {
+        tool.run_and_watch(command, &arguments, |printed| {
+            if let Some(line) = stage.due(printed) {
                 told = say(&line);
             }
         })?;
         told
     }
 
-    fn files(&self, lifted: &Path) -> Options {
+    fn files(&self, tone_mapped: &Path) -> Options {
         vec![
             ("database_path".to_owned(), self.database.clone().into()),
-            ("image_path".to_owned(), lifted.into()),
+            ("image_path".to_owned(), tone_mapped.into()),
         ]
     }
 

@@ -18,12 +18,12 @@ impl<'a> Stage<'a> {
     }
 
     /// The line that is due, by what the command has said.
-    pub(super) fn due(&mut self, said: &str) -> Option<String> {
+    pub(super) fn due(&mut self, printed: &str) -> Option<String> {
         if self.last.elapsed() < PAUSE {
             return None;
         }
         self.last = Instant::now();
-        let how_far = counted(said).map_or_else(
+        let how_far = counted(printed).map_or_else(
             || "at work".to_owned(),
             |[at, of]| match of {
                 0 => format!("{at} so far"),
@@ -36,7 +36,7 @@ impl<'a> Stage<'a> {
 
 /// The last count that COLMAP printed: files as [3/48], blocks of pairs as [1/6, 2/6], registered photographs by a line each,
 /// of which it does not say the total: 0.
-fn counted(said: &str) -> Option<[usize; 2]> {
+fn counted(printed: &str) -> Option<[usize; 2]> {
     let bracket = |line: &str| {
         let inside = line.split_once('[')?.1.split_once(']')?.0;
         let pairs = inside.split(',').map(|pair| {
@@ -52,8 +52,8 @@ fn counted(said: &str) -> Option<[usize; 2]> {
             _ => None,
         }
     };
-    let registered = said.lines().filter(|line| line.contains("Registering image #")).count();
-    let by_line = said.lines().rev().find_map(bracket);
+    let registered = printed.lines().filter(|line| line.contains("Registering image #")).count();
+    let by_line = printed.lines().rev().find_map(bracket);
     if registered > 0 { Some([registered, 0]) } else { by_line }
 }
 
@@ -73,8 +73,8 @@ mod tests {
             ("Registering image #4 (3)\n x [1/2]\nRegistering image #9 (4)\n", Some([2, 0])),
             ("[no/count]\nnothing [", None),
         ];
-        for (said, expected) in cases {
-            assert_eq!(counted(said), expected, "{said}");
+        for (printed, expected) in cases {
+            assert_eq!(counted(printed), expected, "{printed}");
         }
         let mut stage = Stage::new("matching");
         assert_eq!(stage.due("Matching block [1/1, 1/1]"), None, "too early");

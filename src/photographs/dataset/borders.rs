@@ -20,7 +20,7 @@ const SOMETHING: f32 = 4.0 / 255.0;
 const LOOKED_AT: usize = 12;
 const NEEDED: usize = 3;
 /// The part of the photographs that is black in the same place.
-const MOST_VIEWS: f64 = 0.9;
+const MAX_VIEWS: f64 = 0.9;
 /// The least part of a photograph that matters.
 const LEAST_AREA: f64 = 0.002;
 /// The part of its outline at which black must end abruptly.
@@ -95,7 +95,7 @@ fn border(images: impl Iterator<Item = Image>, (width, height): (u32, u32)) -> O
     if views < NEEDED {
         return None;
     }
-    let most = (MOST_VIEWS * views as f64).ceil() as u16;
+    let most = (MAX_VIEWS * views as f64).ceil() as u16;
     let is_common = |pixel: usize| counts[pixel] >= most;
     let common: Vec<usize> = (0..plane.len()).filter(|&pixel| is_common(pixel)).collect();
     if common.len() < least || common.len() == plane.len() {

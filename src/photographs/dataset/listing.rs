@@ -27,7 +27,7 @@ pub(super) fn list(layout: &Layout, images: Option<&Path>, files: &Files) -> Res
             format!("has no usable view ({first}); export the cameras anew"),
         ));
     }
-    names::tell_apart(&mut listing.frames);
+    names::disambiguate(&mut listing.frames);
     refuse_two_of_one_name(root, &listing.frames)?;
     listing.frames.sort_by(|a, b| a.name.cmp(&b.name));
     listing.remarks.extend(unused::remarks(root, &listing.frames));

@@ -27,7 +27,7 @@ pub(super) fn possible(path: &str) -> [String; 3] {
 /// Puts folders into every name where two photographs in different folders have one: those below the folder of all
 /// photographs, or where these are equal as well (`train/r_0`, `test/r_0`) all of the path. Of one pose they are one photograph
 /// that is listed twice (`low/0`, `high/0`), and nothing is renamed.
-pub(super) fn tell_apart(frames: &mut [ListedView]) {
+pub(super) fn disambiguate(frames: &mut [ListedView]) {
     let are_distinct =
         |names: &[String]| names.iter().collect::<BTreeSet<_>>().len() == names.len();
     let own: Vec<String> = frames.iter().map(|frame| frame.name.clone()).collect();

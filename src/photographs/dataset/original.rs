@@ -12,7 +12,7 @@ use crate::Result;
 use crate::base::hash::Hasher;
 use crate::camera::Lens;
 use crate::photographs::image::{Image, PictureFile};
-use crate::photographs::tone::Measured;
+use crate::photographs::tone::MeasuredPhotograph;
 
 /// A photograph that was shrunk on loading, or is not kept.
 #[derive(Clone, Debug)]
@@ -23,7 +23,7 @@ pub struct Original {
     /// As [`super::LoadOptions::undistort`].
     undistort: bool,
     /// The statistics of the photograph, and of which size.
-    pub(super) measured: Option<(MeasuredSize, Measured)>,
+    pub(super) measured: Option<(MeasuredSize, MeasuredPhotograph)>,
     /// Of the pixels as they are loaded, where they are not kept.
     pub(super) checksum: Option<Hasher>,
     /// The photograph at its own size, if memory allows, until it is released.
@@ -64,7 +64,7 @@ impl Original {
     }
 
     /// The statistics at a size, if they were measured while the photograph was decoded.
-    pub(crate) fn measured(&self, size: MeasuredSize) -> Option<&Measured> {
+    pub(crate) fn measured(&self, size: MeasuredSize) -> Option<&MeasuredPhotograph> {
         self.measured.as_ref().filter(|(own, _)| *own == size).map(|(_, measured)| measured)
     }
 

@@ -161,7 +161,7 @@ fn listed_path(path: &str) -> String {
 }
 
 /// A frame with its pose.
-struct Frame {
+struct TrainingFrame {
     listed: ListedFrame,
     split: Option<Split>,
     view_from_world: DAffine3,
@@ -173,7 +173,7 @@ fn usable_frames(
     transforms: &mut Transforms,
     split: Option<Split>,
     listing: &mut Listing,
-) -> Vec<Frame> {
+) -> Vec<TrainingFrame> {
     let mut unsupported = Unsupported::default();
     unsupported.add(&transforms.others);
     let held_out = std::mem::take(&mut transforms.test_frames);
@@ -208,7 +208,7 @@ fn usable_frames(
                 mended.add(&pose);
                 let split = stated.split().or(split);
                 let view_from_world = pose.view_from_world;
-                frames.push(Frame { listed, split, view_from_world });
+                frames.push(TrainingFrame { listed, split, view_from_world });
             }
         }
     }

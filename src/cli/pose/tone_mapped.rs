@@ -10,7 +10,7 @@ use crate::gpu::Gpu;
 use crate::photographs::image::files::stem;
 use crate::photographs::image::{Image, exif_segment};
 use crate::photographs::pseudo_gt::PseudoGt;
-use crate::photographs::tone::{Measured, ToneSettings, all_black};
+use crate::photographs::tone::{MeasuredPhotograph, ToneSettings, all_black};
 
 /// Lifts the photographs into `folder`, as stored, and returns the gain of the scene. A JPEG stays one and keeps its Exif,
 /// so that COLMAP finds the focal length; everything else becomes PNG. Those that do not decode are named and taken out of
@@ -29,7 +29,7 @@ pub(super) fn write(gpu: &Gpu, photographs: &mut Vec<PathBuf>, folder: &Path) ->
     photographs.retain(|path| {
         progress.inc(1);
         match Image::load(path) {
-            Ok(image) => measured.push(Measured::of(&image.data)),
+            Ok(image) => measured.push(MeasuredPhotograph::of(&image.data)),
             Err(error) => {
                 tracing::warn!("left out: {error}");
                 undecoded = Some(error);
@@ -43,7 +43,8 @@ pub(super) fn write(gpu: &Gpu, photographs: &mut Vec<PathBuf>, folder: &Path) ->
     }
     let scene = settings.scene(&measured).ok_or_else(|| all_black(&root))?;
     for (path, measured) in photographs.iter().zip(&measured) {
-        let image = pseudo_gt.lifted(&Image::load(path)?, &settings.lift(&scene, measured))?;
+        let image =
+            pseudo_gt.tone_mapped(&Image::load(path)?, &settings.tone_mapping(&scene, measured))?;
         let file = folder.join(name(path));
         if is_jpeg(path) {
             image.save_jpeg(file, exif_of(path)?.as_deref())?;
