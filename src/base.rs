@@ -5,6 +5,7 @@
 //! - [`hash`]: checksums of numbers and bytes
 //! - [`random`]: counter-based random numbers
 //! - [`settings`]: a row for each setting: key, default, rule, unit, help, option
+//! - [`tree`]: files and folders by path, on the disk or in a ZIP archive
 
 #[cfg(feature = "io")]
 pub mod hash;
@@ -14,3 +15,5 @@ pub mod output;
 pub mod random;
 #[cfg(feature = "io")]
 pub mod settings;
+#[cfg(feature = "io")]
+pub mod tree;

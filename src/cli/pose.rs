@@ -1,7 +1,9 @@
 //! `nightsplat pose`: from photographs without cameras to a dataset.
 
+mod cameras;
 mod clip;
 mod reconstruction;
+mod stages;
 mod tone_mapped;
 mod tool;
 
@@ -16,8 +18,10 @@ use anyhow::Result;
 use self::reconstruction::{Mapper, Matcher, Reconstruction};
 use self::tool::Tool;
 use crate::Error;
+use crate::base::output::write_whole;
+use crate::base::{input, tree};
 use crate::gpu::{DeviceChoice, Gpu};
-use crate::photographs::dataset::Dataset;
+use crate::photographs::dataset::{Dataset, is_mask};
 use crate::photographs::image::files::{photographs_in, stem, unread_in};
 
 /// Find the cameras of dark photographs with COLMAP, and write a dataset that `train` takes.
@@ -51,7 +55,10 @@ pub struct PoseArgs {
     /// The program `glomap`, which places all at once where your COLMAP is older than 4.0
     #[arg(long, value_name = "PATH", default_value = "glomap")]
     pub glomap: PathBuf,
-    /// COLMAP's model of the lens, the same for all photographs of one size
+    /// Pass an option to the command of COLMAP that has it, as Mapper.init_min_tri_angle=4; may be given again
+    #[arg(long, value_name = "NAME=VALUE")]
+    pub colmap_option: Vec<String>,
+    /// COLMAP's model of the lens; photographs of one size, lens and focal length share a camera
     #[arg(long, value_name = "NAME", default_value = "OPENCV")]
     pub camera_model: String,
     /// How many frames a second of a clip to take
@@ -71,6 +78,9 @@ pub struct PoseArgs {
     pub device: Option<DeviceChoice>,
 }
 
+/// Of many calibrations these are shown.
+const MOST_SHOWN: usize = 3;
+
 /// Two cameras tell the shape of little.
 const FEWEST: usize = 3;
 
@@ -86,7 +96,7 @@ pub fn run(args: &PoseArgs) -> Result<()> {
         ))
         .into());
     }
-    let is_clip = args.photos.is_file();
+    let is_clip = tree::is_file(&args.photos) && !tree::is_dir(&args.photos);
     let begin = Instant::now();
     let mut out = Unfinished::new(&args.out, args.overwrite)?;
     let colmap = Tool::new(&args.colmap, "colmap", &out.log)
@@ -94,17 +104,22 @@ pub fn run(args: &PoseArgs) -> Result<()> {
     let matcher =
         args.matcher.unwrap_or(if is_clip { Matcher::Sequential } else { Matcher::Exhaustive });
     let reconstruction = Reconstruction::new(args, colmap, matcher, &out.work)?;
-    let photographs = if is_clip {
+    let folder = if tree::archive_of(&args.photos).is_some() {
+        Dataset::folder_of(&args.photos)?
+    } else {
+        args.photos.clone()
+    };
+    let mut photographs = if is_clip {
         let ffmpeg = Tool::new(&args.ffmpeg, "ffmpeg", &out.log).found("")?;
         clip::frames(&ffmpeg, &args.photos, args.fps, &out.work.join("frames"))?
     } else {
-        photographs(&args.photos)?
+        photographs(&folder)?
     };
     let gpu = Gpu::new(&args.device.clone().unwrap_or_default())?;
     let tone_mapped = out.work.join("tone-mapped");
-    let gain = tone_mapped::write(&gpu, &photographs, &tone_mapped)?;
+    let gain = tone_mapped::write(&gpu, &mut photographs, &tone_mapped)?;
     say(begin, &format!("{} photographs lifted (gain {gain:.1})", photographs.len()))?;
-    let models = reconstruction.models(&tone_mapped, |what| say(begin, what))?;
+    let models = reconstruction.models((&tone_mapped, &photographs), |what| say(begin, what))?;
     let (model, placed) = Dataset::largest_model(&models)?.filter(|(_, placed)| placed.len() >= FEWEST).ok_or_else(|| {
         let problem = format!(
             "COLMAP found no cameras for these {} photographs: they show too little in common or no texture; take more of them, closer together, or expose longer ({} has its output)",
@@ -123,15 +138,30 @@ pub fn run(args: &PoseArgs) -> Result<()> {
         let Some(path) = by_name.get(stem(name)) else { continue };
         link_or_copy(path, &images.join(path.file_name().unwrap_or_default()))?;
     }
-    keep_masks(&args.photos.join("masks"), &out.folder.join("masks"))?;
+    keep_masks(&folder.join("masks"), &out.folder.join("masks"))?;
+    if !is_clip {
+        for mask in photographs_in(&folder)?.iter().filter(|file| is_mask(file)) {
+            link_or_copy(mask, &images.join(mask.file_name().unwrap_or_default()))?;
+        }
+    }
     let sparse = out.folder.join("sparse/0");
     create(&sparse)?;
     for file in ["cameras.bin", "images.bin", "points3D.bin"] {
         link_or_copy(&model.join(file), &sparse.join(file))?;
     }
+    let lenses = Dataset::lenses(&sparse)?;
     out.finish()?;
     let (count, of) = (placed.len(), photographs.len());
     say(begin, &format!("{count} of {of} photographs have a camera -> {}", args.out.display()))?;
+    for lens in &lenses {
+        if let Some(problem) = cameras::implausible(lens) {
+            tracing::warn!(
+                "the calibration of {} is implausible: {problem}; photographs of several lenses may share it, or show too little \
+                 in common",
+                cameras::shown(lens)
+            );
+        }
+    }
     if 2 * count < of {
         tracing::warn!(
             "most photographs have no camera: take more of them, closer together, or expose longer"
@@ -139,8 +169,10 @@ pub fn run(args: &PoseArgs) -> Result<()> {
     }
     writeln!(
         std::io::stdout(),
-        "{}: {count} of {of} photographs with their cameras; next: nightsplat train {} --out run",
+        "{}: {count} of {of} photographs with their cameras, {} calibrated ({}); next: nightsplat train {} --out run",
         args.out.display(),
+        if lenses.len() == 1 { "one".to_owned() } else { lenses.len().to_string() },
+        lenses.iter().take(MOST_SHOWN).map(cameras::shown).collect::<Vec<_>>().join("; "),
         args.out.display()
     )?;
     Ok(())
@@ -172,7 +204,8 @@ fn keep_masks(masks: &Path, to: &Path) -> Result<()> {
 
 /// The photographs of a folder, of different names.
 fn photographs(folder: &Path) -> Result<Vec<PathBuf>> {
-    let paths = photographs_in(folder)?;
+    let mut paths = photographs_in(folder)?;
+    paths.retain(|path| !is_mask(path));
     if let Some(line) = unread_in(folder) {
         tracing::warn!("{line}");
     }
@@ -206,6 +239,9 @@ fn create(folder: &Path) -> crate::Result<()> {
 
 /// The same file under another name where the disk can do that, else a copy.
 fn link_or_copy(from: &Path, to: &Path) -> crate::Result<()> {
+    if tree::archive_of(from).is_some() {
+        return write_whole(to, &input::bytes(from)?);
+    }
     let from = from.canonicalize().unwrap_or_else(|_| from.to_owned());
     if fs::hard_link(&from, to).is_ok() {
         return Ok(());

@@ -31,10 +31,14 @@ pub(crate) use codec::PictureFile;
 pub(crate) use codec::openings;
 #[cfg(feature = "io")]
 pub use exif::exposure_value;
+#[cfg(feature = "cli")]
+pub(crate) use exif::lens_name;
 #[cfg(feature = "io")]
 pub use jpeg::exif_segment;
 #[cfg(feature = "io")]
 pub use mask::Mask;
+#[cfg(feature = "io")]
+pub(crate) use mask::MaskFile;
 #[cfg(feature = "io")]
 pub use orientation::Orientation;
 use rayon::prelude::*;

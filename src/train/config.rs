@@ -64,6 +64,8 @@ settings! {
 pub struct TrainConfig {
     /// The dataset's folder.
     dataset: PathBuf = PathBuf::new() => Rule::PATH;
+    /// The folder that holds the photographs by their listed names.
+    images: Option<PathBuf> = None, "where the dataset's listing says" => Rule::PATH, "--images DIR";
     /// A folder of reference images by name, for scores only.
     reference: Option<PathBuf> = None, "what lies beside the photographs" => Rule::PATH, "--reference DIR";
     /// Begin with the Gaussians of a PLY, of a run or of another program, in the dataset's world, in place of the dataset's
@@ -71,6 +73,9 @@ pub struct TrainConfig {
     init: Option<PathBuf> = None, "the dataset's points" => Rule::PATH, "--init MODEL.ply";
     /// Masks (masks/NAME.png or masks/NAME.jpg.png of the dataset) hide what is white, not what is black.
     invert_masks: bool = false => Rule::Flag, "--invert-masks";
+    /// Mask black borders and corners that the photographs have in the same place, as undistorting leaves them where the lens
+    /// saw nothing.
+    mask_borders: bool = true => Rule::Flag;
     /// Undistort the photographs of a fisheye to a pinhole's, cropped to 60 degrees off its axis, in place of training on
     /// the fisheye as it is; those of other distorted lenses are always undistorted.
     undistort: bool = false => Rule::Flag, "--undistort";
@@ -250,8 +255,10 @@ impl TrainConfig {
             max_resolution: self.max_resolution,
             test_every: self.test_every,
             keep: CacheSize::on_host(self.cache, self.max_ram),
+            images: self.images.clone(),
             reference: self.reference.clone(),
             invert_masks: self.invert_masks,
+            mask_borders: self.mask_borders,
             undistort: self.undistort,
             measured: if self.tone.full_resolution {
                 MeasuredSize::Own
@@ -290,7 +297,12 @@ impl TrainConfig {
     /// The same run of another copy of its dataset; what lay in its folder lies there, too.
     pub(crate) fn move_dataset(&mut self, dataset: &Path) {
         let from = std::mem::replace(&mut self.dataset, dataset.to_owned());
-        let inside = [&mut self.reference, &mut self.model.depth_folder, &mut self.exposure.start];
+        let inside = [
+            &mut self.images,
+            &mut self.reference,
+            &mut self.model.depth_folder,
+            &mut self.exposure.start,
+        ];
         for folder in inside.into_iter().flatten() {
             if let Ok(place) = folder.strip_prefix(&from) {
                 *folder = dataset.join(place);

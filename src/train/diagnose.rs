@@ -263,7 +263,7 @@ impl Photograph {
     fn load(file: &dataset::Photograph, invert_masks: bool) -> Result<Self> {
         let (image, alpha) = PictureFile::open(&file.input)?.decode()?;
         let decoded = (&image, alpha.as_ref());
-        let mask = Mask::over(&file.input, decoded, file.mask.as_deref(), invert_masks)?;
+        let mask = Mask::over(&file.input, decoded, file.mask.as_ref(), invert_masks)?;
         Ok(Self::of(&image, mask.as_ref()))
     }
 

@@ -1,6 +1,5 @@
 //! Photographs from and to files: PNG, JPEG, WebP, TIFF and EXR in, PNG and EXR out.
 
-use std::fs::File;
 use std::io::{BufReader, Cursor};
 use std::path::{Path, PathBuf};
 
@@ -15,8 +14,8 @@ use super::files::RAW_REMEDY;
 use super::files::{HEIC_REMEDY, is_raw};
 use super::source::{Source, not_an_image, reader};
 use super::{Image, budget, exr_file, from_interleaved, jpeg, linear_from_srgb, srgb_from_linear};
-use crate::base::input;
 use crate::base::output::write_whole;
+use crate::base::{input, tree};
 use crate::{Error, Result};
 
 /// The file of a picture, read whole.
@@ -123,7 +122,7 @@ pub(crate) mod openings {
 fn file_reader(path: &Path) -> Result<ImageReader<Box<dyn Source>>> {
     #[cfg(test)]
     openings::count(path);
-    let opened = File::open(path).and_then(|file| reader(BufReader::new(file)));
+    let opened = tree::open(path).and_then(|file| reader(BufReader::new(file)));
     opened.map_err(|error| unreadable(path, &error))
 }
 

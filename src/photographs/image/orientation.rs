@@ -1,6 +1,5 @@
 //! How a photograph is turned: cameras store what the sensor saw, and say in Exif which way is up.
 
-use std::fs::File;
 use std::io::BufReader;
 use std::path::Path;
 
@@ -9,6 +8,7 @@ use rayon::prelude::*;
 
 use super::Image;
 use crate::Result;
+use crate::base::tree;
 
 /// The orientation of Exif, 1 to 8: where the first row and column of what is stored lie in what is seen.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -21,7 +21,7 @@ impl Orientation {
     /// What a file says; upright where it says nothing.
     pub fn of(path: &Path) -> Self {
         let tagged = || {
-            let file = File::open(path).ok()?;
+            let file = tree::open(path).ok()?;
             let exif = Reader::new().read_from_container(&mut BufReader::new(file)).ok()?;
             let value = exif.get_field(Tag::Orientation, In::PRIMARY)?.value.get_uint(0)?;
             u8::try_from(value).ok().filter(|value| (1..=8).contains(value))

@@ -15,11 +15,11 @@ use crate::common::{not_run, shared};
 
 /// A program that does as the real one's command line asks, by a few lines of shell for each of its commands.
 #[cfg(unix)]
-fn stub(folder: &Path, cases: &str) -> PathBuf {
+pub(super) fn stub(folder: &Path, cases: &str) -> PathBuf {
     use std::os::unix::fs::PermissionsExt;
     let path = folder.join("colmap-stub");
     let script = format!(
-        "#!/bin/sh\ncommand=$1; shift\n[ \"$1\" = -h ] && exit 0\nwhile [ $# -gt 0 ]; do\n case $1 in\n  --image_path) images=$2;;\n  --output_path) output=$2;;\n esac\n shift\ndone\ncase $command in\n{cases}\nesac\n"
+        "#!/bin/sh\ncommand=$1; shift\nif [ \"$1\" = -h ]; then\n [ $command = mapper ] && echo '  --Mapper.init_min_tri_angle arg (=16)'\n exit 0\nfi\nwhile [ $# -gt 0 ]; do\n case $1 in\n  --image_path) images=$2;;\n  --output_path) output=$2;;\n  --image_list_path) list=$2;;\n  --Mapper.init_min_tri_angle) angle=$2;;\n esac\n shift\ndone\ncase $command in\n{cases}\nesac\n"
     );
     fs::write(&path, script).unwrap();
     fs::set_permissions(&path, fs::Permissions::from_mode(0o755)).unwrap();
@@ -27,7 +27,7 @@ fn stub(folder: &Path, cases: &str) -> PathBuf {
 }
 
 /// Photographs with some detail, dark, `photos/v00.png` to `v08.png`.
-fn photographed(root: &Path) -> PathBuf {
+pub(super) fn photographed(root: &Path) -> PathBuf {
     let photos = root.join("photos");
     fs::create_dir_all(&photos).unwrap();
     for index in 0..9 {

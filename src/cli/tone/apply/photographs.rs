@@ -4,10 +4,11 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use super::{ApplyArgs, is_same_file};
+use crate::base::tree;
 use crate::cli::ImageFormat;
 use crate::photographs::dataset::{Dataset, LoadOptions, Photograph, Split};
 use crate::photographs::image::files::{photographs_in, unread_in};
-use crate::photographs::image::{Image, Mask, Orientation, PictureFile};
+use crate::photographs::image::{Image, Mask, MaskFile, Orientation, PictureFile};
 use crate::{Error, Result};
 
 /// A photograph to map.
@@ -19,7 +20,7 @@ pub(super) struct Listed {
     /// Of a dataset's view.
     pub(super) split: Option<Split>,
     /// Its mask.
-    pub(super) mask: Option<PathBuf>,
+    pub(super) mask: Option<MaskFile>,
     /// The file to write.
     pub(super) target: Option<PathBuf>,
 }
@@ -30,7 +31,7 @@ impl Listed {
     pub(super) fn load(&self, inverted: bool) -> Result<(Image, Vec<usize>)> {
         let (image, alpha) = PictureFile::open(&self.input)?.decode()?;
         let decoded = (&image, alpha.as_ref());
-        let mask = Mask::over(&self.input, decoded, self.mask.as_deref(), inverted)?;
+        let mask = Mask::over(&self.input, decoded, self.mask.as_ref(), inverted)?;
         let hidden = mask.as_ref().map(Mask::hidden).unwrap_or_default();
         Ok((image, hidden))
     }
@@ -59,8 +60,8 @@ pub(super) fn listed(args: &ApplyArgs) -> Result<Vec<Listed>> {
     let input = &args.input;
     let unreadable =
         |error: std::io::Error| Error::input(input, format!("cannot be read: {error}"));
-    let is_folder = std::fs::metadata(input).map_err(unreadable)?.is_dir();
-    let mut photographs = if !is_folder {
+    std::fs::metadata(input).map_err(unreadable)?;
+    let mut photographs = if !tree::is_dir(input) {
         vec![plain(input, args.reference.as_deref())?]
     } else if Dataset::is_at(input) {
         let options = LoadOptions { reference: args.reference.clone(), ..LoadOptions::default() };
@@ -104,7 +105,7 @@ fn plain(input: &Path, reference: Option<&Path>) -> Result<Listed> {
     let masks = input.with_file_name("masks");
     let file = input.file_name().unwrap_or_default().to_string_lossy();
     let candidates = [format!("{name}.png"), format!("{file}.png")].map(|mask| masks.join(mask));
-    let mask = candidates.into_iter().find(|mask| mask.is_file());
+    let mask = candidates.into_iter().find(|mask| mask.is_file()).map(MaskFile::shown);
     Ok(Listed { name, input: input.to_owned(), reference, split: None, mask, target: None })
 }
 
