@@ -28,7 +28,9 @@ fn without_a_terminal_scores_on_the_way_are_lines() {
         assert!(stdout.contains("6 steps"), "{stdout}");
     }
     let (stdout, stderr) = trained("--progress none");
-    assert!(!stderr.contains("step 3") && stdout.contains("6 steps"), "{stderr}");
+    assert!(stderr.is_empty(), "{stderr}");
+    assert!(stdout.contains("6 steps") && !stdout.contains("views of"), "{stdout}");
+    assert!(stdout.contains("wrote ") && stdout.contains("next: nightsplat export "), "{stdout}");
 }
 
 #[test]

@@ -229,8 +229,8 @@ fn of_gaussians(gaussians: &Gaussians, wanted: &Range<usize>) -> Vec<f32> {
     own.copied().collect()
 }
 
-/// The largest difference between what the trainer shows and what the references do in f64, without tiles; none where that
-/// takes too long.
+/// The largest difference between what the trainer shows and what the references do in f64, without tiles; none where
+/// that takes too long.
 fn render_error(
     trainer: &mut Trainer,
     config: &TrainConfig,

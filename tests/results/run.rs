@@ -100,7 +100,7 @@ fn scores_on_the_way_are_rows_and_a_resumed_run_has_each_once() {
 fn a_run_says_at_its_start_what_it_trains_and_why() {
     let folder = folder();
     let start = |out: &str, options: &str| succeed(&train(folder.path(), out, options));
-    let said = start("a", "--steps 1 --progress none");
+    let said = start("a", "--steps 1 --progress plain");
     for part in [
         "8 views of 48x32 to train on",
         "2 test views (as the transforms files say) scored against reference images",
@@ -110,17 +110,20 @@ fn a_run_says_at_its_start_what_it_trains_and_why() {
         assert!(said.contains(part), "no `{part}` in: {said}");
     }
     // Nothing is held out of eight views but one, and nothing of seven.
-    let said = start("d", "--progress none --preset balanced --set steps=30");
+    let said = start("d", "--progress plain --preset balanced --set steps=30");
     for part in [
-        "30 steps at most: the run settles for 10 and ends once 1 held-out view has converged",
-        "30 steps are too few to settle for 250 (a third of them at most)",
+        "at most 30 steps: training stops early once 1 held-out view has converged, after a cooldown of 10",
+        "30 steps are too few for a cooldown of 250 (at most a third)",
     ] {
         assert!(said.contains(part), "no `{part}` in: {said}");
     }
     assert!(said.contains("ended at step 30: all steps are done"), "{said}");
-    let said = start("e", "--progress none --preset balanced --set steps=3 --test-every 3");
-    assert!(said.contains("no early end: 6 training views are too few to hold one out"), "{said}");
-    let said = start("b", "--steps 1 --progress none --plan none --curve AP3 --test-every 5");
+    let said = start("e", "--progress plain --preset balanced --set steps=3 --test-every 3");
+    assert!(
+        said.contains("no early stopping: 6 training views are too few to hold one out"),
+        "{said}"
+    );
+    let said = start("b", "--steps 1 --progress plain --plan none --curve AP3 --test-every 5");
     assert!(said.contains("curve ap3: as asked for"), "{said}");
     assert!(said.contains("2 test views (every 5th by name, as asked for)"), "{said}");
     let said = start("c", "--steps 1 --progress json --curve none");
@@ -278,7 +281,7 @@ fn a_camera_flies_and_the_pictures_become_a_video() {
         let [first, last] = [&files[0], &files[3]].map(|file| Image::load(file).unwrap());
         assert_eq!((first.width, first.height), (48, 32));
         assert!(first.data != last.data && first.data.iter().any(|&value| value > 0.1), "{way}");
-        // Whatever cannot show a moving PNG shows its first picture.
+        // Viewers without support for animation show the first frame.
         assert_eq!(Image::load(&video).unwrap(), first);
         let bytes = fs::read(&video).unwrap();
         let chunks = |name: &[u8]| bytes.windows(4).filter(|window| *window == name).count();
@@ -294,13 +297,20 @@ fn a_camera_flies_and_the_pictures_become_a_video() {
     let video =
         format!("{render} --path orbit --frames 2 --video {}/orbit.mp4", folder.path().display());
     let nowhere = [("PATH", "/nonexistent")];
-    let parts = ["orbit.mp4", "there is no ffmpeg", "ffmpeg -y", "-framerate 30", "%05d.png"];
+    let parts = ["orbit.mp4", "needs ffmpeg", "-framerate 30", "*.png"];
     refused_with(&video, &nowhere, 1, &parts);
     assert_eq!(file_count(&out), 2);
     if crate::common::command::exists("ffmpeg") {
         succeed(&video);
         assert!(fs::metadata(path("orbit.mp4")).unwrap().len() > 100);
+        let views = format!("{render} --split test --video {}/views.mp4", folder.path().display());
+        succeed(&views);
+        assert!(fs::metadata(path("views.mp4")).unwrap().len() > 100);
     }
+    // The views of a split are frames, too.
+    let views = format!("{render} --split test --video {}/views.png", folder.path().display());
+    assert!(succeed(&views).contains("views.png"));
+    assert!(fs::read(path("views.png")).unwrap().windows(4).any(|chunk| chunk == b"acTL"));
     refused(&render, 2, &["--split"]);
     refused(&format!("{render} --split all --path orbit"), 2, &["--path"]);
     refused(&format!("{render} --path orbit --format exr --video a.mp4"), 2, &["--video", "exr"]);

@@ -1,4 +1,4 @@
-//! The photographs as COLMAP can see them: all lifted by one curve, under their own names.
+//! Brightened copies of the photographs for COLMAP, all by the same curve.
 
 use std::path::{Path, PathBuf};
 
@@ -12,14 +12,14 @@ use crate::photographs::image::{Image, exif_segment};
 use crate::photographs::pseudo_gt::PseudoGt;
 use crate::photographs::tone::{Measured, ToneSettings, all_black};
 
-/// Lifts the photographs into `folder`, as stored, and returns the gain of the scene. A JPEG stays one and keeps its Exif,
-/// so that COLMAP finds the focal length; everything else becomes PNG.
+/// Writes brightened copies into `folder` and returns the gain. A JPEG stays JPEG and keeps its Exif, where COLMAP
+/// finds the focal length; other formats become PNG.
 ///
 /// # Errors
 /// A photograph cannot be read, all are black, or the device is out of memory.
 pub(super) fn write(gpu: &Gpu, photographs: &[PathBuf], folder: &Path) -> Result<f64> {
     create(folder)?;
-    // One curve for all: what two photographs show of one place stays alike.
+    // The same curve for all, so that features keep matching.
     let settings = ToneSettings { scene_statistics: true, ..ToneSettings::default() };
     let pseudo_gt = PseudoGt::new(gpu, &settings)?;
     let progress = progress_bar(2 * photographs.len());
@@ -55,7 +55,7 @@ fn exif_of(path: &Path) -> Result<Option<Vec<u8>>> {
     Ok(exif_segment(&bytes))
 }
 
-/// Whether all photographs of a folder are of one size, and so of one camera.
+/// Whether all photographs of a folder have the same size, and so one camera.
 pub(super) fn are_of_one_size(folder: &Path) -> bool {
     let sizes = photographs_in(folder).unwrap_or_default();
     let mut sizes = sizes.iter().map(|path| Image::size_of(path).ok());

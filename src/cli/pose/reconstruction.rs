@@ -1,4 +1,4 @@
-//! What COLMAP is asked to do with the lifted photographs: features, matches, cameras.
+//! Runs COLMAP on the brightened photographs: features, matches, cameras.
 
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
@@ -10,12 +10,12 @@ use super::{PoseArgs, create, lifted};
 use crate::photographs::dataset::Dataset;
 use crate::photographs::image::files::photographs_in;
 
-/// Which photographs COLMAP compares.
+/// The pairs of photographs that COLMAP matches.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum Matcher {
-    /// Each with each.
+    /// Every pair
     Exhaustive,
-    /// Each with those that follow it by name.
+    /// Neighbours by name
     Sequential,
 }
 
@@ -28,19 +28,19 @@ impl Matcher {
     }
 }
 
-/// How cameras are placed.
+/// The mapper that registers cameras.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum Mapper {
-    /// One after the other (COLMAP's mapper).
+    /// One by one (COLMAP's mapper)
     Incremental,
-    /// All at once (GLOMAP, or COLMAP from 4.0 on).
+    /// All at once (GLOMAP, or COLMAP from 4.0 on)
     Global,
 }
 
 /// The programs and files of one reconstruction.
 pub(super) struct Reconstruction<'a> {
     colmap: Tool<'a>,
-    /// Where it is a program of its own that places cameras.
+    /// If GLOMAP registers the cameras.
     glomap: Option<Tool<'a>>,
     args: &'a PoseArgs,
     matcher: Matcher,
@@ -49,16 +49,16 @@ pub(super) struct Reconstruction<'a> {
     models: PathBuf,
 }
 
-/// How many photographs the largest of some models places.
+/// The number of photographs in the largest model.
 fn placed_in(models: &Path) -> Result<usize> {
     Ok(Dataset::largest_model(models)?.map_or(0, |(_, placed)| placed.len()))
 }
 
 impl<'a> Reconstruction<'a> {
-    /// One in a folder of its own, by programs that are there.
+    /// Sets up the folder, and checks that the programs exist.
     ///
     /// # Errors
-    /// Cameras are to be placed all at once, and neither COLMAP nor GLOMAP is there that does.
+    /// `--mapper global` with neither GLOMAP nor a COLMAP that has it.
     pub(super) fn new(
         args: &'a PoseArgs,
         colmap: Tool<'a>,
@@ -73,9 +73,9 @@ impl<'a> Reconstruction<'a> {
         Ok(Self { colmap, glomap, args, matcher, is_guided: false, database, models })
     }
 
-    /// The folder that holds the models, a folder each; none where the photographs show too little. Where one in ten or more is
-    /// left without a camera, they are compared once more, guided: what a small set comes to is luck otherwise, and for a large
-    /// one it would take twice as long.
+    /// The folder of the models, which is empty if none was found. If more than one photograph in ten gets no camera,
+    /// all are matched again with guided matching: small sets depend on luck otherwise, and for large ones it would
+    /// double the time.
     ///
     /// # Errors
     /// A program fails.
@@ -90,16 +90,16 @@ impl<'a> Reconstruction<'a> {
         if 10 * placed >= 9 * all {
             return Ok(self.models);
         }
-        say(&format!("{placed} of {all} have a camera: compared once more, guided"))?;
+        say(&format!("{placed} of {all} have a camera: matching again, guided"))?;
         let first = self.models.clone();
         self.is_guided = true;
         self.database.set_file_name("guided.db");
         self.models.set_file_name("guided");
         create(&self.models)?;
         match self.attempt(lifted, &say) {
-            // What the first comparison came to is there.
+            // The first attempt found something.
             Err(error) if placed > 0 => {
-                tracing::warn!("{error}; the cameras are those of the first comparison");
+                tracing::warn!("{error}; using the cameras of the first attempt");
                 return Ok(first);
             }
             outcome => outcome?,
@@ -112,7 +112,7 @@ impl<'a> Reconstruction<'a> {
         say("features extracted")?;
         self.compare()?;
         say("features matched")?;
-        // It fails where it found nothing to begin with, which is said of the photographs.
+        // Without an initial pair the mapper fails; the caller reports that no camera was found.
         match self.place(lifted) {
             Err(_) if NOTHING.iter().any(|words| self.colmap.said(words)) => {}
             outcome => outcome?,
@@ -143,7 +143,7 @@ impl<'a> Reconstruction<'a> {
     fn compare(&self) -> crate::Result<()> {
         let command = self.matcher.command();
         let use_gpu = self.named(command, ["FeatureMatching", "SiftMatching"], "use_gpu");
-        // Once it is known how two photographs lie to each other, more of their features find their twins.
+        // With the relative pose of two photographs known, more of their features match.
         let guided = self.named(command, ["FeatureMatching", "SiftMatching"], "guided_matching");
         let guided: [&OsStr; 2] = [guided.as_ref(), "1".as_ref()];
         let mut options = vec!["--database_path".as_ref(), self.database.as_ref()];
@@ -165,14 +165,14 @@ impl<'a> Reconstruction<'a> {
             (Mapper::Incremental, _) => self.colmap.run("mapper", &files),
             (Mapper::Global, Some(glomap)) => glomap.run("mapper", &files),
             (Mapper::Global, None) => {
-                // Placed all at once, cameras need their focal lengths before.
+                // The global mapper needs focal lengths.
                 self.colmap.run("view_graph_calibrator", &files[..2])?;
                 self.colmap.run(GLOBAL, &files)
             }
         }
     }
 
-    /// The option by its name in this version of COLMAP: before 3.12 its group was another.
+    /// The name of an option in this version of COLMAP; its group changed in 3.12.
     fn named(&self, command: &str, [new, old]: [&str; 2], option: &str) -> String {
         let own = format!("{new}.{option}");
         let is_new = self.colmap.helps_with(&[command, "-h"], &own);
@@ -184,8 +184,8 @@ impl<'a> Reconstruction<'a> {
     }
 }
 
-/// The command of COLMAP, from 4.0 on, that is GLOMAP.
+/// GLOMAP's command in COLMAP from 4.0 on.
 const GLOBAL: &str = "global_mapper";
 
-/// What a mapper says that found nothing to begin with.
+/// Messages of a mapper that found no initial pair.
 const NOTHING: [&str; 2] = ["No good initial image pair found", "failed to create sparse model"];

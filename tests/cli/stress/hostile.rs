@@ -111,8 +111,8 @@ impl Hostile {
         own
     }
 
-    /// Photographs in EXR files, as the loader takes them; `value` of linear light, column and row. The first Gaussians are
-    /// the dataset's own.
+    /// Photographs in EXR files, as the loader takes them; `value` of linear light, column and row. The first
+    /// Gaussians are the dataset's own.
     pub(super) fn exr(value: impl Fn(f32, u32, u32) -> f32) -> Result<Self> {
         let config = config();
         let files = tempfile::tempdir()
