@@ -13,7 +13,7 @@ use crate::base::output::{check_writable, write_whole};
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::Dataset;
 use crate::results::diagnosis;
-use crate::results::eval::{Leftover, hole_warning};
+use crate::results::eval::{ResidualTransmittance, hole_warning};
 use crate::results::finished_run::FinishedRun;
 use crate::train::diagnose::{Diagnosis, Plan};
 use crate::train::{Preset, TrainConfig, diagnosed};
@@ -72,7 +72,7 @@ struct Output<'a> {
     plan: &'a Plan,
     /// Leftover transmittance of the model by view.
     #[serde(skip_serializing_if = "Option::is_none")]
-    leftover_transmittance: Option<&'a BTreeMap<String, Leftover>>,
+    residual_transmittance: Option<&'a BTreeMap<String, ResidualTransmittance>>,
 }
 
 const EXAMPLES: &str = "Examples:
@@ -106,8 +106,9 @@ pub fn run(args: &DiagnoseArgs) -> Result<()> {
     }
     let device = gpu.properties().name.as_str();
     let text = if args.json {
-        let leftover_transmittance = run.as_ref().map(|(_, leftovers)| leftovers);
-        let output = Output { device, diagnosis: &diagnosis, plan: &plan, leftover_transmittance };
+        let residual_transmittance =
+            run.as_ref().map(|(_, residual_transmittances)| residual_transmittances);
+        let output = Output { device, diagnosis: &diagnosis, plan: &plan, residual_transmittance };
         let json = serde_json::to_string_pretty(&output);
         json.map_err(|error| Error::output("standard output", error.to_string()))? + "\n"
     } else {
@@ -126,17 +127,26 @@ pub fn run(args: &DiagnoseArgs) -> Result<()> {
 }
 
 /// The residual transmittance of the model of a run in every view, and a remark on it.
-fn holes(run: &Path, args: &DiagnoseArgs) -> Result<(String, BTreeMap<String, Leftover>)> {
-    let FinishedRun { config, dataset, mut player, .. } =
+fn holes(
+    run: &Path,
+    args: &DiagnoseArgs,
+) -> Result<(String, BTreeMap<String, ResidualTransmittance>)> {
+    let FinishedRun { config, dataset, mut model_renderer, .. } =
         FinishedRun::open(run, Some(&args.dataset), args.device.as_ref())?;
-    let mut leftovers = BTreeMap::new();
+    let mut residual_transmittances = BTreeMap::new();
     for view in &dataset.views {
-        let leftover = Leftover::of(&player.render(view)?, view);
-        leftovers.extend(leftover.map(|leftover| (view.name.clone(), leftover)));
+        let residual_transmittance = ResidualTransmittance::of(&model_renderer.render(view)?, view);
+        residual_transmittances.extend(
+            residual_transmittance
+                .map(|residual_transmittance| (view.name.clone(), residual_transmittance)),
+        );
     }
-    let views = leftovers.iter().map(|(name, leftover)| (name.as_str(), *leftover));
+    let views = residual_transmittances
+        .iter()
+        .map(|(name, residual_transmittance)| (name.as_str(), *residual_transmittance));
     let healthy = || {
-        let mean = Leftover::mean(leftovers.values().copied()).map_or(0.0, |own| own.mean);
+        let mean = ResidualTransmittance::mean(residual_transmittances.values().copied())
+            .map_or(0.0, |own| own.mean);
         format!(
             "{}: {:.1} % of the background shows through the model",
             run.display(),
@@ -144,7 +154,7 @@ fn holes(run: &Path, args: &DiagnoseArgs) -> Result<(String, BTreeMap<String, Le
         )
     };
     let remark = hole_warning(views, config.background).unwrap_or_else(healthy);
-    Ok((remark, leftovers))
+    Ok((remark, residual_transmittances))
 }
 
 /// Parses `--max-resolution`.

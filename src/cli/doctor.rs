@@ -181,10 +181,10 @@ mod tests {
         assert!(
             text.contains("also 8x16x32 cooperative") && text.contains("no 16-bit cooperative")
         );
-        let said = verdict(Some(&devices[1]), None);
-        assert_eq!(said, "ready: trains on Babbage; --device selects another");
-        let said = verdict(Some(&devices[2]), Some("CUDA_VISIBLE_DEVICES=1"));
-        assert!(said.contains("Curta (CUDA_VISIBLE_DEVICES=1)"), "{said}");
+        let printed = verdict(Some(&devices[1]), None);
+        assert_eq!(printed, "ready: trains on Babbage; --device selects another");
+        let printed = verdict(Some(&devices[2]), Some("CUDA_VISIBLE_DEVICES=1"));
+        assert!(printed.contains("Curta (CUDA_VISIBLE_DEVICES=1)"), "{printed}");
         let software = DeviceReport { kind: "software", ..device("Abacus", true) };
         assert!(verdict(Some(&software), None).contains("minutes per scene"));
         assert!(verdict(None, None).starts_with("not ready"));
@@ -192,10 +192,11 @@ mod tests {
 
     #[test]
     fn a_program_that_is_missing_is_said_with_its_use_and_how_to_install_it() {
-        let said = program_lines(&BTreeMap::from([("ffmpeg", Some("/usr/bin/ffmpeg".into()))]));
-        assert!(said.contains("colmap  not found; install it for camera poses"), "{said}");
+        let printed = program_lines(&BTreeMap::from([("ffmpeg", Some("/usr/bin/ffmpeg".into()))]));
+        assert!(printed.contains("colmap  not found; install it for camera poses"), "{printed}");
         assert!(
-            said.contains("apt install colmap") && said.contains("ffmpeg  /usr/bin/ffmpeg, for")
+            printed.contains("apt install colmap")
+                && printed.contains("ffmpeg  /usr/bin/ffmpeg, for")
         );
     }
 }

@@ -10,11 +10,11 @@ use crate::base::output::{check_writable, printable, write_whole};
 use crate::gpu::DeviceChoice;
 use crate::networks::lpips::{Lpips, Range};
 use crate::photographs::dataset::View;
-use crate::results::eval::{self, Yardstick};
+use crate::results::eval::{self, ScoreReference};
 use crate::results::evaluation::{EvalPage, score_table};
 use crate::results::finished_run::{FinishedRun, is_model};
 use crate::results::run;
-use crate::train::Learning;
+use crate::train::OnOff;
 
 /// Score a run on the test views of its dataset.
 ///
@@ -77,26 +77,26 @@ impl From<LpipsRange> for Range {
 /// The folder holds no run with a model, its dataset is gone, or a file cannot be written.
 pub fn run(args: &EvalArgs) -> Result<()> {
     args.report.iter().try_for_each(|path| check_writable(path))?;
-    let FinishedRun { gpu, config, dataset, gaussian_count, mut player } =
+    let FinishedRun { gpu, config, dataset, gaussian_count, mut model_renderer } =
         FinishedRun::open(&args.run, args.dataset.as_deref(), args.device.as_ref())?;
     let load = |weights| Lpips::load(&gpu, weights, args.lpips_range.into());
     let lpips = args.lpips.as_ref().map(load).transpose()?;
     let measure = lpips.as_ref().map(Lpips::measure);
-    let mut yardstick = Yardstick::of(&gpu, &config.tone, &dataset)?;
+    let mut score_reference = ScoreReference::of(&gpu, &config.tone, &dataset)?;
     let images = match is_model(&args.run) {
         true => args.run.with_extension("eval"),
         false => args.run.join("eval"),
     };
     let mut page = args.report.as_ref().map(|_| EvalPage::default());
-    let bar = progress_bar(yardstick.view_count(&dataset));
+    let bar = progress_bar(score_reference.view_count(&dataset));
     let render = |view: &View| {
         bar.set_message(printable(&view.name).into_owned());
-        player.render(view)
+        model_renderer.render(view)
     };
-    let scored = eval::score_by(&mut yardstick, &dataset, render, |score, compared| {
+    let scored = eval::score_by(&mut score_reference, &dataset, render, |score, compared| {
         let lpips = lpips.as_ref().map(|lpips| compared.lpips(&gpu, lpips));
         score.scores.lpips = lpips.transpose()?;
-        if config.exposure.learn == Learning::On {
+        if config.exposure.learn == OnOff::On {
             score.aligned = Some(compared.aligned()?);
         }
         if args.save_images {
@@ -109,7 +109,7 @@ pub fn run(args: &EvalArgs) -> Result<()> {
         Ok(())
     })?;
     bar.finish_and_clear();
-    eval::warn_of_holes(&scored, &dataset, config.background, |view| player.render(view))?;
+    eval::warn_of_holes(&scored, &dataset, config.background, |view| model_renderer.render(view))?;
     if scored.is_empty() {
         let root = dataset.root.display();
         tracing::warn!(
@@ -137,13 +137,13 @@ pub fn run(args: &EvalArgs) -> Result<()> {
         }
         eval::add_reference(&mut metrics, &config.tone);
         for what in
-            [run::SPENT, run::TARGET_EXPOSURE, run::ENDED, run::TRAINED_WITH, run::HELD_OUT_COURSE]
+            [run::SPENT, run::TARGET_EXPOSURE, run::ENDED, run::TRAINED_WITH, run::HELD_OUT_CURVE]
         {
             if let Some(known) = recorded.get(what) {
                 metrics[what] = known.clone();
             }
         }
-        if config.exposure.learn == Learning::On {
+        if config.exposure.learn == OnOff::On {
             eval::add_exposure(&mut metrics, &scored);
         }
         writeln!(out, "{metrics:#}")?;

@@ -12,7 +12,7 @@ use crate::camera::{Camera, CameraPath};
 use crate::gpu::DeviceChoice;
 use crate::photographs::dataset::{Dataset, Split, View};
 use crate::photographs::image::Image;
-use crate::results::eval::Layer;
+use crate::results::eval::RenderLayer;
 use crate::results::finished_run::FinishedRun;
 use crate::results::video;
 use crate::results::view_exposures::ViewExposures;
@@ -49,8 +49,8 @@ pub struct RenderArgs {
     pub dataset: Option<PathBuf>,
     /// Layer: rgb, denoised, depth, structure, illumination or noise; depth is scaled to the range of each view, but
     /// in EXR [default: denoised with a denoiser, else rgb]
-    #[arg(long, value_parser = Words::<Layer>::new(Layer::ALL.map(Layer::name)))]
-    pub layer: Option<Layer>,
+    #[arg(long, value_parser = Words::<RenderLayer>::new(RenderLayer::ALL.map(RenderLayer::name)))]
+    pub layer: Option<RenderLayer>,
     /// Render each training view at the exposure of its target, not at the model's
     #[arg(long)]
     pub view_exposure: bool,
@@ -129,7 +129,7 @@ pub fn run(args: &RenderArgs) -> Result<()> {
         return Err(Error::Usage(problem).into());
     }
     args.video.iter().chain([out]).try_for_each(|path| check_writable(path))?;
-    let FinishedRun { dataset, mut player, .. } =
+    let FinishedRun { dataset, mut model_renderer, .. } =
         FinishedRun::open(run, args.dataset.as_deref(), device.as_ref())?;
     let exposures = if *view_exposure { Some(ViewExposures::of(run)?) } else { None };
     let shots = shots(args, &dataset)?;
@@ -143,9 +143,11 @@ pub fn run(args: &RenderArgs) -> Result<()> {
             None => format.save(&image, &path),
         };
         match layer {
-            None => color(player.render_camera(camera)?.output().clone())?,
-            Some(layer) if layer.is_color() => color(player.layer(camera, *layer)?)?,
-            Some(layer) => save_numbers(player.layer(camera, *layer)?, *layer, *format, &path)?,
+            None => color(model_renderer.render_camera(camera)?.output().clone())?,
+            Some(layer) if layer.is_color() => color(model_renderer.layer(camera, *layer)?)?,
+            Some(layer) => {
+                save_numbers(model_renderer.layer(camera, *layer)?, *layer, *format, &path)?
+            }
         }
         bar.inc(1);
     }
@@ -188,14 +190,14 @@ fn shots(args: &RenderArgs, dataset: &Dataset) -> crate::Result<Vec<Shot>> {
 /// Saves a layer that is not colour; EXR keeps the values.
 fn save_numbers(
     mut image: Image,
-    layer: Layer,
+    layer: RenderLayer,
     format: ImageFormat,
     path: &Path,
 ) -> crate::Result<()> {
     if format == ImageFormat::Exr {
         return image.save_exr_as_stored(path);
     }
-    if layer == Layer::Depth {
+    if layer == RenderLayer::Depth {
         let least = image.data.iter().copied().fold(f32::INFINITY, f32::min);
         let largest = image.data.iter().copied().fold(f32::NEG_INFINITY, f32::max);
         let scale = 1.0 / (largest - least).max(f32::MIN_POSITIVE);

@@ -14,10 +14,10 @@ use super::{finish, signals, word};
 use crate::base::output::{check_writable, printable};
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::results::eval;
-use crate::results::run::{self, HeldRun, RunDirectory, Session, Trained};
+use crate::results::run::{self, IfExists, RunDirectory, RunSummary, Session};
 use crate::results::run_facts::RunFacts;
 use crate::train::diagnose::Plan;
-use crate::train::{Origin, Planned, Planning, Said};
+use crate::train::{Origin, PlanSource, PlannedRun, RequestedSettings};
 
 /// Train a 3D Gaussian Splatting model from dark photographs.
 ///
@@ -68,8 +68,8 @@ const EXAMPLE: &str = "Example:
 /// # Errors
 /// Anything that stops the run.
 pub fn run(args: &TrainArgs) -> Result<()> {
-    let mut said = args.options.said(&args.dataset)?;
-    said.settings(None)?.config()?.check()?;
+    let mut requested = args.options.requested(&args.dataset)?;
+    requested.settings(None)?.config()?.check()?;
     check_writable(&args.out)?;
     match args.resume {
         true => RunDirectory::check_resumed(&args.out)?,
@@ -79,20 +79,20 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     if is_resumed && args.options.gives("steps") {
         // The held-out views of the run stay held out.
         let views = i64::try_from(run::load_config(&args.out)?.stop.views)?;
-        said.options.push("stop.views", views.into(), Origin::Run)?;
+        requested.options.push("stop.views", views.into(), Origin::Run)?;
     }
     let given = args.plan.clone().filter(|path| path != Path::new("none"));
     let file = given.or_else(|| run::plan_of(&args.out).filter(|_| is_resumed));
     if is_resumed
         && !args.explain
-        && let Some(steps) = done_by_stamp(args, &said, file.as_deref())?
+        && let Some(steps) = done_by_stamp(args, &requested, file.as_deref())?
     {
-        return say_done(args, steps);
+        return print_done(args, steps);
     }
-    let device = said.settings(None)?.config()?.device;
+    let device = requested.settings(None)?.config()?.device;
     let gpu = Gpu::new(&device.parse::<DeviceChoice>()?)?;
     let planning = planning(args, file.as_deref(), is_resumed);
-    let Planned { config, settings, plan, dataset } = said.planned(planning, &gpu)?;
+    let PlannedRun { config, settings, plan, dataset } = requested.planned(planning, &gpu)?;
     if args.explain {
         return Ok(write!(std::io::stdout(), "{}", printable(&settings.explained(&config)?))?);
     }
@@ -101,7 +101,7 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     }
     let finished = if args.resume { run::done_steps(&args.out, &config, &dataset)? } else { None };
     if let Some(steps) = finished {
-        return say_done(args, steps);
+        return print_done(args, steps);
     }
     let form = args.progress.unwrap_or_else(ProgressForm::of_terminal);
     let (is_text, is_quiet) = (form != ProgressForm::Json, form == ProgressForm::None);
@@ -111,15 +111,16 @@ pub fn run(args: &TrainArgs) -> Result<()> {
         let plan = plan.as_ref().map(diagnose::decisions).unwrap_or_default();
         write!(out, "{}{plan}", facts.text())?;
     }
-    let held = if args.resume { HeldRun::Resume } else { held_unless(args.overwrite) };
+    let if_exists =
+        if args.resume { IfExists::Resume } else { overwrite_or_refuse(args.overwrite) };
     let mut progress = Reporter::new(form).with_facts(serde_json::json!(facts));
     let session = Session {
         plan: plan.as_ref(),
         settings: Some(&settings),
-        held,
+        if_exists,
         requests: signals::requests()?,
     };
-    let Trained { trainer, ended, scored, spent, .. } =
+    let RunSummary { trainer, ended, scored, spent, .. } =
         run::train_in(&gpu, &config, &dataset, &args.out, &session, |event| {
             progress.observe(event);
         })?;
@@ -149,30 +150,34 @@ fn next(args: &TrainArgs) -> String {
     format!("nightsplat export {run} --format html  (then open {run}/model.html)")
 }
 
-fn say_done(args: &TrainArgs, steps: u64) -> Result<()> {
+fn print_done(args: &TrainArgs, steps: u64) -> Result<()> {
     let done = format!("{} is done: {steps} steps", args.out.display());
     writeln!(std::io::stdout(), "{}", printable(&done))?;
     finish("", &next(args))
 }
 
 /// The step count of the run to resume if it is finished and the files of its dataset are unchanged. Decodes nothing.
-fn done_by_stamp(args: &TrainArgs, said: &Said, file: Option<&Path>) -> crate::Result<Option<u64>> {
+fn done_by_stamp(
+    args: &TrainArgs,
+    requested: &RequestedSettings,
+    file: Option<&Path>,
+) -> crate::Result<Option<u64>> {
     let plan = file.map(Plan::read).transpose()?;
-    run::done_steps_by_stamp(&args.out, &said.settings(plan.as_ref())?.config()?)
+    run::done_steps_by_stamp(&args.out, &requested.settings(plan.as_ref())?.config()?)
 }
 
 /// Where settings that no option gives come from: a plan file, a diagnosis, or the defaults.
-fn planning<'a>(args: &TrainArgs, file: Option<&'a Path>, is_resumed: bool) -> Planning<'a> {
+fn planning<'a>(args: &TrainArgs, file: Option<&'a Path>, is_resumed: bool) -> PlanSource<'a> {
     match file {
-        Some(file) => Planning::File(file),
+        Some(file) => PlanSource::File(file),
         None if args.plan.is_none() && !is_resumed && args.options.wants_a_plan() => {
-            Planning::Diagnosis
+            PlanSource::Diagnosis
         }
-        None => Planning::Nothing,
+        None => PlanSource::Nothing,
     }
 }
 
 /// The effect of `--overwrite`.
-fn held_unless(overwrite: bool) -> HeldRun {
-    if overwrite { HeldRun::Replace } else { HeldRun::Refuse }
+fn overwrite_or_refuse(overwrite: bool) -> IfExists {
+    if overwrite { IfExists::Replace } else { IfExists::Refuse }
 }

@@ -186,9 +186,9 @@ mod tests {
             timestamp_period: 1.0,
             is_cpu: false,
             cooperative_matrix: None,
-            pushes_descriptors: true,
-            keeps_subgroups: false,
-            tells_statistics: false,
+            has_push_descriptors: true,
+            has_maximal_reconvergence: false,
+            has_pipeline_statistics: false,
         }
     }
 

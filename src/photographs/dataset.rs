@@ -45,7 +45,7 @@ pub(crate) use pixels::Look;
 pub use pixels::Original;
 use points::points;
 use source::Source;
-use split::{TEST_EVERY, say_whose_split_gives_way, split};
+use split::{TEST_EVERY, log_split, split};
 
 /// Photographs with cameras, and points of the scene they show.
 #[derive(Clone, Debug)]
@@ -263,7 +263,7 @@ impl Dataset {
         options.check()?;
         let files = Files::default();
         let Listing { mut frames, mut skipped, remarks } = list(root, &files)?;
-        say_whose_split_gives_way(root, &frames, options);
+        log_split(root, &frames, options);
         split(root, &mut frames, options.test_every, &files)?;
 
         let sources = sources(root, &frames, options, &files, &mut skipped);
@@ -291,7 +291,7 @@ impl Dataset {
         );
         let mut dataset = Self { root: root.to_owned(), views, points, skipped };
         dataset.leave_out_far_points();
-        dataset.say_what_stands_elsewhere();
+        dataset.warn_of_other_worlds();
         Ok(dataset)
     }
 

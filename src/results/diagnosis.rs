@@ -114,7 +114,12 @@ pub(crate) fn scene_facts(scene: &SceneDiagnosis) -> [[String; 2]; 5] {
     };
     let brightness = format!(
         "mean {:.4}, p10 {:.4}, p90 {:.4}, cubic mean {:.4}; gain {:.1}, {:.0} times too little light",
-        scene.mean_luminance, scene.p10, scene.p90, scene.cubic_mean, scene.lift, scene.darkening
+        scene.mean_luminance,
+        scene.p10,
+        scene.p90,
+        scene.cubic_mean,
+        scene.tone_mapping,
+        scene.darkening
     );
     let exposure = format!(
         "{:.2} stops spread between views, {:.1} stops uneven light within a view",

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use super::eval::{Compared, Leftover, ViewScore, label, means};
+use super::eval::{ResidualTransmittance, ScoredImages, ViewScore, label, means};
 use super::report::{Best, Column, Comparison, Picture, Report, Series, Table, plot};
 use super::run::load_progress;
 use crate::networks::lpips::Measure;
@@ -21,7 +21,8 @@ const LOSS_POINTS: usize = 200;
 /// The scores of each view, and their means.
 pub(crate) fn score_table(scored: &[ViewScore], measure: Option<Measure>) -> Table {
     let (mean, mean_r0) = means(scored);
-    let mean_leftover = Leftover::mean(scored.iter().filter_map(|view| view.leftover));
+    let mean_transmittance =
+        ResidualTransmittance::mean(scored.iter().filter_map(|view| view.residual_transmittance));
     let column = |name: &str, digits, best| Column { name: name.to_owned(), digits, best };
     let mut columns = vec![
         column("PSNR", 2, Best::Greatest),
@@ -34,25 +35,33 @@ pub(crate) fn score_table(scored: &[ViewScore], measure: Option<Measure>) -> Tab
         columns.push(column("PSNR of R_0", 2, Best::Unmarked));
         columns.push(column("SSIM of R_0", 4, Best::Unmarked));
     }
-    if mean_leftover.is_some() {
+    if mean_transmittance.is_some() {
         columns
             .extend(["residual transmittance", "99 %"].map(|name| column(name, 4, Best::Unmarked)));
     }
-    let row = |name: &str, scores: &Scores, r0: Option<&Scores>, leftover: Option<Leftover>| {
+    let row = |name: &str,
+               scores: &Scores,
+               r0: Option<&Scores>,
+               residual_transmittance: Option<ResidualTransmittance>| {
         let Scores { psnr, psnr_channel_mean, ssim, lpips } = *scores;
         let mut values = vec![Some(psnr), Some(psnr_channel_mean), Some(ssim)];
         values.extend(measure.map(|_| lpips));
         if mean_r0.is_some() {
             values.extend([r0.map(|r0| r0.psnr), r0.map(|r0| r0.ssim)]);
         }
-        if mean_leftover.is_some() {
-            values.extend([leftover.map(|own| own.mean), leftover.map(|own| own.q99)]);
+        if mean_transmittance.is_some() {
+            values.extend([
+                residual_transmittance.map(|own| own.mean),
+                residual_transmittance.map(|own| own.q99),
+            ]);
         }
         (name.to_owned(), values)
     };
-    let of_view = |view: &ViewScore| row(&view.name, &view.scores, view.r0.as_ref(), view.leftover);
+    let of_view = |view: &ViewScore| {
+        row(&view.name, &view.scores, view.r0.as_ref(), view.residual_transmittance)
+    };
     let mut rows: Vec<_> = scored.iter().map(of_view).collect();
-    rows.extend(mean.map(|mean| row("mean", &mean, mean_r0.as_ref(), mean_leftover)));
+    rows.extend(mean.map(|mean| row("mean", &mean, mean_r0.as_ref(), mean_transmittance)));
     Table { title: "Test views".to_owned(), label: "view".to_owned(), columns, rows }
 }
 
@@ -65,8 +74,8 @@ pub(crate) struct EvalPage {
 
 impl EvalPage {
     /// Adds a scored view.
-    pub(crate) fn add(&mut self, score: &ViewScore, compared: &Compared<'_>) {
-        let Compared { render, target, .. } = compared;
+    pub(crate) fn add(&mut self, score: &ViewScore, compared: &ScoredImages<'_>) {
+        let ScoredImages { render, target, .. } = compared;
         let picture = |caption: &str, image: &Image| {
             Picture::shrunk(caption, String::new(), image, PICTURE_WIDTH)
         };

@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use super::eval::Yardstick;
+use super::eval::ScoreReference;
 use crate::gpu::Gpu;
 use crate::photographs::dataset::{Dataset, Split};
 use crate::photographs::tone::ToneCurve;
@@ -23,7 +23,7 @@ pub(crate) struct RunFacts {
     /// Maximum number of steps.
     steps: u64,
     /// Length of the cooldown, steps.
-    settling_steps: u64,
+    effective_cooldown_steps: u64,
     /// Requests on the length of the run that cannot be met.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     notes: Vec<String>,
@@ -60,7 +60,7 @@ impl RunFacts {
             test_views: of(Split::Test),
             held_out_views: of(Split::HeldOut),
             steps: config.steps,
-            settling_steps: config.settling_steps(),
+            effective_cooldown_steps: config.effective_cooldown_steps(),
             notes: notes(config, dataset),
             split: Dataset::split_rule(&config.dataset, &config.load_options()),
             points: dataset.points.len(),
@@ -69,13 +69,13 @@ impl RunFacts {
                 Some(planned) if why.is_empty() => planned,
                 _ => why.to_owned(),
             },
-            against: Yardstick::kind(&config.tone, dataset).name(),
+            against: ScoreReference::kind(&config.tone, dataset).name(),
         }
     }
 
     pub(crate) fn text(&self) -> String {
         let Self { dataset, device, size: [width, height], train_views, points, .. } = self;
-        let length = match (self.held_out_views, self.settling_steps) {
+        let length = match (self.held_out_views, self.effective_cooldown_steps) {
             (0, 0) => format!("{} steps", self.steps),
             (0, settling) => {
                 format!("{} steps, of which the last {settling} are the cooldown", self.steps)
@@ -102,7 +102,7 @@ impl RunFacts {
 
 /// A line for each request on the length of the run that cannot be met.
 fn notes(config: &TrainConfig, dataset: &Dataset) -> Vec<String> {
-    let (steps, asked) = (config.steps, config.schedule.settle_steps);
+    let (steps, asked) = (config.steps, config.schedule.cooldown_steps);
     let views = dataset.views.iter().filter(|view| view.is_for_training()).count();
     let is_held_out = dataset.views.iter().any(|view| view.split == Split::HeldOut);
     let none = (config.stop.views > 0 && !is_held_out).then(|| {
@@ -110,7 +110,7 @@ fn notes(config: &TrainConfig, dataset: &Dataset) -> Vec<String> {
             "no early stopping: {views} training views are too few to hold one out (one in eight)"
         )
     });
-    let short = (config.settling_steps() < asked)
+    let short = (config.effective_cooldown_steps() < asked)
         .then(|| format!("{steps} steps are too few for a cooldown of {asked} (at most a third)"));
     none.into_iter().chain(short).collect()
 }

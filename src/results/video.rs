@@ -57,8 +57,8 @@ pub(crate) fn make(video: &Path, folder: &Path, files: &[PathBuf], fps: u16) -> 
     match ffmpeg {
         Ok(output) if output.status.success() => Ok(()),
         Ok(output) => {
-            let said = String::from_utf8_lossy(&output.stderr);
-            let last = said.lines().next_back().unwrap_or("no message").to_owned();
+            let printed = String::from_utf8_lossy(&output.stderr);
+            let last = printed.lines().next_back().unwrap_or("no message").to_owned();
             Err(Error::output(video, format!("ffmpeg failed: {last}; the command was `{command}`")))
         }
         Err(error) if error.kind() == ErrorKind::NotFound => {

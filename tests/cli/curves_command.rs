@@ -73,8 +73,8 @@ fn curves_are_drawn_with_the_statistics_of_a_dataset() {
 fn a_plot_without_names_shows_six_curves_and_says_how_to_choose_others() {
     let folder = tempfile::tempdir().unwrap();
     let svg = folder.path().join("curves.svg");
-    let said = printed(&format!("--plot {}", svg.display()));
-    assert!(said.contains("6 curves; name curves to plot others"), "{said}");
+    let message = printed(&format!("--plot {}", svg.display()));
+    assert!(message.contains("6 curves; name curves to plot others"), "{message}");
     assert_eq!(std::fs::read_to_string(svg).unwrap().matches("<polyline").count(), 6);
 }
 

@@ -215,8 +215,8 @@ fn a_number_of_steps_may_be_written_short() {
     let folder = tempfile::tempdir().unwrap();
     let train = format!("train {} --out {}", fixture().set(), folder.path().join("run").display());
     for (steps, line) in [("1e4", "steps = 10000  (--steps)"), ("5k", "steps = 5000  (--steps)")] {
-        let (said, _) = run(&format!("{train} --explain --steps {steps}"), 0);
-        assert!(said.contains(line), "{said}");
+        let (message, _) = run(&format!("{train} --explain --steps {steps}"), 0);
+        assert!(message.contains(line), "{message}");
     }
 }
 
@@ -243,7 +243,7 @@ fn every_setting_is_explained_with_who_says_it_and_nothing_is_trained() {
         let train = format!("train {} --out {} --explain", fixture().set(), run.display());
         crate::common::command::run(&format!("{train} {options}"), 0).0
     };
-    let said = explained("--preset draft --seed 4 --set stop.margin=1");
+    let message = explained("--preset draft --seed 4 --set stop.margin=1");
     for line in [
         "steps = 400  (preset draft)\n",
         "seed = 4  (--seed)\n",
@@ -251,13 +251,14 @@ fn every_setting_is_explained_with_who_says_it_and_nothing_is_trained() {
         "exposure.learn = \"off\"  (plan)\n",
         "ssim_weight = 0.2  (default)\n    Weight of 1 - SSIM",
     ] {
-        assert!(said.contains(line), "no {line} in {said}");
+        assert!(message.contains(line), "no {line} in {message}");
     }
-    let said = explained(&format!("--preset draft --config {} --steps 5", file.display()));
-    assert!(said.contains(&format!("near = 0.2  ({})\n", file.display())), "{said}");
+    let message = explained(&format!("--preset draft --config {} --steps 5", file.display()));
+    assert!(message.contains(&format!("near = 0.2  ({})\n", file.display())), "{message}");
     assert!(
-        said.contains("steps = 5  (--steps)\n") && said.contains("sh_degree = 0  (preset draft)"),
-        "{said}"
+        message.contains("steps = 5  (--steps)\n")
+            && message.contains("sh_degree = 0  (preset draft)"),
+        "{message}"
     );
     assert!(!run.exists());
 }

@@ -30,11 +30,11 @@ const MEAN_DIFFERENCE: f64 = 1e-5;
 struct Case {
     channels: usize,
     size: [u32; 2],
-    tiles: Vec<Measured>,
+    tiles: Vec<TileTiming>,
 }
 
 /// Measurements of one tile.
-struct Measured {
+struct TileTiming {
     tile: Tile,
     intersections: u32,
     /// Largest and mean difference from the render of the first tile.
@@ -84,7 +84,7 @@ pub(super) fn run(
     for case in &cases {
         writeln!(out, "{}", case.as_text(gaussians))?;
     }
-    if !bench.gpu.properties().tells_statistics {
+    if !bench.gpu.properties().has_pipeline_statistics {
         writeln!(out, "registers and spills: not reported by the driver")?;
     }
     let tile = |TunedTile { channels, tile }: &TunedTile| format!("{tile} at {channels} channels");
@@ -115,7 +115,7 @@ fn fastest(cases: &[Case], channels: usize) -> Option<TunedTile> {
 /// A renderer for one tile with its measurements so far.
 struct Candidate {
     renderer: Renderer,
-    measured: Measured,
+    measured: TileTiming,
     times: Vec<[f64; 3]>,
 }
 
@@ -145,7 +145,7 @@ impl Case {
             renderer.reserve(gaussians, [&camera])?;
             let render = renderer.render_channels(&on_device, &camera, &OPTIONS)?;
             let first = first.get_or_insert_with(|| render.clone());
-            let measured = Measured {
+            let measured = TileTiming {
                 tile,
                 intersections: 0,
                 differences: differences(&render, first),
@@ -180,7 +180,7 @@ impl Case {
             "channels": self.channels,
             "width": self.size[0],
             "height": self.size[1],
-            "tiles": self.tiles.iter().map(Measured::as_json).collect::<Vec<_>>(),
+            "tiles": self.tiles.iter().map(TileTiming::as_json).collect::<Vec<_>>(),
         })
     }
 
@@ -189,7 +189,7 @@ impl Case {
         let head = ["tile", "blend forward", "backward", "rasteriser, ms", "intersections", ""];
         let mut rows = vec![head.map(str::to_owned).to_vec()];
         rows.extend(self.tiles.iter().map(|measured| {
-            let Measured { tile, intersections, .. } = measured;
+            let TileTiming { tile, intersections, .. } = measured;
             let note = match measured.agrees() {
                 false => "renders differently",
                 true if measured.rasteriser == self.least() => "fastest",
@@ -201,7 +201,7 @@ impl Case {
             row.extend([intersections.to_string(), note.to_owned()]);
             row
         }));
-        let registers: String = self.tiles.iter().filter_map(Measured::registers).collect();
+        let registers: String = self.tiles.iter().filter_map(TileTiming::registers).collect();
         format!(
             "{channels} channels, {width}x{height} pixels, {gaussians} Gaussians\n{}{registers}",
             table::aligned(&rows)
@@ -259,16 +259,16 @@ impl Pass {
 }
 
 impl Candidate {
-    fn finish(self, bench: &Bench) -> crate::Result<Measured> {
+    fn finish(self, bench: &Bench) -> crate::Result<TileTiming> {
         let status = Status::from_words(&bench.gpu.read(self.renderer.status())?);
         let [forward, backward, rasteriser] =
             [0, 1, 2].map(|part| median(self.times.iter().map(|times| times[part]).collect()));
         let intersections = status.intersections;
-        Ok(Measured { intersections, forward, backward, rasteriser, ..self.measured })
+        Ok(TileTiming { intersections, forward, backward, rasteriser, ..self.measured })
     }
 }
 
-impl Measured {
+impl TileTiming {
     /// Whether the render matches that of the first tile; phrased so that NaN does not.
     fn agrees(&self) -> bool {
         self.differences.0 <= LARGEST_DIFFERENCE && self.differences.1 <= MEAN_DIFFERENCE
@@ -323,7 +323,7 @@ mod tests {
     use super::*;
 
     fn case(channels: usize, times: &[([u32; 2], f64, f32)]) -> Case {
-        let measured = |&(size, rasteriser, difference): &([u32; 2], _, _)| Measured {
+        let measured = |&(size, rasteriser, difference): &([u32; 2], _, _)| TileTiming {
             tile: size.into(),
             intersections: 0,
             differences: (difference, 0.0),

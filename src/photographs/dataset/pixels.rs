@@ -10,13 +10,13 @@ use rayon::prelude::*;
 
 use super::packed::Packed;
 use super::prepare::{disagreement, prepared};
-use super::source::{MOST_READ, Source};
+use super::source::{MAX_READ, Source};
 use super::undistort::{Undistortion, WIDEST};
 use super::{LoadOptions, MeasuredSize, Split, View};
 use crate::base::hash::Hasher;
 use crate::camera::{Camera, CameraModel, Lens};
 use crate::photographs::image::{Image, Mask, Orientation, PictureFile};
-use crate::photographs::tone::Measured;
+use crate::photographs::tone::MeasuredPhotograph;
 use crate::{Error, Result};
 
 /// The shortest side that leaves something to train on, pixels.
@@ -35,7 +35,7 @@ pub(super) fn load(
     look: Option<Look<'_>>,
     skipped: &mut Vec<String>,
 ) -> Result<Vec<View>> {
-    let room = AtomicI64::new(MOST_READ);
+    let room = AtomicI64::new(MAX_READ);
     let sized = sources.into_par_iter().map(|mut source| {
         let sizes = source.sized(&room);
         Ok(Source { lens: fitted_lens(&source, sizes)?, ..source })
@@ -53,7 +53,7 @@ pub(super) fn load(
     let options = &resolved(&groups, options);
     let largest = groups.iter().map(|(lens, _)| pixels(lens.width, lens.height)).max();
     let at_once = Image::decoded_at_once(largest.unwrap_or_default());
-    let stored = AtomicI64::new(room_for_originals(&groups, options));
+    let stored = AtomicI64::new(original_budget(&groups, options));
     let loading = Loading { options, at_once, look, stored: &stored };
     let mut loaded: Vec<Loaded> = vec![];
     while !groups.is_empty() {
@@ -83,7 +83,7 @@ struct Loading<'a> {
 
 /// What `keep` leaves, bytes, for the photographs at their own size that are shrunk: a curve that is applied to them there
 /// needs the measurements of all first.
-fn room_for_originals(groups: &[(Lens, Vec<Source>)], options: &LoadOptions) -> i64 {
+fn original_budget(groups: &[(Lens, Vec<Source>)], options: &LoadOptions) -> i64 {
     let Some(most) = options.keep.filter(|_| options.measured == MeasuredSize::Own) else {
         return 0;
     };
@@ -145,7 +145,7 @@ pub struct Original {
     /// As [`LoadOptions::undistort`].
     undistort: bool,
     /// At which size, and what.
-    measured: Option<(MeasuredSize, Measured)>,
+    measured: Option<(MeasuredSize, MeasuredPhotograph)>,
     /// Of the pixels as they are loaded, where they are not kept.
     checksum: Option<Hasher>,
     /// The photograph at its own size, while there is room and until it is released.
@@ -181,7 +181,7 @@ impl Original {
     }
 
     /// What was measured of it at a size while it was decoded.
-    pub(crate) fn measured(&self, size: MeasuredSize) -> Option<&Measured> {
+    pub(crate) fn measured(&self, size: MeasuredSize) -> Option<&MeasuredPhotograph> {
         self.measured.as_ref().filter(|(own, _)| *own == size).map(|(_, measured)| measured)
     }
 
@@ -234,9 +234,9 @@ pub(super) fn turn(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Ori
     if lens.fitted(width, height).is_some() {
         return Orientation::UPRIGHT;
     }
-    let said = Orientation::of(path);
-    let (width, height) = said.size((width, height));
-    if lens.fitted(width, height).is_some() { said } else { Orientation::UPRIGHT }
+    let printed = Orientation::of(path);
+    let (width, height) = printed.size((width, height));
+    if lens.fitted(width, height).is_some() { printed } else { Orientation::UPRIGHT }
 }
 
 /// Refuses a file by the size that it declares, before that costs memory: a picture of another shape than its camera's, or
@@ -252,12 +252,12 @@ fn check_size(path: &Path, file: &PictureFile, lens: &Lens) -> Result<()> {
 }
 
 fn check_excess(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Result<()> {
-    const MOST_TIMES: u64 = 64;
+    const MAX_TIMES: u64 = 64;
     let pixels = |width: u32, height: u32| u64::from(width) * u64::from(height);
-    if pixels(width, height) > MOST_TIMES * pixels(lens.width, lens.height) {
+    if pixels(width, height) > MAX_TIMES * pixels(lens.width, lens.height) {
         let (w, h) = (lens.width, lens.height);
         let problem = format!(
-            "is {width}x{height}, over {MOST_TIMES} times the pixels of its view's {w}x{h}; shrink it"
+            "is {width}x{height}, over {MAX_TIMES} times the pixels of its view's {w}x{h}; shrink it"
         );
         return Err(Error::input(path, problem));
     }
@@ -409,8 +409,8 @@ impl Prepared<'_> {
         }
         let mut original = Original::of(path, *self.lens, options.undistort);
         let measured = |image: &Image| match mask {
-            Some(mask) => Measured::of(&mask.counted(image)),
-            None => Measured::of(&image.data),
+            Some(mask) => MeasuredPhotograph::of(&mask.counted(image)),
+            None => MeasuredPhotograph::of(&image.data),
         };
         let at = if room.is_some() { options.measured } else { MeasuredSize::None };
         if at == MeasuredSize::Own {

@@ -58,4 +58,4 @@ impl Source {
 }
 
 /// What files may take that are read before they are decoded, bytes: those beyond are opened once for their size, and again.
-pub(super) const MOST_READ: i64 = 1 << 28;
+pub(super) const MAX_READ: i64 = 1 << 28;

@@ -57,7 +57,7 @@ pub(crate) const ENDED: &str = "ended";
 pub(crate) const TRAINED_WITH: &str = "trained_with";
 
 /// The last scores of the held-out views and their spread, in `metrics.json`.
-pub(crate) const HELD_OUT_COURSE: &str = "held_out";
+pub(crate) const HELD_OUT_CURVE: &str = "held_out";
 
 /// Gain and bias of the training views.
 pub(super) const EXPOSURES: &str = "exposures.csv";

@@ -12,7 +12,7 @@ const POINTS: usize = 200;
 /// Bins of the measured lines.
 const BINS: usize = 64;
 /// Bins with a smaller share of the pixels are left out as too noisy.
-const LEAST_COLUMN: f64 = 1e-4;
+const MIN_COLUMN: f64 = 1e-4;
 /// Reference against t: mean and standard deviation of the pairs, the fitted curve, and AP3 with its defaults.
 /// Adaptive curves are drawn for the mean statistics.
 pub(super) fn svg(fitted: &Fitted, pairs: &[&Pair], options: &FitOptions) -> String {
@@ -34,8 +34,7 @@ pub(super) fn svg(fitted: &Fitted, pairs: &[&Pair], options: &FitOptions) -> Str
     let end = end.map_or(1.0, |column| column.x);
     let line = |name: &str, deviations: f64| {
         let columns = pooled.columns.iter();
-        let columns =
-            columns.filter(|column| column.count > LEAST_COLUMN * count && column.x <= end);
+        let columns = columns.filter(|column| column.count > MIN_COLUMN * count && column.x <= end);
         let point = |column: &crate::photographs::fit::Column| {
             let mean = column.sum_y / column.count;
             let deviation = (column.sum_y2 / column.count - mean * mean).max(0.0).sqrt();
