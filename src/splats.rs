@@ -4,7 +4,7 @@
 //! Gaussians.
 //!
 //! - [`attributes`]: the one table of what every Gaussian has
-//! - [`halves`]: how numbers are stored, and those of 16 bits
+//! - [`packed_sh`]: how numbers are stored, and those of 16 bits
 //! - [`batches`]: Gaussians of more planes than one binding holds
 //! - [`scene`]: Gaussians on the host and on the device, PLY
 //! - [`sort`]: scan and radix sort on the device

@@ -3,8 +3,8 @@
 #include "kernel.glsl"
 #include "gaussian.glsl"
 
-//! The gradients of w_o mean sigmoid(o) + w_s mean exp(s) with respect to the raw opacities o and the logarithms s of the
-//! standard deviations, added to those that are there, and partial sums of sigmoid(o) and of exp(s).
+//! The gradients of w_o mean sigmoid(o) + w_s mean exp(s) + w_a mean max(max s - min s - ln r, 0) with respect to the raw
+//! opacities o and the logarithms s of the standard deviations, added to those that are there, and partial sums of the three.
 //!
 //! A thread takes `GAUSSIANS_PER_THREAD` Gaussians, one subgroup apart. A weight of 0 leaves the gradients as they are.
 //! Reference: `src/reference/parameter_terms.rs`.
@@ -17,18 +17,21 @@ layout(push_constant) uniform Params {
     uint  gaussian_count;   // of the batch
     float opacity_scale;    // w_o / N, N the Gaussians of all batches
     float log_scale_scale;  // w_s / (3N)
+    float ratio_scale;      // w_a / N
+    float log_ratio;        // ln r, the logarithm of the ratio up to which nothing is pressed down
 };
 
 layout(binding = 0) readonly  buffer Parameters      { float parameters[]; };        // planes of the batch
 layout(binding = 1)           buffer Gradients       { float gradients[]; };         // planes of the batch
 layout(binding = 2) writeonly buffer OpacityPartials { float opacity_partials[]; };  // one per workgroup
 layout(binding = 3) writeonly buffer ScalePartials   { float scale_partials[]; };    // one per workgroup
+layout(binding = 4) writeonly buffer RatioPartials   { float ratio_partials[]; };    // one per workgroup
 
 void main() {
     uint first = WORKGROUP_INDEX * SUBGROUP_SIZE * GAUSSIANS_PER_THREAD;
     if (first >= gaussian_count) return;
     first += gl_LocalInvocationID.x;
-    float opacities = 0.0, scales = 0.0;
+    float opacities = 0.0, scales = 0.0, ratios = 0.0;
     for (uint k = 0; k < GAUSSIANS_PER_THREAD; ++k) {
         uint i = first + k * SUBGROUP_SIZE;
         if (i >= gaussian_count) break;
@@ -36,17 +39,31 @@ void main() {
         float opacity = sigmoid(parameters[at]);
         opacities += opacity;
         if (opacity_scale > 0.0) gradients[at] += opacity_scale * opacity * (1.0 - opacity);
+        uint first_axis = LOG_SCALES_COLUMN * gaussian_count + 3 * i;
+        uint longest = 0, shortest = 0;
         for (uint axis = 0; axis < 3; ++axis) {
-            at = LOG_SCALES_COLUMN * gaussian_count + 3 * i + axis;
+            at = first_axis + axis;
             float scale = exp(parameters[at]);
             scales += scale;
             if (log_scale_scale > 0.0) gradients[at] += log_scale_scale * scale;
+            if (parameters[at] > parameters[first_axis + longest]) longest = axis;
+            if (parameters[at] < parameters[first_axis + shortest]) shortest = axis;
+        }
+        float excess = parameters[first_axis + longest] - parameters[first_axis + shortest] - log_ratio;
+        if (excess > 0.0) {
+            ratios += excess;
+            if (ratio_scale > 0.0) {
+                gradients[first_axis + longest] += ratio_scale;
+                gradients[first_axis + shortest] -= ratio_scale;
+            }
         }
     }
     opacities = subgroupAdd(opacities);
     scales = subgroupAdd(scales);
+    ratios = subgroupAdd(ratios);
     if (subgroupElect()) {
         opacity_partials[WORKGROUP_INDEX] = opacities;
         scale_partials[WORKGROUP_INDEX] = scales;
+        ratio_partials[WORKGROUP_INDEX] = ratios;
     }
 }

@@ -55,6 +55,7 @@ pub struct LogSlot<'a> {
 }
 
 /// A term and the partial sums that it is the scaled sum of; with none of them its column is left as it is.
+#[derive(Clone, Copy)]
 pub(super) struct PartialSums<'a> {
     pub(super) term: Term,
     pub(super) partials: &'a Buffer<f32>,

@@ -1,8 +1,10 @@
-//! Terms on the parameters of the Gaussians: the mean opacity and the mean standard deviation, each pressed down by its weight.
+//! Terms on the parameters of the Gaussians: mean opacity, mean standard deviation and anisotropy, each times its weight.
 //!
-//! L = a mean sigmoid(o) + b mean exp(s), a and b the weights, o the raw opacities, s the logarithms of the three standard
-//! deviations: the regularisers of 3DGS-MCMC (Kheradmand et al. 2024). They look at no view, so they are recorded after the render's gradient
-//! has become that of the parameters, and add to it.
+//! L = a mean sigmoid(o) + b mean exp(s) + c mean max(max s - min s - ln r, 0), a, b and c the weights, o the raw opacities,
+//! s the logarithms of the three standard deviations. The first two are the regularisers of 3DGS-MCMC (Kheradmand et al.
+//! 2024). The third is that of `PhysGaussian` (Xie et al. 2024), of the logarithm of the ratio: its gradient does not grow
+//! with the ratio. They look at no view, so they are recorded after the gradient of the render has become that of the
+//! parameters, and add to it.
 
 use super::log::{LogSlot, PartialSums};
 use super::{LossSpec, Term, TermOn};
@@ -13,7 +15,7 @@ use crate::kernels::parameter_terms;
 use crate::splats::batches::{Batch, Batches};
 
 pub(super) const SPEC: LossSpec =
-    LossSpec { terms: &[Term::OPACITY, Term::SCALE], on: TermOn::Parameters };
+    LossSpec { terms: &[Term::OPACITY, Term::SCALE, Term::ANISOTROPY], on: TermOn::Parameters };
 
 impl Term {
     /// Mean opacity.
@@ -22,33 +24,42 @@ impl Term {
         name: "opacity",
         is_likeness: false,
         weight: |config| config.parameters.opacity_weight,
-        setting: "loss.opacity_weight",
     };
     /// Mean standard deviation, in units of the frame.
     pub const SCALE: Self = Self {
         column: "scale",
         name: "scale",
         weight: |config| config.parameters.scale_weight,
-        setting: "loss.scale_weight",
+        ..Self::OPACITY
+    };
+    /// Mean excess of the logarithm of longest over shortest standard deviation.
+    pub const ANISOTROPY: Self = Self {
+        column: "anisotropy",
+        name: "anisotropy",
+        weight: |config| config.parameters.anisotropy_weight,
         ..Self::OPACITY
     };
 }
 
 settings! {
 "loss."
-/// What the terms on parameters weigh; 0: they are not there.
+/// The weights of the terms on parameters; a term of weight 0 is off.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ParameterWeights {
-    /// Of the mean opacity, which it presses down; 3DGS-MCMC has 0.01.
+    /// Weight of the mean opacity; 3DGS-MCMC has 0.01.
     opacity_weight: f64 = 0.0 => Rule::POSITIVE_OR_0;
-    /// Of the mean standard deviation, in units of the frame, which it presses down; 3DGS-MCMC has 0.01.
+    /// Weight of the mean standard deviation, in units of the frame; 3DGS-MCMC has 0.01.
     scale_weight: f64 = 0.0 => Rule::POSITIVE_OR_0;
+    /// Weight of the mean excess of ln(longest / shortest standard deviation) over ln(loss.anisotropy_limit).
+    anisotropy_weight: f64 = 0.0 => Rule::POSITIVE_OR_0;
+    /// The ratio of longest to shortest standard deviation that costs nothing.
+    anisotropy_limit: f64 = 3.0 => Rule::from_to(1.0, 1e6);
 }
 }
 
 impl ParameterWeights {
     fn is_on(self) -> bool {
-        self.opacity_weight > 0.0 || self.scale_weight > 0.0
+        self.opacity_weight > 0.0 || self.scale_weight > 0.0 || self.anisotropy_weight > 0.0
     }
 }
 
@@ -76,6 +87,7 @@ pub struct ParameterTerms {
     /// One a workgroup, of all batches one after the other.
     opacity_partials: Buffer<f32>,
     scale_partials: Buffer<f32>,
+    ratio_partials: Buffer<f32>,
 }
 
 impl ParameterTerms {
@@ -94,6 +106,7 @@ impl ParameterTerms {
                     * constants.gaussians_per_thread,
                 opacity_partials: gpu.uninit("opacity_partials", 0)?,
                 scale_partials: gpu.uninit("scale_partials", 0)?,
+                ratio_partials: gpu.uninit("ratio_partials", 0)?,
             })
         };
         weights.is_on().then(new).transpose()
@@ -120,9 +133,11 @@ impl ParameterTerms {
         if self.opacity_partials.len() < total {
             self.opacity_partials = self.gpu.uninit("opacity_partials", total)?;
             self.scale_partials = self.gpu.uninit("scale_partials", total)?;
+            self.ratio_partials = self.gpu.uninit("ratio_partials", total)?;
         }
         pass.fill(&mut self.opacity_partials, 0);
         pass.fill(&mut self.scale_partials, 0);
+        pass.fill(&mut self.ratio_partials, 0);
         let scale = |weight: f64, each: f64| (weight / (each * f64::from(all.max(1)))) as f32;
         let mut first = 0;
         for batch in batches.iter() {
@@ -134,12 +149,15 @@ impl ParameterTerms {
                     gaussian_count: batch.gaussian_count(),
                     opacity_scale: scale(self.weights.opacity_weight, 1.0),
                     log_scale_scale: scale(self.weights.scale_weight, 3.0),
+                    ratio_scale: scale(self.weights.anisotropy_weight, 1.0),
+                    log_ratio: self.weights.anisotropy_limit.ln() as f32,
                 },
                 parameter_terms::Buffers {
                     parameters: batch.rows(parameters, words)?,
                     gradients: batch.planes_mut(&mut *gradients)?,
                     opacity_partials: self.opacity_partials.slice_mut().range(part.clone())?,
-                    scale_partials: self.scale_partials.slice_mut().range(part)?,
+                    scale_partials: self.scale_partials.slice_mut().range(part.clone())?,
+                    ratio_partials: self.ratio_partials.slice_mut().range(part)?,
                 },
                 Threads::Workgroups([workgroups(&batch), 1, 1]),
             )?;
@@ -153,6 +171,8 @@ impl ParameterTerms {
                 sums(Term::OPACITY, &self.opacity_partials, mean(1.0)),
                 sums(Term::SCALE, &self.scale_partials, mean(3.0)),
             ],
-        )
+        )?;
+        let ratios = sums(Term::ANISOTROPY, &self.ratio_partials, mean(1.0));
+        log.record(pass, [ratios, PartialSums { count: 0, ..ratios }])
     }
 }

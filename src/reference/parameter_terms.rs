@@ -1,4 +1,6 @@
-//! Mean opacity and mean standard deviation of the Gaussians, with their gradients.
+//! Mean opacity, mean standard deviation and anisotropy of the Gaussians, with their gradients.
+
+use std::ops::Range;
 
 use super::rounding::{Rounded, chain};
 use crate::gpu::{Reference, Tolerance};
@@ -17,12 +19,24 @@ fn scale<T: Real>(log_scale: T) -> [T; 2] {
     [log_scale.exp(); 2]
 }
 
-/// `weights[0]` mean opacity + `weights[1]` mean standard deviation of so many Gaussians with these planes, and its gradient.
+/// The axes of the longest and the shortest of three standard deviations, the first of equal ones.
+fn extremes<T: PartialOrd + Copy>(log_scales: [T; 3]) -> [usize; 2] {
+    (1..3).fold([0, 0], |[longest, shortest], axis| {
+        [
+            if log_scales[axis] > log_scales[longest] { axis } else { longest },
+            if log_scales[axis] < log_scales[shortest] { axis } else { shortest },
+        ]
+    })
+}
+
+/// The three weights, of opacity, standard deviation and anisotropy, times the means over the Gaussians with these planes,
+/// and the gradient. `log_ratio` is the logarithm of the ratio that costs nothing.
 #[cfg(feature = "testing")]
 pub fn parameter_terms(
     planes: &[f64],
     gaussian_count: usize,
-    weights: [f64; 2],
+    weights: [f64; 3],
+    log_ratio: f64,
 ) -> (f64, Vec<f64>) {
     let (mut value, mut gradient) = (0.0, vec![0.0; planes.len()]);
     for (term, range) in [opacities(gaussian_count), scales(gaussian_count)].into_iter().enumerate()
@@ -34,66 +48,106 @@ pub fn parameter_terms(
             gradient[at] = weight * derivative;
         }
     }
+    let weight = weights[2] / gaussian_count as f64;
+    for first in scales(gaussian_count).step_by(3) {
+        let [longest, shortest] = extremes([planes[first], planes[first + 1], planes[first + 2]])
+            .map(|axis| first + axis);
+        let excess = planes[longest] - planes[shortest] - log_ratio;
+        if excess > 0.0 {
+            value += weight * excess;
+            gradient[longest] += weight;
+            gradient[shortest] -= weight;
+        }
+    }
     (value, gradient)
 }
 
-fn opacities(gaussian_count: usize) -> std::ops::Range<usize> {
+fn opacities(gaussian_count: usize) -> Range<usize> {
     let first = Attribute::RawOpacities.column(0) * gaussian_count;
     first..first + gaussian_count
 }
 
-fn scales(gaussian_count: usize) -> std::ops::Range<usize> {
+fn scales(gaussian_count: usize) -> Range<usize> {
     let first = Attribute::LogScales.column(0) * gaussian_count;
     first..first + 3 * gaussian_count
 }
 
-/// The values of a term, and what the gradients become.
+/// The values of the terms, and what the gradients become.
 struct Outcome {
-    values: Vec<Rounded>,
-    gradients: Vec<(usize, Rounded)>,
+    opacities: Vec<Rounded>,
+    scales: Vec<Rounded>,
+    ratios: Vec<Rounded>,
+    gradients: Vec<Rounded>,
 }
 
-fn outcomes(params: &Params, slices: &Slices<'_>) -> [Outcome; 2] {
+fn outcome(params: &Params, slices: &Slices<'_>) -> Outcome {
     let count = params.gaussian_count as usize;
-    let of = |range: std::ops::Range<usize>, term: fn(Rounded) -> [Rounded; 2], weight: f32| {
-        let both = range.map(|at| (at, term(Rounded::exact(slices.parameters[at]))));
-        let both: Vec<_> = both.collect();
-        let sum = |&(at, [_, derivative]): &(usize, [Rounded; 2])| {
-            (at, Rounded::exact(slices.gradients[at]) + Rounded::exact(weight) * derivative)
+    let parameter = |at: usize| Rounded::exact(slices.parameters[at]);
+    let mut gradients: Vec<Rounded> =
+        slices.gradients.iter().map(|&gradient| Rounded::exact(gradient)).collect();
+    let mut of = |range: Range<usize>, term: fn(Rounded) -> [Rounded; 2], weight: f32| {
+        let value = |at: usize| {
+            let [value, derivative] = term(parameter(at));
+            if weight > 0.0 {
+                gradients[at] = gradients[at] + Rounded::exact(weight) * derivative;
+            }
+            value
         };
-        let gradients = both.iter().filter(|_| weight > 0.0).map(sum).collect();
-        Outcome { values: both.iter().map(|(_, [value, _])| *value).collect(), gradients }
+        range.map(value).collect()
     };
-    [
-        of(opacities(count), opacity, params.opacity_scale),
-        of(scales(count), scale, params.log_scale_scale),
-    ]
+    let opacities = of(opacities(count), opacity, params.opacity_scale);
+    let all_scales = of(scales(count), scale, params.log_scale_scale);
+    let mut ratios = vec![];
+    for first in scales(count).step_by(3) {
+        let [a, b, c] = [0, 1, 2].map(|axis| slices.parameters[first + axis]);
+        let [longest, shortest] = extremes([a, b, c]).map(|axis| first + axis);
+        let excess = parameter(longest) - parameter(shortest) - Rounded::exact(params.log_ratio);
+        // The kernel decides by its own rounded excess.
+        let is_over = slices.parameters[longest] - slices.parameters[shortest] - params.log_ratio;
+        if is_over > 0.0 {
+            ratios.push(excess);
+            if params.ratio_scale > 0.0 {
+                let weight = Rounded::exact(params.ratio_scale);
+                gradients[longest] = gradients[longest] + weight;
+                gradients[shortest] = gradients[shortest] - weight;
+            }
+        }
+    }
+    Outcome { opacities, scales: all_scales, ratios, gradients }
 }
 
 impl Reference for Kernel {
     /// The whole sums go into the first partials: how many there are is the device's choice.
     fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
-        let outcomes = outcomes(params, &slices);
-        for (at, gradient) in outcomes.iter().flat_map(|of| &of.gradients) {
-            slices.gradients[*at] = gradient.value as f32;
+        let Outcome { opacities, scales, ratios, gradients } = outcome(params, &slices);
+        for (own, gradient) in slices.gradients.iter_mut().zip(gradients) {
+            *own = gradient.value as f32;
         }
-        for (partials, Outcome { values, .. }) in
-            [slices.opacity_partials, slices.scale_partials].into_iter().zip(&outcomes)
-        {
+        for (partials, values) in [
+            (slices.opacity_partials, opacities),
+            (slices.scale_partials, scales),
+            (slices.ratio_partials, ratios),
+        ] {
             partials.fill(0.0);
             partials[0] = values.iter().map(|value| value.value).sum::<f64>() as f32;
         }
     }
 
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
-        let outcomes = outcomes(params, &slices);
-        let mut bounds = vec![0.0; slices.gradients.len()];
-        for (at, gradient) in outcomes.iter().flat_map(|of| &of.gradients) {
-            bounds[*at] = gradient.bound();
-        }
+        let Outcome { opacities, scales, ratios, gradients } = outcome(params, &slices);
+        // A gradient that no term adds to keeps its bits.
+        let bound = |(gradient, &before): (&Rounded, &f32)| {
+            if gradient.value == f64::from(before) { 0.0 } else { gradient.bound() }
+        };
+        let bounds = gradients.iter().zip(slices.gradients.iter()).map(bound).collect();
         let chain = chain(0) + f64::from(3 * constants.gaussians_per_thread);
-        let [opacity_partials, scale_partials] =
-            outcomes.map(|of| Tolerance::Sum(Rounded::sum(chain, of.values).bound()));
-        Tolerances { gradients: Tolerance::Each(bounds), opacity_partials, scale_partials }
+        let [opacity_partials, scale_partials, ratio_partials] = [opacities, scales, ratios]
+            .map(|values| Tolerance::Sum(Rounded::sum(chain, values).bound()));
+        Tolerances {
+            gradients: Tolerance::Each(bounds),
+            opacity_partials,
+            scale_partials,
+            ratio_partials,
+        }
     }
 }

@@ -118,7 +118,7 @@ pub(crate) fn scene_facts(scene: &SceneDiagnosis) -> [[String; 2]; 5] {
         scene.p10,
         scene.p90,
         scene.cubic_mean,
-        scene.tone_mapping,
+        scene.brightening,
         scene.darkening
     );
     let exposure = format!(

@@ -10,8 +10,8 @@ use std::path::{Path, PathBuf};
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
 
-use super::TrainConfig;
 use super::settings::{SETTINGS, flat, number, setting, takes, unknown, value};
+use super::{TrainConfig, old_keys};
 use crate::base::input;
 use crate::base::settings::{Rule, Setting};
 use crate::photographs::tone::{OF_CURVE, ToneCurve};
@@ -119,7 +119,7 @@ impl SettingsLayer {
     /// # Errors
     /// The key is no setting, or the setting does not take the value.
     pub fn push(&mut self, key: &str, value: Value, origin: Origin) -> Result<()> {
-        let key = if key == "tone.family" { "tone.curve" } else { key };
+        let key = old_keys::current(key);
         // The constants of a curve can be set one by one.
         let is_part = key.strip_prefix("tone.constants.").is_some_and(|name| !name.contains('.'));
         match setting(key) {

@@ -1,31 +1,27 @@
 //! The training views on the device: dark photographs, their curves, and the order in which steps take them.
 
-use std::borrow::Cow;
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::RangeInclusive;
 use std::sync::Arc;
 
-use glam::{DVec3, UVec2, Vec3};
+use glam::UVec2;
 
+use super::TrainConfig;
 use super::cache::{Cache, CacheSize, Slot};
 use super::epochs::Epochs;
 use super::measuring::{TargetExposure, measured, photographs};
 use super::precision::Encoder;
-use super::{TrainConfig, streams};
-use crate::base::random::Stream;
-use crate::camera::{Camera, Patch, TrainingFrame};
+use crate::Result;
+use crate::camera::{Patch, TrainingFrame};
 use crate::gpu::{Buffer, Download, Gpu, Recorder};
 use crate::kernels::ToneParameters;
 use crate::loss::ViewSource;
-use crate::loss::exposure::Affine;
-use crate::networks::NetworkVariant;
-use crate::photographs::dataset::{Dataset, Point};
+use crate::photographs::dataset::Dataset;
 use crate::photographs::image::Image;
 use crate::photographs::pseudo_gt::PseudoGt;
 use crate::photographs::tone::SceneTone;
 use crate::splats::render::{Viewpoint, Viewpoints};
-use crate::splats::scene::{COLOR_CHANNELS, Feature, Gaussians, Shape, init};
-use crate::{Error, Result};
+use crate::splats::scene::COLOR_CHANNELS;
 
 /// One training view: a photograph, or a patch of one that is too large to be trained on at once.
 #[derive(Debug)]
@@ -48,6 +44,15 @@ pub(super) struct TrainView {
     gets_curve: bool,
     /// The dark photograph, where that is not what is stored and a network sees it.
     photograph: Option<Slot>,
+}
+
+/// Which of the training views.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct ViewId {
+    /// Of the resolution schedule.
+    level: usize,
+    /// Among the views of the level.
+    index: usize,
 }
 
 /// All training views in the dataset's order, as they are and then by level of the resolution schedule, each half the
@@ -160,7 +165,7 @@ impl Views {
         let (mut bytes, mut last) = (0, *steps.start());
         for step in steps {
             let level = config.schedule.resolution_level(step);
-            let view = self.of_step(config.seed, step, level);
+            let view = self.get(self.of_step(config.seed, step, level));
             let slots = [Some(view.stored), view.photograph].into_iter().flatten();
             let own: u64 = slots.clone().map(|slot| self.cache.bytes(slot)).sum();
             let is_new = !numbers.contains(&view.number);
@@ -274,17 +279,21 @@ impl Views {
 
     /// The view that a step trains on, at one of the levels: every epoch takes each view once, in an order of its own, and
     /// for one that is left out the next again.
-    pub(super) fn of_step(&self, seed: u64, step: u64, level: usize) -> &TrainView {
+    pub(super) fn of_step(&self, seed: u64, step: u64, level: usize) -> ViewId {
         let views = &self.levels[level];
         let (order, place) = self.epochs.of_step(seed, step, views.len());
-        let from_place = order.iter().cycle().skip(place).take(views.len());
+        let from_place = order[place..].iter().chain(&order[..place]);
         let own = from_place.copied().find(|at| !self.left_out.contains(&views[*at].place));
-        &views[own.unwrap_or(order[place])]
+        ViewId { level, index: own.unwrap_or(order[place]) }
     }
 
-    /// A view as it is rendered.
-    pub(super) fn viewpoint(&self, view: &TrainView) -> Viewpoint<'_> {
-        self.viewpoints.get(view.number)
+    pub(super) fn get(&self, ViewId { level, index }: ViewId) -> &TrainView {
+        &self.levels[level][index]
+    }
+
+    /// The camera of a view, on the device.
+    pub(super) fn viewpoint(&self, view: ViewId) -> Viewpoint<'_> {
+        self.viewpoints.get(self.get(view).number)
     }
 
     /// Trains on a view no more; false where there is no other.
@@ -326,19 +335,6 @@ impl Views {
         self.whole().iter().filter(|view| view.patch.is_first())
     }
 
-    /// Warns of every view in which none of the first Gaussians, given in the frame, has its mean: most often its pose is wrong.
-    pub(super) fn warn_of_empty_views(&self, gaussians: &Gaussians) {
-        let means: Vec<DVec3> = gaussians.means().iter().map(|mean| mean.as_dvec3()).collect();
-        for TrainView { name, patch, .. } in self.photographs() {
-            if !scattered(means.len()).any(|at| patch.camera.sees(means[at]).is_some()) {
-                tracing::warn!(
-                    "view {name} shows nothing: none of the {} first Gaussians lies in it; check its pose",
-                    means.len()
-                );
-            }
-        }
-    }
-
     /// The names of the training photographs.
     pub(super) fn names(&self) -> impl Iterator<Item = &str> {
         self.photographs().map(|view| view.name.as_str())
@@ -347,79 +343,6 @@ impl Views {
     /// Width and height of every view, unshrunk.
     pub(super) fn sizes(&self) -> Vec<UVec2> {
         self.whole().iter().map(TrainView::size).collect()
-    }
-
-    /// The points of the dataset, with random ones behind them where there is none or few.
-    fn points<'a>(
-        &self,
-        dataset: &'a Dataset,
-        config: &TrainConfig,
-        frame: &TrainingFrame,
-    ) -> Cow<'a, [Point]> {
-        let own = &dataset.points;
-        let wanted =
-            if own.is_empty() { config.random_points } else { config.density.sparse_threshold() };
-        let count = wanted.min(config.max_gaussians).saturating_sub(own.len());
-        if count == 0 {
-            return own.into();
-        }
-        let firsts = self.all().filter(|view| view.patch.is_first());
-        let cameras: Vec<Camera> = firsts.map(|view| view.patch.camera).collect();
-        let seed = Stream::new(config.seed, streams::POINTS).bits(0);
-        let found = if own.is_empty() { "no".to_owned() } else { own.len().to_string() };
-        tracing::info!("{found} points in the dataset: {count} random ones");
-        let point = |position| Point { position: frame.unframed(position), views: vec![] };
-        let random = init::random(&cameras, count, seed).into_iter().map(point);
-        own.iter().cloned().chain(random).collect()
-    }
-
-    /// One Gaussian per point of the dataset, and per random point where there is none or few, coloured as the targets of
-    /// the training views show it.
-    pub(super) fn initial_gaussians(
-        &self,
-        gpu: &Gpu,
-        pseudo_gt: &PseudoGt,
-        dataset: &Dataset,
-        config: &TrainConfig,
-        exposures: Option<&[Affine]>,
-    ) -> Result<Gaussians> {
-        let frame = config.frame.unwrap_or_default();
-        let points = self.points(dataset, config, &frame);
-        let kept = &points[..points.len().min(config.max_gaussians)];
-        let fitting = config.render_settings().peak_gaussians(gpu);
-        if kept.len() > fitting {
-            let (of, device) = (kept.len(), &gpu.properties().name);
-            tracing::warn!("{fitting} of {of} points begin as Gaussians: {device} binds no more");
-        }
-        let kept = &kept[..kept.len().min(fitting)];
-        // Of the views of the dataset, the place of each among those that are trained on.
-        let mut places = vec![None; dataset.views.len()];
-        self.photographs().for_each(|view| places[view.index] = Some(view.place));
-        let mut targets = ImageBatches::new(self, gpu, pseudo_gt, ImageKind::Targets);
-        let colors = init::colors_from_views(kept, &dataset.views, |index| {
-            let Some(place) = places[index] else { return Ok(None) };
-            let target = targets.next(place)?;
-            let exposure = exposures.and_then(|exposures| exposures.get(place));
-            Ok(Some(exposure.map_or_else(|| target.clone(), |own| own.inverse().applied(&target))))
-        })?;
-        let positions: Vec<DVec3> = kept.iter().map(|point| frame.framed(point.position)).collect();
-        let seed = Stream::new(config.seed, streams::FEATURES).bits(0);
-        let shape = Shape { sh_degree: config.sh_degree, features: config.model.features() };
-        let mut gaussians =
-            Gaussians::from_points(&positions, &colors, shape, &config.start, seed)?;
-        if config.model.network.variant == NetworkVariant::Identity {
-            let low = if shape.features.illumination {
-                let mut photographs =
-                    ImageBatches::new(self, gpu, pseudo_gt, ImageKind::Photographs);
-                init::colors_from_views(kept, &dataset.views, |index| {
-                    places[index].map(|place| photographs.next(place)).transpose()
-                })?
-            } else {
-                vec![]
-            };
-            begin_as_identity(&mut gaussians, &colors, &low);
-        }
-        Ok(gaussians)
     }
 }
 
@@ -430,45 +353,6 @@ pub(super) enum ImageKind {
     Targets,
     /// What it was made of; only where that is kept.
     Photographs,
-}
-
-/// Pictures of the photographs one after the other, made several at a time.
-struct ImageBatches<'a> {
-    views: &'a Views,
-    gpu: &'a Gpu,
-    pseudo_gt: &'a PseudoGt,
-    kind: ImageKind,
-    /// By place.
-    made: BTreeMap<usize, Image>,
-}
-
-impl<'a> ImageBatches<'a> {
-    fn new(views: &'a Views, gpu: &'a Gpu, pseudo_gt: &'a PseudoGt, kind: ImageKind) -> Self {
-        Self { views, gpu, pseudo_gt, kind, made: BTreeMap::new() }
-    }
-
-    /// That of a place; those before are gone.
-    fn next(&mut self, place: usize) -> Result<Image> {
-        /// Of those that are made at a time.
-        const MAX_PIXELS: usize = 1 << 20;
-        let Self { views, gpu, pseudo_gt, kind, ref mut made } = *self;
-        if !made.contains_key(&place) {
-            let mut pixels = 0;
-            let whole = views.whole();
-            let after = &whole[whole.partition_point(|view| view.place < place)..];
-            let after = after.iter().filter(|view| view.patch.is_first());
-            let now = after.take_while(|view| {
-                let is_first = pixels == 0;
-                pixels += Patch::from(&view.patch.camera).pixel_count();
-                is_first || pixels <= MAX_PIXELS
-            });
-            let last = now.last().map_or(place, |view| view.place);
-            let images = views.pictures(gpu, pseudo_gt, place..last + 1, kind)?;
-            *made = (place..).zip(images).collect();
-        }
-        let gone = || Error::Usage(format!("there is no photograph {place} to train on"));
-        made.remove(&place).ok_or_else(gone)
-    }
 }
 
 /// A photograph at the size of a level.
@@ -511,47 +395,6 @@ impl LevelImage<'_> {
     }
 }
 
-/// Sets the features that parts of the model begin with so that nothing changes: no structure, and the illumination that
-/// makes of each point's colour what the dark photographs show of it. Depth, which is correlated, stays as drawn.
-fn begin_as_identity(gaussians: &mut Gaussians, colors: &[Vec3], low: &[Vec3]) {
-    /// Darker targets say nothing of the light.
-    const DARKEST: f32 = 1.0 / 255.0;
-    let features = gaussians.shape.features;
-    let places = |feature| {
-        let channels = features.channels_of(feature).unwrap_or_default();
-        channels.map(|channel| channel - COLOR_CHANNELS)
-    };
-    let width = features.width();
-    for (i, own) in gaussians.features_mut().chunks_mut(width.max(1)).enumerate() {
-        places(Feature::Structure).for_each(|at| own[at] = 0.0);
-        for (channel, at) in places(Feature::Illumination).enumerate() {
-            own[at] = (low[i][channel] / colors[i][channel].max(DARKEST)).clamp(0.0, 1.0);
-        }
-    }
-}
-
-/// The numbers below `count`, each once, with neighbours far apart: what is found at some place in a list is found after few
-/// steps, however the list is sorted.
-fn scattered(count: usize) -> impl Iterator<Item = usize> {
-    const GOLDEN: f64 = 0.618_033_988_75;
-    let divides_both = |step: usize| {
-        let (mut a, mut b) = (step, count);
-        while b > 0 {
-            (a, b) = (b, a % b);
-        }
-        a > 1
-    };
-    let mut step = ((GOLDEN * count as f64) as usize).max(1);
-    while divides_both(step) {
-        step += 1;
-    }
-    (0..count).scan(0, move |at, _| {
-        let here = *at;
-        *at = (here + step) % count;
-        Some(here)
-    })
-}
-
 /// A size halved as often as its level says and its shorter side allows.
 fn shrunk(size: UVec2, level: u32) -> UVec2 {
     let suits = |&level: &u32| level == 0 || (size >> level).min_element() >= SHORTEST_SIDE;
@@ -570,22 +413,5 @@ impl TrainView {
     /// Width and height in pixels.
     pub(super) fn size(&self) -> UVec2 {
         self.patch.size
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::scattered;
-
-    #[test]
-    fn scattered_numbers_are_all_there_and_neighbours_far_apart() {
-        for count in [0, 1, 2, 3, 4, 6, 10, 97, 1000] {
-            let numbers: Vec<usize> = scattered(count).collect();
-            let near = numbers.windows(2).filter(|two| two[0].abs_diff(two[1]) < count / 4).count();
-            assert!(near <= 1 || count < 4, "{count}: {near}");
-            let mut sorted = numbers;
-            sorted.sort_unstable();
-            assert!(sorted.into_iter().eq(0..count));
-        }
     }
 }

@@ -9,3 +9,4 @@ mod architecture;
 mod circles;
 mod install;
 mod settings;
+mod words;

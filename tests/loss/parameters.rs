@@ -21,11 +21,14 @@ fn planes(count: usize) -> Vec<f32> {
 #[test]
 fn the_kernel_matches_its_reference_and_leaves_other_gradients() {
     for count in [1, 7, 64, 65, 1000] {
-        for [opacity_scale, log_scale_scale] in [[0.3, 0.0], [0.0, 0.2], [0.1, 0.05]] {
+        for [opacity_scale, log_scale_scale, ratio_scale] in
+            [[0.3, 0.0, 0.0], [0.0, 0.2, 0.0], [0.0, 0.0, 0.4], [0.1, 0.05, 0.02]]
+        {
             let parameters = planes(count);
             let before: Vec<f32> = parameters.iter().map(|x| 0.01 * x).collect();
             let gradients = before.clone();
-            let [opacity_partials, scale_partials] = [(); 2].map(|()| vec![f32::NAN; count]);
+            let [opacity_partials, scale_partials, ratio_partials] =
+                [(); 3].map(|()| vec![f32::NAN; count]);
             let constants = parameter_terms::Constants::default();
             let each = gpu().properties().subgroup_size * constants.gaussians_per_thread;
             let (gradients, ..) = run_kernel!(
@@ -34,19 +37,24 @@ fn the_kernel_matches_its_reference_and_leaves_other_gradients() {
                 parameter_terms::Params {
                     gaussian_count: count as u32,
                     opacity_scale,
-                    log_scale_scale
+                    log_scale_scale,
+                    ratio_scale,
+                    log_ratio: 1.0,
                 },
                 Threads::Workgroups([(count as u32).div_ceil(each), 1, 1]),
                 [parameters],
-                [gradients, opacity_partials, scale_partials]
+                [gradients, opacity_partials, scale_partials, ratio_partials]
             );
             let [scales, opacities, dc] =
                 [Attribute::LogScales, Attribute::RawOpacities, Attribute::Dc]
                     .map(|attribute| attribute.column(0) * count);
             for (i, (after, before)) in gradients.iter().zip(&before).enumerate() {
-                let is_scale = (scales..opacities).contains(&i) && log_scale_scale > 0.0;
+                let is_scale = (scales..opacities).contains(&i);
                 let is_opacity = (opacities..dc).contains(&i) && opacity_scale > 0.0;
-                assert_eq!(after > before, is_scale || is_opacity, "{i} of {count}");
+                let grows = is_opacity || is_scale && log_scale_scale > 0.0;
+                if ratio_scale == 0.0 || !is_scale {
+                    assert_eq!(after > before, grows, "{i} of {count}");
+                }
             }
         }
     }
@@ -56,10 +64,10 @@ fn the_kernel_matches_its_reference_and_leaves_other_gradients() {
 fn the_gradient_is_that_of_finite_differences() {
     let count = 5;
     let planes: Vec<f64> = planes(count).into_iter().map(f64::from).collect();
-    for weights in [[1.0, 0.0], [0.0, 1.0], [0.3, 0.7]] {
-        let (_, gradient) = parameter_terms(&planes, count, weights);
-        let numeric =
-            central_differences(&planes, |planes| parameter_terms(planes, count, weights).0);
+    for weights in [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.3, 0.7, 0.2]] {
+        let value = |planes: &[f64]| parameter_terms(planes, count, weights, 0.5).0;
+        let (_, gradient) = parameter_terms(&planes, count, weights, 0.5);
+        let numeric = central_differences(&planes, value);
         for (analytic, numeric) in gradient.iter().zip(numeric) {
             assert!((analytic - numeric).abs() < 1e-8, "{analytic} {numeric}");
         }
@@ -69,7 +77,12 @@ fn the_gradient_is_that_of_finite_differences() {
 #[test]
 fn the_means_over_the_gaussians_reach_the_log_and_their_gradients_the_planes() {
     let (gpu, count) = (gpu(), 741);
-    let weights = ParameterWeights { opacity_weight: 0.3, scale_weight: 0.7 };
+    let weights = ParameterWeights {
+        opacity_weight: 0.3,
+        scale_weight: 0.7,
+        anisotropy_weight: 0.2,
+        anisotropy_limit: 2.0,
+    };
     let mut terms = ParameterTerms::new(&gpu, weights).unwrap().unwrap();
     let (planes, words) = (planes(count), column_count(0, 0));
     let batches = Batches::new(&gpu, PlaneCounts { gaussians: count, columns: words, features: 0 });
@@ -81,13 +94,16 @@ fn the_means_over_the_gaussians_reach_the_log_and_their_gradients_the_planes() {
     })
     .unwrap();
     let planes: Vec<f64> = planes.into_iter().map(f64::from).collect();
-    let [opacity, scale] = [[1.0, 0.0], [0.0, 1.0]].map(|of| parameter_terms(&planes, count, of).0);
-    for (term, expected) in [(Term::OPACITY, opacity), (Term::SCALE, scale)] {
+    let log_ratio = weights.anisotropy_limit.ln();
+    let [opacity, scale, anisotropy] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+        .map(|of| parameter_terms(&planes, count, of, log_ratio).0);
+    let expected = [(Term::OPACITY, opacity), (Term::SCALE, scale), (Term::ANISOTROPY, anisotropy)];
+    for (term, expected) in expected {
         let found = f64::from(logged.losses.get(term));
         assert!((found / expected - 1.0).abs() < 1e-5, "{term:?}: {found}, not {expected}");
     }
-    let of_both = [weights.opacity_weight, weights.scale_weight];
-    let (_, expected) = parameter_terms(&planes, count, of_both);
+    let all = [weights.opacity_weight, weights.scale_weight, weights.anisotropy_weight];
+    let (_, expected) = parameter_terms(&planes, count, all, log_ratio);
     let expected: Vec<f32> = expected.into_iter().map(|value| value as f32).collect();
     assert_close("gradients", &batches.read(&gpu, &gradients).unwrap(), &expected, 1e-8);
 }
@@ -95,4 +111,18 @@ fn the_means_over_the_gaussians_reach_the_log_and_their_gradients_the_planes() {
 #[test]
 fn a_weight_of_0_has_no_term() {
     assert!(ParameterTerms::new(&gpu(), ParameterWeights::default()).unwrap().is_none());
+}
+
+#[test]
+fn only_a_ratio_above_the_limit_costs_something_and_its_gradient_does_not_grow_with_it() {
+    let (count, columns) = (2, column_count(0, 0));
+    let first = Attribute::LogScales.column(0) * count;
+    for (stretch, value) in [(0.0, 0.0), (0.9, 0.0), (1.5, 0.25), (61.0, 30.0)] {
+        let mut planes = vec![0.0; count * columns];
+        planes[first + 1] = stretch;
+        let (found, gradient) = parameter_terms(&planes, count, [0.0, 0.0, 1.0], 1.0);
+        assert_eq!(found, value);
+        assert_eq!(gradient[first + 1], if value > 0.0 { 0.5 } else { 0.0 });
+        assert_eq!(gradient.iter().sum::<f64>(), 0.0);
+    }
 }

@@ -76,6 +76,8 @@ impl Args for SingleSettings {
     fn augment_args(command: Command) -> Command {
         Self::rows().fold(command, |command, (row, name, value)| {
             let arg = Arg::new(name).long(name).help(help(row));
+            // The name in other trainers.
+            let arg = if name == "steps" { arg.visible_alias("iterations") } else { arg };
             let is_path = matches!(row.rule, Rule::Text("a path", _));
             let arg = if is_path { arg.value_hint(ValueHint::AnyPath) } else { arg };
             command.arg(match (value, row.rule) {

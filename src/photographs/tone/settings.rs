@@ -428,6 +428,7 @@ struct SerializedToneSettings {
     #[serde(skip_serializing_if = "Option::is_none")]
     brightness: Option<f64>,
     colour: Option<f64>,
+    #[serde(alias = "lift_first")]
     full_resolution: Option<bool>,
     #[serde(skip_serializing_if = "Option::is_none")]
     constants: Option<BTreeMap<String, f64>>,

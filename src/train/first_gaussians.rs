@@ -1,0 +1,204 @@
+//! The first Gaussians: one per point, coloured as the targets of the training views show it.
+
+use std::borrow::Cow;
+use std::collections::BTreeMap;
+
+use glam::{DVec3, Vec3};
+
+use super::views::{ImageKind, TrainView, Views};
+use super::{TrainConfig, streams};
+use crate::base::random::Stream;
+use crate::camera::{Camera, Patch, TrainingFrame};
+use crate::gpu::Gpu;
+use crate::loss::exposure::Affine;
+use crate::networks::NetworkVariant;
+use crate::photographs::dataset::{Dataset, Point};
+use crate::photographs::image::Image;
+use crate::photographs::pseudo_gt::PseudoGt;
+use crate::splats::scene::{COLOR_CHANNELS, Feature, Gaussians, Shape, init};
+use crate::{Error, Result};
+
+impl Views {
+    /// The points of the dataset, with random ones behind them where there is none or few.
+    fn points<'a>(
+        &self,
+        dataset: &'a Dataset,
+        config: &TrainConfig,
+        frame: &TrainingFrame,
+    ) -> Cow<'a, [Point]> {
+        let own = &dataset.points;
+        let wanted =
+            if own.is_empty() { config.random_points } else { config.density.sparse_threshold() };
+        let count = wanted.min(config.max_gaussians).saturating_sub(own.len());
+        if count == 0 {
+            return own.into();
+        }
+        let firsts = self.all().filter(|view| view.patch.is_first());
+        let cameras: Vec<Camera> = firsts.map(|view| view.patch.camera).collect();
+        let seed = Stream::new(config.seed, streams::POINTS).bits(0);
+        let found = if own.is_empty() { "no".to_owned() } else { own.len().to_string() };
+        tracing::info!("{found} points in the dataset: {count} random ones");
+        let point = |position| Point { position: frame.unframed(position), views: vec![] };
+        let random = init::random(&cameras, count, seed).into_iter().map(point);
+        own.iter().cloned().chain(random).collect()
+    }
+
+    /// One Gaussian per point of the dataset, and per random point where there is none or few, coloured as the targets of
+    /// the training views show it.
+    pub(super) fn initial_gaussians(
+        &self,
+        gpu: &Gpu,
+        pseudo_gt: &PseudoGt,
+        dataset: &Dataset,
+        config: &TrainConfig,
+        exposures: Option<&[Affine]>,
+    ) -> Result<Gaussians> {
+        let frame = config.frame.unwrap_or_default();
+        let points = self.points(dataset, config, &frame);
+        let kept = &points[..points.len().min(config.max_gaussians)];
+        let fitting = config.render_settings().peak_gaussians(gpu);
+        if kept.len() > fitting {
+            let (of, device) = (kept.len(), &gpu.properties().name);
+            tracing::warn!("{fitting} of {of} points begin as Gaussians: {device} binds no more");
+        }
+        let kept = &kept[..kept.len().min(fitting)];
+        // Of the views of the dataset, the place of each among those that are trained on.
+        let mut places = vec![None; dataset.views.len()];
+        self.photographs().for_each(|view| places[view.index] = Some(view.place));
+        let mut targets = ImageBatches::new(self, gpu, pseudo_gt, ImageKind::Targets);
+        let colors = init::colors_from_views(kept, &dataset.views, |index| {
+            let Some(place) = places[index] else { return Ok(None) };
+            let target = targets.next(place)?;
+            let exposure = exposures.and_then(|exposures| exposures.get(place));
+            Ok(Some(exposure.map_or_else(|| target.clone(), |own| own.inverse().applied(&target))))
+        })?;
+        let positions: Vec<DVec3> = kept.iter().map(|point| frame.framed(point.position)).collect();
+        let seed = Stream::new(config.seed, streams::FEATURES).bits(0);
+        let shape = Shape { sh_degree: config.sh_degree, features: config.model.features() };
+        let mut gaussians =
+            Gaussians::from_points(&positions, &colors, shape, &config.start, seed)?;
+        if config.model.network.variant == NetworkVariant::Identity {
+            let low = if shape.features.illumination {
+                let mut photographs =
+                    ImageBatches::new(self, gpu, pseudo_gt, ImageKind::Photographs);
+                init::colors_from_views(kept, &dataset.views, |index| {
+                    places[index].map(|place| photographs.next(place)).transpose()
+                })?
+            } else {
+                vec![]
+            };
+            begin_as_identity(&mut gaussians, &colors, &low);
+        }
+        Ok(gaussians)
+    }
+
+    /// Warns of every view in which none of the first Gaussians, given in the frame, has its mean: most often its pose is wrong.
+    pub(super) fn warn_of_empty_views(&self, gaussians: &Gaussians) {
+        let means: Vec<DVec3> = gaussians.means().iter().map(|mean| mean.as_dvec3()).collect();
+        for TrainView { name, patch, .. } in self.photographs() {
+            if !scattered(means.len()).any(|at| patch.camera.sees(means[at]).is_some()) {
+                tracing::warn!(
+                    "view {name} shows nothing: none of the {} first Gaussians lies in it; check its pose",
+                    means.len()
+                );
+            }
+        }
+    }
+}
+
+/// Pictures of the photographs one after the other, made several at a time.
+struct ImageBatches<'a> {
+    views: &'a Views,
+    gpu: &'a Gpu,
+    pseudo_gt: &'a PseudoGt,
+    kind: ImageKind,
+    /// By place.
+    made: BTreeMap<usize, Image>,
+}
+
+impl<'a> ImageBatches<'a> {
+    fn new(views: &'a Views, gpu: &'a Gpu, pseudo_gt: &'a PseudoGt, kind: ImageKind) -> Self {
+        Self { views, gpu, pseudo_gt, kind, made: BTreeMap::new() }
+    }
+
+    /// That of a place; those before are gone.
+    fn next(&mut self, place: usize) -> Result<Image> {
+        /// Of those that are made at a time.
+        const MAX_PIXELS: usize = 1 << 20;
+        let Self { views, gpu, pseudo_gt, kind, ref mut made } = *self;
+        if !made.contains_key(&place) {
+            let mut pixels = 0;
+            let whole = views.whole();
+            let after = &whole[whole.partition_point(|view| view.place < place)..];
+            let after = after.iter().filter(|view| view.patch.is_first());
+            let now = after.take_while(|view| {
+                let is_first = pixels == 0;
+                pixels += Patch::from(&view.patch.camera).pixel_count();
+                is_first || pixels <= MAX_PIXELS
+            });
+            let last = now.last().map_or(place, |view| view.place);
+            let images = views.pictures(gpu, pseudo_gt, place..last + 1, kind)?;
+            *made = (place..).zip(images).collect();
+        }
+        let gone = || Error::Usage(format!("there is no photograph {place} to train on"));
+        made.remove(&place).ok_or_else(gone)
+    }
+}
+
+/// Sets the features that parts of the model begin with so that nothing changes: no structure, and the illumination that
+/// makes of each point's colour what the dark photographs show of it. Depth, which is correlated, stays as drawn.
+fn begin_as_identity(gaussians: &mut Gaussians, colors: &[Vec3], low: &[Vec3]) {
+    /// Darker targets say nothing of the light.
+    const DARKEST: f32 = 1.0 / 255.0;
+    let features = gaussians.shape.features;
+    let places = |feature| {
+        let channels = features.channels_of(feature).unwrap_or_default();
+        channels.map(|channel| channel - COLOR_CHANNELS)
+    };
+    let width = features.width();
+    for (i, own) in gaussians.features_mut().chunks_mut(width.max(1)).enumerate() {
+        places(Feature::Structure).for_each(|at| own[at] = 0.0);
+        for (channel, at) in places(Feature::Illumination).enumerate() {
+            own[at] = (low[i][channel] / colors[i][channel].max(DARKEST)).clamp(0.0, 1.0);
+        }
+    }
+}
+
+/// The numbers below `count`, each once, with neighbours far apart: what is found at some place in a list is found after few
+/// steps, however the list is sorted.
+fn scattered(count: usize) -> impl Iterator<Item = usize> {
+    const GOLDEN: f64 = 0.618_033_988_75;
+    let divides_both = |step: usize| {
+        let (mut a, mut b) = (step, count);
+        while b > 0 {
+            (a, b) = (b, a % b);
+        }
+        a > 1
+    };
+    let mut step = ((GOLDEN * count as f64) as usize).max(1);
+    while divides_both(step) {
+        step += 1;
+    }
+    (0..count).scan(0, move |at, _| {
+        let here = *at;
+        *at = (here + step) % count;
+        Some(here)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::scattered;
+
+    #[test]
+    fn scattered_numbers_are_all_there_and_neighbours_far_apart() {
+        for count in [0, 1, 2, 3, 4, 6, 10, 97, 1000] {
+            let numbers: Vec<usize> = scattered(count).collect();
+            let near = numbers.windows(2).filter(|two| two[0].abs_diff(two[1]) < count / 4).count();
+            assert!(near <= 1 || count < 4, "{count}: {near}");
+            let mut sorted = numbers;
+            sorted.sort_unstable();
+            assert!(sorted.into_iter().eq(0..count));
+        }
+    }
+}
