@@ -70,7 +70,7 @@ struct Output<'a> {
     #[serde(flatten)]
     diagnosis: &'a Diagnosis,
     plan: &'a Plan,
-    /// Leftover transmittance of the model by view.
+    /// Residual transmittance of the model by view.
     #[serde(skip_serializing_if = "Option::is_none")]
     residual_transmittance: Option<&'a BTreeMap<String, ResidualTransmittance>>,
 }

@@ -149,10 +149,10 @@ pub fn run(args: &PoseArgs) -> Result<()> {
 fn by_hand(photos: &Path, out: &Path) -> String {
     let (photos, out) = (photos.display(), out.display());
     format!(
-        "nightsplat tone apply {photos} --scene-statistics --out lifted && mkdir -p {out}/sparse && colmap \
-         feature_extractor --database_path {out}/database.db --image_path lifted --ImageReader.single_camera 1 \
+        "nightsplat tone apply {photos} --scene-statistics --out bright && mkdir -p {out}/sparse && colmap \
+         feature_extractor --database_path {out}/database.db --image_path bright --ImageReader.single_camera 1 \
          && colmap exhaustive_matcher --database_path {out}/database.db && colmap mapper --database_path \
-         {out}/database.db --image_path lifted --output_path {out}/sparse && cp -r {photos} {out}/images"
+         {out}/database.db --image_path bright --output_path {out}/sparse && cp -r {photos} {out}/images"
     )
 }
 

@@ -343,8 +343,8 @@ impl TrainConfig {
             frame.check_rows()?;
         }
         if self.exposure.learn == OnOff::On && self.model.tonemapper {
-            let rule = "off where the model has a tonemapper, which holds it to the dark photographs: their exposures a gain \
-                        on lifted targets does not describe";
+            let rule = "off with a tonemapper, which fits the dark photographs: a gain of the targets does not describe \
+                        their exposures";
             let (key, value) = ("exposure.learn".to_owned(), "on".to_owned());
             return Err(Error::Setting { key, value, rule: rule.to_owned() });
         }

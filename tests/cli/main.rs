@@ -240,7 +240,7 @@ fn eval_scores_lpips_where_it_is_given_the_weights() {
         let header = format!("{} ", table.lines().next().unwrap());
         assert!(header.contains(title) && table.contains(&format!("{mean:.4}")), "{table}");
     }
-    fs::write(&weights, "of nothing").unwrap();
+    fs::write(&weights, "no weights").unwrap();
     refused(&eval, 3, &["weights.safetensors", "safetensors"]);
     let without = format!("eval {} --lpips-range unit", fixture.run());
     refused(&without, 2, &["--lpips <WEIGHTS>"]);

@@ -11,7 +11,7 @@ fn refuses_to_train(root: &Path, options: &str, code: i32, parts: &[&str]) {
     let run = root.join("run");
     refused(&format!("train {} --out {} {options}", root.display(), run.display()), code, parts);
     for name in ["metrics.json", "model.ply"] {
-        assert!(!run.join(name).exists(), "{name} was left behind");
+        assert!(!run.join(name).exists(), "{name} remains");
     }
 }
 
@@ -249,7 +249,7 @@ fn every_setting_is_explained_with_who_says_it_and_nothing_is_trained() {
         "seed = 4  (--seed)\n",
         "stop.margin = 1.0  (--set)\n",
         "exposure.learn = \"off\"  (plan)\n",
-        "ssim_weight = 0.2  (default)\n    Weight of 1 - SSIM",
+        "ssim_weight = 0.2  (default)\n    Weight of the loss 1 - SSIM",
     ] {
         assert!(message.contains(line), "no {line} in {message}");
     }

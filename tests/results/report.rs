@@ -79,6 +79,7 @@ fn page(text: &str) -> String {
     Report {
         title: text.into(),
         intro: vec![text.into()],
+        links: vec![[text.into(), text.into()]],
         facts: vec![Facts { title: text.into(), rows: vec![[text.into(), text.into()]] }],
         tables: vec![table()],
         plots: vec![plot(text, text, &series)],
@@ -105,9 +106,9 @@ fn the_page_refers_to_nothing_outside_itself() {
 fn every_text_is_escaped() {
     let html = page("<b onload=\"x('&')\">");
     assert!(!html.contains("<b onload"));
-    // Title, heading, paragraph, a fact with its caption, two captions with alternative texts, row title, plot label, axes, legend
-    // and its title.
-    assert_eq!(html.matches("&lt;b onload=&quot;x(&#39;&amp;&#39;)&quot;&gt;").count(), 17);
+    // Title, heading, paragraph, a link with its address, a fact with its caption, two captions with alternative texts,
+    // row title, plot label, axes, legend and its title.
+    assert_eq!(html.matches("&lt;b onload=&quot;x(&#39;&amp;&#39;)&quot;&gt;").count(), 19);
 }
 
 #[test]

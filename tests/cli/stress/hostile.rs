@@ -46,8 +46,8 @@ fn config() -> TrainConfig {
 }
 
 impl Hostile {
-    /// `count` Gaussians in the middle of a view of such a size, at depth 3 and some pixels wide, and neighbours behind
-    /// them.
+    /// `count` Gaussians in the middle of a view of this size, at depth 3 and some pixels wide, and farther
+    /// neighbours.
     pub(super) fn gaussians(
         count: usize,
         size: [u32; 2],
