@@ -20,7 +20,7 @@ use scene::BenchScene;
 /// Check a training step against the CPU references, then time its kernels and stages.
 ///
 /// The scene is synthetic and always the same. With --tune, times the rasteriser with every tile size that the device
-/// supports, and stores the fastest in the user's cache folder, where training finds it unless NIGHTSPLAT_TUNE=off.
+/// supports, and stores the fastest in the user's cache folder, where training finds it unless `NIGHTSPLAT_TUNE=off`.
 #[derive(Clone, Debug, clap::Args)]
 pub struct BenchArgs {
     /// Print JSON instead of tables

@@ -103,7 +103,7 @@ pub fn run(args: &EvalArgs) -> Result<()> {
             compared.save(&images, score.against)?;
         }
         if let Some(page) = &mut page {
-            page.add(score, &compared);
+            page.add(score, compared);
         }
         bar.inc(1);
         Ok(())

@@ -57,9 +57,9 @@ pub enum To {
     Ply,
     /// A tenth of the size, eight bits per number
     Spz,
-    /// glTF with KHR_gaussian_splatting
+    /// glTF with `KHR_gaussian_splatting`
     Glb,
-    /// A fifteenth of the size, by PlayCanvas
+    /// A fifteenth of the size, by `PlayCanvas`
     Sog,
     /// A self-contained page with a viewer
     Html,

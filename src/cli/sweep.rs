@@ -79,7 +79,7 @@ pub struct SweepArgs {
     /// Fixed black levels delta0, or adaptive for that of alpha and beta
     #[arg(long, value_name = "LIST", help_heading = GRID)]
     offset: Option<String>,
-    /// Values of any key of config.toml, such as density.min_opacity=0.005,0.01; repeatable
+    /// Values of any key of config.toml, such as `density.min_opacity=0.005,0.01`; repeatable
     #[arg(long, value_name = "KEY=LIST", help_heading = GRID)]
     grid: Vec<String>,
     #[command(flatten)]

@@ -23,7 +23,7 @@ pub struct SynthArgs {
     /// Seed of textures, noise and sampled points
     #[arg(long, default_value_t = SyntheticOptions::default().seed)]
     pub seed: u64,
-    /// Use a fisheye lens (OPENCV_FISHEYE) of 130 degrees across the longer side
+    /// Use a fisheye lens (`OPENCV_FISHEYE`) of 130 degrees across the longer side
     #[arg(long)]
     pub fisheye: bool,
     /// Write into a folder that is not empty, replacing files of the same names

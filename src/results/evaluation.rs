@@ -25,11 +25,11 @@ pub(crate) fn score_table(scored: &[ViewScore], measure: Option<Measure>) -> Tab
         ResidualTransmittance::mean(scored.iter().filter_map(|view| view.residual_transmittance));
     let column = |name: &str, digits, best| Column { name: name.to_owned(), digits, best };
     let mut columns = vec![
-        column("PSNR", 2, Best::Greatest),
-        column("channel mean", 2, Best::Greatest),
-        column("SSIM", 4, Best::Greatest),
+        column("PSNR", 2, Best::Unmarked),
+        column("channel mean", 2, Best::Unmarked),
+        column("SSIM", 4, Best::Unmarked),
     ];
-    columns.extend(measure.map(|measure| column(&measure.title(), 4, Best::Least)));
+    columns.extend(measure.map(|measure| column(&measure.title(), 4, Best::Unmarked)));
     // R_0 is the render before the denoiser.
     if mean_r0.is_some() {
         columns.push(column("PSNR of R_0", 2, Best::Unmarked));
@@ -85,7 +85,7 @@ impl EvalPage {
         let Scores { psnr, ssim, .. } = score.scores;
         let pictures = vec![
             picture("render", render),
-            picture(score.against.name(), target),
+            picture(score.against.name().trim_end_matches('s'), target),
             picture(&format!("error, times {ERROR_SCALE}"), &error),
         ];
         let title = format!("{}: {psnr:.2} dB, SSIM {ssim:.3}", score.name);
@@ -102,15 +102,14 @@ impl EvalPage {
         if let [worst, _, ..] = &mut comparisons[..] {
             worst.title = format!("The worst view, {}", worst.title);
         }
-        let count = format!(
-            "{} test views; images of the {} worst, the worst first.",
-            scored.len(),
-            comparisons.len()
-        );
+        let mean = means(scored).0.map(|Scores { psnr, ssim, .. }| {
+            format!("Mean over {} test views: {psnr:.2} dB, SSIM {ssim:.3}.", scored.len())
+        });
+        let shown = format!("Images of {} views, the worst first.", comparisons.len());
         let against = label(scored).map(|label| format!("Scores are {label}."));
         Report {
             title: format!("Evaluation of {}", run.display()),
-            intro: std::iter::once(count).chain(against).collect(),
+            intro: mean.into_iter().chain(against).chain([shown]).collect(),
             tables: vec![score_table(scored, measure)],
             plots: history(run),
             comparisons,

@@ -90,7 +90,7 @@ pub struct ModelConfig {
     denoiser_crop: u32 = 0 => Rule::Whole(0, u32::MAX as u64), in "pixels", "--denoiser-crop N";
     /// The side of the boxes of the local depth term.
     depth_box: u32 = 128 => Rule::Whole(2, u32::MAX as u64), in "pixels";
-    /// Folder of depth maps, NAME.* or depth_NAME.*, in which larger is farther.
+    /// Folder of depth maps, `NAME.*` or `depth_NAME.*`, in which larger is farther.
     depth_folder: Option<PathBuf> = None, "depth/ or depth_maps/ of the dataset" => Rule::PATH, "--depth DIR";
     /// Depth maps hold disparity, in which larger is nearer.
     depth_is_disparity: bool = false => Rule::Flag, "--depth-is-disparity";

@@ -200,7 +200,7 @@ fn eval_agrees_with_train_and_saves_what_it_scored() {
     let table = succeed(&format!("eval {} --report {}", fixture.run(), page.display()));
     assert!(table.contains("wrote ") && table.contains("eval.html"), "{table}");
     let page = fs::read_to_string(page).unwrap();
-    for part in ["The worst view, 0", "error, times 5", "reference images", ">loss<", "mean</td>"] {
+    for part in ["The worst view, 0", "error, times 5", "reference image<", ">loss<", "mean</td>"] {
         assert!(page.contains(part), "no `{part}` in the page");
     }
     let table = succeed(&format!("eval {}", fixture.run()));

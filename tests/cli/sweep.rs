@@ -322,7 +322,7 @@ fn presets_are_trained_by_their_plans_scored_on_the_way_and_compared() {
     assert!((whole - seconds[2]).abs() < 1e-3, "{whole} {way}");
     assert!(metrics["spent"]["device_bytes"].as_u64().unwrap() > 1000, "{metrics}");
     let html = sweep.read("costs.html");
-    assert!(html.contains("during training") && html.contains("the difference to preset balanced"));
+    assert!(html.contains("during training") && html.contains("The difference to preset balanced"));
     for outside in ["http:", "https:", "<script", "<link", "@import", "url("] {
         assert!(!html.contains(outside), "{outside}");
     }

@@ -257,10 +257,11 @@ fn what_a_mean_is_of_is_drawn_as_a_line_from_least_to_greatest() {
 }
 
 #[test]
-fn pictures_come_first_on_a_page() {
+fn facts_come_before_images_and_these_before_numbers_and_plots() {
     let html = page("chair");
     let at = |part: &str| html.find(part).unwrap();
-    assert!(at("<img") < at("<table") && at("<table") < at("<polyline"));
+    assert!(at("<table class=\"facts\"") < at("<img") && at("<img") < at("<div class=\"table\""));
+    assert!(at("<div class=\"table\"") < at("<polyline"));
 }
 
 #[test]

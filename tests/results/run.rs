@@ -180,13 +180,16 @@ fn a_run_that_was_stopped_is_rendered_scored_and_made_longer_with_a_lower_cap() 
     assert_eq!(stopped_at(&path("run")), Some(10));
     let run_folder = path("run").display().to_string();
     let (printed, message) = run(&format!("eval {run_folder} --json"), 0);
-    assert!(message.contains("stopped at step 10 of 12"), "{message}");
+    assert!(message.contains("incomplete, at step 10 of 12"), "{message}");
     let printed: Value = serde_json::from_str(&printed).unwrap();
     assert_eq!(printed["steps"], 10);
     assert_eq!(printed["mean"], json(path("ten/metrics.json"))["mean"]);
     let shown = path("shown").display().to_string();
     let (_, message) = run(&format!("render {run_folder} --split test --out {shown}"), 0);
-    assert!(message.contains("stopped at step 10 of 12") && file_count(&shown) == 2, "{message}");
+    assert!(
+        message.contains("incomplete, at step 10 of 12") && file_count(&shown) == 2,
+        "{message}"
+    );
 
     succeed(&train(folder.path(), "run", &format!("--steps 12 --resume {options}")));
     assert!(model("run") == whole);
@@ -205,7 +208,7 @@ fn a_planned_run_is_made_longer_on_the_views_that_it_began_with() {
     let folder = tempfile::tempdir().unwrap();
     let set = folder.path().join("set").display().to_string();
     succeed(&format!("synth {set} --views 20 --width 32 --height 24"));
-    let short = "--set steps=6 --checkpoint-every 3 --progress none";
+    let short = "--set steps=6 --checkpoint-every 3 --progress plain";
     let message = succeed(&train(folder.path(), "run", short));
     assert!(message.contains("held-out view"), "{message}");
     let message = succeed(&train(folder.path(), "run", "--steps 9 --resume --progress none"));
@@ -226,7 +229,7 @@ fn a_model_is_written_with_every_checkpoint() {
     child.wait().unwrap();
     assert!(stopped_at(&out).unwrap() >= 5);
     let (_, message) = run(&format!("eval {}", out.display()), 0);
-    assert!(message.contains("stopped at step"), "{message}");
+    assert!(message.contains("incomplete, at step"), "{message}");
 }
 
 fn copy(from: &Path, to: &Path) {
@@ -254,11 +257,11 @@ fn a_run_is_opened_with_another_copy_of_its_dataset_and_what_differs_is_said() {
     let (printed, message) = run(&format!("eval {run_folder} --json --dataset {copied}"), 0);
     let printed: Value = serde_json::from_str(&printed).unwrap();
     assert_eq!(printed, json(path("run/metrics.json")));
-    assert!(!message.contains("is not what"), "{message}");
+    assert!(!message.contains("differs from"), "{message}");
     fs::remove_file(path("copy/low/004.png")).unwrap();
     let arguments = format!("render {run_folder} --split test --out {shown} --dataset {copied}");
     let (_, message) = run(&arguments, 0);
-    assert!(message.contains("is not what") && message.contains("004,train,48,32"), "{message}");
+    assert!(message.contains("differs from") && message.contains("004,train,48,32"), "{message}");
 }
 
 /// The pictures of a path, as files.

@@ -29,7 +29,7 @@ pub struct Initialization {
     opacity: f64 = 0.2 => Rule::Number(Excluded(0.0), Excluded(1.0));
     /// Standard deviation in units of the root mean squared distance to the three nearest points.
     scale: f64 = 0.8 => Rule::from_to(1e-3, 1e3);
-    /// The min_axis_ratio axis of a disc in units of its longest: neighbours that lie on a surface make discs along it. 1: all are
+    /// The shortest axis of a disc in units of its longest: neighbours that lie on a surface make discs along it. 1: all are
     /// round.
     min_axis_ratio: f64 = 1.0 => Rule::from_to(1e-3, 1.0);
 }

@@ -39,7 +39,7 @@ settings! {
 pub struct ExposureConfig {
     /// Learn gain and bias of each channel of each training view, for photographs of different exposure.
     learn: OnOff = OnOff::Off => Rule::OneOf(&["on", "off"]), "--exposure on|off";
-    /// Initial exposures as CSV: name,ev or name,gain_r,gain_g,gain_b,bias_r,bias_g,bias_b.
+    /// Initial exposures as CSV: `name,ev` or `name,gain_r,gain_g,gain_b,bias_r,bias_g,bias_b`.
     start: Option<PathBuf> = None, "the dataset's exposures.csv" => Rule::PATH, "--exposures FILE";
 }
 sections {
