@@ -1,4 +1,4 @@
-//! The frames of a clip that are worth a camera: of each window of time the sharpest.
+//! Extracts the sharpest frame of each time window of a clip.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -11,13 +11,13 @@ use crate::photographs::image::Image;
 use crate::photographs::image::files::photographs_in;
 use crate::{Error, Result};
 
-/// Frames of a window, of which one stays.
+/// Frames per window.
 const CANDIDATES: usize = 4;
 
-/// Takes `fps` frames a second of a clip, as PNG files in `folder`.
+/// Extracts `fps` frames per second of a clip as PNG files in `folder`.
 ///
 /// # Errors
-/// [`Error::Input`] where ffmpeg fails or the clip has no picture.
+/// [`Error::Input`] if ffmpeg fails or the clip has no frame.
 pub(super) fn frames(
     ffmpeg: &Tool<'_>,
     clip: &Path,
@@ -41,7 +41,7 @@ pub(super) fn frames(
     )?;
     let frames = photographs_in(folder)?;
     if frames.is_empty() {
-        return Err(Error::input(clip, "holds no frame that ffmpeg can decode"));
+        return Err(Error::input(clip, "contains no frame that ffmpeg can decode"));
     }
     let sharpness = frames.par_iter().map(|frame| Ok(sharpness(&Image::load(frame)?)));
     let sharpness = sharpness.collect::<Result<Vec<f64>>>()?;
@@ -60,15 +60,15 @@ pub(super) fn frames(
     Ok(kept)
 }
 
-/// How much detail a frame has for its brightness: the mean absolute second difference over the mean. Of frames of
-/// one moment, noise is alike and motion is not.
+/// Detail relative to brightness: mean absolute second difference over the mean. Frames of one moment share their
+/// noise, but not their motion blur.
 fn sharpness(frame: &Image) -> f64 {
     let (width, pixels) = (frame.width as usize, frame.pixel_count());
     let plane = &frame.data[pixels..2 * pixels];
     let (mut detail, mut light) = (0.0, f64::EPSILON);
     for row in plane.chunks_exact(width) {
         for near in row.windows(5) {
-            // Two pixels apart: neighbours differ by noise and by what the codec makes of it.
+            // At a distance of two pixels, since neighbours differ mostly by noise and compression.
             detail += f64::from((2.0 * near[2] - near[0] - near[4]).abs());
             light += f64::from(near[2]);
         }

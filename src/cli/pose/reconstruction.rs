@@ -1,4 +1,4 @@
-//! What COLMAP is asked to do with the lifted photographs: features, matches, cameras.
+//! Runs COLMAP on the brightened photographs: features, matches, cameras.
 
 use std::ffi::{OsStr, OsString};
 use std::path::{Path, PathBuf};
@@ -11,12 +11,12 @@ use super::{PoseArgs, cameras, create, tone_mapped};
 use crate::Error;
 use crate::photographs::dataset::Dataset;
 
-/// Which photographs COLMAP compares.
+/// The pairs of photographs that COLMAP matches.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum Matcher {
-    /// Each with each.
+    /// Every pair
     Exhaustive,
-    /// Each with those that follow it by name.
+    /// Neighbours by name
     Sequential,
 }
 
@@ -29,19 +29,19 @@ impl Matcher {
     }
 }
 
-/// How cameras are placed.
+/// The mapper that registers cameras.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum Mapper {
-    /// One after the other (COLMAP's mapper).
+    /// One by one (COLMAP's mapper)
     Incremental,
-    /// All at once (GLOMAP, or COLMAP from 4.0 on).
+    /// All at once (GLOMAP, or COLMAP from 4.0 on)
     Global,
 }
 
 /// The programs and files of one reconstruction.
 pub(super) struct Reconstruction<'a> {
     colmap: Tool<'a>,
-    /// Where it is a program of its own that places cameras.
+    /// If GLOMAP registers the cameras.
     glomap: Option<Tool<'a>>,
     args: &'a PoseArgs,
     matcher: Matcher,
@@ -55,7 +55,7 @@ pub(super) struct Reconstruction<'a> {
     models: PathBuf,
 }
 
-/// How many photographs the largest of some models places.
+/// The number of photographs in the largest model.
 fn placed_in(models: &Path) -> Result<usize> {
     Ok(Dataset::largest_model(models)?.map_or(0, |(_, placed)| placed.len()))
 }
@@ -75,7 +75,7 @@ const RELAXED: [&[(&str, &str)]; 2] = [
 type Options = Vec<(String, OsString)>;
 
 impl<'a> Reconstruction<'a> {
-    /// One in a folder of its own, by programs that are there.
+    /// Sets up the folder, and checks that the programs exist.
     ///
     /// # Errors
     /// Cameras are to be placed all at once, and neither COLMAP nor GLOMAP is there that does; no command has an option that
@@ -308,7 +308,7 @@ impl<'a> Reconstruction<'a> {
         ]
     }
 
-    /// The option by its name in this version of COLMAP: before 3.12 its group was another.
+    /// The name of an option in this version of COLMAP; its group changed in 3.12.
     fn named(&self, command: &str, [new, old]: [&str; 2], option: &str) -> String {
         let own = format!("{new}.{option}");
         if self.colmap.has_option(command, &own) { own } else { format!("{old}.{option}") }
@@ -319,8 +319,8 @@ impl<'a> Reconstruction<'a> {
     }
 }
 
-/// The command of COLMAP, from 4.0 on, that is GLOMAP.
+/// GLOMAP's command in COLMAP from 4.0 on.
 const GLOBAL: &str = "global_mapper";
 
-/// What a mapper says that found nothing to begin with.
+/// Messages of a mapper that found no initial pair.
 const NOTHING: [&str; 2] = ["No good initial image pair found", "failed to create sparse model"];

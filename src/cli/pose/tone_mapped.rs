@@ -1,4 +1,4 @@
-//! The photographs as COLMAP can see them: all lifted by one curve, under their own names.
+//! Brightened copies of the photographs for COLMAP, all by the same curve.
 
 use std::path::{Path, PathBuf};
 
@@ -20,7 +20,7 @@ use crate::photographs::tone::{MeasuredPhotograph, ToneSettings, all_black};
 /// None decodes, all are black, or the device is out of memory.
 pub(super) fn write(gpu: &Gpu, photographs: &mut Vec<PathBuf>, folder: &Path) -> Result<f64> {
     create(folder)?;
-    // One curve for all: what two photographs show of one place stays alike.
+    // The same curve for all, so that features keep matching.
     let settings = ToneSettings { scene_statistics: true, ..ToneSettings::default() };
     let pseudo_gt = PseudoGt::new(gpu, &settings)?;
     let progress = progress_bar(2 * photographs.len());

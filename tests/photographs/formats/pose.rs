@@ -73,7 +73,7 @@ fn the_dark_photographs_get_the_cameras_of_the_largest_model() {
         "{stdout}"
     );
     for stage in
-        ["9 photographs lifted", "features extracted", "features matched", "cameras placed"]
+        ["9 photographs brightened", "features extracted", "features matched", "cameras placed"]
     {
         assert!(stderr.contains(stage), "no `{stage}` in: {stderr}");
     }
@@ -99,7 +99,7 @@ fn the_dark_photographs_get_the_cameras_of_the_largest_model() {
     refused(&format!("{arguments} --overwrite"), 1, &["exists already; choose another folder"]);
 }
 
-/// One photograph in nine has no camera, so all are compared once more.
+/// One photograph in nine has no camera, so all are matched again.
 #[cfg(unix)]
 #[test]
 fn a_second_comparison_that_fails_costs_nothing_of_the_first() {
@@ -114,7 +114,7 @@ fn a_second_comparison_that_fails_costs_nothing_of_the_first() {
         format!("pose {} --out {} --colmap {}", photos.display(), out.display(), colmap.display());
     let (stdout, stderr) = run(&arguments, 0);
     assert!(stdout.contains("8 of 9 photographs"), "{stdout}");
-    assert!(stderr.contains("are those of the first comparison"), "{stderr}");
+    assert!(stderr.contains("using the cameras of the first attempt"), "{stderr}");
 }
 
 #[cfg(unix)]
@@ -175,7 +175,7 @@ fn colmap_that_fails_or_finds_too_little_is_told_in_a_line_and_leaves_nothing() 
         ),
         (
             "exhaustive_matcher) kill -9 $$;;",
-            &["exhaustive_matcher ended with signal: 9", "it said nothing"],
+            &["exhaustive_matcher ended with signal: 9", "no output"],
         ),
         (two.as_str(), &["no cameras for these 9 photographs", "scene.colmap.log"]),
         (
@@ -253,7 +253,7 @@ fn what_keeps_pose_from_beginning_is_told_in_a_line() {
     refused(&train, 3, &["9 photographs", "nightsplat pose", "--out DATASET"]);
     refused(&pose(&root.join("absent"), "--colmap true"), 3, &["absent", "cannot be read"]);
     fs::create_dir(root.join("empty")).unwrap();
-    refused(&pose(&root.join("empty"), "--colmap true"), 3, &["holds 0 photographs"]);
+    refused(&pose(&root.join("empty"), "--colmap true"), 3, &["contains 0 photographs"]);
     refused(&pose(&photos, "--colmap true --fps 0"), 2, &["--fps"]);
     fs::write(root.join("clip.mp4"), "no clip").unwrap();
     let clip = root.join("clip.mp4");
@@ -264,11 +264,7 @@ fn what_keeps_pose_from_beginning_is_told_in_a_line() {
     );
     refused(&pose(&clip, "--colmap true --ffmpeg false"), 3, &["false", "ended with"]);
     fs::copy(photos.join("v01.png"), photos.join("v00.webp")).unwrap();
-    refused(
-        &pose(&photos, "--colmap true"),
-        3,
-        &["v00.png and v00.webp are two photographs of one name"],
-    );
+    refused(&pose(&photos, "--colmap true"), 3, &["v00.png and v00.webp have the same name"]);
     fs::remove_file(photos.join("v00.webp")).unwrap();
     for index in 0..9 {
         photograph(&photos.join(name(index)).with_extension("png"), SIZE, 0.0);
@@ -319,7 +315,7 @@ fn of_a_clip_the_sharpest_frame_of_each_window_is_taken() {
         colmap.display()
     );
     let (_, stderr) = run(&arguments, 3);
-    assert!(stderr.contains("4 photographs lifted"), "{stderr}");
+    assert!(stderr.contains("4 photographs brightened"), "{stderr}");
     let mut seen: Vec<String> = fs::read_dir(root.join("seen"))
         .unwrap()
         .map(|entry| entry.unwrap().file_name().into_string().unwrap())

@@ -1,4 +1,4 @@
-//! Which photographs `tone apply` reads, and where each goes.
+//! The photographs that `tone apply` reads, and the files that it writes.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -17,7 +17,7 @@ pub(super) struct Listed {
     pub(super) name: String,
     pub(super) input: PathBuf,
     pub(super) reference: Option<PathBuf>,
-    /// Of a dataset's view.
+    /// The split, in a dataset.
     pub(super) split: Option<Split>,
     /// Its mask.
     pub(super) mask: Option<MaskFile>,
@@ -26,8 +26,7 @@ pub(super) struct Listed {
 }
 
 impl Listed {
-    /// The photograph as it is stored, with its pixels that do not count: those that are no numbers, and what alpha or mask
-    /// hides.
+    /// The photograph as stored, with the indices of pixels that are not finite or hidden by alpha or mask.
     pub(super) fn load(&self, inverted: bool) -> Result<(Image, Vec<usize>)> {
         let (image, alpha) = PictureFile::open(&self.input)?.decode()?;
         let decoded = (&image, alpha.as_ref());
@@ -36,7 +35,7 @@ impl Listed {
         Ok((image, hidden))
     }
 
-    /// Turned upright, as its pixels that do not count are, unless cameras may say how it is stored.
+    /// Image and indices turned upright by Exif; photographs of a dataset stay as stored, as their cameras assume.
     pub(super) fn turned(&self, image: Image, gaps: Vec<usize>) -> (Image, Vec<usize>) {
         let orientation = match self.split {
             None => Orientation::of(&self.input),
@@ -55,7 +54,7 @@ impl Listed {
     }
 }
 
-/// The photographs of the input: itself, those of a folder by name, or a dataset's.
+/// The photographs of the input: a file, those of a folder by name, or those of a dataset.
 pub(super) fn listed(args: &ApplyArgs) -> Result<Vec<Listed>> {
     let input = &args.input;
     let unreadable =
@@ -82,7 +81,7 @@ pub(super) fn listed(args: &ApplyArgs) -> Result<Vec<Listed>> {
         files.iter().map(|file| plain(file, args.reference.as_deref())).collect::<Result<_>>()?
     };
     if photographs.is_empty() {
-        return Err(Error::input(input, "holds no PNG, JPEG, WebP, TIFF or EXR image"));
+        return Err(Error::input(input, "contains no PNG, JPEG, WebP, TIFF or EXR image"));
     }
     if let Some(out) = &args.out {
         set_targets(&mut photographs, out, args.format)?;
@@ -90,7 +89,7 @@ pub(super) fn listed(args: &ApplyArgs) -> Result<Vec<Listed>> {
     Ok(photographs)
 }
 
-/// A photograph that belongs to no dataset.
+/// A photograph outside of a dataset.
 fn plain(input: &Path, reference: Option<&Path>) -> Result<Listed> {
     let stem = input.file_stem().unwrap_or_default();
     let reference = match reference {
@@ -98,7 +97,7 @@ fn plain(input: &Path, reference: Option<&Path>) -> Result<Listed> {
             photographs_in(folder)?.into_iter().find(|file| file.file_stem() == Some(stem))
         }
         Some(file) if file.is_file() => Some(file.to_owned()),
-        Some(absent) => return Err(Error::input(absent, "is neither a folder nor a file")),
+        Some(absent) => return Err(Error::input(absent, "does not exist")),
         None => None,
     };
     let name = stem.to_string_lossy().into_owned();
@@ -109,7 +108,7 @@ fn plain(input: &Path, reference: Option<&Path>) -> Result<Listed> {
     Ok(Listed { name, input: input.to_owned(), reference, split: None, mask, target: None })
 }
 
-/// The file that each is written to, all different and none of them a photograph.
+/// Sets the file that each is written to, refusing duplicates and photographs.
 fn set_targets(photographs: &mut [Listed], out: &Path, format: ImageFormat) -> Result<()> {
     let extension = format.extension();
     let mut sources: Vec<PathBuf> = vec![];
@@ -121,8 +120,10 @@ fn set_targets(photographs: &mut [Listed], out: &Path, format: ImageFormat) -> R
     for listed in photographs {
         let target = out.join(format!("{}.{extension}", listed.name));
         if let Some(other) = seen.insert(listed.name.clone(), listed.input.clone()) {
-            let problem =
-                format!("would be written to the same file as {}; rename one", other.display());
+            let problem = format!(
+                "would be written to the same file as {}; rename one of them",
+                other.display()
+            );
             return Err(Error::input(&listed.input, problem));
         }
         if target.exists() && sources.iter().any(|source| is_same_file(source, &target)) {
