@@ -20,6 +20,7 @@ use crate::loss::{LossConfig, ParameterWeights};
 use crate::networks::NetworkVariant;
 use crate::photographs::dataset::{DOWNSCALE, Dataset, DepthOptions, LoadOptions, MeasuredSize};
 use crate::photographs::tone::ToneSettings;
+use crate::photographs::white_balance::WhiteBalance;
 use crate::splats::densify::DensityControl;
 use crate::splats::optimizer::Schedule;
 use crate::splats::packed_sh::StorageFormat;
@@ -75,6 +76,10 @@ pub struct TrainConfig {
     invert_masks: bool = false => Rule::Flag, "--invert-masks";
     /// Mask black borders and corners that the photographs have in the same place, as undistorting leaves them.
     mask_borders: bool = true => Rule::Flag;
+    /// White balance of the photographs before they are measured: gains R,G,B of linear light; the colour temperature of
+    /// the light in kelvin; VIEW,x,y,w,h, a neutral area of one photograph in pixels as stored; or VIEW,x1,y1,..,x4,y4,
+    /// the corners of a ColorChecker, from the dark skin patch round by the blue-green, the black and the white one.
+    white_balance: Option<WhiteBalance> = None, "none" => WHITE_BALANCE, "--white-balance WHITE";
     /// Undistort fisheye photographs to pinhole ones, cropped to 60 degrees off the axis, instead of training with the
     /// fisheye model; other distorted photographs are always undistorted.
     undistort: bool = false => Rule::Flag, "--undistort";
@@ -163,6 +168,9 @@ const MEMORY: Rule =
     Rule::Text("a size of memory with its unit, such as 512M, 4G or 1.5G", |text| {
         text.parse::<CacheSize>().is_ok()
     });
+
+const WHITE_BALANCE: Rule =
+    Rule::Text(WhiteBalance::FORM, |text| text.parse::<WhiteBalance>().is_ok());
 
 const MINUTES: Rule = Rule::from_to(0.0, 1e9);
 
@@ -255,6 +263,7 @@ impl TrainConfig {
             reference: self.reference.clone(),
             invert_masks: self.invert_masks,
             mask_borders: self.mask_borders,
+            white_balance: self.white_balance.clone(),
             undistort: self.undistort,
             measured: if self.tone.full_resolution {
                 MeasuredSize::Own

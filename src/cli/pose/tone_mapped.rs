@@ -8,7 +8,7 @@ use crate::base::input;
 use crate::cli::progress_bar;
 use crate::gpu::Gpu;
 use crate::photographs::image::files::stem;
-use crate::photographs::image::{Image, exif_segment};
+use crate::photographs::image::{ColourTally, Image, PictureFile, exif_segment};
 use crate::photographs::pseudo_gt::PseudoGt;
 use crate::photographs::tone::{MeasuredPhotograph, ToneSettings, all_black};
 
@@ -25,10 +25,11 @@ pub(super) fn write(gpu: &Gpu, photographs: &mut Vec<PathBuf>, folder: &Path) ->
     let pseudo_gt = PseudoGt::new(gpu, &settings)?;
     let progress = progress_bar(2 * photographs.len());
     let root = photographs.first().and_then(|path| path.parent()).unwrap_or(folder).to_owned();
+    let colours = ColourTally::default();
     let (mut measured, mut undecoded) = (vec![], None);
     photographs.retain(|path| {
         progress.inc(1);
-        match Image::load(path) {
+        match Image::load_counted(path, &colours) {
             Ok(image) => measured.push(MeasuredPhotograph::of(&image.data)),
             Err(error) => {
                 tracing::warn!("left out: {error}");
@@ -41,10 +42,11 @@ pub(super) fn write(gpu: &Gpu, photographs: &mut Vec<PathBuf>, folder: &Path) ->
     if let (true, Some(error)) = (photographs.is_empty(), undecoded) {
         return Err(error);
     }
+    progress.suspend(|| colours.say());
     let scene = settings.scene(&measured).ok_or_else(|| all_black(&root))?;
     for (path, measured) in photographs.iter().zip(&measured) {
-        let image =
-            pseudo_gt.tone_mapped(&Image::load(path)?, &settings.tone_mapping(&scene, measured))?;
+        let (photograph, _) = PictureFile::open(path)?.decode()?;
+        let image = pseudo_gt.tone_mapped(&photograph, &settings.tone_mapping(&scene, measured))?;
         let file = folder.join(name(path));
         if is_jpeg(path) {
             image.save_jpeg(file, exif_of(path)?.as_deref())?;

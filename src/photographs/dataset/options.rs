@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use crate::base::settings::Rule;
 use crate::base::tree;
+use crate::photographs::white_balance::WhiteBalance;
 use crate::{Error, Result};
 
 /// The factors by which photographs may shrink.
@@ -35,6 +36,8 @@ pub struct LoadOptions {
     pub invert_masks: bool,
     /// Black borders that photographs have in the same place, as undistorting leaves them, are masked.
     pub mask_borders: bool,
+    /// Gains of the channels of the photographs; reference images stay as they are.
+    pub white_balance: Option<WhiteBalance>,
     /// At which size training photographs are measured while they are decoded, if they are not kept at that size.
     pub measured: MeasuredSize,
     /// Photographs of a fisheye are undistorted to a pinhole's, too, as those of every other lens are; without it the
@@ -80,6 +83,7 @@ impl Default for LoadOptions {
             hold_out: 0,
             invert_masks: false,
             mask_borders: true,
+            white_balance: None,
             measured: MeasuredSize::default(),
             undistort: false,
             depth: DepthOptions::default(),
