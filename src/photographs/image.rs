@@ -1,13 +1,15 @@
 //! Photographs as planar float images, and the files they come from and go to.
 //!
-//! Values are sRGB-encoded, as an 8-bit file stores them divided by 255. EXR files hold linear light by
-//! convention; they are encoded on the way in and decoded on the way out (IEC 61966-2-1, linear toe included,
-//! the power law continued above 1).
+//! Values are sRGB-encoded, as an 8-bit file stores them divided by 255. A file in another colour space is converted when it
+//! is read (`colour`). EXR files hold linear light by convention; they are encoded on the way in and decoded on the way out
+//! (IEC 61966-2-1, linear toe included, the power law continued above 1).
 
 #[cfg(feature = "io")]
 mod budget;
 #[cfg(feature = "io")]
 mod codec;
+#[cfg(feature = "io")]
+mod colour;
 #[cfg(feature = "io")]
 mod exif;
 #[cfg(feature = "io")]
@@ -29,6 +31,8 @@ mod source;
 pub(crate) use codec::PictureFile;
 #[cfg(all(feature = "io", test))]
 pub(crate) use codec::openings;
+#[cfg(feature = "io")]
+pub(crate) use colour::ColourTally;
 #[cfg(feature = "io")]
 pub use exif::exposure_value;
 #[cfg(feature = "io")]

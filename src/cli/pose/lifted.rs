@@ -8,7 +8,7 @@ use crate::base::input;
 use crate::cli::progress_bar;
 use crate::gpu::Gpu;
 use crate::photographs::image::files::{photographs_in, stem};
-use crate::photographs::image::{Image, exif_segment};
+use crate::photographs::image::{ColourTally, Image, PictureFile, exif_segment};
 use crate::photographs::pseudo_gt::PseudoGt;
 use crate::photographs::tone::{Measured, ToneSettings, all_black};
 
@@ -23,15 +23,18 @@ pub(super) fn write(gpu: &Gpu, photographs: &[PathBuf], folder: &Path) -> Result
     let settings = ToneSettings { scene_statistics: true, ..ToneSettings::default() };
     let pseudo_gt = PseudoGt::new(gpu, &settings)?;
     let progress = progress_bar(2 * photographs.len());
+    let colours = ColourTally::default();
     let mut measured = vec![];
     for path in photographs {
-        measured.push(Measured::of(&Image::load(path)?.data));
+        measured.push(Measured::of(&Image::load_counted(path, &colours)?.data));
         progress.inc(1);
     }
+    progress.suspend(|| colours.say());
     let root = photographs.first().and_then(|path| path.parent()).unwrap_or(folder);
     let scene = settings.scene(&measured).ok_or_else(|| all_black(root))?;
     for (path, measured) in photographs.iter().zip(&measured) {
-        let image = pseudo_gt.lifted(&Image::load(path)?, &settings.lift(&scene, measured))?;
+        let (photograph, _) = PictureFile::open(path)?.decode()?;
+        let image = pseudo_gt.lifted(&photograph, &settings.lift(&scene, measured))?;
         let name = path.file_name().unwrap_or_default();
         if is_jpeg(path) {
             image.save_jpeg(folder.join(name), exif_of(path)?.as_deref())?;

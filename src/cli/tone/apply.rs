@@ -15,7 +15,7 @@ use crate::base::output::printable;
 use crate::cli::{ImageFormat, progress_bar, table};
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::{Dataset, Split};
-use crate::photographs::image::{Image, Mask};
+use crate::photographs::image::{ColourTally, Image, Mask, Orientation};
 use crate::photographs::metrics::Scores;
 use crate::photographs::pseudo_gt::PseudoGt;
 use crate::photographs::tone::{
@@ -263,6 +263,7 @@ pub fn apply(args: &ApplyArgs) -> Result<ToneOutput> {
         progress.inc(1);
     }
     progress.finish_and_clear();
+    set.colours.say();
     let exposure = set.scene.exposure;
     let Some(mut scene) = scene(&views) else {
         let nothing = || Error::input(&args.input, "holds no photograph");
@@ -302,6 +303,8 @@ struct CurveOnSet {
     scene: Scene,
     /// Masks hide what is white.
     inverted: bool,
+    /// What was made of the colours of what is mapped.
+    colours: ColourTally,
 }
 
 impl CurveOnSet {
@@ -317,7 +320,8 @@ impl CurveOnSet {
         if settings.scene_statistics || settings.takes_exposure() {
             for listed in photographs.iter().filter(|listed| listed.split != Some(Split::Test)) {
                 // What cannot be used is named where it would be mapped.
-                let Ok((photograph, gaps)) = loaded(listed, inverted) else { continue };
+                let unsaid = ColourTally::default();
+                let Ok((photograph, gaps)) = loaded(listed, inverted, &unsaid) else { continue };
                 measured.push(Measured::of(&without(&photograph, &gaps)));
             }
             if measured.is_empty() && settings.scene_statistics {
@@ -330,7 +334,7 @@ impl CurveOnSet {
             None if measured.is_empty() => Scene::default(),
             None => return Err(all_black(input)),
         };
-        Ok(Self { pseudo_gt, scene, inverted })
+        Ok(Self { pseudo_gt, scene, inverted, colours: ColourTally::default() })
     }
 
     /// What was measured of a photograph, what the curve makes of it, and at which gain.
@@ -346,8 +350,8 @@ impl CurveOnSet {
 }
 
 /// A photograph with those of its pixels that do not count.
-fn loaded(listed: &Listed, inverted: bool) -> Result<(Image, Vec<usize>)> {
-    let (photograph, gaps) = listed.load(inverted)?;
+fn loaded(listed: &Listed, inverted: bool, colours: &ColourTally) -> Result<(Image, Vec<usize>)> {
+    let (photograph, gaps) = listed.load(inverted, colours)?;
     let (photograph, gaps) = listed.turned(photograph, gaps);
     if gaps.len() == photograph.pixel_count() {
         return Err(Error::input(
@@ -369,8 +373,12 @@ struct Mapped {
 }
 
 fn mapped(set: &mut CurveOnSet, listed: &Listed) -> Result<Mapped> {
-    let (photograph, gaps) = loaded(listed, set.inverted)?;
-    let load = if listed.split.is_none() { Image::load_upright } else { Image::load };
+    let (photograph, gaps) = loaded(listed, set.inverted, &set.colours)?;
+    let load = |path: &PathBuf| {
+        let image = Image::load_counted(path, &set.colours)?;
+        let is_plain = listed.split.is_none();
+        Ok(if is_plain { image.turned(Orientation::of(path)) } else { image })
+    };
     let reference = listed.reference.as_ref().map(load).transpose()?;
     let (statistics, image, gain) = set.result(&photograph, &gaps)?;
     Ok(Mapped { photograph, gaps, statistics, image, gain, reference })

@@ -54,7 +54,7 @@ impl Mask {
         inverted: bool,
     ) -> Result<Option<Self>> {
         let Some(file) = file else { return Ok(alpha.and_then(Self::of_plane)) };
-        let mut mask = Image::load(file)?;
+        let mut mask = Image::load_as_stored(file)?;
         let size = (image.width, image.height);
         let (own, upright) = ((mask.width, mask.height), Orientation::of(photograph).size(size));
         let is_of_shape = |(width, height): (u32, u32)| {

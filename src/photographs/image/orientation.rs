@@ -8,7 +8,6 @@ use ::exif::{In, Reader, Tag};
 use rayon::prelude::*;
 
 use super::Image;
-use crate::Result;
 
 /// The orientation of Exif, 1 to 8: where the first row and column of what is stored lie in what is seen.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -50,17 +49,8 @@ impl Orientation {
 }
 
 impl Image {
-    /// As [`Image::load`], turned upright as the file's Exif says.
-    ///
-    /// # Errors
-    /// As there.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn load_upright(path: impl AsRef<Path>) -> Result<Self> {
-        let path = path.as_ref();
-        Ok(Self::load(path)?.turned(Orientation::of(path)))
-    }
-
     /// The image as it is seen.
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn turned(self, orientation: Orientation) -> Self {
         if orientation == Orientation::UPRIGHT {
             return self;

@@ -7,7 +7,7 @@ use super::{ApplyArgs, is_same_file};
 use crate::cli::ImageFormat;
 use crate::photographs::dataset::{Dataset, LoadOptions, Photograph, Split};
 use crate::photographs::image::files::{photographs_in, unread_in};
-use crate::photographs::image::{Image, Mask, Orientation, PictureFile};
+use crate::photographs::image::{ColourTally, Image, Mask, Orientation, PictureFile};
 use crate::{Error, Result};
 
 /// A photograph to map.
@@ -27,8 +27,12 @@ pub(super) struct Listed {
 impl Listed {
     /// The photograph as it is stored, with its pixels that do not count: those that are no numbers, and what alpha or mask
     /// hides.
-    pub(super) fn load(&self, inverted: bool) -> Result<(Image, Vec<usize>)> {
-        let (image, alpha) = PictureFile::open(&self.input)?.decode()?;
+    pub(super) fn load(
+        &self,
+        inverted: bool,
+        colours: &ColourTally,
+    ) -> Result<(Image, Vec<usize>)> {
+        let (image, alpha) = PictureFile::open(&self.input)?.decode_counted(colours)?;
         let decoded = (&image, alpha.as_ref());
         let mask = Mask::over(&self.input, decoded, self.mask.as_deref(), inverted)?;
         let hidden = mask.as_ref().map(Mask::hidden).unwrap_or_default();

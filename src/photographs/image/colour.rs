@@ -1,0 +1,356 @@
+//! Colours as a file stores them become sRGB.
+//!
+//! ```text
+//! sRGB = encode(M decode(stored))      decode: a curve per channel; M: linear light of the file's primaries to sRGB's
+//! ```
+//!
+//! Profiles of tables go through moxcms whole. What is sRGB to one code value of 8 bits keeps its values to the bit. What is
+//! converted is rounded to multiples of 1/65535: fine enough under any tone curve, and 16 bits keep it.
+
+mod metadata;
+mod tally;
+
+use std::sync::Arc;
+
+use glam::{DMat3, DVec3};
+use moxcms::{
+    Chromaticity, CicpColorPrimaries, CicpProfile, ColorPrimaries, ColorProfile, DataColorSpace,
+    Layout, MatrixCoefficients, ProfileText, RenderingIntent, ToneReprCurve,
+    TransferCharacteristics, TransformF32Executor, TransformOptions,
+};
+use rayon::prelude::*;
+
+pub(super) use self::metadata::Chromaticities;
+use self::metadata::{Statement, statements};
+use super::{Image, linear_from_srgb, srgb_from_linear};
+pub(crate) use tally::ColourTally;
+
+/// What was made of the colours of a file.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(crate) struct Conversion {
+    /// The colour space that it was converted from, and the fraction of its pixels that sRGB does not hold; none where the
+    /// values are sRGB as they are stored, or are taken for it.
+    pub(crate) from: Option<(String, f64)>,
+    /// What it says that is not understood, in words.
+    pub(crate) unknown: Option<String>,
+}
+
+/// Steps from 0 to 1 of what is converted.
+const LEVELS: f32 = 65_535.0;
+
+/// Converts a decoded picture to sRGB by what its file says.
+pub(super) fn convert(image: &mut Image, bytes: &[u8]) -> Conversion {
+    let mut unknown = None;
+    for statement in statements(bytes) {
+        match ColourSpace::of(&statement) {
+            Ok(space) if space.is_srgb() => return Conversion { from: None, unknown },
+            Ok(space) => {
+                let outside = space.apply(image);
+                return Conversion { from: Some((space.name, outside)), unknown };
+            }
+            Err(problem) => unknown = unknown.or(Some(problem)),
+        }
+    }
+    Conversion { from: None, unknown }
+}
+
+/// Converts linear light of other primaries to that of sRGB's. What would be negative becomes 0; what was, stays.
+pub(super) fn convert_linear(image: &mut Image, chromaticities: Chromaticities) -> Conversion {
+    /// A code value of 8 bits near black.
+    const MARGIN: f64 = 1.0 / 255.0 / 12.92;
+    let Some(matrix) = to_srgb(chromaticities) else {
+        let unknown = Some("chromaticities of no primaries".to_owned());
+        return Conversion { from: None, unknown };
+    };
+    if matrix.abs_diff_eq(DMat3::IDENTITY, 2e-3) {
+        return Conversion::default();
+    }
+    let count = image.pixel_count();
+    let mut outside = 0;
+    for at in 0..count {
+        let stored =
+            DVec3::from_array([0, 1, 2].map(|plane| f64::from(image.data[plane * count + at])));
+        if !(stored.is_finite() && stored.min_element() >= 0.0) {
+            continue;
+        }
+        let linear = matrix * stored;
+        outside += usize::from(linear.min_element() < -MARGIN);
+        for (plane, value) in linear.to_array().into_iter().enumerate() {
+            image.data[plane * count + at] = value.max(0.0) as f32;
+        }
+    }
+    let name = known_name(matrix).unwrap_or("primaries of its own").to_owned();
+    Conversion { from: Some((name, outside as f64 / count.max(1) as f64)), unknown: None }
+}
+
+/// The matrix from linear light of these primaries to that of sRGB; none where the primaries are none.
+fn to_srgb(chromaticities: Chromaticities) -> Option<DMat3> {
+    let [white, red, green, blue] =
+        chromaticities.map(|[x, y]| Chromaticity { x: x as f32, y: y as f32 });
+    matrix_of(ColorProfile::colorants_matrix(white.to_xyyb(), ColorPrimaries { red, green, blue }))
+}
+
+/// From colorants at D50 to linear sRGB.
+fn matrix_of(colorants: moxcms::Matrix3d) -> Option<DMat3> {
+    let matrix = |rows: moxcms::Matrix3d| DMat3::from_cols_array_2d(&rows.v).transpose();
+    let srgb = matrix(ColorProfile::new_srgb().colorant_matrix());
+    let result = srgb.inverse() * matrix(colorants);
+    (result.is_finite() && result.determinant().abs() > 1e-6).then_some(result)
+}
+
+type Curve = Box<dyn Fn(f32) -> f32 + Send + Sync>;
+
+/// How stored values become sRGB.
+enum Transform {
+    /// Each channel through its curve to linear light, and that through a matrix.
+    Shaper { curves: [Curve; 3], matrix: DMat3 },
+    /// Red, green and blue through tables.
+    Tables(Arc<TransformF32Executor>),
+}
+
+struct ColourSpace {
+    name: String,
+    transform: Transform,
+}
+
+impl ColourSpace {
+    /// # Errors
+    /// What cannot be used, in words.
+    fn of(statement: &Statement) -> Result<Self, String> {
+        match statement {
+            Statement::Srgb => {
+                Ok(Self::shaper("sRGB", std::array::from_fn(|_| srgb_curve()), DMat3::IDENTITY))
+            }
+            Statement::AdobeRgb => Self::of_profile(ColorProfile::new_adobe_rgb()),
+            Statement::Profile(bytes) => {
+                let profile = ColorProfile::new_from_slice(bytes);
+                Self::of_profile(profile.map_err(|_| "a damaged ICC profile".to_owned())?)
+            }
+            &Statement::CodePoints(points) => Self::of_code_points(points),
+            &Statement::Primaries { chromaticities, exponent } => {
+                Self::of_primaries(chromaticities, exponent)
+            }
+            Statement::Unknown(problem) => Err(problem.clone()),
+        }
+    }
+
+    fn shaper(name: &str, curves: [Curve; 3], matrix: DMat3) -> Self {
+        Self { name: name.to_owned(), transform: Transform::Shaper { curves, matrix } }
+    }
+
+    fn of_profile(profile: ColorProfile) -> Result<Self, String> {
+        let said = description(&profile);
+        let name = said.clone().unwrap_or_else(|| "an ICC profile without a name".to_owned());
+        let unusable = |why: &str| format!("the ICC profile {name} ({why})");
+        let curve = |curve: &Option<ToneReprCurve>| {
+            let evaluator = curve.as_ref()?.make_linear_evaluator().ok()?;
+            Some(Box::new(move |value: f32| evaluator.evaluate_value(value)) as Curve)
+        };
+        let curves = |curves: [&Option<ToneReprCurve>; 3]| {
+            let [red, green, blue] = curves.map(curve);
+            Some([red?, green?, blue?])
+        };
+        match profile.color_space {
+            DataColorSpace::Gray => {
+                let curves =
+                    curves([&profile.gray_trc; 3]).ok_or_else(|| unusable("has no curve"))?;
+                Ok(Self::shaper(&name, curves, DMat3::IDENTITY))
+            }
+            DataColorSpace::Rgb if has_tables(&profile) => {
+                let srgb = ColorProfile::new_srgb();
+                let options = TransformOptions {
+                    rendering_intent: RenderingIntent::RelativeColorimetric,
+                    ..TransformOptions::default()
+                };
+                let tables = profile.create_transform_f32(Layout::Rgb, &srgb, Layout::Rgb, options);
+                let tables = tables.map_err(|_| unusable("its tables are damaged"))?;
+                Ok(Self { name, transform: Transform::Tables(tables) })
+            }
+            DataColorSpace::Rgb => {
+                let matrix = profile
+                    .is_matrix_shaper()
+                    .then(|| matrix_of(profile.colorant_matrix()))
+                    .flatten();
+                let curves = curves([&profile.red_trc, &profile.green_trc, &profile.blue_trc]);
+                let parts =
+                    matrix.zip(curves).ok_or_else(|| unusable("has neither matrix nor tables"))?;
+                let name = known_name(parts.0).map_or(name, str::to_owned);
+                Ok(Self::shaper(&name, parts.1, parts.0))
+            }
+            other => Err(unusable(&format!("for {other:?}, not for RGB"))),
+        }
+    }
+
+    fn of_code_points(points: [u8; 4]) -> Result<Self, String> {
+        let unusable = |why: &str| format!("the code points {points:?} of a cICP chunk ({why})");
+        let [primaries, transfer, matrix, range] = points;
+        if matrix != 0 || range != 1 {
+            return Err(unusable("no RGB of full range"));
+        }
+        let color_primaries = CicpColorPrimaries::try_from(primaries).ok();
+        let transfer = TransferCharacteristics::try_from(transfer).ok();
+        let (Some(color_primaries), Some(transfer)) = (color_primaries, transfer) else {
+            return Err(unusable("reserved"));
+        };
+        match transfer {
+            TransferCharacteristics::Smpte2084 | TransferCharacteristics::Hlg => {
+                return Err(unusable("high dynamic range"));
+            }
+            TransferCharacteristics::Reserved | TransferCharacteristics::Unspecified => {
+                return Err(unusable("no transfer function"));
+            }
+            _ => {}
+        }
+        let matrix_coefficients = MatrixCoefficients::Identity;
+        let points = CicpProfile {
+            color_primaries,
+            transfer_characteristics: transfer,
+            matrix_coefficients,
+            full_range: true,
+        };
+        let matrix = matrix_of(ColorProfile::new_from_cicp(points).colorant_matrix());
+        let matrix = matrix.ok_or_else(|| unusable("no primaries"))?;
+        let curve =
+            |_| Box::new(move |value: f32| transfer.linearize(f64::from(value)) as f32) as Curve;
+        let name =
+            known_name(matrix).map_or_else(|| format!("code points {primaries}"), str::to_owned);
+        Ok(Self::shaper(&name, std::array::from_fn(curve), matrix))
+    }
+
+    fn of_primaries(
+        chromaticities: Option<Chromaticities>,
+        exponent: Option<f64>,
+    ) -> Result<Self, String> {
+        let matrix = match chromaticities {
+            Some(chromaticities) => {
+                to_srgb(chromaticities).ok_or("chromaticities of no primaries")?
+            }
+            None => DMat3::IDENTITY,
+        };
+        let known = known_name(matrix);
+        // 1/2.2 is what the curve of sRGB is written as where there is no chunk for it; Display P3 has the same.
+        let is_srgb_curve = |&exponent: &f64| {
+            (exponent - 2.2).abs() < 0.03 && [Some("sRGB"), Some("Display P3")].contains(&known)
+        };
+        let exponent = exponent.filter(|exponent| !is_srgb_curve(exponent));
+        let curve = |_| match exponent {
+            Some(exponent) => {
+                Box::new(move |value: f32| value.max(0.0).powf(exponent as f32)) as Curve
+            }
+            None => srgb_curve(),
+        };
+        let primaries = known.unwrap_or("primaries of its own");
+        let name = match exponent {
+            Some(exponent) if known != Some("Adobe RGB") => {
+                format!("{primaries} at gamma {exponent:.2}")
+            }
+            _ => primaries.to_owned(),
+        };
+        Ok(Self::shaper(&name, std::array::from_fn(curve), matrix))
+    }
+
+    /// Whether it moves no colour by more than a code value of 8 bits.
+    fn is_srgb(&self) -> bool {
+        let greys = (0..=255).map(|code| [code as f32 / 255.0; 3]);
+        let colours = (0..216)
+            .map(|index| [index % 6, index / 6 % 6, index / 36].map(|step| step as f32 / 5.0));
+        let colours: Vec<[f32; 3]> = greys.chain(colours).collect();
+        let mut converted: Vec<f32> = colours.concat();
+        self.convert(&mut converted);
+        let moved = |(before, after): (&f32, &f32)| (before - after).abs() > 1.0 / 255.0;
+        !colours.as_flattened().iter().zip(&converted).any(moved)
+    }
+
+    /// Converts pixels of red, green and blue, unclamped.
+    fn convert(&self, pixels: &mut [f32]) {
+        match &self.transform {
+            Transform::Shaper { curves, matrix } => {
+                for pixel in pixels.as_chunks_mut::<3>().0 {
+                    let linear =
+                        [0, 1, 2].map(|channel| f64::from(curves[channel](pixel[channel])));
+                    *pixel = (*matrix * DVec3::from_array(linear))
+                        .to_array()
+                        .map(|value| encode(value as f32));
+                }
+            }
+            Transform::Tables(tables) => {
+                let stored = pixels.to_vec();
+                // Its lengths are those that it asks for.
+                if tables.transform(&stored, pixels).is_err() {
+                    pixels.copy_from_slice(&stored);
+                }
+            }
+        }
+    }
+
+    /// Converts an image; gives the fraction of its pixels that sRGB does not hold, and clamps them.
+    fn apply(&self, image: &mut Image) -> f64 {
+        /// Pixels that a thread converts in one go.
+        const PIXELS: usize = 1 << 14;
+        /// So far beyond 0 or 1 a value is no rounding.
+        const MARGIN: f32 = 1.0 / 255.0;
+        let count = image.pixel_count();
+        let [red, green, blue] = [0, 1, 2].map(|plane| &image.data[plane * count..][..count]);
+        let converted = |first: usize| {
+            let pixels = first..(first + PIXELS).min(count);
+            let mut values: Vec<f32> =
+                pixels.flat_map(|at| [red[at], green[at], blue[at]]).collect();
+            self.convert(&mut values);
+            values
+        };
+        let starts: Vec<usize> = (0..count).step_by(PIXELS).collect();
+        let mut interleaved: Vec<f32> = starts.into_par_iter().flat_map_iter(converted).collect();
+        // Positive phrasing: a NaN is outside.
+        let is_held = |&value: &f32| value >= -MARGIN && value <= 1.0 + MARGIN;
+        let outside =
+            interleaved.chunks_exact(3).filter(|pixel| !pixel.iter().all(is_held)).count();
+        for value in &mut interleaved {
+            let inside = if *value > 0.0 { value.min(1.0) } else { 0.0 };
+            *value = (inside * LEVELS).round() / LEVELS;
+        }
+        *image = super::from_interleaved(image.width, image.height, &interleaved);
+        outside as f64 / count.max(1) as f64
+    }
+}
+
+/// The encoded value of linear light, continued below 0.
+fn encode(linear: f32) -> f32 {
+    srgb_from_linear(linear.abs()).copysign(linear)
+}
+
+fn srgb_curve() -> Curve {
+    Box::new(linear_from_srgb)
+}
+
+fn has_tables(profile: &ColorProfile) -> bool {
+    profile.lut_a_to_b_colorimetric.is_some() || profile.lut_a_to_b_perceptual.is_some()
+}
+
+/// What a profile calls itself, in quotes.
+fn description(profile: &ColorProfile) -> Option<String> {
+    const MOST: usize = 60;
+    let text = match profile.description.as_ref()? {
+        ProfileText::PlainString(text) => text,
+        ProfileText::Localizable(texts) => &texts.first()?.value,
+        ProfileText::Description(text) => &text.ascii_string,
+    };
+    let text: String =
+        text.chars().filter(|character| !character.is_control()).take(MOST).collect();
+    let text = text.trim();
+    (!text.is_empty()).then(|| format!("\"{text}\""))
+}
+
+/// The name of the colour space whose primaries these are, by the matrix to linear sRGB.
+fn known_name(matrix: DMat3) -> Option<&'static str> {
+    let known = [
+        ("sRGB", ColorProfile::new_srgb()),
+        ("Display P3", ColorProfile::new_display_p3()),
+        ("Adobe RGB", ColorProfile::new_adobe_rgb()),
+        ("ProPhoto RGB", ColorProfile::new_pro_photo_rgb()),
+        ("Rec. 2020", ColorProfile::new_bt2020()),
+    ];
+    let is_near = |profile: &ColorProfile| {
+        matrix_of(profile.colorant_matrix()).is_some_and(|own| own.abs_diff_eq(matrix, 0.01))
+    };
+    known.into_iter().find(|(_, profile)| is_near(profile)).map(|(name, _)| name)
+}
