@@ -122,8 +122,10 @@ struct Shared {
     properties: Properties,
     device: ash::Device,
     descriptors: descriptors::Descriptors,
-    /// Labels; absent where the instance does not offer them.
+    /// Names objects; absent without the validation layer.
     debug: Option<ext::debug_utils::Device>,
+    /// Labels passes; absent without a validation layer that can take labels from several threads.
+    labels: Option<ext::debug_utils::Device>,
     /// Statistics of compiled kernels; absent where the device does not tell them.
     executables: Option<khr::pipeline_executable_properties::Device>,
     allocator: Mutex<Option<gpu_allocator::vulkan::Allocator>>,

@@ -102,8 +102,6 @@ pub struct Term {
     pub is_likeness: bool,
     /// What it weighs.
     pub(crate) weight: fn(&LossConfig) -> f64,
-    /// The setting that the weight follows from.
-    pub setting: &'static str,
 }
 
 impl Term {

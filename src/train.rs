@@ -70,7 +70,7 @@ pub use preset::Preset;
 pub use reference::reference;
 pub use rendered::Rendered;
 use submission::Submissions;
-use supervision::{Supervision, ViewOf};
+use supervision::Supervision;
 pub use target_views::TestTargets;
 
 /// The streams of random numbers that training draws from, one per purpose.
@@ -297,7 +297,7 @@ impl Trainer {
     /// The algorithm: render a view, compare it with its pseudo-GT, go back, update.
     fn record_step(&mut self, pass: &mut Recorder<'_>, step: u64, slot: u32) -> Result<()> {
         let schedule = &self.config.schedule;
-        let level = schedule.resolution_level(step);
+        let view = self.view_id(step);
         let settling_rate = self.settling_rate(step);
         let options = RenderOptions {
             sh_degree: self.sh_degree(step),
@@ -305,14 +305,13 @@ impl Trainer {
         };
         let damping = Damping { weight: schedule.damping_weight(step), depth: self.extent as f32 };
         let Self { gpu, supervision, model, renderer, optimizer, .. } = self;
-        let of = ViewOf { seed: self.config.seed, step, level };
 
-        renderer.forward(pass, &model.gaussians, supervision.viewpoint(of), &options)?;
-        supervision.compare(pass, of, model.shape().features, renderer, slot)?;
+        renderer.forward(pass, &model.gaussians, supervision.views.viewpoint(view), &options)?;
+        supervision.compare(pass, (step, view), model.shape().features, renderer, slot)?;
         renderer.backward(
             pass,
             &model.gaussians,
-            supervision.viewpoint(of),
+            supervision.views.viewpoint(view),
             &options,
             damping,
             &supervision.d_render,

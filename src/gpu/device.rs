@@ -17,11 +17,14 @@ use super::descriptors::Descriptors;
 use super::device_report::{device_memory, report};
 #[cfg(feature = "testing")]
 use super::faults::Faults;
-use super::instance::{Owned, instance, loader_error, physical_devices, validation_is_installed};
+use super::instance::{
+    Owned, instance, loader_error, physical_devices, validation_is_installed, validation_version,
+};
 use super::limits::max_workgroups;
 use super::memory::{BudgetQuery, MemoryUsage};
 use super::offered::{OPTIONAL_EXTENSIONS, Offered};
 use super::requirements::required_device_features;
+use super::validation::FIRST_SAFE_WITH_LABELS;
 use super::{
     DeviceChoice, DeviceReport, Gpu, Properties, Queue, SchedulerVariables, Shared, address_space,
     reconvergence, statistics, tuning,
@@ -184,6 +187,8 @@ impl Gpu {
         };
         let debug = owned.as_ref().and_then(|owned| owned.messenger.as_ref());
         let debug = debug.map(|_| ext::debug_utils::Device::new(instance, &device));
+        let layer = owned.as_ref().and_then(|owned| validation_version(&owned.entry));
+        let has_labels = layer.is_some_and(|version| version >= FIRST_SAFE_WITH_LABELS);
         let executables = properties
             .tells_statistics
             .then(|| khr::pipeline_executable_properties::Device::new(instance, &device));
@@ -191,6 +196,7 @@ impl Gpu {
             shared: Arc::new(Shared {
                 descriptors: Descriptors::of(instance, &device, properties.pushes_descriptors),
                 properties,
+                labels: debug.clone().filter(|_| has_labels),
                 debug,
                 executables,
                 tuned_tiles: OnceLock::new(),

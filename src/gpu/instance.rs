@@ -72,13 +72,15 @@ fn entry() -> Result<ash::Entry> {
 }
 
 pub(super) fn validation_is_installed() -> bool {
-    let layers = entry().and_then(|entry| {
-        // SAFETY: no preconditions.
-        unsafe { entry.enumerate_instance_layer_properties() }.map_err(loader_error)
-    });
-    layers.is_ok_and(|layers| {
-        layers.iter().any(|layer| layer.layer_name_as_c_str() == Ok(validation::LAYER))
-    })
+    entry().is_ok_and(|entry| validation_version(&entry).is_some())
+}
+
+/// The version of Vulkan that the validation layer is built for; `None` where it is not installed.
+pub(super) fn validation_version(entry: &ash::Entry) -> Option<u32> {
+    // SAFETY: no preconditions.
+    let layers = unsafe { entry.enumerate_instance_layer_properties() }.ok()?;
+    let layer = layers.iter().find(|layer| layer.layer_name_as_c_str() == Ok(validation::LAYER));
+    layer.map(|layer| layer.spec_version)
 }
 
 fn instance_has(entry: &ash::Entry, extension: &CStr) -> Result<bool> {

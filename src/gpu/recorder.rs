@@ -321,7 +321,7 @@ impl<'g> Recorder<'g> {
     }
 
     fn begin_label(&self, name: &'static str) {
-        if let (Some(debug), Ok(name)) = (&self.shared.debug, CString::new(name)) {
+        if let (Some(debug), Ok(name)) = (&self.shared.labels, CString::new(name)) {
             let label = vk::DebugUtilsLabelEXT::default().label_name(&name);
             // SAFETY: recording.
             unsafe { debug.cmd_begin_debug_utils_label(self.commands, &label) };
@@ -329,7 +329,7 @@ impl<'g> Recorder<'g> {
     }
 
     fn end_label(&mut self, name: &'static str) {
-        if let Some(debug) = &self.shared.debug {
+        if let Some(debug) = &self.shared.labels {
             // SAFETY: recording; every label that is ended was begun.
             unsafe { debug.cmd_end_debug_utils_label(self.commands) };
         }

@@ -9,6 +9,10 @@ use ash::vk;
 /// The Khronos layer that checks every call, and here every hazard.
 pub(super) const LAYER: &CStr = c"VK_LAYER_KHRONOS_validation";
 
+/// Layers of before race between the labels of command buffers that two threads record, and crash
+/// (KhronosGroup/Vulkan-ValidationLayers#5172).
+pub(super) const FIRST_SAFE_WITH_LABELS: u32 = vk::make_api_version(0, 1, 3, 243);
+
 /// Set in the environment of the processes that tests start, so that they [`fail_at_exit`].
 const FAIL_VARIABLE: &str = "NIGHTSPLAT_FAIL_ON_VALIDATION";
 

@@ -18,14 +18,12 @@ impl Term {
         name: "denoising",
         is_likeness: false,
         weight: |config| config.weights.denoising,
-        setting: "model.weights.denoising",
     };
     /// Total variation of the denoised image.
     pub const TOTAL_VARIATION: Self = Self {
         column: "total_variation",
         name: "total variation",
         weight: |config| config.weights.total_variation,
-        setting: "model.weights.total_variation",
         ..Self::DENOISING
     };
 }

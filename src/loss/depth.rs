@@ -34,7 +34,6 @@ impl Term {
         name: "depth",
         is_likeness: false,
         weight: |config| config.weights.depth,
-        setting: "model.weights.depth",
     };
     /// Mean 1 - correlation of depths over boxes.
     pub const DEPTH_LOCAL: Self =

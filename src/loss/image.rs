@@ -35,7 +35,6 @@ impl Term {
         name: "L1",
         is_likeness: false,
         weight: |config| 1.0 - config.ssim_weight,
-        setting: "ssim_weight",
     };
     /// Mean SSIM of render and target.
     pub const SSIM: Self = Self {
@@ -51,7 +50,6 @@ impl Term {
         name: "L1 of the dark reconstruction",
         is_likeness: false,
         weight: |config| config.low * (1.0 - config.weights.low_ssim),
-        setting: "model.weights.low_ssim",
     };
     /// Mean SSIM of the dark reconstruction and the photograph.
     pub const LOW_SSIM: Self = Self {

@@ -22,14 +22,12 @@ impl Term {
         name: "opacity",
         is_likeness: false,
         weight: |config| config.parameters.opacity_weight,
-        setting: "loss.opacity_weight",
     };
     /// Mean standard deviation, in units of the frame.
     pub const SCALE: Self = Self {
         column: "scale",
         name: "scale",
         weight: |config| config.parameters.scale_weight,
-        setting: "loss.scale_weight",
         ..Self::OPACITY
     };
 }

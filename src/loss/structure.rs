@@ -28,7 +28,6 @@ impl Term {
         name: "structure",
         is_likeness: false,
         weight: |config| config.weights.structure,
-        setting: "model.weights.structure",
     };
 }
 

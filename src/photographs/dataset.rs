@@ -4,7 +4,9 @@
 //! COLMAP model. What the model trains on is the dark photograph (`View::image`); a normal-light photograph of the
 //! same name is a test view's reference image (`View::reference`), used for scores only and loaded for test views only.
 
+mod allowance;
 mod colmap;
+mod depth;
 mod fingerprint;
 mod listed;
 mod listing;
@@ -12,6 +14,7 @@ mod masks;
 mod members;
 mod names;
 mod options;
+mod original;
 mod packed;
 mod pixels;
 mod place;
@@ -41,8 +44,8 @@ use listed::{ListedView, Listing};
 use listing::{list, warn};
 use members::with_held_out;
 pub use options::{DOWNSCALE, DepthOptions, LoadOptions, MeasuredSize};
+pub use original::Original;
 pub(crate) use pixels::Look;
-pub use pixels::Original;
 use points::points;
 use source::Source;
 use split::{TEST_EVERY, say_whose_split_gives_way, split};

@@ -8,7 +8,7 @@ use std::collections::VecDeque;
 use std::ops::RangeInclusive;
 use std::time::{Duration, Instant};
 
-use super::views::TrainView;
+use super::views::{TrainView, ViewId};
 use super::{NotFinite, StepReport, Trainer};
 use crate::gpu::Download;
 use crate::loss::{LossLogDownload, StepLosses};
@@ -284,12 +284,14 @@ impl Trainer {
         Ok(true)
     }
 
+    /// The view that a step trains on.
+    pub(super) fn view_id(&self, step: u64) -> ViewId {
+        let level = self.config.schedule.resolution_level(step);
+        self.supervision.views.of_step(self.config.seed, step, level)
+    }
+
     pub(super) fn view_of(&self, step: u64) -> &TrainView {
-        self.supervision.views.of_step(
-            self.config.seed,
-            step,
-            self.config.schedule.resolution_level(step),
-        )
+        self.supervision.views.get(self.view_id(step))
     }
 
     fn report(&self, step: u64, losses: &StepLosses, milliseconds: f64) -> StepReport {

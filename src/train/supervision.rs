@@ -12,7 +12,7 @@ use super::measuring::TargetExposure;
 use super::model::Model;
 use super::networks::Networks;
 use super::terms::{NetworkTerms, Photographs};
-use super::views::{TrainView, Views};
+use super::views::{ViewId, Views};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Recorder};
 use crate::loss::exposure::Exposures;
@@ -20,7 +20,7 @@ use crate::loss::{LogSlot, LossLog, Losses, ParameterTerms, TermInputs};
 use crate::photographs::pseudo_gt::PseudoGt;
 use crate::photographs::tone::Scene;
 use crate::splats::optimizer::{Adam, Learnable};
-use crate::splats::render::{Renderer, Viewpoint};
+use crate::splats::render::Renderer;
 use crate::splats::scene::{COLOR_CHANNELS, Features};
 
 /// The training views with their targets, and the terms of the loss.
@@ -45,26 +45,7 @@ pub(super) struct Supervision {
     pub(super) log: LossLog,
 }
 
-/// What decides which view a step trains on.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct ViewOf {
-    pub(super) seed: u64,
-    pub(super) step: u64,
-    /// Of resolution.
-    pub(super) level: usize,
-}
-
 impl Supervision {
-    /// The view of a step.
-    pub(super) fn view(&self, ViewOf { seed, step, level }: ViewOf) -> &TrainView {
-        self.views.of_step(seed, step, level)
-    }
-
-    /// The camera of a step's view, on the device.
-    pub(super) fn viewpoint(&self, of: ViewOf) -> Viewpoint<'_> {
-        self.views.viewpoint(self.view(of))
-    }
-
     /// The networks, where the model has any.
     pub(super) fn networks(&mut self) -> Option<&mut Networks> {
         self.networks.as_mut().map(|terms| &mut terms.networks)
@@ -77,19 +58,18 @@ impl Supervision {
     pub(super) fn compare(
         &mut self,
         pass: &mut Recorder<'_>,
-        of: ViewOf,
+        (step, view): (u64, ViewId),
         features: Features,
         renderer: &mut Renderer,
         slot: u32,
     ) -> Result<()> {
         let Self { views, pseudo_gt, masks, d_render, losses, .. } = self;
-        let view = views.of_step(of.seed, of.step, of.level);
+        let view = views.get(view);
         let (render, status) = renderer.render_and_status();
         let (size, number) = (view.size(), view.number);
         let channels = COLOR_CHANNELS + features.width();
         let target = views.record_target(pass, pseudo_gt, view, &mut self.target)?;
         let log = &mut LogSlot { log: &mut self.log, slot, status };
-        let step = of.step;
         let inputs =
             &TermInputs { step, view: number, size, features, render, colors: render, target };
         let exposed = match &mut self.exposures {

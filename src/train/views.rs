@@ -50,6 +50,15 @@ pub(super) struct TrainView {
     photograph: Option<Slot>,
 }
 
+/// Which of the training views.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct ViewId {
+    /// Of the resolution schedule.
+    level: usize,
+    /// Among the views of the level.
+    index: usize,
+}
+
 /// All training views in the dataset's order, as they are and then by level of the resolution schedule, each half the
 /// size of the one before.
 #[derive(Debug)]
@@ -159,7 +168,7 @@ impl Views {
         let (mut bytes, mut last) = (0, *steps.start());
         for step in steps {
             let level = config.schedule.resolution_level(step);
-            let view = self.of_step(config.seed, step, level);
+            let view = self.get(self.of_step(config.seed, step, level));
             let slots = [Some(view.stored), view.photograph].into_iter().flatten();
             let own: u64 = slots.clone().map(|slot| self.cache.bytes(slot)).sum();
             let is_new = !numbers.contains(&view.number);
@@ -273,17 +282,21 @@ impl Views {
 
     /// The view that a step trains on, at one of the levels: every epoch takes each view once, in an order of its own, and
     /// for one that is left out the next again.
-    pub(super) fn of_step(&self, seed: u64, step: u64, level: usize) -> &TrainView {
+    pub(super) fn of_step(&self, seed: u64, step: u64, level: usize) -> ViewId {
         let views = &self.levels[level];
         let (order, place) = self.epochs.of_step(seed, step, views.len());
-        let from_place = order.iter().cycle().skip(place).take(views.len());
+        let from_place = order[place..].iter().chain(&order[..place]);
         let own = from_place.copied().find(|at| !self.left_out.contains(&views[*at].place));
-        &views[own.unwrap_or(order[place])]
+        ViewId { level, index: own.unwrap_or(order[place]) }
     }
 
-    /// A view as it is rendered.
-    pub(super) fn viewpoint(&self, view: &TrainView) -> Viewpoint<'_> {
-        self.viewpoints.get(view.number)
+    pub(super) fn get(&self, ViewId { level, index }: ViewId) -> &TrainView {
+        &self.levels[level][index]
+    }
+
+    /// The camera of a view, on the device.
+    pub(super) fn viewpoint(&self, view: ViewId) -> Viewpoint<'_> {
+        self.viewpoints.get(self.get(view).number)
     }
 
     /// Trains on a view no more; false where there is no other.

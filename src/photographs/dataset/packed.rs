@@ -34,14 +34,14 @@ impl Packed {
         Self { width: image.width, height: image.height, values }
     }
 
-    /// What [`Packed::of`] takes of memory.
-    pub(super) fn bytes(image: &Image) -> i64 {
-        let bytes = match codes(image) {
-            Some(EIGHT) => 1,
-            Some(_) => 2,
-            None => 4,
+    /// Bytes of memory that it takes.
+    pub(super) fn bytes(&self) -> u64 {
+        let bytes = match &self.values {
+            Values::Eight(codes) => size_of_val(codes.as_slice()),
+            Values::Sixteen(codes) => size_of_val(codes.as_slice()),
+            Values::Any(values) => size_of_val(values.as_slice()),
         };
-        bytes * image.data.len() as i64
+        bytes as u64
     }
 
     pub(super) fn image(&self) -> Image {
@@ -77,8 +77,9 @@ mod tests {
         let any = of(&|i| i as f32 * 1e-3 - 0.1);
         let nan = of(&|_| f32::NAN);
         for (image, bytes) in [(eight, 1), (sixteen, 2), (any, 4), (nan, 4)] {
-            assert_eq!(Packed::bytes(&image), bytes * 3 * 256);
-            let back = Packed::of(&image).image();
+            let packed = Packed::of(&image);
+            assert_eq!(packed.bytes(), bytes * 3 * 256);
+            let back = packed.image();
             let bits =
                 |image: &Image| -> Vec<u32> { image.data.iter().map(|x| x.to_bits()).collect() };
             assert_eq!(bits(&back), bits(&image));

@@ -2,39 +2,185 @@
 
 use std::path::Path;
 
+use glam::DAffine3;
+
 use super::undistort::Undistortion;
-use crate::camera::Lens;
-use crate::photographs::image::{Image, Orientation};
+use crate::camera::{Camera, CameraModel, Lens};
+use crate::photographs::image::{Image, Mask, Orientation, PictureFile};
 use crate::{Error, Result};
 
-/// The picture as its view shows it: fitted to the lens, undistorted where that is asked for, and of `size`.
-///
-/// # Errors
-/// Its shape is not that of the lens.
-pub(super) fn prepared(
-    image: Image,
-    path: &Path,
-    lens: &Lens,
-    undistortion: Option<&Undistortion>,
-    size: (u32, u32),
-) -> Result<Image> {
-    let (width, height) = (image.width, image.height);
-    if lens.fitted(width, height).is_none() {
-        return Err(disagreement(path, (width, height), lens));
-    }
-    // A reference image may be of another resolution than the input.
-    let image = if (width, height) == (lens.width, lens.height) {
-        image
-    } else {
-        image.resized(lens.width, lens.height)
-    };
-    let image = match undistortion {
-        Some(undistortion) => undistortion.apply(&image),
-        None => image,
-    };
-    Ok(if (image.width, image.height) == size { image } else { image.resized(size.0, size.1) })
+/// How the photographs of one lens become what their views show.
+#[derive(Debug)]
+pub(super) struct Preparation<'a> {
+    /// Fitted to the photographs' size.
+    pub(super) lens: &'a Lens,
+    /// `None` where the lens is rendered as it is.
+    pub(super) undistortion: Option<Undistortion>,
+    /// Width and height that the views are loaded at.
+    pub(super) size: (u32, u32),
 }
 
+impl<'a> Preparation<'a> {
+    /// With `undistort`, a fisheye is undistorted as a polynomial lens always is.
+    ///
+    /// # Errors
+    /// No pinhole sees inside the photograph only: the distortion describes no lens. `name` is the view or file to name.
+    pub(super) fn new(
+        lens: &'a Lens,
+        undistort: bool,
+        size: (u32, u32),
+        name: &str,
+    ) -> Result<Self> {
+        let native = lens.model().filter(|&model| model == CameraModel::Pinhole || !undistort);
+        let undistortion = match native {
+            Some(_) => None,
+            None => Some(Undistortion::new(lens).ok_or_else(|| no_lens(name))?),
+        };
+        Ok(Self { lens, undistortion, size })
+    }
+
+    /// The picture as its view shows it, of the lens's size: undistorted where that is asked for.
+    ///
+    /// # Errors
+    /// Its shape is not that of the lens.
+    pub(super) fn whole(&self, image: Image, path: &Path) -> Result<Image> {
+        let &Lens { width, height, .. } = self.lens;
+        let size = (image.width, image.height);
+        if self.lens.fitted(size.0, size.1).is_none() {
+            return Err(disagreement(path, size, self.lens));
+        }
+        // A reference image may be of another resolution than the photograph.
+        let image = if size == (width, height) { image } else { image.resized(width, height) };
+        Ok(self.undistorted(image))
+    }
+
+    /// The same at the size that the view is loaded at.
+    ///
+    /// # Errors
+    /// As there.
+    pub(super) fn loaded(&self, image: Image, path: &Path) -> Result<Image> {
+        self.whole(image, path).map(|image| self.shrunk(image))
+    }
+
+    pub(super) fn shrunk(&self, image: Image) -> Image {
+        let (width, height) = self.size;
+        if (image.width, image.height) == self.size { image } else { image.resized(width, height) }
+    }
+
+    pub(super) fn undistorted(&self, image: Image) -> Image {
+        match &self.undistortion {
+            Some(undistortion) => undistortion.apply(&image),
+            None => image,
+        }
+    }
+
+    /// Which pixels of a view count, of the mask as its photograph is stored; `None` where all do.
+    ///
+    /// # Errors
+    /// The photograph's shape is not that of the lens.
+    pub(super) fn mask(
+        &self,
+        stored: &Mask,
+        path: &Path,
+        orientation: Orientation,
+    ) -> Result<Option<Mask>> {
+        let plane = stored.to_image().turned(orientation);
+        Ok(Mask::of_plane(&self.loaded(plane, path)?))
+    }
+
+    /// The camera of its views at the world's origin, of the size that they are loaded at.
+    pub(super) fn camera(&self) -> Camera {
+        let camera = native_camera(self.lens);
+        let camera = match self.undistortion {
+            Some(Undistortion { focal, .. }) => {
+                Camera { focal, model: CameraModel::Pinhole, ..camera }
+            }
+            None => camera,
+        };
+        camera.resized(self.size.0, self.size.1)
+    }
+
+    /// Refuses a lens that is rendered as it is and shows nothing at three quarters of its pixels: the circle of a fisheye
+    /// in a wide picture covers more than a quarter.
+    ///
+    /// # Errors
+    /// As said; `name` is the view to name.
+    pub(super) fn check_coverage(&self, name: &str) -> Result<()> {
+        const MOST_UNSEEN: f64 = 0.75;
+        let &Lens { width, height, .. } = self.lens;
+        let unseen = match self.undistortion {
+            Some(_) => 0,
+            None => native_camera(self.lens).unseen().len(),
+        };
+        let is_covered = unseen as f64 <= MOST_UNSEEN * pixel_count((width, height)) as f64;
+        if is_covered { Ok(()) } else { Err(no_lens(name)) }
+    }
+}
+
+fn no_lens(name: &str) -> Error {
+    Error::input(
+        name,
+        "its distortion coefficients describe no lens; calibrate again or undistort with COLMAP",
+    )
+}
+
+/// A lens at the world's origin, as it is rendered where it is not undistorted.
+fn native_camera(lens: &Lens) -> Camera {
+    Camera {
+        width: lens.width,
+        height: lens.height,
+        focal: lens.focal,
+        principal_point: lens.principal_point,
+        model: lens.model().unwrap_or_default(),
+        view_from_world: DAffine3::IDENTITY,
+    }
+}
+
+/// How a photograph is turned to be what its camera took. Poses are of what is stored, as COLMAP reads it; where the
+/// camera's size is that of what is seen, and not of what is stored, they are of that.
+pub(super) fn turn(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Orientation {
+    if lens.fitted(width, height).is_some() {
+        return Orientation::UPRIGHT;
+    }
+    let stated = Orientation::of(path);
+    let (width, height) = stated.size((width, height));
+    if lens.fitted(width, height).is_some() { stated } else { Orientation::UPRIGHT }
+}
+
+/// Refuses a file by the size that it declares, before that costs memory.
+///
+/// # Errors
+/// The picture has another shape than its camera, or far more pixels.
+pub(super) fn check_size(path: &Path, file: &PictureFile, lens: &Lens) -> Result<()> {
+    // A file without a readable header is named when it is decoded.
+    let Ok(size) = file.size() else { return Ok(()) };
+    let (width, height) = turn(path, size, lens).size(size);
+    if lens.fitted(width, height).is_none() {
+        return Err(disagreement(path, size, lens));
+    }
+    check_excess(path, (width, height), lens)
+}
+
+/// # Errors
+/// The picture has far more pixels than its camera.
+pub(super) fn check_excess(path: &Path, size: (u32, u32), lens: &Lens) -> Result<()> {
+    const MOST_TIMES: u64 = 64;
+    if pixel_count(size) > MOST_TIMES * pixel_count((lens.width, lens.height)) {
+        let (width, height) = size;
+        let (w, h) = (lens.width, lens.height);
+        let problem = format!(
+            "is {width}x{height}, over {MOST_TIMES} times the pixels of its view's {w}x{h}; shrink it"
+        );
+        return Err(Error::input(path, problem));
+    }
+    Ok(())
+}
+
+pub(super) fn pixel_count((width, height): (u32, u32)) -> u64 {
+    u64::from(width) * u64::from(height)
+}
+
+/// The error of a picture whose shape, upright or not, is not its camera's.
 pub(super) fn disagreement(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Error {
     let (w, h) = (lens.width, lens.height);
     let (seen_width, seen_height) = Orientation::of(path).size((width, height));

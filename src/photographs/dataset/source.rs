@@ -2,11 +2,11 @@
 
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicI64, Ordering};
 
 use glam::DAffine3;
 
 use super::Split;
+use super::allowance::Allowance;
 use crate::camera::Lens;
 use crate::photographs::image::{Image, PictureFile};
 
@@ -38,15 +38,14 @@ impl Source {
     }
 
     /// Reads the files of the photograph and of the reference image; gives the size of each as it is stored, where its header
-    /// is readable, and keeps what is read while `room`, bytes, is left.
-    pub(super) fn sized(&mut self, room: &AtomicI64) -> [Option<(u32, u32)>; 2] {
+    /// is readable, and keeps what is read while `memory` allows.
+    pub(super) fn sized(&mut self, memory: &Allowance) -> [Option<(u32, u32)>; 2] {
         let paths = [self.input.as_deref(), self.reference.as_deref()];
         let mut sizes = [None; 2];
         for ((path, read), size) in paths.into_iter().zip(&mut self.read).zip(&mut sizes) {
             let Some(path) = path else { continue };
-            let bytes = path.metadata().map_or(i64::MAX, |there| there.len().cast_signed());
-            if room.fetch_sub(bytes, Ordering::Relaxed) < bytes {
-                room.fetch_add(bytes, Ordering::Relaxed);
+            let bytes = path.metadata().map_or(u64::MAX, |file| file.len());
+            if !memory.take(bytes) {
                 *size = Image::size_of(path).ok();
             } else if let Ok(file) = PictureFile::open(path) {
                 *size = file.size().ok();
@@ -58,4 +57,4 @@ impl Source {
 }
 
 /// What files may take that are read before they are decoded, bytes: those beyond are opened once for their size, and again.
-pub(super) const MOST_READ: i64 = 1 << 28;
+pub(super) const MOST_READ: u64 = 1 << 28;

@@ -1,0 +1,80 @@
+//! Photographs that are not in memory as they are stored on disk.
+
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use glam::UVec2;
+
+use super::MeasuredSize;
+use super::packed::Packed;
+use super::prepare::{Preparation, turn};
+use crate::Result;
+use crate::base::hash::Hasher;
+use crate::camera::Lens;
+use crate::photographs::image::{Image, PictureFile};
+use crate::photographs::tone::Measured;
+
+/// A photograph that was shrunk on loading, or is not kept.
+#[derive(Clone, Debug)]
+pub struct Original {
+    path: PathBuf,
+    /// Fitted to the photograph's size.
+    lens: Lens,
+    /// As [`super::LoadOptions::undistort`].
+    undistort: bool,
+    /// The statistics of the photograph, and of which size.
+    pub(super) measured: Option<(MeasuredSize, Measured)>,
+    /// Of the pixels as they are loaded, where they are not kept.
+    pub(super) checksum: Option<Hasher>,
+    /// The photograph at its own size, if memory allows, until it is released.
+    stored: Arc<Mutex<Option<Packed>>>,
+}
+
+impl Original {
+    pub(super) fn new(path: PathBuf, lens: Lens, undistort: bool) -> Self {
+        Self { path, lens, undistort, measured: None, checksum: None, stored: Arc::default() }
+    }
+
+    /// Width and height, undistorted.
+    pub(super) fn size(&self) -> UVec2 {
+        UVec2::new(self.lens.width, self.lens.height)
+    }
+
+    /// Keeps the photograph at its own size in memory.
+    pub(super) fn store(&mut self, photograph: Packed) {
+        self.stored = Arc::new(Mutex::new(Some(photograph)));
+    }
+
+    /// The photograph at its own size, undistorted: from memory, or decoded again.
+    pub(super) fn load(&self) -> Result<Image> {
+        let stored = self.stored.lock().unwrap_or_else(PoisonError::into_inner);
+        match &*stored {
+            Some(packed) => Ok(packed.image()),
+            None => self.load_at((self.lens.width, self.lens.height)),
+        }
+    }
+
+    /// The photograph at another size, undistorted and decoded again.
+    pub(super) fn load_at(&self, size: (u32, u32)) -> Result<Image> {
+        let Self { path, lens, undistort, .. } = self;
+        let preparation = Preparation::new(lens, *undistort, size, &path.to_string_lossy())?;
+        let (image, _) = PictureFile::open(path)?.decode()?;
+        let orientation = turn(path, (image.width, image.height), lens);
+        preparation.loaded(image.turned(orientation), path)
+    }
+
+    /// The statistics at a size, if they were measured while the photograph was decoded.
+    pub(crate) fn measured(&self, size: MeasuredSize) -> Option<&Measured> {
+        self.measured.as_ref().filter(|(own, _)| *own == size).map(|(_, measured)| measured)
+    }
+
+    /// Of the pixels as they are loaded, where they are not kept.
+    pub(super) fn checksum(&self) -> Option<Hasher> {
+        self.checksum
+    }
+
+    /// Frees the memory of the photograph at its own size.
+    pub(crate) fn release(&self) {
+        *self.stored.lock().unwrap_or_else(PoisonError::into_inner) = None;
+    }
+}
