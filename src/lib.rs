@@ -178,6 +178,7 @@ pub use {
     photographs::image::Mask,
     photographs::metrics::Scores,
     photographs::tone::{Profile, Table, ToneCurve, ToneSettings},
+    photographs::white_balance::WhiteBalance,
     results::export::{Format, spz::Version as SpzVersion},
     splats::scene::init::Start,
     train::{Ended, MemoryEstimate, Part, Preset, Rendered, StepReport, TrainConfig, Trainer},

@@ -15,8 +15,9 @@ use crate::Error;
 use crate::base::output::write_whole;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::Dataset;
+use crate::photographs::white_balance::WhiteBalance;
 use crate::results::eval::{Leftover, hole_warning};
-use crate::train::diagnose::{Diagnosis, Noise, Plan, SceneDiagnosis, ViewDiagnosis};
+use crate::train::diagnose::{Diagnosis, Noise, Plan, SceneDiagnosis, TargetNoise, ViewDiagnosis};
 use crate::train::{Preset, TrainConfig, diagnosed};
 
 /// Look at dark photographs before training: what they are, and what a model of them needs.
@@ -31,9 +32,10 @@ use crate::train::{Preset, TrainConfig, diagnosed};
 ///   nightsplat diagnose photos --run run                where the model has holes
 ///
 /// In the table, p10, p90, mean and cubic mean are of the luminance of encoded values, r is
-/// p10 / p90; EV are stops more light than the other views show of the same points; noise is
-/// its standard deviation at the mean, in linear light; blur is that of the edges, in pixels;
-/// overlap is how much of what a view shows the others look at. No reference image is looked at.
+/// p10 / p90; EV are stops more light than the other views show of the same points; luma and
+/// chroma noise are standard deviations in the target, after the tone curve, of the sensor's noise
+/// with that of whole codes and of JPEG; blur is that of the edges, in pixels; overlap is how much
+/// of what a view shows the others look at. No reference image is looked at.
 #[expect(clippy::doc_markdown, reason = "in help, {setting} stands for its default")]
 #[derive(Clone, Debug, clap::Args)]
 #[command(verbatim_doc_comment)]
@@ -58,6 +60,9 @@ pub struct DiagnoseArgs {
     /// Plan for photographs of at most so many pixels on their longest side, as `train` has it; 0 or none: no limit [default: {max_resolution}]
     #[arg(long, value_name = "N|none", value_parser = max_resolution)]
     pub max_resolution: Option<u32>,
+    /// Balance the photographs' white before they are measured, as `train` has it: R,G,B, kelvin, VIEW,x,y,w,h or VIEW,x1,y1,..,x4,y4
+    #[arg(long, value_name = "WHITE")]
+    pub white_balance: Option<WhiteBalance>,
     /// Plan for this preset: draft, fast, balanced or best [default: balanced]
     #[arg(long, value_name = "NAME")]
     pub preset: Option<Preset>,
@@ -91,6 +96,7 @@ pub fn run(args: &DiagnoseArgs) -> Result<()> {
     config.steps = args.steps.unwrap_or(config.steps);
     config.downscale = args.downscale.unwrap_or(config.downscale);
     config.max_resolution = args.max_resolution.unwrap_or(config.max_resolution);
+    config.white_balance.clone_from(&args.white_balance);
     let gpu = Gpu::new(&args.device.clone().unwrap_or_default())?;
     let options = diagnosed(&config);
     let (dataset, mut diagnosis) = Diagnosis::load(&config.dataset, &options)?;
@@ -191,9 +197,22 @@ fn sizes(views: &[ViewDiagnosis]) -> String {
 }
 
 /// What each column of the table is.
-const COLUMNS: [&str; 14] = [
-    "view", "p10", "p90", "r", "mean", "cubic", "EV", "white %", "black %", "codes", "noise",
-    "blur", "points", "overlap",
+const COLUMNS: [&str; 15] = [
+    "view",
+    "p10",
+    "p90",
+    "r",
+    "mean",
+    "cubic",
+    "EV",
+    "white %",
+    "black %",
+    "codes",
+    "luma noise",
+    "chroma noise",
+    "blur",
+    "points",
+    "overlap",
 ];
 
 fn rows(diagnosis: &Diagnosis) -> Vec<Vec<String>> {
@@ -207,14 +226,14 @@ fn rows(diagnosis: &Diagnosis) -> Vec<Vec<String>> {
 }
 
 /// Digits after the point of the columns behind the name.
-const DIGITS: [usize; 13] = [4, 4, 2, 4, 4, 2, 2, 1, 0, 4, 1, 0, 2];
+const DIGITS: [usize; 14] = [4, 4, 2, 4, 4, 2, 2, 1, 0, 3, 3, 1, 0, 2];
 
 fn cell(value: Option<f64>, digits: usize) -> String {
     value.map_or_else(|| "-".to_owned(), |value| format!("{value:.digits$}"))
 }
 
 /// The numbers of a view, in the order of the columns.
-fn values(view: &ViewDiagnosis) -> [Option<f64>; 13] {
+fn values(view: &ViewDiagnosis) -> [Option<f64>; 14] {
     [
         Some(view.p10),
         Some(view.p90),
@@ -225,7 +244,8 @@ fn values(view: &ViewDiagnosis) -> [Option<f64>; 13] {
         Some(100.0 * view.clipped_fraction),
         Some(100.0 * view.zero_fraction),
         Some(view.code_values as f64),
-        view.noise.map(|noise| noise.deviation(view.light)),
+        view.noise_in_target.map(|noise| noise.luma),
+        view.noise_in_target.map(|noise| noise.chroma),
         view.blur,
         Some(view.points as f64),
         Some(view.overlap),
@@ -234,12 +254,21 @@ fn values(view: &ViewDiagnosis) -> [Option<f64>; 13] {
 
 /// What was measured of all views together: a name and figures in each row.
 fn scene_facts(scene: &SceneDiagnosis) -> [(&'static str, String); 5] {
-    let noise = match scene.noise {
-        Some(Noise { gain, read }) => format!(
-            "gain {gain:.2e}, read {read:.2e} of white in linear light; {:.3} in a target, averaged over its views",
-            scene.target_noise
-        ),
-        None => "not measurable: no part of the photographs is flat and not cut off".to_owned(),
+    let sensor = match scene.noise {
+        Some(Noise { gain, read }) => {
+            format!("sensor: gain {gain:.2e}, read {read:.2e} of white in linear light")
+        }
+        None => {
+            "sensor: not measurable, no part of the photographs is flat and not cut off".to_owned()
+        }
+    };
+    let noise = match scene.noise_in_target {
+        Some(TargetNoise { luma, chroma }) => {
+            format!(
+                "{luma:.3} luma, {chroma:.3} chroma in one target, codes and JPEG included; {sensor}"
+            )
+        }
+        None => sensor,
     };
     let brightness = format!(
         "mean {:.4}, p10 {:.4}, p90 {:.4}, cubic mean {:.4}; lift {:.1}, {:.0} times too little light",

@@ -38,6 +38,7 @@ use glam::{DVec3, UVec2};
 use crate::camera::Camera;
 use crate::photographs::image::files::Files;
 use crate::photographs::image::{Image, Mask};
+use crate::photographs::white_balance::WhiteBalanceGains;
 use crate::{Error, Result};
 pub use fingerprint::Fingerprint;
 use listed::{ListedView, Listing};
@@ -270,7 +271,8 @@ impl Dataset {
         split(root, &mut frames, options.test_every, &files)?;
 
         let sources = sources(root, &frames, options, &files, &mut skipped);
-        let views = pixels::load(sources, options, look, &mut skipped)?;
+        let gains = white_balance_gains(root, &sources, options)?;
+        let views = pixels::load(sources, options, (look, gains), &mut skipped)?;
         if !views.iter().any(|view| view.split == Split::Train) {
             let first = skipped.first().map(|line| format!(" ({line})")).unwrap_or_default();
             let problem = format!(
@@ -355,6 +357,21 @@ impl Dataset {
         };
         Ok((sources.into_iter().filter_map(photograph).collect(), skipped, remarks))
     }
+}
+
+/// The gains of the photographs; `None` where the options ask for none.
+///
+/// # Errors
+/// There is no such photograph, or nothing neutral to be measured in it.
+fn white_balance_gains(
+    root: &Path,
+    sources: &[Source],
+    options: &LoadOptions,
+) -> Result<Option<WhiteBalanceGains>> {
+    let photographs = || {
+        sources.iter().filter_map(|source| Some((source.name.as_str(), source.input.as_deref()?)))
+    };
+    options.white_balance.as_ref().map(|balance| balance.gains(root, photographs())).transpose()
 }
 
 /// Which files each view reads. A training view without its photograph is left out, a test view stays as a pose.

@@ -20,6 +20,7 @@ use crate::loss::{LossConfig, ParameterWeights};
 use crate::networks::Form;
 use crate::photographs::dataset::{DOWNSCALE, Dataset, DepthOptions, LoadOptions, MeasuredSize};
 use crate::photographs::tone::ToneSettings;
+use crate::photographs::white_balance::WhiteBalance;
 use crate::splats::densify::DensityControl;
 use crate::splats::halves::StorageFormat;
 use crate::splats::optimizer::Schedule;
@@ -71,6 +72,11 @@ pub struct TrainConfig {
     init: Option<PathBuf> = None, "the dataset's points" => Rule::PATH, "--init MODEL.ply";
     /// Masks (masks/NAME.png or masks/NAME.jpg.png of the dataset) hide what is white, not what is black.
     invert_masks: bool = false => Rule::Flag, "--invert-masks";
+    /// Balance the photographs' white before they are measured: gains R,G,B of linear light; the colour temperature of the
+    /// light in kelvin; VIEW,x,y,w,h, a grey card or another neutral area of one photograph, in its pixels as it is stored; or
+    /// VIEW,x1,y1,..,x4,y4, the corners of a ColorChecker there, from the dark skin patch round by the blue-green, the black and
+    /// the white one.
+    white_balance: Option<WhiteBalance> = None, "none" => WHITE_BALANCE, "--white-balance WHITE";
     /// Undistort the photographs of a fisheye to a pinhole's, cropped to 60 degrees off its axis, in place of training on
     /// the fisheye as it is; those of other distorted lenses are always undistorted.
     undistort: bool = false => Rule::Flag, "--undistort";
@@ -163,6 +169,9 @@ const MEMORY: Rule = Rule::Text("a size of memory: bytes, or 512M, 4G, 1.5G", |t
     text.parse::<CacheSize>().is_ok()
 });
 
+const WHITE_BALANCE: Rule =
+    Rule::Text(WhiteBalance::FORM, |text| text.parse::<WhiteBalance>().is_ok());
+
 const MINUTES: Rule = Rule::from_to(0.0, 1e9);
 
 settings! {
@@ -252,6 +261,7 @@ impl TrainConfig {
             keep: CacheSize::on_host(self.cache, self.max_ram),
             reference: self.reference.clone(),
             invert_masks: self.invert_masks,
+            white_balance: self.white_balance.clone(),
             undistort: self.undistort,
             measured: if self.tone.lift_first { MeasuredSize::Own } else { MeasuredSize::Loaded },
             hold_out: self.stop.views,

@@ -4,6 +4,7 @@
 
 mod as_it_is;
 mod bad_input;
+mod colours;
 mod photographs;
 #[cfg(feature = "cli")]
 mod pose;

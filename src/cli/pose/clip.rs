@@ -25,7 +25,7 @@ pub(super) fn frames(
     folder: &Path,
 ) -> Result<Vec<PathBuf>> {
     create(folder)?;
-    let filter = format!("fps={}", fps * CANDIDATES as f64);
+    let filter = format!("fps={}{}", fps * CANDIDATES as f64, to_standard_range(ffmpeg, clip)?);
     let pattern = folder.join("frame_%06d.png");
     ffmpeg.run(
         "",
@@ -58,6 +58,46 @@ pub(super) fn frames(
         }
     }
     Ok(kept)
+}
+
+/// ffmpeg's filters that make sRGB of linear light above which nothing is white: HLG and PQ put that at 203 cd/m2 (BT.2408).
+/// What is brighter is clipped; a curve for it would change what is dark, too.
+const STANDARD_RANGE: &str = "zscale=t=linear:npl=203,format=gbrpf32le,zscale=p=bt709,tonemap=clip:desat=0,\
+                              zscale=t=iec61966-2-1:m=gbr:r=full,format=gbrp16le";
+
+/// The filters behind `fps` that a clip of high dynamic range needs; empty for another. Frames of wide primaries say so
+/// themselves, and are converted where they are read.
+///
+/// # Errors
+/// [`Error::Input`] with the command to run where this ffmpeg has no such filters.
+fn to_standard_range(ffmpeg: &Tool<'_>, clip: &Path) -> Result<String> {
+    let transfer = ffmpeg.probed(clip, "color_transfer");
+    let range = match transfer.as_deref() {
+        Some("arib-std-b67") => "HLG",
+        Some("smpte2084") => "PQ",
+        Some(_) => return Ok(String::new()),
+        None => {
+            tracing::warn!(
+                "{}: ffprobe, which comes with ffmpeg, does not tell its colours; they count as SDR",
+                clip.display()
+            );
+            return Ok(String::new());
+        }
+    };
+    let has = |filter: &str| ffmpeg.helps_with(&["-hide_banner", "-filters"], filter);
+    if !has(" zscale ") || !has(" tonemap ") {
+        let path = clip.display();
+        let problem = format!(
+            "is HDR ({range}), and this ffmpeg has no filters zscale and tonemap; with one that has: ffmpeg -i {path} -vf \
+             {STANDARD_RANGE},format=yuv444p -color_primaries bt709 -color_trc iec61966-2-1 -crf 10 sdr.mp4"
+        );
+        return Err(Error::input(clip, problem));
+    }
+    tracing::info!(
+        "{}: HDR ({range}) converted to sRGB, what is brighter than its white is clipped",
+        clip.display()
+    );
+    Ok(format!(",{STANDARD_RANGE}"))
 }
 
 /// How much detail a frame has for its brightness: the mean absolute second difference over the mean. Of frames of

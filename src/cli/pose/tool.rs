@@ -56,6 +56,18 @@ impl<'a> Tool<'a> {
         })
     }
 
+    /// What ffprobe, beside this ffmpeg, tells of the first video stream of a clip; `None` where it tells nothing.
+    pub(super) fn probed(&self, clip: &Path, entry: &str) -> Option<String> {
+        let name = self.path.file_name()?.to_str()?.replace("ffmpeg", "ffprobe");
+        let arguments =
+            ["-v", "error", "-select_streams", "v:0", "-of", "default=nokey=1:noprint_wrappers=1"];
+        let mut process = Command::new(self.path.with_file_name(name));
+        process.args(arguments).arg("-show_entries").arg(format!("stream={entry}")).arg(clip);
+        let output = process.stdin(Stdio::null()).output().ok()?;
+        let text = String::from_utf8(output.stdout).ok()?;
+        output.status.success().then(|| text.lines().next().unwrap_or_default().to_owned())
+    }
+
     /// Runs one of its commands to its end.
     ///
     /// # Errors

@@ -22,6 +22,7 @@ use crate::photographs::tone::{
     CurveChoice, Exposure, GainChoice, Measured, Profile, Scene, Statistics, ToneCurve,
     ToneSettings, all_black,
 };
+use crate::photographs::white_balance::WhiteBalance;
 use crate::results::eval;
 use crate::results::report::Distribution;
 use crate::{Error, Result};
@@ -56,6 +57,9 @@ pub struct ApplyArgs {
     /// One curve for all: percentiles and means are averaged over the training photographs
     #[arg(long)]
     pub scene_statistics: bool,
+    /// Balance the photographs' white before they are measured, as `train` has it: R,G,B, kelvin, VIEW,x,y,w,h or VIEW,x1,y1,..,x4,y4
+    #[arg(long, value_name = "WHITE")]
+    pub white_balance: Option<WhiteBalance>,
     /// Normal-light photographs to score against: a folder with the same names, or a file for one photograph
     #[arg(long, value_name = "DIR|FILE")]
     pub reference: Option<PathBuf>,

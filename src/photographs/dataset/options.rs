@@ -4,6 +4,7 @@ use std::ops::Bound;
 use std::path::PathBuf;
 
 use crate::base::settings::Rule;
+use crate::photographs::white_balance::WhiteBalance;
 use crate::{Error, Result};
 
 /// The factors by which photographs may shrink.
@@ -30,6 +31,8 @@ pub struct LoadOptions {
     pub hold_out: usize,
     /// Masks hide what is white, not what is black.
     pub invert_masks: bool,
+    /// Gains of the channels of the photographs; reference images stay as they are.
+    pub white_balance: Option<WhiteBalance>,
     /// At which size training photographs are measured while they are decoded, if they are not kept at that size.
     pub measured: MeasuredSize,
     /// Photographs of a fisheye are undistorted to a pinhole's, too, as those of every other lens are; without it the
@@ -73,6 +76,7 @@ impl Default for LoadOptions {
             load_low_test: true,
             hold_out: 0,
             invert_masks: false,
+            white_balance: None,
             measured: MeasuredSize::default(),
             undistort: false,
             depth: DepthOptions::default(),

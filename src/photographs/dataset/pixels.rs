@@ -16,8 +16,9 @@ use super::undistort::WIDEST;
 use super::{LoadOptions, MeasuredSize, Split, View};
 use crate::base::hash::Hasher;
 use crate::camera::{Camera, Lens};
-use crate::photographs::image::{Image, Mask, Orientation, PictureFile};
+use crate::photographs::image::{ColourTally, Image, Mask, Orientation, PictureFile};
 use crate::photographs::tone::Measured;
+use crate::photographs::white_balance::WhiteBalanceGains;
 use crate::{Error, Result};
 
 /// The shortest side that leaves something to train on, pixels.
@@ -33,7 +34,7 @@ pub(crate) type Look<'a> = &'a (dyn Fn(&str, &Image, Option<&Mask>) + Sync);
 pub(super) fn load(
     sources: Vec<Source>,
     options: &LoadOptions,
-    look: Option<Look<'_>>,
+    (look, gains): (Option<Look<'_>>, Option<WhiteBalanceGains>),
     skipped: &mut Vec<String>,
 ) -> Result<Vec<View>> {
     let memory = Allowance::new(MOST_READ);
@@ -55,7 +56,9 @@ pub(super) fn load(
     let largest = groups.iter().map(|(lens, _)| pixel_count((lens.width, lens.height))).max();
     let at_once = Image::decoded_at_once(largest.unwrap_or_default());
     let originals = Allowance::new(bytes_for_originals(&groups, options));
-    let loading = Loading { options, at_once, look, originals: &originals };
+    let colours = [ColourTally::default(), ColourTally::of("reference image")];
+    let originals = &originals;
+    let loading = Loading { options, at_once, look, gains, originals, colours: &colours };
     let mut loaded: Vec<Loaded> = vec![];
     while !groups.is_empty() {
         // What was read goes with its group.
@@ -63,6 +66,7 @@ pub(super) fn load(
         let now = now.into_par_iter().map(|(lens, group)| load_group(&lens, group, &loading));
         loaded.extend(now.collect::<Result<Vec<_>>>()?.into_iter().flatten());
     }
+    colours.iter().for_each(ColourTally::say);
     loaded.sort_by(|a, b| a.name.cmp(&b.name));
     let mut views = Vec::with_capacity(loaded.len());
     for Loaded { view, problems, .. } in loaded {
@@ -78,8 +82,12 @@ struct Loading<'a> {
     /// How many photographs are decoded side by side.
     at_once: usize,
     look: Option<Look<'a>>,
+    /// White balance of the photographs.
+    gains: Option<WhiteBalanceGains>,
     /// For photographs at their own size.
     originals: &'a Allowance,
+    /// What was made of the colours of photographs and of reference images.
+    colours: &'a [ColourTally; 2],
 }
 
 /// Bytes that `keep` leaves for photographs at their own size, where a curve is applied to those: it needs the statistics
@@ -231,8 +239,13 @@ impl ViewLoader<'_> {
             source;
         let (options, [read, read_reference]) = (loading.options, read);
         let mut problems = Vec::new();
-        let photograph = self.decode((input, read), &mut problems)?;
-        let reference = self.decode((reference, read_reference), &mut problems)?;
+        let [colours, reference_colours] = loading.colours;
+        let mut photograph = self.decode((input, read), colours, &mut problems)?;
+        if let (Some(gains), Some(photograph)) = (loading.gains, &mut photograph) {
+            gains.apply(&mut photograph.image);
+        }
+        let reference =
+            self.decode((reference, read_reference), reference_colours, &mut problems)?;
         let stored_mask = match photograph.as_ref().or(reference.as_ref()) {
             Some(Decoded { path, image, alpha, orientation }) => {
                 let decoded = (image, alpha.as_ref());
@@ -278,6 +291,7 @@ impl ViewLoader<'_> {
     fn decode(
         &self,
         (path, read): (Option<PathBuf>, Option<Arc<PictureFile>>),
+        colours: &ColourTally,
         problems: &mut Vec<String>,
     ) -> Result<Option<Decoded>> {
         let lens = self.preparation.lens;
@@ -287,7 +301,7 @@ impl ViewLoader<'_> {
         if let Ok(file) = &file {
             check_size(&path, file, lens)?;
         }
-        match file.and_then(PictureFile::decode) {
+        match file.and_then(|file| file.decode_counted(colours)) {
             Ok((image, alpha)) => {
                 let orientation = turn(&path, (image.width, image.height), lens);
                 Ok(Some(Decoded { path, image, alpha, orientation }))
@@ -311,6 +325,7 @@ impl ViewLoader<'_> {
             return Ok((Some(whole), None));
         }
         let mut original = Original::new(path, *preparation.lens, options.undistort);
+        original.gains = loading.gains;
         let measured = |image: &Image| match mask {
             Some(mask) => Measured::of(&mask.counted(image)),
             None => Measured::of(&image.data),

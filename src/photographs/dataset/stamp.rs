@@ -23,6 +23,7 @@ impl Dataset {
         let Listing { mut frames, mut skipped, .. } = list(root, &files)?;
         split(root, &mut frames, options.test_every, &files)?;
         let mut hasher = Hasher::default();
+        hasher.write(READING);
         for source in sources(root, &frames, options, &files, &mut skipped) {
             // Debug tells every two cameras apart.
             let view = format!("{} {:?} {:?}", source.name, source.split, source.lens);
@@ -45,6 +46,9 @@ impl Dataset {
         Ok(hash::text(hasher.finish()))
     }
 }
+
+/// Of how files are read: another where the same file gives other pixels than before.
+const READING: &[u8] = b"in sRGB";
 
 fn write_file(hasher: &mut Hasher, path: &Path) {
     hasher.write(path.as_os_str().as_encoded_bytes());

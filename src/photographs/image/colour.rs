@@ -4,19 +4,19 @@
 //! sRGB = encode(M decode(stored))      decode: a curve per channel; M: linear light of the file's primaries to sRGB's
 //! ```
 //!
-//! Profiles of tables go through moxcms whole. What is sRGB to one code value of 8 bits keeps its values to the bit. What is
-//! converted is rounded to multiples of 1/65535: fine enough under any tone curve, and 16 bits keep it.
+//! Of a profile that has tables as well, the matrix is used; one of tables alone cannot be. What is sRGB to one code value of
+//! 8 bits keeps its values to the bit. What is converted is rounded to multiples of 1/65535: fine enough under any tone curve,
+//! and 16 bits keep it.
 
 mod metadata;
 mod tally;
-
-use std::sync::Arc;
+#[cfg(test)]
+mod tests;
 
 use glam::{DMat3, DVec3};
 use moxcms::{
-    Chromaticity, CicpColorPrimaries, CicpProfile, ColorPrimaries, ColorProfile, DataColorSpace,
-    Layout, MatrixCoefficients, ProfileText, RenderingIntent, ToneReprCurve,
-    TransferCharacteristics, TransformF32Executor, TransformOptions,
+    CicpColorPrimaries, CicpProfile, ColorProfile, DataColorSpace, MatrixCoefficients, ProfileText,
+    ToneReprCurve, TransferCharacteristics,
 };
 use rayon::prelude::*;
 
@@ -35,6 +35,8 @@ pub(crate) struct Conversion {
     pub(crate) unknown: Option<String>,
 }
 
+/// So far two matrices between linear colours may differ by what files round.
+const ROUNDING: f64 = 2e-3;
 /// Steps from 0 to 1 of what is converted.
 const LEVELS: f32 = 65_535.0;
 
@@ -62,7 +64,7 @@ pub(super) fn convert_linear(image: &mut Image, chromaticities: Chromaticities) 
         let unknown = Some("chromaticities of no primaries".to_owned());
         return Conversion { from: None, unknown };
     };
-    if matrix.abs_diff_eq(DMat3::IDENTITY, 2e-3) {
+    if matrix.abs_diff_eq(DMat3::IDENTITY, ROUNDING) {
         return Conversion::default();
     }
     let count = image.pixel_count();
@@ -85,32 +87,47 @@ pub(super) fn convert_linear(image: &mut Image, chromaticities: Chromaticities) 
 
 /// The matrix from linear light of these primaries to that of sRGB; none where the primaries are none.
 fn to_srgb(chromaticities: Chromaticities) -> Option<DMat3> {
-    let [white, red, green, blue] =
-        chromaticities.map(|[x, y]| Chromaticity { x: x as f32, y: y as f32 });
-    matrix_of(ColorProfile::colorants_matrix(white.to_xyyb(), ColorPrimaries { red, green, blue }))
+    from_d50(to_d50(chromaticities))
 }
 
-/// From colorants at D50 to linear sRGB.
-fn matrix_of(colorants: moxcms::Matrix3d) -> Option<DMat3> {
-    let matrix = |rows: moxcms::Matrix3d| DMat3::from_cols_array_2d(&rows.v).transpose();
-    let srgb = matrix(ColorProfile::new_srgb().colorant_matrix());
-    let result = srgb.inverse() * matrix(colorants);
+/// The matrix to linear sRGB of colorants, XYZ at D50 as a profile has them.
+fn from_d50(colorants: DMat3) -> Option<DMat3> {
+    const D65: [f64; 2] = [0.3127, 0.3290];
+    const SRGB: Chromaticities = [D65, [0.64, 0.33], [0.30, 0.60], [0.15, 0.06]];
+    let result = to_d50(SRGB).inverse() * colorants;
     (result.is_finite() && result.determinant().abs() > 1e-6).then_some(result)
+}
+
+/// XYZ at D50 of linear red, green and blue, adapted by Bradford's matrix (ICC.1:2022, annex E).
+fn to_d50([white, red, green, blue]: Chromaticities) -> DMat3 {
+    const BRADFORD: DMat3 = DMat3::from_cols(
+        DVec3::new(0.8951, -0.7502, 0.0389),
+        DVec3::new(0.2664, 1.7135, -0.0685),
+        DVec3::new(-0.1614, 0.0367, 1.0296),
+    );
+    const D50: DVec3 = DVec3::new(0.9642, 1.0, 0.8249);
+    let xyz = |[x, y]: [f64; 2]| DVec3::new(x / y, 1.0, (1.0 - x - y) / y);
+    let primaries = DMat3::from_cols(xyz(red), xyz(green), xyz(blue));
+    let luminances = primaries.inverse() * xyz(white);
+    let adaptation = (BRADFORD * D50) / (BRADFORD * xyz(white));
+    let adapted = BRADFORD.inverse() * DMat3::from_diagonal(adaptation) * BRADFORD;
+    adapted * primaries * DMat3::from_diagonal(luminances)
+}
+
+/// The colorants of a profile.
+fn colorants(profile: &ColorProfile) -> DMat3 {
+    DMat3::from_cols_array_2d(&profile.colorant_matrix().v).transpose()
 }
 
 type Curve = Box<dyn Fn(f32) -> f32 + Send + Sync>;
 
 /// How stored values become sRGB.
-enum Transform {
-    /// Each channel through its curve to linear light, and that through a matrix.
-    Shaper { curves: [Curve; 3], matrix: DMat3 },
-    /// Red, green and blue through tables.
-    Tables(Arc<TransformF32Executor>),
-}
-
 struct ColourSpace {
     name: String,
-    transform: Transform,
+    /// Of each channel to linear light.
+    curves: [Curve; 3],
+    /// From there to the linear light of sRGB.
+    matrix: DMat3,
 }
 
 impl ColourSpace {
@@ -135,7 +152,7 @@ impl ColourSpace {
     }
 
     fn shaper(name: &str, curves: [Curve; 3], matrix: DMat3) -> Self {
-        Self { name: name.to_owned(), transform: Transform::Shaper { curves, matrix } }
+        Self { name: name.to_owned(), curves, matrix }
     }
 
     fn of_profile(profile: ColorProfile) -> Result<Self, String> {
@@ -152,28 +169,14 @@ impl ColourSpace {
         };
         match profile.color_space {
             DataColorSpace::Gray => {
-                let curves =
-                    curves([&profile.gray_trc; 3]).ok_or_else(|| unusable("has no curve"))?;
+                let curves = curves([&profile.gray_trc; 3]).ok_or_else(|| unusable("no curve"))?;
                 Ok(Self::shaper(&name, curves, DMat3::IDENTITY))
             }
-            DataColorSpace::Rgb if has_tables(&profile) => {
-                let srgb = ColorProfile::new_srgb();
-                let options = TransformOptions {
-                    rendering_intent: RenderingIntent::RelativeColorimetric,
-                    ..TransformOptions::default()
-                };
-                let tables = profile.create_transform_f32(Layout::Rgb, &srgb, Layout::Rgb, options);
-                let tables = tables.map_err(|_| unusable("its tables are damaged"))?;
-                Ok(Self { name, transform: Transform::Tables(tables) })
-            }
             DataColorSpace::Rgb => {
-                let matrix = profile
-                    .is_matrix_shaper()
-                    .then(|| matrix_of(profile.colorant_matrix()))
-                    .flatten();
+                let matrix =
+                    profile.is_matrix_shaper().then(|| from_d50(colorants(&profile))).flatten();
                 let curves = curves([&profile.red_trc, &profile.green_trc, &profile.blue_trc]);
-                let parts =
-                    matrix.zip(curves).ok_or_else(|| unusable("has neither matrix nor tables"))?;
+                let parts = matrix.zip(curves).ok_or_else(|| unusable("no matrix and curves"))?;
                 let name = known_name(parts.0).map_or(name, str::to_owned);
                 Ok(Self::shaper(&name, parts.1, parts.0))
             }
@@ -192,15 +195,21 @@ impl ColourSpace {
         let (Some(color_primaries), Some(transfer)) = (color_primaries, transfer) else {
             return Err(unusable("reserved"));
         };
-        match transfer {
+        let is_srgb_curve = match transfer {
             TransferCharacteristics::Smpte2084 | TransferCharacteristics::Hlg => {
                 return Err(unusable("high dynamic range"));
             }
             TransferCharacteristics::Reserved | TransferCharacteristics::Unspecified => {
                 return Err(unusable("no transfer function"));
             }
-            _ => {}
-        }
+            // Video is graded on a display, and every player shows it as if it were sRGB.
+            TransferCharacteristics::Bt709
+            | TransferCharacteristics::Bt601
+            | TransferCharacteristics::Bt202010bit
+            | TransferCharacteristics::Bt202012bit
+            | TransferCharacteristics::Srgb => true,
+            _ => false,
+        };
         let matrix_coefficients = MatrixCoefficients::Identity;
         let points = CicpProfile {
             color_primaries,
@@ -208,10 +217,12 @@ impl ColourSpace {
             matrix_coefficients,
             full_range: true,
         };
-        let matrix = matrix_of(ColorProfile::new_from_cicp(points).colorant_matrix());
+        let matrix = from_d50(colorants(&ColorProfile::new_from_cicp(points)));
         let matrix = matrix.ok_or_else(|| unusable("no primaries"))?;
-        let curve =
-            |_| Box::new(move |value: f32| transfer.linearize(f64::from(value)) as f32) as Curve;
+        let curve = |_| match is_srgb_curve {
+            true => srgb_curve(),
+            false => Box::new(move |value: f32| transfer.linearize(f64::from(value)) as f32),
+        };
         let name =
             known_name(matrix).map_or_else(|| format!("code points {primaries}"), str::to_owned);
         Ok(Self::shaper(&name, std::array::from_fn(curve), matrix))
@@ -228,9 +239,12 @@ impl ColourSpace {
             None => DMat3::IDENTITY,
         };
         let known = known_name(matrix);
-        // 1/2.2 is what the curve of sRGB is written as where there is no chunk for it; Display P3 has the same.
-        let is_srgb_curve = |&exponent: &f64| {
-            (exponent - 2.2).abs() < 0.03 && [Some("sRGB"), Some("Display P3")].contains(&known)
+        // Where there is no chunk for it, the curve of sRGB and Display P3 is written as 1/2.2, and ffmpeg writes that of video,
+        // which is shown as if it were sRGB, as 1/1.961.
+        let is_srgb_curve = |exponent: &f64| {
+            let is_near = |of: f64, by: f64| (exponent - of).abs() < by;
+            is_near(1.961, 0.005)
+                || is_near(2.2, 0.03) && [Some("sRGB"), Some("Display P3")].contains(&known)
         };
         let exponent = exponent.filter(|exponent| !is_srgb_curve(exponent));
         let curve = |_| match exponent {
@@ -249,37 +263,23 @@ impl ColourSpace {
         Ok(Self::shaper(&name, std::array::from_fn(curve), matrix))
     }
 
-    /// Whether it moves no colour by more than a code value of 8 bits.
+    /// Whether its primaries are sRGB's to a rounding, and it moves no grey by more than a code value of 8 bits.
     fn is_srgb(&self) -> bool {
-        let greys = (0..=255).map(|code| [code as f32 / 255.0; 3]);
-        let colours = (0..216)
-            .map(|index| [index % 6, index / 6 % 6, index / 36].map(|step| step as f32 / 5.0));
-        let colours: Vec<[f32; 3]> = greys.chain(colours).collect();
-        let mut converted: Vec<f32> = colours.concat();
-        self.convert(&mut converted);
-        let moved = |(before, after): (&f32, &f32)| (before - after).abs() > 1.0 / 255.0;
-        !colours.as_flattened().iter().zip(&converted).any(moved)
+        let greys: Vec<f32> = (0..=255).map(|code| code as f32 / 255.0).collect();
+        let moves = |grey: &f32| {
+            let mut converted = [*grey; 3];
+            self.convert(&mut converted);
+            converted.iter().any(|value| (value - grey).abs() > 1.0 / 255.0)
+        };
+        self.matrix.abs_diff_eq(DMat3::IDENTITY, ROUNDING) && !greys.iter().any(moves)
     }
 
     /// Converts pixels of red, green and blue, unclamped.
     fn convert(&self, pixels: &mut [f32]) {
-        match &self.transform {
-            Transform::Shaper { curves, matrix } => {
-                for pixel in pixels.as_chunks_mut::<3>().0 {
-                    let linear =
-                        [0, 1, 2].map(|channel| f64::from(curves[channel](pixel[channel])));
-                    *pixel = (*matrix * DVec3::from_array(linear))
-                        .to_array()
-                        .map(|value| encode(value as f32));
-                }
-            }
-            Transform::Tables(tables) => {
-                let stored = pixels.to_vec();
-                // Its lengths are those that it asks for.
-                if tables.transform(&stored, pixels).is_err() {
-                    pixels.copy_from_slice(&stored);
-                }
-            }
+        for pixel in pixels.as_chunks_mut::<3>().0 {
+            let linear = [0, 1, 2].map(|channel| f64::from(self.curves[channel](pixel[channel])));
+            let linear = self.matrix * DVec3::from_array(linear);
+            *pixel = linear.to_array().map(|value| encode(value as f32));
         }
     }
 
@@ -322,10 +322,6 @@ fn srgb_curve() -> Curve {
     Box::new(linear_from_srgb)
 }
 
-fn has_tables(profile: &ColorProfile) -> bool {
-    profile.lut_a_to_b_colorimetric.is_some() || profile.lut_a_to_b_perceptual.is_some()
-}
-
 /// What a profile calls itself, in quotes.
 fn description(profile: &ColorProfile) -> Option<String> {
     const MOST: usize = 60;
@@ -350,7 +346,7 @@ fn known_name(matrix: DMat3) -> Option<&'static str> {
         ("Rec. 2020", ColorProfile::new_bt2020()),
     ];
     let is_near = |profile: &ColorProfile| {
-        matrix_of(profile.colorant_matrix()).is_some_and(|own| own.abs_diff_eq(matrix, 0.01))
+        from_d50(colorants(&profile)).is_some_and(|own| own.abs_diff_eq(matrix, 0.01))
     };
     known.into_iter().find(|(_, profile)| is_near(profile)).map(|(name, _)| name)
 }

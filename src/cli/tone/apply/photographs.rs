@@ -8,6 +8,7 @@ use crate::cli::ImageFormat;
 use crate::photographs::dataset::{Dataset, LoadOptions, Photograph, Split};
 use crate::photographs::image::files::{photographs_in, unread_in};
 use crate::photographs::image::{ColourTally, Image, Mask, Orientation, PictureFile};
+use crate::photographs::white_balance::WhiteBalanceGains;
 use crate::{Error, Result};
 
 /// A photograph to map.
@@ -22,6 +23,7 @@ pub(super) struct Listed {
     pub(super) mask: Option<PathBuf>,
     /// The file to write.
     pub(super) target: Option<PathBuf>,
+    pub(super) gains: Option<WhiteBalanceGains>,
 }
 
 impl Listed {
@@ -32,7 +34,10 @@ impl Listed {
         inverted: bool,
         colours: &ColourTally,
     ) -> Result<(Image, Vec<usize>)> {
-        let (image, alpha) = PictureFile::open(&self.input)?.decode_counted(colours)?;
+        let (mut image, alpha) = PictureFile::open(&self.input)?.decode_counted(colours)?;
+        if let Some(gains) = self.gains {
+            gains.apply(&mut image);
+        }
         let decoded = (&image, alpha.as_ref());
         let mask = Mask::over(&self.input, decoded, self.mask.as_deref(), inverted)?;
         let hidden = mask.as_ref().map(Mask::hidden).unwrap_or_default();
@@ -75,6 +80,7 @@ pub(super) fn listed(args: &ApplyArgs) -> Result<Vec<Listed>> {
             mask,
             split: Some(split),
             target: None,
+            gains: None,
         };
         Dataset::photographs(input, &options)?.into_iter().map(of_view).collect()
     } else {
@@ -87,6 +93,10 @@ pub(super) fn listed(args: &ApplyArgs) -> Result<Vec<Listed>> {
     if photographs.is_empty() {
         return Err(Error::input(input, "holds no PNG, JPEG, WebP, TIFF or EXR image"));
     }
+    let named = || photographs.iter().map(|one| (one.name.as_str(), one.input.as_path()));
+    let balance = args.white_balance.as_ref();
+    let gains = balance.map(|balance| balance.gains(input, named())).transpose()?;
+    photographs.iter_mut().for_each(|photograph| photograph.gains = gains);
     if let Some(out) = &args.out {
         set_targets(&mut photographs, out, args.format)?;
     }
@@ -109,7 +119,8 @@ fn plain(input: &Path, reference: Option<&Path>) -> Result<Listed> {
     let file = input.file_name().unwrap_or_default().to_string_lossy();
     let candidates = [format!("{name}.png"), format!("{file}.png")].map(|mask| masks.join(mask));
     let mask = candidates.into_iter().find(|mask| mask.is_file());
-    Ok(Listed { name, input: input.to_owned(), reference, split: None, mask, target: None })
+    let input = input.to_owned();
+    Ok(Listed { name, input, reference, split: None, mask, target: None, gains: None })
 }
 
 /// The file that each is written to, all different and none of them a photograph.

@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use std::io::{Cursor, Read};
 
 use ::exif::{Context, Exif, In, Reader, Tag, Value};
-use ::image::ImageDecoder;
+use ::image::{ImageDecoder, ImageFormat};
 use flate2::read::ZlibDecoder;
 
 use super::super::jpeg;
@@ -46,11 +46,12 @@ pub(super) fn statements(bytes: &[u8]) -> Vec<Statement> {
     } else if bytes.starts_with(&PNG) {
         of_png(bytes)
     } else {
-        embedded_profile(bytes).map(Statement::Profile).into_iter().collect()
+        webp_profile(bytes).map(Statement::Profile).into_iter().collect()
     };
     // Nothing overrules sRGB, which every file is taken for.
     let is_settled = statements.last() == Some(&Statement::Srgb);
     if !is_settled && let Ok(exif) = Reader::new().read_from_container(&mut Cursor::new(bytes)) {
+        statements.extend(tiff_profile(&exif));
         statements.extend(of_exif(&exif));
     }
     statements
@@ -78,10 +79,21 @@ fn jpeg_profile(bytes: &[u8]) -> Option<Statement> {
     Some(if is_whole { profile() } else { cut() })
 }
 
-/// The profile of a TIFF or a WebP.
-fn embedded_profile(bytes: &[u8]) -> Option<Vec<u8>> {
-    let mut decoder = reader(Cursor::new(bytes)).ok()?.into_decoder().ok()?;
-    decoder.icc_profile().ok().flatten()
+fn webp_profile(bytes: &[u8]) -> Option<Vec<u8>> {
+    let reader = reader(Cursor::new(bytes)).ok()?;
+    if reader.format() != Some(ImageFormat::WebP) {
+        return None;
+    }
+    reader.into_decoder().ok()?.icc_profile().ok()?
+}
+
+/// The profile of a TIFF, whose tags are read as Exif is.
+fn tiff_profile(exif: &Exif) -> Option<Statement> {
+    const PROFILE: Tag = Tag(Context::Tiff, 0x8773);
+    match &exif.get_field(PROFILE, In::PRIMARY)?.value {
+        Value::Undefined(bytes, _) | Value::Byte(bytes) => Some(Statement::Profile(bytes.clone())),
+        _ => Some(Statement::Unknown("a damaged ICC profile".to_owned())),
+    }
 }
 
 /// The chunks of a PNG before its pixels.

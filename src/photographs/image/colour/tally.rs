@@ -6,8 +6,18 @@ use std::sync::{Mutex, PoisonError};
 use super::Conversion;
 
 /// Counts conversions, from any thread.
-#[derive(Debug, Default)]
-pub(crate) struct ColourTally(Mutex<Counts>);
+#[derive(Debug)]
+pub(crate) struct ColourTally {
+    /// What is counted, in the singular.
+    what: &'static str,
+    counts: Mutex<Counts>,
+}
+
+impl Default for ColourTally {
+    fn default() -> Self {
+        Self::of("photograph")
+    }
+}
 
 #[derive(Debug, Default)]
 struct Counts {
@@ -21,9 +31,14 @@ struct Counts {
 const SMALL: f64 = 0.01;
 
 impl ColourTally {
+    /// Of things of this name.
+    pub(crate) fn of(what: &'static str) -> Self {
+        Self { what, counts: Mutex::default() }
+    }
+
     /// Counts a photograph.
     pub(crate) fn add(&self, conversion: Conversion) {
-        let mut counts = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut counts = self.counts.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some((space, outside)) = conversion.from {
             let (count, sum) = counts.converted.entry(space).or_default();
             *count += 1;
@@ -36,37 +51,33 @@ impl ColourTally {
 
     /// Says what was counted.
     pub(crate) fn say(&self) {
-        let counts = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let (notes, warnings) = counts.lines();
+        let (notes, warnings) = self.lines();
         notes.iter().for_each(|line| tracing::info!("{line}"));
         warnings.iter().for_each(|line| tracing::warn!("{line}"));
     }
-}
 
-impl Counts {
     /// What was converted, and what is wrong.
-    fn lines(&self) -> (Vec<String>, Vec<String>) {
-        let converted = |(space, (count, _)): (&String, &(usize, f64))| {
-            format!("{} in {space} converted to sRGB", photographs(*count))
-        };
-        let clipped = self.converted.iter().filter_map(|(space, &(count, sum))| {
-            let outside = sum / count as f64;
-            let percent = 100.0 * outside;
-            let whose = photographs(count);
-            (outside > SMALL)
-                .then(|| format!("{percent:.0} % of the pixels of {whose} in {space} lie outside sRGB and are clipped to it"))
-        });
-        let unknown = |(problem, count): (&String, &usize)| {
-            let whose = photographs(*count);
-            format!(
-                "{whose} with {problem}: the colours are read as sRGB; convert the files to sRGB if they are not"
-            )
-        };
-        let warnings = clipped.chain(self.unknown.iter().map(unknown)).collect();
-        (self.converted.iter().map(converted).collect(), warnings)
+    pub(super) fn lines(&self) -> (Vec<String>, Vec<String>) {
+        let counts = self.counts.lock().unwrap_or_else(PoisonError::into_inner);
+        let these =
+            |count: usize| format!("{count} {}{}", self.what, if count == 1 { "" } else { "s" });
+        let (mut notes, mut warnings) = (vec![], vec![]);
+        for (space, &(count, sum)) in &counts.converted {
+            let (whose, outside) = (these(count), sum / count as f64);
+            notes.push(format!("{whose} in {space} converted to sRGB"));
+            if outside > SMALL {
+                let percent = 100.0 * outside;
+                warnings.push(format!(
+                    "{percent:.0} % of the pixels of {whose} in {space} lie outside sRGB and are clipped to it"
+                ));
+            }
+        }
+        for (problem, &count) in &counts.unknown {
+            let whose = these(count);
+            warnings.push(format!(
+                "{whose} with {problem}, which is not used; convert the files if their colours are not sRGB"
+            ));
+        }
+        (notes, warnings)
     }
-}
-
-fn photographs(count: usize) -> String {
-    format!("{count} photograph{}", if count == 1 { "" } else { "s" })
 }
