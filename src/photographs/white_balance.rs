@@ -46,7 +46,7 @@ const GAINS: std::ops::RangeInclusive<f64> = 1e-3..=1e3;
 
 impl WhiteBalance {
     /// What a white balance is written as.
-    pub const FORM: &'static str = "R,G,B of 0.001 to 1000, a colour temperature of 2000 to 25000 (kelvin), VIEW,x,y,w,h of a \
+    pub(crate) const FORM: &'static str = "R,G,B of 0.001 to 1000, a colour temperature of 2000 to 25000 (kelvin), VIEW,x,y,w,h of a \
                                     neutral area in whole pixels, or VIEW,x1,y1,..,x4,y4, the corners of a colour chart";
 
     /// The gains, measured where they have to be in one of the photographs of `root`, each with its name.
@@ -427,7 +427,7 @@ mod tests {
             ("v2,1,2,3,4", "no photograph is called `v2`"),
             ("v1,58,2,3,4", "leaves the photograph, which is 60x40"),
             ("v1,1,65536,3,4", "leaves the photograph"),
-            ("v1,-5,0,40,0,40,30,0,30", "leaves the photograph"),
+            ("v1,-5,0,40,0,40,30,-5,30", "leaves the photograph"),
             ("v1,1,2,3,4", "is black"),
             ("v1,40,2,3,4", "is clipped"),
         ] {

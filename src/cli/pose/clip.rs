@@ -25,7 +25,9 @@ pub(super) fn frames(
     folder: &Path,
 ) -> Result<Vec<PathBuf>> {
     create(folder)?;
-    let filter = format!("fps={}{}", fps * CANDIDATES as f64, to_standard_range(ffmpeg, clip)?);
+    let transfer = ffmpeg.probed(clip, "color_transfer");
+    let filters = filters(ffmpeg, clip, transfer.as_deref().unwrap_or_default())?;
+    let filter = format!("fps={}{filters}", fps * CANDIDATES as f64);
     let pattern = folder.join("frame_%06d.png");
     ffmpeg.run(
         "",
@@ -42,6 +44,12 @@ pub(super) fn frames(
     let frames = photographs_in(folder)?;
     if frames.is_empty() {
         return Err(Error::input(clip, "holds no frame that ffmpeg can decode"));
+    }
+    if transfer.is_none() {
+        tracing::warn!(
+            "{}: ffprobe, which comes with ffmpeg, does not tell its colours; it is taken for SDR",
+            clip.display()
+        );
     }
     let sharpness = frames.par_iter().map(|frame| Ok(sharpness(&Image::load(frame)?)));
     let sharpness = sharpness.collect::<Result<Vec<f64>>>()?;
@@ -65,24 +73,16 @@ pub(super) fn frames(
 const STANDARD_RANGE: &str = "zscale=t=linear:npl=203,format=gbrpf32le,zscale=p=bt709,tonemap=clip:desat=0,\
                               zscale=t=iec61966-2-1:m=gbr:r=full,format=gbrp16le";
 
-/// The filters behind `fps` that a clip of high dynamic range needs; empty for another. Frames of wide primaries say so
-/// themselves, and are converted where they are read.
+/// The filters after `fps` for a clip of this transfer function: those above for high dynamic range. Frames of wide primaries
+/// say so themselves, and are converted where they are read.
 ///
 /// # Errors
 /// [`Error::Input`] with the command to run where this ffmpeg has no such filters.
-fn to_standard_range(ffmpeg: &Tool<'_>, clip: &Path) -> Result<String> {
-    let transfer = ffmpeg.probed(clip, "color_transfer");
-    let range = match transfer.as_deref() {
-        Some("arib-std-b67") => "HLG",
-        Some("smpte2084") => "PQ",
-        Some(_) => return Ok(String::new()),
-        None => {
-            tracing::warn!(
-                "{}: ffprobe, which comes with ffmpeg, does not tell its colours; they count as SDR",
-                clip.display()
-            );
-            return Ok(String::new());
-        }
+fn filters(ffmpeg: &Tool<'_>, clip: &Path, transfer: &str) -> Result<String> {
+    let range = match transfer {
+        "arib-std-b67" => "HLG",
+        "smpte2084" => "PQ",
+        _ => return Ok(String::new()),
     };
     let has = |filter: &str| ffmpeg.helps_with(&["-hide_banner", "-filters"], filter);
     if !has(" zscale ") || !has(" tonemap ") {
@@ -93,8 +93,8 @@ fn to_standard_range(ffmpeg: &Tool<'_>, clip: &Path) -> Result<String> {
         );
         return Err(Error::input(clip, problem));
     }
-    tracing::info!(
-        "{}: HDR ({range}) converted to sRGB, what is brighter than its white is clipped",
+    tracing::warn!(
+        "{}: HDR ({range}) converted to sRGB; what is brighter than its white is clipped",
         clip.display()
     );
     Ok(format!(",{STANDARD_RANGE}"))

@@ -10,7 +10,8 @@ use ::image::{
     error::UnsupportedErrorKind,
 };
 
-use super::colour::{self, ColourTally, Conversion};
+use super::colour::{self, ColourTally};
+use super::decoded::{Decoded, Meaning};
 #[cfg(not(feature = "raw"))]
 use super::files::RAW_REMEDY;
 use super::files::{HEIC_REMEDY, is_raw};
@@ -65,28 +66,6 @@ impl PictureFile {
         let Decoded { image, alpha, conversion } = decode(&self.path, self.bytes, Meaning::Colour)?;
         tally.add(conversion);
         Ok((image, alpha))
-    }
-}
-
-/// What the numbers of a file are.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Meaning {
-    /// Colours, which become sRGB.
-    Colour,
-    /// Something else, such as a depth or a mask, which is taken as it is stored.
-    Number,
-}
-
-/// What a file holds.
-pub(super) struct Decoded {
-    pub(super) image: Image,
-    pub(super) alpha: Option<Image>,
-    pub(super) conversion: Conversion,
-}
-
-impl Decoded {
-    fn as_stored(image: Image, alpha: Option<Image>) -> Self {
-        Self { image, alpha, conversion: Conversion::default() }
     }
 }
 

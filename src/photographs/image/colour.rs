@@ -45,8 +45,8 @@ pub(super) fn convert(image: &mut Image, bytes: &[u8]) -> Conversion {
     let mut unknown = None;
     for statement in statements(bytes) {
         match ColourSpace::of(&statement) {
-            Ok(space) if space.is_srgb() => return Conversion { from: None, unknown },
-            Ok(space) => {
+            Ok(None) => return Conversion { from: None, unknown },
+            Ok(Some(space)) => {
                 let outside = space.apply(image);
                 return Conversion { from: Some((space.name, outside)), unknown };
             }
@@ -131,33 +131,30 @@ struct ColourSpace {
 }
 
 impl ColourSpace {
+    /// `None` of sRGB.
+    ///
     /// # Errors
     /// What cannot be used, in words.
-    fn of(statement: &Statement) -> Result<Self, String> {
-        match statement {
-            Statement::Srgb => {
-                Ok(Self::shaper("sRGB", std::array::from_fn(|_| srgb_curve()), DMat3::IDENTITY))
-            }
-            Statement::AdobeRgb => Self::of_profile(ColorProfile::new_adobe_rgb()),
+    fn of(statement: &Statement) -> Result<Option<Self>, String> {
+        let space = match statement {
+            Statement::Srgb => return Ok(None),
+            Statement::AdobeRgb => Self::of_profile(&ColorProfile::new_adobe_rgb()),
             Statement::Profile(bytes) => {
                 let profile = ColorProfile::new_from_slice(bytes);
-                Self::of_profile(profile.map_err(|_| "a damaged ICC profile".to_owned())?)
+                Self::of_profile(&profile.map_err(|_| "a damaged ICC profile".to_owned())?)
             }
             &Statement::CodePoints(points) => Self::of_code_points(points),
             &Statement::Primaries { chromaticities, exponent } => {
                 Self::of_primaries(chromaticities, exponent)
             }
             Statement::Unknown(problem) => Err(problem.clone()),
-        }
+        };
+        space.map(|space| (!space.is_srgb()).then_some(space))
     }
 
-    fn shaper(name: &str, curves: [Curve; 3], matrix: DMat3) -> Self {
-        Self { name: name.to_owned(), curves, matrix }
-    }
-
-    fn of_profile(profile: ColorProfile) -> Result<Self, String> {
-        let said = description(&profile);
-        let name = said.clone().unwrap_or_else(|| "an ICC profile without a name".to_owned());
+    fn of_profile(profile: &ColorProfile) -> Result<Self, String> {
+        let name =
+            description(profile).unwrap_or_else(|| "an ICC profile without a name".to_owned());
         let unusable = |why: &str| format!("the ICC profile {name} ({why})");
         let curve = |curve: &Option<ToneReprCurve>| {
             let evaluator = curve.as_ref()?.make_linear_evaluator().ok()?;
@@ -170,15 +167,17 @@ impl ColourSpace {
         match profile.color_space {
             DataColorSpace::Gray => {
                 let curves = curves([&profile.gray_trc; 3]).ok_or_else(|| unusable("no curve"))?;
-                Ok(Self::shaper(&name, curves, DMat3::IDENTITY))
+                Ok(Self { name, curves, matrix: DMat3::IDENTITY })
             }
             DataColorSpace::Rgb => {
                 let matrix =
-                    profile.is_matrix_shaper().then(|| from_d50(colorants(&profile))).flatten();
+                    profile.is_matrix_shaper().then(|| from_d50(colorants(profile))).flatten();
                 let curves = curves([&profile.red_trc, &profile.green_trc, &profile.blue_trc]);
-                let parts = matrix.zip(curves).ok_or_else(|| unusable("no matrix and curves"))?;
-                let name = known_name(parts.0).map_or(name, str::to_owned);
-                Ok(Self::shaper(&name, parts.1, parts.0))
+                let (matrix, curves) =
+                    matrix.zip(curves).ok_or_else(|| unusable("no matrix and curves"))?;
+                // Of sRGB's primaries with another curve, their name says nothing.
+                let known = known_name(matrix).filter(|known| *known != "sRGB");
+                Ok(Self { name: known.map_or(name, str::to_owned), curves, matrix })
             }
             other => Err(unusable(&format!("for {other:?}, not for RGB"))),
         }
@@ -211,21 +210,21 @@ impl ColourSpace {
             _ => false,
         };
         let matrix_coefficients = MatrixCoefficients::Identity;
-        let points = CicpProfile {
+        let profile = CicpProfile {
             color_primaries,
             transfer_characteristics: transfer,
             matrix_coefficients,
             full_range: true,
         };
-        let matrix = from_d50(colorants(&ColorProfile::new_from_cicp(points)));
+        let matrix = from_d50(colorants(&ColorProfile::new_from_cicp(profile)));
         let matrix = matrix.ok_or_else(|| unusable("no primaries"))?;
         let curve = |_| match is_srgb_curve {
             true => srgb_curve(),
             false => Box::new(move |value: f32| transfer.linearize(f64::from(value)) as f32),
         };
-        let name =
-            known_name(matrix).map_or_else(|| format!("code points {primaries}"), str::to_owned);
-        Ok(Self::shaper(&name, std::array::from_fn(curve), matrix))
+        let known = known_name(matrix).filter(|known| *known != "sRGB");
+        let name = known.map_or_else(|| format!("code points {points:?}"), str::to_owned);
+        Ok(Self { name, curves: std::array::from_fn(curve), matrix })
     }
 
     fn of_primaries(
@@ -260,55 +259,49 @@ impl ColourSpace {
             }
             _ => primaries.to_owned(),
         };
-        Ok(Self::shaper(&name, std::array::from_fn(curve), matrix))
+        Ok(Self { name, curves: std::array::from_fn(curve), matrix })
     }
 
     /// Whether its primaries are sRGB's to a rounding, and it moves no grey by more than a code value of 8 bits.
     fn is_srgb(&self) -> bool {
-        let greys: Vec<f32> = (0..=255).map(|code| code as f32 / 255.0).collect();
-        let moves = |grey: &f32| {
-            let mut converted = [*grey; 3];
-            self.convert(&mut converted);
+        let moves = |code: u8| {
+            let grey = f32::from(code) / 255.0;
+            let converted = self.encoded(self.curves.each_ref().map(|curve| curve(grey)));
             converted.iter().any(|value| (value - grey).abs() > 1.0 / 255.0)
         };
-        self.matrix.abs_diff_eq(DMat3::IDENTITY, ROUNDING) && !greys.iter().any(moves)
+        self.matrix.abs_diff_eq(DMat3::IDENTITY, ROUNDING) && !(0..=255).any(moves)
     }
 
-    /// Converts pixels of red, green and blue, unclamped.
-    fn convert(&self, pixels: &mut [f32]) {
-        for pixel in pixels.as_chunks_mut::<3>().0 {
-            let linear = [0, 1, 2].map(|channel| f64::from(self.curves[channel](pixel[channel])));
-            let linear = self.matrix * DVec3::from_array(linear);
-            *pixel = linear.to_array().map(|value| encode(value as f32));
-        }
+    /// A pixel of linear light of this space in sRGB, unclamped.
+    fn encoded(&self, linear: [f32; 3]) -> [f32; 3] {
+        let linear = self.matrix * DVec3::from_array(linear.map(f64::from));
+        linear.to_array().map(|value| encode(value as f32))
     }
 
     /// Converts an image; gives the fraction of its pixels that sRGB does not hold, and clamps them.
     fn apply(&self, image: &mut Image) -> f64 {
-        /// Pixels that a thread converts in one go.
-        const PIXELS: usize = 1 << 14;
         /// So far beyond 0 or 1 a value is no rounding.
         const MARGIN: f32 = 1.0 / 255.0;
+        // Every value of a file of 8 or 16 bits is one of these.
+        let levels = || (0..=LEVELS as u32).map(|level| level as f32 / LEVELS);
+        let tables = self.curves.each_ref().map(|curve| levels().map(curve).collect::<Vec<f32>>());
         let count = image.pixel_count();
-        let [red, green, blue] = [0, 1, 2].map(|plane| &image.data[plane * count..][..count]);
-        let converted = |first: usize| {
-            let pixels = first..(first + PIXELS).min(count);
-            let mut values: Vec<f32> =
-                pixels.flat_map(|at| [red[at], green[at], blue[at]]).collect();
-            self.convert(&mut values);
-            values
+        let linear = |channel: usize, at: usize| {
+            tables[channel][(image.data[channel * count + at] * LEVELS).round() as usize]
         };
-        let starts: Vec<usize> = (0..count).step_by(PIXELS).collect();
-        let mut interleaved: Vec<f32> = starts.into_par_iter().flat_map_iter(converted).collect();
+        let pixels: Vec<[f32; 3]> = (0..count)
+            .into_par_iter()
+            .map(|at| self.encoded([linear(0, at), linear(1, at), linear(2, at)]))
+            .collect();
         // Positive phrasing: a NaN is outside.
         let is_held = |&value: &f32| value >= -MARGIN && value <= 1.0 + MARGIN;
-        let outside =
-            interleaved.chunks_exact(3).filter(|pixel| !pixel.iter().all(is_held)).count();
-        for value in &mut interleaved {
-            let inside = if *value > 0.0 { value.min(1.0) } else { 0.0 };
-            *value = (inside * LEVELS).round() / LEVELS;
+        let outside = pixels.iter().filter(|pixel| !pixel.iter().all(is_held)).count();
+        for (plane, values) in image.data.chunks_exact_mut(count.max(1)).enumerate() {
+            for (value, pixel) in values.iter_mut().zip(&pixels) {
+                let inside = if pixel[plane] > 0.0 { pixel[plane].min(1.0) } else { 0.0 };
+                *value = (inside * LEVELS).round() / LEVELS;
+            }
         }
-        *image = super::from_interleaved(image.width, image.height, &interleaved);
         outside as f64 / count.max(1) as f64
     }
 }
@@ -346,7 +339,7 @@ fn known_name(matrix: DMat3) -> Option<&'static str> {
         ("Rec. 2020", ColorProfile::new_bt2020()),
     ];
     let is_near = |profile: &ColorProfile| {
-        from_d50(colorants(&profile)).is_some_and(|own| own.abs_diff_eq(matrix, 0.01))
+        from_d50(colorants(profile)).is_some_and(|own| own.abs_diff_eq(matrix, 0.01))
     };
     known.into_iter().find(|(_, profile)| is_near(profile)).map(|(name, _)| name)
 }

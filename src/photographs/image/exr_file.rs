@@ -5,8 +5,8 @@ use std::path::Path;
 
 use exr::prelude::{ReadChannels, ReadLayers, SpecificChannels, Vec2, WritableImage};
 
-use super::codec::{Decoded, Meaning};
 use super::colour::{self, Chromaticities, Conversion};
+use super::decoded::{Decoded, Meaning};
 use super::source::{Source, not_an_image};
 use super::{Image, srgb_from_linear};
 use crate::base::output::write_whole;

@@ -123,8 +123,8 @@ fn a_white_balance_that_cannot_be_is_refused_in_a_line() {
     lamp_lit(root);
     let out = root.join("run");
     for (white, code, part) in [
-        ("0,1,1", 2, "white_balance is 0,1,1; it must be R,G,B"),
-        ("warm", 2, "white_balance is warm"),
+        ("0,1,1", 2, "white_balance (--white-balance) is \"0,1,1\"; it must be R,G,B"),
+        ("warm", 2, "(--white-balance) is \"warm\""),
         ("v99,2,2,5,5", 3, "no photograph is called `v99`"),
         ("v03,39,2,5,5", 2, "it leaves the photograph, which is 40x30"),
     ] {

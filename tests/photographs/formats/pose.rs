@@ -420,7 +420,9 @@ fn a_clip_of_high_dynamic_range_or_wide_primaries_gives_the_frames_of_a_plain_on
 fn an_ffmpeg_without_the_filters_for_a_wide_range_names_the_command() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
-    script(&root.join("ffmpeg"), "exit 0");
+    dark_picture(1).save_png8(root.join("source.png")).unwrap();
+    let copy = format!("for last; do :; done; cp {}/source.png $(printf $last 1)", root.display());
+    script(&root.join("ffmpeg"), &copy);
     script(&root.join("ffprobe"), "echo arib-std-b67");
     fs::write(root.join("clip.mov"), "a clip").unwrap();
     let [clip, out, ffmpeg] = ["clip.mov", "scene", "ffmpeg"].map(|name| root.join(name));
@@ -434,7 +436,7 @@ fn an_ffmpeg_without_the_filters_for_a_wide_range_names_the_command() {
     refused(&arguments, 3, &parts);
     script(&root.join("ffprobe"), "exit 1");
     let (_, said) = run(&arguments, 3);
-    assert!(said.contains("ffprobe") && said.contains("count as SDR"), "{said}");
+    assert!(said.contains("ffprobe") && said.contains("taken for SDR"), "{said}");
 }
 
 #[test]

@@ -51,33 +51,30 @@ impl ColourTally {
 
     /// Says what was counted.
     pub(crate) fn say(&self) {
-        let (notes, warnings) = self.lines();
-        notes.iter().for_each(|line| tracing::info!("{line}"));
-        warnings.iter().for_each(|line| tracing::warn!("{line}"));
+        self.lines().iter().for_each(|line| tracing::warn!("{line}"));
     }
 
-    /// What was converted, and what is wrong.
-    pub(super) fn lines(&self) -> (Vec<String>, Vec<String>) {
+    pub(super) fn lines(&self) -> Vec<String> {
         let counts = self.counts.lock().unwrap_or_else(PoisonError::into_inner);
         let these =
             |count: usize| format!("{count} {}{}", self.what, if count == 1 { "" } else { "s" });
-        let (mut notes, mut warnings) = (vec![], vec![]);
+        let mut lines = vec![];
         for (space, &(count, sum)) in &counts.converted {
             let (whose, outside) = (these(count), sum / count as f64);
-            notes.push(format!("{whose} in {space} converted to sRGB"));
+            lines.push(format!("{whose} in {space} converted to sRGB"));
             if outside > SMALL {
                 let percent = 100.0 * outside;
-                warnings.push(format!(
+                lines.push(format!(
                     "{percent:.0} % of the pixels of {whose} in {space} lie outside sRGB and are clipped to it"
                 ));
             }
         }
         for (problem, &count) in &counts.unknown {
             let whose = these(count);
-            warnings.push(format!(
+            lines.push(format!(
                 "{whose} with {problem}, which is not used; convert the files if their colours are not sRGB"
             ));
         }
-        (notes, warnings)
+        lines
     }
 }

@@ -78,7 +78,6 @@ fn spaces() -> [([[f64; 2]; 4], Encoding, &'static str); 5] {
 #[test]
 fn a_profile_of_matrix_and_curve_gives_the_colours_back_from_png_and_tiff() {
     for (space, curve, name) in spaces() {
-        let name = if name == "\"of a test\"" { "sRGB" } else { name };
         let (colours, profile) = (in_space(space, curve), matrix_profile(space, curve));
         // Sixteen bits of a power of 2.2 are coarse near black.
         holds_the_colours(&png(&colours, &[(b"iCCP", iccp(&profile))]), name, 3e-4);
@@ -317,18 +316,13 @@ fn many_files_are_told_in_a_line_for_each_colour_space() {
             tally.add(Conversion { from, unknown: unknown.map(str::to_owned) });
         }
     }
-    let (notes, warnings) = tally.lines();
-    assert_eq!(
-        notes,
-        [
-            "3 photographs in Adobe RGB converted to sRGB",
-            "1 photograph in Display P3 converted to sRGB"
-        ]
-    );
-    assert!(
-        warnings[0].starts_with("12 % of the pixels of 1 photograph in Display P3"),
-        "{warnings:?}"
-    );
-    assert!(warnings[1].starts_with("2 photographs with a damaged ICC profile"), "{warnings:?}");
-    assert_eq!(warnings.len(), 2);
+    let lines = tally.lines();
+    let begins = [
+        "3 photographs in Adobe RGB converted to sRGB",
+        "1 photograph in Display P3 converted to sRGB",
+        "12 % of the pixels of 1 photograph in Display P3",
+        "2 photographs with a damaged ICC profile",
+    ];
+    assert_eq!(lines.len(), begins.len(), "{lines:?}");
+    assert!(lines.iter().zip(begins).all(|(line, begin)| line.starts_with(begin)), "{lines:?}");
 }
