@@ -80,8 +80,8 @@ mod sort_upsweep;
 pub mod splat;
 pub mod ssim;
 mod structure_l1;
-mod window_gather;
-mod window_scatter;
+mod crop_gather;
+mod crop_scatter;
 
 use glam::UVec2;
 

@@ -16,7 +16,7 @@ pub mod attributes;
 pub mod batches;
 #[cfg(feature = "io")]
 pub mod densify;
-pub mod halves;
+pub mod packed_sh;
 #[cfg(feature = "io")]
 pub mod optimizer;
 pub mod render;

@@ -136,7 +136,7 @@ fn looking(center: DVec3, target: DVec3, up: DVec3) -> DAffine3 {
 /// The point with the least squared distances to the optical axes; none where they are as good as parallel.
 fn nearest_to_axes(poses: &[Camera]) -> Option<DVec3> {
     /// Less of the cameras' turns says nothing of a distance.
-    const LEAST_DETERMINANT: f64 = 1e-6;
+    const MIN_DETERMINANT: f64 = 1e-6;
     let (mut matrix, mut vector) = (DMat3::ZERO, DVec3::ZERO);
     for pose in poses {
         let axis = forward(pose);
@@ -146,7 +146,7 @@ fn nearest_to_axes(poses: &[Camera]) -> Option<DVec3> {
         vector += across * pose.center();
     }
     let matrix = matrix * (1.0 / poses.len() as f64);
-    let is_definite = matrix.determinant() > LEAST_DETERMINANT;
+    let is_definite = matrix.determinant() > MIN_DETERMINANT;
     is_definite.then(|| matrix.inverse() * (vector / poses.len() as f64))
 }
 

@@ -165,7 +165,7 @@ fn page(
     let mut frame = config.frame.unwrap_or_default();
     let title = format!("{} by nightsplat", provenance.dataset);
     let bookmarks = if has_networks(config) {
-        let FinishedRun { mut player, dataset, .. } = FinishedRun::open_with(
+        let FinishedRun { mut model_renderer, dataset, .. } = FinishedRun::open_with(
             &args.run,
             args.dataset.as_deref(),
             args.device.as_ref(),
@@ -174,7 +174,7 @@ fn page(
             },
         )?;
         bookmarks(args, gaussians.origin, &dataset, |view| {
-            let networks = player.render(view)?.output().clone();
+            let networks = model_renderer.render(view)?.output().clone();
             Ok(Some(("model with its networks".to_owned(), networks)))
         })?
     } else {

@@ -30,8 +30,8 @@ use crate::photographs::white_balance::WhiteBalanceGains;
 use crate::{Error, Result};
 use geometry::Shared;
 pub use noise::Noise;
-use photograph::Measured;
-pub use plan::{Number, Plan, PlannedViews, Switch};
+use photograph::PhotographStatistics;
+pub use plan::{PlannedNumber, Plan, PlannedViews, PlannedPart};
 pub use target_noise::TargetNoise;
 
 /// A view this many times as blurred as the median is named, and at least so many pixels more.
@@ -96,7 +96,7 @@ pub struct SceneDiagnosis {
     /// 0.18 / the mean light.
     pub darkening: f64,
     /// How many times brighter the targets would be than the photographs; below 1.5 no curve is needed.
-    pub lift: f64,
+    pub brightening: f64,
     /// The gain that the rule of `--curve auto` finds, of encoded values.
     pub gain: f64,
     /// Standard deviation over the views of their exposure, stops; where the points do not tell, of the gain that each asks
@@ -270,7 +270,7 @@ fn read(
 /// A photograph and what was measured of it.
 struct Photograph {
     size: [u32; 2],
-    measured: Measured,
+    measured: PhotographStatistics,
     histogram: LuminanceHistogram,
     noise_in_target: Option<TargetNoise>,
 }
@@ -298,7 +298,7 @@ impl Photograph {
         let exposure = Exposure::of([&histogram], None);
         Self {
             size: [image.width, image.height],
-            measured: Measured::of(image, counted),
+            measured: PhotographStatistics::of(image, counted),
             noise_in_target: exposure.and_then(|own| target_noise::target_noise(image, &own)),
             histogram,
         }
@@ -356,7 +356,7 @@ impl SceneDiagnosis {
             cubic_mean: mean(|view| view.cubic_mean),
             light,
             darkening: darkening(light),
-            lift: exposure.lift(),
+            brightening: exposure.brightening(),
             gain: exposure.gain,
             exposure_spread: measured.unwrap_or(exposure.spread / std::f64::consts::LN_2),
             spread_is_measured: measured.is_some(),

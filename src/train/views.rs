@@ -13,16 +13,16 @@ use super::measuring::{TargetExposure, measured, photographs};
 use super::precision::Encoder;
 use super::{TrainConfig, streams};
 use crate::base::random::Stream;
-use crate::camera::{Camera, Frame, Patch};
+use crate::camera::{Camera, TrainingFrame, Patch};
 use crate::gpu::{Buffer, Download, Gpu, Recorder};
 use crate::kernels::ToneParameters;
 use crate::loss::ViewSource;
 use crate::loss::exposure::Affine;
-use crate::networks::Form;
+use crate::networks::NetworkVariant;
 use crate::photographs::dataset::{Dataset, Point};
 use crate::photographs::image::Image;
 use crate::photographs::pseudo_gt::PseudoGt;
-use crate::photographs::tone::Scene;
+use crate::photographs::tone::SceneTone;
 use crate::splats::render::{Viewpoint, Viewpoints};
 use crate::splats::scene::{COLOR_CHANNELS, Feature, Gaussians, Shape, init};
 use crate::{Error, Result};
@@ -88,9 +88,9 @@ impl Views {
         gpu: &Gpu,
         pseudo_gt: &PseudoGt,
         dataset: &Dataset,
-        frame: &Frame,
+        frame: &TrainingFrame,
         config: &TrainConfig,
-    ) -> Result<(Self, Scene, Option<TargetExposure>)> {
+    ) -> Result<(Self, SceneTone, Option<TargetExposure>)> {
         let settings = pseudo_gt.settings().clone();
         let keeps_photographs = config.model.denoiser || config.model.tonemapper;
         let (scene, measured) = measured(&settings, dataset)?;
@@ -101,18 +101,18 @@ impl Views {
         views.resize_with(config.schedule.resolution_levels(), Vec::<TrainView>::new);
         let (mut gains, mut curves) = (BTreeMap::new(), vec![]);
         for (place, ((index, view), measured)) in photographs(dataset).zip(&measured).enumerate() {
-            let lift = settings.lift(&scene, measured);
-            gains.extend(lift.gain.map(|gain| (view.name.clone(), gain)));
-            curves.push(lift.parameters);
+            let tone_mapping = settings.tone_mapping(&scene, measured);
+            gains.extend(tone_mapping.gain.map(|gain| (view.name.clone(), gain)));
+            curves.push(tone_mapping.parameters);
             let Some(image) = view.loaded()? else { continue };
             let own = UVec2::new(image.width, image.height);
             let sizes = (0..views.len()).map(|level| shrunk(own, level as u32));
             let sizes: Vec<UVec2> = sizes.collect();
             // What is trained on at its own size gets its curve in every step.
-            let own = view.own_size().filter(|_| settings.lift_first);
+            let own = view.own_size().filter(|_| settings.full_resolution);
             let is_larger = own.filter(|own| sizes.iter().any(|size| size != own));
             let whole = if is_larger.is_some() { view.photograph()? } else { None };
-            let whole = whole.map(|whole| pseudo_gt.lifted(&whole, &lift)).transpose()?;
+            let whole = whole.map(|whole| pseudo_gt.tone_mapped(&whole, &tone_mapping)).transpose()?;
             for (views, size) in views.iter_mut().zip(sizes) {
                 let resized = |whole: &Image| view.blacked_out(whole.resized(size.x, size.y));
                 let camera = frame.camera(&view.camera).resized(size.x, size.y);
@@ -120,7 +120,7 @@ impl Views {
                 let is_as_loaded =
                     size == UVec2::new(image.width, image.height) && patches.len() == 1;
                 let depth = view.depth.as_ref().filter(|_| !is_as_loaded);
-                let print = Print {
+                let print = LevelImage {
                     name: &view.name,
                     place,
                     index,
@@ -156,7 +156,7 @@ impl Views {
     ///
     /// # Errors
     /// Photographs that wait in a file cannot be read, or the device is out of memory or lost.
-    pub(super) fn bring(
+    pub(super) fn make_resident(
         &mut self,
         config: &TrainConfig,
         steps: RangeInclusive<u64>,
@@ -181,7 +181,7 @@ impl Views {
             }
             last = step;
         }
-        self.cache.bring(&wanted)?;
+        self.cache.make_resident(&wanted)?;
         Ok(last)
     }
 
@@ -240,13 +240,13 @@ impl Views {
         gpu: &Gpu,
         pseudo_gt: &PseudoGt,
         views: &[TrainView],
-        shown: Shown,
+        kind: ImageKind,
     ) -> Result<Vec<Vec<f32>>> {
         let (mut stored, mut scratch) = (vec![], vec![]);
         for view in views {
-            let slot = view.photograph.filter(|_| shown == Shown::Photographs);
+            let slot = view.photograph.filter(|_| kind == ImageKind::Photographs);
             let photograph = self.cache.load(slot.unwrap_or(view.stored))?;
-            let curve = self.curve(view).filter(|_| shown == Shown::Targets);
+            let curve = self.curve(view).filter(|_| kind == ImageKind::Targets);
             scratch.push(gpu.uninit("target", photograph.value_count)?);
             stored.push((photograph, curve));
         }
@@ -328,7 +328,7 @@ impl Views {
     }
 
     /// How many floats the largest view has.
-    pub(super) fn most_values(&self) -> usize {
+    pub(super) fn largest_view_values(&self) -> usize {
         let values = |view: &TrainView| COLOR_CHANNELS * view.size().element_product() as usize;
         self.all().map(values).max().unwrap_or_default()
     }
@@ -339,7 +339,7 @@ impl Views {
     }
 
     /// Warns of every view in which none of the first Gaussians, given in the frame, has its mean: most often its pose is wrong.
-    pub(super) fn say_what_shows_nothing(&self, gaussians: &Gaussians) {
+    pub(super) fn warn_of_empty_views(&self, gaussians: &Gaussians) {
         let means: Vec<DVec3> = gaussians.means().iter().map(|mean| mean.as_dvec3()).collect();
         for TrainView { name, patch, .. } in self.photographs() {
             if !scattered(means.len()).any(|at| patch.camera.sees(means[at]).is_some()) {
@@ -366,10 +366,10 @@ impl Views {
         &self,
         dataset: &'a Dataset,
         config: &TrainConfig,
-        frame: &Frame,
+        frame: &TrainingFrame,
     ) -> Cow<'a, [Point]> {
         let own = &dataset.points;
-        let wanted = if own.is_empty() { config.random_points } else { config.density.few() };
+        let wanted = if own.is_empty() { config.random_points } else { config.density.sparse_threshold() };
         let count = wanted.min(config.max_gaussians).saturating_sub(own.len());
         if count == 0 {
             return own.into();
@@ -397,7 +397,7 @@ impl Views {
         let frame = config.frame.unwrap_or_default();
         let points = self.points(dataset, config, &frame);
         let kept = &points[..points.len().min(config.max_gaussians)];
-        let fitting = config.render_settings().most_gaussians(gpu);
+        let fitting = config.render_settings().peak_gaussians(gpu);
         if kept.len() > fitting {
             let (of, device) = (kept.len(), &gpu.properties().name);
             tracing::warn!("{fitting} of {of} points begin as Gaussians: {device} binds no more");
@@ -406,7 +406,7 @@ impl Views {
         // Of the views of the dataset, the place of each among those that are trained on.
         let mut places = vec![None; dataset.views.len()];
         self.photographs().for_each(|view| places[view.index] = Some(view.place));
-        let mut targets = Pictures::new(self, gpu, pseudo_gt, Shown::Targets);
+        let mut targets = ImageBatches::new(self, gpu, pseudo_gt, ImageKind::Targets);
         let colors = init::colors_from_views(kept, &dataset.views, |index| {
             let Some(place) = places[index] else { return Ok(None) };
             let target = targets.next(place)?;
@@ -418,9 +418,9 @@ impl Views {
         let shape = Shape { sh_degree: config.sh_degree, features: config.model.features() };
         let mut gaussians =
             Gaussians::from_points(&positions, &colors, shape, &config.start, seed)?;
-        if config.model.network.form == Form::Identity {
+        if config.model.network.variant == NetworkVariant::Identity {
             let low = if shape.features.illumination {
-                let mut photographs = Pictures::new(self, gpu, pseudo_gt, Shown::Photographs);
+                let mut photographs = ImageBatches::new(self, gpu, pseudo_gt, ImageKind::Photographs);
                 init::colors_from_views(kept, &dataset.views, |index| {
                     places[index].map(|place| photographs.next(place)).transpose()
                 })?
@@ -435,7 +435,7 @@ impl Views {
 
 /// What is looked at of a view.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Shown {
+pub(super) enum ImageKind {
     /// What it is held to.
     Targets,
     /// What it was made of; only where that is kept.
@@ -443,25 +443,25 @@ pub(super) enum Shown {
 }
 
 /// Pictures of the photographs one after the other, made several at a time.
-struct Pictures<'a> {
+struct ImageBatches<'a> {
     views: &'a Views,
     gpu: &'a Gpu,
     pseudo_gt: &'a PseudoGt,
-    shown: Shown,
+    kind: ImageKind,
     /// By place.
     made: BTreeMap<usize, Image>,
 }
 
-impl<'a> Pictures<'a> {
-    fn new(views: &'a Views, gpu: &'a Gpu, pseudo_gt: &'a PseudoGt, shown: Shown) -> Self {
-        Self { views, gpu, pseudo_gt, shown, made: BTreeMap::new() }
+impl<'a> ImageBatches<'a> {
+    fn new(views: &'a Views, gpu: &'a Gpu, pseudo_gt: &'a PseudoGt, kind: ImageKind) -> Self {
+        Self { views, gpu, pseudo_gt, kind, made: BTreeMap::new() }
     }
 
     /// That of a place; those before are gone.
     fn next(&mut self, place: usize) -> Result<Image> {
         /// Of those that are made at a time.
-        const MOST_PIXELS: usize = 1 << 20;
-        let Self { views, gpu, pseudo_gt, shown, ref mut made } = *self;
+        const MAX_PIXELS: usize = 1 << 20;
+        let Self { views, gpu, pseudo_gt, kind, ref mut made } = *self;
         if !made.contains_key(&place) {
             let mut pixels = 0;
             let whole = views.whole();
@@ -470,10 +470,10 @@ impl<'a> Pictures<'a> {
             let now = after.take_while(|view| {
                 let is_first = pixels == 0;
                 pixels += Patch::from(&view.patch.camera).pixel_count();
-                is_first || pixels <= MOST_PIXELS
+                is_first || pixels <= MAX_PIXELS
             });
             let last = now.last().map_or(place, |view| view.place);
-            let images = views.pictures(gpu, pseudo_gt, place..last + 1, shown)?;
+            let images = views.pictures(gpu, pseudo_gt, place..last + 1, kind)?;
             *made = (place..).zip(images).collect();
         }
         let gone = || Error::Usage(format!("there is no photograph {place} to train on"));
@@ -482,7 +482,7 @@ impl<'a> Pictures<'a> {
 }
 
 /// A photograph at the size of a level.
-struct Print<'a> {
+struct LevelImage<'a> {
     name: &'a str,
     place: usize,
     index: usize,
@@ -495,7 +495,7 @@ struct Print<'a> {
     depth: Option<Vec<f32>>,
 }
 
-impl Print<'_> {
+impl LevelImage<'_> {
     fn view(&self, patch: Patch, encoder: &mut Encoder, cache: &mut Cache) -> Result<TrainView> {
         let mut upload =
             |name, image: &Image| cache.keep(encoder.upload(name, &patch.cut(&image.data))?);

@@ -12,7 +12,7 @@ use crate::Result;
 use crate::base::hash::Hasher;
 use crate::camera::Lens;
 use crate::photographs::image::{Image, PictureFile};
-use crate::photographs::tone::Measured;
+use crate::photographs::tone::MeasuredPhotograph;
 use crate::photographs::white_balance::WhiteBalanceGains;
 
 /// A photograph that was shrunk on loading, or is not kept.
@@ -26,7 +26,7 @@ pub struct Original {
     /// White balance of a photograph.
     pub(super) gains: Option<WhiteBalanceGains>,
     /// The statistics of the photograph, and of which size.
-    pub(super) measured: Option<(MeasuredSize, Measured)>,
+    pub(super) measured: Option<(MeasuredSize, MeasuredPhotograph)>,
     /// Of the pixels as they are loaded, where they are not kept.
     pub(super) checksum: Option<Hasher>,
     /// The photograph at its own size, if memory allows, until it is released.
@@ -71,7 +71,7 @@ impl Original {
     }
 
     /// The statistics at a size, if they were measured while the photograph was decoded.
-    pub(crate) fn measured(&self, size: MeasuredSize) -> Option<&Measured> {
+    pub(crate) fn measured(&self, size: MeasuredSize) -> Option<&MeasuredPhotograph> {
         self.measured.as_ref().filter(|(own, _)| *own == size).map(|(_, measured)| measured)
     }
 

@@ -62,9 +62,9 @@ impl PictureFile {
     ///
     /// # Errors
     /// As [`Image::load`].
-    pub(crate) fn decode_counted(self, tally: &ColourTally) -> Result<(Image, Option<Image>)> {
+    pub(crate) fn decode_counted(self, counters: &ColourTally) -> Result<(Image, Option<Image>)> {
         let Decoded { image, alpha, conversion } = decode(&self.path, self.bytes, Meaning::Colour)?;
-        tally.add(conversion);
+        counters.add(conversion);
         Ok((image, alpha))
     }
 }
@@ -177,8 +177,8 @@ impl Image {
     ///
     /// # Errors
     /// As [`Image::load`].
-    pub(crate) fn load_counted(path: &Path, tally: &ColourTally) -> Result<Self> {
-        Ok(PictureFile::open(path)?.decode_counted(tally)?.0)
+    pub(crate) fn load_counted(path: &Path, counters: &ColourTally) -> Result<Self> {
+        Ok(PictureFile::open(path)?.decode_counted(counters)?.0)
     }
 
     /// The same for numbers that are no colour, such as depth: they are taken as they are stored, also negative ones of EXR.

@@ -9,7 +9,7 @@
 //! and 16 bits keep it.
 
 mod metadata;
-mod tally;
+mod counters;
 #[cfg(test)]
 mod tests;
 
@@ -23,7 +23,7 @@ use rayon::prelude::*;
 pub(super) use self::metadata::Chromaticities;
 use self::metadata::{Statement, statements};
 use super::{Image, linear_from_srgb, srgb_from_linear};
-pub(crate) use tally::ColourTally;
+pub(crate) use counters::ColourTally;
 
 /// What was made of the colours of a file.
 #[derive(Clone, Debug, Default, PartialEq)]

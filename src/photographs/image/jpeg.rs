@@ -44,8 +44,8 @@ pub(super) fn segments(bytes: &[u8]) -> impl Iterator<Item = (u8, &[u8])> {
         if marker == 0xDA || length < 2 {
             return None;
         }
-        let (segment, behind) = rest.split_at_checked(2 + length)?;
-        rest = behind;
+        let (segment, after) = rest.split_at_checked(2 + length)?;
+        rest = after;
         Some((marker, &segment[4..]))
     })
 }

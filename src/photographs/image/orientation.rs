@@ -19,13 +19,13 @@ impl Orientation {
 
     /// What a file says; upright where it says nothing.
     pub fn of(path: &Path) -> Self {
-        let said = || {
+        let tagged = || {
             let file = File::open(path).ok()?;
             let exif = Reader::new().read_from_container(&mut BufReader::new(file)).ok()?;
             let value = exif.get_field(Tag::Orientation, In::PRIMARY)?.value.get_uint(0)?;
             u8::try_from(value).ok().filter(|value| (1..=8).contains(value))
         };
-        said().map_or(Self::UPRIGHT, Self)
+        tagged().map_or(Self::UPRIGHT, Self)
     }
 
     /// Width and height behind turning.

@@ -61,10 +61,11 @@ fn photographs_and_references_become_srgb_and_masks_do_not() {
     }
     let hidden = view(&after, "v03").mask.as_ref().unwrap();
     assert_eq!(hidden.weights.iter().filter(|&&weight| weight == 0.0).count(), 4 * SIZE.1 as usize);
-    let (_, said) = run(&format!("tone apply {}", root.display()), 0);
-    let lines: Vec<&str> = said.lines().filter(|line| line.contains("converted to sRGB")).collect();
-    assert_eq!(lines.len(), 1, "{said}");
-    assert!(lines[0].contains("photographs in sRGB at gamma 1.00"), "{said}");
+    let (_, message) = run(&format!("tone apply {}", root.display()), 0);
+    let lines: Vec<&str> =
+        message.lines().filter(|line| line.contains("converted to sRGB")).collect();
+    assert_eq!(lines.len(), 1, "{message}");
+    assert!(lines[0].contains("photographs in sRGB at gamma 1.00"), "{message}");
 }
 
 #[test]
@@ -75,10 +76,10 @@ fn a_profile_that_cannot_be_used_is_named_once_for_the_dataset() {
     for entry in fs::read_dir(root.join("low")).unwrap() {
         put_chunk(&entry.unwrap().path(), b"iCCP", b"name\0\0damaged");
     }
-    let (_, said) = run(&format!("diagnose {}", root.display()), 0);
+    let (_, message) = run(&format!("diagnose {}", root.display()), 0);
     let lines: Vec<&str> =
-        said.lines().filter(|line| line.contains("a damaged ICC profile")).collect();
-    assert_eq!(lines.len(), 1, "{said}");
+        message.lines().filter(|line| line.contains("a damaged ICC profile")).collect();
+    assert_eq!(lines.len(), 1, "{message}");
 }
 
 /// The photographs of a dataset under the light of a lamp.

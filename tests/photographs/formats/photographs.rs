@@ -121,8 +121,8 @@ fn heic_is_refused_with_what_converts_it_and_listed_where_it_is_not_read() {
         3,
         &["a.heic", "HEIC", "heif-convert", "sips"],
     );
-    let (_, said) = run(&format!("tone apply {}", root.display()), 0);
-    assert!(said.contains("not read: 1 .heic") && said.contains("heif-convert"), "{said}");
+    let (_, message) = run(&format!("tone apply {}", root.display()), 0);
+    assert!(message.contains("not read: 1 .heic") && message.contains("heif-convert"), "{message}");
 }
 
 /// A JPEG of one grey with an orientation in its Exif.

@@ -391,8 +391,8 @@ fn a_clip_of_high_dynamic_range_or_wide_primaries_gives_the_frames_of_a_plain_on
         (frame.unwrap(), stderr)
     };
     let plain = clip_of(root, "plain.mkv", "null", &[]).unwrap();
-    let (expected, said) = seen(&plain);
-    assert!(!said.contains("HDR") && !said.contains("converted to sRGB"), "{said}");
+    let (expected, message) = seen(&plain);
+    assert!(!message.contains("HDR") && !message.contains("converted to sRGB"), "{message}");
     for (transfer, part) in
         [("arib-std-b67", "HDR (HLG)"), ("smpte2084", "HDR (PQ)"), ("bt709", "Rec. 2020")]
     {
@@ -406,8 +406,8 @@ fn a_clip_of_high_dynamic_range_or_wide_primaries_gives_the_frames_of_a_plain_on
             not_run(format_args!("this ffmpeg has no zscale"));
             return;
         };
-        let (frame, said) = seen(&clip);
-        assert!(said.contains(part), "{said}");
+        let (frame, message) = seen(&clip);
+        assert!(message.contains(part), "{message}");
         let differences = frame.data.iter().zip(&expected.data).map(|(a, b)| (a - b).abs());
         let mean = differences.sum::<f32>() / frame.data.len() as f32;
         assert!(mean < 0.01, "{transfer}: {mean}");
@@ -435,8 +435,8 @@ fn an_ffmpeg_without_the_filters_for_a_wide_range_names_the_command() {
     let parts = ["clip.mov: is HDR (HLG)", "zscale=t=linear", "sdr.mp4"];
     refused(&arguments, 3, &parts);
     script(&root.join("ffprobe"), "exit 1");
-    let (_, said) = run(&arguments, 3);
-    assert!(said.contains("ffprobe") && said.contains("taken for SDR"), "{said}");
+    let (_, message) = run(&arguments, 3);
+    assert!(message.contains("ffprobe") && message.contains("taken for SDR"), "{message}");
 }
 
 #[test]

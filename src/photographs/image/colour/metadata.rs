@@ -35,7 +35,7 @@ pub(super) enum Statement {
 pub(in super::super) type Chromaticities = [[f64; 2]; 4];
 
 /// A profile may take this much when it is inflated, bytes.
-const MOST_BYTES: u64 = 1 << 24;
+const MAX_BYTES: u64 = 1 << 24;
 
 const PNG: [u8; 8] = *b"\x89PNG\r\n\x1a\n";
 
@@ -100,10 +100,10 @@ fn tiff_profile(exif: &Exif) -> Option<Statement> {
 fn of_png(bytes: &[u8]) -> Vec<Statement> {
     let mut chunks: BTreeMap<&[u8], &[u8]> = BTreeMap::new();
     let mut rest = &bytes[PNG.len()..];
-    while let Some((head, behind)) = rest.split_first_chunk::<8>() {
+    while let Some((head, after)) = rest.split_first_chunk::<8>() {
         let [a, b, c, d, name @ ..] = head;
         let length = u32::from_be_bytes([*a, *b, *c, *d]) as usize;
-        let Some((data, after)) = behind.split_at_checked(length) else { break };
+        let Some((data, after)) = after.split_at_checked(length) else { break };
         if name == b"IDAT" {
             break;
         }
@@ -144,7 +144,7 @@ fn inflated(data: &[u8]) -> Statement {
     let compressed = data.iter().position(|&byte| byte == 0).and_then(|at| data.get(at + 2..));
     let mut profile = vec![];
     let read =
-        ZlibDecoder::new(compressed.unwrap_or_default()).take(MOST_BYTES).read_to_end(&mut profile);
+        ZlibDecoder::new(compressed.unwrap_or_default()).take(MAX_BYTES).read_to_end(&mut profile);
     match read {
         Ok(_) => Statement::Profile(profile),
         Err(_) => Statement::Unknown("a damaged ICC profile".to_owned()),

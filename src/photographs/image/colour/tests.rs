@@ -8,7 +8,7 @@ use ::image::{ExtendedColorType, ImageEncoder};
 
 use self::files::*;
 use super::super::jpeg::exif_segment;
-use super::tally::ColourTally;
+use super::counters::ColourTally;
 use super::*;
 
 /// Linear colours from near black to bright, none of which is out of any gamut.
@@ -304,7 +304,7 @@ fn the_exif_of_a_converted_picture_says_srgb() {
 
 #[test]
 fn many_files_are_told_in_a_line_for_each_colour_space() {
-    let tally = ColourTally::default();
+    let counters = ColourTally::default();
     for (count, from, unknown) in [
         (3, Some(("Adobe RGB", 0.0)), None),
         (1, Some(("Display P3", 0.12)), None),
@@ -313,10 +313,10 @@ fn many_files_are_told_in_a_line_for_each_colour_space() {
     ] {
         for _ in 0..count {
             let from = from.map(|(name, outside): (&str, f64)| (name.to_owned(), outside));
-            tally.add(Conversion { from, unknown: unknown.map(str::to_owned) });
+            counters.add(Conversion { from, unknown: unknown.map(str::to_owned) });
         }
     }
-    let lines = tally.lines();
+    let lines = counters.lines();
     let begins = [
         "3 photographs in Adobe RGB converted to sRGB",
         "1 photograph in Display P3 converted to sRGB",
