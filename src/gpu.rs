@@ -26,7 +26,6 @@ mod instance;
 mod kernel;
 mod limits;
 mod memory;
-mod supported;
 mod pci;
 mod pipeline;
 mod reconvergence;
@@ -36,6 +35,7 @@ mod slice;
 mod statistics;
 mod subgroups;
 mod submission;
+mod supported;
 #[cfg(feature = "testing")]
 #[doc(hidden)]
 pub mod testing;
@@ -62,7 +62,6 @@ pub use kernel::{Binding, Bound, Interface, Kernel, Recordable};
 #[cfg(feature = "check")]
 pub use kernel::{OnHost, Reference};
 pub use memory::MemoryBudget;
-pub use supported::PUSH_VARIABLE;
 pub use pci::PciAddress;
 pub use pipeline::Pipeline;
 pub use recorder::{HostRecording, Recorder, Threads};
@@ -71,6 +70,7 @@ pub use slice::{Slice, SliceMut};
 pub use statistics::Statistic;
 pub use subgroups::SUBGROUP_VARIABLE;
 pub use submission::{PassTime, Submission};
+pub use supported::PUSH_VARIABLE;
 pub use tuning::{TUNE_VARIABLE, Tile, TunedTile};
 
 use crate::{Error, Result};

@@ -196,8 +196,8 @@ pub mod config {
     pub use crate::splats::densify::DensityControl;
     pub use crate::splats::optimizer::{LearningRates, Schedule};
     pub use crate::train::{
-        Background, CacheSize, CheckConfig, DensityConfig, EndReason, ExposureConfig, OnOff,
-        ModelConfig, NetworkRates, NotFinite, PhotographBits, PrecisionConfig, StopConfig,
+        Background, CacheSize, CheckConfig, DensityConfig, EndReason, ExposureConfig, ModelConfig,
+        NetworkRates, NotFinite, OnOff, PhotographBits, PrecisionConfig, StopConfig,
     };
 }
 
@@ -212,7 +212,9 @@ pub mod synthetic {
 /// Training into a directory with a log, checkpoints and scores, and such a directory read back.
 #[cfg(feature = "io")]
 pub mod run {
-    pub use crate::results::eval::{ReferenceKind, RenderLayer, ResidualTransmittance, ModelRenderer, ViewScore, means};
+    pub use crate::results::eval::{
+        ModelRenderer, ReferenceKind, RenderLayer, ResidualTransmittance, ViewScore, means,
+    };
     pub use crate::results::run::{
         Event, IfExists, ResourceUsage, RunSummary, load_config, load_model, load_networks, train,
     };

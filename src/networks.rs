@@ -8,6 +8,7 @@
 //! Norms use the statistics of the image itself, in training and afterwards: there are no running averages.
 
 mod conv;
+pub mod crop;
 mod denoiser;
 mod file;
 mod half;
@@ -18,7 +19,6 @@ mod parameters;
 mod relu;
 mod tonemapper;
 mod trunk;
-pub mod crop;
 
 use glam::UVec2;
 use serde::{Deserialize, Serialize};

@@ -16,9 +16,9 @@ pub mod attributes;
 pub mod batches;
 #[cfg(feature = "io")]
 pub mod densify;
-pub mod packed_sh;
 #[cfg(feature = "io")]
 pub mod optimizer;
+pub mod packed_sh;
 pub mod render;
 pub mod scene;
 pub mod sort;

@@ -5,12 +5,12 @@ mod cache;
 mod checkpoint;
 mod config;
 mod decisions;
+mod depth_seeding;
 pub mod diagnose;
 mod difference;
 mod early_stopping;
 mod epochs;
 mod exposures;
-mod depth_seeding;
 mod growth;
 mod layers;
 mod masks;
@@ -50,20 +50,20 @@ use crate::{Error, Result};
 pub use cache::CacheSize;
 pub use checkpoint::check_checkpoint;
 pub use config::{
-    Background, CheckConfig, DensityConfig, ExposureConfig, OnOff, NotFinite, StopConfig,
+    Background, CheckConfig, DensityConfig, ExposureConfig, NotFinite, OnOff, StopConfig,
     TrainConfig,
 };
 use early_stopping::Convergence;
 pub use early_stopping::{EndReason, Ended};
 use growth::Growth;
-pub use layers::{SettingsLayer, Origin, Settings, values};
+pub use layers::{Origin, Settings, SettingsLayer, values};
 pub use measuring::TargetExposure;
 pub use memory::MemoryEstimate;
 use model::Model;
 pub use networks::Networks;
 pub use parts::{ModelConfig, ModelName, NetworkRates, Part};
 use passes::background;
-pub use planned::{PlannedRun, PlanSource, RequestedSettings, diagnosed};
+pub use planned::{PlanSource, PlannedRun, RequestedSettings, diagnosed};
 pub use precision::{PhotographBits, PrecisionConfig};
 pub use preset::Preset;
 #[cfg(feature = "testing")]

@@ -169,7 +169,11 @@ mod tests {
     #[test]
     fn a_world_near_its_origin_of_an_extent_of_one_and_a_half_to_three_is_its_own_frame() {
         for extent in [1.51, 2.0, 2.99] {
-            assert_eq!(TrainingFrame::new(DVec3::splat(4.0), extent), TrainingFrame::WORLD, "{extent}");
+            assert_eq!(
+                TrainingFrame::new(DVec3::splat(4.0), extent),
+                TrainingFrame::WORLD,
+                "{extent}"
+            );
         }
         assert_eq!(TrainingFrame::new(DVec3::ZERO, 3.1).scale, 0.5);
         assert_eq!(TrainingFrame::new(DVec3::ZERO, 1.4).scale, 2.0);

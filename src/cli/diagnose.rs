@@ -112,7 +112,8 @@ pub fn run(args: &DiagnoseArgs) -> Result<()> {
     }
     let device = gpu.properties().name.as_str();
     let text = if args.json {
-        let residual_transmittance = run.as_ref().map(|(_, residual_transmittances)| residual_transmittances);
+        let residual_transmittance =
+            run.as_ref().map(|(_, residual_transmittances)| residual_transmittances);
         let output = Output { device, diagnosis: &diagnosis, plan: &plan, residual_transmittance };
         let json = serde_json::to_string_pretty(&output);
         json.map_err(|error| Error::output("standard output", error.to_string()))? + "\n"
@@ -124,17 +125,26 @@ pub fn run(args: &DiagnoseArgs) -> Result<()> {
 }
 
 /// How much of the background the model of a run shows in every view of the dataset, and what to say of it.
-fn holes(run: &Path, args: &DiagnoseArgs) -> Result<(String, BTreeMap<String, ResidualTransmittance>)> {
+fn holes(
+    run: &Path,
+    args: &DiagnoseArgs,
+) -> Result<(String, BTreeMap<String, ResidualTransmittance>)> {
     let FinishedRun { config, dataset, mut model_renderer, .. } =
         FinishedRun::open(run, Some(&args.dataset), args.device.as_ref())?;
     let mut residual_transmittances = BTreeMap::new();
     for view in &dataset.views {
         let residual_transmittance = ResidualTransmittance::of(&model_renderer.render(view)?, view);
-        residual_transmittances.extend(residual_transmittance.map(|residual_transmittance| (view.name.clone(), residual_transmittance)));
+        residual_transmittances.extend(
+            residual_transmittance
+                .map(|residual_transmittance| (view.name.clone(), residual_transmittance)),
+        );
     }
-    let views = residual_transmittances.iter().map(|(name, residual_transmittance)| (name.as_str(), *residual_transmittance));
+    let views = residual_transmittances
+        .iter()
+        .map(|(name, residual_transmittance)| (name.as_str(), *residual_transmittance));
     let healthy = || {
-        let mean = ResidualTransmittance::mean(residual_transmittances.values().copied()).map_or(0.0, |own| own.mean);
+        let mean = ResidualTransmittance::mean(residual_transmittances.values().copied())
+            .map_or(0.0, |own| own.mean);
         format!(
             "{}: {:.1} % of the background shows through the model",
             run.display(),
@@ -272,7 +282,12 @@ fn scene_facts(scene: &SceneDiagnosis) -> [(&'static str, String); 5] {
     };
     let brightness = format!(
         "mean {:.4}, p10 {:.4}, p90 {:.4}, cubic mean {:.4}; lift {:.1}, {:.0} times too little light",
-        scene.mean_luminance, scene.p10, scene.p90, scene.cubic_mean, scene.brightening, scene.darkening
+        scene.mean_luminance,
+        scene.p10,
+        scene.p90,
+        scene.cubic_mean,
+        scene.brightening,
+        scene.darkening
     );
     let exposure = format!(
         "spread {:.2} stops between the views, light uneven by {:.1} stops within",

@@ -12,7 +12,7 @@ use crate::gpu::DeviceChoice;
 use crate::networks::lpips::{Lpips, Measure, Range};
 use crate::photographs::dataset::View;
 use crate::photographs::metrics::Scores;
-use crate::results::eval::{self, ResidualTransmittance, ViewScore, ScoreReference};
+use crate::results::eval::{self, ResidualTransmittance, ScoreReference, ViewScore};
 use crate::results::run;
 use crate::train::OnOff;
 
@@ -152,9 +152,13 @@ fn score_table(scored: &[ViewScore], measure: Option<Measure>) -> String {
     header.extend(measure.map(Measure::title));
     // Before the denoiser.
     header.extend(mean_r0.iter().flat_map(|_| ["PSNR of R_0", "SSIM of R_0"]).map(str::to_owned));
-    let mean_transmittance = ResidualTransmittance::mean(scored.iter().filter_map(|view| view.residual_transmittance));
+    let mean_transmittance =
+        ResidualTransmittance::mean(scored.iter().filter_map(|view| view.residual_transmittance));
     header.extend(mean_transmittance.iter().flat_map(|_| ["leftover", "99 %"]).map(str::to_owned));
-    let row = |name: &str, scores: &Scores, r0: Option<&Scores>, residual_transmittance: Option<ResidualTransmittance>| {
+    let row = |name: &str,
+               scores: &Scores,
+               r0: Option<&Scores>,
+               residual_transmittance: Option<ResidualTransmittance>| {
         let Scores { psnr, psnr_channel_mean, ssim, lpips } = scores;
         let mut row = vec![
             name.to_owned(),
@@ -166,12 +170,15 @@ fn score_table(scored: &[ViewScore], measure: Option<Measure>) -> String {
         row.extend(
             r0.into_iter().flat_map(|r0| [format!("{:.2}", r0.psnr), format!("{:.4}", r0.ssim)]),
         );
-        let residual_transmittance = residual_transmittance.into_iter().flat_map(|own| [own.mean, own.q99]);
+        let residual_transmittance =
+            residual_transmittance.into_iter().flat_map(|own| [own.mean, own.q99]);
         row.extend(residual_transmittance.map(|value| format!("{value:.4}")));
         row
     };
     let mut rows = vec![header];
-    let of_view = |view: &ViewScore| row(&view.name, &view.scores, view.r0.as_ref(), view.residual_transmittance);
+    let of_view = |view: &ViewScore| {
+        row(&view.name, &view.scores, view.r0.as_ref(), view.residual_transmittance)
+    };
     rows.extend(scored.iter().map(of_view));
     rows.extend(mean.map(|mean| row("mean", &mean, mean_r0.as_ref(), mean_transmittance)));
     table::aligned(&rows)

@@ -1,8 +1,8 @@
 //! `nightsplat pose`: from photographs without cameras to a dataset.
 
 mod clip;
-mod tone_mapped;
 mod reconstruction;
+mod tone_mapped;
 mod tool;
 
 use std::collections::BTreeMap;

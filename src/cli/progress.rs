@@ -290,7 +290,8 @@ mod tests {
             gaussians: 2400,
             milliseconds: 480.0,
         };
-        let expected = "step 200 of 400: loss 0.0432, 2400 Gaussians, 500 ms a step, 1 min 40 s left";
+        let expected =
+            "step 200 of 400: loss 0.0432, 2400 Gaussians, 500 ms a step, 1 min 40 s left";
         assert_eq!(progress.line(&report), expected);
         progress.may_end_early = true;
         let expected = "step 200 of at most 400: loss 0.0432, 2400 Gaussians, 500 ms a step, at most 1 min 40 s left";

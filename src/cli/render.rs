@@ -144,7 +144,9 @@ pub fn run(args: &RenderArgs) -> Result<()> {
         match layer {
             None => color(model_renderer.render_camera(camera)?.output().clone())?,
             Some(layer) if layer.is_color() => color(model_renderer.layer(camera, *layer)?)?,
-            Some(layer) => save_numbers(model_renderer.layer(camera, *layer)?, *layer, *format, &path)?,
+            Some(layer) => {
+                save_numbers(model_renderer.layer(camera, *layer)?, *layer, *format, &path)?
+            }
         }
         bar.inc(1);
     }

@@ -16,9 +16,9 @@ use super::signals;
 use crate::base::output::printable;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::results::eval;
-use crate::results::run::{self, IfExists, RunDirectory, Session, RunSummary};
+use crate::results::run::{self, IfExists, RunDirectory, RunSummary, Session};
 use crate::train::diagnose::Plan;
-use crate::train::{Origin, PlannedRun, PlanSource, RequestedSettings};
+use crate::train::{Origin, PlanSource, PlannedRun, RequestedSettings};
 
 /// Train a 3D Gaussian Splatting model from dark photographs.
 ///
@@ -106,7 +106,8 @@ pub fn run(args: &TrainArgs) -> Result<()> {
             plan.as_ref().map(diagnose::decisions).unwrap_or_default()
         )?;
     }
-    let if_exists = if args.resume { IfExists::Resume } else { overwrite_or_refuse(args.overwrite) };
+    let if_exists =
+        if args.resume { IfExists::Resume } else { overwrite_or_refuse(args.overwrite) };
     let mut progress = Reporter::new(form).with_facts(serde_json::json!(facts));
     let session = Session {
         plan: plan.as_ref(),
@@ -149,7 +150,11 @@ fn print_done(args: &TrainArgs, steps: u64) -> Result<()> {
 
 /// The steps of the run that is to go on, if it is done and the files of its dataset are as they were: nothing is decoded for
 /// that.
-fn done_by_stamp(args: &TrainArgs, requested: &RequestedSettings, file: Option<&Path>) -> crate::Result<Option<u64>> {
+fn done_by_stamp(
+    args: &TrainArgs,
+    requested: &RequestedSettings,
+    file: Option<&Path>,
+) -> crate::Result<Option<u64>> {
     let plan = file.map(Plan::read).transpose()?;
     run::done_steps_by_stamp(&args.out, &requested.settings(plan.as_ref())?.config()?)
 }

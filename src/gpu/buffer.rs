@@ -151,8 +151,12 @@ impl Gpu {
             return Ok(());
         }
         let bytes: &[u8] = bytemuck::cast_slice(data);
-        let mut staging =
-            DeviceMemory::new(&self.shared, "staging", bytes.len() as u64, MemoryLocation::CpuToGpu)?;
+        let mut staging = DeviceMemory::new(
+            &self.shared,
+            "staging",
+            bytes.len() as u64,
+            MemoryLocation::CpuToGpu,
+        )?;
         if let Some(mapped) = staging.allocation.as_mut().and_then(Allocation::mapped_slice_mut) {
             mapped[..bytes.len()].copy_from_slice(bytes);
         }

@@ -119,7 +119,11 @@ impl SchedulerVariables {
     ///
     /// # Errors
     /// There is no such device, or the variables name one that Vulkan does not have, or leave none.
-    pub(crate) fn pick(&self, choice: &DeviceChoice, devices: &[DeviceReport]) -> Result<SelectedDevice> {
+    pub(crate) fn pick(
+        &self,
+        choice: &DeviceChoice,
+        devices: &[DeviceReport],
+    ) -> Result<SelectedDevice> {
         let position = |is_meant: &dyn Fn(&DeviceReport) -> bool| devices.iter().position(is_meant);
         let index = match choice {
             DeviceChoice::Best => return self.best(devices),
@@ -167,8 +171,9 @@ impl SchedulerVariables {
     /// The devices that the variables name, in their order; where they name none, all that they do not hide. And whether
     /// they may mean others.
     fn visible(&self, devices: &[DeviceReport]) -> Result<(Vec<usize>, bool)> {
-        let nvidia = VisibleDevices::new("CUDA_VISIBLE_DEVICES", of_vendor(devices, NVIDIA), devices)
-            .narrow(self.cuda.as_deref());
+        let nvidia =
+            VisibleDevices::new("CUDA_VISIBLE_DEVICES", of_vendor(devices, NVIDIA), devices)
+                .narrow(self.cuda.as_deref());
         let rocr = VisibleDevices::new("ROCR_VISIBLE_DEVICES", of_vendor(devices, AMD), devices)
             .narrow(self.rocr.as_deref());
         let amd = match (rocr, self.hip.as_deref()) {

@@ -18,12 +18,13 @@ use super::device_report::{device_memory, report};
 #[cfg(feature = "testing")]
 use super::faults::Faults;
 use super::instance::{
-    OwnedInstance, instance, loader_error, physical_devices, validation_is_installed, validation_version,
+    OwnedInstance, instance, loader_error, physical_devices, validation_is_installed,
+    validation_version,
 };
 use super::limits::max_workgroups;
 use super::memory::{BudgetQuery, MemoryUsage};
-use super::supported::{OPTIONAL_EXTENSIONS, Supported};
 use super::requirements::required_device_features;
+use super::supported::{OPTIONAL_EXTENSIONS, Supported};
 use super::validation::FIRST_SAFE_WITH_LABELS;
 use super::{
     DeviceChoice, DeviceReport, Gpu, Properties, Queue, SchedulerVariables, Shared, address_space,
@@ -88,13 +89,16 @@ impl Gpu {
         let opened = choose(&owned, choice).and_then(|(physical, supported)| {
             owned.cache_path = cache_path(&supported);
             if takes_tuning {
-                let vk::PhysicalDeviceProperties { vendor_id, device_id, .. } = supported.properties;
+                let vk::PhysicalDeviceProperties { vendor_id, device_id, .. } =
+                    supported.properties;
                 owned.tuning_path = tuning::path(cache_folder(), vendor_id, device_id);
             }
             let OwnedInstance { entry, instance, .. } = &owned;
             let properties = Properties {
                 cooperative_matrix: cooperative::supported(entry, instance, physical, &supported),
-                has_uniform_subgroup_control_flow: reconvergence::supported(instance, physical, &supported),
+                has_uniform_subgroup_control_flow: reconvergence::supported(
+                    instance, physical, &supported,
+                ),
                 has_pipeline_statistics: has_pipeline_statistics(&supported),
                 ..properties(instance, physical, &supported)?
             };
@@ -296,7 +300,8 @@ fn create_device(
         .queue_family_index(family)
         .queue_priorities(&priorities)];
     let is_wanted = |name: &&CStr| {
-        supported.has(name) && (*name != khr::push_descriptor::NAME || supported.has_push_descriptors())
+        supported.has(name)
+            && (*name != khr::push_descriptor::NAME || supported.has_push_descriptors())
     };
     let optional = OPTIONAL_EXTENSIONS.iter().copied().filter(is_wanted);
     let mut extensions: Vec<_> = optional.map(CStr::as_ptr).collect();

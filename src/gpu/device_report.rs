@@ -7,8 +7,8 @@ use super::REQUIREMENTS;
 use super::cooperative::{self, CooperativeMatrix};
 use super::instance::{OwnedInstance, instance, loader_error, physical_devices};
 use super::limits::max_workgroups;
-use super::supported::Supported;
 use super::pci::PciAddress;
+use super::supported::Supported;
 use crate::Result;
 
 /// One device and how it meets the requirements, for `doctor`.

@@ -123,7 +123,11 @@ impl MemoryUsage {
     /// So many bytes more are beyond the limit.
     pub(super) fn admit(&self, bytes: u64) -> Result<(), MemoryLimitExceeded> {
         let (now, limit) = (self.now.load(Ordering::Acquire), self.limit.load(Ordering::Acquire));
-        if now.saturating_add(bytes) > limit { Err(MemoryLimitExceeded { now, limit }) } else { Ok(()) }
+        if now.saturating_add(bytes) > limit {
+            Err(MemoryLimitExceeded { now, limit })
+        } else {
+            Ok(())
+        }
     }
 
     pub(super) fn add(&self, bytes: u64) {

@@ -185,7 +185,8 @@ impl Loss {
             let constants = l1::Constants { adds, ..Default::default() };
             Kernels::L1 {
                 whole: gpu.pipeline(&constants)?,
-                loss_region: gpu.pipeline(&l1::Constants { with_loss_region: true, ..constants })?,
+                loss_region: gpu
+                    .pipeline(&l1::Constants { with_loss_region: true, ..constants })?,
                 values_per_workgroup: subgroup_size * constants.values_per_thread,
             }
         };

@@ -16,9 +16,9 @@ mod memory;
 
 use glam::UVec2;
 
-use self::memory::{Activations, EarlierStages, DenoiserExtent, DenoiserMemory, Repeat};
-use super::conv::{Activation, AccumulateInto, Conv, Precision, WeightGradientInputs, Strips};
-use super::half::{PackedMap, Direction};
+use self::memory::{Activations, DenoiserExtent, DenoiserMemory, EarlierStages, Repeat};
+use super::conv::{AccumulateInto, Activation, Conv, Precision, Strips, WeightGradientInputs};
+use super::half::{Direction, PackedMap};
 use super::inner::{Inner, InnerLayer, Map};
 use super::norm::{Backward, Forward, Norm, NormUse};
 use super::parameters::{Layout, Parameters};
@@ -140,7 +140,9 @@ impl Denoiser {
             conv: layout.conv(&format!("{k}.conv"), channels, channels),
             norm: layout.norm(&format!("{k}.norm"), channels),
             conv_out: match settings.variant {
-                NetworkVariant::Identity => layout.zero_conv(&format!("{k}.conv_out"), channels, RGB),
+                NetworkVariant::Identity => {
+                    layout.zero_conv(&format!("{k}.conv_out"), channels, RGB)
+                }
                 NetworkVariant::Paper => layout.conv(&format!("{k}.conv_out"), channels, RGB),
             },
         };

@@ -104,7 +104,10 @@ impl HalfConv {
             largest: gpu.pipeline(&largest_magnitude::Constants { chunk: CHUNK })?,
             pack_map: gpu.pipeline(&pack_map::Constants::default())?,
             pack_weights: [pack_weights(false)?, pack_weights(true)?],
-            products: [product(true, AccumulateInto::Output)?, product(false, AccumulateInto::InputGradient)?],
+            products: [
+                product(true, AccumulateInto::Output)?,
+                product(false, AccumulateInto::InputGradient)?,
+            ],
             weight_gradient: gpu.pipeline(&conv3x3_weight_gradient_half::Constants {
                 m,
                 n,

@@ -2,8 +2,8 @@
 
 use glam::UVec2;
 
-use super::conv::{Activation, AccumulateInto, Conv, Precision, WeightGradientInputs, Strips};
-use super::half::{HalfConv, PackedMap, PackedWeights, Direction};
+use super::conv::{AccumulateInto, Activation, Conv, Precision, Strips, WeightGradientInputs};
+use super::half::{Direction, HalfConv, PackedMap, PackedWeights};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Recorder};
 

@@ -2,7 +2,9 @@
 
 use glam::UVec2;
 
-use super::conv::{Activation, AccumulateInto, Conv, Precision, WeightGradientInputs, partial_count};
+use super::conv::{
+    AccumulateInto, Activation, Conv, Precision, WeightGradientInputs, partial_count,
+};
 use super::parameters::{Layout, Parameters};
 use super::relu::ReluBackward;
 use super::{NetworkVariant, RGB, check_binding, check_images, out_of_turn, pixel_count};
@@ -204,7 +206,8 @@ impl Tonemapper {
             let remedy = "each backward pass needs a forward pass of its own before it";
             return Err(out_of_turn("tonemapper", size, remedy));
         }
-        let TonemapperMemory { product, features, d_features, d_product, partials, .. } = &mut self.memory;
+        let TonemapperMemory { product, features, d_features, d_product, partials, .. } =
+            &mut self.memory;
         let Parameters { values, gradients, .. } = &mut self.parameters;
         let ([conv_in, conv, conv_out], [at_in, at, at_out]) = (&self.convs, self.offsets);
         let ([first, second], [d_first, d_second]) = (features, d_features);

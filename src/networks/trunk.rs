@@ -176,7 +176,8 @@ impl Trunk {
                 values.extend(published(path, file, &format!("{name}.{part}"), shape)?);
             }
         }
-        let variant = ConvVariant { activation: Activation::Relu, transposed: false, accumulate: false };
+        let variant =
+            ConvVariant { activation: Activation::Relu, transposed: false, accumulate: false };
         let narrowest = network.layers().iter().map(|layer| layer.channels[1]).min();
         Ok(Self {
             network,

@@ -111,7 +111,13 @@ impl PseudoGt {
             let problem = format!("buffer `{name}` holds {len} values, not {value_count}");
             return Err(Error::Usage(problem));
         }
-        self.dispatch(pass, EncodedSlices { code_bits, codes, values }, value_count, curve, target)?;
+        self.dispatch(
+            pass,
+            EncodedSlices { code_bits, codes, values },
+            value_count,
+            curve,
+            target,
+        )?;
         Ok(target)
     }
 

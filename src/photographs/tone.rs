@@ -37,7 +37,7 @@ pub use self::histogram::LuminanceHistogram;
 #[cfg(feature = "fit")]
 pub(crate) use self::law::{CurveInputs, PhotographCurve, law};
 pub(crate) use self::law::{clamped, curve_at, tone_curve};
-pub use self::mapping::{ToneMapping, MeasuredPhotograph, SceneTone};
+pub use self::mapping::{MeasuredPhotograph, SceneTone, ToneMapping};
 pub use self::profile::Profile;
 #[cfg(feature = "check")]
 pub(crate) use self::profile::profiled;

@@ -67,14 +67,24 @@ fn for_each_tile(
     mut write: impl FnMut(usize, f64),
     visit: impl Fn(&TileList, &Pixel, &mut [f64]),
 ) {
-    let Slices { tile_ranges, sorted_intersections, gaussian_ids, splats, colors, render, d_render, .. } = slices;
+    let Slices {
+        tile_ranges,
+        sorted_intersections,
+        gaussian_ids,
+        splats,
+        colors,
+        render,
+        d_render,
+        ..
+    } = slices;
     let (channels, pixels) = (constants.channels as usize, params.size.element_product() as usize);
     let record = RECORD_HEAD as usize + channels;
     let tile = UVec2::new(constants.tile_width, constants.tile_height);
     for index in 0..params.tile_columns * params.size.y.div_ceil(tile.y) {
         let range = tile_ranges[index as usize];
         let intersection_ids = &sorted_intersections[range.x as usize..range.y as usize];
-        let list = TileList::new(constants.channels, intersection_ids, gaussian_ids, splats, colors);
+        let list =
+            TileList::new(constants.channels, intersection_ids, gaussian_ids, splats, colors);
         let mut sums = vec![0.0; record * list.intersection_ids.len()];
         for pixel in tile_pixels(index, params.tile_columns, tile, params.size) {
             let at = (pixel.y * params.size.x + pixel.x) as usize;
@@ -133,7 +143,8 @@ fn add_bounds(constants: &Constants, list: &TileList, pixel: &Pixel, bounds: &mu
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, mut slices: Slices<'_>) {
         let alpha_max = constants.alpha_max.into();
-        let gradient_records: &mut [f32] = bytemuck::cast_slice_mut(std::mem::take(&mut slices.gradient_records));
+        let gradient_records: &mut [f32] =
+            bytemuck::cast_slice_mut(std::mem::take(&mut slices.gradient_records));
         let write = |at: usize, sum: f64| gradient_records[at] = sum as f32;
         for_each_tile(params, constants, &slices, write, |list, pixel, sums| {
             let Pixel { center, render, d_render } = pixel;

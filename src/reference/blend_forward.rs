@@ -45,8 +45,9 @@ impl TileList {
         splats: &[ProjectedSplat],
         colors: &[Vec3],
     ) -> Self {
-        let (channels, ids) =
-            (channels as usize, || intersection_ids.iter().map(|&slot| gaussian_ids[slot as usize] as usize));
+        let (channels, ids) = (channels as usize, || {
+            intersection_ids.iter().map(|&slot| gaussian_ids[slot as usize] as usize)
+        });
         let (stored, colors) =
             (stored_color(channels as u32), bytemuck::cast_slice::<_, f32>(colors));
         let color = |id| colors[stored * id..][..channels].iter().map(|&c| f64::from(c));
@@ -89,7 +90,8 @@ fn for_each_tile(
     for (index, (range, count)) in (0..).zip(tile_runs(params, constants, slices)) {
         let shown = if count > params.longest_run { 0 } else { count };
         let intersection_ids = &sorted_intersections[range.x as usize..][..shown as usize];
-        let list = TileList::new(constants.channels, intersection_ids, gaussian_ids, splats, colors);
+        let list =
+            TileList::new(constants.channels, intersection_ids, gaussian_ids, splats, colors);
         visit(&list, &mut tile_pixels(index, params.tile_columns, tile, params.size));
     }
 }

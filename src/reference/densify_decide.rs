@@ -1,9 +1,9 @@
 use crate::gpu::Reference;
-use crate::kernels::densify_decide::{Constants, Kernel, Params, Slices};
 use crate::kernels::densify_action::{
-    ACTION_CLONE, ACTION_KEEP, ACTION_PRUNE, ACTION_SPLIT, KEY_KEEP, KEY_PRUNE, COUNTER_CANDIDATES,
-    COUNTER_CLONED, COUNTER_PRUNED, COUNTER_SPLIT,
+    ACTION_CLONE, ACTION_KEEP, ACTION_PRUNE, ACTION_SPLIT, COUNTER_CANDIDATES, COUNTER_CLONED,
+    COUNTER_PRUNED, COUNTER_SPLIT, KEY_KEEP, KEY_PRUNE,
 };
+use crate::kernels::densify_decide::{Constants, Kernel, Params, Slices};
 use crate::splats::attributes::Attribute;
 
 impl Reference for Kernel {

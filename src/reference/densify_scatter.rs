@@ -8,11 +8,12 @@ use super::gaussian::sigmoid;
 use super::random::random_bits;
 use super::rounding::{TRIGONOMETRIC, UNIT};
 use crate::gpu::{Reference, Tolerance};
-use crate::kernels::densify_scatter::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::densify_action::{
-    ACTION_CLONE, ACTION_KEEP, ACTION_SPLIT, PAPER_LOG_SPLIT_FACTOR, SPLIT_ACROSS, SPLIT_ACROSS_SLOPE,
-    SPLIT_ALONG, SPLIT_ALONG_SLOPE, SPLIT_OFFSET, SPLIT_OPACITY, SPLIT_OPACITY_SLOPE,
+    ACTION_CLONE, ACTION_KEEP, ACTION_SPLIT, PAPER_LOG_SPLIT_FACTOR, SPLIT_ACROSS,
+    SPLIT_ACROSS_SLOPE, SPLIT_ALONG, SPLIT_ALONG_SLOPE, SPLIT_OFFSET, SPLIT_OPACITY,
+    SPLIT_OPACITY_SLOPE,
 };
+use crate::kernels::densify_scatter::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::splats::attributes::{Attribute, planes};
 
 fn random_uniform(key: u32) -> f32 {

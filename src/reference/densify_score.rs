@@ -8,10 +8,10 @@ use super::rotation::{rotation, unit_quat};
 use super::rounding::UNIT;
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::camera::NEAREST;
-use crate::kernels::densify_score::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::densify_action::{
-    KEY_KEEP, KEY_PRUNE, KEY_TOP, SPLIT_OFFSET, COUNTER_CANDIDATES, COUNTER_PRUNED,
+    COUNTER_CANDIDATES, COUNTER_PRUNED, KEY_KEEP, KEY_PRUNE, KEY_TOP, SPLIT_OFFSET,
 };
+use crate::kernels::densify_score::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::splat::DILATION;
 use crate::splats::attributes::{Attribute, planes};
 

@@ -63,9 +63,9 @@ impl Planes {
         let Self { count: gaussians, feature_count: features, sh_degree } = self;
         let columns = column_count(features, sh_degree);
         match half_rest {
-            true => {
-                PackedSh::new(PlaneCounts { gaussians, columns, features }).unpack(parameters).into()
-            }
+            true => PackedSh::new(PlaneCounts { gaussians, columns, features })
+                .unpack(parameters)
+                .into(),
             false => parameters.into(),
         }
     }

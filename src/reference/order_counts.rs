@@ -4,7 +4,8 @@ use crate::kernels::status::STATUS_OVERFLOWED;
 
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
-        let Slices { sorted_ids, tile_counts, intersection_offsets, sums, counts, status, .. } = slices;
+        let Slices { sorted_ids, tile_counts, intersection_offsets, sums, counts, status, .. } =
+            slices;
         let (count, partition_size) =
             (params.gaussian_count as usize, constants.partition_size as usize);
         sums[0] = 0;

@@ -183,11 +183,17 @@ impl<'a> ProjectionInputs<'a> {
 
 /// The sum of the records of a Gaussian with these slots. Those of few slots are added up in f32 in the kernel's very order;
 /// those of many by the lanes of a subgroup, in an order that is the device's.
-pub(super) fn summed_record(channels: u32, intersection_ids: UVec2, gradient_records: &[Vec3]) -> Vec<Rounded> {
+pub(super) fn summed_record(
+    channels: u32,
+    intersection_ids: UVec2,
+    gradient_records: &[Vec3],
+) -> Vec<Rounded> {
     let gradient_records = bytemuck::cast_slice::<_, f32>(gradient_records);
     let intersection_ids = intersection_ids.x as usize..intersection_ids.y as usize;
     let sum = |k: usize| {
-        let numbers = intersection_ids.clone().map(|slot| gradient_records[stored_record(channels) * slot + k]);
+        let numbers = intersection_ids
+            .clone()
+            .map(|slot| gradient_records[stored_record(channels) * slot + k]);
         if intersection_ids.len() <= SHARED_INTERSECTIONS as usize {
             return Rounded::exact(numbers.fold(0.0, |sum, number| sum + number));
         }
@@ -204,7 +210,15 @@ fn values(record: &[Rounded]) -> Vec<f64> {
 
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
-        let Slices { parameters, splats, colors, tile_counts, intersection_ranges, gradient_records, .. } = slices;
+        let Slices {
+            parameters,
+            splats,
+            colors,
+            tile_counts,
+            intersection_ranges,
+            gradient_records,
+            ..
+        } = slices;
         let Slices { status, gradients, grad_norm_sums, visit_counts, .. } = slices;
         // Of all Gaussians, as the device may look at them in any order.
         let before = status[0];
@@ -212,7 +226,8 @@ impl Reference for Kernel {
         let parameters = scene.planes.floats(parameters, constants.half_rest);
         gradients[..scene.planes.float_count()].fill(0.0);
         for i in (0..scene.planes.count).filter(|&i| tile_counts[i] > 0) {
-            let record = summed_record(constants.channels, intersection_ranges[i], gradient_records);
+            let record =
+                summed_record(constants.channels, intersection_ranges[i], gradient_records);
             let d_splat = scene.d_splat(colors, &values(&record), i);
             let gaussian = scene.planes.load(&parameters, i);
             let gradient = scene.backward(&gaussian, &Splat::from(&splats[i]), &d_splat);
@@ -246,7 +261,11 @@ impl Reference for Kernel {
             let mut inputs = vec![0.0; one.float_count()];
             one.store(&gaussian, 0, |at, value| inputs[at] = value);
             inputs.extend(splat.conic.to_array());
-            let record = summed_record(constants.channels, slices.intersection_ranges[i], slices.gradient_records);
+            let record = summed_record(
+                constants.channels,
+                slices.intersection_ranges[i],
+                slices.gradient_records,
+            );
             inputs.extend(values(&record));
             let mut errors: Vec<f64> = (0..inputs.len())
                 .map(|at| {

@@ -22,7 +22,9 @@ use crate::{Error, Result};
 
 mod transmittance;
 
-pub use transmittance::{ResidualTransmittance, MAX_RESIDUAL_TRANSMITTANCE, hole_warning, warn_of_holes};
+pub use transmittance::{
+    MAX_RESIDUAL_TRANSMITTANCE, ResidualTransmittance, hole_warning, warn_of_holes,
+};
 
 /// What test views are scored against.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -428,8 +430,11 @@ pub fn metrics(
     if let Some(label) = label(scored) {
         metrics[AGAINST] = json!(label);
     }
-    let residual_transmittances = || scored.iter().filter_map(|view| Some((&view.name, view.residual_transmittance?)));
-    if let Some(mean) = ResidualTransmittance::mean(residual_transmittances().map(|(_, residual_transmittance)| residual_transmittance)) {
+    let residual_transmittances =
+        || scored.iter().filter_map(|view| Some((&view.name, view.residual_transmittance?)));
+    if let Some(mean) = ResidualTransmittance::mean(
+        residual_transmittances().map(|(_, residual_transmittance)| residual_transmittance),
+    ) {
         let views: BTreeMap<_, _> = residual_transmittances().collect();
         metrics["residual_transmittance"] = json!({ "mean": mean, "views": views });
     }

@@ -21,8 +21,8 @@ use crate::kernels::densify_action::{
 use crate::kernels::{self, densify_decide, densify_moments, densify_scatter, densify_score};
 use crate::splats::attributes::PlaneCounts;
 use crate::splats::batches::Batch;
-use crate::splats::packed_sh::StorageFormat;
 use crate::splats::optimizer::Moments;
+use crate::splats::packed_sh::StorageFormat;
 use crate::splats::scene::{DeviceGaussians, GaussianSlice, Layout};
 use crate::splats::sort::{Count, RadixSort, Scan};
 use crate::{Error, Result};
@@ -484,7 +484,8 @@ pub(crate) fn capacity(count: usize, limit: usize) -> usize {
 
 fn report(count: usize, counters: &[u32]) -> DensifyReport {
     let counters = |place: u32| counters.get(place as usize).map_or(0, |&count| count as usize);
-    let (cloned, split, pruned) = (counters(COUNTER_CLONED), counters(COUNTER_SPLIT), counters(COUNTER_PRUNED));
+    let (cloned, split, pruned) =
+        (counters(COUNTER_CLONED), counters(COUNTER_SPLIT), counters(COUNTER_PRUNED));
     DensifyReport {
         cloned,
         split,

@@ -8,11 +8,11 @@
 //! Counts stay on the device. Where the intersections of a view exceed the memory reserved for them, a status flag is
 //! raised, nothing is rendered or updated, and the host grows the buffers and redoes the step ([`Renderer::grow`]).
 
-mod cameras;
 mod buffers;
-mod limits;
-mod images;
+mod cameras;
 mod capacity;
+mod images;
+mod limits;
 mod settings;
 
 use std::collections::BTreeMap;
@@ -31,12 +31,12 @@ use crate::splats::scene::{GaussianSlice, Layout, Shape};
 use crate::splats::sort::{Count, RadixSort};
 use crate::{Error, Result};
 
-#[cfg(feature = "testing")]
-pub use cameras::CameraGradient;
-pub use cameras::{Viewpoint, Viewpoints};
 pub use buffers::RenderBuffers;
 pub use buffers::Status;
 use buffers::{RANKS_PER_PARTITION, color_vectors};
+#[cfg(feature = "testing")]
+pub use cameras::CameraGradient;
+pub use cameras::{Viewpoint, Viewpoints};
 use limits::{longest_run, splats_per_turn};
 pub use settings::RenderSettings;
 
@@ -427,7 +427,13 @@ impl Renderer {
         let intersection_ranges = Count { counts: &frame.counts, index: 0 };
         // One value more than there are tiles: padding sorts behind them all.
         let bits = u32::BITS - view.tile_count().leading_zeros();
-        self.tile_sort.record(pass, intersection_ranges, &mut frame.tiles, &mut frame.intersection_ids, bits)
+        self.tile_sort.record(
+            pass,
+            intersection_ranges,
+            &mut frame.tiles,
+            &mut frame.intersection_ids,
+            bits,
+        )
     }
 
     /// Columns and rows of tiles.

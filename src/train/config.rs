@@ -22,8 +22,8 @@ use crate::photographs::dataset::{DOWNSCALE, Dataset, DepthOptions, LoadOptions,
 use crate::photographs::tone::ToneSettings;
 use crate::photographs::white_balance::WhiteBalance;
 use crate::splats::densify::DensityControl;
-use crate::splats::packed_sh::StorageFormat;
 use crate::splats::optimizer::Schedule;
+use crate::splats::packed_sh::StorageFormat;
 use crate::splats::render::RenderSettings;
 use crate::splats::scene::init::Initialization;
 use crate::splats::scene::{MAX_SH_DEGREE, Shape};
@@ -263,7 +263,11 @@ impl TrainConfig {
             invert_masks: self.invert_masks,
             white_balance: self.white_balance.clone(),
             undistort: self.undistort,
-            measured: if self.tone.full_resolution { MeasuredSize::Own } else { MeasuredSize::Loaded },
+            measured: if self.tone.full_resolution {
+                MeasuredSize::Own
+            } else {
+                MeasuredSize::Loaded
+            },
             hold_out: self.stop.views,
             depth: DepthOptions {
                 load: self.model.depth,

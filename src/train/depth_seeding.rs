@@ -41,7 +41,8 @@ struct DepthSample {
 impl Trainer {
     /// The round behind this step fills, if it is the first and there are few Gaussians.
     pub(super) fn seeds_at(&self, step: u64) -> bool {
-        let (sparse_threshold, count) = (self.config.density.sparse_threshold(), self.model.count());
+        let (sparse_threshold, count) =
+            (self.config.density.sparse_threshold(), self.model.count());
         let is_due = step == self.config.schedule.first_round();
         is_due && count <= sparse_threshold && count < self.seeded_count()
     }
@@ -78,7 +79,8 @@ impl Trainer {
         let draws = Stream::new(self.config.seed, streams::FILL);
         let mut order: Vec<usize> = (0..depth_samples.len()).collect();
         order.sort_by_key(|&i| draws.bits(i as u64));
-        let picked: Vec<DepthSample> = order.into_iter().take(more).map(|i| depth_samples[i]).collect();
+        let picked: Vec<DepthSample> =
+            order.into_iter().take(more).map(|i| depth_samples[i]).collect();
         tracing::info!(
             "step {}: {} Gaussians at depths of the views beside {}",
             self.step,
@@ -187,9 +189,11 @@ fn seen(camera: &Camera, depths: &Image, target: &Image, mask: Option<&Image>) -
 /// Gaussians with those of what is seen behind them, which have the features of the nearest.
 fn joined(old: &Gaussians, new: &[DepthSample], start: &Initialization) -> Result<Gaussians> {
     let means = old.means().iter().map(|mean| mean.as_dvec3());
-    let positions: Vec<DVec3> = means.chain(new.iter().map(|depth_sample| depth_sample.position)).collect();
+    let positions: Vec<DVec3> =
+        means.chain(new.iter().map(|depth_sample| depth_sample.position)).collect();
     let colors = std::iter::repeat_n(Vec3::ZERO, old.count);
-    let colors: Vec<Vec3> = colors.chain(new.iter().map(|depth_sample| depth_sample.color)).collect();
+    let colors: Vec<Vec3> =
+        colors.chain(new.iter().map(|depth_sample| depth_sample.color)).collect();
     let mut all = Gaussians::from_points(&positions, &colors, old.shape, start, 0)?;
     let features = old.shape.features.width();
     for (column, width) in planes(features, width(old.shape)) {
@@ -240,7 +244,8 @@ mod tests {
         let target = image(&[0.1, 0.2, 0.3, 0.4, 0.5, 0.6]);
         let shown =
             |data: &[f32], mask: Option<&Image>| seen(&camera(2, 1), &image(data), &target, mask);
-        let left = DepthSample { position: DVec3::new(-1.0, 0.0, 3.0), color: Vec3::new(0.1, 0.3, 0.5) };
+        let left =
+            DepthSample { position: DVec3::new(-1.0, 0.0, 3.0), color: Vec3::new(0.1, 0.3, 0.5) };
         assert_eq!(shown(&[2.0, 0.4, 0.5, 0.4, 0.0, 0.0], None), [left]);
         let nothing: [DepthSample; 0] = [];
         for depth in [f32::NAN, f32::INFINITY] {

@@ -31,7 +31,7 @@ use crate::{Error, Result};
 use geometry::Shared;
 pub use noise::Noise;
 use photograph::PhotographStatistics;
-pub use plan::{PlannedNumber, Plan, PlannedViews, PlannedPart};
+pub use plan::{Plan, PlannedNumber, PlannedPart, PlannedViews};
 pub use target_noise::TargetNoise;
 
 /// A view this many times as blurred as the median is named, and at least so many pixels more.

@@ -91,7 +91,8 @@ impl Convergence {
 impl Trainer {
     /// The step that ends the run, as far as that is known now: fewer than its steps once it has converged.
     pub fn last_step(&self) -> u64 {
-        let early = self.converged().map(|converged| converged + self.config.effective_cooldown_steps());
+        let early =
+            self.converged().map(|converged| converged + self.config.effective_cooldown_steps());
         early.map_or(self.config.steps, |early| early.min(self.config.steps))
     }
 

@@ -73,7 +73,11 @@ impl Views {
         self.names().map(affine).collect::<Result<Vec<_>>>().map(Some)
     }
 
-    fn starts_of_table(&self, path: &Path, dataset: &Dataset) -> Result<BTreeMap<String, InitialExposures>> {
+    fn starts_of_table(
+        &self,
+        path: &Path,
+        dataset: &Dataset,
+    ) -> Result<BTreeMap<String, InitialExposures>> {
         let known = table::load(path)?;
         let views: BTreeSet<&str> = dataset.views.iter().map(|view| view.name.as_str()).collect();
         let names = known.iter().map(|known| known.name.as_str());
@@ -89,7 +93,8 @@ impl Views {
             let stops = known.ev.map(InitialExposures::Stops);
             Some((known.name, known.affine.map(InitialExposures::Affine).or(stops)?))
         };
-        let starts: BTreeMap<String, InitialExposures> = known.into_iter().filter_map(start).collect();
+        let starts: BTreeMap<String, InitialExposures> =
+            known.into_iter().filter_map(start).collect();
         let missing: Vec<&str> = self.names().filter(|name| !starts.contains_key(*name)).collect();
         let place = path.display();
         if missing.is_empty() {

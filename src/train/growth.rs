@@ -56,7 +56,10 @@ impl Trainer {
         let round = Round { step: self.step, rounds_left, most };
         let report = self.densify(round)?;
         self.convergence.decisions.density_due = None;
-        if report.refused > 0 && capacity < self.config.max_gaussians && !self.growth.has_logged_capacity {
+        if report.refused > 0
+            && capacity < self.config.max_gaussians
+            && !self.growth.has_logged_capacity
+        {
             self.growth.has_logged_capacity = true;
             tracing::warn!("growth stops at {capacity} Gaussians, {why}");
         }
@@ -101,7 +104,8 @@ impl Trainer {
             (self.fitting_in_vram(each), "all that fits into max_vram"),
             (self.fitting_in_ram(each), "all that fits into max_ram"),
         ];
-        let (capacity, why) = bounds.into_iter().min_by_key(|(capacity, _)| *capacity).unwrap_or(bounds[0]);
+        let (capacity, why) =
+            bounds.into_iter().min_by_key(|(capacity, _)| *capacity).unwrap_or(bounds[0]);
         (capacity.max(count), why)
     }
 

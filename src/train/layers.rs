@@ -214,7 +214,8 @@ impl Settings {
     /// Where a value comes from, in words.
     fn origin(&self, row: &Setting) -> String {
         let stated = self.0.get(row.key.as_ref()).map(|(_, origin)| origin.to_string());
-        stated.or_else(|| row.absent.map(str::to_owned))
+        stated
+            .or_else(|| row.absent.map(str::to_owned))
             .unwrap_or_else(|| Origin::Default.to_string())
     }
 
@@ -423,7 +424,8 @@ mod tests {
     fn a_written_configuration_says_who_says_each_value_and_reads_as_it_is() {
         let mut settings = Settings::default();
         settings.merge(
-            &SettingsLayer::of_toml("steps = 700\n[stop]\nviews = 0", &Origin::Preset("fast")).unwrap(),
+            &SettingsLayer::of_toml("steps = 700\n[stop]\nviews = 0", &Origin::Preset("fast"))
+                .unwrap(),
         );
         let mut set = SettingsLayer::default();
         set.assign("steps=9").unwrap();

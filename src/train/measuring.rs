@@ -61,7 +61,10 @@ pub(super) fn measured(
 ///
 /// # Errors
 /// As [`tone_map_source`].
-pub(super) fn measured_of(view: &View, full_resolution: bool) -> Result<Option<MeasuredPhotograph>> {
+pub(super) fn measured_of(
+    view: &View,
+    full_resolution: bool,
+) -> Result<Option<MeasuredPhotograph>> {
     let size = if full_resolution { MeasuredSize::Own } else { MeasuredSize::Loaded };
     let read_anew = view.original.as_ref().filter(|_| full_resolution || view.image.is_none());
     let measured = match read_anew.and_then(|original| original.measured(size)) {
@@ -79,6 +82,9 @@ pub(super) fn measured_of(view: &View, full_resolution: bool) -> Result<Option<M
 ///
 /// # Errors
 /// As [`View::photograph`].
-pub(super) fn tone_map_source(view: &View, full_resolution: bool) -> Result<Option<Cow<'_, Image>>> {
+pub(super) fn tone_map_source(
+    view: &View,
+    full_resolution: bool,
+) -> Result<Option<Cow<'_, Image>>> {
     if full_resolution { view.photograph() } else { view.loaded() }
 }

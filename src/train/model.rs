@@ -6,8 +6,8 @@ use crate::gpu::{Buffer, Gpu, Recorder};
 use crate::loss::{LogSlot, ParameterInputs, ParameterTerms};
 use crate::splats::attributes::{PlaneCounts, planes};
 use crate::splats::densify::{Densifier, DensifyInputs, DensifyReport, Round};
-use crate::splats::packed_sh::StorageFormat;
 use crate::splats::optimizer::{Adam, AdamBuffers, FiniteCheck, LearningRates, Moments};
+use crate::splats::packed_sh::StorageFormat;
 use crate::splats::scene::{
     ATTRIBUTES, Attribute, DeviceGaussians, GaussianSlice, Gaussians, Layout, Shape,
 };

@@ -6,7 +6,7 @@ use glam::UVec2;
 
 use super::ModelConfig;
 use crate::gpu::{Buffer, Gpu, Recorder};
-use crate::networks::crop::{PaddedCrop, CropKernels};
+use crate::networks::crop::{CropKernels, PaddedCrop};
 use crate::networks::{self, Denoiser, Parameters, Tonemapper};
 use crate::photographs::image::Image;
 use crate::splats::scene::{COLOR_CHANNELS, Feature, Features};
@@ -48,7 +48,8 @@ impl Networks {
             }
         }
         let denoiser = model.denoiser.then(|| Denoiser::new(gpu, model.network, seed));
-        let tonemapper = model.tonemapper.then(|| Tonemapper::new(gpu, model.network.variant, seed));
+        let tonemapper =
+            model.tonemapper.then(|| Tonemapper::new(gpu, model.network.variant, seed));
         let (mut denoiser, mut tonemapper) = (denoiser.transpose()?, tonemapper.transpose()?);
         if let Some(denoiser) = &mut denoiser {
             denoiser.parameters_mut().learning_rate = model.rates.denoiser;

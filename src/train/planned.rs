@@ -5,7 +5,7 @@ use std::path::Path;
 use toml::Value;
 
 use super::diagnose::{Diagnosis, Plan};
-use super::layers::{SettingsLayer, Origin, Settings};
+use super::layers::{Origin, Settings, SettingsLayer};
 use super::{Preset, TrainConfig, Trainer};
 use crate::gpu::Gpu;
 use crate::photographs::dataset::{Dataset, LoadOptions};
@@ -133,7 +133,9 @@ impl Preset {
     /// # Errors
     /// None for the presets that there are.
     pub fn load_options(self) -> Result<LoadOptions> {
-        let config = RequestedSettings { preset: Some(self), ..RequestedSettings::default() }.settings(None)?.config()?;
+        let config = RequestedSettings { preset: Some(self), ..RequestedSettings::default() }
+            .settings(None)?
+            .config()?;
         Ok(if self.is_planned() { diagnosed(&config) } else { config.load_options() })
     }
 }
@@ -145,7 +147,8 @@ impl Trainer {
     /// # Errors
     /// The dataset cannot be used, or the device is out of memory or lost.
     pub fn planned(gpu: &Gpu, dataset: &Dataset, preset: Preset) -> Result<Self> {
-        let mut requested = RequestedSettings { preset: Some(preset), ..RequestedSettings::default() };
+        let mut requested =
+            RequestedSettings { preset: Some(preset), ..RequestedSettings::default() };
         let root = dataset.root.to_str().ok_or_else(|| {
             Error::input(&dataset.root, "is not Unicode; move it to a path that is")
         })?;

@@ -8,7 +8,7 @@ use std::str::FromStr;
 use toml::Value;
 
 use super::TrainConfig;
-use super::layers::{SettingsLayer, Origin};
+use super::layers::{Origin, SettingsLayer};
 use crate::photographs::tone::ToneCurve;
 use crate::{Error, Result};
 
@@ -204,7 +204,11 @@ mod tests {
             assert_eq!(is_paper, PAPER.contains(&preset), "{preset:?}");
             assert_eq!(is_paper, config.schedule.densify_after == 500, "{preset:?}");
             assert_eq!(is_paper, config.start == Initialization::PAPER, "{preset:?}");
-            assert_eq!(is_paper, config.model.network.variant == NetworkVariant::Paper, "{preset:?}");
+            assert_eq!(
+                is_paper,
+                config.model.network.variant == NetworkVariant::Paper,
+                "{preset:?}"
+            );
             assert_eq!(is_paper, config.model.weights == Weights::paper(), "{preset:?}");
             config.check().unwrap();
         }

@@ -77,7 +77,8 @@ impl Trainer {
     /// Has always so many submissions in flight, of so many steps each; none: as long as suits the device.
     #[doc(hidden)]
     pub fn set_batching(&mut self, in_flight: usize, steps: Option<u64>) {
-        self.submissions.batching = StepBatching { in_flight: in_flight.max(1), steps, ..StepBatching::default() };
+        self.submissions.batching =
+            StepBatching { in_flight: in_flight.max(1), steps, ..StepBatching::default() };
     }
 
     /// Trains up to `until`, to the next step of density control, or for about half a second.
@@ -123,7 +124,9 @@ impl Trainer {
         let last = (next..until).find(changes).unwrap_or(until);
         let (mut in_flight, mut sent) = (VecDeque::new(), Ok(()));
         loop {
-            while sent.is_ok() && next <= last && in_flight.len() < self.submissions.batching.in_flight
+            while sent.is_ok()
+                && next <= last
+                && in_flight.len() < self.submissions.batching.in_flight
             {
                 let has_news = !(reports.is_empty() && in_flight.is_empty());
                 if has_news && begin.elapsed() > REPORT_INTERVAL {

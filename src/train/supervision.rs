@@ -128,8 +128,9 @@ impl Supervision {
         cooldown_factor: f64,
         status: &Buffer<u32>,
     ) -> Result<()> {
-        self.learnables()
-            .try_for_each(|learnable| adam.update(pass, step, cooldown_factor, learnable, status))?;
+        self.learnables().try_for_each(|learnable| {
+            adam.update(pass, step, cooldown_factor, learnable, status)
+        })?;
         match &mut self.exposures {
             Some(exposures) => exposures.center(pass, status),
             None => Ok(()),

@@ -3,7 +3,7 @@
 use glam::{DVec2, UVec2};
 
 use super::Trainer;
-use super::measuring::{TargetExposure, tone_map_source, measured};
+use super::measuring::{TargetExposure, measured, tone_map_source};
 use super::terms::NetworkTerms;
 use super::views::ImageKind;
 use crate::Result;
@@ -14,7 +14,9 @@ use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::image::{Image, Mask};
 use crate::photographs::metrics::psnr_of_counted;
 use crate::photographs::pseudo_gt::PseudoGt;
-use crate::photographs::tone::{LuminanceHistogram, MeasuredPhotograph, SceneTone, ToneSettings, is_black};
+use crate::photographs::tone::{
+    LuminanceHistogram, MeasuredPhotograph, SceneTone, ToneSettings, is_black,
+};
 
 use super::rendered::Rendered;
 

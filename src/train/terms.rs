@@ -9,8 +9,8 @@ use crate::base::random::Stream;
 use crate::gpu::{Buffer, Gpu, Recorder};
 use crate::kernels::ssim::RADIUS;
 use crate::loss::{
-    DenoisingGradients, DenoisingInputs, DenoisingLoss, DenoisingWeights, Gradient, LossRegion,
-    LogSlot, Loss, LossInputs, LossSettings, Term, TermInputs,
+    DenoisingGradients, DenoisingInputs, DenoisingLoss, DenoisingWeights, Gradient, LogSlot, Loss,
+    LossInputs, LossRegion, LossSettings, Term, TermInputs,
 };
 use crate::networks::crop::PaddedCrop;
 use crate::networks::{Denoiser, NetworkVariant};
@@ -145,7 +145,8 @@ impl NetworkTerms {
     pub(super) fn keep_activations(&mut self, sizes: &[UVec2], most: u64) -> Result<()> {
         let crops: Vec<UVec2> = sizes.iter().map(|&size| self.max_of(size)).collect();
         let Some(denoiser) = &mut self.networks.denoiser else { return Ok(()) };
-        let mut kept = crops.into_iter().map(|padded_crop| denoiser.keep_activations(padded_crop, most));
+        let mut kept =
+            crops.into_iter().map(|padded_crop| denoiser.keep_activations(padded_crop, most));
         let are_kept = kept.try_fold(true, |all, kept| Ok::<_, Error>(all & kept?))?;
         tracing::debug!("activations of every stage of the denoiser are kept: {are_kept}");
         Ok(())
@@ -210,8 +211,7 @@ impl NetworkTerms {
             crop => PaddedCrop::random(inputs.size, crop, self.margin(), &self.crops, inputs.step),
         };
         self.networks.denoise(pass, inputs.render, inputs.size, &padded_crop)?;
-        if let Some((mask, CropMask { weights, .. })) =
-            photographs.mask.zip(self.masking.as_mut())
+        if let Some((mask, CropMask { weights, .. })) = photographs.mask.zip(self.masking.as_mut())
         {
             self.networks.crops.gather(pass, mask, inputs.size, 0..1, &padded_crop, weights)?;
         }

@@ -13,7 +13,7 @@ use super::measuring::{TargetExposure, measured, photographs};
 use super::precision::Encoder;
 use super::{TrainConfig, streams};
 use crate::base::random::Stream;
-use crate::camera::{Camera, TrainingFrame, Patch};
+use crate::camera::{Camera, Patch, TrainingFrame};
 use crate::gpu::{Buffer, Download, Gpu, Recorder};
 use crate::kernels::ToneParameters;
 use crate::loss::ViewSource;
@@ -112,7 +112,8 @@ impl Views {
             let own = view.own_size().filter(|_| settings.full_resolution);
             let is_larger = own.filter(|own| sizes.iter().any(|size| size != own));
             let whole = if is_larger.is_some() { view.photograph()? } else { None };
-            let whole = whole.map(|whole| pseudo_gt.tone_mapped(&whole, &tone_mapping)).transpose()?;
+            let whole =
+                whole.map(|whole| pseudo_gt.tone_mapped(&whole, &tone_mapping)).transpose()?;
             for (views, size) in views.iter_mut().zip(sizes) {
                 let resized = |whole: &Image| view.blacked_out(whole.resized(size.x, size.y));
                 let camera = frame.camera(&view.camera).resized(size.x, size.y);
@@ -369,7 +370,8 @@ impl Views {
         frame: &TrainingFrame,
     ) -> Cow<'a, [Point]> {
         let own = &dataset.points;
-        let wanted = if own.is_empty() { config.random_points } else { config.density.sparse_threshold() };
+        let wanted =
+            if own.is_empty() { config.random_points } else { config.density.sparse_threshold() };
         let count = wanted.min(config.max_gaussians).saturating_sub(own.len());
         if count == 0 {
             return own.into();
@@ -420,7 +422,8 @@ impl Views {
             Gaussians::from_points(&positions, &colors, shape, &config.start, seed)?;
         if config.model.network.variant == NetworkVariant::Identity {
             let low = if shape.features.illumination {
-                let mut photographs = ImageBatches::new(self, gpu, pseudo_gt, ImageKind::Photographs);
+                let mut photographs =
+                    ImageBatches::new(self, gpu, pseudo_gt, ImageKind::Photographs);
                 init::colors_from_views(kept, &dataset.views, |index| {
                     places[index].map(|place| photographs.next(place)).transpose()
                 })?

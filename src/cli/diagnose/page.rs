@@ -17,14 +17,16 @@ const SHOWN: usize = 12;
 pub(super) fn html(dataset: &Dataset, diagnosis: &Diagnosis, plan: &Plan) -> String {
     let views: Vec<&View> = dataset.train_views().filter(|view| view.has_photograph()).collect();
     let exposure = exposure(&views);
-    let (mut dark, mut tone_mapped) = (Distribution::new("photographs"), Distribution::new("tone-mapped"));
+    let (mut dark, mut tone_mapped) =
+        (Distribution::new("photographs"), Distribution::new("tone-mapped"));
     let stride = views.len().div_ceil(SHOWN).max(1);
     let mut rows = vec![];
     for view in views.iter().step_by(stride) {
         // One that can no longer be read has no picture.
         let Ok(Some(image)) = view.loaded() else { continue };
         let image = image.as_ref();
-        let target = exposure.as_ref().map_or_else(|| image.clone(), |found| brightening(image, found));
+        let target =
+            exposure.as_ref().map_or_else(|| image.clone(), |found| brightening(image, found));
         dark.add(&image.data);
         tone_mapped.add(&target.data);
         rows.push(comparison(&view.name, image, &target));

@@ -98,7 +98,8 @@ impl<'a> Tool<'a> {
             return Ok(());
         }
         let printed = std::fs::read(self.log).unwrap_or_default();
-        let printed = String::from_utf8_lossy(printed.get(begin..).unwrap_or_default()).into_owned();
+        let printed =
+            String::from_utf8_lossy(printed.get(begin..).unwrap_or_default()).into_owned();
         let lines: Vec<&str> =
             printed.lines().skip(1).map(str::trim).filter(|line| !line.is_empty()).collect();
         let last = lines[lines.len().saturating_sub(LAST_LINES)..].join(" | ");

@@ -19,8 +19,8 @@ use crate::photographs::image::{ColourTally, Image, Mask, Orientation};
 use crate::photographs::metrics::Scores;
 use crate::photographs::pseudo_gt::PseudoGt;
 use crate::photographs::tone::{
-    CurveChoice, Exposure, GainChoice, MeasuredPhotograph, Profile, SceneTone, Statistics, ToneCurve,
-    ToneSettings, all_black,
+    CurveChoice, Exposure, GainChoice, MeasuredPhotograph, Profile, SceneTone, Statistics,
+    ToneCurve, ToneSettings, all_black,
 };
 use crate::photographs::white_balance::WhiteBalance;
 use crate::results::eval;
@@ -349,7 +349,11 @@ impl CurveOnSet {
     ) -> Result<(Statistics, Image, Option<f64>)> {
         let measured = MeasuredPhotograph::of(&without(photograph, gaps));
         let tone_mapping = self.pseudo_gt.settings().tone_mapping(&self.scene, &measured);
-        Ok((measured.statistics, self.pseudo_gt.tone_mapped(photograph, &tone_mapping)?, tone_mapping.gain))
+        Ok((
+            measured.statistics,
+            self.pseudo_gt.tone_mapped(photograph, &tone_mapping)?,
+            tone_mapping.gain,
+        ))
     }
 }
 

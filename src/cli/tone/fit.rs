@@ -9,8 +9,8 @@ use serde::Serialize;
 use crate::base::output::write_whole;
 use crate::cli::table::aligned;
 use crate::photographs::fit::{
-    Channels, Estimate, Fit, FitOptions, HeldOut, Pair, FitScene, Scores, Weighting, cross_validate,
-    fit,
+    Channels, Estimate, Fit, FitOptions, FitScene, HeldOut, Pair, Scores, Weighting,
+    cross_validate, fit,
 };
 use crate::photographs::tone::{FAMILIES, Family, ToneCurve};
 use crate::{Error, Result};

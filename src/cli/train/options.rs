@@ -10,7 +10,9 @@ use crate::base::settings::{Rule, Setting};
 use crate::photographs::tone::{CurveChoice, GainChoice, Profile, ToneSettings};
 use crate::train::diagnose::Plan;
 use crate::train::settings::SETTINGS;
-use crate::train::{SettingsLayer, ModelName, Origin, Part, Preset, RequestedSettings, TrainConfig};
+use crate::train::{
+    ModelName, Origin, Part, Preset, RequestedSettings, SettingsLayer, TrainConfig,
+};
 use crate::{Error, Result};
 
 /// The options of a run; each wins over the configuration file.
@@ -184,7 +186,8 @@ impl TrainOptions {
     /// What the command line and its files say.
     pub(crate) fn requested(&self, dataset: &Path) -> Result<RequestedSettings> {
         let several = &self.several;
-        let mut requested = RequestedSettings { preset: several.preset, ..RequestedSettings::default() };
+        let mut requested =
+            RequestedSettings { preset: several.preset, ..RequestedSettings::default() };
         if let Some(file) = &several.config {
             requested.file = SettingsLayer::load(file)?;
         }

@@ -176,7 +176,11 @@ pub(super) struct EarlierStages {
 impl EarlierStages {
     /// # Errors
     /// The device is out of memory.
-    pub(super) fn new(gpu: &Gpu, settings: DenoiserSettings, extent: DenoiserExtent) -> Result<Self> {
+    pub(super) fn new(
+        gpu: &Gpu,
+        settings: DenoiserSettings,
+        extent: DenoiserExtent,
+    ) -> Result<Self> {
         let stages = (1..settings.stages).map(|_| Activations::new(gpu, settings, extent));
         Ok(Self { extent, stages: stages.collect::<Result<_>>()? })
     }
@@ -223,7 +227,11 @@ pub(super) struct DenoiserMemory {
 impl DenoiserMemory {
     /// # Errors
     /// The device is out of memory.
-    pub(super) fn new(gpu: &Gpu, settings: DenoiserSettings, extent: DenoiserExtent) -> Result<Self> {
+    pub(super) fn new(
+        gpu: &Gpu,
+        settings: DenoiserSettings,
+        extent: DenoiserExtent,
+    ) -> Result<Self> {
         let DenoiserExtent { pixels, partials, packed } = extent;
         let map = |name| gpu.uninit(name, settings.channels() * pixels);
         let image = |name| gpu.uninit(name, RGB as usize * pixels);

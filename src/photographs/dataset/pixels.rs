@@ -314,7 +314,12 @@ impl ViewLoader<'_> {
     }
 
     /// The photograph of a view; one for training is measured as the options say.
-    fn photograph(&self, decoded: Decoded, mask: Option<&Mask>, is_training: bool) -> Result<CachedImage> {
+    fn photograph(
+        &self,
+        decoded: Decoded,
+        mask: Option<&Mask>,
+        is_training: bool,
+    ) -> Result<CachedImage> {
         let Self { preparation, loading, .. } = self;
         let options = loading.options;
         let Decoded { path, image, orientation, .. } = decoded;

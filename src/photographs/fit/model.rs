@@ -2,8 +2,8 @@
 
 use super::{FitOptions, Pair};
 use crate::photographs::tone::{
-    Constant, Dual, Family, OffsetMode, CurveInputs, PhotographCurve, Real, Statistics, ToneSettings, White,
-    clamped, curve_at, law,
+    Constant, CurveInputs, Dual, Family, OffsetMode, PhotographCurve, Real, Statistics,
+    ToneSettings, White, clamped, curve_at, law,
 };
 use crate::{Error, Result};
 
@@ -69,7 +69,8 @@ impl Model {
     /// # Errors
     /// [`Error::Usage`] where the family has nothing to fit.
     pub(super) fn new(family: &'static Family, options: &FitOptions) -> Result<Self> {
-        let mut places: Vec<SettingSlot> = (0..family.constants.len()).map(SettingSlot::Shape).collect();
+        let mut places: Vec<SettingSlot> =
+            (0..family.constants.len()).map(SettingSlot::Shape).collect();
         match family.white {
             White::One => {}
             White::P90 if options.adapt || family.alpha > 0.0 || family.gain_c > 0.0 => {

@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use super::{FitOptions, Pair, FitScene, Scores, fit, mean_psnr, mean_squared_error};
+use super::{FitOptions, FitScene, Pair, Scores, fit, mean_psnr, mean_squared_error};
 use crate::photographs::tone::Family;
 use crate::{Error, Result};
 

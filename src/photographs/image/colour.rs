@@ -8,8 +8,8 @@
 //! 8 bits keeps its values to the bit. What is converted is rounded to multiples of 1/65535: fine enough under any tone curve,
 //! and 16 bits keep it.
 
-mod metadata;
 mod counters;
+mod metadata;
 #[cfg(test)]
 mod tests;
 

@@ -153,7 +153,8 @@ impl Exposure {
         }
         let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
         let every = gains.len().div_ceil(MAX_POSES);
-        let (poses, at) = (CameraPoses::new(&cameras), gains.iter().step_by(every).copied().collect());
+        let (poses, at) =
+            (CameraPoses::new(&cameras), gains.iter().step_by(every).copied().collect());
         let mut around = NeighbourGains { poses: poses.every(every), gains: at, own: 0.0 };
         let smooth: Vec<f64> = cameras.iter().map(|camera| around.ln_gain(camera)).collect();
         let squares = gains.iter().zip(&smooth).map(|(own, smooth)| (own - smooth).powi(2));
@@ -259,7 +260,8 @@ struct SerializedExposure {
 
 impl From<Exposure> for SerializedExposure {
     fn from(exposure: Exposure) -> Self {
-        let (brightening, weight, reason) = (exposure.brightening(), exposure.weight(), exposure.reason());
+        let (brightening, weight, reason) =
+            (exposure.brightening(), exposure.weight(), exposure.reason());
         let Exposure { gain, target, mean, spread, share, black, .. } = exposure;
         Self { gain, target, mean, brightening, weight, spread, share, black, reason }
     }

@@ -75,7 +75,11 @@ impl ToneSettings {
 
     /// How a photograph of the scene is lifted.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn tone_mapping(&self, scene: &SceneTone, photograph: &MeasuredPhotograph) -> ToneMapping {
+    pub(crate) fn tone_mapping(
+        &self,
+        scene: &SceneTone,
+        photograph: &MeasuredPhotograph,
+    ) -> ToneMapping {
         let statistics = scene.statistics.as_ref().unwrap_or(&photograph.statistics);
         let parameters = self.parameters(statistics);
         let Some(exposure) = &scene.exposure else {

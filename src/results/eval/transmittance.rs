@@ -62,7 +62,9 @@ pub fn hole_warning<'a>(
     background: Background,
 ) -> Option<String> {
     let views: Vec<(&str, ResidualTransmittance)> = views.into_iter().collect();
-    let open = views.iter().filter(|(_, residual_transmittance)| residual_transmittance.mean > MAX_RESIDUAL_TRANSMITTANCE);
+    let open = views.iter().filter(|(_, residual_transmittance)| {
+        residual_transmittance.mean > MAX_RESIDUAL_TRANSMITTANCE
+    });
     let (name, worst) = open.clone().max_by(|(_, a), (_, b)| a.mean.total_cmp(&b.mean))?;
     let cause = match background {
         Background::Black => {
@@ -94,15 +96,21 @@ pub fn warn_of_holes(
     /// The number of training views that are looked at, evenly spread.
     const MOST: usize = 8;
     let own = |view: &ViewScore| Some((view.name.clone(), view.residual_transmittance?));
-    let mut residual_transmittances: Vec<(String, ResidualTransmittance)> = scored.iter().filter_map(own).collect();
+    let mut residual_transmittances: Vec<(String, ResidualTransmittance)> =
+        scored.iter().filter_map(own).collect();
     if residual_transmittances.is_empty() {
         let views: Vec<&View> = dataset.views.iter().filter(|v| v.is_for_training()).collect();
         for view in views.iter().step_by(views.len().div_ceil(MOST).max(1)) {
             let residual_transmittance = ResidualTransmittance::of(&render(view)?, view);
-            residual_transmittances.extend(residual_transmittance.map(|residual_transmittance| (view.name.clone(), residual_transmittance)));
+            residual_transmittances.extend(
+                residual_transmittance
+                    .map(|residual_transmittance| (view.name.clone(), residual_transmittance)),
+            );
         }
     }
-    let views = residual_transmittances.iter().map(|(name, residual_transmittance)| (name.as_str(), *residual_transmittance));
+    let views = residual_transmittances
+        .iter()
+        .map(|(name, residual_transmittance)| (name.as_str(), *residual_transmittance));
     if let Some(warning) = hole_warning(views, background) {
         tracing::warn!("{warning}");
     }
@@ -118,11 +126,19 @@ mod tests {
         let mut pixels: Vec<f32> = (0..200).rev().map(|k| k as f32 / 256.0).collect();
         let residual_transmittance = ResidualTransmittance::of_pixels(&mut pixels).unwrap();
         // 198 of 200 have at most 197 / 256.
-        assert_eq!(residual_transmittance, ResidualTransmittance { mean: 99.5 / 256.0, q99: 197.0 / 256.0 });
-        assert_eq!(ResidualTransmittance::of_pixels(&mut [0.25]), Some(ResidualTransmittance { mean: 0.25, q99: 0.25 }));
+        assert_eq!(
+            residual_transmittance,
+            ResidualTransmittance { mean: 99.5 / 256.0, q99: 197.0 / 256.0 }
+        );
+        assert_eq!(
+            ResidualTransmittance::of_pixels(&mut [0.25]),
+            Some(ResidualTransmittance { mean: 0.25, q99: 0.25 })
+        );
         assert_eq!(ResidualTransmittance::of_pixels(&mut []), None);
-        let both =
-            ResidualTransmittance::mean([residual_transmittance, ResidualTransmittance { mean: 0.0, q99: 1.0 }].into_iter()).unwrap();
+        let both = ResidualTransmittance::mean(
+            [residual_transmittance, ResidualTransmittance { mean: 0.0, q99: 1.0 }].into_iter(),
+        )
+        .unwrap();
         assert_eq!(both, ResidualTransmittance { mean: 99.5 / 512.0, q99: 453.0 / 512.0 });
         assert_eq!(ResidualTransmittance::mean([].into_iter()), None);
     }
@@ -130,7 +146,11 @@ mod tests {
     #[test]
     fn the_worst_view_is_named_once_with_what_helps() {
         let residual_transmittance = |mean| ResidualTransmittance { mean, q99: 1.0 };
-        let views = [("a", residual_transmittance(0.3)), ("b", residual_transmittance(0.62)), ("c", residual_transmittance(0.1))];
+        let views = [
+            ("a", residual_transmittance(0.3)),
+            ("b", residual_transmittance(0.62)),
+            ("c", residual_transmittance(0.1)),
+        ];
         let message = hole_warning(views, Background::Black).unwrap();
         for part in ["view b: 62 %", "above 10 % in 2 of 3 views", "--background random", "mask"] {
             assert!(message.contains(part), "{message}");

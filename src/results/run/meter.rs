@@ -39,8 +39,12 @@ impl ResourceMeter {
         let counters = Counter::all(Path::new("/sys"));
         let joules = (is_whole && !counters.is_empty()).then_some(0.0);
         let processor_seconds = processor_seconds().filter(|_| is_whole).map(|_| 0.0);
-        let spent =
-            ResourceUsage { seconds: seconds_before, processor_seconds, joules, ..ResourceUsage::default() };
+        let spent = ResourceUsage {
+            seconds: seconds_before,
+            processor_seconds,
+            joules,
+            ..ResourceUsage::default()
+        };
         Self { counters, spent }
     }
 
@@ -198,6 +202,10 @@ mod tests {
         meter.of(|| while processor_seconds().unwrap() < begin + 0.05 {});
         let busy = meter.spent(7).processor_seconds.unwrap() - idle.processor_seconds.unwrap();
         assert!(busy >= 0.04, "{busy}");
-        assert_eq!(ResourceMeter::new(1.0).spent(0).processor_seconds, None, "another process took a part");
+        assert_eq!(
+            ResourceMeter::new(1.0).spent(0).processor_seconds,
+            None,
+            "another process took a part"
+        );
     }
 }

@@ -10,10 +10,10 @@ use super::tensorboard::EventFile;
 use super::{Event, Requests, RunDirectory, RunSummary, done, generations, load};
 use crate::gpu::Gpu;
 use crate::photographs::dataset::{Dataset, View};
-use crate::results::eval::{self, ScoredImages, ViewScore, ScoreReference};
+use crate::results::eval::{self, ScoreReference, ScoredImages, ViewScore};
 use crate::splats::attributes::{ATTRIBUTES, AttributeSpec};
 use crate::train::diagnose::Plan;
-use crate::train::{Ended, OnOff, MemoryEstimate, Settings, StepReport, TrainConfig, Trainer};
+use crate::train::{Ended, MemoryEstimate, OnOff, Settings, StepReport, TrainConfig, Trainer};
 use crate::{Error, Result, Stop};
 
 /// What becomes of a run that the directory already holds.
@@ -107,10 +107,11 @@ pub fn train_in(
     let mut train_loop = TrainLoop::new(gpu, config, dataset, &directory, &trainer);
     let requests = &session.requests;
     let losses = train_loop.train_to_end(&mut trainer, &mut directory, requests, &mut observe);
-    let losses = losses.inspect_err(|error| train_loop.save_on_error(error, &mut trainer, &mut directory))?;
+    let losses = losses
+        .inspect_err(|error| train_loop.save_on_error(error, &mut trainer, &mut directory))?;
     let finished = train_loop.finish(&mut trainer, &mut directory, &mut observe);
-    let (ended, scored, spent) =
-        finished.inspect_err(|error| train_loop.save_on_error(error, &mut trainer, &mut directory))?;
+    let (ended, scored, spent) = finished
+        .inspect_err(|error| train_loop.save_on_error(error, &mut trainer, &mut directory))?;
     let (gaussians, steps) = (trainer.gaussian_count(), trainer.steps_done());
     let mut metrics = eval::metrics(&scored, spent.seconds, gaussians, steps);
     metrics[SPENT] = serde_json::json!(spent);
@@ -377,21 +378,25 @@ impl<'a> TrainLoop<'a> {
     ) -> Result<Vec<ViewScore>> {
         let mut score_reference = match self.score_reference.take() {
             Some(known) => known,
-            None => {
-                ScoreReference::in_scene(self.gpu, &self.config.tone, self.dataset, trainer.scene())?
-            }
+            None => ScoreReference::in_scene(
+                self.gpu,
+                &self.config.tone,
+                self.dataset,
+                trainer.scene(),
+            )?,
         };
         let (step, mut is_first) = (trainer.steps_done(), true);
         let render = |view: &View| trainer.render(&view.camera);
-        let scored = eval::score_by(&mut score_reference, self.dataset, render, |score, compared| {
-            if self.config.exposure.learn == OnOff::On {
-                score.aligned = Some(compared.aligned()?);
-            }
-            if std::mem::take(&mut is_first) {
-                self.write_event_images(step, score, compared)?;
-            }
-            Ok(())
-        })?;
+        let scored =
+            eval::score_by(&mut score_reference, self.dataset, render, |score, compared| {
+                if self.config.exposure.learn == OnOff::On {
+                    score.aligned = Some(compared.aligned()?);
+                }
+                if std::mem::take(&mut is_first) {
+                    self.write_event_images(step, score, compared)?;
+                }
+                Ok(())
+            })?;
         self.score_reference = Some(score_reference);
         observe(Event::Evaluated { step, scored: &scored });
         self.write_event_scores(step, &scored)?;

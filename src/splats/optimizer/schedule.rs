@@ -278,7 +278,8 @@ mod tests {
 
     #[test]
     fn a_boost_fades_and_leaves_the_rates_as_they_are() {
-        let schedule = Schedule { initial_rate_factor: 4.0, initial_rate_steps: 100, ..Schedule::paper() };
+        let schedule =
+            Schedule { initial_rate_factor: 4.0, initial_rate_steps: 100, ..Schedule::paper() };
         let rate = |step| schedule.learning_rates(step, 1.0)[Attribute::Quats];
         assert_eq!(schedule.learning_rates(0, 1.0)[Attribute::RawOpacities], 0.05);
         assert!((rate(0) - 0.004).abs() < 1e-12 && (rate(50) - 0.002).abs() < 1e-12);

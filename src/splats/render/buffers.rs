@@ -6,7 +6,7 @@ use crate::Result;
 use crate::gpu::{Buffer, Gpu};
 use crate::kernels::splat::RECORD_HEAD;
 use crate::kernels::status::{
-    STATUS_TILE_LIMIT, STATUS_GRADIENT, STATUS_NOT_FINITE, STATUS_OVERFLOWED, STATUS_WORDS,
+    STATUS_GRADIENT, STATUS_NOT_FINITE, STATUS_OVERFLOWED, STATUS_TILE_LIMIT, STATUS_WORDS,
 };
 use crate::kernels::{self, ProjectedSplat};
 
@@ -156,7 +156,8 @@ impl RenderBuffers {
             self.tiles = gpu.uninit("tiles", capacity)?;
             self.intersection_ids = gpu.uninit("intersection_ids", capacity)?;
             self.gaussian_ids = gpu.uninit("gaussian_ids", capacity)?;
-            self.gradient_records = gpu.uninit("gradient_records", self.record_vectors() * capacity)?;
+            self.gradient_records =
+                gpu.uninit("gradient_records", self.record_vectors() * capacity)?;
         }
         Ok(())
     }
@@ -202,7 +203,12 @@ mod tests {
     fn every_flag_is_read_from_its_own_bit() {
         let read = |flags| Status::from_words(&[flags, 5, 7]);
         let flags = |status: Status| {
-            [status.overflowed, status.not_finite, status.gradient_not_finite, status.splats_per_tile == 7]
+            [
+                status.overflowed,
+                status.not_finite,
+                status.gradient_not_finite,
+                status.splats_per_tile == 7,
+            ]
         };
         let all = [STATUS_OVERFLOWED, STATUS_NOT_FINITE, STATUS_GRADIENT, STATUS_TILE_LIMIT];
         for (own, flag) in all.into_iter().enumerate() {

@@ -144,7 +144,10 @@ impl Renderer {
             let status = self.try_render(gaussians, patch, options)?;
             if status.splats_per_tile > 0 {
                 let UVec2 { x: width, y: height } = patch.size;
-                return Err(self.too_many_splats(format!("a {width}x{height} render"), status.splats_per_tile));
+                return Err(self.too_many_splats(
+                    format!("a {width}x{height} render"),
+                    status.splats_per_tile,
+                ));
             }
             if !status.overflowed {
                 break;

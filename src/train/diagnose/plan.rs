@@ -11,7 +11,7 @@ use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::tone::ToneCurve;
 use crate::splats::scene::{Features, Shape, width};
 use crate::train::TrainConfig;
-use crate::train::layers::{SettingsLayer, Origin};
+use crate::train::layers::{Origin, SettingsLayer};
 use crate::{Error, Result};
 
 /// Targets less than this many times brighter than their photographs are the photographs: the rule of `--curve auto`.
@@ -289,7 +289,8 @@ fn denoiser(scene: &SceneDiagnosis) -> PlannedPart {
 fn tonemapper(scene: &SceneDiagnosis, learns_exposures: bool) -> PlannedPart {
     let unevenness = scene.unevenness;
     // A learned exposure does not describe the dark photographs, to which the tonemapper holds the model.
-    let on = unevenness >= MIN_UNEVENNESS && scene.brightening >= MIN_BRIGHTENING && !learns_exposures;
+    let on =
+        unevenness >= MIN_UNEVENNESS && scene.brightening >= MIN_BRIGHTENING && !learns_exposures;
     let why = format!(
         "light varies by {unevenness:.1} stops between large regions (an illumination of its own from {MIN_UNEVENNESS}, in dark sets)"
     );
