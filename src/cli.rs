@@ -56,7 +56,7 @@ const EXAMPLES: &str = "Start with:
   nightsplat train photos --out run                 train from a folder of dark photographs
   nightsplat eval run --save-images                 score it where there are references
   nightsplat render run --split all --out pictures  see the model from every camera
-  nightsplat export run --to html                   a page with the splat to fly through
+  nightsplat export run --format html                   a page with the splat to fly through
   nightsplat sweep photos --out sweep --curves all  train with every curve, and rank them
   nightsplat sweep photos --out s --table presets   what time and memory buy
 

@@ -13,6 +13,7 @@ mod fingerprint;
 mod layout;
 mod listed;
 mod listing;
+mod loaded;
 mod locate;
 mod masks;
 mod members;

@@ -1,6 +1,6 @@
 //! Reference images that are none: photographs of another split, as dark as those to train on.
 
-use super::pixels::Loaded;
+use super::loaded::Loaded;
 use super::{LoadOptions, Split};
 
 /// A photograph whose mean is at most this, encoded, is dark.

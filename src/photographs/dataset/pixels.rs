@@ -10,6 +10,7 @@ use super::allowance::Allowance;
 use super::borders::{self, Border};
 use super::dark_references;
 use super::depth::depth_map;
+use super::loaded::Loaded;
 use super::original::Original;
 use super::packed::Packed;
 use super::prepare::{Preparation, check_size, disagreement, pixel_count, turn};
@@ -235,17 +236,6 @@ struct ViewLoader<'a> {
     loading: &'a Loading<'a>,
 }
 
-pub(super) struct Loaded {
-    pub(super) name: String,
-    /// `None`: a training view whose photograph does not decode.
-    pub(super) view: Option<View>,
-    problems: Vec<String>,
-    /// The mean of the photograph, and that of the reference image.
-    pub(super) brightness: [Option<f32>; 2],
-    /// Where the reference image is read from.
-    pub(super) reference: Option<Original>,
-}
-
 /// A picture of a view.
 struct Decoded {
     path: PathBuf,
@@ -257,7 +247,7 @@ struct Decoded {
 
 /// What memory holds of a photograph or reference image: its pixels as they are loaded, and its file where those are not
 /// all of it.
-type CachedImage = (Option<Image>, Option<Original>);
+type InMemory = (Option<Image>, Option<Original>);
 
 impl ViewLoader<'_> {
     fn load(&self, source: Source) -> Result<Loaded> {
@@ -354,7 +344,7 @@ impl ViewLoader<'_> {
         decoded: Decoded,
         mask: Option<&Mask>,
         is_training: bool,
-    ) -> Result<CachedImage> {
+    ) -> Result<InMemory> {
         let Self { preparation, loading, .. } = self;
         let options = loading.options;
         let Decoded { path, image, orientation, .. } = decoded;
@@ -393,7 +383,7 @@ impl ViewLoader<'_> {
         Ok((None, Some(original)))
     }
 
-    fn reference_image(&self, decoded: Decoded) -> Result<CachedImage> {
+    fn reference_image(&self, decoded: Decoded) -> Result<InMemory> {
         let Self { preparation, loading, .. } = self;
         let Decoded { path, image, orientation, .. } = decoded;
         if loading.options.keep == Some(0) {
