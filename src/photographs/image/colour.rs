@@ -294,7 +294,7 @@ impl ColourSpace {
             .map(|at| self.encoded([linear(0, at), linear(1, at), linear(2, at)]))
             .collect();
         // Positive phrasing: a NaN is outside.
-        let is_held = |&value: &f32| value >= -MARGIN && value <= 1.0 + MARGIN;
+        let is_held = |value: &f32| (-MARGIN..=1.0 + MARGIN).contains(value);
         let outside = pixels.iter().filter(|pixel| !pixel.iter().all(is_held)).count();
         for (plane, values) in image.data.chunks_exact_mut(count.max(1)).enumerate() {
             for (value, pixel) in values.iter_mut().zip(&pixels) {

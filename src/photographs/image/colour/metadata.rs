@@ -175,8 +175,7 @@ fn of_exif(exif: &Exif) -> Option<Statement> {
         _ => {}
     }
     let chromaticities = || {
-        let [white, primaries] =
-            [Tag::WhitePoint, Tag::PrimaryChromaticities].map(|tag| field(tag));
+        let [white, primaries] = [Tag::WhitePoint, Tag::PrimaryChromaticities].map(field);
         let [wx, wy] = *rationals(white?) else { return None };
         let [rx, ry, gx, gy, bx, by] = *rationals(primaries?) else { return None };
         Some([[wx, wy], [rx, ry], [gx, gy], [bx, by]])
