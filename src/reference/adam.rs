@@ -33,7 +33,8 @@ pub(super) fn from_halves(word: u32) -> [f32; 2] {
     [word & 0xffff_0000, word << 16].map(f32::from_bits)
 }
 
-/// Both moments after the step as the device has them, where no product and sum are fused, and the chance of its rounding.
+/// Both moments after the step as the device has them, where no product and sum are fused, and the chance of its
+/// rounding.
 pub(super) fn moments_after(step: u32, [p, g, m, v]: [f32; 4]) -> ([f32; 2], u32) {
     let g = clamp_gradient(g);
     let m = BETA1 as f32 * m + (1.0 - BETA1) as f32 * g;

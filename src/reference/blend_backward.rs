@@ -10,8 +10,8 @@ use crate::gpu::{Reference, Tolerance};
 use crate::kernels::blend_backward::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::splat::RECORD_HEAD;
 
-/// Adds to `gradient_records` (splats, record) what one pixel with the values `render` and the gradient `d_render` says:
-/// the gradients of mean2d, conic and opacity, to which the first `shaping` channels speak, and of the colours.
+/// Adds to `gradient_records` (splats, record) what one pixel with the values `render` and the gradient `d_render`
+/// says: the gradients of mean2d, conic and opacity, to which the first `shaping` channels speak, and of the colours.
 #[expect(clippy::too_many_arguments, reason = "a pixel, its splats and its gradients")]
 pub fn blend_pixel_backward(
     splats: &[Splat],

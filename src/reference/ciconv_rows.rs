@@ -55,7 +55,8 @@ impl Reference for Kernel {
         }
     }
 
-    /// Thirteen products and additions of sums of three: eighteen roundings of the terms' magnitudes, and the constants'.
+    /// Thirteen products and additions of sums of three: eighteen roundings of the terms' magnitudes, and the
+    /// constants'.
     fn tolerances(params: &Params, _: &Constants, slices: Slices<'_>) -> Tolerances {
         let taps = taps();
         let bounds =

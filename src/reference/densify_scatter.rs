@@ -1,4 +1,4 @@
-//! What comes of a Gaussian that multiplies.
+//! The children of a densified Gaussian.
 
 use std::f32::consts::TAU;
 
@@ -27,7 +27,7 @@ fn random_normal3(key: u32) -> Vec3 {
     Vec3::new(radius[0] * angle[0].cos(), radius[0] * angle[0].sin(), radius[1] * angle[1].cos())
 }
 
-/// One of what comes of a Gaussian.
+/// A child of a Gaussian.
 pub(super) struct Child {
     pub(super) of: usize,
     /// The first or the second.
@@ -36,7 +36,8 @@ pub(super) struct Child {
     pub(super) is_new: bool,
 }
 
-/// The copies of all `count` Gaussians that belong to a batch of the new: how many lie before it, and how many it is of.
+/// The copies of all `count` Gaussians that belong to a batch of the new: how many lie before it, and how many it is
+/// of.
 pub(super) fn copies<'a>(
     count: usize,
     actions: &'a [u32],
@@ -149,9 +150,9 @@ impl Reference for Kernel {
         }
     }
 
-    /// Drawn positions are off by a cosine's error, which scales and the radius of the draw, 5.8 at most, magnify; those
-    /// of a half by what an exponential and the axes are off by, its opacity by what the logarithm of a quotient is. What
-    /// else there is is copied.
+    /// Drawn positions are off by a cosine's error, which scales and the radius of the draw, 5.8 at most, magnify;
+    /// those of a half by what an exponential and the axes are off by, its opacity by what the logarithm of a quotient
+    /// is. What else there is is copied.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let (n, new_n) = (params.gaussian_count as usize, params.new_gaussian_count as usize);
         let mut bounds = vec![0.0; slices.new_parameters.len()];

@@ -22,9 +22,9 @@ fn mean_gradient(slices: &Slices<'_>, i: usize) -> f32 {
     }
 }
 
-/// An estimate of the mean squared change of a view where two halves take the place of a Gaussian, in units of the squared
-/// contrast of what it covers: the share of the view that it covers, times the square of its opacity and of the relative
-/// change of depth.
+/// An estimate of the mean squared change of a view where two halves take the place of a Gaussian, in units of the
+/// squared contrast of what it covers: the share of the view that it covers, times the square of its opacity and of the
+/// relative change of depth.
 pub(super) fn view_change(near: f64, camera: &Camera, gaussian: &Gaussian) -> f64 {
     let opacity = sigmoid(gaussian.raw_opacity);
     let scale = DMat3::from_diagonal(gaussian.log_scale.exp());
@@ -106,9 +106,9 @@ impl Reference for Kernel {
     }
 
     /// A division is good to five roundings, and the reference's to one: as many units of a key, which is made of bits,
-    /// and a unit is up to two roundings. At the threshold, whether there is a candidate hangs on it. So it does where a
-    /// view would change by about the bound: by a thousandth of it, as exponentials, differences of depths and the edges
-    /// of what is covered are good to that wherever a parameter is below about 1 000.
+    /// and a unit is up to two roundings. At the threshold, whether there is a candidate hangs on it. So it does where
+    /// a view would change by about the bound: by a thousandth of it, as exponentials, differences of depths and the
+    /// edges of what is covered are good to that wherever a parameter is below about 1 000.
     fn tolerances(params: &Params, _: &Constants, slices: Slices<'_>) -> Tolerances {
         const ROUNDINGS: f64 = 6.0;
         let (threshold, bound) =

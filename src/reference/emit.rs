@@ -54,7 +54,8 @@ impl Reference for Kernel {
         }
     }
 
-    /// Where a border of the ellipse lies within rounding of that of a tile, its Gaussian may or may not cover the tile.
+    /// Where a border of the ellipse lies within rounding of that of a tile, its Gaussian may or may not cover the
+    /// tile.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let mut tiles = vec![0.0; slices.tiles.len()];
         let mut intersection_ranges = vec![0.0; 2 * slices.intersection_ranges.len()];

@@ -37,7 +37,7 @@ pub struct Planes {
 }
 
 impl Planes {
-    /// Those of so many Gaussians whose splats have so many channels: colour, and the features behind it.
+    /// The planes of this many Gaussians whose splats have this many channels: colour, and the features after it.
     pub(super) fn of(gaussian_count: u32, channels: u32, sh_degree: u32) -> Self {
         let feature_count = channels as usize - 3;
         Self { count: gaussian_count as usize, feature_count, sh_degree }

@@ -57,8 +57,8 @@ pub(super) fn weights([from, to]: [u32; 2], packed: &[Eight]) -> Vec<f32> {
     (0..to * from).flat_map(taps).map(|value| value as f32).collect()
 }
 
-/// How far the sum of so many products of packed factors may be off, of terms with such a sum of magnitudes and such largest
-/// magnitudes, all of them scaled. A matrix may cut off where an addition rounds, and flush what is subnormal.
+/// How far the sum of this many products of packed factors may be off, of terms with such a sum of magnitudes and such
+/// largest magnitudes, all of them scaled. A matrix may cut off where an addition rounds, and flush what is subnormal.
 pub(super) fn sum_error(count: u32, magnitude: f64, largest: [f64; 2]) -> f64 {
     let count = f64::from(count);
     let cut = 4.0 * (count + 2.0) * super::rounding::UNIT * magnitude;

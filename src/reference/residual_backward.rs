@@ -3,7 +3,7 @@
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::residual_backward::{Constants, Kernel, Params, Slices, Tolerances};
 
-/// What the gradient `d` of the result of [`super::residual::residual`] becomes behind the clamp, which lets it pass
+/// What the gradient `d` of the result of [`super::residual::residual`] becomes after the clamp, which lets it pass
 /// within 0 and 1, bounds included: the gradient of `R_0`, and the negative of those of I and u.
 pub fn clamp_backward(difference: f64, d: f64) -> f64 {
     if (0.0..=1.0).contains(&difference) { d } else { 0.0 }

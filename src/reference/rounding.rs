@@ -20,7 +20,8 @@ pub(super) fn chain(count: usize) -> f64 {
     count as f64 / 4.0 + 128.0
 }
 
-/// Backward stability: how far the numbers of `f` may be off where each of its inputs is off by its error, to first order.
+/// Backward stability: how far the numbers of `f` may be off where each of its inputs is off by its error, to first
+/// order.
 pub(super) fn sensitivity(
     inputs: &[f64],
     errors: &[f64],
@@ -184,7 +185,7 @@ impl Neg for Rounded {
     }
 }
 
-/// A number that can wait behind a condition.
+/// A number that a condition can select.
 pub trait Gated: Real {
     /// Itself where `y` is above 0, else 0.
     fn where_positive(self, y: Self) -> Self;

@@ -16,7 +16,7 @@ pub(super) fn stored_color(channels: u32) -> usize {
     channels.next_multiple_of(3) as usize
 }
 
-/// What of a [`ProjectedSplat`] makes its light.
+/// The part of a [`ProjectedSplat`] that determines its alpha.
 #[derive(Clone, Copy, Debug)]
 pub struct Splat {
     /// Pixels.
@@ -60,7 +60,7 @@ pub struct Fragment {
     pub before: f64,
 }
 
-/// The fragments of `splats`, front to back, at a pixel's centre, and the transmittance behind them.
+/// The fragments of `splats`, front to back, at a pixel's centre, and the transmittance after them.
 pub fn fragments(splats: &[Splat], pixel: DVec2, alpha_max: f64) -> (Vec<Fragment>, f64) {
     let mut fragments = vec![];
     let mut before = 1.0;
