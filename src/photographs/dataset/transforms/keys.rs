@@ -49,13 +49,13 @@ pub(super) fn is_marked_bad(frame: &Map<String, Value>) -> bool {
     const BAD: [&str; 5] = ["is_bad", "bad", "ignore", "skip", "excluded"];
     const GOOD: [&str; 3] = ["is_valid", "valid", "enabled"];
     let says = |keys: &[&str], value: bool| {
-        let mut is_said = false;
+        let mut is_given = false;
         for key in keys {
             let own =
                 frame.get(*key).and_then(|own| own.as_bool().or(own.as_u64().map(|own| own != 0)));
-            is_said |= own == Some(value);
+            is_given |= own == Some(value);
         }
-        is_said
+        is_given
     };
     says(&BAD, true) | says(&GOOD, false)
 }
