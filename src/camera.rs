@@ -130,9 +130,9 @@ impl Camera {
 /// Lens distortion as COLMAP's camera models define it; the default is none.
 ///
 /// With `(x, y)` at unit depth and r its length, a perspective lens (COLMAP's `SIMPLE_RADIAL`, `RADIAL`, `OPENCV` and
-/// `FULL_OPENCV`, which differ in what is zero) scales by `(1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)`
-/// and shifts by p1 and p2. A fisheye (`SIMPLE_RADIAL_FISHEYE`, `RADIAL_FISHEYE`, `OPENCV_FISHEYE`) projects the angle
-/// t off its axis, t = atan r, to `t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8)`.
+/// `FULL_OPENCV`, which differ in what is zero) scales by `(1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6
+/// r^6)` and shifts by p1 and p2. A fisheye (`SIMPLE_RADIAL_FISHEYE`, `RADIAL_FISHEYE`, `OPENCV_FISHEYE`) projects the
+/// angle t off its axis, t = atan r, to `t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8)`.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Distortion {
     /// Radial coefficient of r^2, or of a fisheye's t^2.

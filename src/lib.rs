@@ -10,8 +10,8 @@
 //! | train into a directory with log, checkpoints and scores | [`run::train`] |
 //! | learn what went wrong | [`Error`]: one line that names the object and the remedy |
 //!
-//! Without default features there is the renderer, forward and backward, and nothing else. Feature `io` adds files, datasets
-//! and training; `check` the CPU references; `fit` the fitting of curves; `cli` the command.
+//! Without default features there is the renderer, forward and backward, and nothing else. Feature `io` adds files,
+//! datasets and training; `check` the CPU references; `fit` the fitting of curves; `cli` the command.
 //!
 //! # Render a model
 //!

@@ -31,7 +31,7 @@ pub fn bytes(path: &Path) -> Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// The text of a file, UTF-8, or UTF-16 behind its mark: a byte-order mark is no text.
+/// The text of a file, UTF-8, or UTF-16 after its mark: a byte-order mark is no text.
 ///
 /// # Errors
 /// As [`bytes`]; it is no text.

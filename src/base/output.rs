@@ -13,8 +13,8 @@ pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
     write_whole_with(path, |path| std::fs::write(path, bytes))
 }
 
-/// As [`write_whole`], for what writes the file itself, under the name that it is given. What a link leads to is written, and
-/// the link stays; a device or a pipe is written to, and not replaced.
+/// As [`write_whole`], for what writes the file itself, under the name that it is given. What a link leads to is
+/// written, and the link stays; a device or a pipe is written to, and not replaced.
 ///
 /// # Errors
 /// As there.
@@ -34,7 +34,7 @@ pub fn write_whole_with(
     let partial = Path::new(&partial);
     let written = write(partial).and_then(|()| std::fs::rename(partial, &target));
     written.map_err(|error| {
-        // The first failure is the one worth reporting; a leftover of it is not.
+        // The first failure is the one worth reporting; a temporary file that remains is not.
         let _ = std::fs::remove_file(partial);
         failed(error)
     })
@@ -60,8 +60,8 @@ pub fn check_writable(path: &Path) -> Result<()> {
     })
 }
 
-/// Text for a terminal or a line of a log: control characters, which names from elsewhere may hold, are spelled out. Line
-/// breaks stay.
+/// Text for a terminal or a line of a log: control characters, which names from elsewhere may hold, are spelled out.
+/// Line breaks stay.
 pub fn printable(text: &str) -> Cow<'_, str> {
     let acts = |c: char| c.is_control() && c != '\n';
     if !text.contains(acts) {

@@ -72,7 +72,8 @@ pub struct Gaussians {
     pub shape: Shape,
     /// `count * width(shape)` floats.
     pub parameters: Vec<f32>,
-    /// The world position that the means are relative to: f32 is too coarse for positions far from the world's own origin.
+    /// The world position that the means are relative to: f32 is too coarse for positions far from the world's own
+    /// origin.
     pub origin: DVec3,
 }
 

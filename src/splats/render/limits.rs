@@ -65,7 +65,8 @@ impl RenderSettings {
     /// Refuses a view that this device cannot render and train on, from its size alone.
     ///
     /// # Errors
-    /// [`Error::Usage`] names the view, the limit, and the longest side that it leaves; the tile does not suit the device.
+    /// [`Error::Usage`] names the view, the limit, and the longest side that it leaves; the tile does not suit the
+    /// device.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn check_size(
         &self,

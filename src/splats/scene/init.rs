@@ -68,7 +68,8 @@ impl Gaussians {
     /// uniform in [0, 1), drawn from `seed` (LITA-GS).
     ///
     /// # Errors
-    /// [`Error::Usage`] where a position or colour is not finite or their numbers differ, or `Initialization::check` refuses.
+    /// [`Error::Usage`] where a position or colour is not finite or their numbers differ, or `Initialization::check`
+    /// refuses.
     pub fn from_points(
         positions: &[DVec3],
         colors: &[Vec3],
