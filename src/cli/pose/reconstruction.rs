@@ -6,7 +6,8 @@ use std::path::{Path, PathBuf};
 use anyhow::Result;
 
 use super::tool::Tool;
-use super::{PoseArgs, create, tone_mapped};
+use super::{PoseArgs, tone_mapped};
+use crate::base::output::create_folder;
 use crate::photographs::dataset::Dataset;
 use crate::photographs::image::files::photographs_in;
 
@@ -69,7 +70,7 @@ impl<'a> Reconstruction<'a> {
         let glomap =
             is_apart.then(|| colmap.beside(&args.glomap, "glomap").found("")).transpose()?;
         let (database, models) = (work.join("database.db"), work.join("sparse"));
-        create(&models)?;
+        create_folder(&models)?;
         Ok(Self { colmap, glomap, args, matcher, is_guided: false, database, models })
     }
 
@@ -95,7 +96,7 @@ impl<'a> Reconstruction<'a> {
         self.is_guided = true;
         self.database.set_file_name("guided.db");
         self.models.set_file_name("guided");
-        create(&self.models)?;
+        create_folder(&self.models)?;
         match self.attempt(tone_mapped, &say) {
             // The first attempt found something.
             Err(error) if placed > 0 => {
