@@ -12,6 +12,7 @@ use crate::Error;
 use crate::base::output::{check_writable, write_whole};
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::Dataset;
+use crate::photographs::white_balance::WhiteBalance;
 use crate::results::diagnosis;
 use crate::results::eval::{ResidualTransmittance, hole_warning};
 use crate::results::finished_run::FinishedRun;
@@ -25,9 +26,9 @@ use crate::train::{Preset, TrainConfig, diagnosed};
 /// lets you edit the plan. Reference images are not used.
 ///
 /// Columns of the table: p10, p90, mean and cubic mean of the encoded luminance; r = p10 / p90; EV: stops above the
-/// other views of the same points; white and black: clipped and zero values; codes: distinct values; noise: standard
-/// deviation at the mean, linear; blur: width of edges, pixels; points: visible points; overlap: share of the view
-/// that other views see.
+/// other views of the same points; white and black: clipped and zero values; codes: distinct values; luma and chroma
+/// noise: standard deviations in the target, after the tone curve, with JPEG and quantisation noise; blur: width of
+/// edges, pixels; points: visible points; overlap: share of the view that other views see.
 #[expect(clippy::doc_markdown, reason = "in help, {setting} stands for its default")]
 #[derive(Clone, Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
@@ -52,6 +53,9 @@ pub struct DiagnoseArgs {
     /// Plan for photographs shrunk to this longest side, pixels; 0 or none: no limit [default: {max_resolution}]
     #[arg(long, value_name = "N|none", value_parser = max_resolution)]
     pub max_resolution: Option<u32>,
+    /// Balance the photographs' white before they are measured, as `train` has it: R,G,B, kelvin, VIEW,x,y,w,h or VIEW,x1,y1,..,x4,y4
+    #[arg(long, value_name = "WHITE")]
+    pub white_balance: Option<WhiteBalance>,
     /// Plan for this preset: draft, fast, balanced or best [default: balanced]
     #[arg(long, value_name = "NAME", value_parser = words::presets())]
     pub preset: Option<Preset>,
@@ -91,6 +95,7 @@ pub fn run(args: &DiagnoseArgs) -> Result<()> {
     config.downscale = args.downscale.unwrap_or(config.downscale);
     config.max_resolution = args.max_resolution.unwrap_or(config.max_resolution);
     args.report.iter().chain(&args.plan).try_for_each(|path| check_writable(path))?;
+    config.white_balance.clone_from(&args.white_balance);
     let gpu = Gpu::new(&args.device.clone().unwrap_or_default())?;
     let options = diagnosed(&config);
     let (dataset, mut diagnosis) = Diagnosis::load(&config.dataset, &options)?;

@@ -1,6 +1,6 @@
 //! `nightsplat export`: writes the model of a run in other formats.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::Result;
 use clap::ValueEnum;

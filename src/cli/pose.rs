@@ -1,7 +1,9 @@
 //! `nightsplat pose`: estimates the cameras of photographs with COLMAP.
 
+mod cameras;
 mod clip;
 mod reconstruction;
+mod stages;
 mod tone_mapped;
 mod tool;
 
@@ -18,9 +20,10 @@ use self::tool::Tool;
 pub(super) use self::tool::sources;
 use super::{finish, word};
 use crate::Error;
-use crate::base::output::{check_writable, create_folder};
+use crate::base::output::{check_writable, create_folder, write_whole};
+use crate::base::{input, tree};
 use crate::gpu::{DeviceChoice, Gpu};
-use crate::photographs::dataset::Dataset;
+use crate::photographs::dataset::{Dataset, is_mask};
 use crate::photographs::image::files::{photographs_in, stem, unread_in};
 
 /// Estimate the cameras of dark photographs with COLMAP, and write a dataset for `train`.
@@ -49,7 +52,10 @@ pub struct PoseArgs {
     /// Path of GLOMAP, for --mapper global with COLMAP before 4.0
     #[arg(long, value_name = "PATH", default_value = "glomap")]
     pub glomap: PathBuf,
-    /// COLMAP camera model, shared by all photographs of one size
+    /// Option of a COLMAP command, as Mapper.init_min_tri_angle=4; may be given again
+    #[arg(long, value_name = "NAME=VALUE")]
+    pub colmap_option: Vec<String>,
+    /// COLMAP camera model; photographs of one size, lens and focal length share a camera
     #[arg(long, value_name = "NAME", default_value = "OPENCV")]
     pub camera_model: String,
     /// Frames per second to take of a clip
@@ -68,6 +74,9 @@ pub struct PoseArgs {
     #[arg(long, value_name = "DEVICE")]
     pub device: Option<DeviceChoice>,
 }
+
+/// The calibrations that are shown, at most.
+const MOST_SHOWN: usize = 3;
 
 /// Fewer cameras constrain no shape.
 const FEWEST: usize = 3;
@@ -88,7 +97,7 @@ pub fn run(args: &PoseArgs) -> Result<()> {
         ))
         .into());
     }
-    let is_clip = args.photos.is_file();
+    let is_clip = tree::is_file(&args.photos) && !tree::is_dir(&args.photos);
     let begin = Instant::now();
     check_writable(&args.out)?;
     let mut out = Unfinished::new(&args.out, args.overwrite)?;
@@ -97,17 +106,22 @@ pub fn run(args: &PoseArgs) -> Result<()> {
     let matcher =
         args.matcher.unwrap_or(if is_clip { Matcher::Sequential } else { Matcher::Exhaustive });
     let reconstruction = Reconstruction::new(args, colmap, matcher, &out.work)?;
-    let photographs = if is_clip {
+    let folder = if tree::archive_of(&args.photos).is_some() {
+        Dataset::folder_of(&args.photos)?
+    } else {
+        args.photos.clone()
+    };
+    let mut photographs = if is_clip {
         let ffmpeg = Tool::new(&args.ffmpeg, "ffmpeg", &out.log).found("")?;
         clip::frames(&ffmpeg, &args.photos, args.fps, &out.work.join("frames"))?
     } else {
-        photographs(&args.photos)?
+        photographs(&folder)?
     };
     let gpu = Gpu::new(&args.device.clone().unwrap_or_default())?;
     let tone_mapped = out.work.join("tone-mapped");
-    let gain = tone_mapped::write(&gpu, &photographs, &tone_mapped)?;
+    let gain = tone_mapped::write(&gpu, &mut photographs, &tone_mapped)?;
     say(begin, &format!("{} photographs brightened (gain {gain:.1})", photographs.len()))?;
-    let models = reconstruction.models(&tone_mapped, |what| say(begin, what))?;
+    let models = reconstruction.models((&tone_mapped, &photographs), |what| say(begin, what))?;
     let (model, placed) = Dataset::largest_model(&models)?.filter(|(_, placed)| placed.len() >= FEWEST).ok_or_else(|| {
         let problem = format!(
             "COLMAP found no cameras for these {} photographs: too little overlap or texture; take more \
@@ -127,21 +141,41 @@ pub fn run(args: &PoseArgs) -> Result<()> {
         let Some(path) = by_name.get(stem(name)) else { continue };
         link_or_copy(path, &images.join(path.file_name().unwrap_or_default()))?;
     }
-    keep_masks(&args.photos.join("masks"), &out.folder.join("masks"))?;
+    keep_masks(&folder.join("masks"), &out.folder.join("masks"))?;
+    if !is_clip {
+        for mask in photographs_in(&folder)?.iter().filter(|file| is_mask(file)) {
+            link_or_copy(mask, &images.join(mask.file_name().unwrap_or_default()))?;
+        }
+    }
     let sparse = out.folder.join("sparse/0");
     create_folder(&sparse)?;
     for file in ["cameras.bin", "images.bin", "points3D.bin"] {
         link_or_copy(&model.join(file), &sparse.join(file))?;
     }
+    let lenses = Dataset::lenses(&sparse)?;
     out.finish()?;
     let (count, of) = (placed.len(), photographs.len());
     say(begin, &format!("{count} of {of} photographs have a camera -> {}", args.out.display()))?;
+    for lens in &lenses {
+        if let Some(problem) = cameras::implausible(lens) {
+            tracing::warn!(
+                "the calibration of {} is implausible: {problem}; photographs of several lenses may share it, or show too little \
+                 in common",
+                cameras::shown(lens)
+            );
+        }
+    }
     if 2 * count < of {
         tracing::warn!(
             "most photographs have no camera; take more of them, closer together, or expose longer"
         );
     }
-    let wrote = format!("{}: {count} of {of} photographs with their cameras", args.out.display());
+    let wrote = format!(
+        "{}: {count} of {of} photographs with their cameras, {} calibrated ({})",
+        args.out.display(),
+        if lenses.len() == 1 { "one".to_owned() } else { lenses.len().to_string() },
+        lenses.iter().take(MOST_SHOWN).map(cameras::shown).collect::<Vec<_>>().join("; ")
+    );
     finish(&wrote, &format!("nightsplat train {} --out run", word(&args.out)))
 }
 
@@ -170,7 +204,8 @@ fn keep_masks(masks: &Path, to: &Path) -> Result<()> {
 
 /// The photographs of a folder; their names differ.
 fn photographs(folder: &Path) -> Result<Vec<PathBuf>> {
-    let paths = photographs_in(folder)?;
+    let mut paths = photographs_in(folder)?;
+    paths.retain(|path| !is_mask(path));
     if let Some(line) = unread_in(folder) {
         tracing::warn!("{line}");
     }
@@ -199,6 +234,9 @@ fn say(begin: Instant, what: &str) -> Result<()> {
 
 /// Creates a hard link, or a copy where the file system has no links.
 fn link_or_copy(from: &Path, to: &Path) -> crate::Result<()> {
+    if tree::archive_of(from).is_some() {
+        return write_whole(to, &input::bytes(from)?);
+    }
     let from = from.canonicalize().unwrap_or_else(|_| from.to_owned());
     if fs::hard_link(&from, to).is_ok() {
         return Ok(());

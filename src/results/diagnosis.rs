@@ -6,7 +6,7 @@ use crate::photographs::tone::{Exposure, LuminanceHistogram, luminance, soft};
 use crate::results::report::{
     Best, Column, Comparison, Distribution, Facts, Picture, Report, Table, distributions,
 };
-use crate::train::diagnose::{Diagnosis, Noise, Plan, SceneDiagnosis, ViewDiagnosis};
+use crate::train::diagnose::{Diagnosis, Noise, Plan, SceneDiagnosis, TargetNoise, ViewDiagnosis};
 
 /// Width of an image, pixels.
 const PICTURE_WIDTH: u32 = 240;
@@ -17,7 +17,7 @@ const SHOWN: usize = 12;
 type Measure = (&'static str, usize, &'static str, &'static str);
 
 /// The columns, in the order of [`values`].
-const MEASURES: [Measure; 13] = [
+const MEASURES: [Measure; 14] = [
     ("p10", 4, "10th percentile of the encoded luminance, 0 to 1", "0: crushed shadows"),
     (
         "p90",
@@ -43,10 +43,16 @@ const MEASURES: [Measure; 13] = [
     ("black %", 1, "zero values, %", "above 20: detail is lost in the shadows"),
     ("codes", 0, "distinct values in use, of 256 for 8 bits", "below 20: banding in the targets"),
     (
-        "noise",
-        4,
-        "standard deviation at the mean, of white, linear",
-        "above 0.01: visible in the targets",
+        "luma noise",
+        3,
+        "standard deviation of the luminance in the target, with JPEG and quantisation noise",
+        "above 0.02: visible in the targets",
+    ),
+    (
+        "chroma noise",
+        3,
+        "the same of the colour differences R - Y and B - Y",
+        "above 0.02: visible in the targets",
     ),
     ("blur", 1, "width of edges, pixels", "1.6 times the median: motion or focus"),
     ("points", 0, "points that the view sees", "below 12: its pose is doubtful"),
@@ -75,7 +81,7 @@ pub(crate) fn table(diagnosis: &Diagnosis) -> Table {
 }
 
 /// The values of a view.
-fn values(view: &ViewDiagnosis) -> [Option<f64>; 13] {
+fn values(view: &ViewDiagnosis) -> [Option<f64>; 14] {
     [
         Some(view.p10),
         Some(view.p90),
@@ -86,7 +92,8 @@ fn values(view: &ViewDiagnosis) -> [Option<f64>; 13] {
         Some(100.0 * view.clipped_fraction),
         Some(100.0 * view.zero_fraction),
         Some(view.code_values as f64),
-        view.noise.map(|noise| noise.deviation(view.light)),
+        view.noise_in_target.map(|noise| noise.luma),
+        view.noise_in_target.map(|noise| noise.chroma),
         view.blur,
         Some(view.points as f64),
         Some(view.overlap),
@@ -105,12 +112,17 @@ pub(crate) fn sizes(views: &[ViewDiagnosis]) -> String {
 
 /// Measurements of the whole set: a name and values in each row.
 pub(crate) fn scene_facts(scene: &SceneDiagnosis) -> [[String; 2]; 5] {
-    let noise = match scene.noise {
-        Some(Noise { gain, read }) => format!(
-            "gain {gain:.2e}, read noise {read:.2e} of white, linear; {:.3} in the mean of the targets of a point",
-            scene.target_noise
+    let sensor = match scene.noise {
+        Some(Noise { gain, read }) => {
+            format!("sensor: gain {gain:.2e}, read noise {read:.2e} of white, linear")
+        }
+        None => "sensor: not measurable, no photograph has a flat, unclipped area".to_owned(),
+    };
+    let noise = match scene.noise_in_target {
+        Some(TargetNoise { luma, chroma }) => format!(
+            "{luma:.3} luma, {chroma:.3} chroma in a target, with JPEG and quantisation noise; {sensor}"
         ),
-        None => "not measurable: no photograph has a flat, unclipped area".to_owned(),
+        None => sensor,
     };
     let brightness = format!(
         "mean {:.4}, p10 {:.4}, p90 {:.4}, cubic mean {:.4}; gain {:.1}, {:.0} times too little light",

@@ -20,6 +20,7 @@ use crate::loss::{LossConfig, ParameterWeights};
 use crate::networks::NetworkVariant;
 use crate::photographs::dataset::{DOWNSCALE, Dataset, DepthOptions, LoadOptions, MeasuredSize};
 use crate::photographs::tone::ToneSettings;
+use crate::photographs::white_balance::WhiteBalance;
 use crate::splats::densify::DensityControl;
 use crate::splats::optimizer::Schedule;
 use crate::splats::packed_sh::StorageFormat;
@@ -64,6 +65,8 @@ settings! {
 pub struct TrainConfig {
     /// The dataset's folder.
     dataset: PathBuf = PathBuf::new() => Rule::PATH;
+    /// The folder that holds the photographs by their listed names.
+    images: Option<PathBuf> = None, "where the dataset's listing says" => Rule::PATH, "--images DIR";
     /// Folder of reference images, under the names of the photographs, for scores only.
     reference: Option<PathBuf> = None, "found beside the photographs" => Rule::PATH, "--reference DIR";
     /// Initial Gaussians from a PLY in the dataset's coordinates, instead of the dataset's points; all SH degrees are in
@@ -71,6 +74,12 @@ pub struct TrainConfig {
     init: Option<PathBuf> = None, "the dataset's points" => Rule::PATH, "--init MODEL.ply";
     /// Masks (masks/NAME.png or masks/NAME.jpg.png) hide white instead of black.
     invert_masks: bool = false => Rule::Flag, "--invert-masks";
+    /// Mask black borders and corners that the photographs have in the same place, as undistorting leaves them.
+    mask_borders: bool = true => Rule::Flag;
+    /// White balance of the photographs before they are measured: gains R,G,B of linear light; the colour temperature of
+    /// the light in kelvin; VIEW,x,y,w,h, a neutral area of one photograph in pixels as stored; or VIEW,x1,y1,..,x4,y4,
+    /// the corners of a ColorChecker, from the dark skin patch round by the blue-green, the black and the white one.
+    white_balance: Option<WhiteBalance> = None, "none" => WHITE_BALANCE, "--white-balance WHITE";
     /// Undistort fisheye photographs to pinhole ones, cropped to 60 degrees off the axis, instead of training with the
     /// fisheye model; other distorted photographs are always undistorted.
     undistort: bool = false => Rule::Flag, "--undistort";
@@ -160,6 +169,9 @@ const MEMORY: Rule =
         text.parse::<CacheSize>().is_ok()
     });
 
+const WHITE_BALANCE: Rule =
+    Rule::Text(WhiteBalance::FORM, |text| text.parse::<WhiteBalance>().is_ok());
+
 const MINUTES: Rule = Rule::from_to(0.0, 1e9);
 
 settings! {
@@ -247,8 +259,11 @@ impl TrainConfig {
             max_resolution: self.max_resolution,
             test_every: self.test_every,
             keep: CacheSize::on_host(self.cache, self.max_ram),
+            images: self.images.clone(),
             reference: self.reference.clone(),
             invert_masks: self.invert_masks,
+            mask_borders: self.mask_borders,
+            white_balance: self.white_balance.clone(),
             undistort: self.undistort,
             measured: if self.tone.full_resolution {
                 MeasuredSize::Own
@@ -287,7 +302,12 @@ impl TrainConfig {
     /// The same run of another copy of its dataset; what lay in its folder lies there, too.
     pub(crate) fn move_dataset(&mut self, dataset: &Path) {
         let from = std::mem::replace(&mut self.dataset, dataset.to_owned());
-        let inside = [&mut self.reference, &mut self.model.depth_folder, &mut self.exposure.start];
+        let inside = [
+            &mut self.images,
+            &mut self.reference,
+            &mut self.model.depth_folder,
+            &mut self.exposure.start,
+        ];
         for folder in inside.into_iter().flatten() {
             if let Ok(place) = folder.strip_prefix(&from) {
                 *folder = dataset.join(place);

@@ -22,6 +22,7 @@ fn args(input: &Path, out: PathBuf) -> ApplyArgs {
         colour: None,
         theta: None,
         scene_statistics: false,
+        white_balance: None,
         reference: None,
         invert_masks: false,
         json: false,

@@ -25,7 +25,9 @@ pub(super) fn frames(
     folder: &Path,
 ) -> Result<Vec<PathBuf>> {
     create_folder(folder)?;
-    let filter = format!("fps={}", fps * CANDIDATES as f64);
+    let transfer = ffmpeg.probed(clip, "color_transfer");
+    let filters = filters(ffmpeg, clip, transfer.as_deref().unwrap_or_default())?;
+    let filter = format!("fps={}{filters}", fps * CANDIDATES as f64);
     let pattern = folder.join("frame_%06d.png");
     ffmpeg.run(
         "",
@@ -43,6 +45,12 @@ pub(super) fn frames(
     if frames.is_empty() {
         return Err(Error::input(clip, "contains no frame that ffmpeg can decode"));
     }
+    if transfer.is_none() {
+        tracing::warn!(
+            "{}: ffprobe, which comes with ffmpeg, does not tell its colours; it is taken for SDR",
+            clip.display()
+        );
+    }
     let sharpness = frames.par_iter().map(|frame| Ok(sharpness(&Image::load(frame)?)));
     let sharpness = sharpness.collect::<Result<Vec<f64>>>()?;
     let mut kept = vec![];
@@ -58,6 +66,38 @@ pub(super) fn frames(
         }
     }
     Ok(kept)
+}
+
+/// ffmpeg's filters that make sRGB of linear light above which nothing is white: HLG and PQ put that at 203 cd/m2 (BT.2408).
+/// What is brighter is clipped; a curve for it would change what is dark, too.
+const STANDARD_RANGE: &str = "zscale=t=linear:npl=203,format=gbrpf32le,zscale=p=bt709,tonemap=clip:desat=0,\
+                              zscale=t=iec61966-2-1:m=gbr:r=full,format=gbrp16le";
+
+/// The filters after `fps` for a clip of this transfer function: those above for high dynamic range. Frames of wide primaries
+/// say so themselves, and are converted where they are read.
+///
+/// # Errors
+/// [`Error::Input`] with the command to run where this ffmpeg has no such filters.
+fn filters(ffmpeg: &Tool<'_>, clip: &Path, transfer: &str) -> Result<String> {
+    let range = match transfer {
+        "arib-std-b67" => "HLG",
+        "smpte2084" => "PQ",
+        _ => return Ok(String::new()),
+    };
+    let has = |filter: &str| ffmpeg.helps_with(&["-hide_banner", "-filters"], filter);
+    if !has(" zscale ") || !has(" tonemap ") {
+        let path = clip.display();
+        let problem = format!(
+            "is HDR ({range}), and this ffmpeg has no filters zscale and tonemap; with one that has: ffmpeg -i {path} -vf \
+             {STANDARD_RANGE},format=yuv444p -color_primaries bt709 -color_trc iec61966-2-1 -crf 10 sdr.mp4"
+        );
+        return Err(Error::input(clip, problem));
+    }
+    tracing::warn!(
+        "{}: HDR ({range}) converted to sRGB; what is brighter than its white is clipped",
+        clip.display()
+    );
+    Ok(format!(",{STANDARD_RANGE}"))
 }
 
 /// Detail relative to brightness: mean absolute second difference over the mean. Frames of one moment share their

@@ -5,6 +5,7 @@ use std::fs::{File, OpenOptions};
 use std::io::{ErrorKind, Write};
 use std::path::Path;
 use std::process::{Command, Stdio};
+use std::time::Duration;
 
 use crate::{Error, Result};
 
@@ -56,11 +57,41 @@ impl<'a> Tool<'a> {
         })
     }
 
-    /// Runs one of its commands.
+    /// Whether the help of a command lists an option.
+    pub(super) fn has_option(&self, command: &str, option: &str) -> bool {
+        self.helps_with(&[command, "-h"], &format!("--{option} "))
+    }
+
+    /// What ffprobe, beside this ffmpeg, tells of the first video stream of a clip; `None` where it tells nothing.
+    pub(super) fn probed(&self, clip: &Path, entry: &str) -> Option<String> {
+        let name = self.path.file_name()?.to_str()?.replace("ffmpeg", "ffprobe");
+        let arguments =
+            ["-v", "error", "-select_streams", "v:0", "-of", "default=nokey=1:noprint_wrappers=1"];
+        let mut process = Command::new(self.path.with_file_name(name));
+        process.args(arguments).arg("-show_entries").arg(format!("stream={entry}")).arg(clip);
+        let output = process.stdin(Stdio::null()).output().ok()?;
+        let text = String::from_utf8(output.stdout).ok()?;
+        output.status.success().then(|| text.lines().next().unwrap_or_default().to_owned())
+    }
+
+    /// Runs one of its commands to its end.
     ///
     /// # Errors
     /// [`Error::Input`] with its last lines if it fails.
     pub(super) fn run(&self, command: &str, arguments: &[&OsStr]) -> Result<()> {
+        self.run_and_watch(command, arguments, |_| {})
+    }
+
+    /// The same; while it runs, `watch` sees what it has said, a few times a second.
+    ///
+    /// # Errors
+    /// As there.
+    pub(super) fn run_and_watch(
+        &self,
+        command: &str,
+        arguments: &[&OsStr],
+        mut watch: impl FnMut(&str),
+    ) -> Result<()> {
         let cannot = |error: std::io::Error| {
             Error::output(
                 self.log,
@@ -79,15 +110,26 @@ impl<'a> Tool<'a> {
         }
         // COLMAP without a display.
         process.args(arguments).env("QT_QPA_PLATFORM", "offscreen").stdin(Stdio::null());
-        let status = process.stdout(output(&log)?).stderr(output(&log)?).status();
-        let status =
-            status.map_err(|error| Error::input(self.path, format!("does not run: {error}")))?;
+        let unrunnable = |error| Error::input(self.path, format!("does not run: {error}"));
+        let started = process.stdout(output(&log)?).stderr(output(&log)?).spawn();
+        let mut child = started.map_err(unrunnable)?;
+        let printed = || {
+            let printed = std::fs::read(self.log).unwrap_or_default();
+            String::from_utf8_lossy(printed.get(begin..).unwrap_or_default()).into_owned()
+        };
+        let mut pause = Duration::from_millis(5);
+        let status = loop {
+            if let Some(status) = child.try_wait().map_err(unrunnable)? {
+                break status;
+            }
+            std::thread::sleep(pause);
+            pause = (2 * pause).min(Duration::from_millis(500));
+            watch(&printed());
+        };
         if status.success() {
             return Ok(());
         }
-        let printed = std::fs::read(self.log).unwrap_or_default();
-        let printed =
-            String::from_utf8_lossy(printed.get(begin..).unwrap_or_default()).into_owned();
+        let printed = printed();
         let lines: Vec<&str> =
             printed.lines().skip(1).map(str::trim).filter(|line| !line.is_empty()).collect();
         let last = lines[lines.len().saturating_sub(LAST_LINES)..].join(" | ");

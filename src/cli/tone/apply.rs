@@ -15,13 +15,14 @@ use crate::base::output::{check_writable, create_folder, printable};
 use crate::cli::{ImageFormat, finish, progress_bar, table, word, words};
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::{Dataset, Split};
-use crate::photographs::image::{Image, Mask};
+use crate::photographs::image::{ColourTally, Image, Mask, Orientation};
 use crate::photographs::metrics::Scores;
 use crate::photographs::pseudo_gt::PseudoGt;
 use crate::photographs::tone::{
     CurveChoice, Exposure, GainChoice, MeasuredPhotograph, Profile, SceneTone, Statistics,
     ToneCurve, ToneSettings, all_black,
 };
+use crate::photographs::white_balance::WhiteBalance;
 use crate::results::eval;
 use crate::results::report::Distribution;
 use crate::{Error, Result};
@@ -62,6 +63,9 @@ pub struct ApplyArgs {
     /// Use the mean statistics of all training photographs for each
     #[arg(long)]
     pub scene_statistics: bool,
+    /// White balance before anything is measured, as in `train`: R,G,B, kelvin, VIEW,x,y,w,h or VIEW,x1,y1,..,x4,y4
+    #[arg(long, value_name = "WHITE")]
+    pub white_balance: Option<WhiteBalance>,
     /// References in normal light to score against: a folder with the same names, or a file
     #[arg(long, value_name = "DIR|FILE")]
     pub reference: Option<PathBuf>,
@@ -274,6 +278,7 @@ pub fn apply(args: &ApplyArgs) -> Result<ToneOutput> {
         progress.inc(1);
     }
     progress.finish_and_clear();
+    set.colours.say();
     let exposure = set.scene.exposure;
     let Some(mut scene) = scene(&views) else {
         let nothing = || Error::input(&args.input, "holds no photograph");
@@ -313,6 +318,8 @@ struct CurveOnSet {
     scene: SceneTone,
     /// Masks hide white.
     inverted: bool,
+    /// What was made of the colours of what is mapped.
+    colours: ColourTally,
 }
 
 impl CurveOnSet {
@@ -328,7 +335,8 @@ impl CurveOnSet {
         if settings.scene_statistics || settings.takes_exposure() {
             for listed in photographs.iter().filter(|listed| listed.split != Some(Split::Test)) {
                 // Unusable photographs are reported when they are mapped.
-                let Ok((photograph, gaps)) = loaded(listed, inverted) else { continue };
+                let unsaid = ColourTally::default();
+                let Ok((photograph, gaps)) = loaded(listed, inverted, &unsaid) else { continue };
                 measured.push(MeasuredPhotograph::of(&without(&photograph, &gaps)));
             }
             if measured.is_empty() && settings.scene_statistics {
@@ -341,7 +349,7 @@ impl CurveOnSet {
             None if measured.is_empty() => SceneTone::default(),
             None => return Err(all_black(input)),
         };
-        Ok(Self { pseudo_gt, scene, inverted })
+        Ok(Self { pseudo_gt, scene, inverted, colours: ColourTally::default() })
     }
 
     /// Statistics of a photograph, its mapped image and the gain.
@@ -361,8 +369,8 @@ impl CurveOnSet {
 }
 
 /// A photograph and the indices of its unusable pixels.
-fn loaded(listed: &Listed, inverted: bool) -> Result<(Image, Vec<usize>)> {
-    let (photograph, gaps) = listed.load(inverted)?;
+fn loaded(listed: &Listed, inverted: bool, colours: &ColourTally) -> Result<(Image, Vec<usize>)> {
+    let (photograph, gaps) = listed.load(inverted, colours)?;
     let (photograph, gaps) = listed.turned(photograph, gaps);
     if gaps.len() == photograph.pixel_count() {
         return Err(Error::input(&listed.input, "has no finite, unmasked pixel; export it again"));
@@ -381,8 +389,12 @@ struct Mapped {
 }
 
 fn mapped(set: &mut CurveOnSet, listed: &Listed) -> Result<Mapped> {
-    let (photograph, gaps) = loaded(listed, set.inverted)?;
-    let load = if listed.split.is_none() { Image::load_upright } else { Image::load };
+    let (photograph, gaps) = loaded(listed, set.inverted, &set.colours)?;
+    let load = |path: &PathBuf| {
+        let image = Image::load_counted(path, &set.colours)?;
+        let is_plain = listed.split.is_none();
+        Ok(if is_plain { image.turned(Orientation::of(path)) } else { image })
+    };
     let reference = listed.reference.as_ref().map(load).transpose()?;
     let (statistics, image, gain) = set.result(&photograph, &gaps)?;
     Ok(Mapped { photograph, gaps, statistics, image, gain, reference })

@@ -5,10 +5,12 @@ use std::path::{Path, PathBuf};
 
 use super::ApplyArgs;
 use crate::base::output::is_same_file;
+use crate::base::tree;
 use crate::cli::ImageFormat;
 use crate::photographs::dataset::{Dataset, LoadOptions, Photograph, Split};
 use crate::photographs::image::files::{photographs_in, unread_in};
-use crate::photographs::image::{Image, Mask, Orientation, PictureFile};
+use crate::photographs::image::{ColourTally, Image, Mask, MaskFile, Orientation, PictureFile};
+use crate::photographs::white_balance::WhiteBalanceGains;
 use crate::{Error, Result};
 
 /// A photograph to map.
@@ -19,18 +21,26 @@ pub(super) struct Listed {
     pub(super) reference: Option<PathBuf>,
     /// The split, in a dataset.
     pub(super) split: Option<Split>,
-    /// Mask file.
-    pub(super) mask: Option<PathBuf>,
-    /// File to write.
+    /// Its mask.
+    pub(super) mask: Option<MaskFile>,
+    /// The file to write.
     pub(super) target: Option<PathBuf>,
+    pub(super) gains: Option<WhiteBalanceGains>,
 }
 
 impl Listed {
     /// The photograph as stored, with the indices of pixels that are not finite or hidden by alpha or mask.
-    pub(super) fn load(&self, inverted: bool) -> Result<(Image, Vec<usize>)> {
-        let (image, alpha) = PictureFile::open(&self.input)?.decode()?;
+    pub(super) fn load(
+        &self,
+        inverted: bool,
+        colours: &ColourTally,
+    ) -> Result<(Image, Vec<usize>)> {
+        let (mut image, alpha) = PictureFile::open(&self.input)?.decode_counted(colours)?;
+        if let Some(gains) = self.gains {
+            gains.apply(&mut image);
+        }
         let decoded = (&image, alpha.as_ref());
-        let mask = Mask::over(&self.input, decoded, self.mask.as_deref(), inverted)?;
+        let mask = Mask::over(&self.input, decoded, self.mask.as_ref(), inverted)?;
         let hidden = mask.as_ref().map(Mask::hidden).unwrap_or_default();
         Ok((image, hidden))
     }
@@ -59,8 +69,8 @@ pub(super) fn listed(args: &ApplyArgs) -> Result<Vec<Listed>> {
     let input = &args.input;
     let unreadable =
         |error: std::io::Error| Error::input(input, format!("cannot be read: {error}"));
-    let is_folder = std::fs::metadata(input).map_err(unreadable)?.is_dir();
-    let mut photographs = if !is_folder {
+    std::fs::metadata(input).map_err(unreadable)?;
+    let mut photographs = if !tree::is_dir(input) {
         vec![plain(input, args.reference.as_deref())?]
     } else if Dataset::is_at(input) {
         let options = LoadOptions { reference: args.reference.clone(), ..LoadOptions::default() };
@@ -71,6 +81,7 @@ pub(super) fn listed(args: &ApplyArgs) -> Result<Vec<Listed>> {
             mask,
             split: Some(split),
             target: None,
+            gains: None,
         };
         Dataset::photographs(input, &options)?.into_iter().map(of_view).collect()
     } else {
@@ -83,6 +94,10 @@ pub(super) fn listed(args: &ApplyArgs) -> Result<Vec<Listed>> {
     if photographs.is_empty() {
         return Err(Error::input(input, "contains no PNG, JPEG, WebP, TIFF or EXR image"));
     }
+    let named = || photographs.iter().map(|one| (one.name.as_str(), one.input.as_path()));
+    let balance = args.white_balance.as_ref();
+    let gains = balance.map(|balance| balance.gains(input, named())).transpose()?;
+    photographs.iter_mut().for_each(|photograph| photograph.gains = gains);
     if let Some(out) = &args.out {
         set_targets(&mut photographs, out, args.format)?;
     }
@@ -104,8 +119,9 @@ fn plain(input: &Path, reference: Option<&Path>) -> Result<Listed> {
     let masks = input.with_file_name("masks");
     let file = input.file_name().unwrap_or_default().to_string_lossy();
     let candidates = [format!("{name}.png"), format!("{file}.png")].map(|mask| masks.join(mask));
-    let mask = candidates.into_iter().find(|mask| mask.is_file());
-    Ok(Listed { name, input: input.to_owned(), reference, split: None, mask, target: None })
+    let mask = candidates.into_iter().find(|mask| mask.is_file()).map(MaskFile::shown);
+    let input = input.to_owned();
+    Ok(Listed { name, input, reference, split: None, mask, target: None, gains: None })
 }
 
 /// Sets the file that each is written to, refusing duplicates and photographs.
