@@ -40,6 +40,20 @@ pub fn write_whole_with(
     })
 }
 
+/// Creates a folder unless it exists.
+///
+/// # Errors
+/// [`Error::Output`].
+pub fn create_folder(folder: &Path) -> Result<()> {
+    std::fs::create_dir_all(folder)
+        .map_err(|error| Error::output(folder, format!("cannot be created: {error}")))
+}
+
+/// Whether two paths name the same file.
+pub fn is_same_file(a: &Path, b: &Path) -> bool {
+    a.canonicalize().ok().zip(b.canonicalize().ok()).is_some_and(|(a, b)| a == b)
+}
+
 /// Checks, before any work, that a file or a folder can be created.
 ///
 /// # Errors

@@ -53,12 +53,8 @@ const SIZE: [u32; 2] = [512, 384];
 const TUNED_SIZES: [[u32; 2]; 2] = [[500, 375], [1920, 1080]];
 const GAUSSIANS: usize = 20_000;
 
-/// The time of a stage.
-#[derive(Clone, Debug)]
-struct Timing {
-    name: &'static str,
-    milliseconds: f64,
-}
+/// A stage and its milliseconds.
+type Timing = (&'static str, f64);
 
 /// Device and repetitions.
 struct Bench {
@@ -125,7 +121,7 @@ impl Findings {
     }
 
     fn as_json(&self, bench: &Bench) -> Value {
-        let entry = |timing: &Timing| (timing.name.to_owned(), json!(timing.milliseconds));
+        let entry = |(name, milliseconds): &Timing| ((*name).to_owned(), json!(milliseconds));
         let properties = bench.gpu.properties();
         let Self { stages, .. } = self;
         let errors = self.checked.kernels();
@@ -137,7 +133,7 @@ impl Findings {
             "not_covered": self.not_covered(),
             "kernels": self.kernels,
             "groups": stages.groups.iter().map(entry).collect::<Map<String, Value>>(),
-            "step_ms": stages.step.milliseconds,
+            "step_ms": stages.step.1,
         })
     }
 
@@ -174,7 +170,7 @@ impl Findings {
                 .groups
                 .iter()
                 .chain([&stages.step])
-                .map(|stage| vec![stage.name.to_owned(), format!("{:.2}", stage.milliseconds)]),
+                .map(|(name, milliseconds)| vec![(*name).to_owned(), format!("{milliseconds:.2}")]),
         );
         let not_covered = self.not_covered().join(", ");
         let stage_table = table::aligned(&rows);

@@ -26,9 +26,9 @@ pub struct DemoArgs {
 }
 
 /// The default curve beside the paper's, with enough steps for a clear picture.
-const SWEEP: [&str; 6] = ["--curves", "auto,ase,ap3,linear", "--steps", "300", "--sh-degree", "1"];
+const SWEEP: [&str; 6] = ["--curves", "auto,ase,ap3,linear", "--steps", "500", "--sh-degree", "1"];
 /// The size of the photographs.
-const SIZE: [u32; 2] = [256, 192];
+const SIZE: [u32; 2] = [384, 288];
 /// The run whose model is exported.
 const SHOWN: &str = "curve=auto";
 

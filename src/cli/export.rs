@@ -1,13 +1,13 @@
 //! `nightsplat export`: writes the model of a run in other formats.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::Result;
 use clap::ValueEnum;
 use glam::{DAffine3, DVec3};
 
 use super::{finish, word};
-use crate::base::output::{check_writable, write_whole};
+use crate::base::output::{check_writable, is_same_file, write_whole};
 use crate::camera::Camera;
 use crate::gpu::DeviceChoice;
 use crate::photographs::dataset::{Dataset, View};
@@ -98,7 +98,7 @@ pub(super) fn write(args: &ExportArgs) -> Result<(PathBuf, String)> {
     check_ending(args)?;
     let (gaussians, config, own) = opened(args)?;
     let out = args.out.as_ref().unwrap_or(&own);
-    if args.to == To::Ply && is_same(out, &own) {
+    if args.to == To::Ply && is_same_file(out, &own) {
         let problem = "is the model itself; name another file with --out";
         return Err(Error::output(out, problem).into());
     }
@@ -165,10 +165,6 @@ fn opened(args: &ExportArgs) -> crate::Result<(Gaussians, TrainConfig, PathBuf)>
 
 fn has_networks(config: &TrainConfig) -> bool {
     config.model.denoiser || config.model.tonemapper
-}
-
-fn is_same(a: &Path, b: &Path) -> bool {
-    a.canonicalize().ok().zip(b.canonicalize().ok()).is_some_and(|(a, b)| a == b)
 }
 
 fn provenance(args: &ExportArgs, config: &TrainConfig) -> Provenance {

@@ -20,7 +20,7 @@ use self::tool::Tool;
 pub(super) use self::tool::sources;
 use super::{finish, word};
 use crate::Error;
-use crate::base::output::{check_writable, write_whole};
+use crate::base::output::{check_writable, create_folder, write_whole};
 use crate::base::{input, tree};
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::{Dataset, is_mask};
@@ -136,7 +136,7 @@ pub fn run(args: &PoseArgs) -> Result<()> {
         .filter_map(|path| Some((stem(path.file_name()?.to_str()?), path)))
         .collect();
     let images = out.folder.join("images");
-    create(&images)?;
+    create_folder(&images)?;
     for name in &placed {
         let Some(path) = by_name.get(stem(name)) else { continue };
         link_or_copy(path, &images.join(path.file_name().unwrap_or_default()))?;
@@ -148,7 +148,7 @@ pub fn run(args: &PoseArgs) -> Result<()> {
         }
     }
     let sparse = out.folder.join("sparse/0");
-    create(&sparse)?;
+    create_folder(&sparse)?;
     for file in ["cameras.bin", "images.bin", "points3D.bin"] {
         link_or_copy(&model.join(file), &sparse.join(file))?;
     }
@@ -195,7 +195,7 @@ fn keep_masks(masks: &Path, to: &Path) -> Result<()> {
     if !masks.is_dir() {
         return Ok(());
     }
-    create(to)?;
+    create_folder(to)?;
     for mask in photographs_in(masks)? {
         link_or_copy(&mask, &to.join(mask.file_name().unwrap_or_default()))?;
     }
@@ -230,11 +230,6 @@ fn photographs(folder: &Path) -> Result<Vec<PathBuf>> {
 fn say(begin: Instant, what: &str) -> Result<()> {
     writeln!(std::io::stderr(), "{:5.0} s  {what}", begin.elapsed().as_secs_f64())?;
     Ok(())
-}
-
-fn create(folder: &Path) -> crate::Result<()> {
-    fs::create_dir_all(folder)
-        .map_err(|error| Error::output(folder, format!("cannot be created: {error}")))
 }
 
 /// Creates a hard link, or a copy where the file system has no links.
@@ -285,7 +280,7 @@ impl Unfinished {
             return Err(Error::output(folder, problem));
         }
         let work = folder.join("work");
-        create(&work)?;
+        create_folder(&work)?;
         let log = folder.join(LOG);
         let replaces = holds(target);
         Ok(Self { target: target.to_owned(), replaces, folder, work, log, is_finished: false })

@@ -7,7 +7,7 @@ use anyhow::Result;
 use super::words::Words;
 use super::{ImageFormat, finish, progress_bar, word};
 use crate::Error;
-use crate::base::output::{check_writable, printable};
+use crate::base::output::{check_writable, create_folder, printable};
 use crate::camera::{Camera, CameraPath};
 use crate::gpu::DeviceChoice;
 use crate::photographs::dataset::{Dataset, Split, View};
@@ -209,8 +209,7 @@ fn save_numbers(
 /// Creates the folder unless it lies in the dataset, where renders would replace photographs of the same names. The run
 /// itself may lie there.
 fn make_folder(out: &Path, dataset: &Dataset, run: &Path) -> crate::Result<()> {
-    std::fs::create_dir_all(out)
-        .map_err(|error| Error::output(out, format!("cannot be created: {error}")))?;
+    create_folder(out)?;
     let is_in = |folder: &Path| {
         let paths = out.canonicalize().ok().zip(folder.canonicalize().ok());
         paths.is_some_and(|(out, folder)| out.starts_with(folder))

@@ -33,11 +33,11 @@ use self::options::Options;
 use self::point::{ADAPTIVE, Axis, OFFSET, PARTS};
 use self::rows::Rows;
 pub(super) use self::run::parsed;
-use self::run::{Common, Run, absolute, difference};
+use self::run::{Run, absolute, difference};
 use super::{finish, progress_bar};
 use crate::Error;
 use crate::base::input;
-use crate::base::output::{check_writable, write_whole};
+use crate::base::output::{check_writable, create_folder, write_whole};
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::Dataset;
 use crate::photographs::tone::Statistics;
@@ -193,11 +193,10 @@ fn plan(args: &SweepArgs) -> crate::Result<(Vec<Run>, Dataset)> {
         return Err(Error::Usage(problem.to_owned()));
     }
     let points = grid::points(&axes, args.table)?;
-    let (dataset, out) = (absolute(&args.dataset)?, absolute(&args.out)?);
-    let common = Common { dataset: &dataset, shared, out: &out };
+    let (dataset, out) = (absolute(&args.dataset)?, PathBuf::from(absolute(&args.out)?));
     let mut runs: Vec<Run> = vec![];
     for point in points {
-        let run = Run::new(point, common)?;
+        let run = Run::new(point, &dataset, shared, &out)?;
         match runs.iter().find(|other| other.config == run.config) {
             None => runs.push(run),
             Some(other) if args.table.is_some() => {
@@ -247,8 +246,7 @@ fn claim(args: &SweepArgs, runs: &[Run]) -> crate::Result<()> {
     if args.dry_run {
         return Ok(());
     }
-    std::fs::create_dir_all(folder)
-        .map_err(|error| Error::output(folder, format!("cannot be created: {error}")))?;
+    create_folder(folder)?;
     write_whole(&path, manifest.as_bytes())
 }
 

@@ -50,7 +50,6 @@ pub use fingerprint::Fingerprint;
 use layout::Layout;
 use listed::{ListedView, Listing};
 use listing::{list, warn};
-#[cfg(feature = "cli")]
 pub(crate) use masks::is_beside as is_mask;
 use members::with_held_out;
 pub use options::{DOWNSCALE, DepthOptions, LoadOptions, MeasuredSize};

@@ -1,8 +1,8 @@
 //! Hostile inputs: whole training steps, every pass against its CPU reference in f64, and the outcome of each.
 //!
-//! The table is [`cases::CASES`]: an input, its outcome in words, and the outcome in a form that is checked. A row fails
-//! where it is anything else. A few rows stand for all; the whole table, printed, is
-//! `cargo test --release --test cli whole_table -- --ignored --nocapture`.
+//! The table is [`cases::CASES`]: an input, its outcome in words, and the outcome in a form that is checked. A row
+//! fails where it is anything else. A few rows stand for all; the whole table, printed, is `cargo test --release
+//! --test cli whole_table -- --ignored --nocapture`.
 
 mod cases;
 mod hostile;

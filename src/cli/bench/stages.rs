@@ -91,18 +91,17 @@ pub(super) fn time(bench: &Bench, trainers: &mut Trainers) -> Result<Stages> {
     let mut photograph = BenchPhotograph::new(&bench.gpu)?;
     let times = repeated(bench, || photograph.profile(&bench.gpu))?;
     let full_hd = median(times.iter().map(|times| total(times)).collect());
-    let group = |name, milliseconds| Timing { name, milliseconds };
     let groups = vec![
-        group("blend_forward", of_step(&["blend_forward"])),
-        group("blend_backward", of_step(&["blend_backward"])),
-        group("sort_65000_pairs", sort(bench)?),
-        group("pseudo_gt_1920x1080", full_hd),
-        group("loss", of_step(&loss_kernels)),
-        group("target", of_step(&["pseudo_gt"])),
+        ("blend_forward", of_step(&["blend_forward"])),
+        ("blend_backward", of_step(&["blend_backward"])),
+        ("sort_65000_pairs", sort(bench)?),
+        ("pseudo_gt_1920x1080", full_hd),
+        ("loss", of_step(&loss_kernels)),
+        ("target", of_step(&["pseudo_gt"])),
     ];
     let milliseconds = whole_step(bench, trainers)?;
     let intersections = trainers.intersections;
-    Ok(Stages { groups, step: group("step", milliseconds), intersections })
+    Ok(Stages { groups, step: ("step", milliseconds), intersections })
 }
 
 /// Wall time of a step, with several steps per submission as in training.

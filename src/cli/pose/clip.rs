@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
 
-use super::create;
 use super::tool::Tool;
+use crate::base::output::create_folder;
 use crate::photographs::image::Image;
 use crate::photographs::image::files::photographs_in;
 use crate::{Error, Result};
@@ -24,7 +24,7 @@ pub(super) fn frames(
     fps: f64,
     folder: &Path,
 ) -> Result<Vec<PathBuf>> {
-    create(folder)?;
+    create_folder(folder)?;
     let transfer = ffmpeg.probed(clip, "color_transfer");
     let filters = filters(ffmpeg, clip, transfer.as_deref().unwrap_or_default())?;
     let filter = format!("fps={}{filters}", fps * CANDIDATES as f64);

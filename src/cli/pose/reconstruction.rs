@@ -7,8 +7,9 @@ use anyhow::Result;
 
 use super::stages::Stage;
 use super::tool::Tool;
-use super::{PoseArgs, cameras, create, tone_mapped};
+use super::{PoseArgs, cameras, tone_mapped};
 use crate::Error;
+use crate::base::output::create_folder;
 use crate::photographs::dataset::Dataset;
 
 /// The pairs of photographs that COLMAP matches.
@@ -90,7 +91,7 @@ impl<'a> Reconstruction<'a> {
         let glomap =
             is_apart.then(|| colmap.beside(&args.glomap, "glomap").found("")).transpose()?;
         let (database, models) = (work.join("database.db"), work.join("sparse"));
-        create(&models)?;
+        create_folder(&models)?;
         let mapper = if args.mapper == Mapper::Global && !is_apart { GLOBAL } else { "mapper" };
         let commands = ["feature_extractor", matcher.command(), mapper];
         let mut asked = vec![];
@@ -187,7 +188,7 @@ impl<'a> Reconstruction<'a> {
     /// Models go into another folder from here on.
     fn into_folder(&mut self, name: &str) -> Result<()> {
         self.models = self.work.join(name);
-        Ok(create(&self.models)?)
+        Ok(create_folder(&self.models)?)
     }
 
     /// Features of each photograph. Photographs of one lens share a camera; each of a lens of its own has its own.

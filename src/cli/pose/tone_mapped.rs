@@ -2,9 +2,9 @@
 
 use std::path::{Path, PathBuf};
 
-use super::create;
 use crate::Result;
 use crate::base::input;
+use crate::base::output::create_folder;
 use crate::cli::progress_bar;
 use crate::gpu::Gpu;
 use crate::photographs::image::files::stem;
@@ -19,7 +19,7 @@ use crate::photographs::tone::{MeasuredPhotograph, ToneSettings, all_black};
 /// # Errors
 /// None decodes, all are black, or the device is out of memory.
 pub(super) fn write(gpu: &Gpu, photographs: &mut Vec<PathBuf>, folder: &Path) -> Result<f64> {
-    create(folder)?;
+    create_folder(folder)?;
     // The same curve for all, so that features keep matching.
     let settings = ToneSettings { scene_statistics: true, ..ToneSettings::default() };
     let pseudo_gt = PseudoGt::new(gpu, &settings)?;

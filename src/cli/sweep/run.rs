@@ -30,28 +30,18 @@ pub(super) struct Run {
     args: TrainArgs,
 }
 
-/// The common part of all runs.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Common<'a> {
-    /// An absolute path.
-    pub(super) dataset: &'a str,
-    /// Options of `train` as arguments.
-    pub(super) shared: &'a [String],
-    /// The absolute path of the folder with all run directories.
-    pub(super) out: &'a str,
-}
-
 impl Run {
-    /// The run of a point. Points with a preset train with its plan for the photographs, as `train --preset` does;
-    /// others train without a plan, so that they differ in nothing but their settings.
+    /// The run of a point with the options `shared`, in a folder of `out`; both paths are absolute. Points with a
+    /// preset train with its plan for the photographs, as `train --preset` does; others train without a plan, so that
+    /// they differ in nothing but their settings.
     ///
     /// # Errors
     /// Those of `train` for these options, after the name of the point.
-    pub(super) fn new(point: Point, common: Common<'_>) -> Result<Self> {
+    pub(super) fn new(point: Point, dataset: &str, shared: &[String], out: &Path) -> Result<Self> {
         let name = point.name();
-        let folder = Path::new(common.out).join(&name);
-        let mut arguments = vec!["train".to_owned(), common.dataset.to_owned()];
-        arguments.extend_from_slice(common.shared);
+        let folder = out.join(&name);
+        let mut arguments = vec!["train".to_owned(), dataset.to_owned()];
+        arguments.extend_from_slice(shared);
         arguments.extend(point.arguments());
         let end = ["--out".to_owned(), unicode(&folder)?, "--resume".to_owned()];
         let mut args: TrainArgs = parsed(&name, arguments.iter().chain(&end))?;

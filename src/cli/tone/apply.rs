@@ -11,7 +11,7 @@ use serde::Serialize;
 
 use self::page::Page;
 use self::photographs::{Listed, listed};
-use crate::base::output::{check_writable, printable};
+use crate::base::output::{check_writable, create_folder, printable};
 use crate::cli::{ImageFormat, finish, progress_bar, table, word, words};
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::{Dataset, Split};
@@ -247,10 +247,7 @@ pub fn apply(args: &ApplyArgs) -> Result<ToneOutput> {
     };
     args.out.iter().chain(&args.report).try_for_each(|path| check_writable(path))?;
     let photographs = listed(args)?;
-    if let Some(out) = &args.out {
-        std::fs::create_dir_all(out)
-            .map_err(|error| Error::output(out, format!("cannot be created: {error}")))?;
-    }
+    args.out.iter().try_for_each(|out| create_folder(out))?;
     let gpu = Gpu::new(&args.device.clone().unwrap_or_default())?;
     let mut set =
         CurveOnSet::new(&gpu, settings.clone(), &photographs, (&args.input, args.invert_masks))?;
@@ -469,9 +466,4 @@ fn scene(views: &[(&Listed, ToneReport)]) -> Option<ToneReport> {
         gain: None,
         scores: Scores::mean(&scores),
     })
-}
-
-/// Whether two paths name the same file.
-fn is_same_file(a: &Path, b: &Path) -> bool {
-    a.canonicalize().ok().zip(b.canonicalize().ok()).is_some_and(|(a, b)| a == b)
 }

@@ -3,7 +3,8 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use super::{ApplyArgs, is_same_file};
+use super::ApplyArgs;
+use crate::base::output::is_same_file;
 use crate::base::tree;
 use crate::cli::ImageFormat;
 use crate::photographs::dataset::{Dataset, LoadOptions, Photograph, Split};
