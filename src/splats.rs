@@ -5,6 +5,7 @@
 //!
 //! - [`attributes`]: the one table of what every Gaussian has
 //! - [`halves`]: how numbers are stored, and those of 16 bits
+//! - [`harmonics`]: the basis of view-dependent colour on the host, and its rotation
 //! - [`batches`]: Gaussians of more planes than one binding holds
 //! - [`scene`]: Gaussians on the host and on the device, PLY
 //! - [`sort`]: scan and radix sort on the device
@@ -17,6 +18,8 @@ pub mod batches;
 #[cfg(feature = "io")]
 pub mod densify;
 pub mod halves;
+#[cfg(any(feature = "io", feature = "check"))]
+pub mod harmonics;
 #[cfg(feature = "io")]
 pub mod optimizer;
 pub mod render;

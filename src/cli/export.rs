@@ -1,5 +1,7 @@
 //! `nightsplat export`: a run's model in the formats of others.
 
+mod up;
+
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
@@ -18,6 +20,8 @@ use crate::splats::scene::Gaussians;
 use crate::train::TrainConfig;
 use crate::{Error, results::run};
 
+pub use up::Up;
+
 /// Write a run's model in the format of a viewer, as bright as it was trained to be.
 #[derive(Clone, Debug, clap::Args)]
 #[command(
@@ -34,6 +38,10 @@ pub struct ExportArgs {
     /// The file to write; one of that name is replaced [default: model with the format's ending, in the run]
     #[arg(long, value_name = "FILE")]
     pub out: Option<PathBuf>,
+    /// What is up in the dataset's world: x, y, z, -x, -y, -z or X,Y,Z. GLB and SPZ are turned so that it is +Y, PLY and SOG
+    /// so that it is -Y; none: the axes of the dataset stay [default: for GLB, SPZ and html as the run says; PLY and SOG stay]
+    #[arg(long, value_name = "DIRECTION", allow_hyphen_values = true)]
+    pub up: Option<Up>,
     /// The version of SPZ: 4, or 3, which more readers know
     #[arg(long, value_name = "3|4", default_value_t = 4, value_parser = clap::value_parser!(u8).range(3..=4))]
     pub spz: u8,
@@ -97,7 +105,9 @@ pub fn run(args: &ExportArgs) -> Result<()> {
             args.run.display()
         );
     }
-    let provenance = provenance(args, &config);
+    let (rotation, turned) = args.rotation(&config).unwrap_or_default();
+    let gaussians = up::turned(gaussians, rotation);
+    let provenance = Provenance { rotation, ..provenance(args, &config) };
     let format = match args.to {
         To::Ply => Some(Format::Ply),
         To::Spz if args.spz == 3 => Some(Format::Spz(spz::Version::V3)),
@@ -113,7 +123,7 @@ pub fn run(args: &ExportArgs) -> Result<()> {
     let (shown, count) = (out.display().to_string(), gaussians.count);
     let kib = std::fs::metadata(out).map_or(0, |file| file.len()).div_ceil(1024);
     let brightness = if is_model(&args.run) { "" } else { ", as bright as their targets" };
-    let line = format!("{}: {count} Gaussians in {kib} KiB{brightness}", printable(&shown));
+    let line = format!("{}: {count} Gaussians in {kib} KiB{brightness}{turned}", printable(&shown));
     Ok(writeln!(std::io::stdout(), "{line}")?)
 }
 
@@ -151,6 +161,7 @@ fn provenance(args: &ExportArgs, config: &TrainConfig) -> Provenance {
         dataset,
         curve: config.tone.curve.to_string(),
         exposure: exposure.unwrap_or_else(|| "of its targets".to_owned()),
+        ..Provenance::default()
     }
 }
 
@@ -164,7 +175,8 @@ fn page(
 ) -> Result<String> {
     let mut frame = config.frame.unwrap_or_default();
     let title = format!("{} by nightsplat", provenance.dataset);
-    let bookmarks = if has_networks(config) {
+    let up = args.up(config);
+    let (bookmarks, up) = if has_networks(config) {
         let FinishedRun { mut player, dataset, .. } = FinishedRun::open_with(
             &args.run,
             args.dataset.as_deref(),
@@ -173,10 +185,11 @@ fn page(
                 own.undistort = true;
             },
         )?;
-        bookmarks(args, gaussians.origin, &dataset, |view| {
+        let bookmarks = bookmarks(args, gaussians.origin, &dataset, |view| {
             let networks = player.render(view)?.output().clone();
             Ok(Some(("model with its networks".to_owned(), networks)))
-        })?
+        })?;
+        (bookmarks, up.unwrap_or_else(|| dataset.up()))
     } else {
         let mut config = config.clone();
         if let Some(dataset) = &args.dataset {
@@ -189,10 +202,11 @@ fn page(
         if is_model(&args.run) {
             frame = dataset.frame();
         }
-        bookmarks(args, gaussians.origin, &dataset, |_| Ok(None))?
+        let bookmarks = bookmarks(args, gaussians.origin, &dataset, |_| Ok(None))?;
+        (bookmarks, up.unwrap_or_else(|| dataset.up()))
     };
     let near = f64::from(config.render_settings().near) / frame.scale;
-    Ok(Page { title, gaussians, provenance, bookmarks, near }.html()?)
+    Ok(Page { title, gaussians, provenance, bookmarks, near, up }.html()?)
 }
 
 fn bookmarks(
@@ -213,10 +227,13 @@ fn bookmarks(
             view.loaded_reference()?.map(|image| ("reference".to_owned(), image.into_owned())),
             rendered(view)?,
         ];
+        // A mirrored photograph is of a mirrored world, which the page shows as it is.
+        let turned =
+            |(label, image): (String, Image)| (label, image.turned(view.orientation.turn()));
         Ok(Bookmark {
             name: view.name.clone(),
-            camera: moved(&view.camera, origin),
-            pictures: pictures.into_iter().flatten().collect(),
+            camera: moved(&view.upright_camera(), origin),
+            pictures: pictures.into_iter().flatten().map(turned).collect(),
         })
     };
     (0..count).map(bookmark).collect()

@@ -6,6 +6,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::Result;
+use glam::DVec3;
 
 use super::finished_run::FinishedRun;
 use super::{ImageFormat, progress_bar};
@@ -14,9 +15,10 @@ use crate::camera::{Camera, CameraPath};
 use crate::gpu::DeviceChoice;
 use crate::loss::exposure::Affine;
 use crate::photographs::dataset::{Dataset, Split, View};
-use crate::photographs::image::Image;
+use crate::photographs::image::{Image, Orientation};
 use crate::photographs::tone::exposed_anew;
 use crate::results::eval::Layer;
+use crate::train::TrainConfig;
 use crate::{Error, results::run};
 
 /// Render a run from the cameras of its dataset, whether they took an image or not, or along a path through them.
@@ -66,26 +68,44 @@ pub struct RenderArgs {
 
 const EXAMPLES: &str = "Examples:
   nightsplat render run --split test --out pictures
-  nightsplat render run --path orbit --frames 180 --out frames --video orbit.mp4
-  nightsplat render run --path interpolate --out frames --video flight.png";
+  nightsplat render run --path auto --frames 180 --out frames --video flight.mp4
+  nightsplat render run --path interpolate --out frames --video moving.png";
 
 /// How a camera flies.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum PathChoice {
+    /// What suits the cameras: an orbit where they surround the scene, an arc over what they cover, a spiral where they look
+    /// in parallel, through all of them where they look outwards
+    Auto,
     /// Around the point nearest to all optical axes
     Orbit,
+    /// Over the part of the orbit that the cameras cover, and back
+    Arc,
     /// About the mean camera, two turns; for photographs from one side
     Spiral,
     /// Smoothly through all training cameras by name
     Interpolate,
 }
 
-impl From<PathChoice> for CameraPath {
-    fn from(path: PathChoice) -> Self {
-        match path {
-            PathChoice::Orbit => Self::Orbit,
-            PathChoice::Spiral => Self::Spiral,
-            PathChoice::Interpolate => Self::Interpolate,
+impl PathChoice {
+    /// The path about what is up; says which one suits the cameras where that is asked.
+    fn path(self, poses: &[Camera], up: DVec3) -> CameraPath {
+        match self {
+            Self::Auto => {
+                let path = CameraPath::suited_about(poses, up);
+                let reason = match path {
+                    CameraPath::Orbit => "an orbit: the cameras surround the scene",
+                    CameraPath::Arc => "an arc: the cameras stand on a part of the circle",
+                    CameraPath::Spiral => "a spiral: the cameras look in parallel",
+                    CameraPath::Interpolate => "through all cameras: they look outwards",
+                };
+                tracing::info!("the path is {reason}");
+                path
+            }
+            Self::Orbit => CameraPath::Orbit,
+            Self::Arc => CameraPath::Arc,
+            Self::Spiral => CameraPath::Spiral,
+            Self::Interpolate => CameraPath::Interpolate,
         }
     }
 }
@@ -116,6 +136,8 @@ struct Shot {
     /// Its file's name without extension.
     name: String,
     camera: Camera,
+    /// How its image is turned to be what people see.
+    orientation: Orientation,
 }
 
 /// Renders the views, or a path.
@@ -128,23 +150,29 @@ pub fn run(args: &RenderArgs) -> Result<()> {
     if let Some(video) = &args.video {
         video::check(video, *format)?;
     }
-    let FinishedRun { dataset, mut player, .. } =
+    let FinishedRun { config, dataset, mut player, .. } =
         FinishedRun::open(run, args.dataset.as_deref(), device.as_ref())?;
     let exposures = if *view_exposure { Some(ViewExposures::of(run)?) } else { None };
-    let shots = shots(args, &dataset)?;
+    let shots = shots(args, &config, &dataset)?;
     make_folder(out, &dataset, run)?;
     let bar = progress_bar(shots.len());
-    for Shot { name, camera } in &shots {
+    for Shot { name, camera, orientation } in &shots {
         bar.set_message(printable(name).into_owned());
         let path = file(out, name, *format);
-        let color = |image: Image| match &exposures {
-            Some(exposures) => format.save(&exposures.applied(name, image), &path),
-            None => format.save(&image, &path),
+        let color = |image: Image| {
+            let image = image.turned(*orientation);
+            match &exposures {
+                Some(exposures) => format.save(&exposures.applied(name, image), &path),
+                None => format.save(&image, &path),
+            }
         };
         match layer {
             None => color(player.render_camera(camera)?.output().clone())?,
             Some(layer) if layer.is_color() => color(player.layer(camera, *layer)?)?,
-            Some(layer) => save_numbers(player.layer(camera, *layer)?, *layer, *format, &path)?,
+            Some(layer) => {
+                let numbers = player.layer(camera, *layer)?.turned(*orientation);
+                save_numbers(numbers, *layer, *format, &path)?;
+            }
         }
         bar.inc(1);
     }
@@ -162,25 +190,31 @@ fn file(folder: &Path, name: &str, format: ImageFormat) -> PathBuf {
 }
 
 /// What is to be seen, from where.
-fn shots(args: &RenderArgs, dataset: &Dataset) -> crate::Result<Vec<Shot>> {
+fn shots(args: &RenderArgs, config: &TrainConfig, dataset: &Dataset) -> crate::Result<Vec<Shot>> {
     let Some(path) = args.path else {
         let includes = |view: &&View| args.split.is_none_or(|split| split.includes(view));
         let views = dataset.views.iter().filter(includes);
-        let shots: Vec<Shot> =
-            views.map(|view| Shot { name: view.name.clone(), camera: view.camera }).collect();
+        let shot = |view: &View| {
+            let View { name, camera, orientation, .. } = view;
+            Shot { name: name.clone(), camera: *camera, orientation: *orientation }
+        };
+        let shots: Vec<Shot> = views.map(shot).collect();
         if shots.is_empty() {
             let problem = "has no view of that split; try --split all";
             return Err(Error::input(&dataset.root, problem));
         }
         return Ok(shots);
     };
-    let poses: Vec<Camera> = dataset.train_views().map(|view| view.camera).collect();
-    let cameras = CameraPath::from(path).cameras(&poses, args.frames as usize)?.into_iter();
+    let poses: Vec<Camera> = dataset.train_views().map(View::upright_camera).collect();
+    let up = config.up.and_then(|up| DVec3::from_array(up).try_normalize());
+    let up = up.unwrap_or_else(|| dataset.up());
+    let cameras = path.path(&poses, up).cameras_about(&poses, up, args.frames as usize)?;
+    // A mirrored photograph is of a mirrored world.
+    let first = dataset.train_views().next().map(|view| view.orientation.mirror());
+    let orientation = first.unwrap_or_default();
     // As ffmpeg counts them.
-    Ok(cameras
-        .zip(0..)
-        .map(|(camera, index)| Shot { name: format!("{index:05}"), camera })
-        .collect())
+    let shot = |(index, camera)| Shot { name: format!("{index:05}"), camera, orientation };
+    Ok((0..).zip(cameras).map(shot).collect())
 }
 
 /// The exposures of a run's training views beside the one of its model.

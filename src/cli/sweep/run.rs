@@ -74,9 +74,9 @@ impl Run {
         let plan = plan.map(|path| Plan::read(&path)).transpose()?;
         let own = self.args.options.config(&self.args.dataset, plan.as_ref())?;
         let own = own.with_absolute_paths();
-        // A run records the tile and the frame that it took; where none is asked for, any is right.
+        // A run records the tile, the frame and the direction of up that it took; where none is asked for, any is right.
         let (tile, frame) = (own.tile.and(found.tile), own.frame.and(found.frame));
-        let found = TrainConfig { tile, frame, ..found };
+        let found = TrainConfig { tile, frame, up: own.up.and(found.up), ..found };
         if found != own {
             let differs = difference(&found.to_toml()?, &own.to_toml()?);
             let problem = format!("holds another run ({differs}); choose another --out");

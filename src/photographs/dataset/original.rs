@@ -7,11 +7,12 @@ use glam::UVec2;
 
 use super::MeasuredSize;
 use super::packed::Packed;
-use super::prepare::{Preparation, turn};
+use super::prepare::Preparation;
+use super::turns::Turns;
 use crate::Result;
 use crate::base::hash::Hasher;
 use crate::camera::Lens;
-use crate::photographs::image::{Image, PictureFile};
+use crate::photographs::image::{Image, Orientation, PictureFile};
 use crate::photographs::tone::Measured;
 
 /// A photograph that was shrunk on loading, or is not kept.
@@ -22,6 +23,8 @@ pub struct Original {
     lens: Lens,
     /// As [`super::LoadOptions::undistort`].
     undistort: bool,
+    /// From what is stored to what the camera took.
+    orientation: Orientation,
     /// The statistics of the photograph, and of which size.
     pub(super) measured: Option<(MeasuredSize, Measured)>,
     /// Of the pixels as they are loaded, where they are not kept.
@@ -31,8 +34,9 @@ pub struct Original {
 }
 
 impl Original {
-    pub(super) fn new(path: PathBuf, lens: Lens, undistort: bool) -> Self {
-        Self { path, lens, undistort, measured: None, checksum: None, stored: Arc::default() }
+    pub(super) fn new(path: PathBuf, lens: Lens, undistort: bool, turns: Turns) -> Self {
+        let (orientation, stored) = (turns.loading, Arc::default());
+        Self { path, lens, undistort, orientation, measured: None, checksum: None, stored }
     }
 
     /// Width and height, undistorted.
@@ -59,8 +63,7 @@ impl Original {
         let Self { path, lens, undistort, .. } = self;
         let preparation = Preparation::new(lens, *undistort, size, &path.to_string_lossy())?;
         let (image, _) = PictureFile::open(path)?.decode()?;
-        let orientation = turn(path, (image.width, image.height), lens);
-        preparation.loaded(image.turned(orientation), path)
+        preparation.loaded(image.turned(self.orientation), path)
     }
 
     /// The statistics at a size, if they were measured while the photograph was decoded.

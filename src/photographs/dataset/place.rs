@@ -2,8 +2,8 @@
 
 use glam::DVec3;
 
-use super::Dataset;
-use crate::camera::{Frame, frame};
+use super::{Dataset, View};
+use crate::camera::{Camera, Frame, frame, upwards};
 
 impl Dataset {
     /// The scene's size as 3DGS takes it: 1.1 times the largest distance of a training camera to their mean, world units.
@@ -18,6 +18,12 @@ impl Dataset {
     pub(crate) fn frame(&self) -> Frame {
         let (center, extent) = self.place();
         Frame::new(center, extent)
+    }
+
+    /// What is up in the world, a unit vector: across what the training cameras hold level.
+    pub fn up(&self) -> DVec3 {
+        let cameras: Vec<Camera> = self.train_views().map(View::upright_camera).collect();
+        upwards(&cameras)
     }
 
     /// The middle of the training cameras, and the extent.
